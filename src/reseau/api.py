@@ -26,15 +26,17 @@ from .core.errors import UsageError
 from .core.failure import Failure
 from .exchange import Lens, read_network
 from .exchange import read_lens as _read_lens
-from .io import ReseauDesign, TestfieldDesign, is_points, read_measurement
+from .io import BoardDesign, ReseauDesign, TestfieldDesign, is_points, read_measurement
 from .io import read_design as _read_design
 from .io.images import Channel, open_scan
 from .io.images import read_image as _read_image
 from .io.scans import scan_of
 from .measure import (
+    BoardOptions,
     PinOptions,
     ReseauOptions,
     TestfieldOptions,
+    measure_board,
     measure_pins,
     measure_reseau,
     measure_testfield,
@@ -68,7 +70,7 @@ T = TypeVar("T")
 PathLike = str | Path
 ImageLike = PathLike | NDArray[Any] | Frame
 PhotoLike = ImageLike | ImagePoints
-DesignLike = PathLike | ReseauDesign | TestfieldDesign
+DesignLike = PathLike | ReseauDesign | TestfieldDesign | BoardDesign
 CalibrationLike = PathLike | Calibration
 LensLike = PathLike | Lens
 
@@ -116,12 +118,12 @@ def read_image(source: ImageLike, channel: Channel = "luma") -> Frame:
     return _read_image(_path(source, "source", "a path, an array or a Frame"), channel)
 
 
-def read_design(source: DesignLike) -> ReseauDesign | TestfieldDesign:
-    """Read the design of a target: ``reseau-design/1`` or ``testfield-design/1``.
+def read_design(source: DesignLike) -> ReseauDesign | TestfieldDesign | BoardDesign:
+    """Read the design of a target: ``reseau-design/1``, ``testfield-design/1`` or ``reseau-board/1``.
 
     Parameters
     ----------
-    source : str, Path, ReseauDesign or TestfieldDesign
+    source : str, Path, ReseauDesign, TestfieldDesign or BoardDesign
         A file, or a design, which is returned as it is.
 
     Raises
@@ -138,7 +140,7 @@ def read_design(source: DesignLike) -> ReseauDesign | TestfieldDesign:
     >>> len(reseau.read_design(coded_sheet(10, 8, 25.0)).ids)
     80
     """
-    if isinstance(source, ReseauDesign | TestfieldDesign):
+    if isinstance(source, ReseauDesign | TestfieldDesign | BoardDesign):
         return source
     return _read_design(_path(source, "source", "a path or a design"))
 
@@ -220,7 +222,7 @@ def measure(
     image: ImageLike,
     design: DesignLike,
     *,
-    options: ReseauOptions | TestfieldOptions | PinOptions | None = None,
+    options: ReseauOptions | TestfieldOptions | BoardOptions | PinOptions | None = None,
     sensor: CalibrationLike | None = None,
     channel: Channel = "luma",
 ) -> Measured | Failure:
@@ -230,9 +232,9 @@ def measure(
     ----------
     image : str, Path, ndarray (h, w) or Frame
         The image.
-    design : str, Path, ReseauDesign or TestfieldDesign
-        The target: a reseau, a sheet of disks, the rods of a test object, or a coded testfield.
-    options : ReseauOptions, TestfieldOptions or PinOptions, optional
+    design : str, Path, ReseauDesign, TestfieldDesign or BoardDesign
+        The target: a reseau, a sheet of disks, the rods of a test object, a coded testfield, or a board.
+    options : ReseauOptions, TestfieldOptions, BoardOptions or PinOptions, optional
         Options of the measurement of this kind of target.
     sensor : str, Path or Calibration, optional
         Calibration of the sensor, applied first.
@@ -253,6 +255,8 @@ def measure(
     frame = _corrected(read_image(image, channel), sensor)
     if isinstance(target, TestfieldDesign):
         return measure_testfield(frame, target, _options(options, TestfieldOptions))
+    if isinstance(target, BoardDesign):
+        return measure_board(frame, target, _options(options, BoardOptions))
     if target.mark.shape == "rod":
         return measure_pins(frame, target, _options(options, PinOptions))
     return measure_reseau(frame, target, _options(options, ReseauOptions))
@@ -276,7 +280,7 @@ def calibrate(
     ----------
     images : iterable of str, Path, ndarray, Frame or ImagePoints
         Photographs of one size, or the coordinates measured in them.
-    design : str, Path, ReseauDesign or TestfieldDesign
+    design : str, Path, ReseauDesign, TestfieldDesign or BoardDesign
         The target.
     model : str or CameraOptions, optional
         Name of the camera model; by default ``brown`` where the pixel size is given, else ``opencv``.

@@ -105,9 +105,10 @@ def blurred(
 
     The images of the targets are formed by rays through the lens and matched with the photograph.
     """
+    from ..core.errors import UsageError
     from ..core.failure import Failure
     from ..exchange import read_lens, read_network
-    from ..io import ReseauDesign
+    from ..io import BoardDesign, ReseauDesign
     from ..io.reading import read_design
     from ..measure import ReseauOptions, measure_reseau
     from ..measure.blurred import BlurredOptions
@@ -116,6 +117,8 @@ def blurred(
     kind = "" if figure is None else suffix_of(writable(figure), (".svg", ".png", ".pdf"))
     task = Task(image, out, overlay, as_json, "targets", "deviations from the orientation")
     target, optics = read_design(design), read_lens(lens)
+    if isinstance(target, BoardDesign):
+        raise UsageError("is a board", where=design, do="give a testfield or a reseau")
     frame = corrected(read_frame(image), sensor)
     size = frame.width, frame.height
     camera = lens_camera(optics, size, pitch_um=pitch, distance=focus, f_number=f_number)

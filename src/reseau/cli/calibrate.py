@@ -68,7 +68,7 @@ LeaveOut = Annotated[
 
 
 def calibrate(
-    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield or reseau.")],
+    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield, board or reseau.")],
     images: Annotated[
         list[Path] | None,
         typer.Argument(help="Photographs of the target, or files of measured image coordinates."),

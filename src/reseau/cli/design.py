@@ -11,7 +11,7 @@ import typer
 from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
-    from ..io import ReseauDesign, TestfieldDesign
+    from ..io import BoardDesign, ReseauDesign, TestfieldDesign
     from ..io.targets import SpaceTargets
 
 __all__ = ["app"]
@@ -35,6 +35,15 @@ class Polarity(StrEnum):
 
     DARK = "dark"
     BRIGHT = "bright"
+
+
+class Kind(StrEnum):
+    """Kinds of boards."""
+
+    CHESS = "chess"
+    CHARUCO = "charuco"
+    CIRCLES = "circles"
+    APRILGRID = "aprilgrid"
 
 
 Svg = Annotated[Path | None, typer.Option("--svg", help="SVG drawing to write.")]
@@ -196,8 +205,50 @@ def frame(
     _write(design, svg, pdf, out, f"{count} targets of {size:g} mm")
 
 
+@app.command()
+def board(
+    kind: Annotated[Kind, typer.Option(help="Pattern of the board.")] = Kind.CHARUCO,
+    columns: Annotated[int, typer.Option(help="Number of squares, circles or tags in a row.")] = 7,
+    rows: Annotated[int, typer.Option(help="Number of squares, circles or tags in a column.")] = 10,
+    pitch: Annotated[
+        float, typer.Option(help="Side of a square, distance of rows of circles, or of tags (mm).")
+    ] = 24.0,
+    size: Annotated[
+        float | None, typer.Option(help="Diameter of a circle, or side of a marker or tag (mm).")
+    ] = None,
+    dictionary: Annotated[str | None, typer.Option(help="Markers, as OpenCV's DICT_5X5_100.")] = None,
+    first_id: Annotated[int, typer.Option(min=0, help="Number of the first marker.")] = 0,
+    border_bits: Annotated[int, typer.Option(help="Width of the border of a marker (bits).")] = 1,
+    legacy: Annotated[bool, typer.Option("--legacy", help="ChArUco layout of OpenCV before 4.6.")] = False,
+    asymmetric: Annotated[
+        bool, typer.Option("--asymmetric", help="Shift every second row of circles by half a step.")
+    ] = False,
+    given: Annotated[
+        Path | None, typer.Option("--from", help="Board file of Kalibr or OpenCV to read (YAML, XML).")
+    ] = None,
+    name: Annotated[str, typer.Option(help="Name of the design.")] = "board",
+    svg: Svg = None,
+    pdf: Pdf = None,
+    out: Design = None,
+) -> None:
+    """Design a chessboard, a ChArUco board, a circle grid or an AprilGrid."""
+    if given is not None:
+        from ..exchange import read_board
+
+        design = read_board(given)
+    else:
+        from ..designs import board as board_of
+
+        design = board_of(
+            kind.value, columns, rows, pitch, size=size, dictionary=dictionary, first_id=first_id,
+            border_bits=border_bits, legacy=legacy, asymmetric=asymmetric, name=name,
+        )  # fmt: skip
+    what = f"{design.kind}, {design.columns} × {design.rows}, pitch {design.pitch:g} mm"
+    _write(design, svg, pdf, out, what)
+
+
 def _write(
-    design: ReseauDesign | TestfieldDesign | SpaceTargets,
+    design: ReseauDesign | TestfieldDesign | SpaceTargets | BoardDesign,
     svg: Path | None,
     pdf: Path | None,
     out: Path | None,

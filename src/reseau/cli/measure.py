@@ -156,6 +156,34 @@ def coded_field(
     )
 
 
+@app.command()
+def board(
+    image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
+    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the board.")],
+    out: Out = None,
+    overlay: Overlay = None,
+    mirrored: Annotated[
+        bool, typer.Option("--mirrored", help="The image shows the board from behind, or is mirrored.")
+    ] = False,
+    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor (px).")] = 0.0,
+    fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive fraction of a pixel.")] = 1.0,
+    channel: Annotated[Channel, typer.Option(help="Channel of a colour image.")] = Channel.LUMA,
+    sensor: SensorFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure a chessboard, a ChArUco board, a circle grid or an AprilGrid."""
+    from ..io import BoardDesign
+    from ..measure import BoardOptions, measure_board
+
+    task = Task(image, out, overlay, as_json, "points")
+    target = BoardDesign.read(design)
+    options = BoardOptions(mirrored=mirrored, row_jitter_px=row_jitter, fill=fill)
+    task.run(
+        lambda: corrected(read_frame(image, channel.value), sensor),
+        lambda frame: measure_board(frame, target, options),
+    )
+
+
 class Task:
     """Measure one image, or read its coordinates; write and report what was found.
 

@@ -1,5 +1,6 @@
 """Targets as designed: reseaus, an ultrasonic test object, coded testfields, space frames, and drawings."""
 
+from .boards import board
 from .frames import space_frame
 from .reseaus import coded_sheet, n_wire_phantom, regular_reseau, standard_reseau, test_object
 from .testfield import coded_testfield
@@ -9,6 +10,7 @@ __all__ = [
     "HIDDEN",
     "Decoded",
     "TopologicalCode",
+    "board",
     "coded_sheet",
     "coded_testfield",
     "n_wire_phantom",

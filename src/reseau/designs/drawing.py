@@ -15,13 +15,14 @@ from ..core.data import Array
 from ..core.errors import UsageError
 from ..core.figures import drawing as house_style
 from ..core.figures import to_bytes
-from ..io import ReseauDesign, TestfieldDesign
+from ..io import BoardDesign, ReseauDesign, TestfieldDesign
 from ..io.targets import SpaceTargets
 from ..optics.targets import target_corners
+from .boards import board_figures
 
 __all__ = ["design_pdf", "design_svg"]
 
-Drawable = ReseauDesign | TestfieldDesign | SpaceTargets
+Drawable = ReseauDesign | TestfieldDesign | SpaceTargets | BoardDesign
 
 _MARGIN = 18.0
 """Margin around the target, mm, for crop marks, scale bar and title."""
@@ -95,6 +96,8 @@ def _sheet(design: Drawable) -> _Sheet:
     """
     if isinstance(design, TestfieldDesign):
         content = _testfield(design)
+    elif isinstance(design, BoardDesign):
+        content = _board(design)
     else:
         content = _frame(design) if isinstance(design, SpaceTargets) else _reseau(design)
     size = content.high - content.low
@@ -195,6 +198,24 @@ def _testfield(design: TestfieldDesign) -> _Content:
     return _Content(low, high, polygons, circles, title, {})
 
 
+def _board(design: BoardDesign) -> _Content:
+    """A board with a margin: half a square, half a pitch of circles or a gap of tags."""
+    polygons, circles = board_figures(design)
+    ends = [np.vstack([polygon.min(axis=0), polygon.max(axis=0)]) for polygon in polygons]
+    ends += [np.vstack([at[:2] - at[2], at[:2] + at[2]]) for at in circles]
+    every = np.concatenate(ends)
+    low, high = every.min(axis=0) - design.pitch / 2, every.max(axis=0) + design.pitch / 2
+    what = {"chess": "squares", "charuco": "squares", "circles": "circles", "aprilgrid": "tags"}[design.kind]
+    title = f"{design.name}: {design.kind}, {design.columns} × {design.rows} {what}"
+    title += f", pitch {design.pitch:g} mm"
+    if design.size is not None:
+        title += f", size {design.size:g} mm"
+    if design.dictionary is not None:
+        title += f", {design.dictionary}"
+    rounds = [(float(x), float(y), float(radius)) for x, y, radius in circles]
+    return _Content(low, high, polygons, rounds, title, {})
+
+
 def _frame(design: SpaceTargets) -> _Content:
     """Single targets in rows, each on a ground of three times its size, to be cut out."""
     if design.unit != "mm":
@@ -268,7 +289,7 @@ def design_svg(design: Drawable) -> str:
 
     Parameters
     ----------
-    design : ReseauDesign, TestfieldDesign or SpaceTargets
+    design : ReseauDesign, TestfieldDesign, BoardDesign or SpaceTargets
         The target.
 
     Returns
@@ -318,7 +339,7 @@ def design_pdf(design: Drawable) -> bytes:
 
     Parameters
     ----------
-    design : ReseauDesign, TestfieldDesign or SpaceTargets
+    design : ReseauDesign, TestfieldDesign, BoardDesign or SpaceTargets
         The target.
 
     Returns

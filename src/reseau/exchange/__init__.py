@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .bal import read_bal
+from .boards import read_board
 from .bundler import read_bundler
 from .codev import read_codev
 from .colmap import read_colmap
@@ -19,6 +20,7 @@ __all__ = [
     "calibration_files",
     "metashape_script",
     "read_bal",
+    "read_board",
     "read_bundler",
     "read_codev",
     "read_colmap",

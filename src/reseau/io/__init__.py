@@ -4,6 +4,7 @@ A document is a strict pydantic model: unknown and missing keys are errors that 
 written completely or not at all.
 """
 
+from .board import BoardDesign
 from .design import DesignPoint, Mark, ReseauDesign, Rings
 from .document import Document, Strict, read_text, write_whole
 from .fiducials import (
@@ -34,6 +35,7 @@ __all__ = [
     "CORNERS",
     "EDGES",
     "SHAPES",
+    "BoardDesign",
     "DesignPoint",
     "Document",
     "FiducialDesign",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..core.provenance import sha256_of
+from .board import BoardDesign
 from .design import ReseauDesign
 from .document import read_text
 from .measurement import ReseauMeasurement
@@ -13,7 +14,7 @@ from .testfield import TestfieldDesign, parse_design
 __all__ = ["is_points", "read_design", "read_measurement"]
 
 
-def read_design(path: Path | str) -> ReseauDesign | TestfieldDesign:
+def read_design(path: Path | str) -> ReseauDesign | TestfieldDesign | BoardDesign:
     """Read the design of a target, of either schema.
 
     Raises

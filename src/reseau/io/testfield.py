@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from ..core.data import Array
+from .board import BoardDesign
 from .design import ReseauDesign, at_one_place
 from .document import Document, Strict
 
@@ -241,7 +242,7 @@ class TestfieldDesign(Document):
         return 2 * shape + self.large
 
 
-def parse_design(text: str, where: object) -> ReseauDesign | TestfieldDesign:
+def parse_design(text: str, where: object) -> ReseauDesign | TestfieldDesign | BoardDesign:
     """Read a design from JSON text, by its schema; `where` names it in messages.
 
     Raises
@@ -255,5 +256,7 @@ def parse_design(text: str, where: object) -> ReseauDesign | TestfieldDesign:
     >>> type(parse_design(standard_reseau().to_json(), "reseau.json")).__name__
     'ReseauDesign'
     """
+    if '"reseau-board/' in text[:4096]:
+        return BoardDesign.parse(text, where=where)
     kind = TestfieldDesign if '"testfield-design/' in text[:4096] else ReseauDesign
     return kind.parse(text, where=where)

@@ -1,5 +1,6 @@
 """One frame to image coordinates: marks of a reseau, a testfield or a sheet, pins, edges of film frames."""
 
+from .boards import BoardOptions, BoardResult, measure_board
 from .fitting import fit_mapping, mapping_problem, reduce_mapping
 from .matching import Matches, MatchOptions, match
 from .pins import (
@@ -17,6 +18,8 @@ from .reseau import ReseauOptions, ReseauResult, measure_reseau
 from .testfield import TestfieldOptions, TestfieldResult, measure_testfield
 
 __all__ = [
+    "BoardOptions",
+    "BoardResult",
     "Layout",
     "LayoutOptions",
     "MatchOptions",
@@ -34,6 +37,7 @@ __all__ = [
     "lay_wires",
     "mapping_problem",
     "match",
+    "measure_board",
     "measure_pins",
     "measure_reseau",
     "measure_testfield",

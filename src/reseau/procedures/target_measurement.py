@@ -17,8 +17,14 @@ from ..core.errors import EstimationError, ImageError
 from ..core.failure import Code, Failure
 from ..core.processes import process_context
 from ..core.threads import always_one_thread, one_thread
-from ..io import ReseauDesign, TestfieldDesign
-from ..measure import TestfieldOptions, measure_reseau, measure_testfield
+from ..io import BoardDesign, ReseauDesign, TestfieldDesign
+from ..measure import (
+    BoardOptions,
+    TestfieldOptions,
+    measure_board,
+    measure_reseau,
+    measure_testfield,
+)
 from ..measure.points import Measured
 
 __all__ = ["Measurer", "drawing_overlays", "measured_in_order", "measurer_of"]
@@ -30,16 +36,16 @@ _AHEAD = 2
 
 
 def measurer_of(
-    design: TestfieldDesign | ReseauDesign, testfield: TestfieldOptions | None = None
+    design: TestfieldDesign | ReseauDesign | BoardDesign, testfield: TestfieldOptions | None = None
 ) -> Measurer:
     """Return the function that measures a design in a frame.
 
     Parameters
     ----------
-    design : TestfieldDesign or ReseauDesign
-        A coded testfield, or any design of marks.
+    design : TestfieldDesign, BoardDesign or ReseauDesign
+        A coded testfield, a board, or any design of marks.
     testfield : TestfieldOptions, optional
-        Options of the measurement of a testfield.
+        Options of the measurement of a testfield; jitter of rows and share of pixels hold for a board, too.
 
     Examples
     --------
@@ -49,6 +55,10 @@ def measurer_of(
     """
     if isinstance(design, TestfieldDesign):
         return partial(measure_testfield, design=design, options=testfield)
+    if isinstance(design, BoardDesign):
+        same = testfield or TestfieldOptions()
+        options = BoardOptions(row_jitter_px=same.row_jitter_px, fill=same.fill)
+        return partial(measure_board, design=design, options=options)
     return partial(measure_reseau, design=design)
 
 

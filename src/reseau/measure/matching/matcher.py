@@ -46,6 +46,7 @@ def match(
     form_sigma: Array | None = None,
     claims: tuple[NDArray[Any], Rows] | None = None,
     others: Array | None = None,
+    region: Mask | None = None,
     light: tuple[Array, Array] | None = None,
     searching: bool = True,
 ) -> Matches:
@@ -75,6 +76,8 @@ def match(
         owned by another mark are not used.
     others : ndarray (k, rows, columns), optional
         Light of other marks in each window, subtracted first.
+    region : ndarray of bool (k, rows, columns), optional
+        Pixels of each window that belong to the mark; the others are not used.
     light : tuple, optional
         Contrast (k,) and coefficients of the background (k, b), if these, the positions and the width are
         known approximately. Then only patches with large residuals are searched for blunders.
@@ -105,7 +108,7 @@ def match(
     """
     if isinstance(outline, Outline):
         outline = GrownOutline(outline, np.zeros((0, 2, 2)) if form is None else form)
-    patch = Patches(pixels, valid, outline, xy, options, claims, others)
+    patch = Patches(pixels, valid, outline, xy, options, claims, others, region)
     free = np.full(patch.form_at + patch.forms, np.inf)
     free[[X, Y]], free[WIDTH] = options.held or np.array(options.half) / 2, options.psf_log_sigma
     free[CONTRAST] = options.contrast_sigma
@@ -118,14 +121,20 @@ def match(
     quick.converged[amiss] = False
     if not len(amiss) or not searching:
         return quick
+    contrast = options.contrast
     few = Patches(
         pixels,
         valid,
         ShapeSubset(outline, amiss),
         xy[amiss],
-        replace(options, psf_px=patch.psf[amiss]),
+        replace(
+            options,
+            psf_px=patch.psf[amiss],
+            contrast=contrast[amiss] if isinstance(contrast, np.ndarray) else contrast,
+        ),
         None if claims is None else (claims[0], claims[1][amiss]),
         None if others is None else others[amiss],
+        None if region is None else region[amiss],
     )
     return quick.replaced(amiss, _searched(few, free, noise))
 

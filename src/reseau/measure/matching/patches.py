@@ -119,6 +119,7 @@ class Patches:
         options: MatchOptions,
         claims: tuple[NDArray[Any], Rows] | None = None,
         others: Array | None = None,
+        region: Mask | None = None,
     ) -> None:
         self.form, self.xy, self.options = shape, xy, options
         self.forms = shape.parameters
@@ -149,6 +150,9 @@ class Patches:
             x_off, y_off = columns - xy[:, :1], rows - xy[:, 1:]
             distance = np.hypot(x_off[:, None, :], y_off[:, :, None])
             self.near = (distance <= options.within_px).reshape(k, -1)
+        if region is not None:
+            self.near &= region.reshape(k, -1)
+        if region is not None or options.within_px < np.inf:
             self.weights *= self.near
         if claims is not None:
             owner, mine = claims
@@ -166,7 +170,14 @@ class Patches:
         # Start with the expected width; see `width`.
         x[:, WIDTH] = np.log(self.psf * np.sqrt(1 - SHARPEST**2))
         x[:, CONTRAST], x[:, self.ground] = contrast, ground
+        self._weigh(x)
         return x
+
+    def _weigh(self, x: Array) -> None:
+        """Weights of the pixels by the grey values that are formed."""
+        if self.options.variance is not None:
+            grey, _ = self.form_image(x, np.arange(len(x)))
+            self.relative_weights = relative_weights(grey, self.options.variance)
 
     def start(self, noise: float) -> Array:
         """Approximate values; rejects pixels of the background that belong to other objects.
@@ -202,9 +213,7 @@ class Patches:
         else:
             top = np.where(self.weights > 0, self.grey - fitted @ design.T, 0.0)
             x[:, CONTRAST] = np.maximum(top.max(axis=1), noise)
-        if self.options.variance is not None:
-            grey, _ = self.form_image(x, np.arange(len(x)))
-            self.relative_weights = relative_weights(grey, self.options.variance)
+        self._weigh(x)
         return x
 
     def width(self, x: Array, at: Rows) -> Array:

@@ -28,7 +28,7 @@ from ..testfield.lattice_mapping import second_order
 from .assignment import spacing
 from .disks import Disks
 
-__all__ = ["MOST_DISKS", "SheetPlacement", "lay_sheet", "through"]
+__all__ = ["MOST_DISKS", "SheetPlacement", "disk_seeds", "grown_disks", "lay_sheet", "through"]
 
 MOST_DISKS = 4
 """Number of ellipses examined, as a multiple of the disks of the design; others are specks."""
@@ -71,7 +71,7 @@ class SheetPlacement:
     disk: Rows
 
 
-def through(at: Array, xy: Array, shape: tuple[int, int]) -> Chain:
+def through(at: Array, xy: Array, shape: tuple[int, int], degree: int = 1) -> Chain:
     """Mapping through points: a projectivity and a polynomial whose degree grows with the number of points.
 
     Parameters
@@ -80,6 +80,8 @@ def through(at: Array, xy: Array, shape: tuple[int, int]) -> Chain:
         Lattice coordinates and images.
     shape : tuple
         Height and width of the frame.
+    degree : int
+        Least degree of the polynomial, for points that were measured precisely.
     """
     h, w = shape
     middle, half = np.array([w - 1, h - 1]) / 2, max(h, w) / 2
@@ -91,7 +93,7 @@ def through(at: Array, xy: Array, shape: tuple[int, int]) -> Chain:
     if found is None:
         found = np.eye(3)
     straight = straight.with_values((found / found[2, 2]).ravel()[:8])
-    curved = RationalPolynomial.polynomial(1, offset=(float(middle[0]), float(middle[1])), scale=half)
+    curved = RationalPolynomial.polynomial(degree, offset=(float(middle[0]), float(middle[1])), scale=half)
     return refit(Chain(straight, curved), at, xy, _POINT_PX)
 
 
@@ -131,8 +133,8 @@ def lay_sheet(
     reach = 2 * step / design.mark.size
     failure = Failure(f"no disks at a distance of {reach / 2:.1f} diameters form a lattice", Code.NOT_FOUND)
     shape = (grey.shape[0], grey.shape[1])
-    for seed in _seeds(disks, reach):
-        nodes, rows, mapping = _grown(*seed, disks, shape, np.ptp(numbers, axis=0).max() + 1)
+    for seed in disk_seeds(disks, reach):
+        nodes, rows, mapping = grown_disks(*seed, disks, shape, np.ptp(numbers, axis=0).max() + 1)
         if len(rows) < max(6, len(numbers) // 6):
             continue
         placed = _read(grey, nodes, rows, mapping, design, numbers, step, mirrored is not False)
@@ -157,7 +159,7 @@ def _numbered(design: ReseauDesign) -> tuple[Array, float, Array]:
     return np.rint(numbers), step, start
 
 
-def _seeds(disks: Disks, reach: float) -> Iterator[tuple[int, Array]]:
+def disk_seeds(disks: Disks, reach: float) -> Iterator[tuple[int, Array]]:
     """Ellipses with neighbours on a lattice around them, and the images (2, 2) of its unit steps."""
     if len(disks) < 6:
         return
@@ -187,7 +189,7 @@ def _seeds(disks: Disks, reach: float) -> Iterator[tuple[int, Array]]:
         yield int(i), reach * disks.form[i] @ turn
 
 
-def _grown(
+def grown_disks(
     seed: int, slope: Array, disks: Disks, shape: tuple[int, int], extent: float
 ) -> tuple[Array, Rows, Chain]:
     """Nodes (m, 2) of the lattice grown from a seed, the disks on them, and the mapping to the image."""

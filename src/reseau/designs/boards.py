@@ -1,0 +1,172 @@
+"""Boards that other programs use: chessboards, ChArUco boards, circle grids, AprilGrids."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from ..core.data import Array
+from ..core.errors import UsageError
+from ..io.board import BoardDesign, BoardKind
+
+__all__ = ["board", "board_figures", "marker_cells", "marker_dictionary"]
+
+_SIZES = {"charuco": 0.75, "circles": 0.5, "aprilgrid": 1 / 1.3}
+"""Sizes of markers, circles and tags in pitches, where none is given; tags are 0.3 of a side apart."""
+_DICTIONARIES = {"charuco": "DICT_5X5_100", "aprilgrid": "DICT_APRILTAG_36h11"}
+
+
+def board(
+    kind: BoardKind,
+    columns: int,
+    rows: int,
+    pitch: float,
+    *,
+    size: float | None = None,
+    dictionary: str | None = None,
+    first_id: int = 0,
+    border_bits: int = 1,
+    legacy: bool = False,
+    asymmetric: bool = False,
+    name: str = "board",
+) -> BoardDesign:
+    """Design a board, with the usual size and dictionary where none is given.
+
+    Parameters
+    ----------
+    kind : {"chess", "charuco", "circles", "aprilgrid"}
+        The pattern.
+    columns, rows : int
+        Number of squares, circles or tags.
+    pitch : float
+        Distance between squares, rows of circles or tags, mm.
+    size, dictionary, first_id, border_bits, legacy, asymmetric, name
+        See :class:`reseau.io.BoardDesign`.
+
+    Raises
+    ------
+    UsageError
+        When they do not agree with each other, or the dictionary has too few markers.
+
+    Examples
+    --------
+    >>> design = board("charuco", 7, 9, 25.0)
+    >>> design.size, design.dictionary, len(design.ids)
+    (18.75, 'DICT_5X5_100', 48)
+    """
+    if size is None and kind in _SIZES:
+        size = _SIZES[kind] * pitch
+    try:
+        design = BoardDesign(
+            name=name, unit="mm", kind=kind, columns=columns, rows=rows, pitch=float(pitch),
+            size=None if size is None else float(size), dictionary=dictionary or _DICTIONARIES.get(kind),
+            first_id=first_id, border_bits=border_bits, legacy=legacy, asymmetric=asymmetric,
+        )  # fmt: skip
+    except ValidationError as error:
+        first = error.errors()[0]
+        what = str(first["msg"]).removeprefix("Value error, ")
+        raise UsageError(what, where=".".join(map(str, first["loc"])) or "board") from None
+    if design.dictionary is not None:
+        available = len(marker_dictionary(design.dictionary).bytesList)
+        needed = int(design.markers[0].max()) + 1
+        if needed > available:
+            raise UsageError(
+                f"has {available} markers, {needed} are needed", where=design.dictionary,
+                do="take a larger dictionary or fewer squares",
+            )  # fmt: skip
+    return design
+
+
+def marker_dictionary(name: str) -> Any:
+    """Dictionary of OpenCV by its name, as ``DICT_5X5_100``.
+
+    Raises
+    ------
+    UsageError
+        When OpenCV has no such dictionary.
+
+    Examples
+    --------
+    >>> marker_dictionary("DICT_5X5_100").markerSize
+    5
+    """
+    import cv2
+
+    number = getattr(cv2.aruco, name, None)
+    if not name.startswith("DICT_") or not isinstance(number, int):
+        raise UsageError(
+            f"{name!r} is not a dictionary of OpenCV", where="dictionary of a board", do="as DICT_5X5_100"
+        )
+    return cv2.aruco.getPredefinedDictionary(number)
+
+
+def marker_cells(design: BoardDesign) -> tuple[Array, NDArray[np.bool_]]:
+    """Markers of a board: their corners (m, 4, 2) and their black cells (m, n, n), rows downwards.
+
+    Examples
+    --------
+    >>> corners, black = marker_cells(board("charuco", 4, 3, 20.0))
+    >>> black.shape, bool(black[:, 0].all())
+    ((6, 7, 7), True)
+    """
+    numbers, corners = design.markers
+    assert design.dictionary is not None
+    dictionary = marker_dictionary(design.dictionary)
+    side = dictionary.markerSize + 2 * design.border_bits
+    images = [dictionary.generateImageMarker(int(k), side, None, design.border_bits) for k in numbers]
+    return corners, np.stack(images) == 0
+
+
+def board_figures(design: BoardDesign) -> tuple[list[Array], Array]:
+    """Black polygons of a board, and its circles (n, 3) with x, y and radius; millimetres, y up.
+
+    Cells of markers that touch are covered twice, by strips along both axes, so that no gap shows between
+    them however a drawing is rendered.
+
+    Examples
+    --------
+    >>> polygons, circles = board_figures(board("circles", 4, 3, 20.0))
+    >>> len(polygons), len(circles)
+    (0, 12)
+    """
+    none = np.zeros((0, 3))
+    if design.kind == "circles":
+        assert design.size is not None
+        return [], np.column_stack([design.xy, np.full(len(design.xy), design.size / 2)])
+    polygons: list[Array] = []
+    if design.kind in ("chess", "charuco"):
+        row, column = np.divmod(np.arange(design.columns * design.rows), design.columns)
+        black = (row + column) % 2 == (0 if design.dark_corner else 1)
+        corner = design.pitch * np.stack([column[black] - 1.0, -row[black].astype(float)], axis=1)
+        polygons += list(corner[:, None] + design.pitch * _BOX)
+    if design.kind == "aprilgrid":
+        assert design.size is not None
+        gap = design.pitch - design.size
+        row, column = np.divmod(np.arange((design.columns + 1) * (design.rows + 1)), design.columns + 1)
+        corner = design.pitch * np.stack([column, row], axis=1) - gap
+        polygons += list(corner[:, None] + gap * _BOX)
+    if design.kind in ("charuco", "aprilgrid"):
+        assert design.size is not None
+        for corners, cells in zip(*marker_cells(design), strict=True):
+            cell = design.size / len(cells)
+            for across in (cells, cells.T):
+                for k, line in enumerate(across):
+                    for a, b in _runs(line):
+                        low, high = np.array([a, k]), np.array([b, k + 1])
+                        low, high = (low, high) if across is cells else (low[::-1], high[::-1])
+                        x0, y0 = corners[0] + cell * low * [1, -1]
+                        x1, y1 = corners[0] + cell * high * [1, -1]
+                        polygons.append(np.array([(x0, y1), (x1, y1), (x1, y0), (x0, y0)]))
+    return polygons, none
+
+
+_BOX = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+
+
+def _runs(line: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Beginnings and ends of runs of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], line, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -1,0 +1,168 @@
+"""``reseau-board/1``: chessboards, ChArUco boards, circle grids and AprilGrids."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from ..core.data import Array
+from .document import Document
+
+__all__ = ["BoardDesign", "BoardKind"]
+
+BoardKind = Literal["chess", "charuco", "circles", "aprilgrid"]
+Length = Annotated[float, Field(gt=1e-6, le=1e6)]
+Count = Annotated[int, Field(ge=1, le=1000)]
+
+_FEWEST = {"chess": 3, "charuco": 2, "circles": 2, "aprilgrid": 1}
+_MARKED = ("charuco", "aprilgrid")
+
+
+class BoardDesign(Document):
+    """``reseau-board/1``: a board of one regular pattern, in millimetres.
+
+    Names are those of the programs that the boards come from, coordinates have y up: the inner corners of a
+    chessboard or a ChArUco board are numbered row by row from the upper left, and so are circles, with the
+    origin at the first; each tag of an AprilGrid has the corners ``tag.0`` … ``tag.3``, anticlockwise from
+    the lower left, with the origin at the lower left of the first tag, which is the lower left one.
+
+    Parameters
+    ----------
+    kind : {"chess", "charuco", "circles", "aprilgrid"}
+        The pattern.
+    columns, rows : int
+        Number of squares, of circles, or of tags.
+    pitch : float
+        Side of a square; distance of neighbouring circles in a row, or of the rows of an asymmetric grid;
+        distance of tags from centre to centre.
+    size : float, optional
+        Diameter of a circle, or side of a marker or a tag with its border.
+    dictionary : str, optional
+        Dictionary of the markers, as OpenCV names it: ``DICT_5X5_100``.
+    first_id : int
+        Number of the first marker.
+    border_bits : int
+        Width of the black border of a marker in bits.
+    legacy : bool
+        Whether a ChArUco board has the layout of OpenCV before 4.6: with an even number of rows, its upper
+        left square is white.
+    asymmetric : bool
+        Whether every second row of circles is shifted by half a step; `pitch` is half their distance in a
+        row, as in OpenCV.
+
+    Examples
+    --------
+    >>> board = BoardDesign(name="print", unit="mm", kind="chess", columns=4, rows=3, pitch=25.0)
+    >>> board.ids, board.xy[-1].tolist()
+    (('0', '1', '2', '3', '4', '5'), [50.0, -25.0])
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-board/1"
+    name: str
+    unit: Literal["mm"]
+    kind: BoardKind
+    columns: Count
+    rows: Count
+    pitch: Length
+    size: Length | None = None
+    dictionary: str | None = None
+    first_id: Annotated[int, Field(ge=0)] = 0
+    border_bits: Annotated[int, Field(ge=1, le=4)] = 1
+    legacy: bool = False
+    asymmetric: bool = False
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        fewest = _FEWEST[self.kind]
+        if min(self.columns, self.rows) < fewest:
+            raise ValueError(f"a board of kind {self.kind!r} has at least {fewest} columns and rows")
+        if (self.size is None) != (self.kind == "chess"):
+            raise ValueError(f"`size` is {'needed' if self.size is None else 'unknown'} for {self.kind!r}")
+        if (self.dictionary is not None) != (self.kind in _MARKED):
+            raise ValueError(
+                f"`dictionary` is {'needed' if self.dictionary is None else 'unknown'} for {self.kind!r}"
+            )
+        if self.size is not None and self.size >= self._room:
+            raise ValueError(f"`size` ({self.size:g}) must be less than the space for it ({self._room:g})")
+        if self.legacy and self.kind != "charuco":
+            raise ValueError("`legacy` is for ChArUco boards")
+        if self.asymmetric and self.kind != "circles":
+            raise ValueError("`asymmetric` is for circles")
+        return self
+
+    @property
+    def _room(self) -> float:
+        return self.pitch * (np.sqrt(2) if self.asymmetric else 1.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of the file; keys that the kind does not need are left out."""
+        content = super().to_dict()
+        fields = type(self).model_fields
+        return {k: v for k, v in content.items() if k not in fields or v != fields[k].default}
+
+    @property
+    def polarity(self) -> Literal["dark", "bright"]:
+        """Of circles: dark."""
+        return "dark"
+
+    @property
+    def nodes(self) -> NDArray[np.intp]:
+        """Column and row (n, 2) of each point, rows downwards.
+
+        Corners are counted in corners, the corners of tags in columns and rows of these. Circles of an
+        asymmetric grid have steps of half their distance in a row.
+        """
+        columns, rows = self.columns, self.rows
+        if self.kind in ("chess", "charuco"):
+            columns, rows = columns - 1, rows - 1
+        if self.kind == "aprilgrid":
+            tag = np.arange(columns * rows)
+            corner = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+            up = 2 * np.stack([tag % columns, tag // columns], axis=1)[:, None] + corner
+            return np.asarray(up.reshape(-1, 2) * [1, -1], dtype=np.intp)
+        row, column = np.divmod(np.arange(columns * rows), columns)
+        if self.asymmetric:
+            column = 2 * column + row % 2
+        return np.stack([column, row], axis=1).astype(np.intp)
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Names of the points."""
+        if self.kind == "aprilgrid":
+            tags = self.first_id + np.arange(self.columns * self.rows)
+            return tuple(f"{tag}.{corner}" for tag in tags.tolist() for corner in range(4))
+        return tuple(map(str, range(len(self.nodes))))
+
+    @property
+    def xy(self) -> Array:
+        """Coordinates of the points (n, 2), y up."""
+        if self.kind == "aprilgrid":
+            assert self.size is not None
+            tag, corner = np.divmod(self.nodes * [1, -1], 2)
+            return np.asarray(tag * self.pitch + corner * self.size)
+        return np.asarray(self.nodes * [self.pitch, -self.pitch], dtype=np.float64)
+
+    @property
+    def dark_corner(self) -> bool:
+        """Whether the upper left square of a chessboard or a ChArUco board is black."""
+        return not (self.legacy and self.rows % 2 == 0)
+
+    @property
+    def markers(self) -> tuple[NDArray[np.intp], Array]:
+        """Numbers (m,) of the markers, and their corners (m, 4, 2), y up, clockwise from the upper left."""
+        if self.kind not in _MARKED:
+            return np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2))
+        assert self.size is not None
+        around = self.size / 2 * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1.0]])
+        if self.kind == "aprilgrid":
+            tag = np.arange(self.columns * self.rows)
+            centre = self.pitch * np.stack([tag % self.columns, tag // self.columns], axis=1) + self.size / 2
+        else:
+            row, column = np.divmod(np.arange(self.columns * self.rows), self.columns)
+            white = (row + column) % 2 == (1 if self.dark_corner else 0)
+            centre = self.pitch * np.stack([column[white] - 0.5, 0.5 - row[white]], axis=1)
+        numbers = self.first_id + np.arange(len(centre))
+        return numbers.astype(np.intp), np.asarray(centre[:, None] + around)

@@ -1,0 +1,227 @@
+"""Matching of corners where squares meet, once they are found and numbered.
+
+The image of a corner is formed from its two edges, with the directions and the curvature that the mapping
+through all corners gives them; the directions are adjusted with the position. A window extends half a square
+to all sides, and shows nothing but the four squares that meet; the markers of a ChArUco board are formed as
+what lies beside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from ...core.data import Array, Frame, Mask, Rows
+from ...optics import Chain
+from ...optics.corners import Corners, corner_images
+from ...optics.formation import Outline, PixelResponse
+from ..matching import GrownOutline, Matches, Shape, Window
+from ..reseau.marks import ReseauOptions
+from ..reseau.plane_marks import Located, PlaneMarks
+from ..screening import Screened
+from ..testfield.lattice_mapping import images_of, second_order
+
+__all__ = ["CornerMarks", "CornerShape", "Sectors"]
+
+_TURN = 0.1
+"""Standard deviation of the directions of edges before the mapping is known, radians."""
+_TURNED = 0.02
+_MOST_PX = 32
+"""Largest distance of a pixel used from its corner along an axis, pixels."""
+_LEARNING_PX = 9
+"""The same while the appearance of corners is learnt, beside widths of the point-spread function."""
+_EDGE = 1.5
+"""Half the width of an edge in widths of the point-spread function."""
+_ALIKE_WIDTH = 0.05
+"""Relative change of the sharpness from which markers are formed anew."""
+_NODES_PX = 1.1
+"""Distance of nodes on an outline, in widths of the point-spread function."""
+
+
+@dataclass(frozen=True, eq=False)
+class CornerShape:
+    """Images of corners as functions of position, blur, and the directions of their edges.
+
+    Parameters
+    ----------
+    corners : Corners
+        The corners, with the directions that are expected.
+
+    Examples
+    --------
+    >>> shape: Shape = CornerShape(Corners(np.eye(2)[None], np.zeros((1, 2)), np.array([True])))
+    >>> window = Window(np.arange(9.0)[None], np.arange(9.0)[None], PixelResponse())
+    >>> place = np.array([[4.0, 4.0]]), np.ones(1), np.zeros((1, 2)), np.array([0]), window
+    >>> float(shape.image(*place)[0, 4, 4]), shape.derivatives(*place)[1].shape
+    (0.5, (1, 5, 9, 9))
+    """
+
+    corners: Corners
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of the form: a turn of each edge."""
+        return 2
+
+    def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
+        """See :class:`reseau.measure.matching.Shape`."""
+        place = self.corners.select(at), xy, width, form, window.columns, window.rows
+        return corner_images(*place, fill=window.response.fill, derivatives=False)[:, 0]
+
+    def derivatives(
+        self, xy: Array, width: Array, form: Array, at: Rows, window: Window
+    ) -> tuple[Array, Array]:
+        """See :class:`reseau.measure.matching.Shape`."""
+        place = self.corners.select(at), xy, width, form, window.columns, window.rows
+        parts = corner_images(*place, fill=window.response.fill)
+        return parts[:, 0], parts[:, 1:]
+
+
+@dataclass(frozen=True, eq=False)
+class Sectors:
+    """What surrounds the corners of a board, in the plane of its design.
+
+    Parameters
+    ----------
+    dark : ndarray (n, 2)
+        Signs of x and y in a sector of each corner that is dark.
+    opposite : ndarray of bool (n,)
+        Whether the opposite sector is dark, too.
+    reach : float
+        Distance up to which edges are straight and their sides even.
+    outlines : ndarray (m, j, 2)
+        Corners of dark figures that lie in the bright sectors, anticlockwise.
+    """
+
+    dark: Array
+    opposite: Mask
+    reach: float
+    outlines: Array
+
+
+class CornerMarks(PlaneMarks):
+    """Corners of squares."""
+
+    word = "corner"
+    form_sigma = np.array([_TURN, _TURN])
+    learnt_form_sigma = np.array([_TURNED, _TURNED])
+    learnt_from = 24
+    precise_start = True
+    formed_px = 0.0007
+    least_seen = 0.4
+
+    def __init__(
+        self, image: Frame, screened: Screened, located: Located, options: ReseauOptions, sectors: Sectors
+    ) -> None:
+        super().__init__(image, screened, located, options, sectors.reach)
+        self.sectors = sectors
+        self.figures: tuple[Array, Chain, float, Array | None] | None = None
+
+    def _steps(self, rows: Rows) -> tuple[Array, Array]:
+        """Derivatives of the image by coordinates of the design, first (k, 2, 2), and second along each."""
+        _, slope, bend = second_order(self.mapping, self.at[rows])
+        along = np.einsum("kabc,bi,ci->kai", bend, self.frame, self.frame)
+        return slope @ self.frame, along
+
+    def _images(self, rows: Rows) -> tuple[Shape, Array]:
+        """See :class:`PlaneMarks`."""
+        slope, bend = self._steps(rows)
+        length = np.linalg.norm(slope, axis=1)  # of a unit along x and y
+        tangent = slope / length[:, None]
+        # An edge along x has the dark sector on the side of ±y, and one along y on that of ±x.
+        normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1).transpose(0, 2, 1)  # (k, edge, xy)
+        towards = slope[:, :, ::-1] * self.sectors.dark[rows][:, None, ::-1]
+        side = np.sign(np.einsum("kei,kie->ke", normal, towards))
+        normal = normal * side[..., None]
+        curvature = np.einsum("kei,kie->ke", normal, bend) / length**2
+        corners = Corners(
+            np.ascontiguousarray(normal), np.ascontiguousarray(curvature), self.sectors.opposite[rows]
+        )
+        reach = np.abs(slope).sum(axis=2) * self.sectors.reach
+        most = _LEARNING_PX + 2 * self.look.blur_px if self.learning else _MOST_PX
+        return CornerShape(corners), np.minimum(reach, most) - self._ground
+
+    @property
+    def _ground(self) -> float:
+        """What :meth:`_windows` adds to the reach of a mark."""
+        return float(max(5, int(np.ceil(3.0 * self.look.blur_px))))
+
+    def _region(self, rows: Rows, half: tuple[int, int]) -> Mask | None:
+        """See :class:`PlaneMarks`: the half squares around a corner."""
+        slope, _ = self._steps(rows)
+        centre = np.rint(self.start[rows])
+        x = centre[:, :1] + np.arange(-half[0], half[0] + 1) - self.start[rows, :1]
+        y = centre[:, 1:] + np.arange(-half[1], half[1] + 1) - self.start[rows, 1:]
+        back = np.linalg.inv(slope)[..., None, None]
+        inside = np.ones((len(rows), y.shape[1], x.shape[1]), dtype=bool)
+        for k in range(2):
+            at = back[:, k, 0] * x[:, None, :] + back[:, k, 1] * y[:, :, None]
+            inside &= np.abs(at) < self.sectors.reach
+        return inside
+
+    def _beside(self) -> Array | None:
+        """See :class:`PlaneMarks`: the markers in the bright squares, as solid figures."""
+        outlines, look = self.sectors.outlines, self.look
+        if not len(outlines):
+            return None
+        if self.figures is not None:
+            share, mapping, psf_px, kernel = self.figures
+            alike = abs(psf_px / look.psf_px - 1) < _ALIKE_WIDTH
+            if alike and mapping is self.mapping and kernel is look.kernel:
+                return share
+        h, w = self.screened.grey.shape
+        share = np.zeros((h, w), dtype=np.float32)
+        corners = images_of(self.mapping, outlines.reshape(-1, 2) @ self.frame.T + self.origin)
+        reach = 0 if look.kernel is None else len(look.kernel) // 2
+        margin = int(np.ceil(6 * look.psf_px)) + 2 + reach
+        for polygon in corners.reshape(outlines.shape):
+            low = np.floor(polygon.min(axis=0)).astype(np.intp) - margin
+            high = np.ceil(polygon.max(axis=0)).astype(np.intp) + margin + 1
+            if not (np.isfinite(polygon).all() and (high > 0).all() and (low < (w, h)).all()):
+                continue
+            x, y = (np.arange(a, b, dtype=np.float64)[None] for a, b in zip(low, high, strict=True))
+            nodes = Outline.polygon(polygon, _NODES_PX * look.psf_px).oriented()
+            single = Outline(nodes.xy[None], nodes.dxy[None]).single()
+            taken = GrownOutline(single, np.zeros((0, 2, 2))).image(
+                np.zeros((1, 2)),
+                np.full(1, look.psf_px),
+                np.zeros((1, 0)),
+                np.zeros(1, dtype=np.intp),
+                Window(x, y, PixelResponse(self.options.fill)),
+            )[0]
+            taken = taken if look.kernel is None else np.asarray(cv2.filter2D(taken, -1, look.kernel))
+            left, top = np.maximum(low, 0)
+            right, bottom = np.minimum(high, (w, h))
+            share[top:bottom, left:right] += taken[
+                top - low[1] : bottom - low[1], left - low[0] : right - low[0]
+            ]
+        self.figures = share, self.mapping, look.psf_px, look.kernel
+        return share
+
+    def _settle(self, first: Matches) -> Matches:
+        """See :class:`PlaneMarks`."""
+        self.look = replace(self.look, psf_px=float(np.median(first.psf_px)))
+        return first
+
+    def _edge_seen(self, rows: Rows, found: Matches) -> Array:
+        """See :class:`PlaneMarks`."""
+        used = np.isfinite(found.residuals)
+        high, wide = (n // 2 for n in used.shape[1:])
+        x, y = self._pixels(rows, (wide, high))
+        slope, _ = self._steps(rows)
+        tangent = slope / np.linalg.norm(slope, axis=1, keepdims=True)
+        rim = np.zeros(used.shape, dtype=bool)
+        for k in range(2):
+            across = tangent[:, 0, k, None, None] * (y - found.xy[:, 1, None, None])
+            across = across - tangent[:, 1, k, None, None] * (x - found.xy[:, 0, None, None])
+            rim |= np.abs(across) < _EDGE * self.look.blur_px
+        region = self._region(rows, (wide, high))
+        assert region is not None
+        rim &= region
+        return np.asarray((used & rim).sum(axis=(1, 2)) / np.maximum(rim.sum(axis=(1, 2)), 1))
+
+    def _radius(self, rows: Rows) -> Array:
+        """See :class:`PlaneMarks`: corners do not bulge."""
+        return np.zeros(len(rows))

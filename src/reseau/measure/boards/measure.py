@@ -1,0 +1,215 @@
+"""Measurement of boards: from a frame and a design to image coordinates with covariances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from ...core.data import Array, Frame
+from ...core.errors import UsageError
+from ...core.failure import Code, Failure, Remark
+from ...core.threads import one_thread
+from ...io.board import BoardDesign
+from ..points import Measured
+from ..reseau.disks import find_disks
+from ..reseau.marks import ReseauOptions
+from ..reseau.plane_marks import PlaneMarks
+from ..reseau.sheet import DiskMarks
+from ..screening import Screened, screen
+from .candidates import find_saddles
+from .corners import CornerMarks, Sectors
+from .markers import find_markers
+from .placement import Placed, lay_charuco, lay_chessboard, lay_circles
+
+__all__ = ["BoardOptions", "BoardResult", "measure_board"]
+
+
+@dataclass(frozen=True)
+class BoardOptions:
+    """Options of the measurement of a board.
+
+    Parameters
+    ----------
+    mirrored : bool
+        Whether the board is seen from behind or the image is mirrored.
+    psf_px : float
+        Approximate width (one sigma) of the point-spread function; it is estimated.
+    row_jitter_px : float
+        Standard deviation of the shift of single rows, if known.
+    fill : float
+        Light-sensitive share of the pixel pitch along either axis, 0 to 1, if known.
+    least_t : float
+        Minimum contrast of a mark over its standard deviation.
+    most_sigma_px : float
+        Largest standard deviation of a coordinate that is accepted.
+    neighbour_px : float
+        Largest deviation, per axis, from the prediction of the neighbours.
+
+    Examples
+    --------
+    >>> BoardOptions(mirrored=True).most_sigma_px
+    0.2
+    """
+
+    mirrored: bool = False
+    psf_px: float = 0.8
+    row_jitter_px: float = 0.0
+    fill: float = 1.0
+    least_t: float = 3.5
+    most_sigma_px: float = 0.2
+    neighbour_px: float = 0.5
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BoardResult(Measured):
+    """Points of a board measured in one frame, in columns over all points of the design.
+
+    Parameters
+    ----------
+    psf_px : ndarray (n,)
+        Width of the point-spread function at each point; NaN where there was no match.
+    notes : tuple of Remark
+        What a user should know: ambiguous names, motion, curves of the camera.
+    """
+
+    psf_px: Array
+    notes: tuple[Remark, ...]
+
+
+def measure_board(
+    frame: Frame, design: BoardDesign, options: BoardOptions | None = None
+) -> BoardResult | Failure:
+    """Measure the points of a chessboard, a ChArUco board, a circle grid or an AprilGrid.
+
+    Parameters
+    ----------
+    frame : Frame
+        A photograph that shows the board, whole or in part, at any rotation and tilt.
+    design : BoardDesign
+        The board.
+    options : BoardOptions, optional
+        Options of the measurement.
+
+    Returns
+    -------
+    BoardResult or Failure
+        A failure (falsy) if the board is not found in the frame.
+
+    Raises
+    ------
+    ImageError
+        When the frame is all black, saturated, or of one grey.
+
+    Examples
+    --------
+    Draw a chessboard with edges half way between pixels, and measure its corners:
+
+    >>> design = BoardDesign(name="small", unit="mm", kind="chess", columns=6, rows=5, pitch=20.0)
+    >>> squares = np.indices((5, 6)).sum(axis=0) % 2 * 160 + 30
+    >>> sheet = np.pad(np.kron(squares, np.ones((20, 20))), 30, constant_values=190)
+    >>> sheet = cv2.GaussianBlur(sheet, (0, 0), 0.8)
+    >>> sheet += np.random.default_rng(0).normal(0, 1, sheet.shape)
+    >>> found = measure_board(Frame(sheet, 255.0), design)
+    >>> found.found, bool(np.abs(found.xy[0] - 49.5).max() < 0.05)
+    (20, True)
+    """
+    options = options or BoardOptions()
+    if design.kind == "aprilgrid":
+        raise UsageError("boards of this kind are drawn only", where="aprilgrid", do="use a ChArUco board")
+    with one_thread():
+        if not options.mirrored:
+            return _measured(frame, design, options)
+        turned = replace(frame, pixels=np.ascontiguousarray(frame.pixels[:, ::-1]))
+        return _unmirrored(_measured(turned, design, options), frame.width)
+
+
+def _unmirrored(found: BoardResult | Failure, width: int) -> BoardResult | Failure:
+    """The result in the image that was mirrored before it was measured."""
+    last = width - 1
+
+    def back(xy: Array) -> Array:
+        return np.stack([last - xy[..., 0], xy[..., 1]], axis=-1)
+
+    if isinstance(found, Failure):
+        return found if found.places is None else replace(found, places=back(found.places))
+    sign = np.array([-1.0, 1.0])
+    return replace(
+        found,
+        xy=back(found.xy),
+        predicted=back(found.predicted),
+        deviation=found.deviation * sign,
+        cov=found.cov * np.outer(sign, sign),
+    )
+
+
+def _measured(frame: Frame, design: BoardDesign, options: BoardOptions) -> BoardResult | Failure:
+    screened = screen(frame, None)
+    placed = _placed(frame, screened, design)
+    if isinstance(placed, Failure):
+        return Failure(
+            f"board {design.name!r} was not found in the frame: {placed.reason}",
+            placed.code,
+            where=frame.name,
+            places=placed.places,
+        )
+    # Whether a pixel beside a clipped one is itself clipped depends on its noise.
+    clipped = cv2.dilate((frame.pixels >= frame.full_scale).astype(np.uint8), np.ones((3, 3), np.uint8))
+    screened = replace(screened, valid=screened.valid & (clipped == 0))
+    common = ReseauOptions(
+        psf_px=options.psf_px,
+        row_jitter_px=options.row_jitter_px,
+        fill=options.fill,
+        least_t=options.least_t,
+        most_sigma_px=options.most_sigma_px,
+        neighbour_px=options.neighbour_px,
+    )
+    marks: PlaneMarks
+    if design.kind == "circles":
+        assert design.size is not None
+        marks = CircleMarks(frame, screened, placed.located, common, design.size)
+    else:
+        marks = CornerMarks(frame, screened, placed.located, common, sectors_of(design))
+    columns = marks.columns()
+    del columns["field"]
+    return BoardResult(**columns | {"notes": placed.notes + columns["notes"]})
+
+
+def _placed(frame: Frame, screened: Screened, design: BoardDesign) -> Placed | Failure:
+    """Where the points of the board are, approximately."""
+    shape = (frame.height, frame.width)
+    if design.kind == "circles":
+        disks = find_disks(screened.grey, screened.valid, screened.noise)
+        found = lay_circles(disks, design, shape)
+        return replace(found, places=disks.xy) if isinstance(found, Failure) else found
+    saddles = find_saddles(screened.grey, screened.noise)
+    if design.kind == "chess":
+        found = lay_chessboard(screened.grey, saddles, design)
+    else:
+        markers = find_markers(frame, design)
+        found = lay_charuco(screened.grey, saddles, design, markers)
+        if isinstance(found, Failure) and not len(markers[1]):
+            turned = replace(frame, pixels=np.ascontiguousarray(frame.pixels[:, ::-1]))
+            if len(find_markers(turned, design)[1]) > 1:
+                return Failure("the board is seen mirrored", Code.MIRRORED)
+    return replace(found, places=saddles.xy[: 4 * len(design.ids)]) if isinstance(found, Failure) else found
+
+
+class CircleMarks(DiskMarks):
+    """Circles of a grid, whose printed size is that of the design to a few hundredths."""
+
+    word = "circle"
+    learnt_from = 30
+    precise_start = True
+    eccentric = True
+    formed_px = 0.0015
+
+
+def sectors_of(design: BoardDesign) -> Sectors:
+    """What surrounds the corners of a board."""
+    count = len(design.ids)
+    below = design.nodes.sum(axis=1) % 2 == (0 if design.dark_corner else 1)
+    dark = np.where(below[:, None], [1.0, -1.0], [1.0, 1.0])
+    _, outlines = design.markers
+    return Sectors(dark, np.ones(count, dtype=bool), design.pitch / 2, outlines)

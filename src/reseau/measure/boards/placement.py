@@ -1,0 +1,345 @@
+"""Which corners or circles of a board are those found in a frame.
+
+The lattice that has grown through a frame is laid on the design in all quarter turns and shifts. Nodes of the
+design that should be in sight and were not found count against a place, and so do nodes found that the design
+has not. Where several places are equally good, one is taken and the user is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ...core.data import Array, Mask, Rows
+from ...core.failure import Code, Failure, Remark
+from ...io.board import BoardDesign
+from ...optics import Chain
+from ..reseau.disks import Disks
+from ..reseau.plane_marks import Located
+from ..reseau.sheet_placement import MOST_DISKS, disk_seeds, grown_disks, through
+from ..testfield.lattice_mapping import images_of, slope_of
+from .candidates import Saddles, along, bright_between, first_mapping, grown, sector_levels, seeds
+
+__all__ = ["Placed", "lay_charuco", "lay_chessboard", "lay_circles"]
+
+_MISSED, _PLAIN, _FOREIGN = 0.4, 3.0, 3.0
+"""What counts against a place: a node in sight that was not found; one between squares as bright as paper and
+ink, where nothing hides it; one found that the design has not."""
+_ALIKE = 2.0
+"""Lead in nodes of a place over another from which it is certain."""
+_SEEDS = 40
+_FEWEST = 6
+"""Least number of corners that show a board."""
+_ENOUGH = 0.6
+"""Share of the corners of the board from which no other seed is tried."""
+_NEAR_PX = 2.5
+"""Distance within which a saddle is the corner that markers predict, pixels; or in steps of the lattice."""
+_NEAR = 0.2
+Integers = NDArray[np.signedinteger[Any]]
+_ASTRAY = 0.1
+"""Largest share of the markers read that do not lie where the board has them: misread, not another layout."""
+_EVEN = 0.5
+"""Largest difference of two dark sectors, as a share of their contrast to the paper."""
+_QUARTER = np.array([[0, -1], [1, 0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Where the points of a board are, approximately, and what the user should know about their names."""
+
+    located: Located
+    notes: tuple[Remark, ...] = ()
+
+
+def _failed(found: int, what: str) -> Failure:
+    return Failure(f"{found} {what} are too few to show the board", Code.NOT_FOUND)
+
+
+def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDesign) -> Placed | Failure:
+    """Find a chessboard among the saddles of a frame, and number its corners.
+
+    Parameters
+    ----------
+    grey : ndarray (h, w), float32
+        Grey values.
+    saddles : Saddles
+        Their saddles.
+    design : BoardDesign
+        A chessboard.
+    """
+    numbers, shape = design.nodes, (grey.shape[0], grey.shape[1])
+    extent = int(numbers.max()) + 2
+    best: tuple[Array, Rows, Chain] | None = None
+    for row, step in seeds(saddles)[:_SEEDS]:
+        found = grown(grey, saddles, first_mapping(step, saddles.xy[row], shape), extent)
+        if best is None or len(found[0]) > len(best[0]):
+            best = found
+        if len(best[0]) >= _ENOUGH * len(numbers):
+            break
+    least = min(_FEWEST, len(numbers))
+    if best is None or len(best[0]) < least:
+        return _failed(0 if best is None else len(best[0]), "corners in a lattice")
+    nodes, rows, mapping = best
+    # The sector of a corner between the steps to the right and downwards is black where the sum is even, as
+    # the square there is the one of the upper left corner, moved diagonally.
+    dark = _dark_sectors(design)
+    bright = bright_between(saddles.edges[rows], slope_of(mapping, nodes))
+    paper = float(np.median(sector_levels(grey, mapping, nodes).max(axis=1)))
+    ink = float(np.median(sector_levels(grey, mapping, nodes).min(axis=1)))
+    limits = paper - 0.25 * (paper - ink), ink + 0.25 * (paper - ink)
+
+    def plain(missing: Array) -> Mask:
+        levels = sector_levels(grey, mapping, missing)
+        return np.asarray(((levels > limits[0]) | (levels < limits[1])).all(axis=1))
+
+    return _numbered(design, nodes.astype(np.intp), saddles.xy[rows], mapping, shape, (dark, ~bright), plain)
+
+
+def _dark_sectors(design: BoardDesign) -> Mask:
+    """Whether the square below and to the right of each inner corner is black."""
+    same: Mask = np.asarray(design.nodes.sum(axis=1) % 2 == 0)
+    return same if design.dark_corner else ~same
+
+
+def _numbered(
+    design: BoardDesign,
+    nodes: NDArray[np.intp],
+    xy: Array,
+    mapping: Chain,
+    shape: tuple[int, int],
+    dark: tuple[Mask, Mask] | None,
+    plain: Callable[[Array], Mask] | None = None,
+) -> Placed | Failure:
+    """Lay the lattice found on the design; `plain` tells where nothing lies over nodes."""
+    # Diagonals of an asymmetric grid are halved: its nodes have columns and rows that are both even or odd.
+    matrix = _lattice_of(design)
+    numbers = design.nodes @ matrix.T // (2 if design.asymmetric else 1)
+    least = numbers.min(axis=0)
+    numbers = numbers - least
+    size = numbers.max(axis=0) + 1
+    index = np.full(tuple(size + 1), -1, dtype=np.intp)
+    index[tuple(numbers.T)] = np.arange(len(numbers))
+    known = {tuple(node): k for k, node in enumerate(nodes.tolist())}
+    mirrored = np.linalg.det(slope_of(mapping, np.zeros((1, 2)))[0]) < 0
+    found: list[tuple[float, Integers, Integers]] = []
+    for quarter in range(4):
+        # Rows of a design go downwards as those of a frame do.
+        turn = np.linalg.matrix_power(_QUARTER, quarter)
+        turn = turn @ np.diag([-1, 1]) if mirrored else turn
+        at = nodes @ turn.T
+        low, high = at.min(axis=0), at.max(axis=0)
+        ranges = []
+        for a, b, n in zip(low, high, size, strict=True):
+            spare = max(0, int(n - 1 - (b - a)))
+            over = max(0, int((b - a) - (n - 1)))
+            ranges.append(range(int(-a) - over, int(-a) + spare + 1))
+        for shift in product(*ranges):
+            place = at + np.array(shift)
+            inside = ((place >= 0) & (place < size)).all(axis=1)
+            of = np.where(inside, index[tuple(np.where(inside[:, None], place, 0).T)], -1)
+            there = of >= 0
+            if dark is not None:
+                # An odd quarter turn exchanges the sectors of a corner.
+                seen = dark[1][there] ^ (quarter % 2 == 1) ^ bool(mirrored)
+                agree = dark[0][of[there]] == seen
+                if agree.mean() < 0.5 if len(agree) else True:
+                    continue
+            back = (numbers - np.array(shift)) @ turn  # the inverse of a turn is its transpose
+            missing = np.array([tuple(node) not in known for node in back.tolist()])
+            lost = 0.0
+            if missing.any():
+                gone = back[missing].astype(np.float64)
+                where = images_of(mapping, gone)
+                sight = ((where > 2) & (where < np.array(shape[::-1]) - 3)).all(axis=1)
+                lost = _MISSED * float(sight.sum())
+                if plain is not None:
+                    lost += (_PLAIN - _MISSED) * float((sight & plain(gone)).sum())
+            score = there.sum() - lost - _FOREIGN * (~there).sum()
+            found.append((float(score), turn, np.array(shift)))
+    if not found:
+        return Failure("the lattice found does not agree with the board at any place", Code.OTHER_DESIGN)
+    found.sort(key=lambda one: -one[0])
+    score, turn, moved = found[0]
+    if score < 0.25 * min(len(nodes), len(numbers)):
+        return Failure(
+            f"{len(nodes)} points in a lattice were found, which the board does not have", Code.OTHER_DESIGN
+        )
+    alike = [one for one in found[1:] if score - one[0] < _ALIKE]
+    place = nodes @ turn.T + moved
+    inside = ((place >= 0) & (place < size)).all(axis=1)
+    of = np.where(inside, index[tuple(np.where(inside[:, None], place, 0).T)], -1)
+    there = of >= 0
+    seen, start = np.zeros(len(numbers), dtype=bool), np.zeros((len(numbers), 2))
+    seen[of[there]], start[of[there]] = True, xy[there]
+    frame, origin = _to_lattice(design, turn, moved + least)
+    located = Located(design.ids, design.xy, "dark", mapping, frame, origin, seen, start)
+    return Placed(located, _ambiguous(design, turn, alike))
+
+
+def _to_lattice(design: BoardDesign, turn: Integers, shift: Integers) -> tuple[Array, Array]:
+    """Lattice coordinates as a linear function of those of the design: frame (2, 2) and origin (2,)."""
+    # turn · node + shift is the place in the design, of which a point is pitch · (column, −row).
+    scale = _lattice_of(design) @ np.diag([1.0, -1.0]) / design.pitch / (2 if design.asymmetric else 1)
+    return turn.T @ scale, -(turn.T @ shift).astype(np.float64)
+
+
+def _ambiguous(
+    design: BoardDesign, turn: Integers, alike: list[tuple[float, Integers, Integers]]
+) -> tuple[Remark, ...]:
+    if not alike:
+        return ()
+    turned = sum(not np.array_equal(other, turn) for _, other, _ in alike)
+    moved = len(alike) - turned
+    texts = []
+    if turned:
+        texts.append(f"the board looks the same turned in {turned + 1} ways: names are those of one of them")
+    if moved:
+        texts.append(
+            "the frame shows a part of a regular pattern that fits shifted, too: names may be off by rows or "
+            "columns"
+        )
+    return tuple(Remark(text, Code.AMBIGUOUS) for text in texts)
+
+
+def lay_circles(disks: Disks, design: BoardDesign, shape: tuple[int, int]) -> Placed | Failure:
+    """Find a grid of circles among the ellipses of a frame, and number them.
+
+    The circles of an asymmetric grid lie on the diagonals of its rows and columns: the lattice that is grown
+    has these as its steps.
+
+    Parameters
+    ----------
+    disks : Disks
+        The ellipses.
+    design : BoardDesign
+        A grid of circles.
+    shape : (int, int)
+        Height and width of the frame.
+    """
+    assert design.size is not None
+    numbers = design.nodes @ _lattice_of(design).T // (2 if design.asymmetric else 1)
+    step = design.pitch * (np.sqrt(2) if design.asymmetric else 1.0)
+    disks = disks.strongest(MOST_DISKS * len(numbers))
+    extent = int(np.ptp(numbers, axis=0).max()) + 1
+    best: tuple[Array, Rows, Chain] | None = None
+    for seed in disk_seeds(disks, 2 * step / design.size):
+        found = grown_disks(*seed, disks, shape, extent)
+        if best is None or len(found[0]) > len(best[0]):
+            best = found
+        if len(best[0]) >= _ENOUGH * len(numbers):
+            break
+    if best is None or len(best[0]) < min(_FEWEST, len(numbers)):
+        return _failed(0 if best is None else len(best[0]), "circles in a lattice")
+    nodes, rows, mapping = best
+    return _numbered(design, nodes.astype(np.intp), disks.xy[rows], mapping, shape, None)
+
+
+def _lattice_of(design: BoardDesign) -> Integers:
+    """Integer matrix from columns and rows to steps between nearest neighbours; twice them if asymmetric."""
+    return np.array([[1, 1], [-1, 1]]) if design.asymmetric else np.eye(2, dtype=np.intp)
+
+
+def lay_charuco(
+    grey: NDArray[np.float32],
+    saddles: Saddles,
+    design: BoardDesign,
+    markers: tuple[Array, NDArray[np.intp]],
+) -> Placed | Failure:
+    """Find the inner corners of a ChArUco board by its markers.
+
+    Parameters
+    ----------
+    grey : ndarray (h, w), float32
+        Grey values.
+    saddles : Saddles
+        Their saddles.
+    design : BoardDesign
+        The board.
+    markers : (ndarray (m, 4, 2), ndarray (m,))
+        Corners of markers in the frame, clockwise from the upper left, and their numbers.
+    """
+    shape = (grey.shape[0], grey.shape[1])
+    corners, numbers = markers
+    own, at = design.markers
+    row_of = {int(number): k for k, number in enumerate(own)}
+    keep = np.array([int(number) in row_of for number in numbers], dtype=bool)
+    if not keep.any():
+        return Failure("no marker of the board was read", Code.NOT_FOUND)
+    corners, rows = corners[keep], np.array([row_of[int(number)] for number in numbers[keep]])
+    plane, image = at[rows].reshape(-1, 2) / design.pitch, corners.reshape(-1, 2)
+    if len(rows) == 1:
+        matrix = cv2.getPerspectiveTransform(plane.astype(np.float32), image.astype(np.float32))
+        good = np.ones(4, dtype=bool)
+    else:
+        # Good to two pixels: distortion bends the board.
+        matrix, inlier = cv2.findHomography(plane, image, cv2.RANSAC, max(3.0, 0.006 * max(shape)))
+        good = inlier.ravel() > 0 if inlier is not None else np.zeros(len(plane), dtype=bool)
+    if matrix is None or good.sum() < 4:
+        return Failure("the markers read do not agree with the board", Code.INCONSISTENT)
+    whole = good.reshape(-1, 4).all(axis=1)
+    if len(rows) > 3 and (~whole).sum() > max(1.0, _ASTRAY * len(rows)):
+        return Failure(
+            f"{int((~whole).sum())} of {len(rows)} markers lie at other places than on the board: it has "
+            "another layout (old or new) or number of columns",
+            Code.OTHER_DESIGN,
+        )
+    use = np.repeat(whole, 4) if whole.any() else good
+    if np.linalg.det(matrix[:2, :2] - np.outer(matrix[:2, 2], matrix[2, :2]) / matrix[2, 2]) > 0:
+        return Failure("the board is seen mirrored", Code.MIRRORED)
+    mapping = through(plane[use], image[use], shape)
+    nodes = design.nodes * [1.0, -1.0]
+    known = np.zeros(len(nodes), dtype=bool)
+    start = images_of(mapping, nodes)
+    dark = _dark_sectors(design)
+    for _ in range(6):
+        again, row = _nearest(saddles, mapping, nodes, dark, plane[use], known)
+        again &= _filled(grey, mapping, nodes, dark)
+        same = np.array_equal(again, known)
+        known, start = again, np.where(again[:, None], saddles.xy[row], images_of(mapping, nodes))
+        if known.sum() < 4 or same:
+            break
+        both = np.concatenate([nodes[known], nodes[known], plane[use]])
+        there = np.concatenate([start[known], start[known], image[use]])
+        if known.sum() >= _FEWEST and known.sum() > 0.5 * len(rows):
+            both, there = nodes[known], start[known]
+        mapping = through(both, there, shape)
+    if known.sum() < 4:
+        return _failed(int(known.sum()), "corners beside the markers read")
+    mapping = through(nodes[known], start[known], shape) if known.sum() >= _FEWEST else mapping
+    frame, origin = np.eye(2) / design.pitch, np.zeros(2)
+    return Placed(Located(design.ids, design.xy, "dark", mapping, frame, origin, known, start))
+
+
+def _filled(grey: NDArray[np.float32], mapping: Chain, nodes: Array, dark: Mask) -> Mask:
+    """Whether both dark sectors of corners are dark: on the outer edge of a board one of them is paper."""
+    # The nodes of the design have y up: its steps have the dark sectors below and to the right beside them.
+    far, near = (sector_levels(grey, mapping, nodes, share) for share in (0.3, 0.08))
+    ink = np.where(dark[:, None], far[:, 2:], far[:, :2])
+    paper = np.where(dark[:, None], near[:, :2], near[:, 2:]).max(axis=1)
+    return np.asarray(np.ptp(ink, axis=1) < _EVEN * np.maximum(paper - ink.min(axis=1), 1e-9))
+
+
+def _nearest(
+    saddles: Saddles, mapping: Chain, nodes: Array, dark: Mask, plane: Array, known: Mask
+) -> tuple[Mask, Rows]:
+    """Corners that are found where the mapping predicts them, and their saddles."""
+    if not len(saddles):
+        return np.zeros(len(nodes), dtype=bool), np.zeros(len(nodes), dtype=np.intp)
+    where, slopes = images_of(mapping, nodes), slope_of(mapping, nodes)
+    gap, row = KDTree(saddles.xy).query(where)
+    pixels = np.linalg.norm(slopes, axis=1).min(axis=1)
+    # Do not extrapolate: the next corners are those beside what is known.
+    support = np.concatenate([plane, nodes[known]])
+    close = KDTree(support).query(nodes)[0] < 1.8
+    down = slopes * [1.0, -1.0]
+    fits = bright_between(saddles.edges[row], down) != dark
+    near = gap < np.minimum(_NEAR * pixels, _NEAR_PX + 0.03 * pixels)
+    found: Mask = near & close & fits & along(saddles.edges[row], slopes)
+    return found, row.astype(np.intp)

@@ -1,0 +1,619 @@
+"""Marks of a plane target, once they are found and numbered: learning of their appearance, and matching.
+
+The image of every mark is formed with the mapping through all marks, to second order, and matched. The
+estimate is therefore the image of its point, not the centre of its image. What differs between kinds of marks
+are the images themselves, which :class:`PlaneMarks` leaves to its subclasses.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ...core.data import Array, Frame, Mask, Rows
+from ...core.failure import Code, Remark
+from ...core.tone import ToneCurve
+from ...optics import Chain
+from ...optics.field import SmoothField
+from ...optics.formation import PixelResponse
+from ..matching import (
+    Matches,
+    MatchOptions,
+    Shape,
+    ShapeSubset,
+    Window,
+    grey_variance,
+    match,
+    with_alike_errors,
+)
+from ..points import Reason
+from ..response import FilteredShape, Samples, estimate_kernel
+from ..screening import Screened
+from ..testfield.targets import merged, replaced
+from ..tone import find_curve
+from .marks import ReseauOptions
+from .sheet_placement import through
+
+__all__ = ["Appearance", "Located", "PlaneMarks"]
+
+_CLASS_PX = 4
+"""Step of the window sizes."""
+_GROUND_PX, _GROUND_WIDTHS = 5, 3.0
+"""Background shown by a window around its mark: pixels, and widths of the point-spread function."""
+_LEARNT_FROM = 120
+"""Most marks from which mapping and appearance are learnt first."""
+_AT_ONCE_PX = 60_000
+"""Number of pixels of windows matched together; what is formed in them fits into the cache of a processor."""
+_SLOPE = 0.3
+"""Standard deviation of the change of contrast from the centre of a mark to the edge of its window, caused by
+reflected light."""
+_SEEN = 0.6
+"""Least share of a mark on pixels that can be used."""
+_HIGH_RESIDUALS = 1.25
+"""Multiple of the usual residuals from which something is suspected in front of a mark."""
+_DISTURBED = 1.6
+"""Multiple of the usual residuals from which a mark is declined."""
+_FOREIGN, _SHADE, _SHIFT_PX = 4.0, 0.03, 0.25
+"""Tolerances of the prediction of a mark by its neighbours: noise, share of the light, and shift."""
+_NEIGHBOURS = 6
+"""Number of neighbours whose light is taken."""
+_ENOUGH_LIKE, _SAMPLE = 6, 20
+"""Least number of reliable marks from which something is learnt, and most that show the camera's response."""
+_FEW = 3
+"""One in so many of these shows whether a kernel is needed."""
+_KERNELS = 2
+"""Number of times a kernel is estimated."""
+_FILTERED = 0.85
+"""Ratio of mean square residuals below which a kernel is used."""
+_BULGED = 0.3
+"""Largest deviation of a mark from its neighbours' prediction, in radii: paper bulges."""
+_UNMODELLED_PX = 0.05
+"""Scatter of positions beyond their own sigmas: the sheet is not plane."""
+_FORMED_PX = 0.002
+"""Standard deviation of what no formed image contains: edges of prints, unequal pixels."""
+_PER_TERM = 2.0
+"""Least number of matched marks for each term of the polynomial of their mapping."""
+_PSF_LOG_SIGMA = 0.2
+"""Spread of sharpness (logarithm) over the marks of one frame."""
+_BLURRED = 1.8
+"""Tolerated factor of the sharpness of a mark."""
+_LEAST_RIM = 0.25
+"""Share of the edge of a mark below which the level of the paper is hardly seen, and has no slope."""
+_BESIDE = 0.05
+"""Share of a pixel from which other ink hides it from the matching; the light of fainter tails is
+subtracted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Appearance:
+    """Appearance of the marks of this frame.
+
+    Examples
+    --------
+    >>> Appearance(0.7, 0.5, 1.0, np.zeros(0), None, None, 0.7, None, None).psf_px
+    0.7
+    """
+
+    psf_px: float
+    psf_log_sigma: float
+    size: float
+    form_sigma: Array
+    variance: tuple[float, float] | None
+    kernel: Array | None
+    """Of motion or sharpening, see :mod:`reseau.measure.response`."""
+    blur_px: float
+    """Width of the point-spread function with the kernel."""
+    contrast: Array | None
+    """Contrast (n,) of each mark of the design."""
+    light: Array | None
+    """Grey values (n,) that full ink adds at each mark of the design; negative for dark ink."""
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Where the marks of a design are in a frame, approximately.
+
+    Parameters
+    ----------
+    ids : tuple of str (n,)
+        Names of the marks.
+    xy : ndarray (n, 2)
+        Their coordinates in the plane of the design.
+    polarity : {"dark", "bright"}
+        Of the marks.
+    mapping : Chain
+        Mapping from lattice coordinates to the image.
+    frame, origin : ndarray (2, 2), (2,)
+        Lattice coordinates are `frame` times those of the design, plus `origin`.
+    found : ndarray of bool (n,)
+        Marks that were found.
+    start : ndarray (n, 2)
+        Where they were found; for others any value.
+
+    Examples
+    --------
+    >>> from reseau.measure.testfield.lattice_mapping import started
+    >>> plain, two = started(np.eye(3), 1, (480, 640)), np.array([[0.0, 0.0], [1.0, 0.0]])
+    >>> all_found = np.ones(2, dtype=bool)
+    >>> Located(("a", "b"), two, "dark", plain, np.eye(2), np.zeros(2), all_found, 100 * two).at[1]
+    array([1., 0.])
+    """
+
+    ids: tuple[str, ...]
+    xy: Array
+    polarity: Literal["dark", "bright"]
+    mapping: Chain
+    frame: Array
+    origin: Array
+    found: Mask
+    start: Array
+
+    @property
+    def at(self) -> Array:
+        """Lattice coordinates (n, 2)."""
+        return np.asarray(self.xy @ self.frame.T + self.origin)
+
+
+class PlaneMarks(ABC):
+    """The two rounds of matching, and the tests of every mark.
+
+    Parameters
+    ----------
+    image : Frame
+        The frame.
+    screened : Screened
+        Its grey values as they are matched.
+    located : Located
+        The marks.
+    options : ReseauOptions
+        Options of the measurement.
+    size : float
+        Size of a mark in the unit of the design.
+    """
+
+    word: ClassVar[str]
+    """What a mark is called in messages."""
+    form_sigma: ClassVar[Array]
+    """Standard deviations of the parameters of the form, before anything is learnt."""
+    learnt_form_sigma: ClassVar[Array]
+    """The same for marks whose common size is known."""
+    learnt_from: ClassVar[int] = _LEARNT_FROM
+    """Most marks from which mapping and appearance are learnt first."""
+    precise_start: ClassVar[bool] = False
+    """Whether marks are found so precisely that a match can continue from what is known of them."""
+    eccentric: ClassVar[bool] = False
+    """Whether the mapping moves the centres of images so much that marks are matched again with the
+    one through all of them."""
+    least_seen: ClassVar[float] = _SEEN
+    """Least share of a mark on pixels that can be used."""
+    formed_px: ClassVar[float] = _FORMED_PX
+    """Standard deviation of what no formed image contains."""
+
+    def __init__(
+        self, image: Frame, screened: Screened, located: Located, options: ReseauOptions, size: float
+    ) -> None:
+        self.image, self.screened, self.options = image, screened, options
+        self.ids, self.xy, self.polarity = located.ids, located.xy, located.polarity
+        self.frame, self.mapping, self.origin = located.frame, located.mapping, located.origin
+        self.at, self.found = located.at, located.found
+        self.start = np.where(self.found[:, None], located.start, self.mapping(self.at))
+        self.look = Appearance(
+            options.psf_px, 0.5, size, self.form_sigma, None, None, options.psf_px, None, None
+        )
+        self.hidden = np.zeros(screened.grey.shape, dtype=bool)
+        self.dazzled = np.zeros(len(self.at), dtype=bool)
+        self.notes: tuple[Remark, ...] = ()
+        self.learning = True
+
+    @abstractmethod
+    def _images(self, rows: Rows) -> tuple[Shape, Array]:
+        """Images of marks around the images of their points, and half their width and height (k, 2)."""
+
+    @abstractmethod
+    def _settle(self, first: Matches) -> Matches:
+        """Learn sharpness and size; the form of the matches refers to the new size."""
+
+    @abstractmethod
+    def _edge_seen(self, rows: Rows, found: Matches) -> Array:
+        """Share (k,) of the pixels on the blurred edge of each mark that were used."""
+
+    @abstractmethod
+    def _radius(self, rows: Rows) -> Array:
+        """Half the mean extent (k,) of marks in the image."""
+
+    def _misshapen(self, found: Matches) -> list[tuple[Mask, Reason]]:
+        """Objections to the form of marks."""
+        return []
+
+    def _beside(self) -> Array | None:
+        """Share (h, w) of each pixel that other ink of the target takes."""
+        return None
+
+    def _region(self, rows: Rows, half: tuple[int, int]) -> Mask | None:
+        """Pixels (k, rows, columns) of the windows that belong to the marks; None for all."""
+        return None
+
+    def columns(self) -> dict[str, Any]:
+        """Columns of the result."""
+        rows = np.flatnonzero(self.found)
+        if len(rows) > self.learnt_from:
+            rows = rows[np.linspace(0, len(rows) - 1, self.learnt_from).astype(np.intp)]
+        first = self._match(rows)
+        sure = first.converged & (first.t > 8) & (first.rejected < 0.2)
+        if sure.sum() >= _ENOUGH_LIKE:
+            self._respond(self._learn(first.select(sure), rows[sure]), rows[sure])
+        rows, self.learning = self._in_sight(), False
+        found = self._match_all(rows)
+        if self.eccentric:
+            sure = found.converged & (found.t > 8) & (found.rejected < 0.1) & (found.seen > _SEEN)
+            if sure.sum() >= _ENOUGH_LIKE:
+                self.start[rows[sure]] = found.xy[sure]
+                at, shape = self.at[rows[sure]], self.screened.grey.shape
+                degree = next(d for d in (5, 4, 3, 2, 1) if _PER_TERM * (d + 1) * (d + 2) <= 2 * len(at))
+                self.mapping = through(at, found.xy[sure], shape, degree)
+                found = self._match_all(rows)
+        why, field = self._judged(rows, found)
+        # Where paper is saturated, neighbours do not predict the light.
+        doubtful = ((why != "") | self._uneasy(found)) & ~self.dazzled[rows]
+        if doubtful.any() and (~doubtful & ~self.dazzled[rows]).sum() >= _NEIGHBOURS and field is not None:
+            # Look again where their neighbours predict them, without what lies in front of them.
+            self._uncover(rows, found, doubtful, field)
+            found = replaced(found, ~doubtful, self._match_all(rows[doubtful]))
+        found = with_alike_errors(found)
+        found = replace(found, cov=found.cov + self.formed_px**2 * np.eye(2))
+        why, field = self._judged(rows, found)
+        return self._spread(rows, found, why, field)
+
+    def _straight(self, rows: Rows) -> Array:
+        """Images by the projectivity alone, the source coordinates of smooth fields."""
+        return self.mapping.first(self.at[rows])
+
+    def _in_sight(self) -> Rows:
+        """Indices of disks whose centres lie in the frame."""
+        h, w = self.screened.grey.shape
+        inside = ((self.start > 0) & (self.start < (w - 1, h - 1))).all(axis=1)
+        return np.flatnonzero(inside)
+
+    def _match_all(self, rows: Rows) -> Matches:
+        """Match disks; on even paper where paper is saturated all around."""
+        found = self._match(rows, influence=True)
+        dim = found.converged & (self._edge_seen(rows, found) < _LEAST_RIM)
+        self.dazzled[rows] |= dim
+        if not dim.any():
+            return found
+        return replaced(found, ~dim, self._match(rows[dim], background=0, influence=True))
+
+    def _match(self, rows: Rows, background: int = 2, influence: bool = False) -> Matches:
+        """Match disks, grouped by window size."""
+        images, reach = self._images(rows)
+        beside = self._beside()
+        valid = self.screened.valid & ~self.hidden
+        if beside is not None:
+            valid &= beside < _BESIDE
+        parts, found = [], []
+        for part, half in self._windows(reach):
+            options = MatchOptions(
+                half_px=half,
+                psf_px=self.look.psf_px,
+                psf_log_sigma=self.look.psf_log_sigma,
+                response=PixelResponse(self.options.fill),
+                polarity=self.polarity,
+                row_jitter_px=self.options.row_jitter_px,
+                settled=0.05,
+                influence=influence,
+                contrast=None if self.look.contrast is None else self.look.contrast[rows[part]],
+                contrast_slope=_SLOPE,
+                background=background,
+                variance=self.look.variance,
+            )
+            found.append(
+                match(
+                    self.screened.grey,
+                    valid,
+                    self._shape(images, part),
+                    self.start[rows[part]],
+                    options,
+                    noise=self.screened.noise,
+                    form_sigma=self.look.form_sigma,
+                    light=self._known_light(rows[part], background),
+                    others=self._light_of(beside, rows[part], half),
+                    region=self._region(rows[part], half),
+                )
+            )
+            parts.append(part)
+        return merged(parts, found)
+
+    def _shape(self, images: Shape, part: Rows) -> Shape:
+        """Images of some of the marks."""
+        plain = ShapeSubset(images, part)
+        return plain if self.look.kernel is None else FilteredShape(plain, self.look.kernel)
+
+    def _windows(self, reach: Array) -> Iterator[tuple[Rows, tuple[int, int]]]:
+        """Marks with windows of one size, not too many, and half their width and height."""
+        ground = max(_GROUND_PX, int(np.ceil(_GROUND_WIDTHS * self.look.blur_px)))
+        sizes, of = np.unique(np.ceil(reach / _CLASS_PX).astype(np.intp), axis=0, return_inverse=True)
+        for k, size in enumerate(sizes):
+            half = size * _CLASS_PX + ground
+            part = np.flatnonzero(of.ravel() == k)
+            some = max(1, int(_AT_ONCE_PX // (2 * half + 1).prod()))
+            for piece in np.array_split(part, -(-len(part) // some)):
+                yield piece, (int(half[0]), int(half[1]))
+
+    def _pixels(self, rows: Rows, half: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Columns (k, 1, c) and rows (k, r, 1) of the windows of marks, within the frame."""
+        h, w = self.screened.grey.shape
+        centre = np.rint(self.start[rows]).astype(np.intp)
+        x, y = (centre[:, k, None] + np.arange(-half[k], half[k] + 1) for k in (0, 1))
+        return np.clip(x, 0, w - 1)[:, None, :], np.clip(y, 0, h - 1)[:, :, None]
+
+    def _known_light(self, rows: Rows, background: int) -> tuple[Array, Array] | None:
+        """Contrast and background from which the match of marks continues."""
+        look = self.look
+        if self.learning or not self.precise_start or look.contrast is None or look.light is None:
+            return None
+        ground = np.zeros((len(rows), (background + 1) * (background + 2) // 2))
+        ground[:, 0] = np.abs(look.light[rows] / look.contrast[rows])
+        return look.contrast[rows], ground
+
+    def _light_of(self, beside: Array | None, rows: Rows, half: tuple[int, int]) -> Array | None:
+        """Light (k, rows, columns) that the blurred edges of other ink take in the windows of marks."""
+        light = self.look.light
+        if light is None or beside is None:
+            return None
+        x, y = self._pixels(rows, half)
+        return np.asarray(beside[y, x] * light[rows, None, None])
+
+    def _learn(self, first: Matches, rows: Rows) -> Matches:
+        """Learn mapping, sharpness, size and noise from reliable marks; their form refers to the new size."""
+        self.start[rows] = first.xy
+        known = self.found if self.precise_start else np.isin(np.arange(len(self.at)), rows)
+        self.mapping = through(self.at[known], self.start[known], self.screened.grey.shape)
+        self._weigh(first, rows)
+        first = self._settle(first)
+        self.look = replace(
+            self.look,
+            psf_log_sigma=_PSF_LOG_SIGMA,
+            form_sigma=self.learnt_form_sigma,
+            blur_px=self.look.psf_px,
+        )
+        self.start = np.where(self.found[:, None], self.start, self.mapping(self.at))
+        return first
+
+    def _depth(self, found: Matches) -> Array:
+        """Grey values (k,) that ink adds."""
+        return np.asarray(found.contrast * (-found.level if self.polarity == "dark" else 1))
+
+    def _respond(self, first: Matches, rows: Rows) -> None:
+        """Learn what motion, sharpening and the curve of the camera make of the images."""
+        some = np.unique(np.linspace(0, len(rows) - 1, _SAMPLE).astype(np.intp))
+        first, rows = first.select(np.isin(np.arange(len(rows)), some)), rows[some]
+        # The first match began far from the sharpness of these images.
+        first = self._settle(self._match(rows))
+        self._weigh(first, rows)
+        few = np.arange(len(rows)) % _FEW == 0
+        kernel, sharper, gain = estimate_kernel(self._samples(first.select(few), rows[few])[0])
+        if gain < _FILTERED:
+            for _ in range(_KERNELS):
+                # Position and form were those of images without the kernel, or with the one before.
+                self.look = replace(self.look, kernel=None)
+                kernel, sharper, _ = estimate_kernel(self._samples(first, rows)[0])
+                self.look = replace(self.look, kernel=kernel, psf_px=sharper * self.look.psf_px)
+                first = self._settle(self._match(rows))
+                self._weigh(first, rows)
+            text = "the images are smeared by motion or sharpened: this was estimated and is modelled"
+            self.notes += (Remark(text, Code.FILTERED),)
+        straight, full_scale = ToneCurve(1.0), self.image.full_scale
+        tried = {straight: (self.screened, self.look, first)}
+
+        def matched(curve: ToneCurve) -> tuple[Samples, Array] | None:
+            if curve not in tried:
+                self.screened = replace(self.screened, grey=self._linear(curve))
+                # The noise of grey values is alike, that of light grows with it where curves are steeper.
+                bent = float(curve.light(np.array(0.5), 1.0)) < 0.5
+                variance = (0.02 * full_scale, 1.0) if bent else None
+                self.look = replace(self.look, variance=variance, light=None)
+                again = self._settle(self._match(rows))
+                self.screened = replace(self.screened, noise=float(np.median(again.noise)))
+                tried[curve] = self.screened, self.look, again
+            self.screened, self.look, again = tried[curve]
+            return self._samples(again, rows) if again.converged.all() else None
+
+        found = find_curve(matched, full_scale, self.image.curve)
+        self.screened, self.look, first = tried[found.curve or straight]
+        if found:
+            self._weigh(first, rows)
+        if (note := found.remark(f"{self.word}s")) is not None:
+            self.notes += (note,)
+
+    def _weigh(self, first: Matches, rows: Rows) -> None:
+        """Learn noise, contrast and light from some of the marks; those of the others change as much."""
+
+        def renewed(known: Array | None, values: Array) -> Array:
+            whole = np.full(len(self.at), np.median(values))
+            if known is not None:
+                whole = known * np.median(values / known[rows])
+            whole[rows] = values
+            return np.asarray(whole)
+
+        look = self.look
+        self.look = replace(
+            look,
+            variance=grey_variance(self.screened.grey, self.start[rows], first.residuals),
+            contrast=renewed(look.contrast, first.contrast),
+            light=renewed(look.light, self._depth(first)),
+        )
+
+    def _linear(self, curve: ToneCurve) -> NDArray[np.float32]:
+        """Grey values of the frame that are proportional to the light."""
+        pixels, full_scale = self.image.pixels, self.image.full_scale
+        if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2:
+            return curve.light(pixels.astype(np.float32), full_scale)
+        levels = np.arange(np.iinfo(pixels.dtype).max + 1, dtype=np.float32)
+        return np.asarray(curve.light(levels, full_scale)[pixels])
+
+    def _samples(self, first: Matches, rows: Rows) -> tuple[Samples, Array]:
+        """Matched marks in windows of one size, and their adjusted images."""
+        images, reach = self._images(rows)
+        high, wide = (n // 2 for n in first.residuals.shape[1:])
+        size = np.max([half for _, half in self._windows(reach)], axis=0)
+        half = int(min(size[0], wide)), int(min(size[1], high))
+        x, y = self._pixels(rows, half)
+        centre = slice(high - half[1], high + half[1] + 1), slice(wide - half[0], wide + half[0] + 1)
+        residuals = first.residuals[:, *centre]
+        grey = self.screened.grey[y, x].astype(np.float64)
+        if (others := self._light_of(self._beside(), rows, half)) is not None:
+            grey -= others
+        window = Window(x[:, 0].astype(float), y[:, :, 0].astype(float), PixelResponse(self.options.fill))
+        every = np.arange(len(rows))
+        samples = Samples(
+            self._shape(images, every),
+            first.xy,
+            first.psf_px,
+            first.form,
+            self._depth(first),
+            window,
+            grey,
+            np.isfinite(residuals),
+        )
+        return samples, grey + np.nan_to_num(residuals)
+
+    def _uneasy(self, found: Matches) -> Mask:
+        """Marks with larger residuals than the others, or that did not converge."""
+        known = found.noise[found.converged]
+        ordinary = np.median(known) if len(known) else np.inf
+        spread = 1.4826 * np.median(np.abs(known / ordinary - 1)) if len(known) else 0.0
+        return ~found.converged | (found.noise > max(_HIGH_RESIDUALS, 1 + 4 * spread) * ordinary)
+
+    def _uncover(self, rows: Rows, found: Matches, uneasy: Mask, field: SmoothField) -> None:
+        """Mask the pixels of windows that show neither paper nor ink, but something in front of them.
+
+        The images of marks are predicted from their neighbours. The tolerance contains what a shift of a
+        quarter of a pixel makes of them.
+        """
+        good = ~uneasy & ~self.dazzled[rows]
+        near = KDTree(self.at[rows[good]]).query(self.at[rows], k=min(_NEIGHBOURS, int(good.sum())))[1]
+        level, depth = (np.median(values[good][near], axis=1) for values in (found.level, self._depth(found)))
+        noise = float(np.median(found.noise[good]))
+        some = rows[uneasy]
+        xy = field(self._straight(some))
+        self.start[some] = xy
+        images, reach = self._images(some)
+        foreign: NDArray[Any] = np.zeros(self.screened.grey.shape, dtype=np.uint8)
+        seen = np.zeros(foreign.shape, dtype=bool)
+        for part, half in self._windows(reach):
+            x, y = self._pixels(some[part], half)
+            window = Window(x[:, 0].astype(float), y[:, :, 0].astype(float), PixelResponse(self.options.fill))
+            formed = self._shape(images, part)
+            width, form = np.full(len(part), self.look.psf_px), np.zeros((len(part), formed.parameters))
+            share, slopes = formed.derivatives(xy[part], width, form, np.arange(len(part)), window)
+            here, ink = (values[uneasy][part, None, None] for values in (level, depth))
+            off = self.screened.grey[y, x] - here - ink * share
+            tolerance = _FOREIGN * noise + _SHADE * np.abs(here)
+            tolerance = tolerance + _SHIFT_PX * np.abs(ink) * np.hypot(slopes[:, 0], slopes[:, 1])
+            np.maximum.at(foreign, (y, x), np.abs(off) > tolerance)
+            seen[y, x] = True
+        foreign = cv2.morphologyEx(foreign, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+        margin = int(np.ceil(2 * self.look.psf_px)) + 1
+        foreign = cv2.dilate(foreign, np.ones((2 * margin + 1,) * 2, np.uint8))
+        self.hidden |= (foreign > 0) & seen
+
+    def _objections(self, rows: Rows, found: Matches) -> list[tuple[Mask, Reason]]:
+        """Objections to marks from their own images, the most serious first."""
+        o = self.options
+        sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
+        strong = found.converged & (found.t > 8)
+        ordinary = float(np.median(found.psf_px[strong])) if strong.any() else self.look.psf_px
+        usual = float(np.median(found.noise[strong])) if strong.any() else np.inf
+        return [
+            (
+                found.seen < self.least_seen,
+                Reason("hidden, saturated or beyond the edge of the frame", Code.HIDDEN),
+            ),
+            (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
+            (
+                ~(found.t >= o.least_t) | (found.contrast <= 0),
+                Reason(f"no {self.word} is distinct from its surroundings", Code.LOW_CONTRAST),
+            ),
+            (
+                found.psf_px > _BLURRED * ordinary,
+                Reason(f"less sharp than the other {self.word}s", Code.BLURRED),
+            ),
+            *self._misshapen(found),
+            # Without paper, the reflection in a disk is all that is left to compare.
+            (
+                (found.correlation < 0.8) & ~self.dazzled[rows],
+                Reason(f"the image is not that of a {self.word}", Code.UNLIKE),
+            ),
+            (
+                (found.rejected > 0.25) | (found.noise > _DISTURBED * usual),
+                Reason("partly hidden or disturbed", Code.DISTURBED),
+            ),
+            (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
+        ]
+
+    def _judged(self, rows: Rows, found: Matches) -> tuple[Array, SmoothField | None]:
+        """Reason why each mark is rejected, and the field through the others."""
+        why = np.full(len(rows), "", dtype=object)
+        for mask, reason in self._objections(rows, found):
+            why[mask & (why == "")] = reason
+        source, field = self._straight(rows), None
+        variance = np.trace(found.cov, axis1=1, axis2=2) / 2 + _UNMODELLED_PX**2
+        radius = self._radius(rows)
+        while (good := np.flatnonzero(why == "")).size >= 10:
+            relative = np.sqrt(variance[good] / np.median(variance[good]))
+            length = field.length if field is not None and np.isfinite(field.length) else None
+            field = SmoothField.fit(source[good], found.xy[good], sigma=relative, length=length)
+            deviation, sigma = field.leave_one_out()
+            limit = np.maximum(np.maximum(self.options.neighbour_px, _BULGED * radius[good, None]), 4 * sigma)
+            excess = (np.abs(deviation) / limit).max(axis=1)
+            worst = int(excess.argmax())
+            if excess[worst] <= 1:
+                break
+            distance = np.hypot(*deviation[worst])
+            why[good[worst]] = Reason(
+                f"{distance:.1f} px from the position predicted by its neighbours", Code.DEVIATES
+            )
+        return why, field
+
+    def _spread(self, rows: Rows, found: Matches, why: Array, field: SmoothField | None) -> dict[str, Any]:
+        """Columns over all marks of the design."""
+        n, good = len(self.at), why == ""
+        ok, reasons = (
+            np.zeros(n, dtype=bool),
+            Reason("outside the frame", Code.OUTSIDE).repeated(n),
+        )
+        ok[rows], reasons[rows] = good, why
+        predicted, deviation = self.mapping(self.at), np.full((n, 2), np.nan)
+        if field is not None:
+            predicted[rows] = field(self._straight(rows))
+            deviation[rows[good]] = field.leave_one_out()[0]
+
+        def spread(values: Array, keep: Mask | slice = slice(None)) -> Array:
+            full = np.full((n, *values.shape[1:]), np.nan)
+            full[rows[keep]] = values[keep]
+            return full
+
+        if field is not None and good.sum() >= 10:
+            design = SmoothField.fit(self.xy[rows[good]], found.xy[good])
+        else:
+            design = SmoothField.fit(self.xy, self.mapping(self.at), local=False)
+        return {
+            "image": self.image.name,
+            "sha256": self.image.sha256,
+            "ids": self.ids,
+            "field": design,
+            "xy": spread(found.xy, good),
+            "cov": spread(found.cov, good),
+            "ok": ok,
+            "why": tuple(reasons),
+            "predicted": predicted,
+            "deviation": deviation,
+            "notes": self.notes,
+        } | {name: spread(getattr(found, name)) for name in ("psf_px", "contrast", "t", "noise")}

@@ -1,0 +1,129 @@
+"""Images of corners, compiled; see :mod:`reseau.optics.corners`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import erf, exp, pi, sqrt
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["formed"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+Floats = NDArray[Any]
+
+_FAR = 5.5
+"""Widths of the point-spread function beyond which an edge has no influence; 2e-8 of the light."""
+_SHARPEST = 0.05
+"""Width in pixels below which a point-spread function is none."""
+_NODE, _WEIGHT = (values.copy() for values in np.polynomial.legendre.leggauss(10))
+
+
+def _compiled(function: F) -> F:
+    """Compile with Numba, cached on disk, releasing the GIL."""
+    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+    return cast(F, numba.njit(**options)(function))
+
+
+@_compiled
+def _step(z: float) -> float:
+    """Normal distribution."""
+    return 0.5 + 0.5 * erf(0.7071067811865476 * z)
+
+
+@_compiled
+def _bell(z: float) -> float:
+    """Normal density."""
+    return 0.3989422804014327 * exp(-0.5 * z * z)
+
+
+@_compiled
+def _both(a: float, b: float, rho: float) -> float:
+    """The integral of the density of two normal variables over their correlation, from 0 to `rho`."""
+    total = 0.0
+    for k in range(len(_NODE)):
+        r = 0.5 * rho * (1 + _NODE[k])
+        free = 1 - r * r
+        total += _WEIGHT[k] * exp(-(a * a - 2 * r * a * b + b * b) / (2 * free)) / sqrt(free)
+    return 0.5 * rho * total / (2 * pi)
+
+
+@_compiled
+def formed(
+    normal: Floats,
+    bend: Floats,
+    opposite: Floats,
+    xy: Floats,
+    sigma: Floats,
+    turn: Floats,
+    columns: Floats,
+    rows: Floats,
+    fill: float,
+    images: Floats,
+) -> None:
+    """Fill images (k, 1 or 6, r, c) of corners; see :func:`reseau.optics.corners.corner_images`."""
+    derived = images.shape[1] > 1
+    box, fourth = fill**2 / 12, -(fill**4) / 120 / 24
+    for k in range(len(normal)):
+        width = max(sigma[k], _SHARPEST)
+        s = sqrt(width * width + box)
+        c1, s1, c2, s2 = np.cos(turn[k, 0]), np.sin(turn[k, 0]), np.cos(turn[k, 1]), np.sin(turn[k, 1])
+        n1x, n1y = c1 * normal[k, 0, 0] - s1 * normal[k, 0, 1], s1 * normal[k, 0, 0] + c1 * normal[k, 0, 1]
+        n2x, n2y = c2 * normal[k, 1, 0] - s2 * normal[k, 1, 1], s2 * normal[k, 1, 0] + c2 * normal[k, 1, 1]
+        rho = min(max(n1x * n2x + n1y * n2y, -0.999), 0.999)
+        free = 1 / sqrt(1 - rho * rho)
+        # A normal turned by 90°: both the tangent of its edge and the derivative by its turn.
+        t1x, t1y, t2x, t2y = -n1y, n1x, -n2y, n2x
+        by_turn1, by_turn2 = t1x * n2x + t1y * n2y, t2x * n1x + t2y * n1y
+        sharp1, sharp2 = fourth * (n1x**4 + n1y**4) / s**4, fourth * (n2x**4 + n2y**4) / s**4
+        two = opposite[k]
+        for i in range(images.shape[2]):
+            y = rows[k, i] - xy[k, 1]
+            for j in range(images.shape[3]):
+                x = columns[k, j] - xy[k, 0]
+                along1, along2 = t1x * x + t1y * y, t2x * x + t2y * y
+                a = (n1x * x + n1y * y - 0.5 * bend[k, 0] * along1 * along1) / s
+                b = (n2x * x + n2y * y - 0.5 * bend[k, 1] * along2 * along2) / s
+                near1, near2 = abs(a) < _FAR, abs(b) < _FAR
+                if not (near1 or near2):
+                    both = (a > 0 and b > 0) or (two and a < 0 and b < 0)
+                    images[k, 0, i, j] = 1.0 if both else 0.0
+                    if derived:
+                        for p in range(1, 6):
+                            images[k, p, i, j] = 0.0
+                    continue
+                pa, pb = _step(a), _step(b)
+                share = pa * pb + (1 - pa) * (1 - pb) if two else pa * pb
+                by_rho = 0.0
+                if near1 and near2:
+                    added = _both(a, b, rho)
+                    share += 2 * added if two else added
+                    by_rho = exp(-0.5 * (a * a - 2 * rho * a * b + b * b) * free * free) * free / (2 * pi)
+                    if two:
+                        by_rho *= 2
+                by_a, by_b = 0.0, 0.0
+                if near1:
+                    side = _step((b - rho * a) * free)
+                    bell = _bell(a)
+                    beside = 2 * side - 1 if two else side
+                    by_a = bell * beside
+                    share += sharp1 * (3 * a - a * a * a) * bell * beside
+                if near2:
+                    side = _step((a - rho * b) * free)
+                    bell = _bell(b)
+                    beside = 2 * side - 1 if two else side
+                    by_b = bell * beside
+                    share += sharp2 * (3 * b - b * b * b) * bell * beside
+                images[k, 0, i, j] = share
+                if not derived:
+                    continue
+                slope1, slope2 = bend[k, 0] * along1, bend[k, 1] * along2
+                images[k, 1, i, j] = -(by_a * (n1x - slope1 * t1x) + by_b * (n2x - slope2 * t2x)) / s
+                images[k, 2, i, j] = -(by_a * (n1y - slope1 * t1y) + by_b * (n2y - slope2 * t2y)) / s
+                images[k, 3, i, j] = -(a * by_a + b * by_b) * width / (s * s)
+                # A tangent turned by 90° is the negative normal.
+                images[k, 4, i, j] = by_a * along1 * (1 + bend[k, 0] * a * s) / s + by_rho * by_turn1
+                images[k, 5, i, j] = by_b * along2 * (1 + bend[k, 1] * b * s) / s + by_rho * by_turn2

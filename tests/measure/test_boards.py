@@ -1,0 +1,143 @@
+"""Boards of other programs: positions, sigmas, names, parts of boards, and what is declined."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reseau.core.data import Array, Frame
+from reseau.core.failure import Code, Failure
+from reseau.designs import board
+from reseau.io import BoardDesign
+from reseau.io.images import read_image
+from reseau.measure import BoardOptions, BoardResult, measure_board
+
+from .board_pictures import picture
+
+CHESS = board("chess", 9, 8, 20.0)
+CHARUCO = board("charuco", 7, 6, 25.0, size=18.0)
+CIRCLES = board("circles", 8, 6, 20.0, size=10.0)
+SHIFTED = board("circles", 5, 9, 12.0, size=9.0, asymmetric=True)
+DATA = Path(os.environ.get("RESEAU_DATA", "/nowhere")) / "independent" / "boards"
+
+
+def measured(frame: Frame, design: BoardDesign, options: BoardOptions | None = None) -> BoardResult:
+    found = measure_board(frame, design, options)
+    assert not isinstance(found, Failure), found.reason
+    return found
+
+
+def renamed(found: BoardResult, truth: Array) -> Array:
+    """Errors (m, 2) of the measured points against the nearest true ones."""
+    near = np.hypot(*(found.xy[found.ok, None] - truth[None]).transpose(2, 0, 1)).argmin(axis=1)
+    assert len(set(near.tolist())) == len(near)
+    return np.asarray(found.xy[found.ok] - truth[near])
+
+
+@pytest.mark.parametrize(
+    ("design", "tilt", "turn"),
+    [(CHESS, 20.0, 10.0), (CHESS, 50.0, 200.0), (CHARUCO, 25.0, -15.0), (CHARUCO, 45.0, 160.0)],
+)
+def test_corners_are_measured_to_their_sigmas_and_named(
+    design: BoardDesign, tilt: float, turn: float
+) -> None:
+    frame, truth = picture(design, tilt, turn)
+    found = measured(frame, design)
+    assert found.ok.all()
+    error = found.xy - truth
+    sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
+    assert np.sqrt((error**2).mean()) < 0.008
+    assert 0.7 < np.sqrt(((error / sigma) ** 2).mean()) < 1.5
+    assert np.abs(error.mean(axis=0)).max() < 0.003  # no half pixel
+
+
+@pytest.mark.parametrize(("design", "ways"), [(CIRCLES, 2), (SHIFTED, 2)])
+def test_circles_have_no_eccentricity_at_60_degrees(design: BoardDesign, ways: int) -> None:
+    frame, truth = picture(design, 60.0, 5.0)
+    found = measured(frame, design)
+    assert found.found > 0.95 * len(design.ids)
+    error = renamed(found, truth)
+    assert np.sqrt((error**2).mean()) < 0.012
+    assert np.abs(error.mean(axis=0)).max() < 0.004
+    said = [note for note in found.notes if note.code is Code.AMBIGUOUS]
+    assert bool(said) == (ways > 1 and design is CIRCLES) or f"{ways} ways" in str(said[0])
+
+
+def test_half_a_chessboard_in_sight_is_measured() -> None:
+    frame, truth = picture(CHESS, 20.0, 10.0)
+    cut = 150
+    part = Frame(frame.pixels[:, cut:], 255.0, "part")
+    found = measured(part, CHESS)
+    # The right, upper and lower ends of the pattern are in sight: the names are certain.
+    inside = truth[:, 0] > cut + 6
+    assert found.ok[inside].mean() > 0.95
+    assert np.abs(found.xy[found.ok] + [cut, 0] - truth[found.ok]).max() < 0.05
+    assert not [note for note in found.notes if note.code is Code.AMBIGUOUS]
+
+
+def test_a_part_without_the_ends_of_the_pattern_is_said_to_be_ambiguous() -> None:
+    frame, truth = picture(CHESS, 20.0, 10.0)
+    part = Frame(frame.pixels[130:290, 150:330], 255.0, "part")
+    found = measured(part, CHESS)
+    assert found.found >= 12
+    assert np.abs(renamed(found, truth - [150, 130])).max() < 0.05
+    assert [note for note in found.notes if note.code is Code.AMBIGUOUS]
+
+
+@pytest.mark.parametrize("hidden", [(slice(120, 260), slice(180, 330)), (slice(0, 400), slice(0, 230))])
+def test_something_over_a_part_hides_only_that_part(hidden: tuple[slice, slice]) -> None:
+    for design in (CHESS, CHARUCO):
+        frame, truth = picture(design, 20.0, 10.0)
+        pixels = frame.pixels.copy()
+        pixels[hidden] = np.random.default_rng(1).normal(120, 12, pixels[hidden].shape).astype(np.uint8)
+        found = measured(replace(frame, pixels=pixels), design)
+        rows, columns = hidden
+        away = (truth[:, 0] < columns.start - 16) | (truth[:, 0] > columns.stop + 16)
+        away |= (truth[:, 1] < rows.start - 16) | (truth[:, 1] > rows.stop + 16)
+        assert found.ok[away].mean() > 0.9
+        assert np.abs(renamed(found, truth)).max() < 0.1
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_old_and_new_layout_differ_with_an_even_number_of_rows(legacy: bool) -> None:
+    design = CHARUCO.model_copy(update={"legacy": legacy})
+    frame, truth = picture(design)
+    assert np.abs(measured(frame, design).xy - truth).max() < 0.03
+    other = measure_board(frame, CHARUCO.model_copy(update={"legacy": not legacy}))
+    assert isinstance(other, Failure)
+
+
+def test_a_mirrored_charuco_board_is_declined_or_measured_as_such() -> None:
+    frame, truth = picture(CHARUCO)
+    mirrored = replace(frame, pixels=np.ascontiguousarray(frame.pixels[:, ::-1]))
+    declined = measure_board(mirrored, CHARUCO)
+    assert isinstance(declined, Failure)
+    assert declined.code is Code.MIRRORED
+    found = measured(mirrored, CHARUCO, BoardOptions(mirrored=True))
+    assert np.abs(found.xy - (truth * [-1, 1] + [frame.width - 1, 0])).max() < 0.03
+
+
+@pytest.mark.parametrize("design", [CHESS, CHARUCO, CIRCLES])
+def test_pictures_of_something_else_are_declined(design: BoardDesign) -> None:
+    noise = np.random.default_rng(0).normal(120, 8, (300, 400))
+    empty = measure_board(Frame(np.rint(noise).astype(np.uint8), 255.0), design)
+    assert isinstance(empty, Failure)
+    other = picture(SHIFTED if design is not CIRCLES else CHESS)[0]
+    assert isinstance(measure_board(other, design), Failure)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="RESEAU_DATA has no independent/boards")
+def test_a_picture_of_another_program_is_measured_to_three_thousandths() -> None:
+    import json
+
+    truth = json.loads((DATA / "truth.json").read_text())
+    design = board("charuco", 11, 11, 23.0, size=17.0)
+    for name in ("charuco_1_clean.png", "charuco_3_clean.png"):
+        found = measured(read_image(DATA / name), design)
+        error = found.xy - np.array(truth[name]["xy"])
+        assert found.ok.all()
+        assert np.sqrt((error**2).mean()) < 0.003
