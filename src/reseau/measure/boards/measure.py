@@ -72,6 +72,13 @@ class BoardResult(Measured):
         Width of the point-spread function at each point; NaN where there was no match.
     notes : tuple of Remark
         What a user should know: ambiguous names, motion, curves of the camera.
+
+    Examples
+    --------
+    See :func:`measure_board`:
+
+    >>> issubclass(BoardResult, Measured)
+    True
     """
 
     psf_px: Array
