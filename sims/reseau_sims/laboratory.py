@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from hashlib import sha256
 from typing import Literal
@@ -340,6 +340,12 @@ class Laboratory:
         if self._stood is None or not _same_camera(self._stood, crept):
             self._stood = crept
         return replace(crept, camera=self._stood.camera)
+
+    def pose_at(self, position: Mapping[str, float]) -> Pose:
+        """Pose of the camera in the system of the board, at a position of the axes, without drift."""
+        at = dict.fromkeys(AXES, 0.0) | dict(position)
+        station = Station(at["tilt"], at["roll"], at["camera_roll"])
+        return _Mounted.of(self.field, np.array([0.0, 0.0, at["z"]])).pose(station)
 
     def _moved(self) -> tuple[Station, FieldBench]:
         """Present station of the table, and the testfield on it."""

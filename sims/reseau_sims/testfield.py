@@ -32,6 +32,7 @@ from reseau.optics.formation import Outline, PixelResponse, draw
 from reseau.optics.grids import line_grid
 from reseau.optics.targets import target_outline
 
+from .frame import SpaceFrame
 from .photograph import Photograph
 from .streams import stream
 from .water import Water
@@ -189,6 +190,8 @@ class FieldBench:
         Standard deviation of the true height of the stage about its reading.
     water : Water, optional
         Port of the camera and the water between it and the board; by default air.
+    frame : SpaceFrame, optional
+        Targets of a frame in place of the board, photographed by their lens in place of `camera`.
 
     Examples
     --------
@@ -233,6 +236,7 @@ class FieldBench:
     stage_tilt: tuple[float, float] = (0.0, 0.0)
     stage_sigma_mm: float = 0.0
     water: Water | None = None
+    frame: SpaceFrame | None = None
 
     def submerged(self, water: Water) -> FieldBench:
         """The bench in a tank: a camera of 8 mm in a housing, 1 m in front of the testfield."""
@@ -315,6 +319,10 @@ class FieldBench:
     def light(self, station: Station, row_shifts: Array | None = None) -> Array:
         """Light on each pixel, (height, width), in grey values and without noise."""
         shape = (self.sensor.height, self.sensor.width)
+        if self.frame is not None:
+            share = self.frame.share(self.pose(station), self.water, shape, self.psf_px, self.response)
+            even = illumination(self.sensor.width, self.sensor.height, gradient=self.gradient)
+            return np.maximum(self.level * even * (1 - self.contrast * share), 0.0)
         colours = (None,) if self.water is None else self.water.colours
         share = np.zeros(shape)
         for colour in colours:

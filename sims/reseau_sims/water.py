@@ -113,7 +113,7 @@ class Water:
     @property
     def index(self) -> float:
         """Index of the water at the mean wavelength."""
-        return self._indices(self.colour_nm)[1]
+        return self.indices(self.colour_nm)[1]
 
     @property
     def colours(self) -> tuple[float, ...]:
@@ -125,7 +125,7 @@ class Water:
         """Return the description of port and water for an instrument of a ``bench.toml``."""
         x, y = np.tan(np.deg2rad(self.tilt_deg)).tolist()
         d, t = self.distance_mm, self.thickness_mm
-        glass, water = self._indices(self.colour_nm)
+        glass, water = self.indices(self.colour_nm)
         port = f"instruments.{instrument}.refraction"
         # The normal, the z-axis, turned about y leans towards x, and turned about x away from y.
         return f"""
@@ -159,7 +159,7 @@ curvature = {SIGMAS["curvature"]}
         colour_nm : float, optional
             Wavelength; by default the mean one.
         """
-        index = self._indices(colour_nm or self.colour_nm)
+        index = self.indices(colour_nm or self.colour_nm)
         turn = rotation_matrix(np.deg2rad(np.array([*self.tilt_deg, 0.0])))
         # The system of the port: its normal is z.
         aim = points @ turn
@@ -189,7 +189,7 @@ curvature = {SIGMAS["curvature"]}
         d_xy = (d_ray[:, :2] - xy[:, :, None] * d_ray[:, 2:]) / ray[:, 2, None, None]
         return Directions(xy, d_xy @ d_aim @ turn.T, found)
 
-    def _indices(self, colour_nm: float) -> tuple[float, float]:
+    def indices(self, colour_nm: float) -> tuple[float, float]:
         """Indices of glass and water at a wavelength."""
         glass = _GLASS[0] + _GLASS[1] * (colour_nm - _GREEN_NM)
         return glass, WaterMedium(self.temperature_c).index(colour_nm)

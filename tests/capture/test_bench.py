@@ -13,7 +13,9 @@ import pytest
 from reseau.capture import Bench, BenchFile, found_instruments, plugin
 from reseau.cli import run
 from reseau.core.errors import BenchError, ConnectionLost, FormatError, InputError, UsageError
+from reseau.exchange import read_lens
 from reseau.instruments import Oscilloscope, Turntable, UltrasonicScanner
+from reseau.io.targets import SpaceTargets
 from reseau_sims import Reflectors
 from reseau_sims.serving import Fault, SimulatedBench
 from reseau_sims.serving.bench import serve
@@ -201,6 +203,15 @@ def test_sim_puts_a_port_and_water_before_the_camera(monkeypatch: pytest.MonkeyP
     with pytest.raises(FormatError, match="windows"):
         BenchFile.parse_toml(text.replace('shape = "plane"', 'shape = "cone"'), where="bench.toml")
     assert run(["bench", "sim", "--water", "--camera", "screen"]) == 2
+
+
+def test_sim_with_a_frame_writes_what_a_session_needs(tmp_path: Path) -> None:
+    out = tmp_path / "bench.toml"
+    assert run(["bench", "sim", "--seconds", "0.01", "--camera", "frame", "--out", str(out)]) == 0
+    lens = read_lens(tmp_path / "lens.toml")
+    assert lens.sensor is not None
+    assert lens.sensor.size_px == (640, 480)
+    assert len(SpaceTargets.read(tmp_path / "targets.json").targets.id) == 28
 
 
 def test_list_shows_found_instruments_and_why_a_search_failed(

@@ -20,7 +20,7 @@ POINTS = np.random.default_rng(1).uniform([-350, -350, 700], [350, 350, 1300], (
 def test_the_ray_through_a_pane_satisfies_snells_law_in_closed_form() -> None:
     water = Water(distance_mm=50.0, thickness_mm=15.0)
     seen = water.directions(POINTS)
-    glass, index = water._indices(water.colour_nm)
+    glass, index = water.indices(water.colour_nm)
     sine = np.linalg.norm(seen.xy, axis=1) / np.hypot(1, np.linalg.norm(seen.xy, axis=1))
     tangents = [sine / np.sqrt(n * n - sine * sine) for n in (1.0, glass, index)]
     reached = 50.0 * tangents[0] + 15.0 * tangents[1] + (POINTS[:, 2] - 65.0) * tangents[2]

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from reseau.core.errors import UsageError
 
+from ..frame import DISTANCE_MM as FRAME_DISTANCE_MM
+from ..frame import SIZE as FRAME_SIZE
+from ..frame import SpaceFrame
 from ..laboratory import AXES, Laboratory
 from ..streams import stream
 from ..testfield import FieldBench
@@ -35,7 +38,7 @@ from .zaber import ZaberChain
 __all__ = ["SimulatedBench", "TableKind", "serve"]
 
 TableKind = Literal["zaber", "smc100"]
-SceneName = Literal["screen", "testfield"]
+SceneName = Literal["screen", "testfield", "frame"]
 _PATIENCE_S = 120.0
 """Time to wait for the port of another simulated camera on this machine (s)."""
 _DISTORTION_PX = 1.5
@@ -101,7 +104,7 @@ class SimulatedBench:
         Controllers of the table.
     family : str
         Oscilloscope, one of :data:`~reseau_sims.serving.FAMILIES`.
-    camera : {"screen", "testfield"}, optional
+    camera : {"screen", "testfield", "frame"}, optional
         Object in front of a camera. The camera uses GigE Vision if Aravis is installed; otherwise it is a
         Video4Linux camera in this process (`video`) and not part of the ``bench.toml``.
     repeatable : bool
@@ -118,6 +121,8 @@ class SimulatedBench:
     ----------
     toml : str
         ``bench.toml`` for the instruments.
+    documents : dict of str to str
+        With a frame of targets: the files that a session needs, ``targets.json`` and ``lens.toml``.
     refraction : str
         The part of a ``bench.toml`` about the port and the water before the camera; empty in air.
     laboratory : Laboratory
@@ -161,12 +166,18 @@ class SimulatedBench:
                     f"is not a simulated {what}", where=asked, do=f"choose from {', '.join(known)}"
                 )
         if water is not None and camera == "screen":
-            raise UsageError("there is water before the testfield only", where="water")
+            raise UsageError("there is water before testfield and frame only", where="water")
         field = FieldBench(seed=seed)
-        self.refraction = ""
+        self.refraction, self.documents = "", dict[str, str]()
         if water is not None:
             field = field.submerged(water.made(stream(seed, "water")))
             self.refraction = water.toml()
+        if camera == "frame":
+            frame = SpaceFrame(seed)
+            width, height = FRAME_SIZE
+            sensor = replace(field.sensor, width=width, height=height, row_jitter_px=0.0)
+            field = replace(field, frame=frame, sensor=sensor, distance_mm=FRAME_DISTANCE_MM)
+            self.documents = frame.documents
         if flat:
             field = replace(field, bend_mm=0.0).distorted(_DISTORTION_PX)
         self.laboratory = laboratory = Laboratory(World.standard(seed), field, repeatable=repeatable)
@@ -203,8 +214,9 @@ class SimulatedBench:
 
     def _camera(self, scene: SceneName, in_process: bool, stack: ExitStack) -> str:
         """Create the camera; return its part of the ``bench.toml`` if it can be reached from outside."""
-        first = self.laboratory.expose(scene)  # do the long computations now
-        body = SimulatedCamera(LaboratoryScene(self.laboratory, scene), first.width, first.height)
+        sight: Literal["screen", "testfield"] = "screen" if scene == "screen" else "testfield"
+        first = self.laboratory.expose(sight)  # do the long computations now
+        body = SimulatedCamera(LaboratoryScene(self.laboratory, sight), first.width, first.height)
         self.scripts["camera"] = body.script
         if in_process or not aravis_is_installed():
             self.video = VideoCamera(body)

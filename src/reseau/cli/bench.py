@@ -79,7 +79,7 @@ def sim(
     table: Annotated[str, typer.Option(help="Controller of the turntable: zaber or smc100.")] = "zaber",
     family: Annotated[str, typer.Option(help="Oscilloscope family: keysight, rigol-1000z, …")] = "keysight",
     camera: Annotated[
-        str, typer.Option(help="Scene of the camera: screen or testfield. Default: no camera.")
+        str, typer.Option(help="Scene of the camera: screen, testfield or frame. Default: no camera.")
     ] = "",
     repeatable: Annotated[
         bool, typer.Option("--repeatable", help="Identical frames for identical states, without drift.")
@@ -89,7 +89,8 @@ def sim(
         typer.Option("--flat", help="Plane testfield. Default: bent by its mount, as in the paper."),
     ] = False,
     water: Annotated[
-        bool, typer.Option("--water", help="Testfield under water, camera in a housing with a plane port.")
+        bool,
+        typer.Option("--water", help="Testfield or frame under water, camera behind a plane port."),
     ] = False,
     port_distance: Annotated[
         float,
@@ -127,6 +128,8 @@ def sim(
             typer.echo("no camera: Aravis or PyGObject is not installed", err=True)
         if out is not None:
             write_whole(out, bench.toml)
+            for name, text in bench.documents.items():
+                write_whole(out.with_name(name), text)
         else:
             say(bench.toml)
             typer.get_text_stream("stdout").flush()

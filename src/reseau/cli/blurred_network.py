@@ -13,7 +13,6 @@ from .common import SensorFile, corrected, progress, read_frame, required, say
 if TYPE_CHECKING:
     from ..bundle import Network
     from ..core.data import Frame
-    from ..io.network import Network1
     from ..procedures.blurred_network import BlurredNetwork
 
 __all__ = ["blurred_network"]
@@ -66,7 +65,7 @@ def blurred_network(
     from ..io.targets import SpaceTargets
     from ..measure.blurred import BlurredOptions
     from ..procedures.blurred import lens_camera
-    from ..procedures.blurred_network import NetworkOptions, measure_blurred_network
+    from ..procedures.blurred_network import NetworkOptions, final_document, measure_blurred_network
     from ..report.blurred_network import blurred_network_report
 
     if initial not in ("given", "centroid", "edge"):
@@ -121,7 +120,7 @@ def blurred_network(
     for number, entry in enumerate(found.rounds):
         ResultDocument.of(entry.result, provenance=provenance).write(out / f"round-{number}.json")
     ResultDocument.of(found.result, provenance=provenance).write(out / "result.json")
-    _final(document, found).write(out / "network.json")
+    final_document(document, found).write(out / "network.json")
     write_whole(out / "report.html", blurred_network_report(found, title=network.name, provenance=provenance))
     _say(found, out)
 
@@ -141,27 +140,6 @@ def _photographs(folder: Path, network: Network) -> dict[str, Path]:
         if file is not None:
             found[image] = file
     return found
-
-
-def _final(document: Network1, found: BlurredNetwork) -> Network1:
-    """The document of the network with the final image coordinates."""
-    import numpy as np
-
-    from ..io.network import ObservationColumns
-
-    network = found.network
-    sigma = np.sqrt(np.diagonal(network.cov, axis1=1, axis2=2))
-    rho = network.cov[:, 0, 1] / sigma.prod(axis=1)
-    columns = ObservationColumns(
-        image=tuple(network.images[i] for i in network.image_of),
-        point=tuple(network.points[j] for j in network.point_of),
-        x=tuple(network.xy[:, 0].tolist()),
-        y=tuple(network.xy[:, 1].tolist()),
-        sx=tuple(sigma[:, 0].tolist()),
-        sy=tuple(sigma[:, 1].tolist()),
-        rho=tuple(rho.tolist()),
-    )
-    return document.model_copy(update={"observations": columns})
 
 
 def _say(found: BlurredNetwork, out: Path) -> None:

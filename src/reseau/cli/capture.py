@@ -12,7 +12,7 @@ from .acquisition import CameraName, Where, conduct, in_session
 
 if TYPE_CHECKING:
     from ..capture import Bench
-    from ..sessions import TestfieldParameters
+    from ..sessions import BlurredParameters, TestfieldParameters
 
 __all__ = ["app"]
 
@@ -112,6 +112,53 @@ def coded_field(
         )  # fmt: skip
 
     conduct(where, "testfield", parameters, {"design.json": design})
+
+
+@app.command()
+@in_session()
+def blurred(
+    where: Where,
+    network: Annotated[
+        Path | None,
+        typer.Option("--network", "-n", help="reseau-network/1 whose images are named as the poses."),
+    ] = None,
+    targets: Annotated[
+        Path | None, typer.Option("--targets", "-t", help="Targets, reseau-targets/1.")
+    ] = None,
+    lens: Annotated[Path | None, typer.Option("--lens", "-l", help="Lens with its sensor, lens/1.")] = None,
+    poses: Poses = None,
+    psf: Annotated[
+        float, typer.Option(min=0.1, help="Blur of sensor and diffraction beside that of the rays (px).")
+    ] = 0.5,
+    search: Annotated[
+        float, typer.Option(min=1.0, help="Largest distance from the predicted position (px).")
+    ] = 6.0,
+    rounds: Annotated[int, typer.Option(min=1, help="Largest number of rounds.")] = 6,
+    average: Average = 1,
+    checks: Checks = 3,
+    retakes: Retakes = 2,
+    home: Annotated[
+        bool, typer.Option("--home", help="First home axes without a reference. The axes move.")
+    ] = False,
+    camera: CameraName = None,
+    table: TableName = None,
+) -> None:
+    """Record targets on a frame from all poses, measure them by rays, and adjust the network."""
+
+    def parameters(bench: Bench) -> BlurredParameters:
+        from ..capture import read_steps
+        from ..sessions import BlurredParameters
+
+        if poses is None:
+            raise UsageError("is missing", where="--poses", do="give a CSV with the images of the network")
+        return BlurredParameters(
+            steps=tuple((step.name, dict(step.position)) for step in read_steps(poses)), psf=psf,
+            search=search, rounds=rounds, average=average, checks=checks, retakes=retakes, home=home,
+            camera=camera, table=table,
+        )  # fmt: skip
+
+    inputs = {"network.json": network, "targets.json": targets, "lens.toml": lens}
+    conduct(where, "blurred", parameters, inputs)
 
 
 @app.command()

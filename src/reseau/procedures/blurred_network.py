@@ -20,6 +20,7 @@ from ..core.data import Array, Frame, Mask, Rows
 from ..core.display import Display
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
+from ..io.network import Network1, ObservationColumns
 from ..io.targets import SpaceTargets
 from ..measure.blurred import BlurredOptions, BlurredResult, measure_blurred
 from ..measure.ordinary import ordinary_coordinates
@@ -27,7 +28,13 @@ from ..optics.lenses import LensCamera, PlaneTarget, behind_windows, image_scale
 from ..optics.refraction import RefractedRays, Refraction
 from .blurred import SPACING_PX
 
-__all__ = ["BlurredNetwork", "BlurredRound", "NetworkOptions", "measure_blurred_network"]
+__all__ = [
+    "BlurredNetwork",
+    "BlurredRound",
+    "NetworkOptions",
+    "final_document",
+    "measure_blurred_network",
+]
 
 _NODES = 150
 """Largest number of nodes along the size of a target."""
@@ -243,6 +250,39 @@ def measure_blurred_network(
     sigma0 = [entry.result.sigma0 for entry in rounds[1:]]
     best = 1 + int(np.argmin(sigma0))
     return BlurredNetwork(tuple(rounds), best, run.notes(rounds, best))
+
+
+def final_document(document: Network1, found: BlurredNetwork) -> Network1:
+    """The document of a network with the final image coordinates.
+
+    Parameters
+    ----------
+    document : Network1
+        The network that was measured.
+    found : BlurredNetwork
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> from reseau.bundle.network import network_document
+    >>> network, none = example_network(), np.zeros(160, dtype=bool)
+    >>> found = BlurredNetwork((BlurredRound(adjust_network(network), {}, none, ~none, none, 0.0),), 0)
+    >>> bool(final_document(network_document(network), found).observations.x[0] == network.xy[0, 0])
+    True
+    """
+    network = found.network
+    sigma = np.sqrt(np.diagonal(network.cov, axis1=1, axis2=2))
+    rho = network.cov[:, 0, 1] / sigma.prod(axis=1)
+    columns = ObservationColumns(
+        image=tuple(network.images[i] for i in network.image_of),
+        point=tuple(network.points[j] for j in network.point_of),
+        x=tuple(network.xy[:, 0].tolist()),
+        y=tuple(network.xy[:, 1].tolist()),
+        sx=tuple(sigma[:, 0].tolist()),
+        sy=tuple(sigma[:, 1].tolist()),
+        rho=tuple(rho.tolist()),
+    )
+    return document.model_copy(update={"observations": columns})
 
 
 def _ordinary(

@@ -24,6 +24,7 @@ from .conducting import (
 )
 from .kinds import KINDS, Reported, SessionKind, kind_of, own_plan
 from .parameters import (
+    BlurredParameters,
     FramesParameters,
     OscilloscopeParameters,
     OwnParameters,
@@ -35,6 +36,7 @@ from .parameters import (
 
 __all__ = [
     "KINDS",
+    "BlurredParameters",
     "FramesParameters",
     "OscilloscopeParameters",
     "OwnParameters",

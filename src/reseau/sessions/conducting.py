@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 from ..archive import Archive, Session
@@ -11,7 +10,6 @@ from ..calibration.document import Calibration
 from ..capture import Acquisition, Bench, BenchLock, Decision, Procedure, Rerun, Watch, carry_out
 from ..capture import rerun as rerun_with
 from ..core.errors import UsageError
-from ..io import parse_design
 from .kinds import GENERATOR, Reported, kind_of, own_plan
 from .parameters import OwnParameters, SessionParameters
 
@@ -74,8 +72,7 @@ def check(
     for each in kind.inputs:
         if each not in given:
             raise UsageError("missing input", where=f"{name}: {each}", do="pass its content in `inputs`")
-        if Path(each).suffix == ".json":
-            parse_design(given[each], each)
+        kind.read(given[each], each)
     if isinstance(found, OwnParameters):
         own_plan(given[GENERATOR], GENERATOR, found.set)
     if bench is not None:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from ..archive import Session, Verdict
 from ..capture import Acquisition, BenchFile, Limits, Plan, Procedure, Step, plans, spread
 from ..core.data import Frame
 from ..core.errors import FormatError, UsageError
+from ..core.failure import Failure
 from ..io import ReseauDesign, parse_design
 from .parameters import (
+    BlurredParameters,
     FramesParameters,
     OscilloscopeParameters,
     OwnParameters,
@@ -24,6 +26,7 @@ from .parameters import (
 
 if TYPE_CHECKING:
     from ..io.refraction import RefractionEntry
+    from ..procedures.blurred_session import BlurredProcedure
     from ..procedures.oscilloscope_acquisition import OscilloscopeProcedure
     from ..procedures.sensor import SensorProcedure
     from ..procedures.testfield import TestfieldProcedure
@@ -45,7 +48,9 @@ class SessionKind:
     acquire : callable
         Makes the plan of messages, of an acquisition and the parameters.
     inputs : tuple of str
-        Names of the files that a session must be given; ``.json`` files are designs.
+        Names of the files that a session must be given.
+    read : callable
+        Reads the text of an input with a name, to check it; by default ``.json`` files are designs.
     procedure : callable, optional
         Makes the procedure, of a session and its parameters. Without one, frames are only stored.
     results : callable, optional
@@ -63,9 +68,14 @@ class SessionKind:
     parameters: type[SessionParameters]
     acquire: Callable[[Acquisition, Any], Plan]
     inputs: tuple[str, ...] = ()
+    read: Callable[[str, str], object] = lambda text, name: _read_design(text, name)
     procedure: Callable[[Session, Any], Procedure] | None = None
     results: Callable[[Any, Session], dict[str, str]] | None = None
     limits: Limits | None = None
+
+
+def _read_design(text: str, name: str) -> object:
+    return parse_design(text, name) if name.endswith(".json") else text
 
 
 class Reported:
@@ -247,6 +257,53 @@ def _testfield_results(procedure: TestfieldProcedure, session: Session) -> dict[
     return results | {"report.html": report}
 
 
+def _blurred(run: Acquisition, given: BlurredParameters) -> Plan:
+    plan = plans.poses(run, given.poses(), given.average, given.checks)
+    return plans.homed(run, plan) if given.home else plan
+
+
+def _read_blurred(text: str, name: str) -> object:
+    """An input of a session of blurred targets."""
+    from ..io import LensDocument
+    from ..io.network import Network1
+    from ..io.targets import SpaceTargets
+
+    reader: Any = {"network.json": Network1, "targets.json": SpaceTargets, "lens.toml": LensDocument}[name]
+    return reader.parse(text, where=name)
+
+
+def _blurred_procedure(session: Session, given: BlurredParameters) -> BlurredProcedure:
+    from ..bundle import Network
+    from ..exchange import Lens
+    from ..measure.blurred import BlurredOptions
+    from ..procedures.blurred_network import NetworkOptions
+    from ..procedures.blurred_session import BlurredProcedure
+
+    document, targets, lens = (_read_blurred(session.input(name), name) for name in _OF_BLURRED)
+    sensor = lens.sensor  # type: ignore[attr-defined]
+    matching = BlurredOptions(
+        psf_px=given.psf, search_px=given.search, fill=1.0 if sensor is None else sensor.fill
+    )
+    options = {key: value for key, value in session.parameters.items() if key != "steps"}
+    return BlurredProcedure(
+        cast(Any, document), Network.from_document(cast(Any, document)), cast(Any, targets),
+        Lens(lens.prescription(), sensor),  # type: ignore[attr-defined]
+        NetworkOptions(matching, given.rounds, initial=given.initial),
+        name=session.name, parameters=options, inputs=_hashes(session),
+    )  # fmt: skip
+
+
+def _blurred_results(procedure: BlurredProcedure, session: Session) -> dict[str, str]:
+    from ..report.blurred_network import blurred_network_report
+
+    results = procedure.finish()
+    found = procedure.measured()
+    assert not isinstance(found, Failure)
+    title = f"Blurred targets, session {session.name}"
+    report = blurred_network_report(found, title=title, provenance=procedure.provenance)
+    return results | {"report.html": report}
+
+
 def _sensor(run: Acquisition, given: SensorParameters) -> Plan:
     return plans.sensor(run, given.series)
 
@@ -266,15 +323,32 @@ def _sensor_results(procedure: SensorProcedure, session: Session) -> dict[str, s
     return procedure.calibrated(camera) | {"report.html": report}
 
 
+_OF_BLURRED = ("network.json", "targets.json", "lens.toml")
+
 KINDS: Mapping[str, SessionKind] = {
     "testfield": SessionKind(
-        TestfieldParameters, _testfield, ("design.json",), _testfield_procedure, _testfield_results
+        TestfieldParameters,
+        _testfield,
+        ("design.json",),
+        procedure=_testfield_procedure,
+        results=_testfield_results,
     ),
     "oscilloscope": SessionKind(
-        OscilloscopeParameters, _oscilloscope, ("reseau.json", "object.json"), _oscilloscope_procedure
+        OscilloscopeParameters,
+        _oscilloscope,
+        ("reseau.json", "object.json"),
+        procedure=_oscilloscope_procedure,
     ),
     "sensor": SessionKind(
-        SensorParameters, _sensor, (), _sensor_procedure, _sensor_results, plans.NO_EXPOSURE_LIMITS
+        SensorParameters,
+        _sensor,
+        (),
+        procedure=_sensor_procedure,
+        results=_sensor_results,
+        limits=plans.NO_EXPOSURE_LIMITS,
+    ),
+    "blurred": SessionKind(
+        BlurredParameters, _blurred, _OF_BLURRED, _read_blurred, _blurred_procedure, _blurred_results
     ),
     "frames": SessionKind(FramesParameters, _frames),
     "scan": SessionKind(ScanParameters, _scan),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from pydantic import Field, NonNegativeInt, PositiveInt
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ..procedures.calibration import CameraOptions
 
 __all__ = [
+    "BlurredParameters",
     "FramesParameters",
     "OscilloscopeParameters",
     "OwnParameters",
@@ -227,6 +228,84 @@ class OscilloscopeParameters(SessionParameters):
     check: tuple[str, ...] = ()
 
 
+class BlurredParameters(SessionParameters):
+    """Parameters of the plan `blurred`: targets on a frame, measured by rays through lens and windows.
+
+    Parameters
+    ----------
+    steps : tuple of (str, dict of str to float)
+        Names and positions of the poses; the names are those of images of the network.
+    psf : float
+        Blur of sensor and diffraction beside that of the rays (px, one sigma).
+    search : float
+        Largest distance from the predicted position (px).
+    rounds : int
+        Largest number of rounds.
+    initial : {"given", "centroid", "edge"}
+        Ordinary coordinates; see :class:`reseau.procedures.blurred_network.NetworkOptions`.
+    average, checks : int
+        As for :class:`FramesParameters`.
+    home : bool
+        Whether axes without a reference are homed first.
+
+    Examples
+    --------
+    >>> BlurredParameters(steps=(("frontal", {"tilt": 0.0}),)).expected
+    1
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-blurred-parameters/1"
+    NEEDS: ClassVar[tuple[str, ...]] = ("camera", "table")
+
+    steps: tuple[tuple[str, dict[str, float]], ...]
+    psf: float = Field(default=0.5, ge=0.1)
+    search: float = Field(default=6.0, ge=1.0)
+    rounds: PositiveInt = 6
+    initial: Literal["given", "centroid", "edge"] = "centroid"
+    average: PositiveInt = 1
+    checks: NonNegativeInt = 0
+    home: bool = False
+
+    @property
+    def expected(self) -> int:
+        """Number of poses."""
+        return len(self.steps)
+
+    def poses(self) -> tuple[Step, ...]:
+        """Return the poses as steps."""
+        return tuple(Step(name, position) for name, position in self.steps)
+
+    def check_bench(self, bench: Bench) -> None:
+        """Check instruments, and the range of all poses."""
+        super().check_bench(bench)
+        check_poses(
+            bench.one(Turntable, self.table),
+            (*self.poses(), Step("park", self.park), Step("retreat", self.retreat or {})),
+        )
+
+
+def check_poses(table: Turntable, steps: Sequence[Step]) -> None:
+    """Check that a table has the axes of poses, and reaches them.
+
+    Raises
+    ------
+    UsageError
+        If it does not.
+    """
+    axes = table.axes
+    for step in steps:
+        for axis, value in step.position.items():
+            if axis not in axes:
+                raise UsageError(
+                    f"the table has no axis {axis}", where=step.name, do=f"use {', '.join(axes)}"
+                )
+            low, high = axes[axis].limits
+            if not low <= value <= high:
+                unit = axes[axis].unit
+                what = f"{axis} = {value:g} {unit} is out of range"
+                raise UsageError(what, where=step.name, do=f"use {low:g} to {high:g} {unit}")
+
+
 class TestfieldParameters(SessionParameters):
     """Parameters of the plan `testfield`: a camera calibrated by images of a target from many poses.
 
@@ -315,18 +394,10 @@ class TestfieldParameters(SessionParameters):
     def check_bench(self, bench: Bench) -> None:
         """Check instruments, the range of all poses, and that the goal is about an estimated parameter."""
         super().check_bench(bench)
-        axes = bench.one(Turntable, self.table).axes
-        for step in (*self.poses(), Step("park", self.park), Step("retreat", self.retreat or {})):
-            for axis, value in step.position.items():
-                if axis not in axes:
-                    raise UsageError(
-                        f"the table has no axis {axis}", where=step.name, do=f"use {', '.join(axes)}"
-                    )
-                low, high = axes[axis].limits
-                if not low <= value <= high:
-                    unit = axes[axis].unit
-                    what = f"{axis} = {value:g} {unit} is out of range"
-                    raise UsageError(what, where=step.name, do=f"use {low:g} to {high:g} {unit}")
+        check_poses(
+            bench.one(Turntable, self.table),
+            (*self.poses(), Step("park", self.park), Step("retreat", self.retreat or {})),
+        )
         self._check_goal()
 
     def _check_goal(self) -> None:
