@@ -151,6 +151,9 @@ class CameraMapping(CalibratedMapping):
             )
         except (UsageError, KeyError, IndexError) as error:
             raise FormatError(f"has a damaged or unknown model: {error}", where=where) from None
+        unknown = [name for name in values if name not in mapping.names]
+        if unknown:
+            raise FormatError(f"the model {model['model']!r} has no parameter {unknown[0]!r}", where=where)
         names, n = calibration.covariance.names, len(calibration.covariance.names)
         matrix = np.array(calibration.covariance.matrix).reshape(n, n)
         size, extent = (model["width"], model["height"]), extent_of(calibration.validity)

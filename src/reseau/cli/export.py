@@ -1,4 +1,4 @@
-"""`reseau export`: marks of scanned film for MicMac and Metashape."""
+"""`reseau export`: calibrations of cameras, and marks of scanned film, for other programs."""
 
 from __future__ import annotations
 
@@ -8,19 +8,27 @@ from typing import Annotated
 import typer
 
 from ..core.errors import UsageError
-from .common import say, suffix_of, writable
+from .common import Out, say, suffix_of, writable
 
 __all__ = ["export"]
 
 
 def export(
-    scans: Annotated[
+    files: Annotated[
         list[Path],
         typer.Argument(
-            help="Oriented scans of one camera: results of `reseau measure fiducials`, `reseau orient` or "
-            "`reseau measure reseau` (JSON)."
+            help="A calibration of a camera, ours or of another program, for --to; or oriented scans of "
+            "one camera: results of `reseau measure fiducials`, `reseau orient` or `reseau measure reseau`."
         ),
     ],
+    to: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FORMAT",
+            help="Format of the calibration: opencv, ros, kalibr, colmap, mrcal, metashape, matlab, reseau.",
+        ),
+    ] = None,
+    out: Out = None,
     micmac: Annotated[
         Path | None,
         typer.Option(help="Folder of the images for MicMac: writes Ori-InterneScan and id_fiducial.txt."),
@@ -32,12 +40,17 @@ def export(
         Path | None, typer.Option("--design", "-d", help="Design of the reseau, for its measurements.")
     ] = None,
 ) -> None:
-    """Export marks of scanned film with their coordinates in the camera."""
+    """Write a calibration for another program, or marks of scanned film with their coordinates."""
+    if to is not None or out is not None:
+        _calibration(files, to, out)
+        if micmac is None and metashape is None:
+            return
+    scans = files
     from ..exchange import metashape_script, read_film_marks, write_micmac
     from ..io import ReseauDesign, write_whole
 
     if micmac is None and metashape is None:
-        raise UsageError("nothing to write", where="reseau export", do="give --micmac or --metashape")
+        raise UsageError("nothing to write", where="reseau export", do="give --to, --micmac or --metashape")
     if metashape is not None:
         suffix_of(writable(metashape), (".py",))
     grid = None if design is None else ReseauDesign.read(design)
@@ -50,3 +63,27 @@ def export(
     if metashape is not None:
         write_whole(metashape, metashape_script(marks))
         say(f"{metashape}: {len(marks)} scans\n")
+
+
+def _calibration(files: list[Path], to: str | None, out: Path | None) -> None:
+    """Write one calibration in a format."""
+    from ..calibration import Calibration
+    from ..exchange import export_calibration, import_calibration
+    from ..io import read_text
+
+    if len(files) != 1 or to is None or out is None:
+        raise UsageError("writes one calibration", where="--to", do="give a file, --to FORMAT and --out FILE")
+    source = files[0]
+    ours = source.suffix.lower() == ".json" and '"reseau-calibration/' in read_text(source)[:4096]
+    calibration = Calibration.read(source) if ours else import_calibration(source)
+    writable(out)
+    if to == "reseau":
+        calibration.write(out)
+        say(f"{out}: {calibration.model.get('model', calibration.kind)}\n")
+        return
+    done = export_calibration(calibration, to, out)
+    say(f"{out}: {done.camera.model}\n")
+    if done.greatest_px > 0:
+        say(f"  differs from the calibration by {done.rms_px:.2g} px rms, {done.greatest_px:.2g} px at most")
+        rest = "" if done.share == 1 else f"; not compared in {100 * (1 - done.share):.2g} % of the image"
+        say(f"{rest}\n")

@@ -1,10 +1,11 @@
-"""Networks, control points, marks of film, lenses: files of this project and of other programs."""
+"""Networks, calibrations, control points, marks of film, lenses: our files and those of other programs."""
 
 from __future__ import annotations
 
 from .bal import read_bal
 from .boards import read_board
 from .bundler import read_bundler
+from .calibrations import export_calibration, import_calibration
 from .codev import read_codev
 from .colmap import read_colmap
 from .control import read_control
@@ -18,6 +19,8 @@ __all__ = [
     "FilmMarks",
     "Lens",
     "calibration_files",
+    "export_calibration",
+    "import_calibration",
     "metashape_script",
     "read_bal",
     "read_board",

@@ -1,0 +1,17 @@
+"""Calibrations of cameras in the files of other programs, written and read.
+
+A format is one module: which registered camera models it holds, how it is written, recognised and read. A
+camera whose model a format lacks is converted, with the differences over the image stated.
+"""
+
+from .formats import CalibrationFormat, Exported, calibration_formats, export_calibration, import_calibration
+from .plain import PlainCamera
+
+__all__ = [
+    "CalibrationFormat",
+    "Exported",
+    "PlainCamera",
+    "calibration_formats",
+    "export_calibration",
+    "import_calibration",
+]

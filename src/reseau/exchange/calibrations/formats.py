@@ -1,0 +1,256 @@
+"""The formats, by name; writing a calibration to one, and reading a file of any."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ...calibration import Calibration, CameraMapping
+from ...calibration.document import Covariance, Quantity
+from ...core.errors import FormatError, UsageError
+from ...core.provenance import Provenance, sha256_of
+from ...io import read_text, write_whole
+from ...optics import PixelGrid
+from ...optics.cameras import camera_model, convert, unit_of
+from . import colmap, matlab, metashape, mrcal, opencv, yamls
+from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, PlainCamera
+
+__all__ = [
+    "CalibrationFormat",
+    "Exported",
+    "calibration_formats",
+    "export_calibration",
+    "import_calibration",
+]
+
+_CENTRE = ("fx", "fy", "cx", "cy")
+_RADTAN, _FIVE = (*_CENTRE, *RADIAL_TANGENTIAL), (*_CENTRE, *RADIAL_TANGENTIAL, "k3")
+_EIGHT, _TWELVE = (*_CENTRE, *RATIONAL), (*_CENTRE, *THIN_PRISM)
+_FISHEYE = (*_CENTRE, "k1", "k2", "k3", "k4")
+# Differences (px) below which a simpler model of a format is not replaced by a more general one.
+_SAME = 1e-3
+
+
+@dataclass(frozen=True)
+class CalibrationFormat:
+    """A format of calibrations.
+
+    Parameters
+    ----------
+    name : str
+        Its name, as in ``reseau export --to``.
+    suffixes : tuple of str
+        Usual suffixes of its files.
+    models : tuple of (str, tuple of str)
+        Registered models that it holds, the simplest first, with the parameters it has of each.
+    write : callable
+        Text of the file of a camera.
+    recognises : callable
+        Whether a text is of this format.
+    read : callable
+        Camera of a text.
+
+    Examples
+    --------
+    >>> calibration_formats()["colmap"].suffixes
+    ('.txt',)
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    models: tuple[tuple[str, tuple[str, ...]], ...]
+    write: Callable[[PlainCamera], str]
+    recognises: Callable[[str], bool]
+    read: Callable[[str, Path], PlainCamera]
+
+
+def calibration_formats() -> dict[str, CalibrationFormat]:
+    """Return the formats by name.
+
+    Examples
+    --------
+    >>> list(calibration_formats())
+    ['opencv', 'ros', 'kalibr', 'colmap', 'mrcal', 'metashape', 'matlab']
+    """
+    wide, fisheye = (("opencv", _FIVE), ("opencv", _EIGHT)), ("fisheye", _FISHEYE)
+    formats = (
+        CalibrationFormat(
+            "opencv", (".yml", ".yaml", ".xml", ".json"),
+            (*wide, ("opencv_full", _TWELVE), ("opencv_full", (*_CENTRE, *TILTED)), fisheye),
+            opencv.write, opencv.recognises, opencv.read,
+        ),
+        CalibrationFormat(
+            "ros", (".yaml",), (*wide, fisheye), yamls.write_ros, yamls.is_ros, yamls.read_ros
+        ),
+        CalibrationFormat(
+            "kalibr", (".yaml",),
+            (("opencv", _RADTAN), fisheye, ("omni", (*_RADTAN, "xi")),
+             ("double_sphere", (*_CENTRE, "xi", "alpha"))),
+            yamls.write_kalibr, yamls.is_kalibr, yamls.read_kalibr,
+        ),
+        CalibrationFormat(
+            "colmap", (".txt",), (("opencv", _RADTAN), ("opencv", _EIGHT), fisheye),
+            colmap.write, colmap.recognises, colmap.read,
+        ),
+        CalibrationFormat(
+            "mrcal", (".cameramodel",),
+            (("opencv", _RADTAN), *wide, ("opencv_full", _TWELVE)), mrcal.write, mrcal.recognises, mrcal.read,
+        ),
+        CalibrationFormat(
+            "metashape", (".xml",), (("opencv", _FIVE),),
+            metashape.write, metashape.recognises, metashape.read,
+        ),
+        CalibrationFormat(
+            "matlab", (".m",), (("opencv", _FIVE),), matlab.write, matlab.recognises, matlab.read
+        ),
+    )  # fmt: skip
+    return {entry.name: entry for entry in formats}
+
+
+class Exported(NamedTuple):
+    """A camera as it was written.
+
+    Parameters
+    ----------
+    camera : PlainCamera
+        In the model that the format holds.
+    rms_px, greatest_px : float
+        Differences from the calibration over the image: root mean square, and largest; 0 where the model is
+        the same.
+    share : float
+        Share of the image where the calibration has directions; the rest was not compared.
+
+    Examples
+    --------
+    >>> Exported(PlainCamera("front", 640, 480, "opencv", {"fx": 800.0, "fy": 800.0}), 0.0, 0.0, 1.0).rms_px
+    0.0
+    """
+
+    camera: PlainCamera
+    rms_px: float
+    greatest_px: float
+    share: float
+
+
+def export_calibration(calibration: Calibration, to: str, path: Path | str) -> Exported:
+    """Write the calibration of a camera in the format of another program.
+
+    A model that the format lacks is converted: of the models that it has, the simplest that differs by less
+    than 0.001 px is written, otherwise that with the smallest largest difference.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Calibration of a camera.
+    to : str
+        Name of the format; see :func:`calibration_formats`.
+    path : path
+        File to write.
+
+    Raises
+    ------
+    UsageError
+        When the format is unknown, the calibration is not that of a camera, or no model describes it.
+    InputError
+        When the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> values = {"fx": 800.0, "fy": 800.0, "cx": 319.5, "cy": 239.5}
+    >>> camera = PlainCamera("front", 640, 480, "opencv", values)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "front.m"
+    ...     done = export_calibration(_calibration(camera, {}), "matlab", file)
+    ...     import_calibration(file).values()["cx"]
+    319.5
+    """
+    formats = calibration_formats()
+    if to not in formats:
+        raise UsageError(f"is not one of {', '.join(formats)}", where=to)
+    lens = calibration.mapping()
+    if not isinstance(lens, CameraMapping):
+        raise UsageError(calibration.not_of("camera"), where=calibration.name)
+    found = _in_a_model_of(formats[to], calibration, lens)
+    write_whole(Path(path), formats[to].write(found.camera))
+    return found
+
+
+def _in_a_model_of(form: CalibrationFormat, calibration: Calibration, lens: CameraMapping) -> Exported:
+    """The camera in one of the models of a format."""
+    name, (width, height) = calibration.name, lens.size
+    model, grid = str(calibration.model.get("model")), PixelGrid(width, height, (1.0, 1.0))
+    own = {key: value for key, value in calibration.values().items() if value or key in _CENTRE}
+    plain = not calibration.model.get("additional")
+    for wanted, names in form.models:
+        if plain and wanted.partition("_full")[0] == model.partition("_full")[0] and set(own) <= set(names):
+            return Exported(PlainCamera(name, width, height, wanted, own), 0.0, 0.0, 1.0)
+    best: Exported | None = None
+    why = "no model of the format describes it"
+    for wanted, names in form.models:
+        try:
+            done = convert(lens.mapping, grid, wanted, free=names)
+        except UsageError as error:
+            why = str(error)
+            continue
+        values = dict(zip(camera_model(wanted).names, done.mapping.values.tolist(), strict=False))
+        camera = PlainCamera(
+            name, width, height, wanted, {key: values[key] for key in names if key in values}
+        )
+        trial = Exported(camera, done.rms_px, done.greatest_px, done.share)
+        if best is None or trial.greatest_px < best.greatest_px:
+            best = trial
+        if best.greatest_px < _SAME:
+            break
+    if best is None:
+        raise UsageError(f"cannot be written as {form.name}: {why}", where=f"calibration {name}")
+    return best
+
+
+def import_calibration(path: Path | str) -> Calibration:
+    """Read the calibration of a camera from a file of another program, recognised by its content.
+
+    Its parameters have no uncertainty: they are held fixed.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is of no known format, or incomplete.
+
+    Examples
+    --------
+    >>> import_calibration("missing.yaml")
+    Traceback (most recent call last):
+    reseau.core.errors.InputError: missing.yaml: cannot be read (No such file or directory)
+    """
+    path = Path(path)
+    text = read_text(path)
+    for form in (calibration_formats()[name] for name in ("ros", "kalibr", "mrcal", "metashape", "opencv",
+                                                          "matlab", "colmap")):  # fmt: skip
+        if form.recognises(text):
+            source = Provenance({path.name: sha256_of(path)}, {"format": form.name})
+            return _calibration(form.read(text, path), source.to_dict())
+    known = ", ".join(calibration_formats())
+    raise FormatError(f"is not a calibration of one of the formats {known}", where=path)
+
+
+def _calibration(camera: PlainCamera, provenance: dict[str, Any]) -> Calibration:
+    model = camera_model(camera.model)
+    names = [name for name in model.names if name in _CENTRE or camera.values.get(name, 0.0)]
+    return Calibration(
+        kind="camera",
+        name=camera.name,
+        model={"model": camera.model, "width": camera.width, "height": camera.height, "pitch_mm": [1.0, 1.0]},
+        parameters={
+            name: Quantity(value=camera.values.get(name, 0.0), sigma=0.0, unit=unit_of(name, camera.model))
+            for name in names
+        },
+        covariance=Covariance(names=(), matrix=()),
+        sigma0=None,
+        redundancy=0,
+        provenance=provenance,
+    )

@@ -1,0 +1,68 @@
+"""mrcal's ``.cameramodel``: a Python dictionary with lens model, intrinsics, extrinsics and image size.
+
+Lens models: ``LENSMODEL_PINHOLE`` and ``LENSMODEL_OPENCV4``, ``5``, ``8``, ``12``. Pixels are counted from
+the centre of the first one.
+"""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+from ...core.errors import FormatError
+from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, PlainCamera, opencv_camera
+
+__all__ = ["read", "recognises", "write"]
+
+_MODELS: dict[str, tuple[str, ...]] = {
+    "LENSMODEL_PINHOLE": (),
+    "LENSMODEL_OPENCV4": RADIAL_TANGENTIAL,
+    "LENSMODEL_OPENCV5": (*RADIAL_TANGENTIAL, "k3"),
+    "LENSMODEL_OPENCV8": RATIONAL,
+    "LENSMODEL_OPENCV12": THIN_PRISM,
+}
+
+
+def write(camera: PlainCamera) -> str:
+    """Return the text of a camera model, with the camera at the origin."""
+    used = {name for name, value in camera.values.items() if value and name not in ("fx", "fy", "cx", "cy")}
+    model = next(name for name, own in _MODELS.items() if own and used <= set(own))
+    values = camera.of("fx", "fy", "cx", "cy", *_MODELS[model])
+    return (
+        "{\n"
+        f"    'lensmodel':  '{model}',\n\n"
+        "    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....\n"
+        f"    'intrinsics': [ {', '.join(map(repr, values))},],\n\n"
+        "    # extrinsics are rt_fromref\n"
+        "    'extrinsics': [ 0,0,0,0,0,0 ],\n\n"
+        f"    'imagersize': [ {camera.width}, {camera.height},]\n"
+        "}\n"
+    )
+
+
+def recognises(text: str) -> bool:
+    """Whether this is such a file."""
+    return "LENSMODEL_" in text
+
+
+def read(text: str, path: Path) -> PlainCamera:
+    """Read a camera.
+
+    Raises
+    ------
+    FormatError
+        When the lens model is unknown, or the file is incomplete.
+    """
+    try:
+        content = ast.literal_eval(text.strip())
+        model, numbers = str(content["lensmodel"]), [float(v) for v in content["intrinsics"]]
+        width, height = (int(v) for v in content["imagersize"])
+    except (SyntaxError, ValueError, KeyError, TypeError):
+        raise FormatError("has no complete lensmodel, intrinsics and imagersize", where=path) from None
+    names = _MODELS.get(model)
+    if names is None:
+        raise FormatError(f"has the lens model {model}; known are {', '.join(_MODELS)}", where=path)
+    if len(numbers) != 4 + len(names):
+        raise FormatError(f"has {len(numbers)} intrinsics, not the {4 + len(names)} of {model}", where=path)
+    (fx, fy, cx, cy), found = numbers[:4], numbers[4:]
+    return opencv_camera(path.stem, (width, height), (fx, fy), (cx, cy), found, path)

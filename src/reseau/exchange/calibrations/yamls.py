@@ -1,0 +1,162 @@
+"""YAML files: ``camera_info`` of ROS, and the ``camchain`` of Kalibr.
+
+ROS: sensor_msgs/CameraInfo as ``camera_calibration`` writes it, with the models ``plumb_bob``,
+``rational_polynomial`` and ``equidistant``. Kalibr: pinhole cameras with ``radtan`` or ``equidistant``
+distortion, ``omni`` with ``radtan``, ``ds`` without. Pixels are counted from the centre of the first one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ...core.errors import FormatError
+from .opencv import coefficients
+from .plain import RADIAL_TANGENTIAL, PlainCamera, opencv_camera
+
+__all__ = ["is_kalibr", "is_ros", "read_kalibr", "read_ros", "write_kalibr", "write_ros"]
+
+_ROS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,), "fisheye": (4,)}
+
+
+def write_ros(camera: PlainCamera) -> str:
+    """Return the text of a ``camera_info`` file."""
+    fx, fy, cx, cy = camera.of("fx", "fy", "cx", "cy")
+    found = coefficients(camera)
+    model = (
+        "equidistant"
+        if camera.model == "fisheye"
+        else {5: "plumb_bob"}.get(len(found), "rational_polynomial")
+    )
+    text: str = yaml.safe_dump(
+        {
+            "image_width": camera.width,
+            "image_height": camera.height,
+            "camera_name": camera.name,
+            "camera_matrix": _matrix(3, 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+            "distortion_model": "equidistant" if camera.model == "fisheye" else model,
+            "distortion_coefficients": _matrix(1, len(found), found),
+            "rectification_matrix": _matrix(3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
+            "projection_matrix": _matrix(3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
+        },
+        sort_keys=False,
+    )
+    return text
+
+
+def _matrix(rows: int, cols: int, data: list[float]) -> dict[str, Any]:
+    return {"rows": rows, "cols": cols, "data": data}
+
+
+def is_ros(text: str) -> bool:
+    """Whether this is a ``camera_info`` file."""
+    return "distortion_model:" in text and "projection_matrix:" in text
+
+
+def read_ros(text: str, path: Path) -> PlainCamera:
+    """Read a camera of ROS.
+
+    Raises
+    ------
+    FormatError
+        When the camera is incomplete, or of an unknown model.
+    """
+    content = _mapping(text, path)
+    model = content.get("distortion_model", "")
+    try:
+        matrix = [float(v) for v in content["camera_matrix"]["data"]]
+        found = [float(v) for v in content["distortion_coefficients"]["data"]]
+        size = int(content["image_width"]), int(content["image_height"])
+        (fx, _, cx, _, fy, cy, *_) = matrix
+    except (KeyError, TypeError, ValueError):
+        raise FormatError(
+            "has no complete camera_matrix, distortion_coefficients and size", where=path
+        ) from None
+    if model not in _ROS or len(found) not in _ROS[model]:
+        raise FormatError(
+            f"has the distortion model {model!r} with {len(found)} coefficients; known are {', '.join(_ROS)}",
+            where=path,
+        )
+    name = str(content.get("camera_name") or path.stem)
+    fisheye = model in ("equidistant", "fisheye")
+    return opencv_camera(name, size, (fx, fy), (cx, cy), found, path, fisheye=fisheye)
+
+
+def write_kalibr(camera: PlainCamera) -> str:
+    """Return the text of a ``camchain`` file with one camera."""
+    centre = camera.of("fx", "fy", "cx", "cy")
+    kind, own = {"omni": ("omni", ["xi"]), "double_sphere": ("ds", ["xi", "alpha"])}.get(
+        camera.model, ("pinhole", [])
+    )
+    distortion = {"opencv": "radtan", "fisheye": "equidistant", "omni": "radtan", "double_sphere": "none"}
+    names = {"radtan": RADIAL_TANGENTIAL, "equidistant": ("k1", "k2", "k3", "k4"), "none": ()}
+    model = distortion[camera.model]
+    entry = {
+        "camera_model": kind,
+        "intrinsics": [*camera.of(*own), *centre],
+        "distortion_model": model,
+        "distortion_coeffs": camera.of(*names[model]),
+        "resolution": [camera.width, camera.height],
+        "rostopic": f"/{camera.name}/image_raw",
+    }
+    text: str = yaml.safe_dump({"cam0": entry}, sort_keys=False, default_flow_style=None)
+    return text
+
+
+def is_kalibr(text: str) -> bool:
+    """Whether this is a ``camchain`` file."""
+    return "cam0:" in text and "intrinsics:" in text
+
+
+def read_kalibr(text: str, path: Path) -> PlainCamera:
+    """Read the first camera of a chain.
+
+    Raises
+    ------
+    FormatError
+        When the camera is incomplete, or of an unknown model.
+    """
+    entry: Any = _mapping(text, path).get("cam0")
+    try:
+        kind, model = str(entry["camera_model"]), str(entry.get("distortion_model", "none"))
+        values = [float(v) for v in entry["intrinsics"]]
+        found = [float(v) for v in entry.get("distortion_coeffs", ())]
+        width, height = (int(v) for v in entry["resolution"])
+        own = {"pinhole": (), "omni": ("xi",), "ds": ("xi", "alpha")}[kind]
+        *shape, fx, fy, cx, cy = values
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise FormatError(
+            "has no complete camera cam0 of the model pinhole, omni or ds", where=path
+        ) from None
+    names = {"radtan": RADIAL_TANGENTIAL, "equidistant": ("k1", "k2", "k3", "k4"), "none": ()}.get(model)
+    if (
+        names is None
+        or len(found) not in (len(names), 0)
+        or len(shape) != len(own)
+        or (model == "equidistant" and kind != "pinhole")
+    ):
+        raise FormatError(f"has the model {kind} with the distortion {model!r}, which is unknown", where=path)
+    name = path.stem
+    if model == "equidistant":
+        return opencv_camera(
+            name, (width, height), (fx, fy), (cx, cy), found or [0.0] * 4, path, fisheye=True
+        )
+    plain = opencv_camera(name, (width, height), (fx, fy), (cx, cy), found, path)
+    if kind == "pinhole":
+        return plain
+    registered = {"omni": "omni", "ds": "double_sphere"}[kind]
+    return PlainCamera(
+        name, width, height, registered, {**plain.values, **dict(zip(own, shape, strict=True))}
+    )
+
+
+def _mapping(text: str, path: Path) -> dict[str, Any]:
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise FormatError("is not YAML", where=path) from None
+    if not isinstance(content, dict):
+        raise FormatError("has no camera", where=path)
+    return content

@@ -1,0 +1,224 @@
+"""Calibrations of cameras in the files of other programs: written, read, and read by these programs."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from reseau.calibration import Calibration
+from reseau.calibration.document import Covariance, Quantity
+from reseau.core.data import Array
+from reseau.core.errors import FormatError, UsageError
+from reseau.exchange import export_calibration, import_calibration
+from reseau.exchange.calibrations import calibration_formats
+from reseau.optics.cameras import unit_of
+
+SIZE = (1280, 960)
+CENTRE = {"fx": 1010.0, "fy": 1008.0, "cx": 652.3, "cy": 470.8}
+PLAIN = CENTRE | {"k1": -0.21, "k2": 0.07, "p1": 8e-4, "p2": -6e-4}
+CAMERAS = {
+    "radial": ("opencv", PLAIN),
+    "five": ("opencv", PLAIN | {"k3": -0.01}),
+    "rational": ("opencv", PLAIN | {"k3": 0.02, "k4": 0.05, "k5": 0.01, "k6": 0.004}),
+    "prism": (
+        "opencv_full",
+        PLAIN | {"k3": 0.02, "k4": 0.05, "s1": 1e-3, "s2": 2e-4, "s3": -7e-4, "s4": 1e-4},
+    ),
+    "tilted": ("opencv_full", PLAIN | {"tau_x": 0.02, "tau_y": -0.01}),
+    "fisheye": ("fisheye", CENTRE | {"k1": 0.03, "k2": -0.004, "k3": 1e-3, "k4": -2e-4}),
+    "omni": ("omni", CENTRE | {"fx": 1700.0, "fy": 1698.0, "xi": 0.7, "k1": -0.08, "k2": 0.03}),
+    "spheres": ("double_sphere", CENTRE | {"xi": -0.2, "alpha": 0.56}),
+}
+# Which cameras each format holds without conversion.
+HELD = {
+    "opencv": ("radial", "five", "rational", "prism", "tilted", "fisheye"),
+    "ros": ("radial", "five", "rational", "fisheye"),
+    "kalibr": ("radial", "fisheye", "omni", "spheres"),
+    "colmap": ("radial", "rational", "fisheye"),
+    "mrcal": ("radial", "five", "rational", "prism"),
+    "metashape": ("radial", "five"),
+    "matlab": ("radial", "five"),
+}
+PAIRS = [(form, camera) for form, cameras in HELD.items() for camera in cameras]
+
+
+def calibration(camera: str) -> Calibration:
+    model, values = CAMERAS[camera]
+    return Calibration(
+        kind="camera", name=camera, sigma0=None, redundancy=0, covariance=Covariance(names=(), matrix=()),
+        model={"model": model, "width": SIZE[0], "height": SIZE[1], "pitch_mm": [1.0, 1.0]},
+        parameters={k: Quantity(value=v, sigma=0.0, unit=unit_of(k, model)) for k, v in values.items()},
+    )  # fmt: skip
+
+
+def file(folder: Path, form: str) -> Path:
+    return folder / f"camera{calibration_formats()[form].suffixes[0]}"
+
+
+def directions() -> Array:
+    u, v = np.meshgrid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.4, 0.4, 7))
+    return np.stack([u.ravel(), v.ravel()], axis=1)
+
+
+def projected(found: Calibration) -> Array:
+    mapping = found.mapping()
+    return mapping.to_pixels(directions())  # type: ignore[attr-defined, no-any-return]
+
+
+@pytest.mark.parametrize(("form", "camera"), PAIRS)
+def test_a_camera_that_a_format_holds_comes_back_unchanged(form: str, camera: str, tmp_path: Path) -> None:
+    given, path = calibration(camera), file(tmp_path, form)
+    done = export_calibration(given, form, path)
+    assert (done.rms_px, done.greatest_px) == (0.0, 0.0)
+    again = import_calibration(path)
+    assert again.model["model"] == CAMERAS[camera][0]  # type: ignore[typeddict-item]
+    assert np.abs(projected(again) - projected(given)).max() < 1e-9
+    assert again.provenance["inputs"].keys() == {path.name}
+
+
+@pytest.mark.parametrize(
+    ("form", "camera", "off"),
+    [
+        ("metashape", "rational", 0.05),
+        ("matlab", "prism", 1.5),
+        ("ros", "tilted", 9.0),
+        ("mrcal", "fisheye", 0.05),
+    ],
+)
+def test_a_model_that_a_format_lacks_is_converted_with_its_differences(
+    form: str, camera: str, off: float, tmp_path: Path
+) -> None:
+    given, path = calibration(camera), file(tmp_path, form)
+    done = export_calibration(given, form, path)
+    assert 0 < done.rms_px <= done.greatest_px < off
+    again = import_calibration(path)
+    inside = (np.abs(projected(given) - np.array(SIZE) / 2) < np.array(SIZE) / 2).all(axis=1)
+    difference = np.linalg.norm(projected(again) - projected(given), axis=1)
+    assert difference[inside].max() < 1.1 * done.greatest_px
+
+
+@pytest.mark.parametrize("camera", HELD["opencv"])
+def test_opencv_reads_the_file_and_projects_the_same_points(camera: str, tmp_path: Path) -> None:
+    path, given = file(tmp_path, "opencv"), calibration(camera)
+    export_calibration(given, "opencv", path)
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    matrix, distortion = (storage.getNode(n).mat() for n in ("camera_matrix", "distortion_coefficients"))
+    points, zero = np.column_stack([directions(), np.ones(63)]), np.zeros(3)
+    if storage.getNode("distortion_model").string() == "fisheye":
+        seen, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, matrix, distortion)
+    else:
+        seen, _ = cv2.projectPoints(points, zero, zero, matrix, distortion)
+    assert np.abs(seen.reshape(-1, 2) - projected(given)).max() < 1e-8
+
+
+def test_what_opencv_itself_writes_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "calibrated.xml"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_Width", 640)
+    storage.write("image_Height", 480)
+    storage.write("Camera_Matrix", np.array([[500.0, 0, 320.5], [0, 501.0, 240.5], [0, 0, 1]]))
+    storage.write("Distortion_Coefficients", np.array([[0.1, 0.02, 0.0, 0.0]]))
+    storage.release()
+    found = import_calibration(path)
+    assert found.values() == {"fx": 500.0, "fy": 501.0, "cx": 320.5, "cy": 240.5, "k1": 0.1, "k2": 0.02}
+
+
+@pytest.mark.parametrize("camera", HELD["colmap"])
+def test_colmap_reads_the_file_and_projects_the_same_points(camera: str, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    given = calibration(camera)
+    export_calibration(given, "colmap", tmp_path / "cameras.txt")
+    for name in ("images.txt", "points3D.txt"):
+        (tmp_path / name).write_text("")
+    (found,) = pycolmap.Reconstruction(str(tmp_path)).cameras.values()
+    points = np.column_stack([directions(), np.ones(63)])
+    seen = np.array([found.img_from_cam(point) for point in points]).reshape(-1, 2)
+    # COLMAP counts from the corner of the first pixel.
+    assert np.abs(seen - 0.5 - projected(given)).max() < 1e-8
+
+
+@pytest.mark.parametrize("camera", HELD["mrcal"])
+def test_mrcal_reads_the_file_and_projects_the_same_points(camera: str, tmp_path: Path) -> None:
+    if shutil.which("mrcal-reproject-points") is None:
+        pytest.skip("mrcal is not installed")
+    given, path = calibration(camera), file(tmp_path, "mrcal")
+    export_calibration(given, "mrcal", path)
+    code = (
+        "import sys, mrcal, numpy as np; m = mrcal.cameramodel(sys.argv[1]); "
+        "np.save(sys.argv[2], mrcal.project(np.load(sys.argv[2]), *m.intrinsics()))"
+    )
+    np.save(tmp_path / "points.npy", np.column_stack([directions(), np.ones(63)]))
+    subprocess.run(
+        ["/usr/bin/python3", "-c", code, str(path), str(tmp_path / "points.npy")],
+        check=True,
+        capture_output=True,
+    )
+    assert np.abs(np.load(tmp_path / "points.npy") - projected(given)).max() < 1e-8
+
+
+def test_metashape_has_the_principal_point_from_the_middle_and_the_tangential_terms_exchanged(
+    tmp_path: Path,
+) -> None:
+    """By the formulas of its manual, with its pixels."""
+    given, path = calibration("five"), file(tmp_path, "metashape")
+    export_calibration(given, "metashape", path)
+    text = path.read_text()
+    names = ("width", "height", "f", "cx", "cy", "b1", "k1", "k2", "k3", "p1", "p2")
+    number = {name: float(text.split(f"<{name}>")[1].split("<")[0]) for name in names}
+    f, k1, k2, k3, p1, p2 = (number[name] for name in ("f", "k1", "k2", "k3", "p1", "p2"))
+    x, y = directions().T
+    r2 = x * x + y * y
+    bend = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    dx = x * bend + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
+    dy = y * bend + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+    u = 0.5 * number["width"] + number["cx"] + dx * f + dx * number["b1"]
+    v = 0.5 * number["height"] + number["cy"] + dy * f
+    assert np.abs(np.stack([u, v], axis=1) - 0.5 - projected(given)).max() < 1e-9
+
+
+def test_ros_and_kalibr_have_their_own_names(tmp_path: Path) -> None:
+    export_calibration(calibration("rational"), "ros", tmp_path / "ros.yaml")
+    ros = yaml.safe_load((tmp_path / "ros.yaml").read_text())
+    assert ros["distortion_model"] == "rational_polynomial"
+    assert ros["projection_matrix"]["data"][:4] == [1010.0, 0.0, 652.3, 0.0]
+    export_calibration(calibration("omni"), "kalibr", tmp_path / "chain.yaml")
+    kalibr = yaml.safe_load((tmp_path / "chain.yaml").read_text())["cam0"]
+    assert (kalibr["camera_model"], kalibr["distortion_model"]) == ("omni", "radtan")
+    assert kalibr["intrinsics"] == [0.7, 1700.0, 1698.0, 652.3, 470.8]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("a.txt", "hello", "is not a calibration of one of the formats"),
+        ("a.txt", "1 OPENCV 640 480 1 2 3", "has not 8 numbers for OPENCV"),
+        ("a.txt", "1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1", "has 2 cameras, not one"),
+        ("a.yaml", "cam0:\n  intrinsics: [1]\n", "has no complete camera cam0"),
+        ("a.yaml", "distortion_model: x\nprojection_matrix: 1", "has no complete camera_matrix"),
+        (
+            "a.xml",
+            "<calibration><projection>fisheye</projection></calibration>",
+            "has the projection 'fisheye'",
+        ),
+        ("a.m", "fc = [ 1 ; 2 ]; cc = 1", "is not a calibration"),
+        ("a.m", "fc = [1;2];\ncc = [1;2];\nkc = [0;0;0;0;0];\n", "has no complete fc"),
+        ("a.cameramodel", "{'lensmodel': 'LENSMODEL_SPLINED'}", "has no complete lensmodel"),
+        ("a.yml", "%YAML:1.0\n---\ncamera_matrix: 3\n", "is not a file of OpenCV"),
+    ],
+)
+def test_broken_files_are_told_in_one_line(name: str, text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(FormatError, match=said) as error:
+        import_calibration(tmp_path / name)
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_format_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="is not one of opencv, ros"):
+        export_calibration(calibration("five"), "nothing", tmp_path / "x")
