@@ -86,8 +86,8 @@ class Matches:
     def __len__(self) -> int:
         return len(self.xy)
 
-    def select(self, keep: Mask) -> Matches:
-        """Matches selected by a mask (k,)."""
+    def select(self, keep: Mask | Rows) -> Matches:
+        """Matches selected by a mask (k,), or by rows."""
         return Matches(**{column.name: getattr(self, column.name)[keep] for column in fields(self)})
 
     def replaced(self, rows: Rows, others: Matches) -> Matches:

@@ -19,6 +19,7 @@ __all__ = [
     "ridges",
     "supported",
     "voted",
+    "without_own",
 ]
 
 
@@ -344,6 +345,23 @@ def add_windows(
                 total[top + r, left + c] += images[k, r, c]
                 if wanted:
                     seen[top + r, left + c] = True
+
+
+@numba.njit(cache=True, nogil=True)
+def without_own(
+    total: NDArray[Any], first: NDArray[Any], own: NDArray[Any], sign: float, others: NDArray[Any]
+) -> None:
+    """Fill the light (k, r, c) of other marks in windows: `sign` times the total (h, w) without the own.
+
+    `first` (k, 2) are column and row of the first pixels; the border of the frame continues beyond it.
+    """
+    h, w = total.shape
+    for k in range(len(own)):
+        for r in range(own.shape[1]):
+            y = min(max(first[k, 1] + r, 0), h - 1)
+            for c in range(own.shape[2]):
+                x = min(max(first[k, 0] + c, 0), w - 1)
+                others[k, r, c] = sign * (total[y, x] - own[k, r, c])
 
 
 @numba.njit(cache=True, nogil=True)

@@ -423,7 +423,7 @@ class _Measurement:
 
         def matched(curve: ToneCurve) -> tuple[Samples, Array] | None:
             scene = self.scene if curve.linear else self._linearised(curve, full_scale)
-            found = match_targets(scene, self.rows, some, searching=False)
+            found = match_targets(scene, self.rows, some, searching=False, residuals=True)
             # Residuals are large, and matches do not count as converged, where the curve is wrong.
             clear = (found.t > self.options.least_t) & np.isfinite(found.xy).all(axis=1)
             if clear.sum() < _LEAST_FIRST:
@@ -454,13 +454,13 @@ class _Measurement:
 
         Start between the lines, where the mapping is known, and continue outwards.
         """
-        for beyond in (_BEYOND, np.inf):
+        every = max(_MOST_FIRST, int(_FIRST_SHARE * self.inside.sum()))
+        for beyond, most in ((_BEYOND, _MOST_FIRST), (np.inf, every)):
             candidates = np.flatnonzero(self.inside & self.scene.design.large[self.rows])
             out = np.abs(self.at[self.rows[candidates]] - self.middle) - self.half
             candidates = candidates[(out <= beyond).all(axis=1)]
             if len(candidates) < _LEAST_FIRST:
                 continue
-            most = max(_MOST_FIRST, int(_FIRST_SHARE * self.inside.sum()))
             each = np.linspace(0, len(candidates) - 1, min(most, len(candidates))).astype(np.intp)
             targets = self.rows[candidates[each]]
             predicted = self.predicted
@@ -469,12 +469,12 @@ class _Measurement:
                 if not self._shifted():
                     break
             moved = (self.predicted - predicted)[self.rows[self.inside]]
-            if len(moved) and np.abs(moved).max() < _SETTLED_PX:
+            if most == every and len(moved) and np.abs(moved).max() < _SETTLED_PX:
                 break
 
     def _learn(self, some: Mask) -> None:
         for searching in (False, True):
-            first = match_targets(self.scene, self.rows, some, searching=searching)
+            first = match_targets(self.scene, self.rows, some, searching=searching, residuals=True)
             sure = first.converged & (first.t > self.options.least_t) & (first.rejected < 0.1)
             if sure.sum() >= max(_LEAST_FIRST, some.sum() // 2):
                 break
@@ -484,7 +484,9 @@ class _Measurement:
 
     def _spread(self, first: Matches, sure: Mask, rows: Rows) -> Array:
         """Anisotropy of the point-spread function, from the residuals of matched targets."""
-        samples, formed = _samples(self.scene, rows[sure], first.select(sure))
+        some = np.flatnonzero(sure)
+        some = some[np.linspace(0, len(some) - 1, min(_MOST_FIRST, len(some))).astype(np.intp)]
+        samples, formed = _samples(self.scene, rows[some], first.select(some))
         left = np.where(samples.used, samples.grey - formed, np.nan) / samples.depth[:, None, None]
         place = samples.shape, samples.xy, samples.psf_px, samples.window
         return spread_of(self.scene.path) + anisotropy(*place, left)
@@ -583,7 +585,7 @@ class _Measurement:
         covered[uneasy] = (seen < _SEEN) & ~(found.correlation[uneasy] > _LIKE)
         found.seen[covered] = seen[covered[uneasy]]
         among = self._among(np.isin(np.arange(len(found)), some))
-        again = match_targets(replace(self.scene, valid=valid), self.rows, among, searching=False)
+        again = match_targets(self.scene.through(valid), self.rows, among, searching=False)
         better = again.converged & (again.seen >= _SEEN) & ~(again.noise > _CLEARED * found.noise[some])
         keep = np.ones(len(found), dtype=bool)
         keep[some] = ~better

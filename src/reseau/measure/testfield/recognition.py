@@ -48,6 +48,9 @@ _WIDTH_PX = 0.2
 """Required accuracy of the width of the point-spread function for classification."""
 _LEAST_VARIANCE = 1e-6
 """Residual variance assumed where an image of a few pixels fits exactly."""
+_ENOUGH_PX = 7
+"""Half the number of pixels on a side of the windows in which targets are told apart; of larger ones, not all
+pixels are used."""
 _LEAST_STEP_PX = 2.5
 """Least distance of targets in the image, along either direction, at which they can be told apart."""
 _MOST_SQUARES = 4
@@ -205,11 +208,15 @@ class _Clusters:
             return
         self.group, self.frames = _grouped(frames[legible])
         reach = np.ceil(np.abs(self.frames).sum(axis=2).max(axis=0) * self.step / 2).astype(int)
+        # Large targets are told apart by every second pixel, or less.
+        self.each = max(1, int(reach.min() // _ENOUGH_PX))
+        reach += -reach % self.each
         self.columns, self.rows = (np.arange(-r, r + 1.0) for r in reach)
-        offset = np.stack(np.meshgrid(self.columns, self.rows), axis=-1).reshape(-1, 2)
+        columns, rows = self.columns[:: self.each], self.rows[:: self.each]
+        offset = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         sampled = (self.xy[:, :, None] + offset).astype(np.float32)
         # OpenCV samples less than 32768 rows and columns at a time.
-        lines = sampled.reshape(-1, len(self.columns), 2)
+        lines = sampled.reshape(-1, len(columns), 2)
         self.seen = np.concatenate(
             [
                 cv2.remap(grey, some[..., 0], some[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -280,6 +287,7 @@ class _Clusters:
         columns, rows = (np.tile(v, (len(every), 1)) for v in (self.columns, self.rows))
         window = Window(columns, rows, self.response)
         share, slopes = images.derivatives(none, np.full(len(every), psf_px), none[:, :1], every, window)
+        share, slopes = (images[..., :: self.each, :: self.each] for images in (share, slopes))
         design = np.stack([np.ones_like(share), share, *np.moveaxis(slopes[:, :3], 1, 0)], axis=-1)
         return design.reshape(*nodes.xy.shape[:2], -1, 5).astype(np.float64)
 

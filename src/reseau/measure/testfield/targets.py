@@ -8,14 +8,14 @@ of the board is modelled by polynomials over the frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask, Rows
 from ...io import TestfieldDesign
@@ -140,6 +140,12 @@ class Scene:
         """Lattice coordinates (n, 2) of points of the design (n, 2)."""
         return np.asarray(xy @ self.frame.T + self.origin)
 
+    def through(self, valid: Mask) -> Scene:
+        """The same with other pixels that may be used."""
+        scene = replace(self, valid=valid)
+        scene.__dict__["line_light"] = self.line_light
+        return scene
+
     @cached_property
     def line_light(self) -> Array:
         """Grey values that the lines attenuate or add, (h, w)."""
@@ -154,6 +160,7 @@ def match_targets(
     *,
     searching: bool = True,
     contrast_slope: float | None = None,
+    residuals: bool = False,
 ) -> Matches:
     """Match targets of the design.
 
@@ -172,13 +179,19 @@ def match_targets(
         :func:`reseau.measure.matching.match`.
     contrast_slope : float, optional
         Standard deviation of the change of contrast over half a window; by default it is constant.
+    residuals : bool
+        Whether the residuals are wanted.
 
     Returns
     -------
     Matches
-        The n measured targets, in their order; residuals have the size of the largest window.
+        The n measured targets, in their order; residuals have the size of the largest window, or of none.
     """
-    return merged(*_Canvas.of(scene, rows, inside).match(background, searching, contrast_slope))
+    parts, found = _Canvas.of(scene, rows, inside).match(background, searching, contrast_slope)
+    if not residuals:
+        # For all targets of a frame they take more memory, and time, than everything else.
+        found = [replace(matches, residuals=np.empty((len(matches), 0, 0))) for matches in found]
+    return merged(parts, found)
 
 
 def pixels_of_targets(scene: Scene, rows: Rows, inside: Mask, level: Array) -> tuple[Mask, Array]:
@@ -204,16 +217,25 @@ def pixels_of_targets(scene: Scene, rows: Rows, inside: Mask, level: Array) -> t
 
 def _around(scene: Scene, rows: Rows, inside: Mask) -> tuple[Rows, Mask]:
     """Targets to measure, and those whose light falls into the windows of these."""
-    # Windows overlap by at most 1.5 times the distance of targets within a square.
-    xy = scene.lattice(scene.design.xy[rows])
-    step = np.abs(scene.frame).max() * np.sqrt(scene.design.pitch**2 / 16)
-    size = max(scene.design.targets.size) * np.abs(scene.frame).max()
-    slope = slope_of(scene.mapping, xy[inside])
-    blur = 7 * scene.psf_px / np.sqrt(np.abs(np.linalg.det(slope)).min())
-    far = max(1.5 * step, 1.2 * size + blur)
-    keep = inside.copy()
-    keep[~inside] = KDTree(xy[inside]).query(xy[~inside], p=np.inf, distance_upper_bound=far)[0] < far
+    at = scene.lattice(scene.design.xy[rows])
+    xy, slope = images_of(scene.mapping, at), slope_of(scene.mapping, at) @ scene.frame
+    # No outline reaches farther from its centroid than 0.6 of its size.
+    reach = np.abs(slope).sum(axis=2) * (0.6 * scene.design.sizes[rows, None])
+    keep, large = inside.copy(), scene.design.large[rows]
+    for one, other in product((large, ~large), repeat=2):
+        mine, others = one & inside, np.flatnonzero(other & ~keep)
+        if mine.any() and len(others):
+            # Windows have the size of the largest one, and begin at whole pixels; see `_Canvas`.
+            far = _half(scene, reach[mine].max(axis=0)) + _half(scene, reach[others]) + 1.0
+            across, down = (np.abs(xy[others, k, None] - xy[mine, k]) < far[:, k, None] for k in (0, 1))
+            keep[others] = (across & down).any(axis=1)
     return rows[keep], inside[keep]
+
+
+def _half(scene: Scene, reach: Array) -> Rows:
+    """Half the width and height (..., 2) of the windows of targets that reach so far."""
+    wide = np.ceil(reach + np.abs(scene.path) / 2 + 2.5 * scene.psf_px + 1.0)
+    return np.asarray(wide, dtype=np.intp)
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +261,7 @@ class _Canvas:
         for size in (False, True):
             of = large == size
             if of.any():
-                half = np.ceil(reach[of].max(axis=0) + 2.5 * scene.psf_px + 1.0).astype(np.intp)
+                half = _half(scene, reach[of].max(axis=0))
                 self._lay(np.flatnonzero(of & ~wanted), half)
                 mine = np.flatnonzero(of & wanted)
                 parts = -(-len(mine) * int(np.prod(2 * half + 1)) // _AT_ONCE)
@@ -255,7 +277,7 @@ class _Canvas:
         formed, xy, reach = form_targets(scene.design, rows, scene.mapping, scene.frame, at, scene.psf_px)
         images: Shape = formed
         if scene.path.any():
-            images, reach = MovedShape(formed, scene.path), reach + np.abs(scene.path) / 2
+            images = MovedShape(formed, scene.path)
         return cls(scene, images, xy, reach, scene.design.large[rows], inside)
 
     def differing(self, level: Array) -> tuple[NDArray[np.uint8], Mask]:
@@ -343,10 +365,13 @@ class _Canvas:
         searching: bool,
         contrast_slope: float | None,
     ) -> Matches:
+        from .compiled import without_own  # takes half a second to import; not every command needs it
+
         scene, half = self.scene, part.half
         centre = np.rint(self.xy[part.rows]).astype(np.intp)
-        column, row = self._pixels(part)
-        others = self.total[row[:, :, None], column[:, None, :]] - part.own
+        others = np.empty(part.own.shape)
+        dark = scene.design.polarity == "dark"
+        without_own(self.total, centre - half, part.own, -1.0 if dark else 1.0, others)
         options = MatchOptions(
             half_px=(int(half[0]), int(half[1])),
             psf_px=scene.psf_px,
@@ -364,7 +389,6 @@ class _Canvas:
         levels, amplitudes = scene.light.at((centre + steps[:, None]).reshape(-1, 2))
         (level, right, down), amplitude = levels.reshape(3, -1), amplitudes[: len(centre)]
         right, down = right - level, down - level
-        dark = scene.design.polarity == "dark"
         contrast = amplitude / level if dark else amplitude
         return match(
             scene.grey,
@@ -374,7 +398,7 @@ class _Canvas:
             options,
             noise=noise,
             form_sigma=np.array([0.05]),
-            others=-others if dark else others,
+            others=others,
             light=(contrast, np.stack([level, down, right], axis=1)) if background == 1 else None,
             searching=searching,
         )
