@@ -6,12 +6,14 @@ In the Cramér–Rao bound, position, sharpness, contrast, background (level and
 and all simulated noise is included, also row jitter. The figures refer to the 256 targets of the central
 4 × 4 squares. ``--freed`` measures photographs whose blur, light, print, board and processing the measurement
 does not model as they are, instead; see :class:`reseau_sims.Photograph`. ``--speed`` prints only processor
-times, ``--small`` measures fields that are small in the frame.
+times, also for one megapixel with 1000 targets (:mod:`worlds.boards`), ``--small`` measures fields that are
+small in the frame.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -23,6 +25,7 @@ import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from shared import of_the_tests
+from worlds.boards import OPENCV, Pose, picture
 
 from reseau.core.data import Array, Frame
 from reseau.core.tone import ToneCurve
@@ -321,6 +324,28 @@ def freed(seeds: int, conditions: list[str]) -> bool:
     return kept
 
 
+def megapixel() -> None:
+    """Print the processor time for a picture of one megapixel with 1000 targets, of independent formation."""
+    camera = replace(OPENCV, fx=1260.0, fy=1262.0, cx=578.8, cy=426.1, width=1154, height=868)
+    pose = Pose.towards(25.0, 40.0, 10.0, 1700.0, (0.0, 0.0))
+    pixels, xy = picture(json.loads(DESIGN.to_json()), camera, pose, seed=1)
+    frame = Frame(pixels.astype(np.uint8), 255.0)
+    found, seconds = measure_testfield(frame, DESIGN), []
+    if not found:
+        print(f"{frame.width} x {frame.height} pixels: {found.reason}")
+        return
+    for _ in range(9):
+        start = time.process_time()
+        measure_testfield(frame, DESIGN)
+        seconds.append(time.process_time() - start)
+    error = (found.xy - xy)[found.ok]
+    print(
+        f"{frame.width} x {frame.height} pixels, {found.found} targets, "
+        f"rms {np.sqrt((error**2).mean()):.4f} px: "
+        f"processor time median {np.median(seconds) * 1e3:.0f} ms, least {min(seconds) * 1e3:.0f} ms"
+    )
+
+
 def first_pictures() -> None:
     """Print the processor time for the first picture of this process, and for those after it."""
     bench = FieldBench(seed=0)
@@ -365,6 +390,7 @@ def main() -> int:
     cv2.setNumThreads(1)
     if arguments.speed:
         first_pictures()
+        megapixel()
         return 0
     if arguments.small:
         return 0 if small() else 1

@@ -484,7 +484,8 @@ class _Measurement:
 
     def _spread(self, first: Matches, sure: Mask, rows: Rows) -> Array:
         """Anisotropy of the point-spread function, from the residuals of matched targets."""
-        some = np.flatnonzero(sure)
+        # What lies over a target looks like motion, too.
+        some = np.flatnonzero(sure & (first.noise <= np.median(first.noise[sure])))
         some = some[np.linspace(0, len(some) - 1, min(_MOST_FIRST, len(some))).astype(np.intp)]
         samples, formed = _samples(self.scene, rows[some], first.select(some))
         left = np.where(samples.used, samples.grey - formed, np.nan) / samples.depth[:, None, None]
