@@ -302,8 +302,8 @@ def choices(seeds: int = 20) -> None:
 
 def difference(lens: lenses.Lens, camera: Camera, seen: np.ndarray) -> float:
     """Root mean square difference (px) from the lens where there are observations, after a rotation."""
-    # Beyond 45° the polynomials of the standard lenses turn back into the image.
-    x = points(80.0 if lens.fisheye else 45.0, 20_000)
+    # Beyond 40° the polynomials of the standard lenses turn back into the image.
+    x = points(80.0 if lens.fisheye else 40.0, 20_000)
     image = lens.project(x)
     x = x[np.isfinite(image).all(axis=1)]
     image = lens.project(x)

@@ -455,9 +455,10 @@ def test_calibrate_says_which_model_it_chose_and_why(reseau: Run, tmp_path: Path
         "calibrate", *sorted(tmp_path.glob("*.csv")), "-d", tmp_path / "field.json", "--size", "240x240",
         "--model", "auto",
     )  # fmt: skip
-    status, out, err = reseau(*command, "-o", tmp_path / "K.json")
+    status, out, err = reseau(*command, "--target", "auto", "-o", tmp_path / "K.json")
     assert (status, err) == (0, "")
     assert out.startswith("camera model opencv: no distortion (chosen")
+    assert "target flat as designed" in out
     assert "opencv: k1 k2 p1 p2 " in out
     assert "too many parameters" in out
     written = json.loads((tmp_path / "K.json").read_text())
@@ -466,6 +467,7 @@ def test_calibrate_says_which_model_it_chose_and_why(reseau: Run, tmp_path: Path
     table = written["validity"]["camera_models"]
     assert table[0]["free"] == ["fx", "fy", "cx", "cy"]
     assert len(table) > 15
+    assert written["validity"]["target"]["chosen"] == "flat"
     status, out, err = reseau(*command, "--free", "fx")
     assert (status, out) == (2, "")
     assert "camera model auto: has no parameters or options of its own" in err

@@ -20,6 +20,8 @@ from .diagnostics import (
 )
 from .document import ResultDocument, model_search_entries
 from .modelling import (
+    BoardChoice,
+    BoardModel,
     Candidate,
     Compared,
     Kind,
@@ -29,10 +31,12 @@ from .modelling import (
     adjust_network,
     calibration_of,
     camera_candidates,
+    choose_board,
     choose_model,
     cross_validation,
     eliminate_parameters,
     estimate_components,
+    held_as_designed,
     problem_of,
     reweighted,
     search_model,
@@ -53,6 +57,8 @@ from .solver import Approximate, BundleFit, BundleProblem, approximate
 __all__ = [
     "Additional",
     "Approximate",
+    "BoardChoice",
+    "BoardModel",
     "BundleFit",
     "BundleProblem",
     "Camera",
@@ -83,6 +89,7 @@ __all__ = [
     "calibration_of",
     "camera_candidates",
     "camera_mapping",
+    "choose_board",
     "choose_model",
     "common_pattern",
     "cross_validation",
@@ -90,6 +97,7 @@ __all__ = [
     "estimate_components",
     "example_network",
     "film_camera",
+    "held_as_designed",
     "model_search_entries",
     "problem_of",
     "projection_field_at",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -41,7 +42,7 @@ from .common import (
 from .measure import Channel
 
 if TYPE_CHECKING:
-    from ..bundle import Kind, ModelChoice
+    from ..bundle import BoardChoice, Kind, ModelChoice
     from ..calibration import CameraMapping, FieldDifference, ProjectionField
     from ..core.data import Frame, ImagePoints
     from ..core.provenance import Provenance
@@ -62,6 +63,16 @@ Refraction = Annotated[
     Path | None,
     typer.Option(help="Windows and media before the target, reseau-refraction/1; lengths in mm."),
 ]
+
+
+class Target(StrEnum):
+    """Model of the target."""
+
+    FREE = "free"
+    FLAT = "flat"
+    AUTO = "auto"
+
+
 LeaveOut = Annotated[
     list[str] | None, typer.Option(help="Image point to leave out, e.g. photo.jpg:A1; repeatable.")
 ]
@@ -115,6 +126,14 @@ def calibrate(
     sigma: Sigma = None,
     control: Control = None,
     refraction: Refraction = None,
+    target_points: Annotated[
+        Target,
+        typer.Option(
+            "--target",
+            help="Points of the target: all free, flat as designed, or chosen by a test, which also says how "
+            "much the target is bent.",
+        ),
+    ] = Target.FREE,
     leave_out: LeaveOut = None,
     reject: Reject = False,
     components: ComponentsOf = None,
@@ -147,7 +166,9 @@ def calibrate(
     if others and taken:
         raise UsageError("requires one camera", where="--against", do="compare the cameras one by one")
     level = level_of(eliminate, "--eliminate")
-    options = _options(sigma, control, refraction, leave_out or [], reject, kind, level, workers)
+    options = _options(
+        sigma, control, refraction, leave_out or [], reject, kind, level, workers, target_points
+    )
     lens = _camera(model, pitch, side, model_option or [], free)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
     measure = drawing_overlays(
@@ -221,6 +242,7 @@ def _options(
     components: Kind | None,
     level: float | None,
     workers: int,
+    target: Target,
 ) -> CalibrationOptions:
     """Options of the procedure, from the options of the command."""
     from ..bundle import Options
@@ -237,7 +259,7 @@ def _options(
     return CalibrationOptions(
         Options(outliers="reject" if reject else "keep"), sigma,
         None if control is None else read_control(control), tuple(pairs), components, level, workers,
-        refraction=None if refraction is None else RefractionFile.read(refraction),
+        refraction=None if refraction is None else RefractionFile.read(refraction), target=target.value,
     )  # fmt: skip
 
 
@@ -335,6 +357,8 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     result = done.result
     if done.choice is not None:
         _say_choice(done.choice)
+    if done.board is not None:
+        _say_board(done.board, result.network.unit)
     count = sum(len(points) for points in done.measured.values())
     say(f"{len(done.measured)} images, {count} image points, redundancy {result.redundancy}\n")
     say(f"sigma0 {result.sigma0:.4g}")
@@ -364,6 +388,23 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
         say(f"left out: {name}: {why}\n")
     for warning in result.warnings:
         say(f"warning: {warning}\n")
+
+
+def _say_board(choice: BoardChoice, unit: str) -> None:
+    """Print the comparison of the models of the target."""
+    import numpy as np
+
+    said = {"flat": "flat as designed", "warp": "bent; all points are free", "free": "all points free"}
+    say(f"target {said[choice.chosen.name]}\n")
+    for each in choice.models:
+        line = f"  {each.name:5} {each.parameters:5} parameters  sigma0 {each.sigma0:.4f}  "
+        line += f"length {each.length:.1f}"
+        if np.isfinite(each.p):
+            line += f"  p = {each.p:.2g} against the next"
+        if np.isfinite(each.warp).all():
+            pairs = zip("xy", each.warp, each.warp_sigma, strict=True)
+            line += "  bent " + ", ".join(f"{v:.3g} ± {s:.2g} {unit} along {k}" for k, v, s in pairs)
+        say(line + "\n")
 
 
 def _say_choice(choice: ModelChoice) -> None:

@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import cv2
 import numpy as np
 
 from ..bundle import (
+    BoardChoice,
     Camera,
     CameraEstimate,
     ControlPoints,
@@ -30,7 +31,9 @@ from ..bundle import (
     Rig,
     calibration_of,
     camera_mapping,
+    choose_board,
     choose_model,
+    held_as_designed,
     model_search_entries,
     search_model,
 )
@@ -177,6 +180,14 @@ class CalibrationOptions:
         calibration is that of the camera in air. Without control points the diagonals of the target are
         distances of the design, known to a ten-thousandth: windows have dimensions, and the scale is not
         free.
+    target : {"free", "flat", "auto"}
+        Whether all points of the target are unknowns, or are held as designed; ``auto`` holds them where
+        :func:`reseau.bundle.choose_board` finds the target flat and as designed.
+
+    Raises
+    ------
+    UsageError
+        When the target is not one of these, or is defined otherwise.
     """
 
     adjustment: Options = field(default_factory=Options)
@@ -188,6 +199,16 @@ class CalibrationOptions:
     workers: int = 1
     heights: Heights | None = None
     refraction: RefractionEntry | None = None
+    target: Literal["free", "flat", "auto"] = "free"
+
+    def __post_init__(self) -> None:
+        if self.target not in ("free", "flat", "auto"):
+            raise UsageError(f"is {self.target!r}, not `free`, `flat` or `auto`", where="target")
+        if self.target != "free" and (self.control or self.heights or self.refraction):
+            raise UsageError(
+                f"cannot be {self.target!r} with control points, heights, or windows and media",
+                where="target",
+            )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -204,12 +225,15 @@ class Calibrated(Display):
         Reasons why images were left out, by image.
     choice : ModelChoice, optional
         How the camera model was chosen.
+    board : BoardChoice, optional
+        How the model of the target was chosen.
     """
 
     result: Result
     measured: dict[str, ImagePoints]
     declined: dict[str, str]
     choice: ModelChoice | None = None
+    board: BoardChoice | None = None
 
     def __bool__(self) -> bool:
         return True
@@ -269,6 +293,8 @@ class Calibrated(Display):
         more = model_search_entries(self.result)
         if self.choice is not None:
             more |= {"camera_models": self.choice.entries()}
+        if self.board is not None:
+            more |= {"target": self.board.entries()}
         return found.model_copy(update={"validity": found.validity | more}) if more else found
 
     def write(self, path: Path | str) -> None:
@@ -426,8 +452,16 @@ def calibrate_camera(
         if isinstance(chosen, Failure):
             return chosen
         choice, network = chosen, replace(network, cameras=(chosen.camera,))
+    board = None
+    if options.target == "flat":
+        network = held_as_designed(network)
+    elif options.target == "auto":
+        bent = choose_board(network, options.adjustment)
+        if isinstance(bent, Failure):
+            return bent
+        board, network = bent, bent.network
     found = search_model(network, options.adjustment, options.components, options.level)
-    return found if isinstance(found, Failure) else Calibrated(found, measured, declined, choice)
+    return found if isinstance(found, Failure) else Calibrated(found, measured, declined, choice, board)
 
 
 def _fixed_to_each_other(

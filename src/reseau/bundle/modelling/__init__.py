@@ -1,6 +1,7 @@
 """Adjustment of a network, search for a model, calibrations of the cameras."""
 
 from .adjustment import Options, adjust_network, problem_of
+from .board import BoardChoice, BoardModel, choose_board, held_as_designed
 from .calibration import calibration_of
 from .choice import Candidate, Compared, ModelChoice, camera_candidates, choose_model
 from .search import (
@@ -14,6 +15,8 @@ from .search import (
 )
 
 __all__ = [
+    "BoardChoice",
+    "BoardModel",
     "Candidate",
     "Compared",
     "Kind",
@@ -23,10 +26,12 @@ __all__ = [
     "adjust_network",
     "calibration_of",
     "camera_candidates",
+    "choose_board",
     "choose_model",
     "cross_validation",
     "eliminate_parameters",
     "estimate_components",
+    "held_as_designed",
     "problem_of",
     "reweighted",
     "search_model",

@@ -51,7 +51,7 @@ _WIDEST = 50.0
 class Projected(Radial):
     """Base of the family: from the ideal direction to pixels.
 
-    With s = u² + v², a projection g(s), and the distorted plane (m = g·(u, v), t = |m|²)::
+    With s = u² + v², a projection g(s), and its plane m = g·(u, v), t = mx² + my²::
 
         x' = mx·L + 2·p1·mx·my + p2(t + 2mx²) + sx1·t,   L = 1 + k1t + k2t² + k3t³ + k4t⁴
         y' = my·L + p1(t + 2my²) + 2·p2·mx·my + sy1·t,   x = fx·x' + cx,  y = fy·y' + cy
@@ -349,7 +349,7 @@ class DoubleSphere(Projected):
 
 @dataclass(frozen=True, eq=False)
 class Division(Projected):
-    """The division model with distortion: r = |m|/(1 + λ|m|²), so that m = 2(u, v)/(1 + √(1 − 4λr²)).
+    """The division model with distortion: m = 2(u, v)/(1 + √(1 − 4λr²)), so that ``r = |m|/(1 + λ|m|²)``.
 
     Fitzgibbon, A. (2001), Simultaneous linear estimation of multiple view geometry and lens distortion, CVPR;
     with fx, fy and λ it is COLMAP's ``DIVISION``.
