@@ -74,7 +74,7 @@ def test_deflection_and_camera_are_covered_by_their_sigmas() -> None:
 
 
 def test_a_bent_target_held_flat_has_a_wrong_camera() -> None:
-    """What the test protects from: the focal length is off by several of its sigmas, the bent one's is not."""
+    """What the test protects from: the focal length is off by more than its sigma says."""
     flat, bent, _ = chosen(warp=(1.0, -0.4)).models
     assert abs(flat.values["fx"] - 1200.0) > 2 * flat.sigma["fx"]
     assert abs(bent.values["fx"] - 1200.0) < 4 * bent.sigma["fx"]
