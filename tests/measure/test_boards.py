@@ -22,6 +22,7 @@ CHESS = board("chess", 9, 8, 20.0)
 CHARUCO = board("charuco", 7, 6, 25.0, size=18.0)
 CIRCLES = board("circles", 8, 6, 20.0, size=10.0)
 SHIFTED = board("circles", 5, 9, 12.0, size=9.0, asymmetric=True)
+STEREO = Path(os.environ.get("RESEAU_DATA", "/nowhere")) / "chessboard_stereo"
 DATA = Path(os.environ.get("RESEAU_DATA", "/nowhere")) / "independent" / "boards"
 
 
@@ -128,6 +129,14 @@ def test_pictures_of_something_else_are_declined(design: BoardDesign) -> None:
     assert isinstance(empty, Failure)
     other = picture(SHIFTED if design is not CIRCLES else CHESS)[0]
     assert isinstance(measure_board(other, design), Failure)
+
+
+@pytest.mark.skipif(not STEREO.is_dir(), reason="RESEAU_DATA has no chessboard_stereo")
+def test_the_largest_of_several_boards_in_a_scene_is_measured() -> None:
+    # A screen in the scene shows pictures of the same board.
+    found = measured(read_image(STEREO / "left02.jpg"), board("chess", 10, 7, 25.0))
+    assert found.ok.all()
+    assert np.ptp(found.xy, axis=0).min() > 200
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="RESEAU_DATA has no independent/boards")

@@ -109,6 +109,7 @@ class CornerMarks(PlaneMarks):
     learnt_form_sigma = np.array([_TURNED, _TURNED])
     learnt_from = 24
     precise_start = True
+    curve_first = True
     formed_px = 0.0007
     least_seen = 0.4
 

@@ -209,6 +209,7 @@ class CircleMarks(DiskMarks):
     word = "circle"
     learnt_from = 30
     precise_start = True
+    curve_first = True
     eccentric = True
     formed_px = 0.0015
 

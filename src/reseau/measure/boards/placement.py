@@ -35,6 +35,8 @@ ink, where nothing hides it; one found that the design has not."""
 _ALIKE = 2.0
 """Lead in nodes of a place over another from which it is certain."""
 _SEEDS = 40
+_LARGER = 2.0
+"""Ratio of the meshes of two lattices from which the second is another one, not the first in perspective."""
 _FEWEST = 6
 """Least number of corners that show a board."""
 _ENOUGH = 0.6
@@ -77,12 +79,15 @@ def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDes
     numbers, shape = design.nodes, (grey.shape[0], grey.shape[1])
     extent = int(numbers.max()) + 2
     best: tuple[Array, Rows, Chain] | None = None
+    enough, mesh = _ENOUGH * len(numbers), 0.0
     for row, step in seeds(saddles)[:_SEEDS]:
+        size = abs(float(np.linalg.det(step)))
+        # Another board may be in the scene, or a picture of one: the largest in the frame counts.
+        if best is not None and len(best[0]) >= enough and size < _LARGER * mesh:
+            continue
         found = grown(grey, saddles, first_mapping(step, saddles.xy[row], shape), extent)
-        if best is None or len(found[0]) > len(best[0]):
-            best = found
-        if len(best[0]) >= _ENOUGH * len(numbers):
-            break
+        if best is None or len(found[0]) >= min(enough, len(best[0]) + 1):
+            best, mesh = found, size
     least = min(_FEWEST, len(numbers))
     if best is None or len(best[0]) < least:
         return _failed(0 if best is None else len(best[0]), "corners in a lattice")

@@ -78,6 +78,8 @@ _UNMODELLED_PX = 0.05
 """Scatter of positions beyond their own sigmas: the sheet is not plane."""
 _FORMED_PX = 0.002
 """Standard deviation of what no formed image contains: edges of prints, unequal pixels."""
+_EXPLAINED = 0.7
+"""Ratio of residuals below which a curve explains what looked like motion or sharpening."""
 _PER_TERM = 2.0
 """Least number of matched marks for each term of the polynomial of their mapping."""
 _PSF_LOG_SIGMA = 0.2
@@ -193,6 +195,8 @@ class PlaneMarks(ABC):
     one through all of them."""
     least_seen: ClassVar[float] = _SEEN
     """Least share of a mark on pixels that can be used."""
+    curve_first: ClassVar[bool] = False
+    """Whether a curve between light and grey values is looked for before motion and sharpening."""
     formed_px: ClassVar[float] = _FORMED_PX
     """Standard deviation of what no formed image contains."""
 
@@ -284,6 +288,12 @@ class PlaneMarks(ABC):
     def _match_all(self, rows: Rows) -> Matches:
         """Match disks; on even paper where paper is saturated all around."""
         found = self._match(rows, influence=True)
+        if self.look.kernel is not None and self.precise_start and not found.converged.all():
+            # Without the kernel residuals are larger, and so are the sigmas.
+            look, lost = self.look, ~found.converged
+            self.look = replace(look, kernel=None, psf_px=look.blur_px)
+            found = replaced(found, ~lost, self._match(rows[lost], influence=True))
+            self.look = look
         dim = found.converged & (self._edge_seen(rows, found) < _LEAST_RIM)
         self.dazzled[rows] |= dim
         if not dim.any():
@@ -399,6 +409,11 @@ class PlaneMarks(ABC):
         self._weigh(first, rows)
         few = np.arange(len(rows)) % _FEW == 0
         kernel, sharper, gain = estimate_kernel(self._samples(first.select(few), rows[few])[0])
+        bent = False
+        if gain < _FILTERED and self.curve_first:
+            first, bent = self._straighten(first, rows, sure=True)
+            if bent:
+                gain = estimate_kernel(self._samples(first.select(few), rows[few])[0])[2]
         if gain < _FILTERED:
             for _ in range(_KERNELS):
                 # Position and form were those of images without the kernel, or with the one before.
@@ -409,6 +424,14 @@ class PlaneMarks(ABC):
                 self._weigh(first, rows)
             text = "the images are smeared by motion or sharpened: this was estimated and is modelled"
             self.notes += (Remark(text, Code.FILTERED),)
+        if not bent:
+            self._straighten(first, rows)
+
+    def _straighten(self, first: Matches, rows: Rows, sure: bool = False) -> tuple[Matches, bool]:
+        """Learn the curve between light and grey values; whether there is one.
+
+        With `sure`, a curve is adopted only if it leaves much less than grey values as they are.
+        """
         straight, full_scale = ToneCurve(1.0), self.image.full_scale
         tried = {straight: (self.screened, self.look, first)}
 
@@ -426,11 +449,20 @@ class PlaneMarks(ABC):
             return self._samples(again, rows) if again.converged.all() else None
 
         found = find_curve(matched, full_scale, self.image.curve)
-        self.screened, self.look, first = tried[found.curve or straight]
-        if found:
+        chosen = found.curve or straight
+        if sure and found:
+            # A kernel was suspected: whether the curve explains the residuals instead.
+            left, before = (
+                np.median(tried[c][2].noise / np.abs(self._depth(tried[c][2]))) for c in (chosen, straight)
+            )
+            chosen = chosen if left < _EXPLAINED * before else straight
+        self.screened, self.look, first = tried[chosen]
+        if chosen is not straight:
             self._weigh(first, rows)
-        if (note := found.remark(f"{self.word}s")) is not None:
+        note = found.remark(f"{self.word}s")
+        if note is not None and (chosen is not straight or not sure):
             self.notes += (note,)
+        return first, chosen is not straight
 
     def _weigh(self, first: Matches, rows: Rows) -> None:
         """Learn noise, contrast and light from some of the marks; those of the others change as much."""
