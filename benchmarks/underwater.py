@@ -283,6 +283,7 @@ def _row(text: str, rows: list[Figures]) -> str:
         return np.array([getattr(row, name) for row in rows])
 
     errors = column("errors_mm").astype(float)
+    errors = errors[:, np.isfinite(errors).any(axis=(0, 2))]  # points that no seed determined
     bias = np.nanmean(errors, axis=0)
     residuals, over = _rms(column("residuals_px")), _rms(column("over_sigma"))
     return (

@@ -1,4 +1,4 @@
-"""Cameras above water beside AquaCal, on its own scenarios: ``python benchmarks/aquacal.py [--seeds N]``.
+"""Cameras above water beside AquaCal, on its own scenarios: ``python benchmarks/water_rigs.py [--seeds N]``.
 
 AquaCal (McGrath Lab, MIT licence) calibrates cameras that are fixed to each other and look down through one
 surface of water, from photographs of a board under water. Its scenarios carry their truth

@@ -65,9 +65,9 @@ def network(drawn: Project) -> dict[str, object]:
     held = np.isfinite(made.xyz).all(axis=1)
     return {
         "schema": "reseau-network/1", "unit": "mm",
-        "cameras": [{"id": "cam", "width": SIZE[0], "height": SIZE[1], "pitch_mm": [PITCH, PITCH],
-                     "model": "brown", "side": "object", "parameters": camera.parameters,
-                     "free": list(camera.free)}],
+        "cameras": [{"id": "cam", "width": SIZE[0], "height": SIZE[1], "model": camera.model,
+                     "parameters": camera.parameters, "free": list(camera.free),
+                     "sigma": dict(camera.sigma)}],
         "images": {"id": list(made.images), "camera": ["cam"] * len(made.images), "X0": made.x0.tolist(),
                    "rotation": made.rotation.tolist()},
         "points": {"id": list(made.points),
