@@ -324,7 +324,7 @@ def normalised_errors(case: Case, seeds: range) -> tuple[Array, Array]:
     The image is wide for the two models with spheres: in a narrow one their shape is hardly determined, and
     first order does not suffice; for the double sphere it does so only with little noise.
     """
-    sigma_px = 0.004 if len(case.model.of_role("shape")) > 1 else 0.02
+    sigma_px = 0.001 if len(case.model.of_role("shape")) > 1 else 0.02
     wide = bool(case.model.of_role("shape"))
     camera = camera_of(case, f=330.0) if wide else camera_of(case)
     world = networks.world(
