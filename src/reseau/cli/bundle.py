@@ -40,7 +40,8 @@ def bundle(
     network: Annotated[
         Path,
         typer.Argument(
-            help="Network: reseau-network/1, a file of PhotoModeler, BAL or Bundler, or a folder of COLMAP."
+            help="Network: reseau-network/1, a file of PhotoModeler, Metashape, BAL, Bundler or libmv, "
+            "or a folder of COLMAP."
         ),
     ],
     out: Out = None,

@@ -11,6 +11,8 @@ from .colmap import read_colmap
 from .control import read_control
 from .film import FilmMarks, metashape_script, read_film_marks, read_micmac, write_micmac
 from .lenses import Lens, read_lens
+from .libmv import read_libmv
+from .metashape import read_metashape
 from .networks import calibration_files, read_foreign, read_network
 from .photomodeler import read_photomodeler
 from .zemax import read_zemax
@@ -31,6 +33,8 @@ __all__ = [
     "read_film_marks",
     "read_foreign",
     "read_lens",
+    "read_libmv",
+    "read_metashape",
     "read_micmac",
     "read_network",
     "read_photomodeler",

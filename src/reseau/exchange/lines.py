@@ -11,7 +11,7 @@ from ..bundle import Camera, Network
 from ..core.data import Array, Rows
 from ..core.errors import FormatError, InputError
 
-__all__ = ["network_of", "numbers", "read_bytes"]
+__all__ = ["network_of", "numbers", "read_bytes", "read_head"]
 
 
 def numbers(words: Sequence[str], count: int, path: Path, line: int) -> list[float]:
@@ -44,6 +44,21 @@ def read_bytes(path: Path, most_mb: int) -> bytes:
         if path.stat().st_size > most_mb * 1_000_000:
             raise InputError(f"is larger than {most_mb} MB", where=path)
         return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+
+
+def read_head(path: Path) -> bytes:
+    """Return the first 4000 bytes of a file, which tell its format.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return file.read(4000)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Set
+from collections.abc import Callable, Mapping, Set
 from pathlib import Path
 
 from ..bundle import Camera, Network, calibrated_camera, film_camera
@@ -14,9 +14,18 @@ from ..io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Ne
 from .bal import read_bal
 from .bundler import is_bundler, read_bundler
 from .colmap import read_colmap
+from .libmv import is_libmv, read_libmv
+from .lines import read_head
+from .metashape import is_metashape, read_metashape
 from .photomodeler import read_photomodeler
 
 __all__ = ["calibration_files", "read_foreign", "read_network"]
+
+# Formats that the first bytes tell, and their readers.
+_BINARY_OR_XML: tuple[tuple[Callable[[bytes], bool], Callable[[Path], Network]], ...] = (
+    (is_metashape, read_metashape),
+    (is_libmv, read_libmv),
+)
 
 
 def read_network(path: Path | str, calibrations: Mapping[str, Path | str] | None = None) -> Network:
@@ -127,7 +136,8 @@ def read_foreign(path: Path | str) -> Network:
     Parameters
     ----------
     path : Path or str
-        Text export of PhotoModeler, BAL or Bundler file, or folder with COLMAP's text or binary files.
+        Text export of PhotoModeler, BAL or Bundler file, XML or ``.psz`` of Metashape, problem of libmv, or
+        folder with COLMAP's text or binary files.
 
     Raises
     ------
@@ -150,6 +160,10 @@ def read_foreign(path: Path | str) -> Network:
         return read_colmap(path)
     if not path.exists():
         raise InputError("does not exist", where=path)
+    head = read_head(path)
+    for recognise, read in _BINARY_OR_XML:
+        if recognise(head):
+            return read(path)
     lines = read_text(path).splitlines()
     first = lines[0].split() if lines else []
     if lines and is_bundler(lines[0]):
@@ -161,5 +175,5 @@ def read_foreign(path: Path | str) -> Network:
     raise FormatError(
         "is not a network of a known program",
         where=path,
-        do="use reseau-network/1, PhotoModeler, BAL, Bundler or COLMAP",
+        do="use reseau-network/1, PhotoModeler, BAL, Bundler, COLMAP, Metashape or libmv",
     )
