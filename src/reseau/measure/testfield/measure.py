@@ -455,7 +455,9 @@ class _Measurement:
         Start between the lines, where the mapping is known, and continue outwards.
         """
         every = max(_MOST_FIRST, int(_FIRST_SHARE * self.inside.sum()))
-        for beyond, most in ((_BEYOND, _MOST_FIRST), (np.inf, every)):
+        # Where many are wanted, a first mapping by fewer of them is sufficient.
+        few = _MOST_FIRST if every > 2 * _MOST_FIRST else every
+        for beyond, most in ((_BEYOND, few), (np.inf, every)):
             candidates = np.flatnonzero(self.inside & self.scene.design.large[self.rows])
             out = np.abs(self.at[self.rows[candidates]] - self.middle) - self.half
             candidates = candidates[(out <= beyond).all(axis=1)]
