@@ -80,6 +80,8 @@ _FORMED_PX = 0.002
 """Standard deviation of what no formed image contains: edges of prints, unequal pixels."""
 _EXPLAINED = 0.7
 """Ratio of residuals below which a curve explains what looked like motion or sharpening."""
+_WHOLE = 0.97
+"""Share of the pixels of a mark below which it is seen in part."""
 _PER_TERM = 2.0
 """Least number of matched marks for each term of the polynomial of their mapping."""
 _PSF_LOG_SIGMA = 0.2
@@ -271,6 +273,8 @@ class PlaneMarks(ABC):
             self._uncover(rows, found, doubtful, field)
             found = replaced(found, ~doubtful, self._match_all(rows[doubtful]))
         found = with_alike_errors(found)
+        if self.precise_start:
+            found = self._with_doubtful_light(rows, found)
         found = replace(found, cov=found.cov + self.formed_px**2 * np.eye(2))
         why, field = self._judged(rows, found)
         return self._spread(rows, found, why, field)
@@ -284,6 +288,31 @@ class PlaneMarks(ABC):
         h, w = self.screened.grey.shape
         inside = ((self.start > 0) & (self.start < (w - 1, h - 1))).all(axis=1)
         return np.flatnonzero(inside)
+
+    def _with_doubtful_light(self, rows: Rows, found: Matches) -> Matches:
+        """Matches with covariances that contain what a plainer background would change.
+
+        Where a part of a window is saturated or hidden, it is no longer symmetric about its mark, and errors
+        of the background shift the position.
+        """
+        used = np.isfinite(found.residuals).sum(axis=(1, 2)) / max(found.residuals[0].size, 1)
+        whole = np.array(self._region_sizes(rows, found), dtype=np.float64)
+        partly = found.converged & (used < _WHOLE * whole)
+        if not partly.any():
+            return found
+        plain = self._match(rows[partly], background=1)
+        change = np.where(plain.converged[:, None], plain.xy - found.xy[partly], 0.0)
+        cov = found.cov.copy()
+        cov[partly] += change[:, :, None] * change[:, None, :]
+        # The change shows the size of the error, not its direction.
+        cov[partly] += 0.5 * (change**2).sum(axis=1)[:, None, None] * np.eye(2)
+        return replace(found, cov=cov)
+
+    def _region_sizes(self, rows: Rows, found: Matches) -> Array:
+        """Share (k,) of the pixels of the windows, all of one size, that belong to the marks."""
+        high, wide = (n // 2 for n in found.residuals.shape[1:])
+        region = self._region(rows, (wide, high))
+        return np.ones(len(rows)) if region is None else np.asarray(region.mean(axis=(1, 2)))
 
     def _match_all(self, rows: Rows) -> Matches:
         """Match disks; on even paper where paper is saturated all around."""
