@@ -52,7 +52,13 @@ def test_photographs_of_one_name_are_refused() -> None:
         calibrate_camera(twice, BENCH.design, measure)
 
 
-def test_photographs_of_two_sizes_are_refused() -> None:
-    small = Frame(np.zeros((120, 240), dtype=np.uint8), 255.0, "small", "0")
-    with pytest.raises(UsageError, match="is not 240×240 pixels"):
-        calibrate_camera([blank(next(iter(STATIONS))), small], BENCH.design, measure)
+def test_photographs_of_another_size_or_that_cannot_be_read_do_not_end_the_others() -> None:
+    last = list(STATIONS)[-1]
+    small = Frame(np.zeros((120, 240), dtype=np.uint8), 255.0, last, "0")
+    lost = ("lost", Failure("is a truncated image", Code.DECLINED, where="lost"))
+    frames = [small, lost, *(blank(name) for name in list(STATIONS)[:-1])]
+    model = CameraOptions(pitch_mm=(0.027, 0.027), free=("c",))
+    found = calibrate_camera(frames, BENCH.design, measure, model=model)
+    assert isinstance(found, Calibrated)
+    assert found.declined == {"lost": "is a truncated image", last: "is 240×120 pixels, not 240×240"}
+    assert len(found.measured) == 3

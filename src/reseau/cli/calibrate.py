@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..core.errors import UsageError
+from ..core.errors import ImageError, UsageError
+from ..core.failure import Code, Failure
 from .bundle_compare import read_lens
 from .bundle_options import (
     ComponentsOf,
@@ -44,10 +45,10 @@ from .measure import Channel
 if TYPE_CHECKING:
     from ..bundle import BoardChoice, Kind, ModelChoice
     from ..calibration import CameraMapping, FieldDifference, ProjectionField
-    from ..core.data import Frame, ImagePoints
     from ..core.provenance import Provenance
     from ..procedures.calibration import Calibrated, CalibrationOptions, CameraOptions
     from ..procedures.exposures import Taken
+    from ..procedures.target_measurement import Photograph
 
 __all__ = ["calibrate"]
 
@@ -82,7 +83,7 @@ def calibrate(
     design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield, board or reseau.")],
     images: Annotated[
         list[Path] | None,
-        typer.Argument(help="Photographs of the target, or files of measured image coordinates."),
+        typer.Argument(help="Photographs of the target, folders of them, or measured image coordinates."),
     ] = None,
     camera: Annotated[
         list[str] | None,
@@ -202,19 +203,20 @@ def calibrate(
 
 def _photographs(images: list[Path], cameras: list[str]) -> tuple[dict[str, Path], dict[str, Taken]]:
     """Photographs by their names; with several cameras also when each was taken."""
+    from ..procedures.exposures import exposures_of_files, files_of, photographs_in
+
     if not cameras:
         if not images:
             raise UsageError(
                 "are missing", where="photographs", do="name IMAGES, or --camera for each camera"
             )
+        images = [file for path in images for file in (photographs_in(path) if path.is_dir() else [path])]
         named = {path.name: path for path in images}
         if len(named) < len(images):
             names = [path.name for path in images]
             twice = next(name for name in named if names.count(name) > 1)
             raise UsageError("two photographs have this name", where=twice)
         return named, {}
-    from ..procedures.exposures import exposures_of_files, files_of
-
     if images:
         raise UsageError("cannot be combined with --camera", where=images[0])
     files: dict[str, list[Path]] = {}
@@ -293,8 +295,8 @@ def _write_report(
 
 def _frames(
     photographs: Mapping[str, Path], channel: Channel, sensor: Path | None, step: Callable[[str], None]
-) -> Iterator[Frame | tuple[str, ImagePoints]]:
-    """Photographs, or measured image coordinates, in order."""
+) -> Iterator[Photograph]:
+    """Photographs, or measured image coordinates, in order; why a photograph cannot be used."""
     from ..io import is_points, read_measurement
 
     for name, path in photographs.items():
@@ -302,7 +304,11 @@ def _frames(
         if is_points(path):
             yield name, read_measurement(path).image_points()
         else:
-            yield replace(corrected(read_frame(path, channel.value), sensor), name=name)
+            try:
+                yield replace(corrected(read_frame(path, channel.value), sensor), name=name)
+            except ImageError as error:
+                # One photograph does not end the calibration.
+                yield name, Failure(error.what, Code.DECLINED, where=name)
 
 
 def _camera(model: str, pitch: float | None, side: str | None, more: list[str], free: str) -> CameraOptions:

@@ -8,6 +8,7 @@ given as control points instead.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -47,7 +48,7 @@ from ..optics import CameraModel, PixelGrid, camera_model
 from ..optics.cameras import default_camera_model
 from ..optics.refraction import RefractedRays, Refraction
 from .exposures import Taken
-from .target_measurement import Measurer, measured_in_order, measurer_of
+from .target_measurement import Measurer, Photograph, measured_in_order, measurer_of
 from .z_stage import Heights
 
 if TYPE_CHECKING:
@@ -370,7 +371,7 @@ class Calibrated(Display):
 
 
 def calibrate_camera(
-    frames: Iterable[Frame | tuple[str, ImagePoints]],
+    frames: Iterable[Photograph],
     design: PlaneDesign,
     measure: Measurer,
     size: tuple[int, int] | None = None,
@@ -382,8 +383,9 @@ def calibrate_camera(
 
     Parameters
     ----------
-    frames : iterable of Frame, or of (name, ImagePoints)
-        Photographs, of one size for each camera, or measured image points.
+    frames : iterable of Frame, or of (name, ImagePoints) or (name, Failure)
+        Photographs, of one size for each camera, measured image points, or why a photograph cannot be read.
+        Those of another size than most are declined.
     design : PlaneDesign
         The target.
     measure : callable
@@ -407,7 +409,7 @@ def calibrate_camera(
     Raises
     ------
     UsageError
-        When two photographs have the same name or different sizes, the size is not known, a point to leave
+        When two photographs have the same name, the size is not known, a point to leave
         out was not measured, or windows and media contradict each other.
     """
     options = options or CalibrationOptions()
@@ -475,7 +477,7 @@ def _fixed_to_each_other(
 
 
 def _measured(
-    frames: Iterable[Frame | tuple[str, ImagePoints]],
+    frames: Iterable[Photograph],
     measure: Measurer,
     size: tuple[int, int] | None,
     taken: Mapping[str, Taken] | None,
@@ -484,9 +486,9 @@ def _measured(
     """Return the image points of each photograph, reasons of declined ones, and image sizes by camera."""
     names = set[str]()
     every = {each.camera for each in taken.values()} if taken else {_CAMERA}
-    sizes = {} if size is None else dict.fromkeys(every, size)
+    seen: dict[str, tuple[int, int]] = {}
 
-    def checked() -> Iterator[Frame | tuple[str, ImagePoints]]:
+    def checked() -> Iterator[Photograph]:
         for frame in frames:
             name = frame.name if isinstance(frame, Frame) else frame[0]
             if name in names:
@@ -495,11 +497,7 @@ def _measured(
                 raise UsageError("is of no known camera and exposure", where=name)
             names.add(name)
             if isinstance(frame, Frame):
-                known = sizes.setdefault(
-                    taken[name].camera if taken else _CAMERA, (frame.width, frame.height)
-                )
-                if known != (frame.width, frame.height):
-                    raise UsageError(f"is not {known[0]}×{known[1]} pixels like the others", where=name)
+                seen[name] = (frame.width, frame.height)
             yield frame
 
     measured: dict[str, ImagePoints] = {}
@@ -511,7 +509,21 @@ def _measured(
             declined[name] = f"{len(found)} points are too few"
         else:
             measured[name] = found
+    sizes = {} if size is None else dict.fromkeys(every, size)
+    for camera in every - sizes.keys():
+        own = Counter(seen[name] for name in measured if name in seen and _camera_of(name, taken) == camera)
+        if own:
+            sizes[camera] = own.most_common(1)[0][0]
+    for name in [name for name in measured if name in seen]:
+        width, height = sizes[_camera_of(name, taken)]
+        if seen[name] != (width, height):
+            del measured[name]
+            declined[name] = f"is {seen[name][0]}×{seen[name][1]} pixels, not {width}×{height}"
     return measured, declined, sizes
+
+
+def _camera_of(name: str, taken: Mapping[str, Taken] | None) -> str:
+    return taken[name].camera if taken else _CAMERA
 
 
 def _without(

@@ -11,7 +11,9 @@ from typing import NamedTuple
 
 from ..core.errors import InputError, UsageError
 
-__all__ = ["Taken", "exposures_of_files", "files_of"]
+__all__ = ["Taken", "exposures_of_files", "files_of", "photographs_in"]
+
+_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".dcm")
 
 _NUMBER = re.compile(r"\d+(?=\D*$)")
 
@@ -24,7 +26,7 @@ class Taken(NamedTuple):
 
 
 def files_of(pattern: str) -> list[Path]:
-    """Files of a folder, or that match a pattern such as ``left/*.png``, in the order of their names.
+    """Photographs of a folder, or files that match a pattern such as ``left/*.png``, by their names.
 
     Raises
     ------
@@ -38,12 +40,35 @@ def files_of(pattern: str) -> list[Path]:
     ...
     reseau.core.errors.InputError: no/such/folder/*.png: matches no file
     """
-    folder = Path(pattern)
-    paths = folder.iterdir() if folder.is_dir() else map(Path, glob(pattern))
-    found = sorted(path for path in paths if path.is_file() and not path.name.startswith("."))
+    if Path(pattern).is_dir():
+        return photographs_in(Path(pattern))
+    found = sorted(path for path in map(Path, glob(pattern)) if path.is_file())
     if not found:
-        raise InputError("has no file" if folder.is_dir() else "matches no file", where=pattern)
+        raise InputError("matches no file", where=pattern)
     return found
+
+
+def photographs_in(folder: Path) -> list[Path]:
+    """Images in a folder, in the order of their names; without any, its files of image coordinates (CSV).
+
+    Raises
+    ------
+    InputError
+        When there is neither.
+
+    Examples
+    --------
+    >>> photographs_in(Path("src/reseau/optics"))
+    Traceback (most recent call last):
+    ...
+    reseau.core.errors.InputError: src/reseau/optics: has no photograph
+    """
+    files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    for suffixes in (_IMAGES, (".csv",)):
+        found = [path for path in files if path.suffix.lower() in suffixes]
+        if found:
+            return found
+    raise InputError("has no photograph", where=folder)
 
 
 def exposures_of_files(files: Mapping[str, Sequence[Path]]) -> dict[str, tuple[Path, Taken]]:

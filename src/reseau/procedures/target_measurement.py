@@ -27,10 +27,12 @@ from ..measure import (
 )
 from ..measure.points import Measured
 
-__all__ = ["Measurer", "drawing_overlays", "measured_in_order", "measurer_of"]
+__all__ = ["Measurer", "Photograph", "drawing_overlays", "measured_in_order", "measurer_of"]
 
 Measurer = Callable[[Frame], Measured | Failure]
 """A function that measures a target in a frame."""
+Photograph = Frame | tuple[str, ImagePoints | Failure]
+"""A frame, the points measured in it by its name, or why it cannot be read."""
 # Frames queued for each process, so that none is idle.
 _AHEAD = 2
 
@@ -88,14 +90,14 @@ def _drawn(measure: Measurer, files: Mapping[str, Path], frame: Frame) -> Measur
 
 
 def measured_in_order(
-    frames: Iterable[Frame | tuple[str, ImagePoints]], measure: Measurer, workers: int = 1
+    frames: Iterable[Photograph], measure: Measurer, workers: int = 1
 ) -> Iterator[tuple[str, ImagePoints | Failure]]:
     """Yield names of frames with their measured points, in the order of the frames.
 
     Parameters
     ----------
-    frames : iterable of Frame, or of (name, ImagePoints)
-        Read when needed; points that were measured before are passed on.
+    frames : iterable of Frame, or of (name, ImagePoints) or (name, Failure)
+        Read when needed; points that were measured before, and failures to read a frame, are passed on.
     measure : callable
         Measures a frame; must be picklable with several processes.
     workers : int
@@ -117,7 +119,7 @@ def measured_in_order(
             yield (frame.name, work(frame)) if isinstance(frame, Frame) else frame
         return
     pool = ProcessPoolExecutor(workers, mp_context=process_context([__name__]), initializer=_one_thread)
-    waiting: deque[tuple[str, ImagePoints | Future[ImagePoints | Failure]]] = deque()
+    waiting: deque[tuple[str, ImagePoints | Failure | Future[ImagePoints | Failure]]] = deque()
     try:
         for frame in frames:
             waiting.append((frame.name, pool.submit(work, frame)) if isinstance(frame, Frame) else frame)
@@ -144,10 +146,10 @@ def _points(measure: Measurer, frame: Frame) -> ImagePoints | Failure:
 
 
 def _next(
-    waiting: deque[tuple[str, ImagePoints | Future[ImagePoints | Failure]]],
+    waiting: deque[tuple[str, ImagePoints | Failure | Future[ImagePoints | Failure]]],
 ) -> tuple[str, ImagePoints | Failure]:
     name, found = waiting.popleft()
-    if isinstance(found, ImagePoints):
+    if isinstance(found, ImagePoints | Failure):
         return name, found
     try:
         return name, found.result()
