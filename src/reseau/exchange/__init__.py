@@ -9,6 +9,7 @@ from .calibrations import export_calibration, import_calibration
 from .codev import read_codev
 from .colmap import read_colmap
 from .control import read_control
+from .dbat import read_dbat
 from .film import FilmMarks, metashape_script, read_film_marks, read_micmac, write_micmac
 from .lenses import Lens, read_lens
 from .libmv import read_libmv
@@ -30,6 +31,7 @@ __all__ = [
     "read_codev",
     "read_colmap",
     "read_control",
+    "read_dbat",
     "read_film_marks",
     "read_foreign",
     "read_lens",

@@ -14,6 +14,7 @@ from ..io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Ne
 from .bal import read_bal
 from .bundler import is_bundler, read_bundler
 from .colmap import read_colmap
+from .dbat import is_dbat, read_dbat
 from .libmv import is_libmv, read_libmv
 from .lines import read_head
 from .metashape import is_metashape, read_metashape
@@ -24,6 +25,7 @@ __all__ = ["calibration_files", "read_foreign", "read_network"]
 # Formats that the first bytes tell, and their readers.
 _BINARY_OR_XML: tuple[tuple[Callable[[bytes], bool], Callable[[Path], Network]], ...] = (
     (is_metashape, read_metashape),
+    (is_dbat, read_dbat),
     (is_libmv, read_libmv),
 )
 
@@ -136,8 +138,8 @@ def read_foreign(path: Path | str) -> Network:
     Parameters
     ----------
     path : Path or str
-        Text export of PhotoModeler, BAL or Bundler file, XML or ``.psz`` of Metashape, problem of libmv, or
-        folder with COLMAP's text or binary files.
+        Text export of PhotoModeler, BAL or Bundler file, XML or ``.psz`` of Metashape, project of DBAT,
+        problem of libmv, or folder with COLMAP's text or binary files.
 
     Raises
     ------
@@ -175,5 +177,5 @@ def read_foreign(path: Path | str) -> Network:
     raise FormatError(
         "is not a network of a known program",
         where=path,
-        do="use reseau-network/1, PhotoModeler, BAL, Bundler, COLMAP, Metashape or libmv",
+        do="use reseau-network/1, PhotoModeler, BAL, Bundler, COLMAP, Metashape, DBAT or libmv",
     )
