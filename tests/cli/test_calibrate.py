@@ -236,13 +236,13 @@ def test_photographs_without_an_image_are_named_in_one_line(reseau: Run, tmp_pat
         assert f"{name}.png: is all of one grey" in err
 
 
-def test_an_error_in_a_worker_process_is_reported_in_one_line(reseau: Run, tmp_path: Path) -> None:
+def test_photographs_of_which_none_can_be_read_are_reported_in_one_line(reseau: Run, tmp_path: Path) -> None:
     FieldBench(seed=4).design.write(tmp_path / "field.json")
     for name in "abc":
         (tmp_path / f"{name}.png").write_text("no image")
     images = sorted(tmp_path.glob("*.png"))
     status, out, err = reseau("calibrate", *images, "-d", tmp_path / "field.json", "--jobs", 2)
-    assert (status, out) == (2, "")
+    assert (status, out) == (1, "")
     assert err.count("\n") == 1
     assert "a.png" in err
 
