@@ -98,7 +98,7 @@ def test_control_check_points_sigmas_and_free_parameters(tmp_path: Path) -> None
     network = read_dbat(project(tmp_path))
     assert network.role[:4] == ("control", "check", "check", "control")
     assert network.datum == "control"
-    np.testing.assert_array_equal(network.sigma[0], [0.02, 0.02, 0.04])
+    np.testing.assert_array_equal(network.sigma[:2], [[0.02, 0.02, 0.04], [np.nan] * 3])
     np.testing.assert_array_equal(network.cov[0], np.diag([0.0625, 0.0625]))
     assert network.cameras[0].free == ("c", "x0", "y0", "K1", "K2", "P1", "P2")
 

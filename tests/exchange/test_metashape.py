@@ -126,7 +126,7 @@ def test_markers_are_control_points_with_their_accuracies_and_check_points_where
     network = read_metashape(written(tmp_path, document()))
     assert network.points[:2] == ("P0", "P1")
     assert network.role == ("check", *("control",) * 14)
-    np.testing.assert_array_equal(network.sigma[:2], [[0.01, 0.01, 0.01], [0.02, 0.02, 0.04]])
+    np.testing.assert_array_equal(network.sigma[:2], [[np.nan] * 3, [0.02, 0.02, 0.04]])
     assert network.datum == "control"
     assert network.unit == "m"
     np.testing.assert_allclose(network.cov[0], np.diag([0.04, 0.04]), atol=1e-12)

@@ -145,7 +145,9 @@ def read_dbat(path: Path | str) -> Network:
     for kind, found in control.items():
         for name, (at, accuracy) in found.items():
             if name in order:
-                xyz[order[name]], sigma[order[name]], role[order[name]] = at, accuracy, kind
+                # A check point is compared with its coordinates, which are no observations.
+                observed = accuracy if kind == "control" else np.full(3, np.nan)
+                xyz[order[name]], sigma[order[name]], role[order[name]] = at, observed, kind
     network = replace(network, xyz=xyz, sigma=sigma, role=tuple(role))
     return replace(network, datum="control") if role.count("control") >= 3 else network
 

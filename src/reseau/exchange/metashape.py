@@ -300,7 +300,8 @@ class _Chunk:
                 raise FormatError("has an accuracy that is not positive", where=given.where)
             found[f"marker:{node.attribute('id')}"] = (
                 np.array([given.number(axis) for axis in "xyz"]),
-                np.array(sigma),
+                # A check point is compared with its coordinates, which are no observations.
+                np.array(sigma) if _on(given) else np.full(3, np.nan),
                 "control" if _on(given) else "check",
             )
         return found
