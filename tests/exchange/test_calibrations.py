@@ -12,12 +12,13 @@ import pytest
 import yaml
 
 from reseau.calibration import Calibration
-from reseau.calibration.document import Covariance, Quantity
+from reseau.calibration.document import Covariance, Place, Quantity
 from reseau.core.data import Array
 from reseau.core.errors import FormatError, UsageError
-from reseau.exchange import export_calibration, import_calibration
+from reseau.exchange import export_calibration, export_rig, import_calibration
 from reseau.exchange.calibrations import calibration_formats
 from reseau.optics.cameras import unit_of
+from reseau.optics.poses import rotation_matrix
 
 SIZE = (1280, 960)
 CENTRE = {"fx": 1010.0, "fy": 1008.0, "cx": 652.3, "cy": 470.8}
@@ -217,6 +218,60 @@ def test_broken_files_are_told_in_one_line(name: str, text: str, said: str, tmp_
     with pytest.raises(FormatError, match=said) as error:
         import_calibration(tmp_path / name)
     assert "\n" not in str(error.value)
+
+
+TURN, BASE = np.array([0.02, 0.1, -0.01]), np.array([90.0, 2.0, -4.0])
+
+
+def placed(camera: str, reference: str, turn: Array, base: Array) -> Calibration:
+    place = Place(
+        reference=reference, rotation=tuple(turn.tolist()), base=tuple(base.tolist()), unit="mm",
+        covariance=tuple(tuple(row) for row in (1e-8 * np.eye(6)).tolist()),
+    )  # fmt: skip
+    return calibration(camera).model_copy(update={"place": place})
+
+
+def test_opencv_reads_a_pair_and_projects_the_same_points_into_both_images(tmp_path: Path) -> None:
+    pair = [placed("five", "radial", TURN, BASE), calibration("radial")]
+    export_rig(pair, "opencv", tmp_path / "pair.yml")
+    storage = cv2.FileStorage(str(tmp_path / "pair.yml"), cv2.FILE_STORAGE_READ)
+    m2, d2, turn, shift = (storage.getNode(name).mat() for name in ("M2", "D2", "R", "T"))
+    assert storage.getNode("D1").mat().ravel() == pytest.approx([-0.21, 0.07, 8e-4, -6e-4, 0.0])
+    points = np.column_stack([400 * directions(), np.full(63, 800.0)])
+    seen, _ = cv2.projectPoints(points, cv2.Rodrigues(turn)[0], shift, m2, d2)
+    own = (points - BASE) @ rotation_matrix(TURN).T
+    mapping = calibration("five").mapping()
+    expected = mapping.to_pixels(own[:, :2] / own[:, 2:])  # type: ignore[attr-defined]
+    assert np.abs(seen.reshape(-1, 2) - expected).max() < 1e-8
+
+
+def test_a_chain_of_kalibr_leads_from_each_camera_to_the_next(tmp_path: Path) -> None:
+    rig = [
+        calibration("radial"), placed("fisheye", "radial", TURN, BASE),
+        placed("omni", "radial", -2 * TURN, -3 * BASE),
+    ]  # fmt: skip
+    export_rig(rig, "kalibr", tmp_path / "chain.yaml")
+    chain = yaml.safe_load((tmp_path / "chain.yaml").read_text())
+    point = np.array([0.3, -0.2, 1.5])
+    at = np.append(point, 1.0)
+    for k, (turn, base) in enumerate(((TURN, BASE), (-2 * TURN, -3 * BASE)), start=1):
+        at = np.array(chain[f"cam{k}"]["T_cn_cnm1"]) @ at
+        assert np.abs(at[:3] - rotation_matrix(turn) @ (point - 1e-3 * base)).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("cameras", "to", "said"),
+    [
+        (("radial", "five"), "kalibr", "are not those of one rig: 2 have no place"),
+        (("radial", "five"), "ros", "has no cameras that are fixed to each other"),
+    ],
+)
+def test_calibrations_that_are_no_rig_are_refused(
+    cameras: tuple[str, ...], to: str, said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError, match=said):
+        export_rig([calibration(camera) for camera in cameras], to, tmp_path / "x")
+    assert not (tmp_path / "x").exists()
 
 
 def test_an_unknown_format_is_refused(tmp_path: Path) -> None:

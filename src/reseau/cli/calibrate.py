@@ -188,7 +188,8 @@ def calibrate(
     )  # fmt: skip
     differences = _differences(done, others)
     calibrations = [
-        done.calibration(target.name, provenance.to_dict(), entry.id) for entry in done.result.network.cameras
+        done.calibration(entry.id if taken else target.name, provenance.to_dict(), entry.id)
+        for entry in done.result.network.cameras
     ]
     if report is not None:
         _write_report(report, done, f"Calibration with {target.name}", provenance, differences, distance)

@@ -17,8 +17,9 @@ def export(
     files: Annotated[
         list[Path],
         typer.Argument(
-            help="A calibration of a camera, ours or of another program, for --to; or oriented scans of "
-            "one camera: results of `reseau measure fiducials`, `reseau orient` or `reseau measure reseau`."
+            help="For --to a calibration of a camera, ours or of another program, or those of a rig; or "
+            "oriented scans of one camera: results of `reseau measure fiducials`, `reseau orient` or "
+            "`reseau measure reseau`."
         ),
     ],
     to: Annotated[
@@ -66,24 +67,31 @@ def export(
 
 
 def _calibration(files: list[Path], to: str | None, out: Path | None) -> None:
-    """Write one calibration in a format."""
+    """Write a calibration, or those of a rig, in a format."""
     from ..calibration import Calibration
-    from ..exchange import export_calibration, import_calibration
+    from ..exchange import export_calibration, export_rig, import_calibration
     from ..io import read_text
 
-    if len(files) != 1 or to is None or out is None:
-        raise UsageError("writes one calibration", where="--to", do="give a file, --to FORMAT and --out FILE")
-    source = files[0]
-    ours = source.suffix.lower() == ".json" and '"reseau-calibration/' in read_text(source)[:4096]
-    calibration = Calibration.read(source) if ours else import_calibration(source)
+    if to is None or out is None:
+        raise UsageError("are both required", where="--to FORMAT and --out FILE")
+    calibrations = []
+    for source in files:
+        ours = source.suffix.lower() == ".json" and '"reseau-calibration/' in read_text(source)[:4096]
+        calibrations.append(Calibration.read(source) if ours else import_calibration(source))
     writable(out)
-    if to == "reseau":
+    calibration = calibrations[0]
+    if len(calibrations) > 1:
+        written = export_rig(calibrations, to, out)
+    elif to == "reseau":
         calibration.write(out)
         say(f"{out}: {calibration.model.get('model', calibration.kind)}\n")
         return
-    done = export_calibration(calibration, to, out)
-    say(f"{out}: {done.camera.model}\n")
-    if done.greatest_px > 0:
-        say(f"  differs from the calibration by {done.rms_px:.2g} px rms, {done.greatest_px:.2g} px at most")
-        rest = "" if done.share == 1 else f"; not compared in {100 * (1 - done.share):.2g} % of the image"
-        say(f"{rest}\n")
+    else:
+        written = (export_calibration(calibration, to, out),)
+    for done in written:
+        name = f" {done.camera.name}" if len(written) > 1 else ""
+        say(f"{out}:{name} {done.camera.model}\n")
+        if done.greatest_px > 0:
+            say(f"  differs from the calibration by {done.rms_px:.2g} px rms, {done.greatest_px:.2g} at most")
+            rest = "" if done.share == 1 else f"; not compared in {100 * (1 - done.share):.2g} % of the image"
+            say(f"{rest}\n")

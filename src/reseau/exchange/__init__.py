@@ -5,7 +5,7 @@ from __future__ import annotations
 from .bal import read_bal
 from .boards import read_board
 from .bundler import read_bundler
-from .calibrations import export_calibration, import_calibration
+from .calibrations import export_calibration, export_rig, import_calibration
 from .codev import read_codev
 from .colmap import read_colmap
 from .control import read_control
@@ -23,6 +23,7 @@ __all__ = [
     "Lens",
     "calibration_files",
     "export_calibration",
+    "export_rig",
     "import_calibration",
     "metashape_script",
     "read_bal",

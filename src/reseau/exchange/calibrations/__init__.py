@@ -4,14 +4,23 @@ A format is one module: which registered camera models it holds, how it is writt
 camera whose model a format lacks is converted, with the differences over the image stated.
 """
 
-from .formats import CalibrationFormat, Exported, calibration_formats, export_calibration, import_calibration
-from .plain import PlainCamera
+from .formats import (
+    CalibrationFormat,
+    Exported,
+    calibration_formats,
+    export_calibration,
+    export_rig,
+    import_calibration,
+)
+from .plain import Mounted, PlainCamera
 
 __all__ = [
     "CalibrationFormat",
     "Exported",
+    "Mounted",
     "PlainCamera",
     "calibration_formats",
     "export_calibration",
+    "export_rig",
     "import_calibration",
 ]

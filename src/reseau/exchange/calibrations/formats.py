@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from ...calibration import Calibration, CameraMapping
 from ...calibration.document import Covariance, Quantity
@@ -14,14 +16,16 @@ from ...core.provenance import Provenance, sha256_of
 from ...io import read_text, write_whole
 from ...optics import PixelGrid
 from ...optics.cameras import camera_model, convert, unit_of
+from ...optics.poses import rotation_matrix
 from . import colmap, matlab, metashape, mrcal, opencv, yamls
-from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, PlainCamera
+from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, Mounted, PlainCamera
 
 __all__ = [
     "CalibrationFormat",
     "Exported",
     "calibration_formats",
     "export_calibration",
+    "export_rig",
     "import_calibration",
 ]
 
@@ -176,6 +180,65 @@ def export_calibration(calibration: Calibration, to: str, path: Path | str) -> E
     found = _in_a_model_of(formats[to], calibration, lens)
     write_whole(Path(path), formats[to].write(found.camera))
     return found
+
+
+def export_rig(calibrations: Sequence[Calibration], to: str, path: Path | str) -> tuple[Exported, ...]:
+    """Write the calibrations of cameras that are fixed to each other in one file of another program.
+
+    Parameters
+    ----------
+    calibrations : sequence of Calibration
+        One of them is the reference, all others have a `place` with respect to it.
+    to : str
+        ``opencv``, for two cameras, or ``kalibr``.
+    path : path
+        File to write; OpenCV's translation is in mm, Kalibr's in m.
+
+    Returns
+    -------
+    tuple of Exported
+        The cameras, the reference first.
+
+    Raises
+    ------
+    UsageError
+        When the format has no rigs, or the calibrations are not those of one rig.
+    InputError
+        When the file cannot be written.
+
+    Examples
+    --------
+    >>> export_rig([], "kalibr", "chain.yaml")
+    Traceback (most recent call last):
+    ...
+    reseau.core.errors.UsageError: calibrations: are not those of one rig: 0 have no place; give ...
+    """
+    if to not in ("opencv", "kalibr"):
+        raise UsageError("has no cameras that are fixed to each other; use opencv or kalibr", where=to)
+    first = [each for each in calibrations if each.place is None]
+    placed = [each for each in calibrations if each.place is not None]
+    units = {each.place.unit for each in placed if each.place is not None}
+    if len(first) != 1 or not placed or len({each.place.reference for each in placed if each.place}) > 1:
+        raise UsageError(
+            f"are not those of one rig: {len(first)} have no place", where="calibrations",
+            do="give its reference and the cameras placed with respect to it",
+        )  # fmt: skip
+    if units != {"mm"}:
+        raise UsageError(f"have places in {', '.join(sorted(units))}, not in mm", where="calibrations")
+    if to == "opencv" and len(placed) > 1:
+        raise UsageError("holds two cameras", where=to, do="use kalibr, or write pairs")
+    form, done, rig = calibration_formats()[to], list[Exported](), list[Mounted]()
+    for each in (*first, *placed):
+        lens = each.mapping()
+        if not isinstance(lens, CameraMapping):
+            raise UsageError(each.not_of("camera"), where=each.name)
+        done.append(_in_a_model_of(form, each, lens))
+        place = each.place
+        turn = np.eye(3) if place is None else rotation_matrix(np.array(place.rotation))
+        rig.append(Mounted(done[-1].camera, turn, np.zeros(3) if place is None else np.array(place.base)))
+    text = opencv.write_pair(rig[0], rig[1]) if to == "opencv" else yamls.write_kalibr_rig(rig)
+    write_whole(Path(path), text)
+    return tuple(done)
 
 
 def _in_a_model_of(form: CalibrationFormat, calibration: Calibration, lens: CameraMapping) -> Exported:

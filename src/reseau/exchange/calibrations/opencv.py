@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from ...core.errors import FormatError
-from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, PlainCamera, opencv_camera
+from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, Mounted, PlainCamera, opencv_camera
 
-__all__ = ["read", "recognises", "write"]
+__all__ = ["coefficients", "read", "recognises", "write", "write_pair"]
 
 
 def write(camera: PlainCamera) -> str:
@@ -29,6 +29,23 @@ def write(camera: PlainCamera) -> str:
     storage.write("distortion_model", "fisheye" if camera.model == "fisheye" else "opencv")
     storage.write("camera_matrix", np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
     storage.write("distortion_coefficients", np.array(coefficients(camera)).reshape(-1, 1))
+    return storage.releaseAndGetString()
+
+
+def write_pair(left: Mounted, right: Mounted) -> str:
+    """Return the text of a YAML file with the keys of OpenCV's sample of stereo calibration.
+
+    A point of the left camera is x' = R x + T in the right one, mm.
+    """
+    storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("image_width", left.camera.width)
+    storage.write("image_height", left.camera.height)
+    for number, mounted in enumerate((left, right), start=1):
+        fx, fy, cx, cy = mounted.camera.of("fx", "fy", "cx", "cy")
+        storage.write(f"M{number}", np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
+        storage.write(f"D{number}", np.array(coefficients(mounted.camera)).reshape(1, -1))
+    storage.write("R", np.ascontiguousarray(right.rotation))
+    storage.write("T", right.translation.reshape(3, 1))
     return storage.releaseAndGetString()
 
 

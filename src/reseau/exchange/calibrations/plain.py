@@ -5,17 +5,50 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
+from typing import NamedTuple
 
+import numpy as np
+
+from ...core.data import Array
 from ...core.errors import FormatError
 from ...optics import PixelGrid, PlaneMapping, camera_model
 
-__all__ = ["RADIAL_TANGENTIAL", "RATIONAL", "THIN_PRISM", "TILTED", "PlainCamera", "opencv_camera"]
+__all__ = ["RADIAL_TANGENTIAL", "RATIONAL", "THIN_PRISM", "TILTED", "Mounted", "PlainCamera", "opencv_camera"]
 
 RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2")
 RATIONAL = (*RADIAL_TANGENTIAL, "k3", "k4", "k5", "k6")
 THIN_PRISM = (*RATIONAL, "s1", "s2", "s3", "s4")
 TILTED = (*THIN_PRISM, "tau_x", "tau_y")
 """Coefficients of OpenCV's model in the order of OpenCV: 4, 8, 12 and 14 of them."""
+
+
+class Mounted(NamedTuple):
+    """A camera of a rig: x_c = R (x − b) of a point x in the axes of its first camera.
+
+    Parameters
+    ----------
+    camera : PlainCamera
+        The camera.
+    rotation : ndarray (3, 3)
+        R, from the axes of the first camera to its own.
+    base : ndarray (3,)
+        b, its projection centre, mm.
+
+    Examples
+    --------
+    >>> camera = PlainCamera("left", 640, 480, "opencv", {"fx": 800.0, "fy": 800.0})
+    >>> Mounted(camera, np.eye(3), np.array([120.0, 0.0, 0.0])).translation
+    array([-120.,   -0.,   -0.])
+    """
+
+    camera: PlainCamera
+    rotation: Array
+    base: Array
+
+    @property
+    def translation(self) -> Array:
+        """t of x_c = R x + t, mm."""
+        return np.asarray(-self.rotation @ self.base)
 
 
 @dataclass(frozen=True)

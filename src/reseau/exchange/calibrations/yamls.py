@@ -7,16 +7,18 @@ distortion, ``omni`` with ``radtan``, ``ds`` without. Pixels are counted from th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from ...core.errors import FormatError
 from .opencv import coefficients
-from .plain import RADIAL_TANGENTIAL, PlainCamera, opencv_camera
+from .plain import RADIAL_TANGENTIAL, Mounted, PlainCamera, opencv_camera
 
-__all__ = ["is_kalibr", "is_ros", "read_kalibr", "read_ros", "write_kalibr", "write_ros"]
+__all__ = ["is_kalibr", "is_ros", "read_kalibr", "read_ros", "write_kalibr", "write_kalibr_rig", "write_ros"]
 
 _ROS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,), "fisheye": (4,)}
 
@@ -86,6 +88,27 @@ def read_ros(text: str, path: Path) -> PlainCamera:
 
 def write_kalibr(camera: PlainCamera) -> str:
     """Return the text of a ``camchain`` file with one camera."""
+    return _chain([_entry(camera)])
+
+
+def write_kalibr_rig(rig: Sequence[Mounted]) -> str:
+    """Return the text of a ``camchain`` file; ``T_cn_cnm1`` maps from the camera before to the camera, m."""
+    entries = [_entry(mounted.camera) for mounted in rig]
+    for before, after, entry in zip(rig[:-1], rig[1:], entries[1:], strict=True):
+        matrix = np.eye(4)
+        matrix[:3, :3] = after.rotation @ before.rotation.T
+        matrix[:3, 3] = 1e-3 * (after.translation - matrix[:3, :3] @ before.translation)
+        entry["T_cn_cnm1"] = matrix.tolist()
+    return _chain(entries)
+
+
+def _chain(entries: list[dict[str, Any]]) -> str:
+    content = {f"cam{k}": entry for k, entry in enumerate(entries)}
+    text: str = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+    return text
+
+
+def _entry(camera: PlainCamera) -> dict[str, Any]:
     centre = camera.of("fx", "fy", "cx", "cy")
     kind, own = {"omni": ("omni", ["xi"]), "double_sphere": ("ds", ["xi", "alpha"])}.get(
         camera.model, ("pinhole", [])
@@ -93,7 +116,7 @@ def write_kalibr(camera: PlainCamera) -> str:
     distortion = {"opencv": "radtan", "fisheye": "equidistant", "omni": "radtan", "double_sphere": "none"}
     names = {"radtan": RADIAL_TANGENTIAL, "equidistant": ("k1", "k2", "k3", "k4"), "none": ()}
     model = distortion[camera.model]
-    entry = {
+    return {
         "camera_model": kind,
         "intrinsics": [*camera.of(*own), *centre],
         "distortion_model": model,
@@ -101,8 +124,6 @@ def write_kalibr(camera: PlainCamera) -> str:
         "resolution": [camera.width, camera.height],
         "rostopic": f"/{camera.name}/image_raw",
     }
-    text: str = yaml.safe_dump({"cam0": entry}, sort_keys=False, default_flow_style=None)
-    return text
 
 
 def is_kalibr(text: str) -> bool:

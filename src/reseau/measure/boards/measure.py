@@ -88,7 +88,7 @@ class BoardResult(Measured):
 def measure_board(
     frame: Frame, design: BoardDesign, options: BoardOptions | None = None
 ) -> BoardResult | Failure:
-    """Measure the points of a chessboard, a ChArUco board, a circle grid or an AprilGrid.
+    """Measure the points of a chessboard, a ChArUco board or a circle grid.
 
     Parameters
     ----------
@@ -108,6 +108,8 @@ def measure_board(
     ------
     ImageError
         When the frame is all black, saturated, or of one grey.
+    UsageError
+        For an AprilGrid, which can be drawn only.
 
     Examples
     --------
