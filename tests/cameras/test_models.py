@@ -184,10 +184,19 @@ def test_a_model_describes_its_parameters(case: Case) -> None:
 
 
 @EVERY
-def test_the_model_is_converted_to_itself_and_to_every_other_model(case: Case) -> None:
+def test_the_model_is_converted_to_itself_and_to_that_of_opencv(case: Case) -> None:
     camera = case.mapping()
     same = convert(camera, GRID, case.model.name, case.options)
     assert same.greatest_px < 1e-6
+    other = convert(camera, GRID, "opencv")
+    assert other.share == 1
+    assert other.greatest_px < 3 * BEND
+
+
+@pytest.mark.slow
+@EVERY
+def test_the_model_is_converted_to_every_other_model(case: Case) -> None:
+    camera = case.mapping()
     for model in camera_models():
         other = convert(camera, GRID, model.name)
         assert other.share == 1

@@ -143,3 +143,19 @@ def test_too_few_candidates_give_no_grid(count):
     few = Candidates(np.full((count, 2), 50.0) + np.arange(count)[:, None], np.full(count, 9.0))
     assert assign(design(), seen(design()), few, VALID) is None
     assert place_grid(design(), few, VALID, GridOptions()) is None
+
+
+def test_places_along_the_wires_do_not_hide_the_crossings_a_quarter_of_a_pitch_beside_them() -> None:
+    """Nominal positions are off by (−7, 9) px; all along the wires weak places support other shifts."""
+    pitch, rng = 97.0, np.random.default_rng(3)
+    design = np.stack(np.meshgrid(np.arange(11.0), np.arange(9.0)), axis=-1).reshape(-1, 2)
+    crossings = design * pitch + [90.0, 70.0]
+    along = [crossings + np.array([step, 0.7]) for step in (20.0, 22.5, 25.0, 27.5, 30.0)]
+    weak = np.concatenate(along) + rng.normal(0, 0.3, (5 * len(design), 2))
+    xy = np.concatenate([crossings + rng.normal(0, 0.2, crossings.shape), weak])
+    t = np.concatenate([np.linspace(290.0, 115.0, len(design)), np.linspace(34.0, 27.0, len(weak))])
+    found = assign(
+        design, crossings + np.array([-7.0, 9.0]), Candidates(xy, t), np.ones((954, 1156), dtype=bool)
+    )
+    assert found is not None
+    assert np.abs(found.predicted - crossings).max() < 1.0

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..core.errors import ImageError, UsageError
-from ..core.failure import Code, Failure
 from .bundle_compare import read_lens
 from .bundle_options import (
     ComponentsOf,
@@ -298,6 +297,7 @@ def _frames(
     photographs: Mapping[str, Path], channel: Channel, sensor: Path | None, step: Callable[[str], None]
 ) -> Iterator[Photograph]:
     """Photographs, or measured image coordinates, in order; why a photograph cannot be used."""
+    from ..core.failure import Code, Failure
     from ..io import is_points, read_measurement
 
     for name, path in photographs.items():

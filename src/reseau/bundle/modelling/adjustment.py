@@ -117,14 +117,11 @@ def _begun(
         moved, rotation, x0 = network.stage.approximate(start.rotation, start.x0)
         start = replace(start, rotation=rotation, x0=x0, stage=moved)
     if network.rig is not None:
-        # Images that are seen through windows on the rig have no orientation without it.
-        single = network.refraction is None or not network.refraction.on_rig.any()
-        if single and not finite(network.x0[network.rig.exposure >= 0]).all():
+        if not finite(network.x0[network.rig.exposure >= 0]).all():
             start = _without_rig(network, options, start)
         odd, typical = network.rig.apart(start.rotation, start.x0)
         if len(odd) or typical > _NOT_AT_ONCE:
-            apart = single and options.outliers == "reject"
-            network, doubts = _not_at_once(network, odd, typical, apart=apart)
+            network, doubts = _not_at_once(network, odd, typical, apart=options.outliers == "reject")
     if network.rig is not None:
         places, rotation, x0 = network.rig.approximate(start.rotation, start.x0)
         start = replace(start, rotation=rotation, x0=x0, rig=places)

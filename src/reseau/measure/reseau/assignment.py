@@ -19,6 +19,9 @@ from .candidates import Candidates
 
 __all__ = ["Assignment", "assign", "in_sight", "nearest_candidates", "spacing", "voted"]
 
+# Widest search radius in the pitch; of common shifts that are closer than this, one is tried.
+_REACH = 0.2
+
 
 @dataclass(frozen=True, eq=False)
 class Assignment:
@@ -61,13 +64,17 @@ class Assignment:
             Strengths of all candidates, in descending order.
         """
         has = self.candidate >= 0
-        usual = float(np.median(t[: max(4, len(self.candidate) // 2)]))
-        likeness: Array = np.minimum(t[self.candidate[has]] / usual, 1.0)
+        likeness: Array = np.minimum(t[self.candidate[has]] / _usual(t, len(self.candidate)), 1.0)
         return likeness
 
     def support(self, t: Array) -> float:
         """The score with every mark weighted with its likeness."""
         return float(self.likeness(t).sum()) - 0.5 * self.missed
+
+
+def _usual(t: Array, marks: int) -> float:
+    """Strength that marks have, from the strengths (m,) of all candidates in descending order."""
+    return float(np.median(t[: max(4, marks // 2)]))
 
 
 def spacing(xy: Array) -> float:
@@ -110,9 +117,9 @@ def assign(
         return None
     pitch, best = spacing(start), None
     if within_px is not None:
-        return _assigned(source, start, candidates, valid, pitch, min(within_px, 0.2 * pitch))
+        return _assigned(source, start, candidates, valid, pitch, min(within_px, _REACH * pitch))
     for shift in _common_shifts(start, candidates, pitch, shifts):
-        found = _assigned(source, start + shift, candidates, valid, pitch, 0.2 * pitch)
+        found = _assigned(source, start + shift, candidates, valid, pitch, _REACH * pitch)
         if found is None:
             continue
         # At a shift of half a pitch, wires look a little like crossings everywhere, but nowhere strongly.
@@ -162,7 +169,9 @@ def in_sight(xy: Array, valid: Mask) -> Mask:
 def _common_shifts(start: Array, candidates: Candidates, pitch: float, count: int) -> Iterator[Array]:
     """Shifts of at most one pitch that most pairs of start and candidate support, the likeliest first."""
     offset = (candidates.xy[None] - start[:, None]).reshape(-1, 2)
-    weight = np.broadcast_to(np.minimum(candidates.t, 15.0), (len(start), len(candidates))).ravel()
+    # Strong places count more, up to the strength that marks have: along a wire there are many weak ones.
+    most = max(15.0, _usual(candidates.t, len(start)))
+    weight = np.broadcast_to(np.minimum(candidates.t, most), (len(start), len(candidates))).ravel()
     near = (np.abs(offset) < pitch).all(axis=1)
     votes, (x, y) = voted(offset[near], weight[near], [(-pitch, pitch)] * 2, max(1.0, pitch / 40), 2.0)
     # Of two shifts with similar support take the smaller: a grid agrees with itself at every pitch.
@@ -173,7 +182,7 @@ def _common_shifts(start: Array, candidates: Candidates, pitch: float, count: in
         if not votes[i, j] > 0.5 * most:
             return
         yield np.array([x[i], y[j]])
-        votes[np.hypot(x[:, None] - x[i], y[None] - y[j]) < 0.3 * pitch] = 0
+        votes[np.hypot(x[:, None] - x[i], y[None] - y[j]) < _REACH * pitch] = 0
 
 
 def voted(
