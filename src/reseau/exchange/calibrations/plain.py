@@ -38,7 +38,7 @@ class Mounted(NamedTuple):
     --------
     >>> camera = PlainCamera("left", 640, 480, "opencv", {"fx": 800.0, "fy": 800.0})
     >>> Mounted(camera, np.eye(3), np.array([120.0, 0.0, 0.0])).translation
-    array([-120.,   -0.,   -0.])
+    array([-120.,    0.,    0.])
     """
 
     camera: PlainCamera
@@ -48,7 +48,8 @@ class Mounted(NamedTuple):
     @property
     def translation(self) -> Array:
         """t of x_c = R x + t, mm."""
-        return np.asarray(-self.rotation @ self.base)
+        # A sum with 0 has no negative zeros, whose sign would depend on the BLAS in use.
+        return np.asarray(0.0 - self.rotation @ self.base)
 
 
 @dataclass(frozen=True)
