@@ -21,19 +21,33 @@ def test_a_testfield_is_written_with_its_drawings(reseau: Run, tmp_path: Path) -
     status, out, err = reseau("design", "testfield", "--svg", svg, "--pdf", pdf, "--json", json)
     assert (status, err) == (0, "")
     assert out.split() == [str(path) for path in files]
-    assert TestfieldDesign.read(json) == coded_testfield()
+    assert TestfieldDesign.read(json) == coded_testfield(pitch=20.0)  # fills a sheet of A4
     assert svg.read_text().startswith("<svg")
     assert pdf.read_bytes().startswith(b"%PDF")
 
 
 def test_the_design_is_printed_on_request(reseau: Run) -> None:
-    status, out, _ = reseau("design", "testfield", "--columns", 2, "--rows", 1, "--json", "-")
+    status, out, _ = reseau("design", "testfield", "--columns", 2, "--rows", 1, "--pitch", 125, "--json", "-")
     assert status == 0
     assert TestfieldDesign.parse(out, where="stdout") == coded_testfield(2, 1)
 
 
 def test_impossible_testfields_are_reported_in_one_line(reseau: Run, tmp_path: Path) -> None:
-    status, out, err = reseau("design", "testfield", "--pitch", 90, "--json", tmp_path / "f.json")
+    status, out, err = reseau(
+        "design",
+        "testfield",
+        "--pitch",
+        90,
+        "--spread",
+        30,
+        "--large",
+        17,
+        25,
+        25,
+        22,
+        "--json",
+        tmp_path / "f.json",
+    )
     assert (status, out) == (2, "")
     assert err.count("\n") == 1
     assert "do not fit squares of 90 mm" in err

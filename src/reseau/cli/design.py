@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
+    from ..designs.drawing import Drawable
     from ..io import BoardDesign, ReseauDesign, TestfieldDesign
-    from ..io.targets import SpaceTargets
 
 __all__ = ["app"]
 
@@ -28,6 +29,16 @@ class Shape(StrEnum):
     CROSS = "cross"
     DISK = "disk"
     SQUARE = "square"
+
+
+class Paper(StrEnum):
+    """Sizes of paper."""
+
+    A4 = "A4"
+    A3 = "A3"
+    LETTER = "Letter"
+    TABLOID = "Tabloid"
+    OWN = "own"
 
 
 class Polarity(StrEnum):
@@ -48,6 +59,17 @@ class Kind(StrEnum):
 
 Svg = Annotated[Path | None, typer.Option("--svg", help="SVG drawing to write.")]
 Pdf = Annotated[Path | None, typer.Option("--pdf", help="PDF drawing to write.")]
+PaperOf = Annotated[
+    Paper,
+    typer.Option(
+        "--paper",
+        help="Paper of the PDF. Larger targets are divided over several sheets, with marks to join them; own "
+        "is a page as large as the target needs.",
+    ),
+]
+Fitted = Annotated[
+    float | None, typer.Option(help="Distance between neighbouring marks (mm). Default: fills the --paper.")
+]
 Design = Annotated[
     Path | None,
     typer.Option("--json", "--out", "-o", help="JSON design to write; - for standard output."),
@@ -76,6 +98,7 @@ def reseau(
     name: Annotated[str, typer.Option(help="Name of the design.")] = "reseau",
     svg: Svg = None,
     pdf: Pdf = None,
+    paper: PaperOf = Paper.A4,
     out: Design = None,
 ) -> None:
     """Design a reseau: a regular grid of marks."""
@@ -94,14 +117,14 @@ def reseau(
         origin=origin,
         axis=axis,
     )
-    _write(design, svg, pdf, out, f"{columns} × {rows} marks, pitch {pitch:g} mm")
+    _write(design, svg, pdf, out, paper, f"{columns} × {rows} marks, pitch {pitch:g} mm")
 
 
 @app.command()
 def sheet(
     columns: Annotated[int, typer.Option(help="Number of disks in a row.")] = 10,
-    rows: Annotated[int, typer.Option(help="Number of disks in a column.")] = 10,
-    pitch: Annotated[float, typer.Option(help="Distance between neighbouring disks (mm).")] = 25.0,
+    rows: Annotated[int, typer.Option(help="Number of disks in a column.")] = 13,
+    pitch: Fitted = None,
     size: Annotated[
         float | None, typer.Option(help="Diameter of a disk (mm). Default: 0.22 times --pitch.")
     ] = None,
@@ -109,13 +132,18 @@ def sheet(
     name: Annotated[str, typer.Option(help="Name of the design.")] = "sheet",
     svg: Svg = None,
     pdf: Pdf = None,
+    paper: PaperOf = Paper.A4,
     out: Design = None,
 ) -> None:
     """Design a sheet of disks, four of them in coded rings that identify all disks."""
     from ..designs import coded_sheet
 
-    design = coded_sheet(columns, rows, pitch, size=size, name=name, polarity=polarity.value)
-    _write(design, svg, pdf, out, f"{columns} × {rows} disks, pitch {pitch:g} mm")
+    def of(pitch: float, size: float | None = None) -> ReseauDesign:
+        return coded_sheet(columns, rows, pitch, size=size, name=name, polarity=polarity.value)
+
+    pitch = pitch or _filling(of, paper)
+    design = of(pitch, size)
+    _write(design, svg, pdf, out, paper, f"{columns} × {rows} disks, pitch {pitch:g} mm")
 
 
 @app.command("n-wires")
@@ -130,29 +158,37 @@ def n_wires(
     from ..designs import n_wire_phantom
 
     design = n_wire_phantom(layers, width, spacing, name=name)
-    _write(design, None, None, out, f"{layers} layers of {width:g} mm, {spacing:g} mm apart")
+    _write(design, None, None, out, Paper.OWN, f"{layers} layers of {width:g} mm, {spacing:g} mm apart")
 
 
 @app.command("testfield")
 def coded_field(
     columns: Annotated[int, typer.Option(help="Number of squares in a row.")] = 8,
     rows: Annotated[int, typer.Option(help="Number of squares in a column.")] = 8,
-    pitch: Annotated[float, typer.Option(help="Distance between the lines (mm).")] = 125.0,
-    line_width: Annotated[float, typer.Option(help="Width of the lines (mm).")] = 2.0,
+    pitch: Annotated[
+        float | None,
+        typer.Option(help="Distance between the lines (mm). Default: fills the --paper; the paper's is 125."),
+    ] = None,
+    line_width: Annotated[
+        float | None, typer.Option(help="Width of the lines (mm). Default: 2/125 of --pitch.")
+    ] = None,
     small: Annotated[
-        tuple[float, float, float, float],
-        typer.Option(help="Sizes of small squares, triangles, crosses and circles (mm)."),
-    ] = (9.0, 13.0, 15.0, 12.0),
+        tuple[float, float, float, float] | None,
+        typer.Option(
+            help="Sizes of small squares, triangles, crosses and circles (mm). Default: 9 13 15 12 "
+            "at a pitch of 125 mm."
+        ),
+    ] = None,
     large: Annotated[
-        tuple[float, float, float, float],
-        typer.Option(help="Sizes of large squares, triangles, crosses and circles (mm)."),
-    ] = (
-        17.0,
-        25.0,
-        25.0,
-        22.0,
-    ),
-    spread: Annotated[float, typer.Option(help="Distance between targets in a square (mm).")] = 30.0,
+        tuple[float, float, float, float] | None,
+        typer.Option(
+            help="Sizes of large squares, triangles, crosses and circles (mm). Default: 17 25 25 22 "
+            "at a pitch of 125 mm."
+        ),
+    ] = None,
+    spread: Annotated[
+        float | None, typer.Option(help="Distance between targets in a square (mm). Default: 0.24 × --pitch.")
+    ] = None,
     turn_seed: Annotated[
         int | None, typer.Option(help="Rotate each target by an angle drawn from this seed.")
     ] = None,
@@ -160,24 +196,22 @@ def coded_field(
     name: Annotated[str, typer.Option(help="Name of the design.")] = "testfield",
     svg: Svg = None,
     pdf: Pdf = None,
+    paper: PaperOf = Paper.A4,
     out: Design = None,
 ) -> None:
     """Design a coded testfield: squares of sixteen targets, coded by their arrangement."""
     from ..designs import coded_testfield
 
-    design = coded_testfield(
-        columns,
-        rows,
-        pitch,
-        line_width=line_width,
-        small=small,
-        large=large,
-        spread=spread,
-        turn_seed=turn_seed,
-        polarity=polarity.value,
-        name=name,
-    )
-    _write(design, svg, pdf, out, f"{columns} × {rows} squares, pitch {pitch:g} mm")
+    given: dict[str, Any] = {"line_width": line_width, "small": small, "large": large, "spread": spread}
+
+    def of(pitch: float, **sizes: Any) -> TestfieldDesign:
+        return coded_testfield(
+            columns, rows, pitch, turn_seed=turn_seed, polarity=polarity.value, name=name, **sizes
+        )
+
+    pitch = pitch or _filling(of, paper)
+    design = of(pitch, **{key: value for key, value in given.items() if value is not None})
+    _write(design, svg, pdf, out, paper, f"{columns} × {rows} squares, pitch {pitch:g} mm")
 
 
 @app.command()
@@ -192,6 +226,7 @@ def frame(
     name: Annotated[str, typer.Option(help="Name of the design.")] = "frame",
     svg: Svg = None,
     pdf: Pdf = None,
+    paper: PaperOf = Paper.A4,
     out: Design = None,
 ) -> None:
     """Design the targets of a space frame, to be cut out and fixed to it; for `reseau blurred`."""
@@ -202,7 +237,7 @@ def frame(
         raise UsageError(f"is {shape.value!r}", where="--shape", do="use disk or square")
     kind: Literal["disk", "square"] = "disk" if shape is Shape.DISK else "square"
     design = space_frame(sides, count, size, shape=kind, polarity=polarity.value, name=name)
-    _write(design, svg, pdf, out, f"{count} targets of {size:g} mm")
+    _write(design, svg, pdf, out, paper, f"{count} targets of {size:g} mm")
 
 
 @app.command()
@@ -211,8 +246,11 @@ def board(
     columns: Annotated[int, typer.Option(help="Number of squares, circles or tags in a row.")] = 7,
     rows: Annotated[int, typer.Option(help="Number of squares, circles or tags in a column.")] = 10,
     pitch: Annotated[
-        float, typer.Option(help="Side of a square, distance of rows of circles, or of tags (mm).")
-    ] = 24.0,
+        float | None,
+        typer.Option(
+            help="Side of a square, distance of rows of circles, or of tags (mm). Default: fills the --paper."
+        ),
+    ] = None,
     size: Annotated[
         float | None, typer.Option(help="Diameter of a circle, or side of a marker or tag (mm).")
     ] = None,
@@ -229,6 +267,7 @@ def board(
     name: Annotated[str, typer.Option(help="Name of the design.")] = "board",
     svg: Svg = None,
     pdf: Pdf = None,
+    paper: PaperOf = Paper.A4,
     out: Design = None,
 ) -> None:
     """Design a chessboard, a ChArUco board, a circle grid or an AprilGrid."""
@@ -239,19 +278,32 @@ def board(
     else:
         from ..designs import board as board_of
 
-        design = board_of(
-            kind.value, columns, rows, pitch, size=size, dictionary=dictionary, first_id=first_id,
-            border_bits=border_bits, legacy=legacy, asymmetric=asymmetric, name=name,
-        )  # fmt: skip
+        def of(pitch: float, size: float | None = None) -> BoardDesign:
+            return board_of(
+                kind.value, columns, rows, pitch, size=size, dictionary=dictionary, first_id=first_id,
+                border_bits=border_bits, legacy=legacy, asymmetric=asymmetric, name=name,
+            )  # fmt: skip
+
+        design = of(pitch or _filling(of, paper), size)
     what = f"{design.kind}, {design.columns} × {design.rows}, pitch {design.pitch:g} mm"
-    _write(design, svg, pdf, out, what)
+    _write(design, svg, pdf, out, paper, what)
+
+
+def _filling(of: Callable[[float], Drawable], paper: Paper) -> float:
+    """The pitch with which a target fills the paper."""
+    from ..designs.drawing import content_of
+    from ..designs.paper import largest_pitch
+
+    size = Paper.A4 if paper is Paper.OWN else paper
+    return largest_pitch(lambda pitch: content_of(of(pitch)), size.value)
 
 
 def _write(
-    design: ReseauDesign | TestfieldDesign | SpaceTargets | BoardDesign,
+    design: Drawable,
     svg: Path | None,
     pdf: Path | None,
     out: Path | None,
+    paper: Paper,
     what: str,
 ) -> None:
     """Write the requested drawings and design, either all or none, and report their paths."""
@@ -264,10 +316,12 @@ def _write(
             suffix_of(writable(path), (suffix,))
     files: dict[Path, str | bytes] = {}
     if svg is not None or pdf is not None:
-        from ..designs.drawing import design_pdf, design_svg  # needs matplotlib
+        from ..designs.drawing import design_pdf, design_svg
 
-        drawn = ((svg, design_svg), (pdf, design_pdf))
-        files = {path: content(design) for path, content in drawn if path is not None}
+        if svg is not None:
+            files[svg] = design_svg(design)
+        if pdf is not None:
+            files[pdf] = design_pdf(design, None if paper is Paper.OWN else paper.value)
     if out is not None:
         files[out] = design.to_json()
     for path, content in files.items():

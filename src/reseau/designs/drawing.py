@@ -6,130 +6,79 @@ Both formats are written from one list of filled polygons, circles and texts in 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from html import escape
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..core.data import Array
 from ..core.errors import UsageError
-from ..core.figures import drawing as house_style
-from ..core.figures import to_bytes
 from ..io import BoardDesign, ReseauDesign, TestfieldDesign
 from ..io.targets import SpaceTargets
 from ..optics.targets import target_corners
 from .boards import board_figures
+from .paper import Content, Page, page_of, room_on, sheets_of
 
-__all__ = ["design_pdf", "design_svg"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["content_of", "design_pdf", "design_svg"]
 
 Drawable = ReseauDesign | TestfieldDesign | SpaceTargets | BoardDesign
 
-_MARGIN = 18.0
-"""Margin around the target, mm, for crop marks, scale bar and title."""
-_BAR = 100.0
-_CROP = 5.0
 _GREY = "#555555"
 _GROUND, _LETTERS = 3.0, 6.0
 """Ground of a single target in its sizes, and room for its name, mm."""
 
 
-@dataclass(frozen=True)
-class _Sheet:
-    """A drawing in millimetres, y down, from the upper left corner of the paper.
+def content_of(design: Drawable, across: int | None = None) -> Content:
+    """The drawn parts of a target.
 
     Parameters
     ----------
-    width, height : float
-        Size of the paper.
-    target : (float, float, float, float)
-        Left, top, right and bottom of the target.
-    polygons : list of ndarray (k, 2)
-        Polygons filled with the colour of the marks.
-    circles : list of (x, y, radius)
-        Circles filled likewise.
-    lines : list of (x0, y0, x1, y1)
-        Hairlines outside the target.
-    texts : list of (x, y, anchor, text)
-        Labels, 2.6 mm high.
-    """
-
-    width: float
-    height: float
-    target: tuple[float, float, float, float]
-    polygons: list[Array]
-    circles: list[tuple[float, float, float]]
-    lines: list[tuple[float, float, float, float]]
-    texts: list[tuple[float, float, str, str]]
-
-
-@dataclass(frozen=True)
-class _Content:
-    """The drawn parts of a design in its own plane: millimetres, y up.
-
-    Parameters
-    ----------
-    low, high : ndarray (2,)
-        Lower left and upper right corner of the target.
-    polygons, circles
-        As in :class:`_Sheet`.
-    title : str
-        Description in one line.
-    letters : dict
-        Labels and the positions of their lower left corners.
-    """
-
-    low: Array
-    high: Array
-    polygons: list[Array]
-    circles: list[tuple[float, float, float]]
-    title: str
-    letters: dict[str, Array]
-
-
-def _sheet(design: Drawable) -> _Sheet:
-    """Lay out the design on paper.
+    design : ReseauDesign, TestfieldDesign, BoardDesign or SpaceTargets
+        The target.
+    across : int, optional
+        Number of single targets in a row; by default they fill a square.
 
     Raises
     ------
     UsageError
         When coordinates are missing, the unit is not the millimetre, or wires are not parallel to the axes.
+
+    Examples
+    --------
+    >>> from reseau.designs import standard_reseau
+    >>> content_of(standard_reseau()).size
+    array([150., 110.])
     """
     if isinstance(design, TestfieldDesign):
-        content = _testfield(design)
-    elif isinstance(design, BoardDesign):
-        content = _board(design)
-    else:
-        content = _frame(design) if isinstance(design, SpaceTargets) else _reseau(design)
-    size = content.high - content.low
-    width, height = size + 2 * _MARGIN
-    # A narrow target has a sheet that is wide enough for the bar.
-    width = max(width, _BAR + 2 * _MARGIN)
-    left = float(width - size[0]) / 2
-    corner = np.array([left - content.low[0], _MARGIN + content.high[1]])
-
-    def on_paper(at: Array) -> Array:
-        return np.asarray(corner + at * [1, -1])
-
-    target = (left, _MARGIN, float(width - left), float(_MARGIN + size[1]))
-    texts = [
-        (target[0], target[1] - 7.5, "start", content.title),
-        (float(width / 2), target[3] + 15.2, "middle", "100 mm: measure it before you trust the print"),
-    ]
-    for letter, at in content.letters.items():
-        x, y = on_paper(at)
-        texts.append((float(x), float(y), "start", letter))
-    return _Sheet(
-        float(width),
-        float(height + 8),
-        target,
-        [on_paper(polygon) for polygon in content.polygons],
-        [(*map(float, on_paper(np.array([x, y]))), radius) for x, y, radius in content.circles],  # type: ignore[misc]
-        [*_crop_marks(target), *_bar(width, target[3])],
-        texts,
-    )
+        return _testfield(design)
+    if isinstance(design, BoardDesign):
+        return _board(design)
+    return _frame(design, across) if isinstance(design, SpaceTargets) else _reseau(design)
 
 
-def _reseau(design: ReseauDesign) -> _Content:
+def _pages(design: Drawable, paper: str | None) -> list[Page]:
+    """Pages of a drawing; single targets, which are cut out, are never divided."""
+    if paper is None:
+        return [page_of(content_of(design))]
+    if not isinstance(design, SpaceTargets):
+        return sheets_of(content_of(design), paper)
+    cell, room = _cell(design), room_on(paper)
+    across, down = (int(length // cell) for length in room)
+    if min(across, down) < 1:
+        raise UsageError(f"has targets that do not fit {paper}", where=f"design {design.name}")
+    targets, step = design.targets, across * down
+    pages = []
+    for k in range(0, len(targets.id), step):
+        part = {key: column[k : k + step] for key, column in dict(targets).items() if column is not None}
+        some = design.model_copy(update={"targets": targets.model_copy(update=part)})
+        pages += sheets_of(content_of(some, across), paper)
+    return pages
+
+
+def _reseau(design: ReseauDesign) -> Content:
     """The marks of a reseau, with a margin of half a pitch."""
     xy, mark = design.xy, design.mark
     if design.unit != "mm" or not np.isfinite(xy).all():
@@ -160,7 +109,7 @@ def _reseau(design: ReseauDesign) -> _Content:
         if mark_id is not None
     }
     title = f"{design.name}: {len(xy)} marks, {_describe(design)}"
-    return _Content(low, high, polygons, circles, title, letters)
+    return Content(low, high, polygons, circles, title, letters)
 
 
 def _ring_sectors(design: ReseauDesign) -> Iterator[Array]:
@@ -176,7 +125,7 @@ def _ring_sectors(design: ReseauDesign) -> Iterator[Array]:
             yield centre + np.concatenate(edges)
 
 
-def _testfield(design: TestfieldDesign) -> _Content:
+def _testfield(design: TestfieldDesign) -> Content:
     """Lines and targets, with a margin of most of a square."""
     lines, targets = design.lines, design.targets
     x0, y0, x1, y1 = lines.extent
@@ -195,10 +144,10 @@ def _testfield(design: TestfieldDesign) -> _Content:
         f"{len(targets.id)} targets"
     )
     low, high = np.array([x0, y0]) - around, np.array([x1, y1]) + around
-    return _Content(low, high, polygons, circles, title, {})
+    return Content(low, high, polygons, circles, title, {})
 
 
-def _board(design: BoardDesign) -> _Content:
+def _board(design: BoardDesign) -> Content:
     """A board with a margin: half a square, half a pitch of circles or a gap of tags."""
     polygons, circles = board_figures(design)
     ends = [np.vstack([polygon.min(axis=0), polygon.max(axis=0)]) for polygon in polygons]
@@ -213,16 +162,21 @@ def _board(design: BoardDesign) -> _Content:
     if design.dictionary is not None:
         title += f", {design.dictionary}"
     rounds = [(float(x), float(y), float(radius)) for x, y, radius in circles]
-    return _Content(low, high, polygons, rounds, title, {})
+    return Content(low, high, polygons, rounds, title, {})
 
 
-def _frame(design: SpaceTargets) -> _Content:
+def _cell(design: SpaceTargets) -> float:
+    """Side of the ground of a single target with its name, mm."""
+    return float(_GROUND * max(design.targets.size) + _LETTERS)
+
+
+def _frame(design: SpaceTargets, columns: int | None) -> Content:
     """Single targets in rows, each on a ground of three times its size, to be cut out."""
     if design.unit != "mm":
         raise UsageError("is not in millimetres", where=f"design {design.name}")
     targets, count = design.targets, len(design.targets.id)
-    cell = _GROUND * max(targets.size) + _LETTERS
-    columns = int(np.ceil(np.sqrt(count)))
+    cell = _cell(design)
+    columns = columns or int(np.ceil(np.sqrt(count)))
     rows = -(-count // columns)
     polygons, circles, letters = list[Array](), list[tuple[float, float, float]](), {}
     for k, (name, shape, size) in enumerate(zip(targets.id, targets.shape, targets.size, strict=True)):
@@ -235,7 +189,7 @@ def _frame(design: SpaceTargets) -> _Content:
         letters[name] = at - 0.5 * cell + 1.5
     low, high = np.array([0.0, -rows * cell]), np.array([columns * cell, 0.0])
     title = f"{design.name}: {count} single targets, cells of {cell:g} mm"
-    return _Content(low, high, polygons, circles, title, letters)
+    return Content(low, high, polygons, circles, title, letters)
 
 
 def _gap(xy: Array) -> float:
@@ -258,23 +212,6 @@ def _box(x0: float, y0: float, x1: float, y1: float) -> Array:
     return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], dtype=np.float64)
 
 
-def _crop_marks(target: tuple[float, ...]) -> Iterator[tuple[float, float, float, float]]:
-    x0, y0, x1, y1 = map(float, target)
-    for x, out in ((x0, -1), (x1, 1)):
-        for y, down in ((y0, -1), (y1, 1)):
-            yield x + out, y, x + out * (1 + _CROP), y
-            yield x, y + down, x, y + down * (1 + _CROP)
-
-
-def _bar(width: float, bottom: float) -> Iterator[tuple[float, float, float, float]]:
-    """The scale bar: 100 mm between the centres of its end strokes, with a stroke every 10 mm."""
-    left, y = float(width - _BAR) / 2, float(bottom) + 10.0
-    yield left, y, left + _BAR, y
-    for k in range(11):
-        tall = 1.8 if k % 5 == 0 else 1.0
-        yield left + 10 * k, y - tall, left + 10 * k, y + tall
-
-
 def _colours(design: Drawable) -> tuple[str, str]:
     """Colours of background and marks."""
     return ("#ffffff", "#000000") if design.polarity == "dark" else ("#000000", "#ffffff")
@@ -285,7 +222,7 @@ def _number(value: float) -> str:
 
 
 def design_svg(design: Drawable) -> str:
-    """Draw a target as SVG in true size.
+    """Draw a target as SVG in true size, on a page as large as it needs.
 
     Parameters
     ----------
@@ -308,7 +245,7 @@ def design_svg(design: Drawable) -> str:
     >>> design_svg(standard_reseau())[:4]
     '<svg'
     """
-    sheet = _sheet(design)
+    sheet = page_of(content_of(design))
     ground, ink = _colours(design)
     x0, y0, x1, y1 = sheet.target
     n = _number
@@ -334,13 +271,16 @@ def design_svg(design: Drawable) -> str:
     return "\n".join(parts) + "</g></svg>\n"
 
 
-def design_pdf(design: Drawable) -> bytes:
-    """Draw a target as a PDF of one page in true size; all elements are vectors.
+def design_pdf(design: Drawable, paper: str | None = None) -> bytes:
+    """Draw a target as PDF in true size; all elements are vectors.
 
     Parameters
     ----------
     design : ReseauDesign, TestfieldDesign, BoardDesign or SpaceTargets
         The target.
+    paper : {"A4", "A3", "Letter", "Tabloid"}, optional
+        Paper to print on. A target that does not fit one sheet is divided over several, with marks to join
+        them. By default one page as large as the target needs.
 
     Returns
     -------
@@ -350,26 +290,43 @@ def design_pdf(design: Drawable) -> bytes:
     Raises
     ------
     UsageError
-        When the design has no millimetre coordinates for all marks.
+        When the design has no millimetre coordinates for all marks, the paper is unknown, or too many sheets
+        are needed.
     """
+    from io import BytesIO
+
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    from ..core.figures import drawing as house_style
+
+    stream = BytesIO()
+    # Without dates: the same design, the same bytes.
+    about = {"Title": design.name, "CreationDate": None, "Creator": None}
+    with house_style(), PdfPages(stream, metadata=about) as pdf:
+        for page in _pages(design, paper):
+            pdf.savefig(_figure(page, *_colours(design)))
+    return stream.getvalue()
+
+
+def _figure(page: Page, ground: str, ink: str) -> Figure:
+    """A page as a figure in true size."""
     from matplotlib.collections import PatchCollection
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 
-    sheet = _sheet(design)
-    ground, ink = _colours(design)
-    x0, y0, x1, y1 = sheet.target
-    with house_style():
-        figure = Figure(figsize=(sheet.width / 25.4, sheet.height / 25.4))
-        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, sheet.width), ylim=(sheet.height, 0))
-        axes.axis("off")
-        axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fc=ground, ec="none"))
-        patches: list[Patch] = [Polygon(polygon, closed=True) for polygon in sheet.polygons]
-        patches += [Circle((x, y), r) for x, y, r in sheet.circles]
-        axes.add_collection(PatchCollection(patches, facecolor=ink, edgecolor="none", linewidth=0))
-        for a, b, c, d in sheet.lines:
-            axes.plot([a, c], [b, d], color=_GREY, lw=0.1 / 25.4 * 72, solid_capstyle="butt")
-        sides = {"start": "left", "middle": "center"}
-        for x, y, anchor, text in sheet.texts:
-            axes.text(x, y, text, ha=sides[anchor], va="baseline", fontsize=2.6 / 25.4 * 72, color=_GREY)
-        return to_bytes(figure, "pdf", metadata={"Title": design.name})
+    x0, y0, x1, y1 = page.target
+    figure = Figure(figsize=(page.width / 25.4, page.height / 25.4))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, page.width), ylim=(page.height, 0))
+    axes.axis("off")
+    axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fc=ground, ec="none"))
+    patches: list[Patch] = [Polygon(polygon, closed=True) for polygon in page.polygons]
+    patches += [Circle((x, y), r) for x, y, r in page.circles]
+    figures = PatchCollection(patches, facecolor=ink, edgecolor="none", linewidth=0)
+    axes.add_collection(figures)
+    figures.set_clip_path(Rectangle((x0, y0), x1 - x0, y1 - y0, transform=axes.transData))
+    for a, b, c, d in page.lines:
+        axes.plot([a, c], [b, d], color=_GREY, lw=0.1 / 25.4 * 72, solid_capstyle="butt")
+    sides = {"start": "left", "middle": "center"}
+    for x, y, anchor, text in page.texts:
+        axes.text(x, y, text, ha=sides[anchor], va="baseline", fontsize=2.6 / 25.4 * 72, color=_GREY)
+    return figure

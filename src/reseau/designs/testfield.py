@@ -18,6 +18,8 @@ _LARGE = (17.0, 25.0, 25.0, 22.0)
 """Sizes of squares, triangles, crosses and circles. The areas of the first two are slightly smaller than
 those of the others (the paper's table 3); areas of the small ones are one third of those of the large
 ones."""
+_PITCH, _LINE, _SPREAD = 125.0, 2.0, 30.0
+"""Distance and width of the lines, and distance of the targets, for these sizes."""
 
 
 def coded_testfield(
@@ -25,10 +27,10 @@ def coded_testfield(
     rows: int = 8,
     pitch: float = 125.0,
     *,
-    line_width: float = 2.0,
-    small: Sequence[float] = _SMALL,
-    large: Sequence[float] = _LARGE,
-    spread: float = 30.0,
+    line_width: float | None = None,
+    small: Sequence[float] | None = None,
+    large: Sequence[float] | None = None,
+    spread: float | None = None,
     turn_seed: int | None = None,
     polarity: Literal["dark", "bright"] = "dark",
     name: str = "testfield",
@@ -41,12 +43,12 @@ def coded_testfield(
         Number of squares; at most 168 in total, the number of words of the code.
     pitch : float
         Distance of the lines, mm.
-    line_width : float
-        Width of the straight lines, mm.
-    small, large : sequence of 4 float
-        Sizes of squares, triangles, crosses and circles, mm.
-    spread : float
-        Distance of neighbouring targets in a square, mm.
+    line_width : float, optional
+        Width of the straight lines, mm; by default in proportion to `pitch`, 2 mm at 125 mm.
+    small, large : sequence of 4 float, optional
+        Sizes of squares, triangles, crosses and circles, mm; by default in proportion to `pitch`.
+    spread : float, optional
+        Distance of neighbouring targets in a square, mm; by default 0.24 of `pitch`.
     turn_seed : int, optional
         Rotates every target by an angle drawn with this seed; by default all are upright.
     polarity : {"dark", "bright"}
@@ -69,7 +71,13 @@ def coded_testfield(
     >>> len(field.ids), field.ids[0], field.lines.extent, field.targets.shape[0]
     (1024, '1.01', (-501.0, -501.0, 501.0, 501.0), 'cross')
     """
-    where = f"design {name}"
+    where, scale = f"design {name}", pitch / _PITCH
+    small, large = (
+        np.round(np.array(sizes) * scale, 6).tolist() if given is None else given
+        for given, sizes in ((small, _SMALL), (large, _LARGE))
+    )
+    line_width = round(_LINE * scale, 6) if line_width is None else line_width
+    spread = round(_SPREAD * scale, 6) if spread is None else spread
     if min(columns, rows) < 1 or not min(pitch, line_width, spread, *small, *large) > 0:
         raise UsageError(f"cannot have {columns} × {rows} squares at {pitch} mm", where=where)
     if len(small) != 4 or len(large) != 4 or not (np.array(large) > np.array(small)).all():
