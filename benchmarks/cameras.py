@@ -229,7 +229,11 @@ def times() -> None:
         if model.kernel is not None:
             constants = np.asarray(model.constants(model.checked_options()), dtype=np.float64).reshape(1, -1)
             columns = CameraColumns(
-                values[None], constants, np.array([[639.5, 479.5, 0.01, 0.01]]), np.zeros((1, 0)), np.zeros(1)
+                values[None],
+                constants,
+                np.array([[639.5, 479.5, 0.01, 0.01]]),
+                np.zeros((1, 0)),
+                np.zeros((1, 2)),
             )
             room = np.zeros((2, 2)), np.zeros((2, len(values))), np.zeros((2, 0)), np.zeros(2)
             seconds = least(compiled(_run, camera=model.kernel), n, uv, uv, columns, *room)

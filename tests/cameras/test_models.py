@@ -57,6 +57,11 @@ class Case(NamedTuple):
                 values[k] += 2.0 / effect[k]
         return values
 
+    @property
+    def size(self) -> float:
+        """Size of a world that is in the image; with parallel rays one of few tenths of its unit."""
+        return 0.28 if self.model.parallel else 1.0
+
     def mapping(self) -> PlaneMapping:
         return self.model.mapping(self.values(), GRID, self.options)
 
@@ -119,7 +124,7 @@ def kernel_at(case: Case, compiled_: bool, uv: Array, xy: Array, values: Array) 
         np.asarray(case.model.constants(options), dtype=np.float64).reshape(1, -1),
         np.array([[(GRID.width - 1) / 2, (GRID.height - 1) / 2, *GRID.pitch_mm]]),
         np.zeros((1, 0)),
-        np.zeros(1),
+        np.zeros((1, 2)),
     )
     n, u = len(uv), len(values)
     off, by_uv, d = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 2, u))
@@ -188,6 +193,10 @@ def test_the_model_is_converted_to_itself_and_to_that_of_opencv(case: Case) -> N
     camera = case.mapping()
     same = convert(camera, GRID, case.model.name, case.options)
     assert same.greatest_px < 1e-6
+    if camera.parallel:
+        with pytest.raises(UsageError, match="has parallel rays, the model `opencv` has not"):
+            convert(camera, GRID, "opencv")
+        return
     other = convert(camera, GRID, "opencv")
     assert other.share == 1
     assert other.greatest_px < 3 * BEND
@@ -198,6 +207,8 @@ def test_the_model_is_converted_to_itself_and_to_that_of_opencv(case: Case) -> N
 def test_the_model_is_converted_to_every_other_model(case: Case) -> None:
     camera = case.mapping()
     for model in camera_models():
+        if model.parallel != camera.parallel:
+            continue
         other = convert(camera, GRID, model.name)
         assert other.share == 1
         assert other.greatest_px < 3 * BEND
@@ -267,7 +278,7 @@ def test_the_entry_of_a_file_is_read_back(case: Case) -> None:
 
 def network_file(case: Case, path: Path) -> tuple[networks.World, Path]:
     """A world seen by the camera, and its network with approximate values of the camera in a file."""
-    world = networks.world(images=6, points=30, cameras=(camera_of(case),), sigma_px=0.02)
+    world = networks.world(images=6, points=30, cameras=(camera_of(case),), sigma_px=0.02, size=case.size)
     network = world.noisy(5)
     start = case.model.rescaled(np.zeros(len(case.model.names)), 1.03 * F, GRID)
     centred = case.model.start_values(F, GRID)
@@ -337,7 +348,7 @@ def normalised_errors(case: Case, seeds: range) -> tuple[Array, Array]:
     wide = bool(case.model.of_role("shape"))
     camera = camera_of(case, f=330.0) if wide else camera_of(case)
     world = networks.world(
-        images=6, points=30, cameras=(camera,), sigma_px=sigma_px, size=1.7 if wide else 1.0
+        images=6, points=30, cameras=(camera,), sigma_px=sigma_px, size=1.7 if wide else case.size
     )
     true = world.network.cameras[0].parameters
     single, joint = [], []
@@ -386,7 +397,9 @@ def test_commands_accept_the_model_and_write_report_and_calibration(
         "calibrate", *sorted(tmp_path.glob("*.csv")), "-d", tmp_path / "field.json", "--size", "240x240",
         "--model", case.model.name, *options, *pitch,
     )  # fmt: skip
-    free = ("--free", ",".join(case.model.of_role("scale", "centre")))
+    # With parallel rays and without distortion the principal point is not determined.
+    roles = ("scale",) if case.model.parallel else ("scale", "centre")
+    free = ("--free", ",".join(case.model.of_role(*roles)))
     files = ("-o", tmp_path / "K.json", "--report", tmp_path / "F.html")
     status, out, err = reseau(*command, *free, *files)
     assert (status, err) == (0, "")
@@ -397,7 +410,7 @@ def test_commands_accept_the_model_and_write_report_and_calibration(
         assert written["parameters"][name]["unit"] == unit
     assert "<svg" in (tmp_path / "F.html").read_text()
     f = next(iter(case.model.of_role("scale")))
-    expected = case.model.start_values(57.5 / 0.027, PixelGrid(240, 240, (0.027, 0.027)))
+    expected = case.model.start_values(bench_scale(case), PixelGrid(240, 240, (0.027, 0.027)))
     found = written["parameters"][f]
     assert abs(found["value"] - expected[case.model.names.index(f)]) < 5 * found["sigma"]
     points = tmp_path / "00.csv"
@@ -415,17 +428,25 @@ def test_commands_accept_the_model_and_write_report_and_calibration(
     assert "p = 1\n" in out
 
 
+def bench_scale(case: Case) -> float:
+    """Focal length (px) of the bench, or pixels per millimetre of its board with parallel rays."""
+    return 57.5 / 0.027 / (FieldBench(seed=3).distance_mm if case.model.parallel else 1.0)
+
+
 def calibrated(case: Case, folder: Path) -> None:
     """The design of a testfield, and coordinates of recordings by a camera of the model."""
     bench, rng = FieldBench(seed=3, bend_mm=0.0), np.random.default_rng(0)
     bench.design.write(folder / "field.json")
     grid = PixelGrid(240, 240, (0.027, 0.027))
-    lens = case.model.mapping(case.model.start_values(57.5 / 0.027, grid), grid, case.options)
+    lens = case.model.mapping(case.model.start_values(bench_scale(case), grid), grid, case.options)
     for k, (phi, kappa) in enumerate(product((0.0, 30.0, 45.0), (0.0, 90.0, 180.0))):
         truth = bench.truth(Station(phi, kappa, kappa))
         rows = np.flatnonzero(bench.inside(truth, 8.0))
         # The bench has a lens without distortion: its image points give the directions.
-        xy = lens(bench.camera.inverse(truth.xy[rows])) + 0.005 * rng.normal(size=(len(rows), 2))
+        uv = bench.camera.inverse(truth.xy[rows])
+        if lens.parallel:
+            uv = truth.pose(truth.xyz[rows])[:, :2]
+        xy = lens(uv) + 0.005 * rng.normal(size=(len(rows), 2))
         lines = [
             f"{truth.names[j]},{x!r},{y!r},0.005,0.005" for j, (x, y) in zip(rows, xy.tolist(), strict=True)
         ]

@@ -248,7 +248,9 @@ def projection_field(lens: CameraMapping, across: int = 25, down: int | None = N
     uv = lens.mapping.inverse(xy)
     known = np.isfinite(uv).all(axis=1)
     seen = lens.mapping.derivatives(uv[known])
-    slope = referred(seen.d_xy @ by_rotation(uv[known]), seen.d_parameters[:, :, lens.rows])
+    slope = referred(
+        seen.d_xy @ by_rotation(uv[known], lens.mapping.parallel), seen.d_parameters[:, :, lens.rows]
+    )
     cov = np.full((len(xy), 2, 2), np.nan)
     cov[known] = slope @ lens.covariance @ np.swapaxes(slope, 1, 2)
     return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2))
@@ -263,10 +265,16 @@ def places(lens: CameraMapping, across: int, down: int | None) -> tuple[Array, t
     return np.column_stack([x.ravel(), y.ravel()]), (down, across)
 
 
-def by_rotation(uv: Array) -> Array:
-    """Derivatives (n, 2, 3) of directions by a small rotation of the rays about the camera's axes."""
+def by_rotation(uv: Array, parallel: bool = False) -> Array:
+    """Derivatives (n, 2, 3) of directions by a small rotation of the rays about the camera's axes.
+
+    For parallel rays these are derivatives by a shift along two axes and a rotation about the third; one
+    about the others would move them out of the plane.
+    """
     u, v = uv.T
     one = np.ones_like(u)
+    if parallel:
+        return np.stack([np.stack([one, 0 * u, -v], axis=1), np.stack([0 * u, one, u], axis=1)], axis=1)
     return np.stack(
         [np.stack([-u * v, one + u * u, -v], axis=1), np.stack([-one - v * v, u * v, u], axis=1)], axis=1
     )

@@ -8,9 +8,11 @@ Two calibrations are compared after the rotation that brings the rays of one nea
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.special
+from numpy.typing import NDArray
 
 from ..core.data import Array
 from ..core.errors import UsageError
@@ -113,6 +115,9 @@ def calibration_difference(
             f"{first.width}×{first.height} and {second.width}×{second.height} pixels cannot be compared",
             where="calibrations",
         )
+    parallel = first.mapping.parallel
+    if second.mapping.parallel != parallel:
+        raise UsageError("parallel and central rays cannot be compared", where="calibrations")
     xy, shape = places(first, across, down)
     uv = first.mapping.inverse(xy)
     known = np.isfinite(uv).all(axis=1) & np.isfinite(second.mapping(uv)).all(axis=1)
@@ -122,10 +127,10 @@ def calibration_difference(
     for _ in range(_ROUNDS):
         turned, by_uv = _turned(turn, uv)
         there = second.mapping.derivatives(turned)
-        g = there.d_xy @ by_rotation(turned)
+        g = there.d_xy @ by_rotation(turned, parallel)
         off = there.value - xy[known]
         step = -np.linalg.lstsq(g.reshape(-1, 3), off.ravel(), rcond=None)[0]
-        turn = rotation_matrix(step) @ turn
+        turn = (_shifted(step) if parallel else rotation_matrix(step)) @ turn
     here = first.mapping.derivatives(uv)
     own = there.d_parameters[:, :, second.rows]
     carried = there.d_xy @ by_uv @ np.linalg.inv(here.d_xy) @ here.d_parameters[:, :, first.rows]
@@ -135,6 +140,8 @@ def calibration_difference(
     difference[known], cov[known] = off, root @ np.swapaxes(root, 1, 2)
     # The camera is rotated in the opposite sense to its rays.
     angle = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    if parallel:
+        angle[:2] = 0.0
     return FieldDifference(
         xy.reshape(*shape, 2), difference.reshape(*shape, 2), cov.reshape(*shape, 2, 2), angle, statistic,
         degrees,
@@ -149,6 +156,12 @@ def _joint_root(first: CameraMapping, second: CameraMapping, by_first: Array, by
         return mean
     parts = [by_first @ _root(first.covariance), by_second @ _root(second.covariance)]
     return np.concatenate(parts, axis=2)
+
+
+def _shifted(step: NDArray[Any]) -> Array:
+    """Shift and rotation of a plane, for homogeneous coordinates (3, 3)."""
+    c, s = np.cos(step[2]), np.sin(step[2])
+    return np.array([[c, -s, step[0]], [s, c, step[1]], [0.0, 0.0, 1.0]])
 
 
 def _turned(turn: Array, uv: Array) -> tuple[Array, Array]:

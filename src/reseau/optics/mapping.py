@@ -141,6 +141,11 @@ class PlaneMapping(ABC):
         def values(self) -> Array:
             """Values of the parameters, (u,)."""
 
+    @property
+    def parallel(self) -> bool:
+        """Whether the first plane of a camera is that of parallel rays: (xc, yc), not (xc/zc, yc/zc)."""
+        return False
+
     @abstractmethod
     def derivatives(self, xy: ArrayLike) -> Derivatives:
         """Map points and differentiate.

@@ -300,7 +300,7 @@ def project(camera: PlaneMapping, pose: Pose, points: ArrayLike) -> Projection:
     Parameters
     ----------
     camera : PlaneMapping
-        From ideal directions to the image.
+        From ideal directions to the image; from xc, yc where its rays are parallel.
     pose : Pose
         One for all points, or one for each.
     points : array_like (n, 3)
@@ -309,7 +309,8 @@ def project(camera: PlaneMapping, pose: Pose, points: ArrayLike) -> Projection:
     Returns
     -------
     Projection
-        Image points and derivatives, NaN where a point is not in front of its camera.
+        Image points and derivatives, NaN where a point is not in front of its camera; parallel rays have no
+        such side.
 
     Examples
     --------
@@ -322,12 +323,14 @@ def project(camera: PlaneMapping, pose: Pose, points: ArrayLike) -> Projection:
     if object_points.ndim != 2 or object_points.shape[1] != 3:
         raise UsageError(f"object points have the shape {object_points.shape}, not (n, 3)")
     x_c, d_rotation = rotate(pose.rotation, object_points - pose.x0)
-    z = np.where(x_c[:, 2] > 0, x_c[:, 2], np.nan)
+    parallel = getattr(camera, "parallel", False)
+    z = np.ones(len(x_c)) if parallel else np.where(x_c[:, 2] > 0, x_c[:, 2], np.nan)
     direction = x_c[:, :2] / z[:, None]
     xy, d_direction, d_camera = camera.derivatives(direction)
-    d_x_c = np.empty((len(z), 2, 3))
+    d_x_c = np.zeros((len(z), 2, 3))
     d_x_c[:, :, :2] = d_direction / z[:, None, None]
-    d_x_c[:, :, 2] = -(d_x_c[:, :, :2] @ direction[:, :, None])[:, :, 0]
+    if not parallel:
+        d_x_c[:, :, 2] = -(d_x_c[:, :, :2] @ direction[:, :, None])[:, :, 0]
     d_point = d_x_c @ pose.matrix
     # The parameters of a camera that sees no points must not appear determined.
     d_camera[np.isnan(xy).any(axis=1)] = np.nan

@@ -641,20 +641,33 @@ def first_camera(
 ) -> Camera:
     """Return a camera with approximate values, from the homographies of the images (Zhang 2000).
 
-    `magnification` is that of windows before the camera.
+    With parallel rays, affine mappings of the plane have the magnification: it is not foreshortened along the
+    axis about which the plane is tilted. `magnification` is that of windows before the camera.
     """
     known = dict(zip(design.ids, design.xy, strict=True))
-    object_points, image_points = [], []
+    object_points, image_points = list[Any](), list[Any]()
     for points in measured.values():
         rows = [k for k, name in enumerate(points.names) if name in known]
         plane = np.array([known[points.names[k]] for k in rows]).reshape(-1, 2)
         object_points.append(np.column_stack([plane, np.zeros(len(rows))]).astype(np.float32))
         image_points.append(points.xy[rows].astype(np.float32))
-    matrix = cv2.initCameraMatrix2D(object_points, image_points, size, 1.0)
-    f = float(matrix[0, 0])
-    if not np.isfinite(f) or not 0.2 * max(size) < f < 100 * max(size):
-        f = 1.2 * max(size)
+    if model.registered.parallel:
+        f = _scale(object_points, image_points)
+    else:
+        f = float(cv2.initCameraMatrix2D(object_points, image_points, size, 1.0)[0, 0])
+        if not np.isfinite(f) or not 0.2 * max(size) < f < 100 * max(size):
+            f = 1.2 * max(size)
     f /= magnification
     pitch = model.pitch_mm or (1.0, 1.0)
     values = model.registered.start_values(f, PixelGrid(*size, pitch))
     return Camera(_CAMERA, *size, pitch, model.registered.name, values, model.chosen, model.options)
+
+
+def _scale(object_points: Sequence[Any], image_points: Sequence[Any]) -> float:
+    """Pixels per unit of object space: the largest scale of affine mappings, in the median of the images."""
+    scales = []
+    for plane, xy in zip(object_points, image_points, strict=True):
+        design = plane[:, :2].astype(np.float64) - plane[:, :2].mean(axis=0)
+        mapping = np.linalg.lstsq(design, xy - xy.mean(axis=0), rcond=None)[0]
+        scales.append(float(np.linalg.svd(mapping, compute_uv=False)[0]))
+    return float(np.median(scales))

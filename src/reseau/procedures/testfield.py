@@ -280,6 +280,9 @@ def _joined(
 def _directions(network: Network, pose: Pose) -> Array:
     """Ideal directions (p, 2) of all points in another image with the windows of the first; NaN behind it."""
     x = (network.xyz - pose.x0) @ pose.matrix.T
+    if network.parallel[0]:
+        along: Array = x[:, :2]
+        return along
     uv: Array = x[:, :2] / np.where(x[:, 2:] > 0, x[:, 2:], np.nan)
     bent, every = network.refraction, np.arange(len(uv))
     if bent is None or bent.path_of[0] < 0:

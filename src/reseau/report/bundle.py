@@ -219,7 +219,7 @@ def _fields(
     away = values.xyz[network.point_of[rows]] - values.x0[network.image_of[rows]]
     usual = float(np.median(np.linalg.norm(away, axis=1)))
     fields = [("directions", projection_field(lens, _PLACES))]
-    if network.behind_windows(c):
+    if network.behind_windows(c) or network.cameras[c].parallel:
         distances, usual = [], 0.0
     fields += [
         (

@@ -79,7 +79,8 @@ def _camera(camera: Camera) -> list[Remark]:
         return []
     values = camera.parameters
     half = np.hypot(camera.width, camera.height) / 2
-    scale = [name for name in model.of_role("scale") if values[name] > 0]
+    # A magnification is not limited by an angle of view.
+    scale = [name for name in model.of_role("scale") if values[name] > 0 and not camera.parallel]
     found: list[str] = []
     if model.needs_pitch:
         pitch = float(np.mean(camera.pitch_mm))
@@ -216,6 +217,8 @@ def _one_station(network: Network, uv: Array) -> list[Remark]:
     m = len(network.images)
     if m < 2 or finite(network.xyz).sum() >= 4 or network.refraction is not None:
         return []
+    if network.parallel.any() or network.shutters.any():
+        return []
     seen = _by_image(network, finite(uv))
     tested = 0
     for a, b in _spread_pairs(m):
@@ -296,6 +299,7 @@ def seen_frontally(network: Network, rotation: Array, xyz: Array, used: Mask) ->
     used : ndarray of bool (m,)
         Images with a known rotation.
     """
+    used = used & ~network.parallel
     points = xyz[finite(xyz)]
     if len(points) < 4 or not used.any():
         return []

@@ -32,6 +32,8 @@ _SCATTERED = 2.0
 _MIN_IMAGES = 3
 # Size of a corner as a fraction of width and height.
 _CORNER = 0.2
+# Points are in a plane where their extent across it is this part of the largest.
+_PLANE = 1e-4
 
 
 def listed(names: Iterable[object]) -> str:
@@ -141,6 +143,7 @@ def checks(result: Result) -> list[Remark]:
         *_patterns(result),
         *_between(result),
         *_behind(network, fit),
+        *_parallel(network, fit),
         *_corners(network, fit),
     ]
 
@@ -401,13 +404,35 @@ def _behind(network: Network, fit: BundleFit) -> list[Remark]:
     rows = np.flatnonzero(fit.usable.observations)
     i, j = network.image_of[rows], network.point_of[rows]
     depth = np.einsum("nk,nk->n", fit.values.rotation[i, 2], fit.values.xyz[j] - fit.values.x0[i])
-    wrong = rows[depth <= 0]
+    wrong = rows[(depth <= 0) & ~network.parallel[i]]
     if not len(wrong):
         return []
     names = [
         f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}" for k in wrong
     ]
     return [Remark(f"{_plural('point', wrong)} behind the camera: {listed(names)}", Code.GROSS_ERRORS)]
+
+
+def _parallel(network: Network, fit: BundleFit) -> list[Remark]:
+    """What images with parallel rays do not determine."""
+    images = np.flatnonzero(fit.usable.images & network.parallel)
+    if not len(images):
+        return []
+    names = listed(network.images[i] for i in images)
+    text = (
+        f"rank defect of each image with parallel rays: the distance of the camera along its axis is not "
+        f"determined, and held, in {names}"
+    )
+    found = [Remark(text, Code.NOT_IDENTIFIED)]
+    points = fit.values.xyz[fit.usable.points]
+    extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if extent[2] < _PLANE * extent[0]:
+        text = (
+            "all points are in a plane: two tilts of an image with parallel rays, mirrored at its image "
+            "plane, have the same image points; one of them was chosen for each image"
+        )
+        found.append(Remark(text, Code.NOT_IDENTIFIED))
+    return found
 
 
 def _corners(network: Network, fit: BundleFit) -> list[Remark]:

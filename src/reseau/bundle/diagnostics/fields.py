@@ -117,6 +117,12 @@ def projection_field_at(
             "the projection of points through windows is not known at a distance",
             where=result.network.cameras[c].label,
         )
+    if result.network.cameras[c].parallel:
+        raise UsageError(
+            "the projection by parallel rays is the same at every distance",
+            where=result.network.cameras[c].label,
+            do="use the field without a distance",
+        )
     camera = camera_mapping(result, c, additional)
     _, columns, _ = own_columns(result, c, additional)
     covariance = _with_mean_pose(result, c, columns)

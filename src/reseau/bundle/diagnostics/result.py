@@ -372,6 +372,9 @@ class Result(Display):
         block = cofactor[at[:, :, None], at[:, None, :]] * self.fit.variance
         turn = np.tile(np.eye(6), (len(images), 1, 1))
         rotation = self.fit.values.rotation[images]
+        # Projection centres of parallel rays are along the axes of the camera.
+        along = self.network.parallel[images]
+        turn[along, 3:, 3:] = np.swapaxes(rotation[along], 1, 2)
         for axis in range(3):
             small = rotation_matrix(_STEP * np.eye(3)[axis])
             change = parameters(small @ rotation) - parameters(small.T @ rotation)

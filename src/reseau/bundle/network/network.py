@@ -18,6 +18,7 @@ from ...optics import CameraModel, PixelGrid, PlaneMapping, additional_model, ca
 from ...optics.cameras import distortion_names
 from ...optics.refraction import Refraction
 from .rig import Rig
+from .shutter import Shutter
 from .stage import Stage
 
 __all__ = ["Additional", "Camera", "ControlPoints", "Network", "Usable", "finite", "usable"]
@@ -35,7 +36,7 @@ class Additional:
     Parameters
     ----------
     base_mm : float
-        Base b of the grid over which they are orthogonal.
+        Base b: of the grid over which they are orthogonal, or half of the longer side of the format.
     free : bool
         Whether they are estimated; otherwise they are zero.
     per : {"camera", "group", "image"}
@@ -61,6 +62,11 @@ class Additional:
     def names(self) -> tuple[str, ...]:
         """Names of the parameters of a set."""
         return additional_model(self.model).names
+
+    @property
+    def base(self) -> tuple[float, float]:
+        """Base and degree, for the kernels."""
+        return self.base_mm, float(additional_model(self.model).degree)
 
     def name(self, k: int, label: str) -> str:
         """Name of the k-th parameter, from 0, of the set with this label."""
@@ -101,6 +107,8 @@ class Camera:
     covariance : ndarray (u, u), optional
         Joint covariance of all parameters, for values from an earlier calibration: free parameters with a
         positive variance are observations. Replaces `sigma`.
+    shutter : Shutter, optional
+        For images whose lines are taken one after the other.
 
     Examples
     --------
@@ -123,6 +131,7 @@ class Camera:
     additional: Additional | None = None
     mapping: PlaneMapping | None = None
     covariance: Array | None = None
+    shutter: Shutter | None = None
 
     def __post_init__(self) -> None:
         if (self.model == "mapping") != (self.mapping is not None):
@@ -135,6 +144,12 @@ class Camera:
             raise UsageError(
                 f"the model `{self.model}` does not support additional parameters", where=f"camera {self.id}"
             )
+        if self.shutter is not None and self.compiled_kind is None:
+            raise UsageError(
+                f"the model `{self.model}` does not support a shutter", where=f"camera {self.id}"
+            )
+        if self.shutter is not None and self.shutter.mode == "line" and self.corrects_measured:
+            raise UsageError("a line camera needs the `side` object", where=f"camera {self.id}")
         if len(self.values) != len(self.names):
             raise UsageError(
                 f"has {len(self.values)} values, not {len(self.names)}", where=f"camera {self.id}"
@@ -184,6 +199,29 @@ class Camera:
         if model is None or model.kernel is None:
             return None
         return model.name, None if self.additional is None else self.additional.model
+
+    @property
+    def parallel(self) -> bool:
+        """Whether the rays are parallel to the optical axis."""
+        model = self.registered
+        return bool(self.mapping is not None and self.mapping.parallel) if model is None else model.parallel
+
+    @property
+    def corrects_measured(self) -> bool:
+        """Whether the distortion is that of the measured point."""
+        return self.options.get("side") == "image"
+
+    @property
+    def moving(self) -> bool:
+        """Whether velocities or rotation rates of its images are estimated."""
+        return self.shutter is not None and bool(self.shutter.is_free.any())
+
+    @property
+    def shutter_columns(self) -> Array:
+        """The shutter for the compiled loops (4,); zero for images that are taken at one moment."""
+        if self.shutter is None:
+            return np.zeros(4)
+        return self.shutter.columns(self.height, implicit=self.corrects_measured)
 
     @property
     def constants(self) -> Array:
@@ -305,6 +343,9 @@ class Network(Display):
         Images that were taken at once by cameras fixed to each other; cannot be combined with a stage.
     refraction : Refraction, optional
         Windows and media that the rays pass; without it, and for images without a path, all is in air.
+    motion : ndarray (m, 6), optional
+        Velocities and rotation rates of images of cameras with a shutter: observed, held or approximate
+        values; zero by default. See :mod:`reseau.bundle.network.shutter`.
 
     Examples
     --------
@@ -340,6 +381,7 @@ class Network(Display):
     stage: Stage | None = None
     rig: Rig | None = None
     refraction: Refraction | None = None
+    motion: Array | None = None
 
     def __post_init__(self) -> None:
         m, p, n = len(self.images), len(self.points), len(self.image_of)
@@ -365,6 +407,51 @@ class Network(Display):
             raise UsageError("cannot be combined with a stage", where="Network.rig")
         if self.refraction is not None:
             self._check_refraction(self.refraction)
+        if self.motion is not None and self.motion.shape != (m, 6):
+            raise UsageError(f"has the shape {self.motion.shape}, not ({m}, 6)", where="Network.motion")
+        for camera in self.cameras:
+            if not (camera.parallel or camera.shutter is not None):
+                continue
+            what = "parallel rays" if camera.parallel else "a shutter"
+            for name in ("stage", "rig", "refraction"):
+                if getattr(self, name) is not None:
+                    raise UsageError(
+                        f"a camera with {what} cannot be combined with a {name}", where=camera.label
+                    )
+
+    @property
+    def shutters(self) -> Mask:
+        """Images whose lines are taken one after the other (m,)."""
+        return np.array([camera.shutter is not None for camera in self.cameras])[self.camera_of]
+
+    @property
+    def parallel(self) -> Mask:
+        """Images with parallel rays (m,)."""
+        return np.array([camera.parallel for camera in self.cameras])[self.camera_of]
+
+    @property
+    def motions(self) -> Array:
+        """Velocities and rotation rates (m, 6), as given."""
+        return np.zeros((len(self.images), 6)) if self.motion is None else self.motion
+
+    @cached_property
+    def motion_free(self) -> Mask:
+        """Components of the motion that are estimated (m, 6); there is none along parallel rays."""
+        none = np.zeros(6, dtype=bool)
+        free = np.array([none if c.shutter is None else c.shutter.is_free for c in self.cameras])[
+            self.camera_of
+        ]
+        free[self.parallel, 2] = False
+        return free
+
+    @cached_property
+    def motion_sigma(self) -> Array:
+        """Standard deviations of observed components (m, 6), 0 for the others."""
+        none = np.zeros(6)
+        sigma = np.array([none if c.shutter is None else c.shutter.sigmas for c in self.cameras])[
+            self.camera_of
+        ]
+        return np.where(self.motion_free, sigma, 0.0)
 
     def _check_rig_windows(self, refraction: Refraction) -> None:
         where, through = "Network.refraction", refraction.path_of >= 0

@@ -15,6 +15,7 @@ from ...optics.refraction import RefractedRays, Refraction
 from ..network import Network
 from ..network.network import finite
 from .datum import similarity_onto
+from .parallel import resect_parallel
 from .spatial import behind_ports, directions, intersect, relative_orientation, resect, resect_through
 from .values import Values
 
@@ -173,7 +174,7 @@ class _Block:
         image, point = network.image_of[rows], network.point_of[rows]
         uv = self.uv[rows]
         for _ in range(3):
-            xyz, angle = intersect(image, point, uv, self.rotation, self.x0, len(self.xyz))
+            xyz, angle = intersect(image, point, uv, self.rotation, self.x0, len(self.xyz), network.parallel)
             off = self._misfit(image, point, uv, xyz)
             worst = np.zeros(len(xyz))
             np.maximum.at(worst, point, np.nan_to_num(off, posinf=1e9))
@@ -190,6 +191,10 @@ class _Block:
     def _misfit(self, image: Rows, point: Rows, uv: Array, xyz: Array) -> Array:
         """Angles (sine) between computed and measured directions; infinite behind the camera."""
         x = np.einsum("nij,nj->ni", self.rotation[image], xyz[point] - self.x0[image])
+        # Parallel rays: the distance from the ray, in that from the camera, which stands for its size.
+        beside = self.network.parallel[image]
+        x[beside, :2] -= uv[beside]
+        uv = np.where(beside[:, None], 0.0, uv)
         ray = np.column_stack([uv, np.ones(len(uv))])
         with np.errstate(divide="ignore", invalid="ignore"):
             across = np.linalg.norm(np.cross(x, ray), axis=1)
@@ -229,6 +234,12 @@ class _Block:
     def _resect(self, i: int, rows: Mask) -> bool:
         """Orient an image by some of its points; return whether it could be oriented."""
         refraction, xyz = self.network.refraction, self.xyz[self.network.point_of[rows]]
+        if self.network.parallel[i]:
+            straight = resect_parallel(xyz, self.uv[rows], _LOOSE)
+            if straight is None or straight.agree.sum() < max(4, 0.5 * rows.sum()):
+                return False
+            self.rotation[i], self.x0[i] = straight.rotation, straight.x0
+            return True
         bent = refraction is not None and refraction.path_of[i] >= 0
         found = resect(xyz, self.uv[rows], _BENT if bent else _LOOSE)
         if found is not None and bent and refraction is not None:
@@ -325,6 +336,9 @@ class _Block:
     def _pair(self, a: int, b: int) -> tuple[float, Array, Array] | None:
         """Return the score of a pair and its relative orientation."""
         network = self.network
+        if network.parallel[[a, b]].any():
+            # Two images with parallel rays do not determine their angle.
+            return None
         in_a, in_b = np.flatnonzero(network.image_of == a), np.flatnonzero(network.image_of == b)
         _, left, right = np.intersect1d(
             network.point_of[in_a], network.point_of[in_b], assume_unique=True, return_indices=True

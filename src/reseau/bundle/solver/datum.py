@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg
 
 from ...core.data import Array, Mask, Rows
+from ..network import Camera
 from .system import System
 from .unknowns import Unknowns
 from .values import Values
@@ -44,6 +45,8 @@ class Similarity(NamedTuple):
             xyz=self.scale * values.xyz @ self.turn.T + self.shift,
             stage=None if values.stage is None else values.stage.turned(self.turn),
             rig=None if values.rig is None else values.rig.scaled(self.scale),
+            cameras=values.cameras.copy(),
+            motion=values.motion * np.repeat([self.scale, 1.0], 3),
         )
 
     def about(self, origin: Array) -> Similarity:
@@ -98,7 +101,19 @@ def _similarity_changes(
     images = np.flatnonzero(unknowns.pose >= 0)
     at = unknowns.pose[images, None] + np.arange(3)
     reduced[at, 3:6] = -values.rotation[images]
-    reduced[at + 3] = moved(values.x0[images])
+    centres = moved(values.x0[images])
+    along = unknowns.network.parallel[images]
+    centres[along] = values.rotation[images][along] @ centres[along]
+    # No ray depends on the distance of parallel rays.
+    centres[along, 2] = 0.0
+    reduced[at + 3] = centres
+    for c in np.flatnonzero(unknowns.camera >= 0):
+        camera = unknowns.network.cameras[c]
+        for k, name in enumerate(camera.free):
+            if camera.parallel and name in _magnification(camera):
+                reduced[unknowns.camera[c] + k, 6] = -values.cameras[c, camera.names.index(name)]
+    moving = np.flatnonzero(unknowns.motion >= 0)
+    reduced[unknowns.motion[moving, None] + np.arange(3), 6] = values.motion[moving, :3]
     reduced[unknowns.refraction_columns] = windows[unknowns.refracting]
     for c in np.flatnonzero(unknowns.mount >= 0):
         if values.rig is not None:
@@ -153,7 +168,7 @@ def freedom_of(system: System, values: Values, taking_part: Mask, *, windows: bo
         known[system.others.refraction[system.sigma_root[system.others.windows] > 0]] = True
         rows.append(moving[known])
     bases = system.sigma_root[system.others.base_lengths]
-    if network.stage is not None or (bases > 0).any():
+    if network.stage is not None or (bases > 0).any() or _scaled_by_cameras(unknowns, values):
         rows.append(np.eye(7)[6:])
     size = float(np.sqrt((values.xyz[taking_part] ** 2).sum(axis=1).mean())) or 1.0
     scale = np.array([1.0, 1.0, 1.0, 1 / size, 1 / size, 1 / size, 1 / size])
@@ -168,6 +183,23 @@ def freedom_of(system: System, values: Values, taking_part: Mask, *, windows: bo
     basis = scale[:, None] * free
     points *= system.movable[:, :, None]
     return Freedom(reduced @ basis, points @ basis, names)
+
+
+def _magnification(camera: Camera) -> tuple[str, ...]:
+    return () if camera.registered is None else camera.registered.of_role("scale")
+
+
+def _scaled_by_cameras(unknowns: Unknowns, values: Values) -> bool:
+    """Whether a known magnification of parallel rays, or a known velocity of an image, gives the scale."""
+    network = unknowns.network
+    for c in np.unique(network.camera_of[unknowns.pose >= 0]):
+        camera = network.cameras[c]
+        free = {name for name in camera.free if name not in camera.sigma and camera.covariance is None}
+        if camera.parallel and not set(_magnification(camera)) <= free:
+            return True
+    given = ~network.motion_free[:, :3] & (values.motion[:, :3] != 0) & network.shutters[:, None]
+    observed = network.motion_sigma[:, :3] > 0
+    return bool((given | observed)[unknowns.pose >= 0].any())
 
 
 def scaled_by_windows(system: System, values: Values, taking_part: Mask) -> bool:
@@ -220,7 +252,7 @@ def held_minimally(freedom: Freedom, unknowns: Unknowns, values: Values) -> Rows
     """
     images = np.flatnonzero(unknowns.pose >= 0)
     first: Rows = np.asarray(unknowns.pose[images[0]] + np.arange(6), dtype=np.intp)
-    if freedom.defect < 6 or len(images) < 2:
+    if freedom.defect < 6 or len(images) < 2 or len(unknowns.distances):
         return held_for(freedom, unknowns, np.ones(unknowns.size))
     if freedom.defect == 6:
         return first

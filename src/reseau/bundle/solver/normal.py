@@ -2,9 +2,9 @@
 
 For each point j with rays k, the blocks V = Σ BᵀB, W = Σ AᵀB and the right-hand side are formed and its part
 of the reduced normal equations S = Σ AᵀA − Σ W V⁻¹ Wᵀ is added (Brown 1958; Kraus, *Photogrammetry*;
-Förstner & Wrobel 2016, sect. 15.3.3). A ray depends on at most five *segments* of the reduced unknowns: pose,
-interior orientation, additional parameters, windows and media, and the point itself where it is not
-eliminated.
+Förstner & Wrobel 2016, sect. 15.3.3). A ray depends on at most six *segments* of the reduced unknowns: pose,
+interior orientation, additional parameters, windows and media, the point itself where it is not eliminated,
+and the motion of the camera.
 
 S is an arrow matrix: a band of `bands` unknowns (lower triangle, column by column) and full rows below it.
 """
@@ -20,13 +20,13 @@ from .compiled import compiled
 
 __all__ = ["SEGMENTS", "Pattern", "Sums", "assemble", "locals_of", "posterior", "reduce_sides", "substitute"]
 
-SEGMENTS = 5
+SEGMENTS = 6
 
 
 class Pattern(NamedTuple):
     """Sparsity pattern, in columns over points (p), rays (n) and local segments.
 
-    Point j has the rays `first[j]:first[j+1]`. For each segment of a ray, `start` (n, 5) is its first reduced
+    Point j has the rays `first[j]:first[j+1]`. For each segment of a ray, `start` (n, 6) is its first reduced
     unknown, `width` its number of unknowns, `column` its first column among the derivatives of the ray, and
     `place` its first position among the unknowns that the point depends on. These unknowns are the segments
     `local[j]:local[j+1]` of `at`, `size`, `offset`, in ascending order; `eliminated` (p,) is 1 for
@@ -57,7 +57,7 @@ class Sums(NamedTuple):
 
 @compiled
 def locals_of(first: Rows, start: Rows, width: Rows, place: Rows, out: Rows, count: Rows) -> int:
-    """Write the distinct segments of each point to `out` (n·5, 3) and `place`; return their number."""
+    """Write the distinct segments of each point to `out` (n·6, 3) and `place`; return their number."""
     total = 0
     for j in range(len(first) - 1):
         base = total

@@ -35,6 +35,8 @@ class OtherObservations:
         Rows of L⁻¹: the observations are the uncorrelated combinations L⁻¹ p of the parameters p.
     refraction : ndarray of int (w,)
         Rows of the observed parameters of windows and media.
+    motion : ndarray of int (v, 2)
+        Image and component of the observed velocities and rotation rates.
     reading : ndarray of int (r,)
         Images of the stage readings.
     across : ndarray (3, t)
@@ -42,7 +44,7 @@ class OtherObservations:
         observed as zero. Empty without a stage.
     bases : ndarray of int (b, 2)
         Cameras of the known bases of a rig.
-    value, sigma : ndarray (d + q + i + k + w + r + t + b,)
+    value, sigma : ndarray (d + q + i + k + w + v + r + t + b,)
         Observed values and their standard deviations, in this order.
     """
 
@@ -52,6 +54,7 @@ class OtherObservations:
     joint: Rows
     combination: Array
     refraction: Rows
+    motion: Rows
     reading: Rows
     across: Array
     bases: Rows
@@ -73,6 +76,7 @@ class OtherObservations:
         bent = network.refraction
         windows = np.zeros(0, np.intp) if bent is None else np.flatnonzero(bent.free & (bent.sigma > 0))
         j, axis = coordinate.T
+        moved = np.argwhere(network.motion_sigma > 0).astype(np.intp)
         stage = network.stage
         read = np.zeros(0) if stage is None else stage.reading
         across_axis = np.zeros((3, 0)) if stage is None else perpendicular(stage.axis)
@@ -85,6 +89,7 @@ class OtherObservations:
             joint,
             combination,
             windows.astype(np.intp),
+            moved,
             np.arange(len(read), dtype=np.intp),
             across_axis,
             np.zeros((0, 2), dtype=np.intp) if network.rig is None else network.rig.base_of,
@@ -95,6 +100,7 @@ class OtherObservations:
                     [network.cameras[c].values[row] for c, row in at],
                     observed,
                     [] if bent is None else bent.values[windows],
+                    network.motions[moved[:, 0], moved[:, 1]],
                     read,
                     np.zeros(tilts),
                     known[:, 0],
@@ -107,6 +113,7 @@ class OtherObservations:
                     [s for *_, s in interior],
                     np.ones(len(joint)),
                     [] if bent is None else bent.sigma[windows],
+                    network.motion_sigma[moved[:, 0], moved[:, 1]],
                     np.full(len(read), 0.0 if stage is None else stage.sigma),
                     np.full(tilts, 0.0 if stage is None else stage.axis_sigma),
                     known[:, 1],
@@ -133,9 +140,15 @@ class OtherObservations:
         return slice(start, start + len(self.refraction))
 
     @property
+    def motions(self) -> slice:
+        """Positions of velocities and rotation rates in `value`."""
+        start = self.windows.stop
+        return slice(start, start + len(self.motion))
+
+    @property
     def readings(self) -> slice:
         """Positions of the stage readings in `value`."""
-        start = self.windows.stop
+        start = self.motions.stop
         return slice(start, start + len(self.reading))
 
     @property
@@ -160,6 +173,7 @@ class OtherObservations:
                 values.cameras[self.interior[:, 0], self.interior[:, 1]],
                 (self.combination * values.cameras[self.joint, :width]).sum(axis=1),
                 values.refraction[self.refraction],
+                values.motion[self.motion[:, 0], self.motion[:, 1]],
                 [] if values.stage is None else values.stage.reading[self.reading],
                 [] if values.stage is None else values.stage.axis @ self.across,
                 [] if values.rig is None else values.rig.lengths(self.bases),

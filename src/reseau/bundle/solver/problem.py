@@ -58,7 +58,8 @@ class BundleProblem(Display):
     """All observations of a network in one column, with approximate values.
 
     Image coordinates come first, x and y alternating, then distances, observed coordinates, observed interior
-    orientation (single parameters, then joint), windows and media, readings and axis of a stage. It is an
+    orientation (single parameters, then joint), windows and media, motion of the images, readings and axis of
+    a stage. It is an
     :class:`~reseau.adjust.fitted.Adjustable`: robust estimation, data snooping and variance components of
     :mod:`reseau.adjust` apply to it as to any other problem.
 
@@ -301,10 +302,13 @@ class _Run:
         coordinate, interior = part[more.coordinate[:, 0]], used[more.interior[:, 0]]
         joint = used[more.joint]
         windows = np.ones(len(more.refraction), dtype=bool)
+        moved = self.usable.images[more.motion[:, 0]]
         read = self.usable.images[more.reading]
         axis = np.ones(more.across.shape[1], dtype=bool)
         bases = self._connected(more.bases)
-        self.in_others = np.concatenate([bars, coordinate, interior, joint, windows, read, axis, bases])
+        self.in_others = np.concatenate(
+            [bars, coordinate, interior, joint, windows, moved, read, axis, bases]
+        )
         self.weights = np.concatenate(
             [
                 np.where(self.usable.observations[:, None], pairs, 0.0).ravel(),
@@ -320,6 +324,7 @@ class _Run:
             more.joint[joint],
             more.combination[joint],
             more.refraction,
+            more.motion[moved],
             more.reading[read],
             more.across,
             more.bases[bases],
@@ -521,6 +526,11 @@ class _Run:
         scaled = freedom.defect == 7
         similarity = similarity_onto(values.xyz[chosen], reference[chosen], scaled=scaled)
         moved, bent = similarity(values), self.network.refraction
+        for c, camera in enumerate(self.network.cameras):
+            if camera.parallel and camera.registered is not None:
+                # A magnification counts per unit of object space.
+                rows = [camera.names.index(name) for name in camera.registered.of_role("scale")]
+                moved.cameras[c, rows] /= similarity.scale
         if bent is None:
             return moved
         # Windows count from the origin of the network.

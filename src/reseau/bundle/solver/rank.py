@@ -112,6 +112,8 @@ def weak_images(linear: Linear) -> Rows:
     j = linear.rows[:, :, :6]
     normal = np.zeros((len(unknowns.pose), 6, 6))
     np.add.at(normal, system.seen.image, np.swapaxes(j, 1, 2) @ j)
+    # The distance of parallel rays is held.
+    normal[unknowns.network.parallel, 5, 5] = 1.0
     images = np.flatnonzero(unknowns.pose >= 0)
     size = np.sqrt(np.diagonal(normal[images], axis1=1, axis2=2))
     known = (size > 0).all(axis=1)

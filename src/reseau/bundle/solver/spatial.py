@@ -116,7 +116,7 @@ def behind_ports(refraction: Refraction, uv: Array, image_of: Rows) -> Array:
 
 
 def intersect(
-    image: Rows, point: Rows, uv: Array, rotation: Array, x0: Array, points: int
+    image: Rows, point: Rows, uv: Array, rotation: Array, x0: Array, points: int, parallel: Mask | None = None
 ) -> tuple[Array, Array]:
     """Compute the points nearest to all their rays, and the intersection angles of the rays.
 
@@ -130,16 +130,22 @@ def intersect(
         Poses.
     points : int
         Number of points p.
+    parallel : ndarray of bool (m,), optional
+        Images with parallel rays, whose `uv` are xc, yc.
 
     Returns
     -------
     ndarray (p, 3), ndarray (p,)
         Points, NaN with fewer than two rays; intersection angles (rad), 0 for parallel rays.
     """
-    ray = np.einsum("nji,nj->ni", rotation[image], np.column_stack([uv, np.ones(len(uv))]))
+    beside = np.zeros(len(uv), dtype=bool) if parallel is None else parallel[image]
+    uv3 = np.column_stack([uv, np.zeros(len(uv))])
+    ray = np.where(beside[:, None], 0.0, uv3)
+    ray[:, 2] = 1.0
+    ray = np.einsum("nji,nj->ni", rotation[image], ray)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
-    begin = x0[image]
+    begin = x0[image] + np.einsum("nji,nj->ni", rotation[image], np.where(beside[:, None], uv3, 0.0))
     centre = begin.mean(axis=0) if len(begin) else np.zeros(3)
     normal, side = np.zeros((points, 3, 3)), np.zeros((points, 3))
     np.add.at(normal, point, across)

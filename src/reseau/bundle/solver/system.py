@@ -140,7 +140,7 @@ class System:
         """Columns of other observations of single reduced unknowns.
 
         Rows and columns of observed coordinates of kept points, then rows and columns of observed interior
-        orientation and of observed parameters of windows and media.
+        orientation, of observed parameters of windows and media, and of the motion of cameras.
         """
         unknowns, (_, coordinates, interior) = self.unknowns, self.others.slices
         kept = unknowns.kept[self.others.coordinate[:, 0]]
@@ -149,14 +149,23 @@ class System:
         place = [int(np.flatnonzero(unknowns.free[i] == p)[0]) for i, p in zip(c, parameter, strict=True)]
         used = unknowns.camera[c] >= 0
         windows, bent = self.others.windows, self.others.refraction
+        image, component = self.others.motion.T
+        moved = unknowns.motion[image] >= 0
         return (
             coordinates.start + rows,
             kept[rows] + self.others.coordinate[rows, 1],
-            np.concatenate([interior.start + np.flatnonzero(used), windows.start + np.arange(len(bent))]),
+            np.concatenate(
+                [
+                    interior.start + np.flatnonzero(used),
+                    windows.start + np.arange(len(bent)),
+                    self.others.motions.start + np.flatnonzero(moved),
+                ]
+            ),
             np.concatenate(
                 [
                     (unknowns.camera[c] + np.array(place, dtype=np.intp))[used],
                     unknowns.refraction + np.searchsorted(unknowns.refracting, bent),
+                    (unknowns.motion[image] + component)[moved],
                 ]
             ),
         )

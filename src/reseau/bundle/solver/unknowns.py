@@ -11,6 +11,7 @@ import scipy.sparse.csgraph
 
 from ...core.data import Mask, Rows
 from ..network import Network
+from ..network.shutter import MOTION
 from .normal import SEGMENTS, Pattern, locals_of
 
 __all__ = ["Unknowns"]
@@ -19,6 +20,8 @@ __all__ = ["Unknowns"]
 _DENSE = 1500
 _POINT = ("X", "Y", "Z")
 _POSE = ("dx", "dy", "dz", "X0", "Y0", "Z0")
+# With parallel rays the projection centre moves along the axes of the camera.
+_PARALLEL_POSE = ("dx", "dy", "dz", "shift x", "shift y", "distance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +50,8 @@ class Unknowns:
         First of the six columns of the place of each camera on a rig on which the rays through a window of
         the rig depend: rotation about the axes of the camera, projection centre; −1 for the others. They
         follow the parameters of windows and media.
+    motion : ndarray of int (m,)
+        First of the six columns of velocity and rotation rates of each image, −1 for none.
     kept : ndarray of int (p,)
         First of three columns of points that are not eliminated, −1 for the others.
     size, bands, bandwidth : int
@@ -62,6 +67,7 @@ class Unknowns:
     extra_names: tuple[tuple[int, str], ...]
     refraction: int
     mount: Rows
+    motion: Rows
     kept: Rows
     size: int
     bands: int
@@ -79,11 +85,15 @@ class Unknowns:
         widths = [0 if a is None else len(a.names) for a in sets]
         order, reach = _ordered(network, active)
         m = len(network.images)
-        pose, camera = np.full(m, -1), np.full(len(users), -1)
+        pose, camera, motion = np.full(m, -1), np.full(len(users), -1), np.full(m, -1)
+        moving: Mask = np.asarray(network.motion_free.any(axis=1))
         extra, at, ends = np.full(len(extra_names), -1), 0, []
         for i in order:
             pose[i] = at
             at += 6
+            if moving[i]:
+                motion[i] = at
+                at += 6
             c, e = network.camera_of[i], extra_of[i]
             if users[c] == 1:
                 camera[c] = at
@@ -113,8 +123,8 @@ class Unknowns:
             kept[j] = at
             at += 3
         return cls(
-            network, active, pose, camera, extra, extra_of, extra_names, refraction, mount, kept, int(at),
-            int(bands), bandwidth if bands else 0,
+            network, active, pose, camera, extra, extra_of, extra_names, refraction, mount, motion, kept,
+            int(at), int(bands), bandwidth if bands else 0,
         )  # fmt: skip
 
     @cached_property
@@ -174,10 +184,28 @@ class Unknowns:
         """Number of derivatives of a ray by windows, media and places of cameras before windows of a rig."""
         return len(self.refracting) + 6 * int((self.mount >= 0).sum())
 
+    @property
+    def moving_width(self) -> int:
+        """Number of derivatives of a ray by velocity and rotation rates."""
+        return 6 * int((self.motion >= 0).any())
+
+    @cached_property
+    def distances(self) -> Rows:
+        """Columns (k,) of the distances of cameras with parallel rays, which no ray depends on."""
+        images = (self.pose >= 0) & self.network.parallel
+        return (self.pose[images] + 5).astype(np.intp)
+
     @cached_property
     def dropped(self) -> Mask:
-        """Mask of the columns (u,) of additional parameters held at zero."""
+        """Mask of the columns (u,) that are held.
+
+        These are additional parameters held at zero, components of the motion that are not estimated, and
+        distances of cameras with parallel rays.
+        """
         held = np.zeros(self.size, dtype=bool)
+        held[self.distances] = True
+        for i in np.flatnonzero(self.motion >= 0):
+            held[self.motion[i] + np.flatnonzero(~self.network.motion_free[i])] = True
         for (c, label), at in zip(self.extra_names, self.extra, strict=True):
             extra = self.network.cameras[c].additional
             if at >= 0 and extra is not None and extra.dropped:
@@ -188,7 +216,7 @@ class Unknowns:
     @property
     def width(self) -> int:
         """Number of derivatives of a ray."""
-        return 6 + int(self.count.max()) + self.bent_width + self.extra_width + 3
+        return 6 + int(self.count.max()) + self.moving_width + self.bent_width + self.extra_width + 3
 
     @cached_property
     def pattern(self) -> Pattern:
@@ -209,6 +237,9 @@ class Unknowns:
             start[:, 3] = np.where(bent.path_of[image] >= 0, self.refraction, -1)
             width[:, 3] = np.where(start[:, 3] >= 0, self.bent_width, 0)
             column[:, 3] = self.width - 3 - self.extra_width - self.bent_width
+        start[:, 5] = self.motion[image]
+        width[:, 5] = np.where(start[:, 5] >= 0, 6, 0)
+        column[:, 5] = self.width - 3 - self.extra_width - self.bent_width - self.moving_width
         start[:, 4] = self.kept[point]
         width[:, 4], column[:, 4] = np.where(start[:, 4] >= 0, 3, 0), self.width - 3
         place = np.zeros_like(start)
@@ -227,7 +258,11 @@ class Unknowns:
         names = [""] * self.size
         for i, at in enumerate(self.pose):
             if at >= 0:
-                names[at : at + 6] = [f"{name} of image {self.network.images[i]}" for name in _POSE]
+                own_pose = _PARALLEL_POSE if self.network.parallel[i] else _POSE
+                names[at : at + 6] = [f"{name} of image {self.network.images[i]}" for name in own_pose]
+            if self.motion[i] >= 0:
+                own = [f"{name} of image {self.network.images[i]}" for name in MOTION]
+                names[self.motion[i] : self.motion[i] + 6] = own
         for camera, at in zip(self.network.cameras, self.camera, strict=True):
             if at >= 0:
                 names[at : at + len(camera.free)] = [f"{name} of camera {camera.id}" for name in camera.free]

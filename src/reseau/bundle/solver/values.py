@@ -82,6 +82,8 @@ class Values:
         Parameters of all windows and media.
     rig : RigValues, optional
         Places of the cameras on a rig.
+    motion : ndarray (m, 6)
+        Velocities and rotation rates of the images.
     """
 
     rotation: Array
@@ -92,6 +94,7 @@ class Values:
     stage: StageValues | None = None
     refraction: Array = field(default_factory=lambda: np.zeros(0))
     rig: RigValues | None = None
+    motion: Array = field(default_factory=lambda: np.zeros((0, 6)))
 
     @classmethod
     def of_cameras(cls, unknowns: Unknowns, rotation: Array, x0: Array, xyz: Array) -> Values:
@@ -103,12 +106,12 @@ class Values:
         extra = np.zeros((max(1, len(unknowns.extra)), unknowns.extra_width))
         bent = network.refraction
         refraction = np.zeros(0) if bent is None else bent.values
-        return cls(rotation, x0, xyz, cameras, extra, refraction=refraction)
+        return cls(rotation, x0, xyz, cameras, extra, refraction=refraction, motion=network.motions)
 
     @property
     def orientation(self) -> Orientation:
         """Poses and points for the compiled loops."""
-        return Orientation(self.rotation, self.x0, self.xyz)
+        return Orientation(self.rotation, self.x0, self.xyz, self.motion)
 
     def beyond(self, radius: float) -> Rows:
         """Return the points farther than `radius` from the origin."""
@@ -131,6 +134,9 @@ class Values:
         images = unknowns.pose >= 0
         pose = np.zeros((len(images), 6))
         pose[images] = y[unknowns.pose[images, None] + np.arange(6)]
+        # Projection centres of parallel rays move along the axes of the camera.
+        along = images & unknowns.network.parallel
+        pose[along, 3:] = np.einsum("nji,nj->ni", self.rotation[along], pose[along, 3:])
         rotation = self.rotation.copy()
         rotation[images] = rotation_matrix(pose[images, :3]) @ self.rotation[images]
         cameras, extra, xyz = self.cameras.copy(), self.extra.copy(), self.xyz + step.points
@@ -153,4 +159,7 @@ class Values:
             )
         refraction = self.refraction.copy()
         refraction[unknowns.refracting] += y[unknowns.refraction_columns]
-        return Values(rotation, x0, xyz, cameras, extra, stage, refraction, rig)
+        motion = self.motion.copy()
+        moving = unknowns.motion >= 0
+        motion[moving] += y[unknowns.motion[moving, None] + np.arange(6)]
+        return Values(rotation, x0, xyz, cameras, extra, stage, refraction, rig, motion)

@@ -21,6 +21,7 @@ from .projections import (  # isort: skip
     Orthographic,
     Stereographic,
 )
+from .telecentric import Telecentric  # isort: skip
 from .convert import Converted, convert
 from .ebner import EbnerCorrection
 from .grid import PixelGrid
@@ -39,6 +40,7 @@ from .registry import (
     register_camera,
     unit_of,
 )
+from .series import ChebyshevCorrection, FourierCorrection
 
 __all__ = [
     "AdditionalModel",
@@ -46,12 +48,14 @@ __all__ = [
     "BrownDistortion",
     "BrownWithAdditional",
     "CameraModel",
+    "ChebyshevCorrection",
     "Converted",
     "Division",
     "DoubleSphere",
     "EbnerCorrection",
     "Equisolid",
     "Fisheye",
+    "FourierCorrection",
     "Omni",
     "OpenCV",
     "Option",
@@ -59,6 +63,7 @@ __all__ = [
     "Parameter",
     "PixelGrid",
     "Stereographic",
+    "Telecentric",
     "additional_model",
     "additional_models",
     "camera_model",

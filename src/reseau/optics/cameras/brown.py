@@ -280,6 +280,11 @@ class BrownWithAdditional(PlaneMapping):
         """Values of all parameters."""
         return np.concatenate([self.camera.values, self.additional.values])
 
+    @property
+    def parallel(self) -> bool:
+        """As of the camera."""
+        return self.camera.parallel
+
     def _replaced(self, values: Array) -> Self:
         count = len(self.camera.names)
         return replace(
@@ -306,7 +311,7 @@ class BrownWithAdditional(PlaneMapping):
 
 
 @kernel
-def _brown(
+def brown_kernel(
     k: int, c: int, e: int, u: float, v: float, xy: Array, cameras: CameraColumns, by_uv: Array, d: Array,
     more: Array, off: Array,
 ) -> None:  # fmt: skip
@@ -398,11 +403,13 @@ def _start(f: float, grid: PixelGrid) -> dict[str, float]:
     return {"c": f * grid.pitch_mm[0]}
 
 
-def _combine(camera: Brown, extra: PlaneMapping) -> BrownWithAdditional | None:
+def with_additional(camera: Brown, extra: PlaneMapping) -> BrownWithAdditional | None:
+    """Return the camera with additional parameters; None with the distortion on the image side."""
     return None if camera.side == "image" else BrownWithAdditional(camera, extra)
 
 
-def _constants(options: Named[str, Any], higher: bool) -> list[float]:
+def brown_constants(options: Named[str, Any], higher: bool) -> list[float]:
+    """Return what the kernel finds in `CameraColumns.constants`."""
     radius = float(options["balance_radius_mm"]) ** np.array([2.0, 4.0, 6.0, 8.0, 10.0])
     return [float(options["side"] == "image"), *radius.tolist(), float(higher)]
 
@@ -416,8 +423,8 @@ for _name, _parameters in (("brown", PARAMETERS), ("brown_higher", HIGHER_PARAME
             _start,
             (Option("side", "object", ("object", "image"), required=True), Option("balance_radius_mm", 0.0)),
             needs_pitch=True,
-            combine=_combine,
-            kernel=_brown,
-            constants=partial(_constants, higher=_parameters is HIGHER_PARAMETERS),
+            combine=with_additional,
+            kernel=brown_kernel,
+            constants=partial(brown_constants, higher=_parameters is HIGHER_PARAMETERS),
         )
     )

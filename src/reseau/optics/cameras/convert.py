@@ -142,7 +142,8 @@ def convert(
     Raises
     ------
     UsageError
-        When the model or a parameter is unknown, or the original has no directions over most of the image.
+        When the model or a parameter is unknown, the rays of one of the models are parallel and those of the
+        other are not, or the original has no directions over most of the image.
 
     Examples
     --------
@@ -157,6 +158,9 @@ def convert(
     unknown = [name for name in free if name not in wanted.names]
     if unknown:
         raise UsageError(f"is not one of {', '.join(wanted.names)}", where=unknown[0])
+    if camera.parallel != wanted.parallel:
+        rays = "parallel" if camera.parallel else "central"
+        raise UsageError(f"has {rays} rays, the model `{model}` has not", where="camera to be converted")
     step = max(grid.width, grid.height) / _POINTS
     columns = np.linspace(0, grid.width - 1, max(2, round(grid.width / step)))
     rows = np.linspace(0, grid.height - 1, max(2, round(grid.height / step)))

@@ -86,7 +86,7 @@ def _ebner(
     syx: float, syy: float, more: Array,
 ) -> tuple[float, float, float, float, float, float]:  # fmt: skip
     """See :func:`reseau.optics.cameras.kernels.additional`."""
-    b, base = cameras.extra, cameras.base[e]
+    b, base = cameras.extra, cameras.base[e, 0]
     k, m = 2.0 * base * base / 3.0, 4.0 * base * base / 3.0
     xk, yk = x * x - k, y * y - k
     more[:, :] = 0.0

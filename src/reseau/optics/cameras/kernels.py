@@ -49,8 +49,8 @@ class CameraColumns(NamedTuple):
         Centre of the image (px) and pitch (mm).
     extra : ndarray (e, a)
         Values of the additional parameters; padded to the longest.
-    base : ndarray (e,)
-        Base of the grid of the additional parameters (mm).
+    base : ndarray (e, 2)
+        Base of the additional parameters (mm), and their degree.
     """
 
     values: Array

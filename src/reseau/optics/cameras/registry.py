@@ -145,6 +145,9 @@ class CameraModel:
         For the compiled loops of the bundle adjustment.
     constants : callable
         ``constants(options)`` is what the kernel finds in `CameraColumns.constants`.
+    parallel : bool
+        Whether the rays are parallel to the optical axis: the mapping then begins with xc, yc in the unit of
+        object space, and its scale is a magnification.
 
     Examples
     --------
@@ -165,6 +168,7 @@ class CameraModel:
     combine: Callable[[Any, PlaneMapping], PlaneMapping | None] | None = None
     kernel: Kernel[..., Any] | None = None
     constants: Callable[[Options], ArrayLike] = lambda options: ()
+    parallel: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -280,6 +284,8 @@ class AdditionalModel:
         ``build(values, base_mm)`` is the mapping of photo-coordinates (mm) to corrected ones.
     kernel : Kernel
         For the slot :func:`reseau.optics.cameras.kernels.additional`.
+    degree : int
+        Degree of a series, for the kernel.
 
     Examples
     --------
@@ -291,8 +297,14 @@ class AdditionalModel:
     names: tuple[str, ...]
     build: Callable[[Array, float], PlaneMapping]
     kernel: Kernel[..., Any]
+    degree: int = 0
 
 
+# Names under which other programs and publications know the models.
+_OTHER_NAMES = {
+    "equidistant": "fisheye", "kannala_brandt": "fisheye", "kb4": "fisheye", "mei": "omni", "ucm": "omni",
+    "unified": "omni", "ds": "double_sphere", "radtan": "opencv", "affine": "telecentric",
+}  # fmt: skip
 _CAMERAS: dict[str, CameraModel] = {}
 _ADDITIONAL: dict[str, AdditionalModel] = {}
 
@@ -357,8 +369,8 @@ def additional_models() -> tuple[AdditionalModel, ...]:
 
     Examples
     --------
-    >>> [model.name for model in additional_models()]
-    ['ebner12']
+    >>> [model.name for model in additional_models()][:2]
+    ['ebner12', 'chebyshev2']
     """
     return tuple(_ADDITIONAL.values())
 
@@ -453,5 +465,9 @@ def unit_of(name: str, model: str = "mapping") -> str:
 
 def _found(table: Mapping[str, T], name: str, what: str) -> T:
     if name not in table:
+        if name in _OTHER_NAMES:
+            raise UsageError(
+                "has another name here", where=f"{what} {name!r}", do=f"use {_OTHER_NAMES[name]}"
+            )
         raise UsageError("is unknown", where=f"{what} {name!r}", do=f"use one of {', '.join(table)}")
     return table[name]
