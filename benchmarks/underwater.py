@@ -12,8 +12,9 @@ with its interval of 95 %, and µm), the rms that the standard deviations of the
 numbers predict, rms of the errors of the object points that are not control and of their means over all seeds
 (mm), the mean shift of the coordinates, errors over sigmas of the object points with their interval, the
 standard deviations of the coordinates (pixels; those by rays attain the Cramér–Rao bound,
-``benchmarks/blurred.py``), and all of it for sharp photographs with the same noise. With `--assumed`: the
-same with a wrong design of the lens. With `--keep`, the figures of each seed are kept in a file, and those
+``benchmarks/blurred.py``), grey-value residuals over noise (misfit) and the number of image points left out,
+and all of it for sharp photographs with the same noise. With `--assumed`: the same with a wrong design of the
+lens. With `--keep`, the figures of each seed are kept in a file, and those
 there are not computed again.
 """
 
@@ -67,7 +68,8 @@ class Figures:
     """What one way of measuring gives for one project.
 
     Residuals outside the sharp centre and what their sigmas predict, errors of the object points that are not
-    control, mean shift of the coordinates, errors over sigmas, sigmas of the coordinates.
+    control, mean shift of the coordinates, errors over sigmas, sigmas of the coordinates; grey-value residuals
+    of the targets over the noise of the worst photograph, and the image points left out.
     """
 
     residuals_px: float
@@ -76,6 +78,8 @@ class Figures:
     shift_px: float
     over_sigma: float
     sigma_px: float
+    misfit: float = float("nan")
+    left_out: int = 0
 
 
 def camera_of(strength: str, change: Callable[[Prescription], Prescription] | None = None) -> LensCamera:
@@ -189,7 +193,12 @@ def figures(drawn: Project, result: Result, shift_px: float = 0.0) -> Figures:
 def by_rays(drawn: Project, camera: LensCamera) -> Figures:
     """Figures of the procedure."""
     found = measured(drawn, camera, "centroid")
-    return figures(drawn, found.result, found.rounds[found.chosen].shift_px)
+    chosen = found.rounds[found.chosen]
+    return replace(
+        figures(drawn, found.result, chosen.shift_px),
+        misfit=max(photograph.misfit for photograph in chosen.measured.values()),
+        left_out=int(chosen.declined.sum()),
+    )
 
 
 TRIPLET = (
@@ -291,6 +300,7 @@ def _row(text: str, rows: list[Figures]) -> str:
         f"{_rms(column('predicted_px'))[0]:>10.4f}{np.sqrt(np.nanmean(errors**2)):>8.4f}"
         f"{np.sqrt(np.nanmean(bias**2)):>8.4f}{_rms(column('shift_px'))[0]:>8.3f}"
         f"{over[0]:>7.2f} ± {over[1]:.2f}{_rms(column('sigma_px'))[0]:>9.4f}"
+        f"{_rms(column('misfit'))[0]:>8.2f}{column('left_out').mean():>10.1f}"
     )
 
 
@@ -312,7 +322,7 @@ def main() -> None:
         chosen.report.write_text(blurred_network_report(found, title=f"underwater, {strengths[0]}"))
     print(
         f"{'':<28}{'residuals, px':>17}{'µm':>6}{'predicted':>10}{'mm rms':>8}{'bias':>8}{'shift':>8}"
-        f"{'e/σ':>14}{'σ, px':>9}"
+        f"{'e/σ':>14}{'σ, px':>9}{'misfit':>8}{'left out':>10}"
     )
     # Seed by seed, so that what is kept after a stop is of all strengths.
     rows: dict[str, dict[str, list[Figures]]] = {name: {} for name in ("sharp", *strengths)}

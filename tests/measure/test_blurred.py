@@ -18,7 +18,9 @@ from reseau.measure.blurred import (
     estimate_optics,
     measure_blurred,
 )
-from reseau.optics.formation import Outline
+from reseau.measure.blurred.shapes import RayShapes
+from reseau.measure.matching import Window
+from reseau.optics.formation import Outline, PixelResponse
 from reseau.optics.lenses import (
     AIR,
     Cauchy,
@@ -30,6 +32,7 @@ from reseau.optics.lenses import (
     SensorPlane,
     Surface,
     ThinLens,
+    ray_image,
 )
 
 from . import blurs
@@ -188,6 +191,17 @@ def test_what_is_not_there_is_declined_with_the_reason(centre: Array, code: Code
 def test_another_target_is_declined() -> None:
     found = measure_blurred(photograph(), camera(), ["1"], [target(diameter=2.2 * DIAMETER)])
     assert not found.ok.any()
+
+
+def test_a_step_to_a_blur_wider_than_the_window_forms_no_image() -> None:
+    """Its response would need memory in proportion to the width, here 60 GB."""
+    shapes = RayShapes((ray_image(camera(), target(), PupilElements.gauss(4)),))
+    pixels = np.arange(40.0)[None]
+    window, one = Window(pixels, pixels, PixelResponse()), np.zeros(1, np.intp)
+    for width, formed in ((0.5, True), (1e9, False), (np.nan, False)):
+        place = np.full((1, 2), 20.0), np.full(1, width), np.zeros((1, 0))
+        assert np.isfinite(shapes.image(*place, one, window)).all() == formed
+        assert np.isfinite(shapes.derivatives(*place, one, window)[1]).all() == formed
 
 
 def test_a_target_behind_the_lens_is_one_line() -> None:

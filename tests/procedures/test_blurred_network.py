@@ -13,7 +13,9 @@ import pytest
 from reseau.core.errors import UsageError
 from reseau.core.failure import Failure
 from reseau.io.targets import SpaceTargets
+from reseau.optics.lenses import LensCamera, in_order
 from reseau.optics.refraction import RefractedRays
+from reseau.procedures.blurred import focused
 from reseau.procedures.blurred_network import (
     BlurredNetwork,
     NetworkOptions,
@@ -126,6 +128,32 @@ def test_targets_whose_blurred_images_touch_are_left_out_and_named() -> None:
     last = found.rounds[-1]
     assert "2 blurred targets were not measured and are left out: t2 in i0, t5 in i0" in found.notes[0].text
     assert last.measured["i0"].why[2] == "its image touches that of t5"
+
+
+def test_a_lens_that_is_not_that_of_the_photographs_is_noticed_in_the_images() -> None:
+    """A stop that is narrower by a third: the adjustment is better than expected, the images are not."""
+    project = drawn()
+    assert all(abs(each.misfit - 1) < 0.2 for each in measured().rounds[1].measured.values())
+    assert not any(note.code == "inconsistent" for note in measured().notes)
+    narrow = replace(underwater.CAMERA, lens=replace(underwater.LENS, stop_radius=3.5))
+    options = NetworkOptions(rounds=1)
+    found = measure_blurred_network(project.network, project.frames, project.targets, narrow, options)
+    assert isinstance(found, BlurredNetwork)
+    assert found.result.sigma0 < 1
+    (note,) = (note for note in found.notes if note.code == "inconsistent")
+    assert note.text.startswith("residuals of the targets in i0, i1, i2 are 1.8 to 2 times the noise")
+
+
+def test_a_lens_that_images_no_target_as_it_is_fails_with_the_reason() -> None:
+    """The front element alone."""
+    project = drawn()
+    rows = [underwater.ROWS[0], (-0.006, 4.5, underwater.AIR), underwater.ROWS[3]]
+    lens = focused(replace(underwater.LENS, surfaces=in_order(rows), stop=2), 900.0)
+    camera = LensCamera(lens, underwater.CAMERA.sensor)
+    options = NetworkOptions(rounds=1)
+    found = measure_blurred_network(project.network, project.frames, project.targets, camera, options)
+    assert isinstance(found, Failure)
+    assert "28 of 29 targets were not measured by rays, most often: nothing like its image" in found.reason
 
 
 def test_a_network_in_an_unknown_unit_and_a_camera_without_lens_are_refused() -> None:

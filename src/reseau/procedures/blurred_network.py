@@ -8,6 +8,7 @@ its ordinary coordinates are as certain and do not differ significantly, these a
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -302,6 +303,42 @@ def _ordinary(
     return replace(network, xy=xy)
 
 
+def _usual_reason(measured: Mapping[str, BlurredResult]) -> str:
+    """Why most of the targets that were not measured were not."""
+    why = Counter(str(reason) for found in measured.values() for reason in found.why if reason)
+    # Image points without a target are left out as well where no ray passes the lens.
+    return why.most_common(1)[0][0] if why else "no ray to it passes the lens"
+
+
+def _too_few(failure: Failure, measured: Mapping[str, BlurredResult]) -> Failure:
+    """Say first that targets were not measured, where the rest cannot be adjusted."""
+    missed = sum(int((~found.ok).sum()) for found in measured.values())
+    text = (
+        f"{missed} of {sum(len(found.ok) for found in measured.values())} targets were not measured by rays, "
+        f"most often: {_usual_reason(measured)}; what is left: {failure.reason}"
+    )
+    return replace(failure, reason=text)
+
+
+def _misfits(entry: BlurredRound) -> tuple[Remark, ...]:
+    """Say in which photographs the targets are not like their images by the lens.
+
+    The adjustment cannot tell: another lens shifts coordinates smoothly over the image, which distortion and
+    object points take up. The matching can, as it compares the form of the images.
+    """
+    unlike = {name: found.misfit for name, found in entry.measured.items() if found.notes}
+    if not unlike:
+        return ()
+    names, values = list(unlike), list(unlike.values())
+    more = f" and {len(names) - 8} more" if len(names) > 8 else ""
+    text = (
+        f"residuals of the targets in {', '.join(names[:8])}{more} are {min(values):.2g} to "
+        f"{max(values):.2g} times the noise of the photographs: lens, focus or aperture are not theirs, and "
+        "object points may be wrong by more than their sigmas, also where sigma0 is good"
+    )
+    return (Remark(text, Code.INCONSISTENT),)
+
+
 def _far(uv: Array) -> Array:
     """Far points (n, 3) in directions (n, 2)."""
     return _FAR_MM * np.column_stack([uv, np.ones(len(uv))])
@@ -375,7 +412,7 @@ class _Run:
         start = replace(network, xy=xy, cov=cov).select(~declined)
         result = adjust_network(start, self.options.bundle)
         if isinstance(result, Failure):
-            return result
+            return _too_few(result, measured) if declined.any() else result
         return BlurredRound(
             result, measured, replaced & ~declined, ~replaced & ~declined, declined, float(shift.mean())
         )
@@ -512,7 +549,8 @@ class _Run:
 
     def notes(self, rounds: list[BlurredRound], best: int) -> tuple[Remark, ...]:
         """Return what a user should know."""
-        last, found = rounds[-1], list(self._unfollowed(rounds[best].result))
+        last = rounds[best]
+        found = [*_misfits(last), *self._unfollowed(last.result)]
         missing = [name for name in self.network.images if name not in self.frames]
         if missing:
             found.append(
@@ -532,7 +570,7 @@ class _Run:
             found.append(
                 Remark(
                     f"{len(rows)} blurred targets were not measured and are left out: "
-                    f"{', '.join(names)}{more}",
+                    f"{', '.join(names)}{more}; most often: {_usual_reason(last.measured)}",
                     Code.DECLINED,
                 )
             )

@@ -152,6 +152,9 @@ class BlurredResult(Measured):
         Estimates of varied parameters of the optics, and their standard deviations.
     rings : int
         Rings of elements of the stop that were used; 0 for those of a surrogate.
+    misfit : float
+        Residuals of the targets (median of their root mean squares) ÷ noise of the frame: about 1 where
+        they are like their images; NaN if none was matched.
 
     Examples
     --------
@@ -164,6 +167,7 @@ class BlurredResult(Measured):
     varied: Array = field(default_factory=lambda: np.zeros((0, 0)))
     varied_sigma: Array = field(default_factory=lambda: np.zeros((0, 0)))
     rings: int = 0
+    misfit: float = float("nan")
     notes: tuple[Remark, ...] = ()
 
 
@@ -300,7 +304,7 @@ class Run:
                 those, [cast(RayImage, images[k]) for k in those], elements, self.options.varied
             )
             results.append((those, self._matched(shape, start[those], int(half))))
-        notes = self._judge(results)
+        misfit = self._judge(results)
         for k in seen:
             image = cast(RayImage, images[k])
             self.columns["blur_px"][k], self.columns["offset"][k] = image.blur, image.centroid
@@ -316,7 +320,8 @@ class Run:
             predicted=self.predicted,
             deviation=np.where(self.ok[:, None], self.columns["xy"] - self.predicted, np.nan),
             rings=rings,
-            notes=notes,
+            misfit=misfit,
+            notes=self._notes(misfit),
             **cast(Any, self.columns),
         )
 
@@ -474,10 +479,10 @@ class Run:
         variance = grey_variance(self.screened.grey, start[sure], first.residuals[sure])
         return first if variance is None else run(replace(options, variance=variance))
 
-    def _judge(self, results: list[tuple[Rows, Matches]]) -> tuple[Remark, ...]:
-        """Fill in the columns; decline what is not an image of its target; say if all images differ."""
+    def _judge(self, results: list[tuple[Rows, Matches]]) -> float:
+        """Fill in the columns; decline what is not an image of its target; return the misfit of all."""
         if not results:
-            return ()
+            return float("nan")
         usual = float(np.median(np.concatenate([found.noise for _, found in results])))
         for rows, found in results:
             found = with_alike_errors(found)
@@ -511,10 +516,14 @@ class Run:
             for name in ("contrast", "t", "noise", "psf_px"):
                 self.columns[name][rows] = getattr(found, name)
             self.columns["varied"][rows], self.columns["varied_sigma"][rows] = found.form, found.form_sigma
-        if not (self.ok.any() and usual > _MISFIT * self.screened.noise):
+        return usual / self.screened.noise
+
+    def _notes(self, misfit: float) -> tuple[Remark, ...]:
+        """Say if the images of all targets differ from those formed."""
+        if not (self.ok.any() and misfit > _MISFIT):
             return ()
         text = (
-            f"residuals are {usual / self.screened.noise:.2g} times the noise of the frame: lens, focus or "
+            f"residuals are {misfit:.2g} times the noise of the frame: lens, focus or "
             "aperture are not those of the photograph, and places may be wrong by more than their sigmas"
         )
         return (Remark(text, Code.INCONSISTENT),)

@@ -58,10 +58,12 @@ class RayShapes:
     ) -> Iterator[tuple[Any, ...]]:
         """Number, outline, place, width, columns, rows, response of each image.
 
-        A step of an adjustment may lead to values without an image: these are left out.
+        A step of an adjustment may lead to values without an image: these are left out. A width beyond the
+        window is one of them; its response would need memory in proportion to it.
         """
+        widest = max(window.rows.shape[1], window.columns.shape[1])
         for k, row in enumerate(at):
-            if not (np.isfinite(xy[k]).all() and np.isfinite(width[k]) and np.isfinite(form[k]).all()):
+            if not (np.isfinite(xy[k]).all() and width[k] <= widest and np.isfinite(form[k]).all()):
                 continue
             try:
                 gridded = self.at(int(row), form[k])
