@@ -14,8 +14,7 @@ numbers predict, rms of the errors of the object points that are not control and
 standard deviations of the coordinates (pixels; those by rays attain the Cramér–Rao bound,
 ``benchmarks/blurred.py``), grey-value residuals over noise (misfit) and the number of image points left out,
 and all of it for sharp photographs with the same noise. With `--assumed`: the same with a wrong design of the
-lens. With `--keep`, the figures of each seed are kept in a file, and those
-there are not computed again.
+lens. With `--keep`, the figures of each seed are kept in a file, and those there are not computed again.
 """
 
 from __future__ import annotations
@@ -68,8 +67,8 @@ class Figures:
     """What one way of measuring gives for one project.
 
     Residuals outside the sharp centre and what their sigmas predict, errors of the object points that are not
-    control, mean shift of the coordinates, errors over sigmas, sigmas of the coordinates; grey-value residuals
-    of the targets over the noise of the worst photograph, and the image points left out.
+    control, mean shift of the coordinates, errors over sigmas, sigmas of the coordinates; grey-value
+    residuals of the targets over the noise of the worst photograph, and the image points left out.
     """
 
     residuals_px: float
