@@ -1,0 +1,185 @@
+"""Control charts of recalibrations: run lengths, joint false alarms without drift, delays with drift.
+
+    python benchmarks/recalibration.py --part lengths     # run lengths compared with r-cran-spc (Debian)
+    python benchmarks/recalibration.py --part false       # years without drift
+    python benchmarks/recalibration.py --part delays      # shifts with known and with estimated parameters
+
+A bench has ten parameters and the norm of the field over the image, which is that of their differences from
+the first run. Series are AR(1); parameters are independent, or correlated by 0.5 and −0.9 as K1, K2, K3 are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from reseau.core.data import Array
+from reseau.service.charts import ChartOptions, KnownSeries, monitor
+from reseau.service.runlength import Cusum, Ewma, Prerun, Shewhart
+
+PARAMETERS, YEAR, AT_ONCE = 10, 52, 2500
+SHIFTS = (0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0)
+
+
+def correlated() -> Array:
+    """Correlations of ten parameters."""
+    found = np.full((PARAMETERS, PARAMETERS), 0.2)
+    found[5:8, 5:8] = [[1.0, -0.9, 0.75], [-0.9, 1.0, -0.95], [0.75, -0.95, 1.0]]
+    found[0, 1:3] = found[1:3, 0] = 0.5
+    np.fill_diagonal(found, 1.0)
+    values, vectors = np.linalg.eigh(found)
+    whole = vectors * np.maximum(values, 1e-3) @ vectors.T
+    scale = np.sqrt(np.diag(whole))
+    fixed: Array = whole / np.outer(scale, scale)
+    return fixed
+
+
+def years(
+    rng: np.random.Generator, count: int, runs: int, phi: float, matrix: Array, heavy: bool = False
+) -> Array:
+    """Ten parameters and the norm of the field (count, runs, 11), without drift."""
+    root = np.linalg.cholesky(matrix)
+    drawn = (
+        rng.standard_t(8, size=(count, runs, PARAMETERS))
+        if heavy
+        else rng.normal(size=(count, runs, PARAMETERS))
+    )
+    x = drawn @ root.T
+    for k in range(1, runs):
+        x[:, k] = phi * x[:, k - 1] + np.sqrt(1.0 - phi * phi) * x[:, k]
+    return with_norm(x)
+
+
+def with_norm(x: Array) -> Array:
+    """The parameters and the transformed norm of their field, with effects of 0.2 to 1 of one sigma."""
+    effect = np.linspace(1.0, 0.2, PARAMETERS)
+    norm = np.sqrt(np.square((x - x[:, :1]) * effect).sum(axis=2, keepdims=True))
+    norm[:, 0] = np.nan
+    return np.concatenate([x, np.cbrt(norm**2)], axis=2)
+
+
+def lengths() -> None:
+    """Compare run lengths with the package spc of R."""
+    if shutil.which("Rscript") is None:
+        print("Rscript is not installed: apt-get install r-cran-spc")
+        return
+    rows = list(_cases())
+    script = "library(spc)\n" + "".join(f"cat(format({code}, digits=12), '\\n')\n" for _, code, _ in rows)
+    said = subprocess.run(["Rscript", "-"], input=script, capture_output=True, text=True, check=True).stdout
+    worst: dict[str, float] = {}
+    for (label, _, own), line in zip(rows, said.splitlines(), strict=True):
+        worst[label] = max(worst.get(label, 0.0), abs(own / float(line) - 1.0))
+    for label, off in worst.items():
+        print(f"{label:<44} largest relative difference {off:.1e}{'' if off < 0.01 else ' !'}")
+    print(f"{len(rows)} run lengths")
+
+
+def _cases() -> Iterator[tuple[str, str, float]]:
+    """Label, call of R, and own value."""
+    for mu in SHIFTS:
+        for k, h in ((0.25, 8.0), (0.5, 4.0), (0.5, 5.0), (0.5, 7.5), (1.0, 2.5)):
+            yield "CUSUM, two-sided, zero state", f'xcusum.arl({k},{h},{mu},sided="two")', Cusum(k, h).arl(mu)
+            one = Cusum(k, h, two_sided=False)
+            yield "CUSUM, one-sided, zero state", f'xcusum.arl({k},{h},{mu},sided="one")', one.arl(mu)
+            yield "CUSUM, one-sided, steady state", f'xcusum.ad({k},{h},{mu},sided="one")', one.delay(mu)
+            late = f'xcusum.arl({k},{h},{mu},q=11,sided="one")[11]'
+            yield "CUSUM, one-sided, shift after 10 runs", late, one.delay(mu, 10)
+        for weight, c in ((0.05, 2.5), (0.1, 2.7), (0.2, 2.86), (0.5, 3.0)):
+            chart, call = Ewma(weight, c), f'({weight},{c},{mu},sided="two"'
+            yield "EWMA, zero state", f"xewma.arl{call},r=80)", chart.arl(mu)
+            yield "EWMA, steady state", f"xewma.ad{call},r=80)", chart.delay(mu)
+            yield "EWMA, shift after 10 runs", f"xewma.arl{call},q=11,r=80)[11]", chart.delay(mu, 10)
+        for runs in (20, 52):
+            for kind, name in (("mean", "mu"), ("sigma", "sigma"), ("both", "both")):
+                call = f'xewma.arl.prerun(0.1,2.7,{mu},sided="two",size={runs},estimated="{name}")'
+                yield f"EWMA, prerun, {kind} estimated", call, Prerun(Ewma(0.1, 2.7), runs, kind).arl(mu)
+        yield "Shewhart", f'xshewhartrunsrules.arl({mu},c=1,type="1")', Shewhart(3.0).arl(mu)
+
+
+def false_alarms(count: int, seed: int) -> None:
+    """Alarms a year without drift."""
+    print(f"{count} years of {YEAR} runs without drift, ten parameters and the norm; limit 0.1 a year")
+    print("  parameters   φ     runs before  alarms a year  upper 95 % limit  width  learning")
+    cases = [
+        (name, phi, m) for name in ("independent", "correlated") for phi in (0.0, 0.15, 0.3) for m in (20, 52)
+    ]
+    for name, phi, m in [*cases, ("t, 8 degrees", 0.0, 20), ("φ above limit", 0.5, 20)]:
+        rng = np.random.default_rng(seed)
+        matrix = correlated() if name == "correlated" else np.eye(PARAMETERS)
+        alarms, width, learning = 0, 0.0, 0.0
+        for _ in range(0, count, AT_ONCE):
+            x = years(rng, AT_ONCE, m + YEAR, phi, matrix, name.startswith("t,"))
+            found = monitor(x, one_sided=(PARAMETERS,))
+            alarms += int(found.alarms[:, m:].sum())
+            width += float(found.width[:, -1].mean()) / (count / AT_ONCE)
+            learning += float(found.learning[:, -1].mean()) / (count / AT_ONCE)
+        rate, most = alarms / count, upper_limit(alarms) / count
+        note = "" if most <= 0.105 else " !"
+        counted = f"{m:10d}{rate:16.4f}{most:16.4f}{note}"
+        print(f"  {name:<13}{phi:4.2f}{counted}{width:12.2f}{100 * learning:7.0f} %", flush=True)
+
+
+def upper_limit(events: int) -> float:
+    """One-sided upper 95 % limit of the mean of a Poisson count."""
+    from scipy.stats import chi2
+
+    return float(chi2.ppf(0.95, 2 * events + 2) / 2)
+
+
+def delays(count: int, seed: int) -> None:
+    """Runs until a shift of one of ten parameters is found."""
+    print("shift of one of ten parameters at a run: mean number of runs to the first alarm of the bench")
+    for name, before, phi in (
+        ("known, from the start", 0, 0.0), ("known, after 20 runs", 20, 0.0), ("known, φ 0.3", 20, 0.3),
+        ("estimated from 20 runs", 20, 0.0), ("estimated from 52", 52, 0.0), ("estimated from 150", 150, 0.0),
+        ("estimated from 150, φ held 0", 150, 0.0),
+    ):  # fmt: skip
+        rng = np.random.default_rng(seed)
+        known = name.startswith("known")
+        options = ChartOptions(autocorrelation=0.0) if name.endswith("held 0") else ChartOptions()
+        line = ""
+        for shift in (1.0, 2.0, 3.0):
+            runs = 200 if known else 104
+            x = years(rng, count, before + runs, phi, np.eye(PARAMETERS))
+            x[:, before:, 0] += shift
+            if known:
+                series = KnownSeries(np.zeros(PARAMETERS), np.ones(PARAMETERS), np.full(PARAMETERS, phi))
+                alarms = monitor(x[:, :, :PARAMETERS], options, known=series).alarms
+            else:
+                x = with_norm(x[:, :, :PARAMETERS])
+                alarms = monitor(x, options, one_sided=(PARAMETERS,)).alarms
+            # Benches that signalled before the shift do not count.
+            after = alarms[~alarms[:, :before].any(axis=1), before:]
+            found = after.any(axis=1)
+            delay = np.argmax(after, axis=1)[found] + 1.0
+            error = delay.std() / np.sqrt(len(delay))
+            within = "" if found.all() else f" of the {100 * found.mean():.0f} % found in {runs} runs"
+            line += f"   {shift:g} σ: {delay.mean():.2f} ± {error:.2f}{within}"
+        print(f"  {name:<30}{line}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--part", choices=("lengths", "false", "delays"))
+    parser.add_argument("--years", type=int, default=20_000)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    start = time.process_time()
+    if given.part in (None, "lengths"):
+        lengths()
+    if given.part in (None, "false"):
+        false_alarms(given.years, given.seed)
+    if given.part in (None, "delays"):
+        delays(5000, given.seed)
+    print(f"{time.process_time() - start:.0f} s of processor time")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,407 @@
+"""Calibrations as a function of covariates such as temperature, zoom or focus.
+
+The parameters of K calibrations are regressed on the covariates, all with one design: β̂ = (ZᵀZ)⁻¹ Zᵀ Y has
+the covariance S ⊗ (ZᵀZ)⁻¹ (Anderson 2003, *Multivariate Statistical Analysis*, ch. 8). S is that of one
+calibration about the function, reproducibility between sessions included. A function is returned only if the
+data support it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import scipy.linalg
+import scipy.special
+from pydantic import Field
+
+from ..calibration import Calibration, Covariance, Quantity
+from ..core.data import Array
+from ..core.errors import UsageError
+from ..core.failure import Code, Failure
+from ..io import Document, Strict
+from .charts import ChartOptions, Monitored, monitor
+
+__all__ = [
+    "CalibrationFunction",
+    "Covariate",
+    "Explanation",
+    "FunctionOptions",
+    "explain",
+    "fit_function",
+    "series_of",
+]
+
+
+@dataclass(frozen=True)
+class FunctionOptions:
+    """Options of :func:`fit_function`.
+
+    Parameters
+    ----------
+    degree : {1, 2}
+        Degree of the polynomial in each covariate.
+    alpha : float
+        Level of the tests of the function and of its lack of fit, over all parameters together.
+
+    Examples
+    --------
+    >>> FunctionOptions().degree
+    1
+    """
+
+    degree: Literal[1, 2] = 1
+    alpha: float = 0.01
+
+
+class Covariate(Strict):
+    """A covariate and where it was observed: the function is not extrapolated.
+
+    Examples
+    --------
+    >>> Covariate(name="temperature", unit="°C", low=18.0, high=26.0, centre=21.5).scaled(23.5)
+    0.5
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    centre: float
+
+    def scaled(self, value: float) -> float:
+        """Return the difference from the centre, in half ranges."""
+        return (value - self.centre) / ((self.high - self.low) / 2)
+
+
+class CalibrationFunction(Document):
+    """A calibration as a function of covariates, ``reseau-calibration-function/1``.
+
+    `coefficients` has a row for each term (constant, then the powers of each scaled covariate) and a column
+    for each name; their covariance is the Kronecker product of `scatter` and `cofactors`. `p` is the
+    probability of a relation at least as strong by chance.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> warm = np.linspace(18.0, 26.0, 30)
+    >>> runs = [example_calibration(8.0 + 0.001 * (t - 22) + 2e-4 * rng.normal()) for t in warm]
+    >>> found = fit_function(runs, {"temperature": warm}, {"temperature": "°C"})
+    >>> found.at(temperature=25.0).parameters["c"]
+    Quantity(value=8.0029..., sigma=0.00017..., unit='mm')
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-calibration-function/1"
+
+    base: dict[str, Any]
+    names: tuple[str, ...]
+    covariates: tuple[Covariate, ...]
+    degree: Annotated[int, Field(ge=1, le=2)]
+    runs: int
+    coefficients: tuple[tuple[float, ...], ...]
+    cofactors: tuple[tuple[float, ...], ...]
+    scatter: tuple[tuple[float, ...], ...]
+    p: float
+
+    def at(self, **values: float) -> Calibration:
+        """Return the calibration at a value of each covariate.
+
+        Its covariance is that of a single calibration at these values: of the coefficients and between
+        sessions.
+
+        Raises
+        ------
+        UsageError
+            If a covariate is missing or unknown, or a value is outside its range.
+        """
+        names = [each.name for each in self.covariates]
+        if set(values) != set(names):
+            raise UsageError(
+                f"needs {', '.join(names)}, not {', '.join(values) or 'none'}", where="calibration function"
+            )
+        for each in self.covariates:
+            value = values[each.name]
+            if not each.low <= value <= each.high:
+                raise UsageError(
+                    f"{value:g} {each.unit} is outside {each.low:g} to {each.high:g} {each.unit}",
+                    where=each.name, do="calibrate there",
+                )  # fmt: skip
+        scaled = np.array([[each.scaled(values[each.name]) for each in self.covariates]])
+        row = _terms(scaled, self.degree)[0]
+        estimate = row @ np.array(self.coefficients)
+        cov = np.array(self.scatter) * (1.0 + row @ np.array(self.cofactors) @ row)
+        base = Calibration.from_content(dict(self.base), where="calibration function")
+        parameters = dict(base.parameters)
+        for k, name in enumerate(self.names):
+            sigma = float(np.sqrt(cov[k, k]))
+            parameters[name] = Quantity(value=float(estimate[k]), sigma=sigma, unit=parameters[name].unit)
+        return base.model_copy(
+            update={
+                "parameters": parameters,
+                "covariance": Covariance(names=self.names, matrix=tuple(tuple(row) for row in cov.tolist())),
+                "sigma0": None, "redundancy": self.runs - len(row), "tests": (), "times": {},
+                "validity": base.validity | {name: float(value) for name, value in values.items()},
+            }
+        )  # fmt: skip
+
+
+def series_of(calibrations: Sequence[Calibration]) -> tuple[tuple[str, ...], Array]:
+    """Names and values (runs, c) of the parameters that all calibrations estimated.
+
+    Raises
+    ------
+    UsageError
+        If there are none, or the calibrations are of different kinds, models or units.
+
+    Examples
+    --------
+    >>> series_of([example_calibration(8.0), example_calibration(8.1)])
+    (('c',), array([[8. ],
+           [8.1]]))
+    """
+    if not calibrations:
+        raise UsageError("none were given", where="calibrations")
+    first = calibrations[0]
+    for other in calibrations[1:]:
+        if (other.kind, _model(other)) != (first.kind, _model(first)):
+            raise UsageError(
+                "are of different models", where=f"{first.name}, {other.name}", do="convert them first"
+            )
+    names = tuple(
+        n for n in first.covariance.names if all(n in each.covariance.names for each in calibrations)
+    )
+    if not names:
+        raise UsageError("have no estimated parameter in common", where="calibrations")
+    for name in names:
+        units = {each.parameters[name].unit for each in calibrations}
+        if len(units) > 1:
+            raise UsageError(f"has the units {', '.join(sorted(units))}", where=name)
+    return names, np.array([[each.parameters[name].value for name in names] for each in calibrations])
+
+
+def fit_function(
+    calibrations: Sequence[Calibration],
+    covariates: Mapping[str, Array],
+    units: Mapping[str, str],
+    options: FunctionOptions | None = None,
+) -> CalibrationFunction | Failure:
+    """Fit a calibration as a function of covariates, if the data support it.
+
+    Parameters
+    ----------
+    calibrations : sequence of Calibration
+        Of one camera and model, in time order.
+    covariates : mapping of str to ndarray (runs,)
+        Values of each covariate.
+    units : mapping of str to str
+        Their units.
+    options : FunctionOptions, optional
+        Degree and level of the tests.
+
+    Returns
+    -------
+    CalibrationFunction or Failure
+        A failure if there are too few runs, a covariate did not vary, no parameter depends on the
+        covariates, or the polynomial does not describe how.
+
+    Raises
+    ------
+    UsageError
+        If the calibrations cannot be compared, or the lengths differ.
+
+    Examples
+    --------
+    >>> runs = [example_calibration(8.0 + 1e-4 * (k % 3)) for k in range(12)]
+    >>> fit_function(runs, {"temperature": np.linspace(18, 26, 12)}, {"temperature": "°C"}).code
+    <Code.NOT_IDENTIFIED: 'not-identified'>
+    """
+    options = options or FunctionOptions()
+    names, y = series_of(calibrations)
+    values = _columns(covariates, len(y))
+    n, terms = len(y), 1 + options.degree * values.shape[1]
+    if n < terms + 5:
+        return Failure(
+            f"{n} runs are too few for {terms} coefficients; {terms + 5} are needed", Code.NO_REDUNDANCY
+        )
+    if not (np.ptp(values, axis=0) > 0).all():
+        constant = list(covariates)[int(np.argmin(np.ptp(values, axis=0)))]
+        return Failure(f"{constant} did not vary", Code.NOT_IDENTIFIED)
+    known = tuple(
+        Covariate(
+            name=name, unit=units[name], low=float(v.min()), high=float(v.max()), centre=float(v.mean())
+        )
+        for name, v in zip(covariates, values.T, strict=True)
+    )
+    scaled = np.column_stack(
+        [(v - c.centre) / ((c.high - c.low) / 2) for v, c in zip(values.T, known, strict=True)]
+    )
+    z = _terms(scaled, options.degree)
+    if np.linalg.matrix_rank(z) < terms:
+        return Failure("the covariates depend on each other linearly", Code.NOT_IDENTIFIED)
+    further = _terms(scaled, options.degree + 1)
+    if n >= further.shape[1] + 5 and (lack := _p_value(y, further, z)) < options.alpha:
+        word = "line" if options.degree == 1 else "parabola"
+        return Failure(f"a {word} does not describe the relation (p = {lack:.2g})", Code.UNMODELLED)
+    p = _p_value(y, z, np.ones((n, 1)))
+    if not p < options.alpha:
+        return Failure(f"no parameter depends on {', '.join(covariates)} (p = {p:.2g})", Code.NOT_IDENTIFIED)
+    beta, residuals = _regressed(y, z)
+    cofactors = np.asarray(np.linalg.inv(z.T @ z), dtype=np.float64)
+    scatter = _scatter(residuals, z.shape[1], [_within(each, names) for each in calibrations])
+    return CalibrationFunction(
+        base=calibrations[-1].to_dict() | {"times": {}}, names=names, covariates=known,
+        degree=options.degree, runs=n,
+        coefficients=_rows(beta), cofactors=_rows(cofactors), scatter=_rows(scatter), p=p,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Signals of charts with and without covariates.
+
+    Parameters
+    ----------
+    raw, adjusted : Monitored
+        Charts without and with the covariates as predictors.
+    p : float
+        Probability of a dependence on the covariates at least as strong by chance, over all series.
+    verdicts : tuple of (int, int, {"drift", "explained"})
+        Run and series of each signal, in time order. A signal that the covariates remove is explained by
+        them.
+
+    Examples
+    --------
+    >>> Explanation(monitor(np.zeros((3, 1))), monitor(np.zeros((3, 1))), 1.0, ()).verdicts
+    ()
+    """
+
+    raw: Monitored
+    adjusted: Monitored
+    p: float
+    verdicts: tuple[tuple[int, int, Literal["drift", "explained"]], ...]
+
+
+def explain(
+    values: Array,
+    covariates: Array,
+    options: ChartOptions | None = None,
+    *,
+    one_sided: tuple[int, ...] = (),
+    alpha: float = 0.01,
+) -> Explanation:
+    """Tell drift that covariates explain from drift.
+
+    Parameters
+    ----------
+    values : ndarray (n, c)
+        Series over the runs of one bench.
+    covariates : ndarray (n, q)
+        Covariates of each run.
+    options, one_sided
+        As for :func:`reseau.service.charts.monitor`.
+    alpha : float
+        Level at which a dependence on the covariates must be significant; otherwise nothing is explained by
+        them.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(3)
+    >>> warm = np.where(np.arange(80) < 40, 20.0, 23.0) + rng.normal(0.0, 0.8, 80)
+    >>> values = 1.5 * warm[:, None] + rng.normal(size=(80, 1))
+    >>> set(found[2] for found in explain(values, warm[:, None]).verdicts)
+    {'explained'}
+    """
+    raw = monitor(values, options, one_sided=one_sided)
+    adjusted = monitor(values, options, one_sided=one_sided, covariates=covariates)
+    there = np.isfinite(values).all(axis=1)
+    y, z = values[there], np.column_stack([np.ones(there.sum()), covariates[there]])
+    enough = len(y) >= z.shape[1] + 5 and np.linalg.matrix_rank(z) == z.shape[1]
+    p = _p_value(y, z, np.ones((len(y), 1))) if enough else 1.0
+    known = p < alpha
+    verdicts: list[tuple[int, int, Literal["drift", "explained"]]] = []
+    for run, series in np.argwhere((raw.alarm != 0) | (adjusted.alarm != 0) & known).tolist():
+        remains = bool(adjusted.alarm[run, series]) or not known
+        verdicts.append((run, series, "drift" if remains else "explained"))
+    return Explanation(raw, adjusted, p, tuple(verdicts))
+
+
+def example_calibration(c: float = 8.0) -> Calibration:
+    """A small calibration of a camera, for examples."""
+    return Calibration(
+        kind="camera", name="example", sigma0=1.0, redundancy=100,
+        model={"model": "brown", "width": 640, "height": 480, "pitch_mm": [0.01, 0.01]},
+        parameters={"c": Quantity(value=c, sigma=1e-4, unit="mm")},
+        covariance=Covariance(names=("c",), matrix=((1e-8,),)),
+    )  # fmt: skip
+
+
+def _model(calibration: Calibration) -> dict[str, Any]:
+    model: dict[str, Any] = dict(calibration.model)
+    return model if calibration.kind == "camera" else {"name": model.get("name")}
+
+
+def _columns(covariates: Mapping[str, Array], runs: int) -> Array:
+    """Covariates as columns (runs, q)."""
+    if not covariates:
+        raise UsageError("none were given", where="covariates")
+    for name, v in covariates.items():
+        if np.shape(v) != (runs,) or not np.isfinite(v).all():
+            raise UsageError(f"needs a finite value for each of {runs} runs", where=name)
+    return np.column_stack([np.asarray(v, dtype=np.float64) for v in covariates.values()])
+
+
+def _terms(scaled: Array, degree: int) -> Array:
+    """Constant and powers of the covariates (n, 1 + degree · q)."""
+    powers = [scaled ** (k + 1) for k in range(degree)]
+    return np.column_stack([np.ones(len(scaled)), *powers])
+
+
+def _regressed(y: Array, z: Array) -> tuple[Array, Array]:
+    beta = np.asarray(np.linalg.lstsq(z, y, rcond=None)[0], dtype=np.float64)
+    return beta, y - z @ beta
+
+
+def _p_value(y: Array, larger: Array, smaller: Array) -> float:
+    """Level of the F-test that only the smaller design is needed, over all series (Bonferroni).
+
+    Autocorrelated residuals are counted as n (1 − φ) / (1 + φ) independent ones.
+    """
+    scale = np.ptp(y, axis=0)
+    y = (y - y.mean(axis=0)) / np.where(scale > 0, scale, 1.0)
+    _, wide = _regressed(y, smaller)
+    _, narrow = _regressed(y, larger)
+    n, more = len(y), larger.shape[1] - smaller.shape[1]
+    degrees = n - larger.shape[1]
+    before, after = np.square(wide).sum(axis=0), np.square(narrow).sum(axis=0)
+    usable = after > 1e-24 * n
+    phi = np.where(usable, (narrow[1:] * narrow[:-1]).sum(axis=0) / np.where(usable, after, 1.0), 0.0)
+    phi = np.clip(phi + (larger.shape[1] + 3 * phi) / n, 0.0, 0.9)
+    f = np.where(usable, (before - after) / more / np.where(usable, after, 1.0) * degrees, np.inf)
+    f = np.where(before > 1e-24 * n, f, 0.0) * (1.0 - phi) / (1.0 + phi)
+    return float(min(1.0, y.shape[1] * scipy.special.fdtrc(more, degrees, f).min()))
+
+
+def _within(calibration: Calibration, names: tuple[str, ...]) -> Array:
+    """Covariance of the named parameters."""
+    rows = [calibration.covariance.names.index(name) for name in names]
+    found: Array = np.array(calibration.covariance.matrix)[np.ix_(rows, rows)]
+    return found
+
+
+def _scatter(residuals: Array, terms: int, within: Sequence[Array]) -> Array:
+    """Covariance of one calibration about the function, at least its own: C + the positive part of S − C."""
+    total = residuals.T @ residuals / (len(residuals) - terms)
+    own = np.mean(within, axis=0)
+    size = np.sqrt(np.maximum(np.diag(own), np.diag(total)))
+    size = np.where(size > 0, size, 1.0)
+    scaled = np.outer(size, size)
+    values, vectors = scipy.linalg.eigh((total - own) / scaled)
+    more: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    found: Array = own + more * scaled
+    return (found + found.T) / 2
+
+
+def _rows(matrix: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in matrix.tolist())
