@@ -51,7 +51,8 @@ def test_the_calibration_is_within_its_sigmas_of_the_truth(
     files = ("-o", tmp_path / "K.json", "--report", tmp_path / "F.html")
     status, out, err = reseau(*common(measured), "--free", "c,x0,y0,K1", *files)
     assert (status, err) == (0, "")
-    assert out.startswith("12 images, ")
+    assert out.startswith("usable for ")
+    assert "\n12 images, " in out
     assert "uncertainty of the projection: median" in out
     found = Calibration.read(tmp_path / "K.json")
     assert found.sigma0 == pytest.approx(1.0, abs=0.05)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -34,6 +35,11 @@ CAMERAS = {
     "tilted": ("opencv_full", PLAIN | {"tau_x": 0.02, "tau_y": -0.01}),
     "fisheye": ("fisheye", CENTRE | {"k1": 0.03, "k2": -0.004, "k3": 1e-3, "k4": -2e-4}),
     "omni": ("omni", CENTRE | {"fx": 1700.0, "fy": 1698.0, "xi": 0.7, "k1": -0.08, "k2": 0.03}),
+    "photo": ("brown", {"c": 8.1, "x0": 0.05, "y0": -0.08, "K1": 3e-3, "K2": -2e-5, "P1": 9e-5, "P2": -5e-5}),
+    "tracking": (
+        "openptv",
+        {"c": 8.1, "x0": 0.05, "y0": -0.08, "K1": -3e-3, "P2": 4e-5, "B1": 2e-4, "she": 1e-4},
+    ),
     "spheres": ("double_sphere", CENTRE | {"xi": -0.2, "alpha": 0.56}),
 }
 # Which cameras each format holds without conversion.
@@ -44,8 +50,12 @@ HELD = {
     "colmap": ("radial", "rational", "fisheye"),
     "mrcal": ("radial", "five", "rational", "prism"),
     "metashape": ("radial", "five"),
+    "photomodeler": ("photo",),
+    "dbat": ("photo",),
     "matlab": ("radial", "five"),
+    "openptv": ("tracking",),
 }
+PITCH = {"brown": [0.008, 0.0081], "openptv": [0.008, 0.0081]}
 PAIRS = [(form, camera) for form, cameras in HELD.items() for camera in cameras]
 
 
@@ -53,7 +63,10 @@ def calibration(camera: str) -> Calibration:
     model, values = CAMERAS[camera]
     return Calibration(
         kind="camera", name=camera, sigma0=None, redundancy=0, covariance=Covariance(names=(), matrix=()),
-        model={"model": model, "width": SIZE[0], "height": SIZE[1], "pitch_mm": [1.0, 1.0]},
+        model={
+            "model": model, "width": SIZE[0], "height": SIZE[1], "pitch_mm": PITCH.get(model, [1.0, 1.0]),
+            **({"side": "image", "balance_radius_mm": 0.0} if model == "brown" else {}),
+        },
         parameters={k: Quantity(value=v, sigma=0.0, unit=unit_of(k, model)) for k, v in values.items()},
     )  # fmt: skip
 
@@ -90,6 +103,11 @@ def test_a_camera_that_a_format_holds_comes_back_unchanged(form: str, camera: st
         ("matlab", "prism", 1.5),
         ("ros", "tilted", 9.0),
         ("mrcal", "fisheye", 0.05),
+        ("photomodeler", "radial", 0.7),
+        ("dbat", "radial", 0.7),
+        ("openptv", "radial", 1.5),
+        ("openptv", "photo", 0.9),
+        ("opencv", "photo", 0.1),
     ],
 )
 def test_a_model_that_a_format_lacks_is_converted_with_its_differences(
@@ -181,6 +199,56 @@ def test_metashape_has_the_principal_point_from_the_middle_and_the_tangential_te
     u = 0.5 * number["width"] + number["cx"] + dx * f + dx * number["b1"]
     v = 0.5 * number["height"] + number["cy"] + dy * f
     assert np.abs(np.stack([u, v], axis=1) - 0.5 - projected(given)).max() < 1e-9
+
+
+def test_openptv_reads_the_file_and_projects_the_same_points(tmp_path: Path) -> None:
+    """By the formulas of liboptv (imgcoord.c, trafo.c), from the numbers of the files and of ptv.par."""
+    given, path = calibration("radial"), tmp_path / "cam1.ori"
+    done = export_calibration(given, "openptv", path)
+    numbers = [float(word) for word in path.read_text().split("#")[0].split()]
+    xh, yh, cc = numbers[15:18]
+    k1, k2, k3, p1, p2, scx, she = map(float, (tmp_path / "cam1.addpar").read_text().split())
+    imx, imy, pix_x, pix_y = map(float, path.read_text().split("ptv.par:")[1].split())
+    u, v = directions().T
+    x, y = cc * u + xh, -cc * v + yh
+    r = np.hypot(x, y)
+    bend = k1 * r**2 + k2 * r**4 + k3 * r**6
+    dx = x + x * bend + p1 * (r**2 + 2 * x**2) + 2 * p2 * x * y
+    dy = y + y * bend + p2 * (r**2 + 2 * y**2) + 2 * p1 * x * y
+    px = (scx * dx - np.sin(she) * dy) / pix_x + imx / 2
+    py = imy / 2 - np.cos(she) * dy / pix_y
+    # Its pixels count from the corner of the first one.
+    seen, expected = np.stack([px, py], axis=1) - 0.5, projected(given)
+    inside = (np.abs(expected - np.array(SIZE) / 2) < np.array(SIZE) / 2).all(axis=1)
+    off = np.linalg.norm(seen - expected, axis=1)[inside].max()
+    assert off < 1.1 * done.greatest_px
+    assert np.abs(seen - projected(import_calibration(path))).max() < 1e-9
+
+
+def test_the_calibration_of_an_openptv_project_is_read(
+    reference_data: Callable[[str], Path],
+) -> None:
+    path = reference_data("multimedia_cavity") / "cal" / "cam1.tif.ori"
+    found = import_calibration(path)
+    assert found.values()["c"] == pytest.approx(float(path.read_text().split()[17]))
+    assert found.model["width"] == 1280  # type: ignore[typeddict-item]
+
+
+def test_photomodeler_and_dbat_correct_what_was_measured(tmp_path: Path) -> None:
+    """By their formulas: corrected coordinates of projected points are those of a central projection."""
+    given = calibration("photo")
+    seen = projected(given)
+    export_calibration(given, "photomodeler", tmp_path / "c.txt")
+    lines = (tmp_path / "c.txt").read_text().splitlines()
+    width, height = (float(v) for v in lines[1].split()[2:])
+    c, px, py, wide, tall, k1, k2, k3, p1, p2 = map(float, lines[3].split())
+    x = (seen[:, 0] + 0.5) * wide / width - px
+    y = py - (seen[:, 1] + 0.5) * tall / height
+    r2 = x * x + y * y
+    bend = k1 * r2 + k2 * r2**2 + k3 * r2**3
+    u = (x + x * bend + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y) / c
+    v = -(y + y * bend + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y) / c
+    assert np.abs(np.stack([u, v], axis=1) - directions()).max() < 1e-9
 
 
 def test_ros_and_kalibr_have_their_own_names(tmp_path: Path) -> None:

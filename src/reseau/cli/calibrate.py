@@ -288,8 +288,9 @@ def _write_report(
     from ..report.bundle import bundle_report
 
     page = bundle_report(
-        done.result, title=title, provenance=provenance, against=differences, distances=distances or ()
-    )
+        done.result, title=title, provenance=provenance, against=differences, distances=distances or (),
+        assessments=done.assessments,
+    )  # fmt: skip
     write_whole(path, page)
 
 
@@ -360,8 +361,12 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
 
     from ..bundle import camera_mapping, projection_field_at, sigma_between_images
     from ..calibration import projection_field
+    from ..core.failure import Code
 
     result = done.result
+    for name, assessed in done.assessments.items():
+        before = f"camera {name}: " if len(done.cameras) > 1 else ""
+        say(before + "\n".join(assessed.lines) + "\n")
     if done.choice is not None:
         _say_choice(done.choice)
     if done.board is not None:
@@ -393,8 +398,17 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     say_left_out(result)
     for name, why in done.declined.items():
         say(f"left out: {name}: {why}\n")
+    # Remarks concern the whole network; without an assessment all are warnings.
+    every = list(done.assessments.values())
+    tests = [remark for remark in result.warnings if every and all(remark in each.tests for each in every)]
+    covered = [remark for remark in result.warnings if every and remark.code is Code.COVERAGE]
     for warning in result.warnings:
-        say(f"warning: {warning}\n")
+        if warning not in tests and warning not in covered:
+            say(f"warning: {warning}\n")
+    if tests:
+        say("tests that are not passed, by amounts that the errors above contain:\n")
+    for remark in tests:
+        say(f"  {remark}\n")
 
 
 def _say_board(choice: BoardChoice, unit: str) -> None:

@@ -26,7 +26,8 @@ def export(
         str | None,
         typer.Option(
             metavar="FORMAT",
-            help="Format of the calibration: opencv, ros, kalibr, colmap, mrcal, metashape, matlab, reseau.",
+            help="Format of the calibration: opencv, ros, kalibr, colmap, mrcal, metashape, photomodeler, "
+            "dbat, matlab, openptv, reseau.",
         ),
     ] = None,
     out: Out = None,

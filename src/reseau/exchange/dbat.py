@@ -23,7 +23,7 @@ from ..optics.poses import angles_to_matrix, matrix_to_vector
 from .lines import network_of
 from .markup import Node, read_markup
 
-__all__ = ["is_dbat", "read_dbat"]
+__all__ = ["camera_of", "is_dbat", "read_dbat"]
 
 _OPENING = re.compile(rb"<document\b[^>]*\bdbat_script_version")
 _TURN = {"radian": 1.0, "degrees": np.pi / 180, "gon": np.pi / 200}
@@ -325,7 +325,7 @@ def _cameras(node: Node, base: Path, free: tuple[str, ...]) -> dict[str, Camera]
         name = str(k) if key is None else key.text
         if name in found:
             raise FormatError(f"has the camera {name} twice", where=entry.where)
-        found[name] = _camera(entry, name, free)
+        found[name] = camera_of(entry, name, free)
     if not found:
         raise FormatError("defines no camera", where=node.where)
     return found
@@ -336,7 +336,14 @@ def _values(node: Node, path: str) -> Array:
     return np.zeros(0) if found is None or not found.text else found.numbers()
 
 
-def _camera(node: Node, name: str, free: tuple[str, ...]) -> Camera:
+def camera_of(node: Node, name: str, free: tuple[str, ...]) -> Camera:
+    """A camera of its element, with the parameters that are free.
+
+    Raises
+    ------
+    FormatError
+        When it is incomplete, or of a lens model that is not read.
+    """
     unit = node.find("unit")
     if unit is not None and unit.text not in ("mm", ""):
         raise FormatError(f"has the unit `{unit.text}`, not mm", where=node.where)

@@ -24,7 +24,7 @@ from ..io import read_text
 from ..optics.poses import angles_to_matrix, matrix_to_vector
 from .lines import network_of, numbers
 
-__all__ = ["read_photomodeler"]
+__all__ = ["camera_of_numbers", "read_photomodeler"]
 
 _FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
 
@@ -68,7 +68,7 @@ def read_photomodeler(path: Path | str) -> Network:
     default = numbers(lines.next(), 10, path, lines.number)
     lines.next()
     size = int(width), int(height)
-    cameras, poses, files, camera_of, ids = [_camera("1", default, *size)], [], [], [], list[str]()
+    cameras, poses, files, camera_of, ids = [camera_of_numbers("1", default, *size)], [], [], [], list[str]()
     kept = [_printed(default)]
     while (words := lines.peek()) and len(words) >= 2 and not _is_number(words[1]):
         ids.append(lines.next()[0])
@@ -79,7 +79,7 @@ def read_photomodeler(path: Path | str) -> Network:
         lines.next()
         if _printed(own) not in kept:
             kept.append(_printed(own))
-            cameras.append(_camera(str(len(kept)), own, *size))
+            cameras.append(camera_of_numbers(str(len(kept)), own, *size))
         camera_of.append(kept.index(_printed(own)))
     points, xyz = list[str](), []
     while (words := lines.peek()) and len(words) == 7:
@@ -168,7 +168,14 @@ def _printed(values: list[float]) -> tuple[float, ...]:
     return tuple(round(v, 3) if k < 3 else v for k, v in enumerate(values))
 
 
-def _camera(name: str, values: list[float], width: int, height: int) -> Camera:
+def camera_of_numbers(name: str, values: list[float], width: int, height: int) -> Camera:
+    """A camera of its line: c, principal point, format, K1, K2, K3, P1, P2; mm.
+
+    Examples
+    --------
+    >>> camera_of_numbers("1", [35.0, 18.0, 12.0, 36.0, 24.0, 0, 0, 0, 0, 0], 3600, 2400).pitch_mm
+    (0.01, 0.01)
+    """
     c, px, py, format_x, format_y, *distortion = values
     pitch = format_x / width, format_y / height
     brown = [c, px - format_x / 2, format_y / 2 - py, *distortion, 0.0, 0.0]

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
@@ -47,6 +48,7 @@ from ..io.refraction import RefractionEntry
 from ..optics import CameraModel, PixelGrid, camera_model
 from ..optics.cameras import default_camera_model
 from ..optics.refraction import RefractedRays, Refraction
+from .assessment import Assessment, assess
 from .exposures import Taken
 from .target_measurement import Measurer, Photograph, measured_in_order, measurer_of
 from .z_stage import Heights
@@ -258,6 +260,17 @@ class Calibrated(Display):
         """Estimated parameters of the cameras, by their names; one that is alone is called ``camera``."""
         return self.result.cameras
 
+    @cached_property
+    def assessments(self) -> dict[str, Assessment]:
+        """What the calibration of each camera is good for; of those with one set of parameters."""
+        network = self.result.network
+        one = {c for c, entry in enumerate(network.cameras) if entry.has_plane_mapping}
+        return {
+            entry.id: assess(self.result, c)
+            for c, entry in enumerate(network.cameras)
+            if c in one and (entry.additional is None or entry.additional.per == "camera")
+        }
+
     @property
     def images(self) -> ImageEstimates:
         """Exterior orientations."""
@@ -292,6 +305,9 @@ class Calibrated(Display):
         """
         found = calibration_of(self.result, camera or _CAMERA, name=name, provenance=provenance)
         more = model_search_entries(self.result)
+        assessed = self.assessments.get(camera or _CAMERA)
+        if assessed is not None:
+            more |= {"assessment": assessed.entries()}
         if self.choice is not None:
             more |= {"camera_models": self.choice.entries()}
         if self.board is not None:

@@ -9,7 +9,6 @@ same frames give the same results to the byte. For files, the procedure is
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
@@ -22,9 +21,10 @@ from ..core.failure import Code, Failure
 from ..core.provenance import Provenance
 from ..io.refraction import RefractionEntry
 from ..optics import Pose
-from ..optics.poses import matrix_to_vector, rotation_matrix
+from ..optics.poses import rotation_matrix
 from ..optics.refraction import RefractedRays
 from .calibration import Calibrated, CalibrationOptions, CameraOptions, PlaneDesign, calibrate_camera
+from .next_pose import PREDICTED, adjusted, with_image
 from .target_measurement import Measurer
 from .turntable import HEIGHT, Mount
 from .z_stage import Heights
@@ -32,8 +32,6 @@ from .z_stage import Heights
 __all__ = ["Place", "TestfieldProcedure"]
 
 _LEAST_IMAGES = 3
-_MARGIN_PX = 6.0
-_PREDICTED = "predicted"
 
 
 class Place(Protocol):
@@ -142,7 +140,7 @@ class TestfieldProcedure:
         reading = {name: float(place.get(HEIGHT, 0.0)) for name, place in self._places.items()}
         pose = dict(self._pose)
         if more is not None:
-            pose[_PREDICTED], reading[_PREDICTED] = self._at(more)[0], float(more.position.get(HEIGHT, 0.0))
+            pose[PREDICTED], reading[PREDICTED] = self._at(more)[0], float(more.position.get(HEIGHT, 0.0))
         return Heights(pose, reading, *self._sigmas)
 
     def calibrated(self) -> Calibrated | Failure:
@@ -198,7 +196,7 @@ class TestfieldProcedure:
             do = f"use {', '.join(names)}"
             raise EstimationError("is not estimated", where=f"sigma_{wanted}", do=do)
         column = names.index(wanted)
-        network, result = _adjusted(found.result), found.result
+        network, result = adjusted(found.result), found.result
         mount = Mount.of(
             [self._places[name] for name in network.images],
             np.array([rotation_matrix(vector) for vector in result.rotation]),
@@ -231,50 +229,14 @@ class TestfieldProcedure:
         return {"calibration.json": calibration.to_json()}
 
 
-def _adjusted(result: Result) -> Network:
-    """The network with its estimates as approximate values, for fast convergence."""
-    network, values = result.network, result.fit.values
-    camera = replace(network.cameras[0], values=values.cameras[0, : len(network.cameras[0].values)])
-    bent = network.refraction
-    return replace(
-        network,
-        cameras=(camera,),
-        x0=values.x0,
-        rotation=result.rotation,
-        xyz=values.xyz,
-        refraction=None if bent is None else bent.with_values(values.refraction),
-    )
-
-
 def _joined(
     network: Network, result: Result, mount: Mount, place: Place, heights: Heights | None
 ) -> Network | None:
     """The network with an image from another pose; None if the image shows fewer than four points."""
-    camera, pose = network.cameras[0], _predicted(network, result, mount, place, heights)
-    seen = camera_mapping(result, 0).mapping(_directions(network, pose))
-    size = np.array([camera.width, camera.height]) - 1
-    inside = np.flatnonzero(((seen >= _MARGIN_PX) & (seen <= size - _MARGIN_PX)).all(axis=1))
-    if len(inside) < 4:
-        return None
-    m, bent = len(network.images), network.refraction
-    cov = np.median(network.cov, axis=0)
-    images = (*network.images, _PREDICTED)
+    pose = _predicted(network, result, mount, place, heights)
     axis = np.array([0.0, 0.0, mount.lifts]) if network.stage is None else network.stage.axis
-    return replace(
-        network,
-        images=images,
-        stage=None if heights is None else heights.stage(images, axis),
-        refraction=None if bent is None else replace(bent, path_of=np.append(bent.path_of, bent.path_of[:1])),
-        camera_of=np.append(network.camera_of, 0),
-        x0=np.vstack([network.x0, pose.x0]),
-        rotation=np.vstack([network.rotation, matrix_to_vector(pose.matrix)]),
-        image_of=np.concatenate([network.image_of, np.full(len(inside), m)]),
-        point_of=np.concatenate([network.point_of, inside]),
-        xy=np.concatenate([network.xy, seen[inside]]),
-        cov=np.concatenate([network.cov, np.tile(cov, (len(inside), 1, 1))]),
-        groups=(*network.groups, None),
-        files=(*network.files, _PREDICTED),
-    )
+    stage = None if heights is None else heights.stage((*network.images, PREDICTED), axis)
+    return with_image(network, camera_mapping(result, 0), pose, _directions(network, pose), stage)
 
 
 def _directions(network: Network, pose: Pose) -> Array:
@@ -300,14 +262,14 @@ def _predicted(network: Network, result: Result, mount: Mount, place: Place, hei
     same = [
         k
         for k, name in enumerate(network.images)
-        if heights is not None and heights.pose[name] == heights.pose[_PREDICTED]
+        if heights is not None and heights.pose[name] == heights.pose[PREDICTED]
     ]
     if heights is None or not same:
         return by_mount
     k, stage = same[-1], result.fit.values.stage
     axis = np.array([0.0, 0.0, mount.lifts]) if stage is None else stage.axis
     stood = heights.reading[network.images[k]] if stage is None else float(stage.reading[k])
-    return Pose(network.rotation[k], network.x0[k] + (stood - heights.reading[_PREDICTED]) * axis)
+    return Pose(network.rotation[k], network.x0[k] + (stood - heights.reading[PREDICTED]) * axis)
 
 
 def _sigma(network: Network, column: int) -> float:

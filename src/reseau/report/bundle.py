@@ -11,10 +11,12 @@ from markupsafe import Markup
 from ..bundle import Result, camera_mapping, projection_field_at, sigma_between_images
 from ..calibration import CameraMapping, FieldDifference, projection_field
 from ..core.data import Rows
+from ..core.failure import Remark
 from ..core.numbers import plain, power
 from ..core.provenance import Provenance
 from ..optics.cameras import unit_of
-from .bundle_figures import distortion_figure, network_figure, residual_figure
+from ..procedures.assessment import Assessment
+from .bundle_figures import distortion_figure, network_figure, next_figure, residual_figure
 from .bundle_tables import components_table, dropped_table, images_table, left_out_table, worst_points
 from .fields import difference_figure, uncertainty_figure
 from .patterns import patterns_of
@@ -33,6 +35,7 @@ def bundle_report(
     provenance: Provenance | None = None,
     against: Mapping[str, FieldDifference] | None = None,
     distances: Sequence[float] = (),
+    assessments: Mapping[str, Assessment] | None = None,
 ) -> str:
     """Render the report of a bundle adjustment.
 
@@ -49,6 +52,8 @@ def bundle_report(
     distances : sequence of float
         Distances at which the uncertainty of the projection is mapped, in addition to that of directions; by
         default the median distance of the points.
+    assessments : mapping of str to Assessment, optional
+        What the calibrations of the cameras are good for, by their names.
 
     Returns
     -------
@@ -60,7 +65,9 @@ def bundle_report(
         "bundle.html.j2",
         title=title,
         summary=_summary(result),
-        warnings=result.warnings,
+        verdicts=[_verdict(result, name, each) for name, each in (assessments or {}).items()],
+        warnings=_warnings(result, assessments or {}),
+        tests=_tests(result, assessments or {}),
         network=Markup(network_figure(result)),
         components=components_table(result),
         dropped=dropped_table(result),
@@ -77,6 +84,30 @@ def bundle_report(
         unit=result.network.unit,
         provenance=(provenance or Provenance()).to_dict(),
     )
+
+
+def _verdict(result: Result, name: str, assessed: Assessment) -> dict[str, Any]:
+    """The verdict on a camera, with the next photograph."""
+    c = [entry.id for entry in result.network.cameras].index(name)
+    drawn = next_figure(result, c, _rows(result, c), assessed)
+    return {
+        "camera": name if len(result.network.cameras) > 1 else "",
+        "lines": assessed.lines,
+        "use": assessed.use.value,
+        "figure": None if drawn is None else Markup(drawn),
+        "next": "" if assessed.next_photograph is None else assessed.next_photograph.words,
+    }
+
+
+def _tests(result: Result, assessments: Mapping[str, Assessment]) -> list[Remark]:
+    """Remarks whose effect is contained in the errors of all cameras."""
+    every = list(assessments.values())
+    return [remark for remark in result.warnings if every and all(remark in each.tests for each in every)]
+
+
+def _warnings(result: Result, assessments: Mapping[str, Assessment]) -> list[Remark]:
+    tests = _tests(result, assessments)
+    return [remark for remark in result.warnings if remark not in tests]
 
 
 def _shown(result: Result) -> list[int]:

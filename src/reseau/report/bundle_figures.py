@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 from ..bundle import Result
 from ..calibration import CameraMapping
 from ..core.data import Array, Rows
-from ..core.figures import ACCENT, BLUE, FAINT, INK, PALE, drawing, nice, to_svg
+from ..core.figures import ACCENT, BLUE, FAINT, INK, PALE, drawing, image_axes, nice, to_svg
 from ..optics.cameras import distortion_names
+from ..procedures.assessment import Assessment
 
-__all__ = ["distortion_figure", "network_figure", "residual_figure"]
+__all__ = ["distortion_figure", "network_figure", "next_figure", "residual_figure"]
 
 _MANY_POINTS, _ELLIPSES, _CELLS, _WEAK = 4000, 250, 12, 5.0
 _BAND = 3.0
@@ -107,6 +108,25 @@ def residual_figure(result: Result, c: int, rows: Rows) -> str:
         )
         right.plot(bins, np.sqrt(2 / np.pi) * np.exp(-(bins**2) / 2), color=INK, linewidth=1)
         right.set_title("test values w and the normal distribution")
+        return to_svg(figure)
+
+
+def next_figure(result: Result, c: int, rows: Rows, assessed: Assessment) -> str | None:
+    """Draw the image with its points so far, and the target as the next photograph shows it."""
+    then, camera = assessed.next_photograph, result.network.cameras[c]
+    if then is None:
+        return None
+    xy = result.network.xy[rows]
+    xy = xy[:: max(1, len(xy) // _MANY_POINTS)]
+    with drawing():
+        figure = Figure(figsize=(4.6, 0.9 + 4.0 * camera.height / camera.width), layout="constrained")
+        axes = figure.subplots()
+        axes.plot(*xy.T, ".", color=FAINT, markersize=2.5, label="points so far")
+        axes.fill(*then.outline.T, facecolor=BLUE, alpha=0.15)
+        axes.plot(*np.vstack([then.outline, then.outline[:1]]).T, color=BLUE, lw=1.2)
+        axes.plot(*then.xy.T, ".", color=BLUE, markersize=3.5, label="in the next photograph")
+        image_axes(axes, camera.width, camera.height)
+        figure.legend(loc="outside upper left", ncols=2, frameon=False, fontsize=8.5)
         return to_svg(figure)
 
 

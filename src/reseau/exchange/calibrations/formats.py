@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from ...calibration import Calibration, CameraMapping
-from ...calibration.document import Covariance, Quantity
+from ...calibration.document import CameraModel, Covariance, Quantity
 from ...core.errors import FormatError, UsageError
 from ...core.provenance import Provenance, sha256_of
 from ...io import read_text, write_whole
 from ...optics import PixelGrid
 from ...optics.cameras import camera_model, convert, unit_of
 from ...optics.poses import rotation_matrix
-from . import colmap, matlab, metashape, mrcal, opencv, yamls
+from . import brown, colmap, matlab, metashape, mrcal, opencv, openptv, yamls
 from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, Mounted, PlainCamera
 
 __all__ = [
@@ -33,6 +33,12 @@ _CENTRE = ("fx", "fy", "cx", "cy")
 _RADTAN, _FIVE = (*_CENTRE, *RADIAL_TANGENTIAL), (*_CENTRE, *RADIAL_TANGENTIAL, "k3")
 _EIGHT, _TWELVE = (*_CENTRE, *RATIONAL), (*_CENTRE, *THIN_PRISM)
 _FISHEYE = (*_CENTRE, "k1", "k2", "k3", "k4")
+# The most specific formats are tried first.
+_ORDER = (
+    "ros", "kalibr", "mrcal", "dbat", "metashape", "opencv", "matlab", "openptv", "photomodeler", "colmap",
+)  # fmt: skip
+# Pixel size where none is known: models in mm have only ratios to it.
+_NOMINAL_MM = 0.005
 # Differences (px) below which a simpler model of a format is not replaced by a more general one.
 _SAME = 1e-3
 
@@ -55,6 +61,8 @@ class CalibrationFormat:
         Whether a text is of this format.
     read : callable
         Camera of a text.
+    beside : mapping of str to callable
+        Texts of further files, by the suffixes with which they lie beside the first.
 
     Examples
     --------
@@ -68,6 +76,7 @@ class CalibrationFormat:
     write: Callable[[PlainCamera], str]
     recognises: Callable[[str], bool]
     read: Callable[[str, Path], PlainCamera]
+    beside: Mapping[str, Callable[[PlainCamera], str]] = field(default_factory=dict)
 
 
 def calibration_formats() -> dict[str, CalibrationFormat]:
@@ -76,7 +85,7 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
     Examples
     --------
     >>> list(calibration_formats())
-    ['opencv', 'ros', 'kalibr', 'colmap', 'mrcal', 'metashape', 'matlab']
+    ['opencv', 'ros', 'kalibr', 'colmap', 'mrcal', 'metashape', 'photomodeler', 'dbat', 'matlab', 'openptv']
     """
     wide, fisheye = (("opencv", _FIVE), ("opencv", _EIGHT)), ("fisheye", _FISHEYE)
     formats = (
@@ -107,7 +116,18 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
             metashape.write, metashape.recognises, metashape.read,
         ),
         CalibrationFormat(
+            "photomodeler", (".txt",), (("brown", brown.BROWN),),
+            brown.write_photomodeler, brown.is_photomodeler, brown.read_photomodeler,
+        ),
+        CalibrationFormat(
+            "dbat", (".xml",), (("brown", brown.BROWN),), brown.write_dbat, brown.is_dbat, brown.read_dbat
+        ),
+        CalibrationFormat(
             "matlab", (".m",), (("opencv", _FIVE),), matlab.write, matlab.recognises, matlab.read
+        ),
+        CalibrationFormat(
+            "openptv", (".ori",), (("openptv", openptv.OPENPTV),),
+            openptv.write, openptv.recognises, openptv.read, {openptv.BESIDE: openptv.write_beside},
         ),
     )  # fmt: skip
     return {entry.name: entry for entry in formats}
@@ -178,7 +198,14 @@ def export_calibration(calibration: Calibration, to: str, path: Path | str) -> E
     if not isinstance(lens, CameraMapping):
         raise UsageError(calibration.not_of("camera"), where=calibration.name)
     found = _in_a_model_of(formats[to], calibration, lens)
-    write_whole(Path(path), formats[to].write(found.camera))
+    path = Path(path)
+    for suffix, write in formats[to].beside.items():
+        if path.suffix == suffix:
+            raise UsageError(
+                f"has the suffix of the file beside it, use {formats[to].suffixes[0]}", where=path
+            )
+        write_whole(path.with_suffix(suffix), write(found.camera))
+    write_whole(path, formats[to].write(found.camera))
     return found
 
 
@@ -244,24 +271,33 @@ def export_rig(calibrations: Sequence[Calibration], to: str, path: Path | str) -
 def _in_a_model_of(form: CalibrationFormat, calibration: Calibration, lens: CameraMapping) -> Exported:
     """The camera in one of the models of a format."""
     name, (width, height) = calibration.name, lens.size
-    model, grid = str(calibration.model.get("model")), PixelGrid(width, height, (1.0, 1.0))
+    stored: dict[str, Any] = dict(calibration.model)
+    model, given = str(stored.get("model")), tuple(float(v) for v in stored["pitch_mm"])
+    registered = camera_model(model)
     own = {key: value for key, value in calibration.values().items() if value or key in _CENTRE}
-    plain = not calibration.model.get("additional")
+    options = registered.checked_options(
+        {o.name: stored[o.name] for o in registered.options if o.name in stored}
+    )
+    plain = not stored.get("additional")
     for wanted, names in form.models:
-        if plain and wanted.partition("_full")[0] == model.partition("_full")[0] and set(own) <= set(names):
-            return Exported(PlainCamera(name, width, height, wanted, own), 0.0, 0.0, 1.0)
+        same = wanted.partition("_full")[0] == model.partition("_full")[0] and set(own) <= set(names)
+        if plain and same and options == _options(wanted):
+            pitch = (given[0], given[1])
+            return Exported(PlainCamera(name, width, height, wanted, own, pitch, options), 0.0, 0.0, 1.0)
     best: Exported | None = None
     why = "no model of the format describes it"
     for wanted, names in form.models:
+        pitch = _pitch(lens, given[0]) if camera_model(wanted).needs_pitch else (1.0, 1.0)
         try:
-            done = convert(lens.mapping, grid, wanted, free=names)
+            done = convert(
+                lens.mapping, PixelGrid(width, height, pitch), wanted, _options(wanted), free=names
+            )
         except UsageError as error:
             why = str(error)
             continue
         values = dict(zip(camera_model(wanted).names, done.mapping.values.tolist(), strict=False))
-        camera = PlainCamera(
-            name, width, height, wanted, {key: values[key] for key in names if key in values}
-        )
+        held = {key: values[key] for key in names if key in values}
+        camera = PlainCamera(name, width, height, wanted, held, pitch, _options(wanted))
         trial = Exported(camera, done.rms_px, done.greatest_px, done.share)
         if best is None or trial.greatest_px < best.greatest_px:
             best = trial
@@ -270,6 +306,19 @@ def _in_a_model_of(form: CalibrationFormat, calibration: Calibration, lens: Came
     if best is None:
         raise UsageError(f"cannot be written as {form.name}: {why}", where=f"calibration {name}")
     return best
+
+
+def _options(model: str) -> dict[str, str | float]:
+    """Options of a model in the files of other programs: Brown's distortion is that of measured points."""
+    given = {"side": "image"} if model == "brown" else {}
+    return camera_model(model).checked_options(given)
+
+
+def _pitch(lens: CameraMapping, given: float) -> tuple[float, float]:
+    """Pixel size for models in mm: that of the calibration, or a nominal one, in the ratio of the scales."""
+    slope = lens.mapping.derivatives(np.zeros((1, 2))).d_xy[0]
+    across = _NOMINAL_MM if given == 1.0 else given
+    return across, float(across * slope[0, 0] / slope[1, 1])
 
 
 def import_calibration(path: Path | str) -> Calibration:
@@ -292,8 +341,7 @@ def import_calibration(path: Path | str) -> Calibration:
     """
     path = Path(path)
     text = read_text(path)
-    for form in (calibration_formats()[name] for name in ("ros", "kalibr", "mrcal", "metashape", "opencv",
-                                                          "matlab", "colmap")):  # fmt: skip
+    for form in (calibration_formats()[name] for name in _ORDER):
         if form.recognises(text):
             source = Provenance({path.name: sha256_of(path)}, {"format": form.name})
             return _calibration(form.read(text, path), source.to_dict())
@@ -303,11 +351,17 @@ def import_calibration(path: Path | str) -> Calibration:
 
 def _calibration(camera: PlainCamera, provenance: dict[str, Any]) -> Calibration:
     model = camera_model(camera.model)
-    names = [name for name in model.names if name in _CENTRE or camera.values.get(name, 0.0)]
+    scales = (*_CENTRE, *model.required)
+    names = [name for name in model.names if name in scales or camera.values.get(name, 0.0)]
+    entry: CameraModel = {
+        "model": camera.model, "width": camera.width, "height": camera.height,
+        "pitch_mm": list(camera.pitch_mm),
+    }  # fmt: skip
+    entry = cast(CameraModel, entry | dict(camera.options))
     return Calibration(
         kind="camera",
         name=camera.name,
-        model={"model": camera.model, "width": camera.width, "height": camera.height, "pitch_mm": [1.0, 1.0]},
+        model=entry,
         parameters={
             name: Quantity(value=camera.values.get(name, 0.0), sigma=0.0, unit=unit_of(name, camera.model))
             for name in names

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite
 from typing import NamedTuple
 
@@ -66,6 +66,10 @@ class PlainCamera:
         Name of the model.
     values : mapping of str to float
         Its parameters; those that are missing are zero.
+    pitch_mm : (float, float)
+        Pixel size; 1 where the model is in pixels.
+    options : mapping of str to str or float
+        Options of the model.
 
     Examples
     --------
@@ -79,12 +83,14 @@ class PlainCamera:
     height: int
     model: str
     values: Mapping[str, float]
+    pitch_mm: tuple[float, float] = (1.0, 1.0)
+    options: Mapping[str, str | float] = field(default_factory=dict)
 
     def mapping(self) -> PlaneMapping:
         """The mapping from ideal directions to pixels."""
         model = camera_model(self.model)
         values = [self.values.get(name, 0.0) for name in model.names]
-        return model.mapping(values, PixelGrid(self.width, self.height, (1.0, 1.0)))
+        return model.mapping(values, PixelGrid(self.width, self.height, self.pitch_mm), self.options)
 
     def of(self, *names: str) -> list[float]:
         """Values of parameters, zero where they are missing."""

@@ -22,6 +22,7 @@ from .projections import (  # isort: skip
     Stereographic,
 )
 from .telecentric import Telecentric  # isort: skip
+from .openptv import OpenPtv  # isort: skip
 from .convert import Converted, convert
 from .ebner import EbnerCorrection
 from .grid import PixelGrid
@@ -58,6 +59,7 @@ __all__ = [
     "FourierCorrection",
     "Omni",
     "OpenCV",
+    "OpenPtv",
     "Option",
     "Orthographic",
     "Parameter",

@@ -1,0 +1,130 @@
+"""Cameras with Brown's distortion in the image: PhotoModeler's text export, and the cameras of DBAT (XML).
+
+Both correct measured coordinates: c, principal point from the upper left corner of the format, K1, K2, K3,
+P1, P2, in mm. A camera of PhotoModeler is written as the head of its text export, which DBAT reads; into
+PhotoModeler itself the numbers are typed (Camera Viewer).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+from ...bundle import Camera
+from ...core.errors import FormatError
+from ..dbat import camera_of as dbat_camera
+from ..markup import read_markup
+from ..photomodeler import camera_of_numbers
+from .plain import PlainCamera
+
+__all__ = [
+    "BROWN",
+    "is_dbat",
+    "is_photomodeler",
+    "read_dbat",
+    "read_photomodeler",
+    "write_dbat",
+    "write_photomodeler",
+]
+
+BROWN = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
+"""Parameters that both have."""
+_HEAD, _CAMERA_LINE = 4, 10
+
+
+def write_photomodeler(camera: PlainCamera) -> str:
+    """Return the head of a text export, without images."""
+    wide, tall = _format(camera)
+    c, x0, y0, *more = camera.of(*BROWN)
+    values = [c, x0 + wide / 2, tall / 2 - y0, wide, tall, *more]
+    lines = [
+        camera.name or "camera",
+        f"1e-06 20 {camera.width} {camera.height}",
+        "1.0",
+        " ".join(map(repr, values)),
+        " ".join(["0.0"] * 10),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def is_photomodeler(text: str) -> bool:
+    """Whether this is such a file."""
+    lines = [line.split() for line in text.splitlines() if line.strip()]
+    counts = [_numbers(line) for line in lines[1:5]]
+    return len(counts) >= 3 and counts[0] == _HEAD and counts[2] == _CAMERA_LINE
+
+
+def read_photomodeler(text: str, path: Path) -> PlainCamera:
+    """Read the camera at the head of a text export.
+
+    Raises
+    ------
+    FormatError
+        When a number is not positive where it must be.
+    """
+    lines = [line.split() for line in text.splitlines() if line.strip()]
+    values = [float(word) for word in lines[3]]
+    width, height = int(float(lines[1][2])), int(float(lines[1][3]))
+    if min(values[0], values[3], values[4]) <= 0 or min(width, height) < 1:
+        raise FormatError("has a camera constant, a format or a size that is not positive", where=path)
+    return _plain(camera_of_numbers(path.stem, values, width, height))
+
+
+def write_dbat(camera: PlainCamera) -> str:
+    """Return the text of a file of cameras with one camera."""
+    wide, tall = _format(camera)
+    c, x0, y0, k1, k2, k3, p1, p2 = camera.of(*BROWN)
+    aspect = camera.pitch_mm[1] / camera.pitch_mm[0]
+    entries = {
+        "id": "1", "name": escape(camera.name), "unit": "mm", "sensor": f"{wide!r},{tall!r}",
+        "image": f"{camera.width},{camera.height}", "aspect": repr(aspect), "focal": repr(c), "model": "3",
+        "nK": "3", "nP": "2", "cc": repr(c), "pp": f"{(x0 + wide / 2) * aspect!r},{tall / 2 - y0!r}",
+        "K": f"{k1!r},{k2!r},{k3!r}", "P": f"{p1!r},{p2!r}", "skew": "0",
+    }  # fmt: skip
+    lines = "".join(f"      <{key}>{value}</{key}>\n" for key, value in entries.items())
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<document dbat_script_version="1.0">\n  <cameras>\n'
+        f"    <camera>\n{lines}    </camera>\n  </cameras>\n</document>\n"
+    )
+
+
+def is_dbat(text: str) -> bool:
+    """Whether this is such a file."""
+    return "<camera>" in text and "<sensor>" in text and ("<cc>" in text or "<focal>" in text)
+
+
+def read_dbat(text: str, path: Path) -> PlainCamera:
+    """Read the only camera.
+
+    Raises
+    ------
+    FormatError
+        When there are several, it is incomplete, or of a lens model that is not read.
+    """
+    root = read_markup(path)
+    cameras = root if root.tag == "cameras" else root.find("cameras") or root.need("input/cameras")
+    found = list(cameras.all("camera"))
+    if len(found) != 1:
+        raise FormatError(f"has {len(found)} cameras, not one", where=path)
+    name = found[0].find("name")
+    return _plain(dbat_camera(found[0], path.stem if name is None or not name.text else name.text, ()))
+
+
+def _format(camera: PlainCamera) -> tuple[float, float]:
+    """Size of the image, mm."""
+    return camera.width * camera.pitch_mm[0], camera.height * camera.pitch_mm[1]
+
+
+def _plain(camera: Camera) -> PlainCamera:
+    return PlainCamera(
+        camera.id, camera.width, camera.height, camera.model, camera.parameters, camera.pitch_mm,
+        dict(camera.options),
+    )  # fmt: skip
+
+
+def _numbers(words: list[str]) -> int:
+    """Number of words, if all are numbers; otherwise -1."""
+    try:
+        return len([float(word) for word in words])
+    except ValueError:
+        return -1

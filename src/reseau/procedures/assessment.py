@@ -1,0 +1,270 @@
+"""What a calibration is good for: its accuracy in pixels, what the photographs do not cover, what to do next.
+
+The accuracy at a place of the image is the root of the squares of the standard deviation of the projection,
+enlarged where the images scatter more than it says, and of what the residuals have in common there beyond
+noise. It is a size in pixels, not a test: with many points, a test finds errors that are too small to matter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from ..bundle import Result, by_place, camera_mapping, common_pattern, sigma_between_images
+from ..calibration import CameraMapping, projection_field
+from ..core.data import Array, Mask
+from ..core.errors import UsageError
+from ..core.failure import Code, Remark
+from .next_pose import NextPose, next_photograph
+
+__all__ = ["Assessment", "Use", "assess"]
+
+
+class Use(StrEnum):
+    """What a calibration is accurate enough for, by its error in the corners of the image."""
+
+    MEASUREMENT = "measurement"  # up to 0.05 px
+    RECONSTRUCTION = "reconstruction"  # up to 0.3 px: stereo, poses of objects and robots, models of scenes
+    VIEWING = "viewing"  # up to 2 px: images without visible distortion
+    NOTHING = "nothing"
+
+
+_LIMITS = ((0.05, Use.MEASUREMENT), (0.3, Use.RECONSTRUCTION), (2.0, Use.VIEWING))
+_FOR = {
+    Use.MEASUREMENT: "usable for measurement",
+    Use.RECONSTRUCTION: "usable for 3-D reconstruction, stereo and poses, not for precise measurement",
+    Use.VIEWING: "usable to remove visible distortion only",
+    Use.NOTHING: "not usable",
+}
+_FITS = 0.02
+"""Common residuals (px) below which a model fits for all practical purposes."""
+_CELLS, _EMPTY = 12, 0.5
+"""Cells of a zone along each axis are a third of these; a zone with fewer of them covered is not covered."""
+_ZONES = (
+    ("upper left corner", "upper edge", "upper right corner"),
+    ("left edge", "middle", "right edge"),
+    ("lower left corner", "lower edge", "lower right corner"),
+)
+_ACROSS = 13
+_ENOUGH = 6
+"""Fewer images do not show whether the camera is stable and the model fits."""
+_STATISTICAL = (Code.SIGMAS_DOUBTFUL, Code.CORRELATED, Code.WEAK_GEOMETRY)
+"""Remarks that concern the statistics; their effect on the result is part of the accuracy."""
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """What a calibration is good for.
+
+    Parameters
+    ----------
+    use : Use
+        What it is accurate enough for.
+    centre_px, corners_px : float
+        Standard error of the projection in the middle, and in the worst of the corners.
+    focal_px : float
+        Pixels in a radian at the centre.
+    fits : bool
+        Whether the camera model describes the residuals but for practically nothing.
+    misfit_px : float
+        What the residuals have in common beyond noise, root mean square.
+    images : int
+        Number of photographs.
+    uncovered : tuple of str
+        Parts of the image with few points.
+    next_photograph : NextPose, optional
+        Photograph that would help most; none where no photograph lowers the error.
+    warnings, tests : tuple of Remark
+        Warnings that matter to the result, and remarks of the statistical tests whose effect is contained in
+        the errors above.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> print(assess(adjust_network(example_network())).lines[0])  # doctest: +ELLIPSIS
+    usable to remove visible distortion only: 0.019 px at the centre, 0.42 px in the corners...
+    """
+
+    use: Use
+    centre_px: float
+    corners_px: float
+    focal_px: float
+    fits: bool
+    misfit_px: float
+    images: int
+    uncovered: tuple[str, ...]
+    next_photograph: NextPose | None
+    warnings: tuple[Remark, ...]
+    tests: tuple[Remark, ...]
+
+    @property
+    def lines(self) -> tuple[str, str]:
+        """The verdict in two lines."""
+        first = f"{_FOR[self.use]}: "
+        if np.isfinite(self.corners_px):
+            far = 1e3 * self.corners_px / self.focal_px
+            first += f"{self.centre_px:.2g} px at the centre, {self.corners_px:.2g} px in the corners "
+            first += f"({far:.2g} mm at 1 m)"
+        else:
+            first += "the projection is not determined in the corners"
+        if self.fits:
+            first += f"; the model fits (to {_rounded(self.misfit_px)})"
+        else:
+            first += f"; the model does not fit by {self.misfit_px:.2g} px: try --model auto"
+        second = "the image is covered"
+        if self.uncovered:
+            second = f"not covered, and extrapolated there: {_listed(self.uncovered)}"
+        if self.images < _ENOUGH:
+            second += f"; {self.images} photographs are few, take 10 or more"
+        if self.next_photograph is not None:
+            then = self.next_photograph
+            enough = self.use is Use.MEASUREMENT and not self.uncovered and self.images >= _ENOUGH
+            second += "; more photographs are not needed; most would help" if enough else "; photograph next"
+            second += f": {then.words} (then {then.worst_px:.2g} px at most)"
+        elif not self.uncovered:
+            second += "; no further photograph is needed"
+        return first, second
+
+    def entries(self) -> dict[str, Any]:
+        """Entries for a document.
+
+        Examples
+        --------
+        >>> from reseau.bundle import adjust_network, example_network
+        >>> list(assess(adjust_network(example_network())).entries())[:3]
+        ['use', 'lines', 'centre_px']
+        """
+        then = self.next_photograph
+        return {
+            "use": self.use.value,
+            "lines": list(self.lines),
+            "centre_px": self.centre_px,
+            "corners_px": self.corners_px if np.isfinite(self.corners_px) else None,
+            "fits": self.fits,
+            "misfit_px": self.misfit_px,
+            "uncovered": list(self.uncovered),
+            "next_photograph": None
+            if then is None
+            else {
+                "text": then.words,
+                "outline_px": [point for point in then.outline.tolist() if np.isfinite(point).all()],
+                "worst_px": then.worst_px,
+            },
+        }
+
+
+def assess(result: Result, camera: int = 0) -> Assessment:
+    """Assess a calibration.
+
+    Parameters
+    ----------
+    result : Result
+        The adjustment.
+    camera : int
+        Row of the camera.
+
+    Raises
+    ------
+    UsageError
+        When the camera has no mapping of its own.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> assess(adjust_network(example_network())).uncovered
+    ()
+    """
+    lens = camera_mapping(result, camera)
+    used = result.fit.usable.observations & ~result.rejected
+    rows = np.flatnonzero(used & (result.network.camera_of[result.network.image_of] == camera))
+    covered = _covered(result.network.xy[rows], lens)
+    share = covered.reshape(3, _CELLS // 3, 3, _CELLS // 3).mean(axis=(1, 3))
+    uncovered = tuple(_ZONES[r][c] for r in range(3) for c in range(3) if share[r, c] < _EMPTY)
+    centre, corners = _sigmas(lens, _enlarged(result, camera))
+    misfit, at_centre, at_corners, chance = _misfits(result, camera, lens)
+    centre, corners = float(np.hypot(centre, at_centre)), float(np.hypot(corners, at_corners))
+    fits = misfit <= _FITS or chance > 0.01
+    use = next((use for limit, use in _LIMITS if corners <= limit), Use.NOTHING)
+    empty = np.repeat(np.repeat(share < _EMPTY, _CELLS // 3, axis=0), _CELLS // 3, axis=1) & ~covered
+    then = next_photograph(result, empty) if camera == 0 else None
+    few = _few_gross_errors(result, len(rows))
+    tests = tuple(
+        remark
+        for remark in result.warnings
+        if remark.code in _STATISTICAL
+        or (remark.code is Code.GROSS_ERRORS and few)
+        or (remark.code is Code.UNMODELLED and fits)
+    )
+    important = tuple(
+        remark for remark in result.warnings if remark not in tests and remark.code is not Code.COVERAGE
+    )
+    slope = lens.mapping.derivatives(np.zeros((1, 2))).d_xy[0]
+    focal = float(np.sqrt(abs(np.linalg.det(slope))))
+    images = int((result.fit.usable.images & (result.network.camera_of == camera)).sum())
+    return Assessment(
+        use, centre, corners, focal, fits, misfit, images, uncovered, then, important, tests
+    )  # fmt: skip
+
+
+def _covered(xy: Array, lens: CameraMapping) -> Mask:
+    """Cells of the image that have points, or a neighbour that has."""
+    cell = np.clip((xy / np.array(lens.size) * _CELLS).astype(int), 0, _CELLS - 1)
+    seen = np.zeros((_CELLS + 2, _CELLS + 2), dtype=np.bool_)
+    seen[1 + cell[:, 1], 1 + cell[:, 0]] = True
+    shifts = [(i, k) for i in range(3) for k in range(3) if 1 in (i, k)]
+    near = [seen[i : i + _CELLS, k : k + _CELLS] for i, k in shifts]
+    return np.asarray(np.any(near, axis=0), dtype=np.bool_)
+
+
+def _enlarged(result: Result, camera: int) -> float:
+    """Factor by which the images scatter more than their standard deviations say; at least 1."""
+    sigma = np.sqrt(np.diag(result.camera_covariance(camera)))
+    ratio = sigma_between_images(result, camera) / np.where(sigma > 0, sigma, np.inf)
+    ratio = ratio[np.isfinite(ratio)]
+    return max(1.0, float(np.sqrt(np.mean(ratio**2)))) if len(ratio) else 1.0
+
+
+def _sigmas(lens: CameraMapping, factor: float) -> tuple[float, float]:
+    """Standard deviations at the centre and in the worst corner; infinite where there is no ray."""
+    sigma = projection_field(lens, _ACROSS).sigma
+    rows, columns = sigma.shape
+    corners = sigma[[0, 0, -1, -1], [0, -1, 0, -1]]
+    if not np.isfinite(corners).any():
+        return float(factor * sigma[rows // 2, columns // 2]), float("inf")
+    # Corners that a circular image does not reach have no rays, and none are needed.
+    return float(factor * sigma[rows // 2, columns // 2]), float(factor * np.nanmax(corners))
+
+
+def _misfits(result: Result, camera: int, lens: CameraMapping) -> tuple[float, float, float, float]:
+    """Common residuals beyond noise: of the whole image, near its centre and its corners; probability."""
+    try:
+        pattern = common_pattern(result, by_place(result, camera))
+    except UsageError:
+        return 0.0, 0.0, 0.0, 1.0
+    size = np.array(lens.size)
+    radius = np.linalg.norm(2 * (pattern.xy + 0.5) / size - 1, axis=1) / np.sqrt(2)
+    excess = ((pattern.shift**2).sum(axis=1) - pattern.cov[:, [0, 1], [0, 1]].sum(axis=1)) / 2
+
+    def rms(rows: Mask) -> float:
+        return float(np.sqrt(max(excess[rows].mean(), 0.0))) if rows.sum() > 3 else pattern.rms
+
+    if pattern.p > 0.01:
+        return pattern.rms, 0.0, 0.0, pattern.p
+    return pattern.rms, rms(radius < 0.4), max(pattern.rms, rms(radius > 0.7)), pattern.p
+
+
+def _few_gross_errors(result: Result, count: int) -> bool:
+    """Whether fewer than a hundredth of the image points have test values above the limit of snooping."""
+    w = result.test_values[~result.rejected]
+    return bool((np.nan_to_num(w) > 4).sum() < max(0.01 * count, 5))
+
+
+def _rounded(value: float) -> str:
+    return "0.001 px" if value < 0.001 else f"{value:.1g} px"
+
+
+def _listed(words: tuple[str, ...]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

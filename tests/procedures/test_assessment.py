@@ -1,0 +1,112 @@
+"""The verdict on a calibration: accuracy, coverage, fit, and the next photograph."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from reseau.core.data import ImagePoints
+from reseau.core.failure import Code
+from reseau.designs import coded_sheet
+from reseau.procedures.assessment import Use
+from reseau.procedures.calibration import Calibrated, CameraOptions, calibrate_camera
+
+DESIGN = coded_sheet(9, 8, 20.0)
+SIZE = (800, 600)
+SIGMA = 0.01
+MATRIX = np.array([[700.0, 0, 402.0], [0, 700.0, 297.0], [0, 0, 1]])
+
+
+def measured(
+    count: int = 10, *, side: float = 0.0, k2: float = 0.05, noise: float = SIGMA, tilt: float = 30.0
+) -> list[tuple[str, ImagePoints]]:
+    """Coordinates by OpenCV's projection; with `side` the target is in the left part of all images."""
+    rng, found = np.random.default_rng(4), []
+    xyz = np.column_stack([DESIGN.xy * [1, -1], np.zeros(len(DESIGN.xy))])
+    for k in range(count):
+        roll = cv2.Rodrigues(np.array([0, 0, np.pi / 2 * k]))[0]
+        axis = np.deg2rad(tilt) * np.array([np.cos(1.3 * k), np.sin(1.3 * k), 0])
+        turn = cv2.Rodrigues(cv2.Rodrigues(axis)[0] @ roll)[0]
+        place = np.array([rng.uniform(-40, 40) - side, rng.uniform(-30, 30), 170.0 + side + 10 * (k % 3)])
+        xy = cv2.projectPoints(xyz, turn, place, MATRIX, np.array([-0.2, k2, 0, 0]))[0][:, 0]
+        inside = ((xy > 5) & (xy < np.array(SIZE) - 6)).all(axis=1)
+        xy = xy + noise * rng.normal(size=xy.shape)
+        names = [name for name, good in zip(DESIGN.ids, inside, strict=True) if good]
+        found.append((f"{k}.png", ImagePoints.with_sigma(names, xy[inside], SIGMA)))
+    return found
+
+
+def calibrated(images: list[tuple[str, ImagePoints]], free: tuple[str, ...] = ()) -> Calibrated:
+    model = CameraOptions("opencv", free or ("fx", "fy", "cx", "cy", "k1", "k2"))
+    return calibrate_camera(images, DESIGN, lambda frame: None, SIZE, model).required()  # type: ignore[arg-type, return-value]
+
+
+def test_a_covered_and_accurate_calibration_is_usable_for_measurement() -> None:
+    found = calibrated(measured()).assessments["camera"]
+    assert found.use is Use.MEASUREMENT
+    assert found.fits
+    assert found.uncovered == ()
+    assert found.centre_px < found.corners_px < 0.05
+    assert found.lines[0].startswith("usable for measurement: 0.00")
+    assert "more photographs are not needed" in found.lines[1] or "no further" in found.lines[1]
+
+
+def test_the_part_without_points_is_named_and_the_next_photograph_shows_the_target_there() -> None:
+    found = calibrated(measured(side=70.0)).assessments["camera"]
+    assert {"upper right corner", "right edge", "lower right corner"} <= set(found.uncovered)
+    then = found.next_photograph
+    assert then is not None
+    assert then.xy[:, 0].max() > 0.8 * SIZE[0]
+    assert then.worst_px < found.corners_px
+
+
+def test_the_predicted_uncertainty_is_that_after_the_photograph_was_taken() -> None:
+    images = measured(5, side=40.0)
+    before = calibrated(images)
+    then = before.assessments["camera"].next_photograph
+    assert then is not None
+    # The target is photographed there, by OpenCV.
+    xyz = np.column_stack([DESIGN.xy, np.zeros(len(DESIGN.xy))])
+    shift = -then.pose.matrix @ then.pose.x0
+    xy = cv2.projectPoints(xyz, then.pose.rotation, shift, MATRIX, np.array([-0.2, 0.05, 0, 0]))[0][:, 0]
+    xy += SIGMA * np.random.default_rng(1).normal(size=xy.shape)
+    inside = ((xy > 6) & (xy < np.array(SIZE) - 7)).all(axis=1)
+    names = [name for name, good in zip(DESIGN.ids, inside, strict=True) if good]
+    after = calibrated([*images, ("next.png", ImagePoints.with_sigma(names, xy[inside], SIGMA))])
+    from reseau.bundle import camera_mapping
+    from reseau.calibration import projection_field
+
+    reached = float(np.nanmax(projection_field(camera_mapping(after.result, 0), 13).sigma))
+    assert then.worst_px == pytest.approx(reached, rel=0.25)
+
+
+def test_a_model_that_does_not_fit_is_said_so_in_pixels() -> None:
+    found = calibrated(measured(k2=0.4), ("fx", "fy", "cx", "cy", "k1")).assessments["camera"]
+    assert not found.fits
+    assert found.misfit_px > 0.05
+    assert "the model does not fit by" in found.lines[0]
+    assert any(remark.code is Code.UNMODELLED for remark in found.warnings)
+
+
+def test_a_failed_global_test_of_small_residuals_is_no_alarm() -> None:
+    done = calibrated(measured(noise=1.2 * SIGMA))
+    found = done.assessments["camera"]
+    assert any(remark.code is Code.SIGMAS_DOUBTFUL for remark in done.warnings)
+    assert any(remark.code is Code.SIGMAS_DOUBTFUL for remark in found.tests)
+    assert found.warnings == ()
+    assert found.use is Use.MEASUREMENT
+
+
+def test_frontal_photographs_are_not_usable() -> None:
+    found = calibrated(measured(6, tilt=0.5)).assessments["camera"]
+    assert found.use is not Use.MEASUREMENT
+    assert found.next_photograph is not None
+    assert "towards the camera" in found.next_photograph.words
+
+
+def test_the_calibration_contains_the_verdict() -> None:
+    done = calibrated(measured())
+    entry = done.calibration("c").validity["assessment"]
+    assert entry["use"] == "measurement"
+    assert entry["lines"] == list(done.assessments["camera"].lines)
