@@ -66,7 +66,7 @@ class Assessment:
     centre_px, corners_px : float
         Standard error of the projection in the middle, and in the worst of the corners.
     focal_px : float
-        Pixels in a radian at the centre.
+        Pixels in a radian at the centre; NaN for parallel rays.
     fits : bool
         Whether the camera model describes the residuals but for practically nothing.
     misfit_px : float
@@ -105,9 +105,9 @@ class Assessment:
         """The verdict in two lines."""
         first = f"{_FOR[self.use]}: "
         if np.isfinite(self.corners_px):
+            first += f"{self.centre_px:.2g} px at the centre, {self.corners_px:.2g} px in the corners"
             far = 1e3 * self.corners_px / self.focal_px
-            first += f"{self.centre_px:.2g} px at the centre, {self.corners_px:.2g} px in the corners "
-            first += f"({far:.2g} mm at 1 m)"
+            first += f" ({far:.2g} mm at 1 m)" if np.isfinite(far) else ""
         else:
             first += "the projection is not determined in the corners"
         if self.fits:
@@ -202,7 +202,7 @@ def assess(result: Result, camera: int = 0) -> Assessment:
         remark for remark in result.warnings if remark not in tests and remark.code is not Code.COVERAGE
     )
     slope = lens.mapping.derivatives(np.zeros((1, 2))).d_xy[0]
-    focal = float(np.sqrt(abs(np.linalg.det(slope))))
+    focal = float("nan") if lens.mapping.parallel else float(np.sqrt(abs(np.linalg.det(slope))))
     images = int((result.fit.usable.images & (result.network.camera_of == camera)).sum())
     return Assessment(
         use, centre, corners, focal, fits, misfit, images, uncovered, then, important, tests

@@ -181,6 +181,8 @@ def next_photograph(result: Result, empty: Mask) -> NextPose | None:
     if not camera.has_plane_mapping or camera.additional is not None:
         return None
     lens = camera_mapping(result, 0)
+    if lens.mapping.parallel:
+        return None
     part = result.fit.usable
     xyz = result.fit.values.xyz[part.points]
     weight = 1.0 / (float(np.median(network.cov[:, [0, 1], [0, 1]])) * result.fit.variance)
