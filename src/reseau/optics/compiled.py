@@ -12,6 +12,10 @@ from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
@@ -21,14 +25,14 @@ F = TypeVar("F", bound=Callable[..., Any])
 Single = NDArray[Any]
 Double = NDArray[Any]
 
-_SIDE = 5.5
-"""End of the table of the normal distribution in standard deviations; 2e-8 of the light is outside."""
+_SIDE = 5.0
+"""End of the table of the normal distribution in standard deviations; 6e-7 of the light is outside."""
 _PER_SIGMA = 64
 """Entries per standard deviation; with two more terms of the series in between, accurate to 1e-7."""
 
 
 def _table() -> tuple[Single, Single]:
-    """Distribution and density of the normal distribution at steps of 1/64 from −5.5 to 5.5."""
+    """Distribution and density of the normal distribution at steps of 1/64 from −5 to 5."""
     z = np.arange(-_SIDE * _PER_SIGMA, _SIDE * _PER_SIGMA + 1) / _PER_SIGMA
     return ndtr(z).astype(np.float32), (np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)).astype(np.float32)
 
@@ -46,9 +50,6 @@ def _fine_table() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 _FINE_STEP, _FINE_BELL = _fine_table()
 f32 = np.float32
-_TOGETHER, _SMALL = 24, 600
-"""Number of nodes that are summed together; of pixels of a window up to which all are."""
-
 _FREE = {"nnan", "ninf", "nsz"}
 """Assumptions allowed to the compiler. Sums must not be reordered, and products not be fused into sums: both
 would make the last bits depend on the compilation. (Products of matrices are left to BLAS.)
@@ -78,18 +79,76 @@ def _edges(
         bell[k] = b * (f32(1) - d * (middle - f32(0.5) * d * (middle * middle - f32(1))))
 
 
+def _sum_of_eight(context: Any, sums: Any, at: Any, factors: Any, rows: Any, begin: Any) -> Any:
+    """Add factors[k] · rows[k, begin : begin + 8] to sums[k, at : at + 8] with vector instructions.
+
+    The compiler would leave loops as short as these in single numbers. There are no checks of the limits.
+
+    Parameters
+    ----------
+    sums, rows : tuple of ndarray (n,)
+        As many as there are factors; a row may be given several times, and is read once.
+    """
+
+    def code(target: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        eight = ir.VectorType(ir.FloatType(), 8)
+
+        def place(group: int, k: int, index: Any) -> Any:
+            array = builder.extract_value(arguments[group], k)
+            array_type = cast(Any, make_array)(signature.args[group].types[k])
+            data = array_type(target, builder, array).data
+            return builder.bitcast(builder.gep(data, [index]), eight.as_pointer())
+
+        count = len(signature.args[2])
+        values = [builder.load(place(3, k, arguments[4]), align=4) for k in range(count)]
+        for k, value in enumerate(values):
+            factor = ir.Constant(eight, ir.Undefined)
+            for i in range(8):
+                one = builder.extract_value(arguments[2], k)
+                factor = builder.insert_element(factor, one, ir.Constant(ir.IntType(32), i))
+            sum_ = place(0, k, arguments[1])
+            product = builder.fmul(factor, value)
+            builder.store(builder.fadd(builder.load(sum_, align=4), product), sum_, align=4)
+        return target.get_dummy_value()
+
+    return types.void(sums, types.intp, factors, rows, types.intp), code
+
+
+_add_eight: Any = intrinsic(_sum_of_eight)
+
+
+@_compiled
+def _steps(offset: Single, count: int, shift: np.float32, inverse: np.float32, step: Single) -> None:
+    """Distribution at (offset + shift) · inverse, as in :func:`_edges`."""
+    for k in range(count):
+        z = (offset[k] + shift) * inverse
+        z = min(max(z, f32(-_SIDE)), f32(_SIDE))
+        i = np.uint32((z + f32(_SIDE)) * f32(_PER_SIGMA) + f32(0.5))
+        middle = f32(i) * f32(1 / _PER_SIGMA) - f32(_SIDE)
+        d = z - middle
+        step[k] = _STEP[i] + _BELL[i] * d * (f32(1) - f32(0.5) * d * middle)
+
+
 @_compiled
 def _responses(
-    points: Single, n: int, sigma: np.float32, half: np.float32, first: Single, work: Single, out: Single
+    points: Single,
+    n: int,
+    sigma: np.float32,
+    half: np.float32,
+    whole: int,
+    complete: bool,
+    first: Single,
+    work: Single,
+    out: Single,
 ) -> int:
     """Integral, value and derivative (3, j·s) of the response to light at points (j,), for s pixels each.
 
-    Pixels are at 0, 1, … n − 1; `first` (j,) is filled with the first one with a response. Returns s; the
-    last of these pixels has no meaning. The integral is 0 before and 1 after them. Loops over all points are
-    much faster than loops over the pixels of each.
+    Pixels are at 0, 1, … n − 1; `first` (j,) is filled with the first one with a response. Returns s, a
+    multiple of `whole`. The integral is 0 before and 1 after them. Only the value is needed if not
+    `complete`. Loops over all points are much faster than loops over the pixels of each.
     """
     reach, lag = f32(_SIDE) * sigma + half, 1 if half == f32(0.5) else 0
-    stride = int(min(f32(2) * reach, f32(n))) + 2
+    stride = (int(min(f32(2) * reach, f32(n))) + 1 + whole) // whole * whole
     count = len(points) * stride
     offset, per, inverse = work[4], f32(0.5) / half, f32(1) / sigma
     for j in range(len(points)):
@@ -97,64 +156,29 @@ def _responses(
         begin = f32(first[j]) - points[j] - half
         for k in range(stride):
             offset[j * stride + k] = begin + f32(k)
-    _edges(offset, count, f32(0), inverse, work[0], work[1])
-    if lag == 0:  # otherwise adjacent pixels share an edge
+    if complete:
+        _edges(offset, count, f32(0), inverse, work[0], work[1])
+    else:
+        _steps(offset, count, f32(0), inverse, work[0])
+    if lag == 0 and complete:  # otherwise adjacent pixels share an edge
         _edges(offset, count, f32(2) * half, inverse, work[2], work[3])
-    count -= lag
-    before, bell = work[0, :count], work[1, :count]
-    beyond, bells = (
-        (work[0, 1 : count + 1], work[1, 1 : count + 1]) if lag else (work[2, :count], work[3, :count])
-    )
+    elif lag == 0:
+        _steps(offset, count, f32(2) * half, inverse, work[2])
+    before, bell = work[0, : count - lag], work[1, : count - lag]
+    beyond, bells = (work[0, 1:count], work[1, 1:count]) if lag else (work[2, :count], work[3, :count])
     integral, value, slope = out[0], out[1], out[2]
     # Loops over few arrays each, so that the compiler can prove that these do not overlap.
-    for k in range(count):
+    for k in range(count - lag):
         value[k] = (beyond[k] - before[k]) * per
-    for k in range(count):
+    for k in range(count - lag if complete else 0):
         slope[k] = (bells[k] - bell[k]) * (inverse * per)
-    for k in range(count):
+    for k in range(count - lag if complete else 0):
         integral[k] = offset[k] * value[k] + beyond[k] + sigma * sigma * slope[k]
+    if lag:  # the second edge of the last pixel is the first one of the next point
+        for j in range(len(points)):
+            k = (j + 1) * stride - 1
+            integral[k], value[k], slope[k] = f32(1), f32(0), f32(0)
     return stride
-
-
-@_compiled
-def _spread(
-    responses: Single, some: tuple[int, int], first: Single, stride: int, begin: int, out: Single
-) -> None:
-    """Responses (p, j·s) of some of j points, of s − 1 pixels each, to pixels (p, m, n) from `begin` on."""
-    n = out.shape[2]
-    for p in range(len(out)):
-        response, window = responses[p], out[p].reshape(-1)
-        for k in range(len(window)):
-            window[k] = f32(0)
-        for j in range(some[0], some[1]):
-            left, right = min(max(first[j] - begin, 0), n), min(max(first[j] + stride - 1 - begin, 0), n)
-            source = response[j * stride + left + begin - first[j] : j * stride + right + begin - first[j]]
-            target = window[(j - some[0]) * n + left : (j - some[0]) * n + right]
-            for k in range(len(target)):
-                target[k] = source[k]
-
-
-@_compiled
-def _extent(first: Single, stride: int, n: int) -> tuple[int, int]:
-    """First pixel of n with a response to any of some points, and the one after the last."""
-    low, high = n, 0
-    for j in range(len(first)):
-        low, high = min(low, first[j]), max(high, first[j] + stride - 1)
-    return low, max(min(high, n), low)
-
-
-@_compiled
-def _add(values: Single, part: Single) -> None:
-    for r in range(part.shape[0]):
-        row, out = values[r], part[r]
-        for c in range(len(out)):
-            out[c] += row[c]
-
-
-@_compiled
-def _scaled(factor: np.float32, values: Single, out: Single) -> None:
-    for k in range(len(out)):
-        out[k] = factor * values[k]
 
 
 @_compiled
@@ -190,14 +214,14 @@ def formed(
     parts : ndarray (n, 1, r, c) or (n, 4 + m, r, c)
         The share and, if there is space for them, its derivatives by shifts along x and y, width, and forms.
     """
-    half, (high, wide), most = f32(max(fill, 1e-6) / 2), parts.shape[2:], nodes.shape[1]
-    derived, forms = parts.shape[1] > 1, parts.shape[1] - 4
-    size = most * (max(high, wide) + 2)
+    half, (count, high, wide), most = f32(max(fill, 1e-6) / 2), parts.shape[1:], nodes.shape[1]
+    size = most * (max(high, wide) + 9)
     work, of_x, of_y = np.empty((5, size), f32), np.empty((3, size), f32), np.empty((3, size), f32)
     x, y, dx, dy = np.empty(most, f32), np.empty(most, f32), np.empty(most, f32), np.empty(most, f32)
     first_x, first_y = np.empty(most, np.intp), np.empty(most, np.intp)
     normals, grown = np.empty((most, len(generators)), f32), np.empty((2, 2), f32)
-    behind = np.empty((high, wide + 1), f32)
+    # Light to the right of a window is added to columns beyond it.
+    behind, sums = np.empty((high, wide + 1), f32), np.empty(count * high * (2 * wide + 9), f32)
     for k in range(len(at)):
         grown[:] = f32(0)
         grown[0, 0], grown[1, 1] = f32(1), f32(1)
@@ -216,46 +240,40 @@ def formed(
                 f = generators[m]
                 normals[n, m] = (f[0, 0] * u + f[0, 1] * v) * dy[n] - (f[1, 0] * u + f[1, 1] * v) * dx[n]
             n += 1
-        parts[k], behind[:] = f32(0), f32(0)
-        tall = _responses(y[:n], high, sigma[k], half, first_y, work, of_y)
-        broad = _responses(x[:n], wide, sigma[k], half, first_x, work, of_x)
-        # Nodes that follow each other are near each other: their light falls into a part of the window.
-        together = _TOGETHER if high * wide > _SMALL else max(n, 1)
-        for begin in range(0, n, together):
-            some = begin, min(begin + together, n)
-            top, bottom = _extent(first_y[begin : some[1]], tall, high)
-            left, right = _extent(first_x[begin : some[1]], broad, wide)
-            m, rows, columns = some[1] - begin, bottom - top, right - left
-            down, along = (
-                np.empty((1 + derived, m, rows), f32),
-                np.empty((3 if derived else 1, m, columns), f32),
-            )
-            _spread(of_y[1:3], some, first_y, tall, top, down)
-            _spread(of_x, some, first_x, broad, left, along)
-            # Factors of the response along x: of its integral, and of its value for all derivatives.
-            covered, moved = np.empty((m, rows), f32), np.empty((m, (3 + max(forms, 0)) * rows), f32)
-            for j in range(m):
-                beyond = along[0, j, min(max(first_x[begin + j] + broad - 1 - left, 0), columns) :]
-                for c in range(len(beyond)):
-                    beyond[c] = f32(1)
-                _scaled(-dy[begin + j], down[0, j], covered[j])
-                for r in range(rows):
-                    behind[top + r, right] += covered[j, r]
-            _add(np.dot(covered.T, along[0]), parts[k, 0, top:bottom, left:right])
-            if not derived:
-                continue
-            for j in range(m):
-                u, v = dx[begin + j], dy[begin + j]
-                _scaled(v, down[0, j], moved[j, :rows])
-                _scaled(-u, down[0, j], moved[j, rows : 2 * rows])
-                _scaled(sigma[k] * u, down[1, j], moved[j, 2 * rows : 3 * rows])
-                for f in range(forms):
-                    _scaled(normals[begin + j, f], down[0, j], moved[j, (3 + f) * rows : (4 + f) * rows])
-                _scaled(sigma[k], covered[j], covered[j])
-            slopes = np.dot(moved.T, along[1])
-            for f in range(3 + forms):
-                _add(slopes[f * rows : (f + 1) * rows], parts[k, 1 + f, top:bottom, left:right])
-            _add(np.dot(covered.T, along[2]), parts[k, 3, top:bottom, left:right])
+        tall = _responses(y[:n], high, sigma[k], half, 1, count > 1, first_y, work, of_y)
+        broad = _responses(x[:n], wide, sigma[k], half, 8, True, first_x, work, of_x)
+        row, behind[:] = wide + broad, f32(0)
+        part = high * row
+        sums[: count * part] = f32(0)
+        integral, value, slope = of_x[0], of_x[1], of_x[2]
+        reach, share = f32(_SIDE) * sigma[k] + half, sums
+        if count > 1:
+            slopes = sums[part:], sums[2 * part :], sums[3 * part :], sums
+        for j in range(n):
+            begin, beyond = j * broad, min(first_x[j] + broad, wide)
+            u, v, widths = dx[j], dy[j], sigma[k]
+            last = min(int(y[j] + reach) + 2, first_y[j] + tall, high)
+            for r in range(first_y[j], last):
+                down, bend = of_y[1, j * tall + r - first_y[j]], of_y[2, j * tall + r - first_y[j]]
+                covered, to = -v * down, r * row + first_x[j]
+                behind[r, beyond] += covered
+                if count == 1:
+                    for c in range(0, broad, 8):
+                        _add_eight((share,), to + c, (covered,), (integral,), begin + c)
+                    continue
+                four = v * down, -u * down, widths * u * bend, covered
+                for c in range(0, broad, 8):
+                    _add_eight(slopes, to + c, four, (value, value, value, integral), begin + c)
+                    _add_eight((slopes[2],), to + c, (widths * covered,), (slope,), begin + c)
+                for m in range(count - 4):
+                    for c in range(0, broad, 8):
+                        to_form = (4 + m) * part + to + c
+                        _add_eight((sums,), to_form, (normals[j, m] * down,), (value,), begin + c)
+        for p in range(count):
+            for r in range(high):
+                line, out = sums[p * part + r * row : p * part + r * row + wide], parts[k, p, r]
+                for c in range(wide):
+                    out[c] = line[c]
         # Outside the reach of nodes their integral is 1: add all at once.
         for r in range(high):
             total = f32(0)

@@ -16,7 +16,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ACTIVE", "DONE", "LEFT", "advanced", "compared", "cut", "linearised"]
+from ...optics.compiled import formed
+
+__all__ = ["ACTIVE", "DONE", "LEFT", "adjusted", "advanced", "compared", "cut", "linearised"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 Floats = NDArray[Any]
@@ -26,6 +28,8 @@ ACTIVE, DONE, LEFT = 0, 1, 2
 _WIDTH, _CONTRAST, _LEVEL = 2, 3, 4
 _SERVES, _SHRINKS, _SINGULAR, _LEAST_DAMPING = 0.75, 0.1, 1e-12, 1e-10
 """As in :mod:`reseau.adjust.batch`."""
+_AT_ONCE = 40_000
+"""Number of pixels in the windows that are adjusted together."""
 f32 = np.float32
 
 
@@ -425,3 +429,141 @@ def advanced(
         iteration[k, 1] = max(iteration[k, 1] / 3, _LEAST_DAMPING)
         limit = share_of_sigma**2 * cost / max(used + np.count_nonzero(prior) - u, 1)
         _next(k, normals[k], gradients[k], limit, x, trial, iteration, state)
+
+
+@_compiled
+def adjusted(
+    shares: Floats,
+    slopes: Floats,
+    outlines: tuple[Floats, Floats, Floats, Floats],
+    place: Floats,
+    fill: float,
+    observed: Floats,
+    weights: Floats,
+    window: tuple[Floats, Floats, int],
+    light: tuple[bool, float, float],
+    psf: Floats,
+    prior: Floats,
+    share_of_sigma: float,
+    most: int,
+    x: Floats,
+    found: tuple[Floats, Floats, Floats, Floats, Floats],
+) -> None:
+    """Adjust windows with one outline each, as many together as fit into a cache.
+
+    Parameters
+    ----------
+    shares : ndarray (k, r, c), float32
+        Images formed at the initial values, replaced by those formed last.
+    slopes : ndarray (k, 3 + p, n), float32
+        Derivatives of the first images.
+    outlines : tuple
+        Nodes, tangents and generators, and the index (k,) of the outline of each window; see
+        :func:`reseau.optics.compiled.formed`.
+    place : ndarray (k, 2)
+        Origins of the outlines from the first pixel of each window, where x and y are 0.
+    fill : float
+        Light-sensitive share of the pitch.
+    most : int
+        Largest number of iterations.
+    found : tuple
+        Filled: residuals (k, n), cofactors (k, u, u), numbers of iterations (k,). Filled as in
+        :func:`linearised`: iteration (k, 4), state (k,).
+    observed, weights, window, light, psf, prior, share_of_sigma, x
+        As in :func:`linearised`.
+    """
+    residuals, cofactors, rounds, iteration, state = found
+    nodes, tangents, generators, at = outlines
+    (count, high, wide), n, u = shares.shape, observed.shape[1], x.shape[1]
+    forms, together = len(generators), max(1, min(_AT_ONCE // observed.shape[1], len(observed)))
+    kept, normals = np.empty((together, u, n), f32), np.zeros((together, u, u))
+    common = np.zeros((2, together if light[2] > 0 else 0, n), f32)
+    trial, first, gradients = (
+        np.empty((together, u)),
+        np.empty((together, u)),
+        np.zeros((together, u)),
+    )
+    images, where = np.empty((together, 1, high, wide), f32), np.empty((together, 2), f32)
+    form, sigma = np.empty((together, forms), f32), np.empty(together, f32)
+    rows, flat = np.empty(together, np.intp), shares.reshape(count, n)
+    for begin in range(0, count, together):
+        part = slice(begin, min(begin + together, count))
+        some = part.stop - begin
+        first[:some], trial[:some] = x[part], x[part]
+        work = (
+            residuals[part],
+            kept[:some],
+            normals[:some],
+            gradients[:some],
+            cofactors[part],
+            common[0, :some],
+            common[1, :some],
+        )
+        linearised(
+            flat[part],
+            slopes[part],
+            observed[part],
+            weights[part],
+            window,
+            light,
+            psf[part],
+            prior,
+            share_of_sigma,
+            x[part],
+            work,
+            trial[:some],
+            iteration[part],
+            state[part],
+        )
+        for _ in range(most):
+            active = 0
+            for j in range(some):
+                k = begin + j
+                if state[k] != ACTIVE:
+                    continue
+                total = 0.0
+                for i in range(2):
+                    where[active, i] = place[k, i] + trial[j, i]
+                    total += where[active, i]
+                for i in range(forms):
+                    form[active, i] = trial[j, u - forms + i]
+                    total += form[active, i]
+                sigma[active] = math.hypot(psf[k], math.exp(trial[j, _WIDTH]))
+                if not math.isfinite(total + sigma[active]):
+                    state[k] = LEFT  # a step may lead to values without an image
+                    continue
+                rounds[k] += 1
+                rows[active] = j
+                active += 1
+            if active == 0:
+                break
+            formed(
+                nodes,
+                tangents,
+                generators,
+                at[begin + rows[:active]],
+                where[:active],
+                form[:active],
+                sigma[:active],
+                fill,
+                images[:active],
+            )
+            tried = images[:active].reshape(active, n)
+            for j in range(active):
+                flat[begin + rows[j]] = tried[j]
+            advanced(
+                rows[:active],
+                tried,
+                observed[part],
+                weights[part],
+                window,
+                light[0],
+                first[:some],
+                prior,
+                share_of_sigma,
+                x[part],
+                work,
+                trial[:some],
+                iteration[part],
+                state[part],
+            )

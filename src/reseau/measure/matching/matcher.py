@@ -20,7 +20,7 @@ from ...optics.formation import Outline
 from .matches import Matches, matches_of, with_rows
 from .noise import medians
 from .patches import CONTRAST, SHARPEST, WIDTH, MatchOptions, Patches, X, Y
-from .shapes import GrownOutline, Shape, ShapeSubset
+from .shapes import GrownOutline, Shape, ShapeSubset, outlines_of
 
 __all__ = ["SIZE", "match"]
 
@@ -45,7 +45,7 @@ def match(
     form: Array | None = None,
     form_sigma: Array | None = None,
     claims: tuple[NDArray[Any], Rows] | None = None,
-    others: Array | None = None,
+    others: NDArray[Any] | None = None,
     region: Mask | None = None,
     light: tuple[Array, Array] | None = None,
     searching: bool = True,
@@ -221,54 +221,36 @@ def _compiled(
     )
     if share.dtype != np.float32:
         return None, every
-    from .compiled import ACTIVE, DONE, advanced, linearised  # takes half a second to import
+    from .compiled import DONE, adjusted  # takes half a second to import; not every command needs it
 
     (k, n), u = patch.grey.shape, start.shape[1]
     jitter, dark = patch.options.row_jitter_px, patch.options.polarity == "dark"
     window = patch.monomials.T.copy(), patch.across.reshape(len(patch.across), n), patch.shape[2]
-    prior = 1 / free**2
-    residuals, normal, cofactor = np.empty((k, n)), np.zeros((k, u, u)), np.full((k, u, u), np.nan)
-    common = np.zeros((2, k if jitter > 0 else 0, n), np.float32)
-    kept = np.empty((k, u, n), np.float32)
-    work = residuals, kept, normal, np.zeros((k, u)), cofactor, common[0], common[1]
-    x, trial, iteration, state = start.copy(), start.copy(), np.zeros((k, 4)), np.zeros(k, np.int64)
+    prior, light = 1 / free**2, (dark, noise**2, (jitter / noise) ** 2)
+    residuals, cofactor = np.empty((k, n)), np.full((k, u, u), np.nan)
+    x, iteration, (state, rounds) = start.copy(), np.zeros((k, 4)), np.zeros((2, k), np.int64)
     iteration[:, 1] = options.damping
-    with one_thread():
-        linearised(
-            share.reshape(k, -1),
-            slopes.reshape(k, -1, n),
-            patch.grey,
-            weights,
-            window,
-            (dark, noise**2, (jitter / noise) ** 2),
-            SHARPEST * patch.psf,
-            prior,
-            options.share,
-            *(x, work, trial, iteration, state),
-        )
-        patch.shares = share.copy()
-        rounds = np.zeros(k, np.int64)
-        for _ in range(options.max_iterations - 1):
-            rows = np.flatnonzero(state == ACTIVE)
-            if not len(rows):
-                break
-            around = patch.window if len(rows) == k else patch.window.select(rows)
-            width, form = patch.width(trial[rows], rows), trial[rows, patch.form_at :]
-            tried = shape.image(patch.xy[rows] + trial[rows, :2], width, form, rows, around)
-            patch.shares[rows] = tried
-            rounds[rows] += 1
-            advanced(
-                rows,
-                tried.reshape(len(rows), n),
-                patch.grey,
-                weights,
-                window,
-                dark,
-                start,
-                prior,
-                options.share,
-                *(x, work, trial, iteration, state),
+    patch.shares = share.copy()
+    given = patch.grey, weights, window, light, SHARPEST * patch.psf, prior, options.share
+    outlines = outlines_of(shape, every)
+    if outlines is not None:
+        plain, at = outlines
+        with one_thread():
+            adjusted(
+                patch.shares,
+                slopes.reshape(k, -1, n),
+                (plain.nodes.xy, plain.nodes.dxy, plain.generators.astype(np.float32), at),
+                patch.xy - np.stack([patch.window.columns[:, 0], patch.window.rows[:, 0]], axis=1),
+                patch.options.response.fill,
+                *given,
+                options.max_iterations - 1,
+                x,
+                (residuals, cofactor, rounds, iteration, state),
             )
+    else:
+        _stepwise(
+            patch, start, (share, slopes, *given), options, x, (residuals, cofactor, rounds, iteration, state)
+        )
     redundancy = (patch.weights > 0).sum(axis=1) + np.count_nonzero(prior) - u
     left = state != DONE
     found = BatchAdjustment(
@@ -283,6 +265,46 @@ def _compiled(
         factors=np.broadcast_to(1.0, (k, n)),
     )
     return found, np.flatnonzero(left)
+
+
+def _stepwise(
+    patch: Patches,
+    start: Array,
+    given: tuple[Any, ...],
+    options: BatchOptions,
+    x: Array,
+    found: tuple[Any, ...],
+) -> None:
+    """The iterations of :func:`reseau.measure.matching.compiled.adjusted` for shapes other than outlines."""
+    from .compiled import ACTIVE, advanced, linearised  # takes half a second to import
+
+    (residuals, cofactor, rounds, iteration, state), (k, n), u = found, patch.grey.shape, start.shape[1]
+    share, slopes, observed, weights, window, light, psf, prior, share_of_sigma = given
+    common = np.zeros((2, k if light[2] > 0 else 0, n), np.float32)
+    kept, trial = np.empty((k, u, n), np.float32), start.copy()
+    work = residuals, kept, np.zeros((k, u, u)), np.zeros((k, u)), cofactor, common[0], common[1]
+    steps: Any = x, work, trial, iteration, state
+    with one_thread():
+        linearised(
+            *(share.reshape(k, n), slopes.reshape(k, -1, n), observed, weights),
+            *(window, light, psf, prior, share_of_sigma),
+            *steps,
+        )
+        for _ in range(options.max_iterations - 1):
+            rows = np.flatnonzero(state == ACTIVE)
+            if not len(rows):
+                break
+            around = patch.window if len(rows) == k else patch.window.select(rows)
+            width, form = patch.width(trial[rows], rows), trial[rows, patch.form_at :]
+            tried = patch.form.image(patch.xy[rows] + trial[rows, :2], width, form, rows, around)
+            patch.shares[rows] = tried
+            rounds[rows] += 1
+            advanced(
+                rows,
+                tried.reshape(len(rows), n),
+                *(observed, weights, window, light[0], start, prior, share_of_sigma),
+                *steps,
+            )
 
 
 def _robust_sigma(residuals: Array, used: Array) -> Array:

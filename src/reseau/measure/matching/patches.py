@@ -118,7 +118,7 @@ class Patches:
         xy: Array,
         options: MatchOptions,
         claims: tuple[NDArray[Any], Rows] | None = None,
-        others: Array | None = None,
+        others: NDArray[Any] | None = None,
         region: Mask | None = None,
     ) -> None:
         self.form, self.xy, self.options = shape, xy, options

@@ -427,12 +427,20 @@ def ridges(
     for r in range(xx.shape[0]):
         for c in range(xx.shape[1]):
             half, mean = (xx[r, c] - yy[r, c]) / 2, (xx[r, c] + yy[r, c]) / 2
-            root = math.sqrt(half * half + xy[r, c] * xy[r, c])
+            square, lack = half * half + xy[r, c] * xy[r, c], least - mean
+            if not (square > lack * lack or lack < 0):
+                continue
+            root = math.sqrt(square)
             across = mean + root
             if not (across > least and abs(mean - root) < across / 2):
                 continue
-            angle = 0.5 * math.atan2(xy[r, c], half)
-            u, v = math.cos(angle), math.sin(angle)
+            # The direction across has half the angle of (half, xy).
+            if half > 0:
+                u = math.sqrt(0.5 + 0.5 * half / root)
+                v = 0.5 * xy[r, c] / (root * u)
+            else:
+                v = math.copysign(math.sqrt(0.5 - 0.5 * half / root), xy[r, c])
+                u = 0.5 * xy[r, c] / (root * v)
             step = -(x[r, c] * u + y[r, c] * v) / across
             if abs(step) < 0.7:
                 if count == len(points):

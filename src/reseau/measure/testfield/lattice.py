@@ -47,6 +47,9 @@ _FAMILY, _CROSSING = np.deg2rad(40.0), np.deg2rad(30.0)
 """Largest angle between the strongest line of a family and the others in the image; smallest between the
 strongest lines of both families."""
 _MOST_PEAKS, _MOST_LINES = 250, 48
+_SURROUNDED, _SAMPLED = 480, 500
+"""Size of the frame, in pixels, from which not all are used to find the brightest surroundings; number of
+samples along its longest side from which they are more than a pixel apart on a line."""
 _APART_PX = 5.0
 """Distance below which two lines are the same."""
 _OWN = 0.5
@@ -144,8 +147,13 @@ def ridge_points(grey: NDArray[np.float32], noise: float, sigma: float = 1.0) ->
 def _darkness(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     """Difference between the brightest value around each pixel and its own."""
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
-    size = max(grey.shape) // 14 | 1
-    bright = cv2.blur(cv2.dilate(smooth, np.ones((size, size), np.uint8)), (size, size))
+    # Of a smooth image, and for surroundings much wider than a pixel, some pixels are enough.
+    each = max(1, max(grey.shape) // _SURROUNDED)
+    size = max(grey.shape) // (14 * each) | 1
+    few = np.ascontiguousarray(smooth[::each, ::each])
+    bright: Any = cv2.blur(cv2.dilate(few, np.ones((size, size), np.uint8)), (size, size))
+    if each > 1:
+        bright = cv2.resize(bright, (each * few.shape[1], each * few.shape[0]))[: len(grey), : grey.shape[1]]
     lack: NDArray[np.float32] = bright - grey
     return lack
 
@@ -271,7 +279,8 @@ def _dark_share(
     from .compiled import supported  # takes half a second to import; not every command needs it
 
     h, w = darkness.shape
-    along = np.arange(-max(h, w) * 0.7, max(h, w) * 0.7)
+    apart = max(1, round(max(h, w) / _SAMPLED))
+    along = np.arange(-max(h, w) * 0.7, max(h, w) * 0.7, apart)
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     step = _STEP_PX * each
     ends = supported(points, normals, normal, rho, _APART_PX / 2, _PARALLEL, step, _DENSE * step / each)
@@ -287,7 +296,7 @@ def _dark_share(
     dark = np.max(across[1:-1], axis=0)
     dense = inside & (along >= ends[:, :1]) & (along <= ends[:, 1:])
     rises = [dark - beside for beside in (across[0], across[-1])]
-    section = min(_SECTION, int(0.6 * min(h, w)))
+    section = min(_SECTION, int(0.6 * min(h, w))) // apart
     return np.maximum(_share(dark, rises, inside, section), _share(dark, rises, dense, section))
 
 

@@ -74,10 +74,10 @@ _NEIGHBOURS, _TOGETHER_PX, _SCATTER, _ALONE = 9, 0.1, 0.5, 6.0
 """Number of neighbouring points, themselves included, of which the median residual is compared; median from
 which they deviate together from a mapping, and its multiple by which they may scatter; multiple of the usual
 deviation from it that a point may have."""
-_LEAST_POINTS, _ENOUGH, _SOME = 40, 800, 3000
+_LEAST_POINTS, _ENOUGH, _SOME, _MANY = 40, 800, 3000, 5000
 """Minimum number of ridge points of a lattice, number that is sufficient at first, and number of ridge points
-of the frame (most not on lines) among which they are selected."""
-"""Central part of the frame, relative to half its size, that determines the projectivity."""
+of the frame (most not on lines) among which they are selected; number of places on profiles of lines that is
+sufficient in the end."""
 _SHORTEST = 20
 """Minimum part of a line within the frame, relative to its length; times the size of the frame."""
 _EACH_PX, _LEAST_SAMPLES = 3, 120
@@ -278,9 +278,9 @@ def _sharpened(fit: LatticeFit, grey: NDArray[np.float32], width: float, blur: f
     points = [np.concatenate(column) for column in zip(*columns, strict=True)]
     if len(points[0]) < _LEAST_POINTS:
         return fit
-    degree = _degree_of([fit.across, fit.along])
-    mapping, residuals = _adjusted(fit.mapping, degree, *points)
-    return replace(fit, mapping=mapping, rms_px=rms(residuals), points=len(residuals))
+    degree, thin = _degree_of([fit.across, fit.along]), slice(None, None, max(1, len(points[0]) // _MANY))
+    mapping, residuals = _adjusted(fit.mapping, degree, *(column[thin] for column in points))
+    return replace(fit, mapping=mapping, rms_px=rms(residuals), points=len(points[0]))
 
 
 def _assigned(

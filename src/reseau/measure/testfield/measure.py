@@ -471,7 +471,7 @@ class _Measurement:
                 if not self._shifted():
                     break
             moved = (self.predicted - predicted)[self.rows[self.inside]]
-            if most == every and len(moved) and np.abs(moved).max() < _SETTLED_PX:
+            if len(moved) and np.abs(moved).max() < _SETTLED_PX:
                 break
 
     def _learn(self, some: Mask) -> None:

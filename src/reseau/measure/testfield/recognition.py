@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -62,6 +61,7 @@ _SURE = 3
 """Most targets of a single square that may be hidden or wrong, if there is no other square to confirm it."""
 _ANGLE = 7.5
 """Resolution of the directions of targets, degrees."""
+f32 = np.float32
 _SYMMETRY = {"square": 90.0, "cross": 90.0, "triangle": 120.0, "circle": np.inf}
 
 
@@ -209,10 +209,10 @@ class _Clusters:
         self.group, self.frames = _grouped(frames[legible])
         reach = np.ceil(np.abs(self.frames).sum(axis=2).max(axis=0) * self.step / 2).astype(int)
         # Large targets are told apart by every second pixel, or less.
-        self.each = max(1, int(reach.min() // _ENOUGH_PX))
+        self.each = max(1, round(reach.min() / _ENOUGH_PX))
         reach += -reach % self.each
-        self.columns, self.rows = (np.arange(-r, r + 1.0) for r in reach)
-        columns, rows = self.columns[:: self.each], self.rows[:: self.each]
+        self.columns, self.rows = (np.arange(-r, r + 1.0) for r in reach // self.each)
+        columns, rows = self.each * self.columns, self.each * self.rows
         offset = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         sampled = (self.xy[:, :, None] + offset).astype(np.float32)
         # OpenCV samples less than 32768 rows and columns at a time.
@@ -281,28 +281,31 @@ class _Clusters:
         turned = np.swapaxes(self.frames, 1, 2)[:, None]
         nodes = Outline(outline.xy @ turned, outline.dxy @ turned).oriented()
         flat = Outline(*(v.reshape(-1, *v.shape[2:]) for v in (nodes.xy, nodes.dxy))).single()
-        images = GrownOutline(flat, SIZE)
+        # Pixels `each` apart are adjacent ones in an image reduced by this factor.
+        images = GrownOutline(Outline(flat.xy / f32(self.each), flat.dxy / f32(self.each)), SIZE)
         every = np.arange(len(images.nodes.xy))
         none = np.zeros((len(every), 2))
         columns, rows = (np.tile(v, (len(every), 1)) for v in (self.columns, self.rows))
-        window = Window(columns, rows, self.response)
-        share, slopes = images.derivatives(none, np.full(len(every), psf_px), none[:, :1], every, window)
-        share, slopes = (images[..., :: self.each, :: self.each] for images in (share, slopes))
-        design = np.stack([np.ones_like(share), share, *np.moveaxis(slopes[:, :3], 1, 0)], axis=-1)
+        window = Window(columns, rows, PixelResponse(self.response.fill / self.each))
+        width = np.full(len(every), psf_px / self.each)
+        share, slopes = images.derivatives(none, width, none[:, :1], every, window)
+        slopes = slopes[:, :3] / f32(self.each)
+        design = np.stack([np.ones_like(share), share, *np.moveaxis(slopes, 1, 0)], axis=-1)
         return design.reshape(*nodes.xy.shape[:2], -1, 5).astype(np.float64)
 
 
 def _grouped(frames: Array) -> tuple[Rows, Array]:
     """Groups of similar local frames (s, 2, 2): group of each frame, and the frames of the groups."""
-    kept: list[Any] = []
-    group = np.zeros(len(frames), dtype=np.intp)
-    for k, frame in enumerate(frames):
-        size = np.linalg.norm(frame)
-        near = [i for i, other in enumerate(kept) if np.linalg.norm(frame - other) < _ALIKE * size]
-        if not near:
-            kept.append(frame)
-        group[k] = near[0] if near else len(kept) - 1
-    return group, np.array(kept)
+    size = np.linalg.norm(frames, axis=(1, 2))
+    group = np.full(len(frames), -1)
+    kept: list[int] = []
+    while (group < 0).any():
+        first = int(np.argmin(group))
+        near = np.linalg.norm(frames - frames[first], axis=(1, 2)) < _ALIKE * size
+        near[first] = True
+        group[near & (group < 0)] = len(kept)
+        kept.append(first)
+    return group, frames[kept]
 
 
 @dataclass(frozen=True, eq=False)

@@ -83,7 +83,7 @@ def _quadratic(xy: Array, size: tuple[float, float]) -> Array:
 
 _UNDETERMINED = 1e-12
 """Weight of the coefficients of the illumination as observations of zero, relative to that of the points."""
-_AT_ONCE = 40_000
+_AT_ONCE = 160_000
 """Number of pixels in the windows of targets matched together; their images fit into the cache of a
 processor."""
 _FOREIGN, _SHADE, _SHIFT_PX = 4.0, 0.03, 0.25
@@ -147,7 +147,7 @@ class Scene:
         return scene
 
     @cached_property
-    def line_light(self) -> Array:
+    def line_light(self) -> NDArray[np.float32]:
         """Grey values that the lines attenuate or add, (h, w)."""
         return _line_light(self)
 
@@ -329,7 +329,7 @@ class _Canvas:
             formed = FormedShape(formed, xy, width, share, slopes)
         else:
             share = self.images.image(xy, width, form, part, window)
-        own = self.scene.light.at(xy)[1][:, None, None] * share
+        own = self.scene.light.at(xy)[1].astype(np.float32)[:, None, None] * share
         add_windows(self.total, self.near, centre.astype(np.intp) - half, own, wanted)
         return _Part(part, half, own, formed)
 
@@ -369,7 +369,7 @@ class _Canvas:
 
         scene, half = self.scene, part.half
         centre = np.rint(self.xy[part.rows]).astype(np.intp)
-        others = np.empty(part.own.shape)
+        others = np.empty(part.own.shape, np.float32)
         dark = scene.design.polarity == "dark"
         without_own(self.total, centre - half, part.own, -1.0 if dark else 1.0, others)
         options = MatchOptions(
@@ -404,13 +404,13 @@ class _Canvas:
         )
 
 
-def _line_light(scene: Scene) -> Array:
+def _line_light(scene: Scene) -> NDArray[np.float32]:
     """Grey values that the lines attenuate or add, (h, w)."""
     from .compiled import attenuate  # takes half a second to import; not every command needs it
     from .compiled_lattice import shade_lines
 
     h, w = scene.grey.shape
-    lines, free = scene.design.lines, np.ones((h, w))
+    lines, free = scene.design.lines, np.ones((h, w), np.float32)
     x0, y0, x1, y1 = lines.extent
     blur, count = blur_of(scene.psf_px, scene.response), max(h, w) // 4
     steps, longest = steps_of(scene.path), float(np.hypot(*scene.path)) / 2
