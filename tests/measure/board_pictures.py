@@ -43,8 +43,9 @@ def picture(
     blur: float = 0.8,
     noise: float = 1.5,
     seed: int = 0,
+    moved: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Frame, Array]:
-    """A picture of a board on white paper, and the images (n, 2) of its points."""
+    """A picture of a board on white paper, `moved` by some pixels, and the images (n, 2) of its points."""
     polygons, circles = board_figures(design)
     ends = np.concatenate([*polygons, circles[:, :2] - circles[:, 2:], circles[:, :2] + circles[:, 2:]])
     low, high = ends.min(axis=0) - 10, ends.max(axis=0) + 10
@@ -66,6 +67,7 @@ def picture(
         part = sheet[first[1] : first[1] + len(rows), first[0] : first[0] + len(rows)]
         part -= 195 * np.clip(0.5 + inside, 0, 1).astype(np.float32)
     plane: Any = homography(design, tilt, turn, distance, size)
+    plane = np.array([[1, 0, moved[0]], [0, 1, moved[1]], [0, 0, 1]]) @ plane
     to_sheet = np.array([[SCALE, 0, -low[0] * SCALE - 0.5], [0, -SCALE, high[1] * SCALE - 0.5], [0, 0, 1.0]])
     # Pixel p covers the fine samples FINE·p … FINE·p + FINE − 1.
     to_fine = np.array([[FINE, 0, (FINE - 1) / 2], [0, FINE, (FINE - 1) / 2], [0, 0, 1.0]])

@@ -12,6 +12,7 @@ import pytest
 from reseau.core.data import Array, Frame
 from reseau.core.failure import Code, Failure
 from reseau.designs import board
+from reseau.designs.boards import marker_cells
 from reseau.io import BoardDesign
 from reseau.io.images import read_image
 from reseau.measure import BoardOptions, BoardResult, measure_board
@@ -21,6 +22,10 @@ from .board_pictures import picture
 CHESS = board("chess", 9, 8, 20.0)
 CHARUCO = board("charuco", 7, 6, 25.0, size=18.0)
 CIRCLES = board("circles", 8, 6, 20.0, size=10.0)
+APRIL = board("aprilgrid", 4, 3, 26.0, border_bits=2)
+APRIL_ONE = board("aprilgrid", 4, 3, 26.0, dictionary="DICT_APRILTAG_25h9")
+MARKERS = board("markers", 4, 3, 26.0, size=21.0)
+SINGLE = board("markers", 1, 1, 60.0, dictionary="DICT_APRILTAG_16h5", first_id=7)
 SHIFTED = board("circles", 5, 9, 12.0, size=9.0, asymmetric=True)
 STEREO = Path(os.environ.get("RESEAU_DATA", "/nowhere")) / "chessboard_stereo"
 DATA = Path(os.environ.get("RESEAU_DATA", "/nowhere")) / "independent" / "boards"
@@ -54,6 +59,32 @@ def test_corners_are_measured_to_their_sigmas_and_named(
     assert np.sqrt((error**2).mean()) < 0.008
     assert 0.7 < np.sqrt(((error / sigma) ** 2).mean()) < 1.5
     assert np.abs(error.mean(axis=0)).max() < 0.003  # no half pixel
+
+
+@pytest.mark.parametrize(("design", "rms_px"), [(APRIL, 0.005), (APRIL_ONE, 0.006), (MARKERS, 0.012)])
+@pytest.mark.parametrize("pixel", [0.0, 0.4])
+def test_corners_of_tags_follow_known_shifts(design: BoardDesign, rms_px: float, pixel: float) -> None:
+    frame, truth = picture(design, 35.0, 160.0, 300.0, moved=(pixel, -pixel))
+    found = measured(frame, design)
+    assert found.ok.all()
+    error = found.xy - truth
+    sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
+    assert np.sqrt((error**2).mean()) < rms_px
+    assert 0.7 < np.sqrt(((error / sigma) ** 2).mean()) < 1.4
+    assert np.abs(error.mean(axis=0)).max() < rms_px / 3  # no half pixel
+
+
+def test_a_single_tag_is_a_grid_of_one() -> None:
+    frame, truth = picture(SINGLE, 20.0, 10.0, 300.0)
+    found = measured(frame, SINGLE)
+    assert found.ids == ("7.0", "7.1", "7.2", "7.3")
+    assert np.abs(found.xy - truth).max() < 0.03
+
+
+def test_tags_of_an_aprilgrid_are_those_of_kalibr() -> None:
+    # The first word of 36h11, 0xd5d628584, from the most significant bit, row by row from the upper left.
+    bits = np.array([int(bit) for bit in f"{0xD5D628584:036b}"]).reshape(6, 6)
+    assert np.array_equal(marker_cells(APRIL)[1][0][2:-2, 2:-2], bits == 0)
 
 
 @pytest.mark.parametrize(("design", "ways"), [(CIRCLES, 2), (SHIFTED, 2)])
@@ -122,7 +153,14 @@ def test_a_mirrored_charuco_board_is_declined_or_measured_as_such() -> None:
     assert np.abs(found.xy - (truth * [-1, 1] + [frame.width - 1, 0])).max() < 0.03
 
 
-@pytest.mark.parametrize("design", [CHESS, CHARUCO, CIRCLES])
+def test_a_mirrored_aprilgrid_is_declined() -> None:
+    frame, _ = picture(APRIL, 20.0, 10.0, 300.0)
+    found = measure_board(replace(frame, pixels=np.ascontiguousarray(frame.pixels[:, ::-1])), APRIL)
+    assert isinstance(found, Failure)
+    assert found.code is Code.MIRRORED
+
+
+@pytest.mark.parametrize("design", [CHESS, CHARUCO, CIRCLES, APRIL, MARKERS])
 def test_pictures_of_something_else_are_declined(design: BoardDesign) -> None:
     noise = np.random.default_rng(0).normal(120, 8, (300, 400))
     empty = measure_board(Frame(np.rint(noise).astype(np.uint8), 255.0), design)

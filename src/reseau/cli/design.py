@@ -55,6 +55,7 @@ class Kind(StrEnum):
     CHARUCO = "charuco"
     CIRCLES = "circles"
     APRILGRID = "aprilgrid"
+    MARKERS = "markers"
 
 
 Svg = Annotated[Path | None, typer.Option("--svg", help="SVG drawing to write.")]
@@ -270,7 +271,7 @@ def board(
     paper: PaperOf = Paper.A4,
     out: Design = None,
 ) -> None:
-    """Design a chessboard, a ChArUco board, a circle grid or an AprilGrid."""
+    """Design a chessboard, a ChArUco board, a circle grid, an AprilGrid or a grid of markers."""
     if given is not None:
         from ..exchange import read_board
 

@@ -171,7 +171,7 @@ def board(
     sensor: SensorFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure a chessboard, a ChArUco board, a circle grid or an AprilGrid."""
+    """Measure a chessboard, a ChArUco board, a circle grid, an AprilGrid or a grid of markers."""
     from ..io import BoardDesign
     from ..measure import BoardOptions, measure_board
 

@@ -14,9 +14,13 @@ from ..io.board import BoardDesign, BoardKind
 
 __all__ = ["board", "board_figures", "marker_cells", "marker_dictionary"]
 
-_SIZES = {"charuco": 0.75, "circles": 0.5, "aprilgrid": 1 / 1.3}
+_SIZES = {"charuco": 0.75, "circles": 0.5, "aprilgrid": 1 / 1.3, "markers": 0.8}
 """Sizes of markers, circles and tags in pitches, where none is given; tags are 0.3 of a side apart."""
-_DICTIONARIES = {"charuco": "DICT_5X5_100", "aprilgrid": "DICT_APRILTAG_36h11"}
+_DICTIONARIES = {
+    "charuco": "DICT_5X5_100",
+    "aprilgrid": "DICT_APRILTAG_36h11",
+    "markers": "DICT_5X5_100",
+}
 
 
 def board(
@@ -37,7 +41,7 @@ def board(
 
     Parameters
     ----------
-    kind : {"chess", "charuco", "circles", "aprilgrid"}
+    kind : {"chess", "charuco", "circles", "aprilgrid", "markers"}
         The pattern.
     columns, rows : int
         Number of squares, circles or tags.
@@ -117,7 +121,9 @@ def marker_cells(design: BoardDesign) -> tuple[Array, NDArray[np.bool_]]:
     dictionary = marker_dictionary(design.dictionary)
     side = dictionary.markerSize + 2 * design.border_bits
     images = [dictionary.generateImageMarker(int(k), side, None, design.border_bits) for k in numbers]
-    return corners, np.stack(images) == 0
+    black = np.stack(images) == 0
+    # OpenCV has the words of AprilTags turned by 180° against those of their authors, whom Kalibr follows.
+    return corners, np.rot90(black, 2, axes=(1, 2)) if design.kind == "aprilgrid" else black
 
 
 def board_figures(design: BoardDesign) -> tuple[list[Array], Array]:
@@ -148,7 +154,7 @@ def board_figures(design: BoardDesign) -> tuple[list[Array], Array]:
         row, column = np.divmod(np.arange((design.columns + 1) * (design.rows + 1)), design.columns + 1)
         corner = design.pitch * np.stack([column, row], axis=1) - gap
         polygons += list(corner[:, None] + gap * _BOX)
-    if design.kind in ("charuco", "aprilgrid"):
+    if design.kind in ("charuco", "aprilgrid", "markers"):
         assert design.size is not None
         for corners, cells in zip(*marker_cells(design), strict=True):
             cell = design.size / len(cells)

@@ -154,7 +154,7 @@ def _board(design: BoardDesign) -> Content:
     ends += [np.vstack([at[:2] - at[2], at[:2] + at[2]]) for at in circles]
     every = np.concatenate(ends)
     low, high = every.min(axis=0) - design.pitch / 2, every.max(axis=0) + design.pitch / 2
-    what = {"chess": "squares", "charuco": "squares", "circles": "circles", "aprilgrid": "tags"}[design.kind]
+    what = {"chess": "squares", "charuco": "squares", "circles": "circles"}.get(design.kind, "tags")
     title = f"{design.name}: {design.kind}, {design.columns} × {design.rows} {what}"
     title += f", pitch {design.pitch:g} mm"
     if design.size is not None:

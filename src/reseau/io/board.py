@@ -1,4 +1,4 @@
-"""``reseau-board/1``: chessboards, ChArUco boards, circle grids and AprilGrids."""
+"""``reseau-board/1``: chessboards, ChArUco boards, circle grids, AprilGrids and grids of markers."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from .document import Document
 
 __all__ = ["BoardDesign", "BoardKind"]
 
-BoardKind = Literal["chess", "charuco", "circles", "aprilgrid"]
+BoardKind = Literal["chess", "charuco", "circles", "aprilgrid", "markers"]
 Length = Annotated[float, Field(gt=1e-6, le=1e6)]
 Count = Annotated[int, Field(ge=1, le=1000)]
 
-_FEWEST = {"chess": 3, "charuco": 2, "circles": 2, "aprilgrid": 1}
-_MARKED = ("charuco", "aprilgrid")
+_FEWEST = {"chess": 3, "charuco": 2, "circles": 2, "aprilgrid": 1, "markers": 1}
+_TAGGED = ("aprilgrid", "markers")
+_MARKED = ("charuco", *_TAGGED)
 
 
 class BoardDesign(Document):
@@ -27,12 +28,14 @@ class BoardDesign(Document):
     Names are those of the programs that the boards come from, coordinates have y up: the inner corners of a
     chessboard or a ChArUco board are numbered row by row from the upper left, and so are circles, with the
     origin at the first; each tag of an AprilGrid has the corners ``tag.0`` … ``tag.3``, anticlockwise from
-    the lower left, with the origin at the lower left of the first tag, which is the lower left one.
+    the lower left, with the origin at the lower left of the first tag, which is the lower left one; each
+    marker of a grid of OpenCV (`markers`: ArUco markers or AprilTags that touch nothing) has the corners
+    clockwise from the upper left, with the origin at the upper left of the first marker, the upper left one.
 
     Parameters
     ----------
-    kind : {"chess", "charuco", "circles", "aprilgrid"}
-        The pattern.
+    kind : {"chess", "charuco", "circles", "aprilgrid", "markers"}
+        The pattern; a single marker is a grid of 1 × 1.
     columns, rows : int
         Number of squares, of circles, or of tags.
     pitch : float
@@ -118,11 +121,13 @@ class BoardDesign(Document):
         columns, rows = self.columns, self.rows
         if self.kind in ("chess", "charuco"):
             columns, rows = columns - 1, rows - 1
-        if self.kind == "aprilgrid":
+        if self.kind in _TAGGED:
             tag = np.arange(columns * rows)
             corner = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-            up = 2 * np.stack([tag % columns, tag // columns], axis=1)[:, None] + corner
-            return np.asarray(up.reshape(-1, 2) * [1, -1], dtype=np.intp)
+            along = 2 * np.stack([tag % columns, tag // columns], axis=1)[:, None] + corner
+            # Kalibr counts upwards, OpenCV downwards.
+            up = -1 if self.kind == "aprilgrid" else 1
+            return np.asarray(along.reshape(-1, 2) * [1, up], dtype=np.intp)
         row, column = np.divmod(np.arange(columns * rows), columns)
         if self.asymmetric:
             column = 2 * column + row % 2
@@ -131,7 +136,7 @@ class BoardDesign(Document):
     @property
     def ids(self) -> tuple[str, ...]:
         """Names of the points."""
-        if self.kind == "aprilgrid":
+        if self.kind in _TAGGED:
             tags = self.first_id + np.arange(self.columns * self.rows)
             return tuple(f"{tag}.{corner}" for tag in tags.tolist() for corner in range(4))
         return tuple(map(str, range(len(self.nodes))))
@@ -139,10 +144,11 @@ class BoardDesign(Document):
     @property
     def xy(self) -> Array:
         """Coordinates of the points (n, 2), y up."""
-        if self.kind == "aprilgrid":
+        if self.kind in _TAGGED:
             assert self.size is not None
-            tag, corner = np.divmod(self.nodes * [1, -1], 2)
-            return np.asarray(tag * self.pitch + corner * self.size)
+            tag, corner = np.divmod(np.abs(self.nodes), 2)
+            up = 1 if self.kind == "aprilgrid" else -1
+            return np.asarray((tag * self.pitch + corner * self.size) * [1, up])
         return np.asarray(self.nodes * [self.pitch, -self.pitch], dtype=np.float64)
 
     @property
@@ -157,9 +163,10 @@ class BoardDesign(Document):
             return np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2))
         assert self.size is not None
         around = self.size / 2 * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1.0]])
-        if self.kind == "aprilgrid":
-            tag = np.arange(self.columns * self.rows)
+        if self.kind in _TAGGED:
+            tag, up = np.arange(self.columns * self.rows), 1 if self.kind == "aprilgrid" else -1
             centre = self.pitch * np.stack([tag % self.columns, tag // self.columns], axis=1) + self.size / 2
+            centre = centre * [1, up]
         else:
             row, column = np.divmod(np.arange(self.columns * self.rows), self.columns)
             white = (row + column) % 2 == (1 if self.dark_corner else 0)

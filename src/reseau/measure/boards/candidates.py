@@ -89,6 +89,11 @@ class Saddles:
         """Selected saddles."""
         return Saddles(self.xy[keep], self.edges[keep], self.strength[keep])
 
+    def mirrored(self, width: int) -> Saddles:
+        """The saddles of the frame of this width with its columns reversed."""
+        xy = self.xy * [-1, 1] + [width - 1, 0]
+        return Saddles(xy, np.pi - self.edges[:, ::-1], self.strength)
+
 
 def find_saddles(grey: NDArray[np.float32], noise: float) -> Saddles:
     """Find the saddle points of a frame that noise does not explain.

@@ -91,14 +91,20 @@ class Sectors:
         Whether the opposite sector is dark, too.
     reach : float
         Distance up to which edges are straight and their sides even.
+    along : float
+        The same along the edges, on the side of the sector `dark`.
     outlines : ndarray (m, j, 2)
-        Corners of dark figures that lie in the bright sectors, anticlockwise.
+        Corners of figures that lie in the sectors.
+    ink : ndarray (m,)
+        1 for dark figures in bright sectors, -1 for bright ones in dark sectors.
     """
 
     dark: Array
     opposite: Mask
     reach: float
+    along: float
     outlines: Array
+    ink: Array
 
 
 class CornerMarks(PlaneMarks):
@@ -141,6 +147,10 @@ class CornerMarks(PlaneMarks):
             np.ascontiguousarray(normal), np.ascontiguousarray(curvature), self.sectors.opposite[rows]
         )
         reach = np.abs(slope).sum(axis=2) * self.sectors.reach
+        if self.sectors.along > self.sectors.reach:
+            # The edges end on one side; a window has both.
+            sides = np.abs(slope) @ np.array([[self.sectors.along, 0], [0, self.sectors.along]])
+            reach = np.maximum(reach, sides.max(axis=2))
         most = _LEARNING_PX + 2 * self.look.blur_px if self.learning else _MOST_PX
         return CornerShape(corners), np.minimum(reach, most) - self._ground
 
@@ -150,20 +160,23 @@ class CornerMarks(PlaneMarks):
         return float(max(5, int(np.ceil(3.0 * self.look.blur_px))))
 
     def _region(self, rows: Rows, half: tuple[int, int]) -> Mask | None:
-        """See :class:`PlaneMarks`: the half squares around a corner."""
+        """See :class:`PlaneMarks`: the half squares around a corner, and what lies along its edges."""
         slope, _ = self._steps(rows)
         centre = np.rint(self.start[rows])
         x = centre[:, :1] + np.arange(-half[0], half[0] + 1) - self.start[rows, :1]
         y = centre[:, 1:] + np.arange(-half[1], half[1] + 1) - self.start[rows, 1:]
         back = np.linalg.inv(slope)[..., None, None]
-        inside = np.ones((len(rows), y.shape[1], x.shape[1]), dtype=bool)
-        for k in range(2):
-            at = back[:, k, 0] * x[:, None, :] + back[:, k, 1] * y[:, :, None]
-            inside &= np.abs(at) < self.sectors.reach
+        one, two = (back[:, k, 0] * x[:, None, :] + back[:, k, 1] * y[:, :, None] for k in (0, 1))
+        near_one, near_two = np.abs(one) < self.sectors.reach, np.abs(two) < self.sectors.reach
+        inside: Mask = near_one & near_two
+        if self.sectors.along > self.sectors.reach:
+            for near, at, sign in ((near_two, one, 0), (near_one, two, 1)):
+                side = at * self.sectors.dark[rows, sign, None, None]
+                inside |= near & (side > 0) & (side < self.sectors.along)
         return inside
 
     def _beside(self) -> Array | None:
-        """See :class:`PlaneMarks`: the markers in the bright squares, as solid figures."""
+        """See :class:`PlaneMarks`: the markers in bright squares, as solid figures; bright cells of tags."""
         outlines, look = self.sectors.outlines, self.look
         if not len(outlines):
             return None
@@ -177,7 +190,7 @@ class CornerMarks(PlaneMarks):
         corners = images_of(self.mapping, outlines.reshape(-1, 2) @ self.frame.T + self.origin)
         reach = 0 if look.kernel is None else len(look.kernel) // 2
         margin = int(np.ceil(6 * look.psf_px)) + 2 + reach
-        for polygon in corners.reshape(outlines.shape):
+        for polygon, ink in zip(corners.reshape(outlines.shape), self.sectors.ink, strict=True):
             low = np.floor(polygon.min(axis=0)).astype(np.intp) - margin
             high = np.ceil(polygon.max(axis=0)).astype(np.intp) + margin + 1
             if not (np.isfinite(polygon).all() and (high > 0).all() and (low < (w, h)).all()):
@@ -195,9 +208,9 @@ class CornerMarks(PlaneMarks):
             taken = taken if look.kernel is None else np.asarray(cv2.filter2D(taken, -1, look.kernel))
             left, top = np.maximum(low, 0)
             right, bottom = np.minimum(high, (w, h))
-            share[top:bottom, left:right] += taken[
-                top - low[1] : bottom - low[1], left - low[0] : right - low[0]
-            ]
+            share[top:bottom, left:right] += (
+                ink * taken[top - low[1] : bottom - low[1], left - low[0] : right - low[0]]
+            )
         self.figures = share, self.mapping, look.psf_px, look.kernel
         return share
 

@@ -1,4 +1,4 @@
-"""Markers of a frame, read with OpenCV."""
+"""Markers of a frame: separate ones, read with OpenCV, and those that touch other squares."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.data import Array, Frame
-from ...designs.boards import marker_dictionary
+from ...designs.boards import marker_cells, marker_dictionary
 from ...io.board import BoardDesign
+from .candidates import Saddles
+from .tags import read_tags, tag_outlines
 
-__all__ = ["find_markers"]
+__all__ = ["find_markers", "find_tags"]
+
+_WRONG = 0.06
+"""Share of the cells of a tag that may be misread; its place on the board tests it, too."""
 
 
 def find_markers(frame: Frame, design: BoardDesign) -> tuple[Array, NDArray[np.intp]]:
@@ -30,3 +35,15 @@ def find_markers(frame: Frame, design: BoardDesign) -> tuple[Array, NDArray[np.i
         return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.intp)
     found = np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2)
     return found, np.asarray(numbers).reshape(-1).astype(np.intp)
+
+
+def find_tags(
+    grey: NDArray[np.float32], saddles: Saddles, design: BoardDesign
+) -> tuple[Array, NDArray[np.intp]]:
+    """Corners (m, 4, 2) of the tags of an AprilGrid, clockwise from the upper left, and their numbers."""
+    outlines = saddles.xy[tag_outlines(grey, saddles)]
+    words = marker_cells(design)[1]
+    most = int(_WRONG * words[0].size)
+    index, corners = read_tags(grey, outlines, words, design.border_bits, most)
+    read = index >= 0
+    return corners[read], design.markers[0][index[read]]

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ...core.data import Array, Frame
-from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ...core.threads import one_thread
+from ...designs.boards import marker_cells
 from ...io.board import BoardDesign
 from ..points import Measured
 from ..reseau.disks import find_disks
@@ -18,10 +19,10 @@ from ..reseau.marks import ReseauOptions
 from ..reseau.plane_marks import PlaneMarks
 from ..reseau.sheet import DiskMarks
 from ..screening import Screened, screen
-from .candidates import find_saddles
+from .candidates import Saddles, find_saddles
 from .corners import CornerMarks, Sectors
-from .markers import find_markers
-from .placement import Placed, lay_charuco, lay_chessboard, lay_circles
+from .markers import find_markers, find_tags
+from .placement import Placed, lay_chessboard, lay_circles, lay_marked
 
 __all__ = ["BoardOptions", "BoardResult", "measure_board"]
 
@@ -88,7 +89,7 @@ class BoardResult(Measured):
 def measure_board(
     frame: Frame, design: BoardDesign, options: BoardOptions | None = None
 ) -> BoardResult | Failure:
-    """Measure the points of a chessboard, a ChArUco board or a circle grid.
+    """Measure the points of a chessboard, a ChArUco board, a circle grid, an AprilGrid or a grid of markers.
 
     Parameters
     ----------
@@ -108,9 +109,6 @@ def measure_board(
     ------
     ImageError
         When the frame is all black, saturated, or of one grey.
-    UsageError
-        For an AprilGrid, which can be drawn only.
-
     Examples
     --------
     Draw a chessboard with edges half way between pixels, and measure its corners:
@@ -125,8 +123,6 @@ def measure_board(
     (20, True)
     """
     options = options or BoardOptions()
-    if design.kind == "aprilgrid":
-        raise UsageError("boards of this kind are drawn only", where="aprilgrid", do="use a ChArUco board")
     with one_thread():
         if not options.mirrored:
             return _measured(frame, design, options)
@@ -196,13 +192,23 @@ def _placed(frame: Frame, screened: Screened, design: BoardDesign) -> Placed | F
     if design.kind == "chess":
         found = lay_chessboard(screened.grey, saddles, design)
     else:
-        markers = find_markers(frame, design)
-        found = lay_charuco(screened.grey, saddles, design, markers)
+        markers = _markers(frame, screened.grey, saddles, design)
+        found = lay_marked(screened.grey, saddles, design, markers)
         if isinstance(found, Failure) and not len(markers[1]):
             turned = replace(frame, pixels=np.ascontiguousarray(frame.pixels[:, ::-1]))
-            if len(find_markers(turned, design)[1]) > 1:
+            grey = np.ascontiguousarray(screened.grey[:, ::-1])
+            if len(_markers(turned, grey, saddles.mirrored(frame.width), design)[1]) > 1:
                 return Failure("the board is seen mirrored", Code.MIRRORED)
     return replace(found, places=saddles.xy[: 4 * len(design.ids)]) if isinstance(found, Failure) else found
+
+
+def _markers(
+    frame: Frame, grey: NDArray[np.float32], saddles: Saddles, design: BoardDesign
+) -> tuple[Array, NDArray[np.intp]]:
+    """Corners (m, 4, 2) of the markers that can be read, clockwise from the upper left, and their numbers."""
+    if design.kind == "aprilgrid":
+        return find_tags(grey, saddles, design)
+    return find_markers(frame, design)
 
 
 class CircleMarks(DiskMarks):
@@ -219,7 +225,43 @@ class CircleMarks(DiskMarks):
 def sectors_of(design: BoardDesign) -> Sectors:
     """What surrounds the corners of a board."""
     count = len(design.ids)
+    if design.kind in ("aprilgrid", "markers"):
+        assert design.size is not None
+        names = np.arange(count) % 4
+        # The tag lies above and to the right of its lower left corner.
+        towards = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+        if design.kind == "markers":
+            towards = towards[::-1]
+        outlines, side = _bright_cells(design)
+        border, free = design.border_bits * side, design.pitch - design.size
+        reach = min(border, free if design.kind == "aprilgrid" else max(free, side))
+        touching = np.full(count, design.kind == "aprilgrid")
+        along = min(2 * reach, design.size / 2)
+        return Sectors(towards[names], touching, reach, along, outlines, np.full(len(outlines), -1.0))
     below = design.nodes.sum(axis=1) % 2 == (0 if design.dark_corner else 1)
     dark = np.where(below[:, None], [1.0, -1.0], [1.0, 1.0])
     _, outlines = design.markers
-    return Sectors(dark, np.ones(count, dtype=bool), design.pitch / 2, outlines)
+    reach = design.pitch / 2
+    return Sectors(dark, np.ones(count, dtype=bool), reach, reach, outlines, np.ones(len(outlines)))
+
+
+def _bright_cells(design: BoardDesign) -> tuple[Array, float]:
+    """Outlines (m, 4, 2) of the bright cells next to the border of tags, as runs; side of a cell."""
+    corners, black = marker_cells(design)
+    assert design.size is not None
+    first, last = design.border_bits, black.shape[1] - design.border_bits - 1
+    side = design.size / black.shape[1]
+    found = []
+    for tag, cells in zip(corners, ~black, strict=True):
+        for turned in range(2):
+            lines = cells.T if turned else cells
+            for k in (first, last):
+                # The corner cells belong to the rows.
+                ends = (first + turned, last + 1 - turned)
+                edges = np.diff(np.concatenate([[0], lines[k, slice(*ends)].astype(np.int8), [0]]))
+                for a, b in np.flatnonzero(edges).reshape(-1, 2) + ends[0]:
+                    low, high = np.array([a, k]), np.array([b, k + 1])
+                    low, high = (low[::-1], high[::-1]) if turned else (low, high)
+                    (x0, y0), (x1, y1) = tag[0] + side * low * [1, -1], tag[0] + side * high * [1, -1]
+                    found.append([(x0, y1), (x1, y1), (x1, y0), (x0, y0)])
+    return np.array(found).reshape(-1, 4, 2), side

@@ -27,7 +27,7 @@ from ..reseau.sheet_placement import MOST_DISKS, disk_seeds, grown_disks, throug
 from ..testfield.lattice_mapping import images_of, slope_of
 from .candidates import Saddles, along, bright_between, first_mapping, grown, sector_levels, seeds
 
-__all__ = ["Placed", "lay_charuco", "lay_chessboard", "lay_circles"]
+__all__ = ["Placed", "lay_chessboard", "lay_circles", "lay_marked"]
 
 _MISSED, _PLAIN, _FOREIGN = 0.4, 3.0, 3.0
 """What counts against a place: a node in sight that was not found; one between squares as bright as paper and
@@ -108,7 +108,10 @@ def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDes
 
 
 def _dark_sectors(design: BoardDesign) -> Mask:
-    """Whether the square below and to the right of each inner corner is black."""
+    """Whether the square below and to the right of each corner is black."""
+    if design.kind == "aprilgrid":
+        # Of the lower right corner of a tag it is the small square beside it, of the upper left one the tag.
+        return np.asarray(np.arange(len(design.nodes)) % 2 == 1)
     same: Mask = np.asarray(design.nodes.sum(axis=1) % 2 == 0)
     return same if design.dark_corner else ~same
 
@@ -251,13 +254,13 @@ def _lattice_of(design: BoardDesign) -> Integers:
     return np.array([[1, 1], [-1, 1]]) if design.asymmetric else np.eye(2, dtype=np.intp)
 
 
-def lay_charuco(
+def lay_marked(
     grey: NDArray[np.float32],
     saddles: Saddles,
     design: BoardDesign,
     markers: tuple[Array, NDArray[np.intp]],
 ) -> Placed | Failure:
-    """Find the inner corners of a ChArUco board by its markers.
+    """Find the corners of a ChArUco board or an AprilGrid by its markers.
 
     Parameters
     ----------
@@ -269,6 +272,12 @@ def lay_charuco(
         The board.
     markers : (ndarray (m, 4, 2), ndarray (m,))
         Corners of markers in the frame, clockwise from the upper left, and their numbers.
+
+    Returns
+    -------
+    Placed or Failure
+        A failure if no or only contradicting markers were read. Of a grid of separate markers, whose corners
+        are no saddles, the corners of the markers read are found.
     """
     shape = (grey.shape[0], grey.shape[1])
     corners, numbers = markers
@@ -299,13 +308,23 @@ def lay_charuco(
     if np.linalg.det(matrix[:2, :2] - np.outer(matrix[:2, 2], matrix[2, :2]) / matrix[2, 2]) > 0:
         return Failure("the board is seen mirrored", Code.MIRRORED)
     mapping = through(plane[use], image[use], shape)
-    nodes = design.nodes * [1.0, -1.0]
+    nodes = design.xy / design.pitch
+    frame, origin = np.eye(2) / design.pitch, np.zeros(2)
+    if design.kind == "markers":
+        known, start = np.zeros(len(nodes), dtype=bool), images_of(mapping, nodes)
+        of = (4 * rows[whole][:, None] + np.arange(4)).ravel()
+        known[of], start[of] = True, image[np.repeat(whole, 4)]
+        return Placed(Located(design.ids, design.xy, "dark", mapping, frame, origin, known, start))
     known = np.zeros(len(nodes), dtype=bool)
     start = images_of(mapping, nodes)
-    dark = _dark_sectors(design)
+    dark, apart = _dark_sectors(design), 1.0
+    if design.kind == "aprilgrid":
+        assert design.size is not None
+        apart = min(design.size, design.pitch - design.size) / design.pitch
     for _ in range(6):
-        again, row = _nearest(saddles, mapping, nodes, dark, plane[use], known)
-        again &= _filled(grey, mapping, nodes, dark)
+        again, row = _nearest(saddles, mapping, nodes, dark, plane[use], known, apart)
+        if design.kind == "charuco":
+            again &= _filled(grey, mapping, nodes, dark)
         same = np.array_equal(again, known)
         known, start = again, np.where(again[:, None], saddles.xy[row], images_of(mapping, nodes))
         if known.sum() < 4 or same:
@@ -318,7 +337,6 @@ def lay_charuco(
     if known.sum() < 4:
         return _failed(int(known.sum()), "corners beside the markers read")
     mapping = through(nodes[known], start[known], shape) if known.sum() >= _FEWEST else mapping
-    frame, origin = np.eye(2) / design.pitch, np.zeros(2)
     return Placed(Located(design.ids, design.xy, "dark", mapping, frame, origin, known, start))
 
 
@@ -332,14 +350,14 @@ def _filled(grey: NDArray[np.float32], mapping: Chain, nodes: Array, dark: Mask)
 
 
 def _nearest(
-    saddles: Saddles, mapping: Chain, nodes: Array, dark: Mask, plane: Array, known: Mask
+    saddles: Saddles, mapping: Chain, nodes: Array, dark: Mask, plane: Array, known: Mask, apart: float
 ) -> tuple[Mask, Rows]:
-    """Corners that are found where the mapping predicts them, and their saddles."""
+    """Corners, `apart` from each other, that are found where the mapping predicts them, and their saddles."""
     if not len(saddles):
         return np.zeros(len(nodes), dtype=bool), np.zeros(len(nodes), dtype=np.intp)
     where, slopes = images_of(mapping, nodes), slope_of(mapping, nodes)
     gap, row = KDTree(saddles.xy).query(where)
-    pixels = np.linalg.norm(slopes, axis=1).min(axis=1)
+    pixels = apart * np.linalg.norm(slopes, axis=1).min(axis=1)
     # Do not extrapolate: the next corners are those beside what is known.
     support = np.concatenate([plane, nodes[known]])
     close = KDTree(support).query(nodes)[0] < 1.8

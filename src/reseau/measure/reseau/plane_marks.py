@@ -335,7 +335,7 @@ class PlaneMarks(ABC):
         beside = self._beside()
         valid = self.screened.valid & ~self.hidden
         if beside is not None:
-            valid &= beside < _BESIDE
+            valid &= np.abs(beside) < _BESIDE
         parts, found = [], []
         for part, half in self._windows(reach):
             options = MatchOptions(

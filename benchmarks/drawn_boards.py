@@ -1,0 +1,210 @@
+"""Boards of other programs in pictures drawn by ``worlds.prints``, beside OpenCV and ``aprilgrid``.
+
+Run from the checkout: ``python benchmarks/drawn_boards.py [--kind K …] [--condition C …] [--count 2]``. For
+every picture: points measured of those in sight and clear, and those of the other program; rms error and the
+other's; errors over sigmas; points wrong by more than 0.15 px and 5 sigma; names wrong beyond the symmetry of
+the board; processor time of both. A board that the other program finds and ours does not counts as missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+from worlds import prints
+from worlds.pixels import Array
+from worlds.sheets import CONDITIONS, View, pose, views
+
+from reseau.core.data import Frame
+from reseau.core.failure import Failure
+from reseau.designs import board
+from reseau.io import BoardDesign
+from reseau.measure import measure_board
+
+WRONG_PX, WRONG_SIGMA, NORMALISED = 0.15, 5.0, (0.85, 1.2)
+APRIL, ARUCO = "DICT_APRILTAG_36h11", "DICT_4X4_100"
+KINDS: dict[str, tuple[BoardDesign, prints.Print]] = {
+    "aprilgrid2": (
+        board("aprilgrid", 6, 6, 28.6, size=22.0, border_bits=2),
+        prints.aprilgrid(6, 6, 22.0, 0.3, APRIL, 2),
+    ),
+    "aprilgrid1": (
+        board("aprilgrid", 5, 4, 39.0, size=30.0),
+        prints.aprilgrid(5, 4, 30.0, 0.3, APRIL, 1),
+    ),
+    "april16h5": (
+        board("aprilgrid", 5, 4, 39.0, size=30.0, dictionary="DICT_APRILTAG_16h5"),
+        prints.aprilgrid(5, 4, 30.0, 0.3, "DICT_APRILTAG_16h5", 1),
+    ),
+    "april25h9": (
+        board("aprilgrid", 5, 4, 37.5, size=30.0, dictionary="DICT_APRILTAG_25h9"),
+        prints.aprilgrid(5, 4, 30.0, 0.25, "DICT_APRILTAG_25h9", 1),
+    ),
+    "markers": (
+        board("markers", 6, 5, 40.0, size=30.0, dictionary=ARUCO),
+        prints.markers(6, 5, 30.0, 10.0, ARUCO),
+    ),
+    "charuco": (
+        board("charuco", 9, 6, 30.0, size=22.0, dictionary=ARUCO),
+        prints.charuco(9, 6, 30.0, 22.0, ARUCO),
+    ),
+    "charuco_old": (
+        board("charuco", 9, 6, 30.0, size=22.0, dictionary=ARUCO, legacy=True),
+        prints.charuco(9, 6, 30.0, 22.0, ARUCO, True),
+    ),
+    "chess": (board("chess", 10, 7, 25.0), prints.chess(10, 7, 25.0)),
+    "circles": (board("circles", 9, 7, 25.0, size=12.0), prints.circles(9, 7, 25.0, 12.0)),
+    "asymmetric": (
+        board("circles", 4, 11, 20.0, size=16.0, asymmetric=True),
+        prints.circles(4, 11, 20.0, 16.0, True),
+    ),
+}
+
+
+def by_others(kind: str, design: BoardDesign, pixels: Any) -> tuple[Array, float]:
+    """Points (n, 2) that OpenCV or ``aprilgrid`` finds, and its processor time."""
+    start, found = time.process_time(), None
+    if design.kind == "aprilgrid":
+        from aprilgrid import Detector
+
+        assert design.dictionary is not None
+        family = f"t{design.dictionary.split('_')[-1]}" + ("b1" if design.border_bits == 1 else "")
+        tags = Detector(family).detect(pixels)
+        found = [tag.corners.reshape(-1, 2) for tag in tags if tag.tag_id < design.columns * design.rows]
+        found = np.concatenate(found) if found else None
+    elif design.kind in ("markers", "charuco"):
+        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, str(design.dictionary)))
+        if design.kind == "markers":
+            parameters = cv2.aruco.DetectorParameters()
+            parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+            found = cv2.aruco.ArucoDetector(words, parameters).detectMarkers(pixels)[0]
+            found = np.concatenate(found).reshape(-1, 2) if len(found) else None
+        else:
+            size = (design.columns, design.rows)
+            plan = cv2.aruco.CharucoBoard(size, design.pitch, float(design.size or 0), words)
+            plan.setLegacyPattern(design.legacy)
+            found = cv2.aruco.CharucoDetector(plan).detectBoard(pixels)[0]
+    elif design.kind == "chess":
+        flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+        good, found = cv2.findChessboardCornersSB(pixels, (design.columns - 1, design.rows - 1), flags=flags)
+        found = found if good else None
+    else:
+        flags = cv2.CALIB_CB_ASYMMETRIC_GRID if design.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
+        good, found = cv2.findCirclesGrid(pixels, (design.columns, design.rows), flags=flags)
+        found = found if good else None
+    seconds = time.process_time() - start
+    return (np.zeros((0, 2)) if found is None else np.asarray(found, float).reshape(-1, 2)), seconds
+
+
+def misnamed(design: BoardDesign, ways: int, own: Array, near: Array) -> int:
+    """Points with the name of another, beyond turns of the whole board by which it equals itself."""
+    wrong = own != near
+    if not wrong.any() or ways == 1:
+        return int(wrong.sum())
+    a = np.column_stack([design.nodes[own], np.ones(len(own))])
+    turn = np.rint(np.linalg.lstsq(a, design.nodes[near].astype(float), rcond=None)[0])
+    if not np.isclose(np.linalg.det(turn[:2]), 1.0):
+        return len(own)
+    moved = a @ turn
+    same = {tuple(node) for node in (np.column_stack([design.nodes, np.ones(len(design.nodes))]) @ turn)}
+    whole = same == {tuple(node) for node in design.nodes.astype(float)}
+    return int((np.abs(moved - design.nodes[near]).max(axis=1) > 0.1).sum()) if whole else len(own)
+
+
+def line(kind: str, label: str, view: View) -> bool:
+    """Measure a picture and print its row; whether it is within its limits."""
+    design, printed = KINDS[kind]
+    pixels, xy = view.picture(), view.truth
+    h, w = pixels.shape
+    sight = ((xy > 6) & (xy < [w - 7, h - 7])).all(axis=1) & (view.hidden > 6)
+    others, their_time = by_others(kind, design, pixels)
+    their_gap = np.hypot(*(others[:, None] - xy[None]).transpose(2, 0, 1))
+    theirs = np.nan
+    if len(others):
+        right = their_gap.min(axis=1) < 1.0
+        others, their_gap = others[right], their_gap[right]
+        theirs = float(np.sqrt((their_gap.min(axis=1) ** 2).mean() / 2)) if len(others) else np.nan
+    start = time.process_time()
+    found = measure_board(Frame(pixels, 255.0, label), design)
+    seconds = time.process_time() - start
+    if isinstance(found, Failure):
+        good = len(others) == 0
+        print(f"{kind:12} {label:14} declined: {found.reason[:70]}; other {len(others)}  "
+              f"{'ok' if good else 'MISSED'}", flush=True)  # fmt: skip
+        return good
+    own = np.flatnonzero(found.ok)
+    near = np.hypot(*(found.xy[own, None] - xy[None]).transpose(2, 0, 1)).argmin(axis=1)
+    error = found.xy[own] - xy[near]
+    sigma = np.sqrt(np.diagonal(found.cov[own], axis1=1, axis2=2))
+    off, scaled = np.hypot(*error.T), np.abs(error / sigma).max(axis=1)
+    wrong = int(((off > WRONG_PX) & (scaled > WRONG_SIGMA)).sum())
+    names = misnamed(design, printed.symmetries, own, near)
+    unclear = any(note.code.value == "ambiguous" for note in found.notes)
+    ratio, rms = float(np.sqrt(((error / sigma) ** 2).mean())), float(np.sqrt((error**2).mean()))
+    slow = "slow" if seconds > 3 * their_time else "    "
+    good = len(own) >= len(others) and not wrong and (not names or unclear)
+    good &= NORMALISED[0] <= ratio <= NORMALISED[1]
+    print(
+        f"{kind:12} {label:14} {len(own):4} of {int(sight.sum()):4} {len(others):4}  {rms:.4f} {theirs:7.4f} "
+        f"{off.max():6.3f} {scaled.max():5.1f} {ratio:5.2f} {wrong:3} {names:3}{'?' if unclear else ' '} "
+        f"{seconds:6.2f} {their_time:6.2f} {slow} {'ok' if good else 'MISSED'}",
+        flush=True,
+    )
+    return good
+
+
+class Wide(View):
+    """A view through a wide lens."""
+
+    _focal = np.array([520.0, 518.0])
+    _centre = np.array([471.2, 366.4])
+    _lens = (-0.24, 0.045, -0.0006, 0.0008)
+
+
+def held_out(kind: str, count: int) -> list[tuple[str, View]]:
+    """Wide lenses, near 60°, small boards, partial views."""
+    printed, found = KINDS[kind][1], []
+    for k in range(count):
+        turn, place = pose(50 + k, printed, nearer=1.7)
+        found.append((f"wide_{k}", Wide(printed, turn, place * [1, 1, 0.55], seed=900 + k)))
+        turn, place = pose(70 + k, printed, nearer=0.4)
+        found.append((f"far_{k}", View(printed, turn, place, seed=920 + k, noise=3.0)))
+        turn, place = pose(90 + k, printed, nearer=1.2)
+        tilt = cv2.Rodrigues(np.deg2rad(60) * np.array([np.cos(k), np.sin(k), 0.0]))[0]
+        found.append((f"steep_{k}", View(printed, tilt @ np.diag([1.0, -1, -1]), place, seed=940 + k)))
+        turn, place = pose(110 + k, printed, nearer=2.6)
+        shift = np.append(np.random.default_rng(k).uniform(-60, 60, 2), 0.0)
+        found.append((f"part_{k}", View(printed, turn, place + shift, seed=960 + k)))
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--kind", nargs="+", default=list(KINDS), choices=list(KINDS))
+    parser.add_argument("--condition", nargs="+", default=[*CONDITIONS, "held"])
+    parser.add_argument("--count", type=int, default=2)
+    options = parser.parse_args()
+    cv2.setNumThreads(1)
+    print("kind         picture      measured  other rms   theirs worst sigma ratio wrong names s other")
+    good = True
+    for kind in options.kind:
+        printed = KINDS[kind][1]
+        warm = View(printed, *pose(1, printed))
+        measure_board(Frame(warm.picture(), 255.0), KINDS[kind][0])
+        for condition in options.condition:
+            if condition == "held":
+                for label, view in held_out(kind, options.count):
+                    good &= line(kind, label, view)
+                continue
+            for k, view in enumerate(views(condition, options.count, printed)):
+                good &= line(kind, f"{condition}_{k}", replace(view))
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

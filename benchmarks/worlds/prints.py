@@ -1,0 +1,182 @@
+"""Prints of other programs' boards, as functions of the position on their plane.
+
+Squares, markers and tags are black cells between lines along both axes; the ink in a sample is an integral of
+the cells over it, which is bilinear between the lines. Words of markers are those of OpenCV's dictionaries.
+Nothing of the project is used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+
+from .pixels import Array, edge
+
+__all__ = ["Print", "aprilgrid", "charuco", "chess", "circles", "markers"]
+
+
+@dataclass(frozen=True, eq=False)
+class Print:
+    """A board on paper.
+
+    Parameters
+    ----------
+    ids : tuple of str
+        Names of the points.
+    xy : ndarray (n, 2)
+        Their places, mm, y up.
+    black : ndarray (m, 4)
+        Black rectangles: left, lower, right and upper end. They do not overlap.
+    disks : ndarray (k, 3)
+        Black disks: x, y, radius.
+    margin : float
+        Paper around the ink, mm.
+    symmetries : int
+        1 if every point has its own name; else in how many ways the board looks the same.
+    """
+
+    ids: tuple[str, ...]
+    xy: Array
+    black: Array
+    disks: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    margin: float = 8.0
+    symmetries: int = 1
+
+    def __post_init__(self) -> None:
+        ends = np.concatenate(
+            [self.black[:, :2], self.black[:, 2:], self.disks[:, :2] - self.disks[:, 2:],
+             self.disks[:, :2] + self.disks[:, 2:]]
+        )  # fmt: skip
+        lines = [np.unique(np.round(self.black[:, [k, k + 2]], 9)) for k in (0, 1)]
+        known: dict[str, Any] = {"ends": (ends.min(axis=0) - self.margin, ends.max(axis=0) + self.margin)}
+        if len(self.black):
+            filled = np.zeros([len(line) for line in lines])
+            at = [np.searchsorted(lines[k % 2], np.round(self.black[:, k], 9)) for k in range(4)]
+            for a, b, c, d in zip(*at, strict=True):
+                filled[a:c, b:d] += np.outer(np.diff(lines[0][a : c + 1]), np.diff(lines[1][b : d + 1]))
+            # Ink to the left of and below each crossing of lines.
+            total = np.zeros_like(filled)
+            total[1:, 1:] = filled[:-1, :-1].cumsum(axis=0).cumsum(axis=1)
+            known |= {"lines": lines, "total": total}
+        object.__setattr__(self, "_known", known)
+
+    _known: Any = field(init=False, repr=False, default=None)
+
+    def _below(self, x: Array, y: Array) -> Array:
+        """Ink (mm²) to the left of and below positions."""
+        part, row = [], []
+        for line, at in zip(self._known["lines"], (x, y), strict=True):
+            at = np.clip(at, line[0], line[-1])
+            k = np.clip(np.searchsorted(line, at, side="right") - 1, 0, len(line) - 2)
+            row.append(k)
+            part.append((at - line[k]) / (line[k + 1] - line[k]))
+        (i, j), (u, v), t = row, part, self._known["total"]
+        low = (1 - u) * t[i, j] + u * t[i + 1, j]
+        return np.asarray((1 - v) * low + v * ((1 - u) * t[i, j + 1] + u * t[i + 1, j + 1]))
+
+    def printed(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Shares (h, w) of paper, and of ink on it, at places that follow each other closely."""
+        half = [np.hypot(*np.gradient(at)) / 2 for at in (x, y)]
+        low, high = self._known["ends"]
+        paper = np.ones(x.shape)
+        for at, a, b, reach in ((x, low[0], high[0], half[0]), (y, low[1], high[1], half[1])):
+            paper *= edge(np.minimum(at - a, b - at), 2 * reach)
+        ink = np.zeros(x.shape)
+        if len(self.black):
+            (a, c), (b, d) = ((at - reach, at + reach) for at, reach in zip((x, y), half, strict=True))
+            whole = self._below(c, d) - self._below(a, d) - self._below(c, b) + self._below(a, b)
+            ink = np.clip(whole / np.maximum((c - a) * (d - b), 1e-12), 0, 1)
+        for u, v, radius in self.disks:
+            near = np.nonzero(np.maximum(np.abs(x - u), np.abs(y - v)) < radius + 3 * (half[0] + half[1]))
+            if near[0].size:
+                dx, dy = x[near] - u, y[near] - v
+                away = np.maximum(np.hypot(dx, dy), 1e-9)
+                # Change of the distance over a sample, from those of both coordinates.
+                change = 2 * np.hypot(dx / away * half[0][near], dy / away * half[1][near])
+                ink[near] = np.maximum(ink[near], edge(radius - away, change))
+        return paper, ink
+
+    def design(self) -> dict[str, Any]:
+        """Points by name."""
+        return {"ids": self.ids, "xy": self.xy.tolist()}
+
+
+def _cells(
+    dictionary: str, number: int, border: int, left: float, low: float, side: float, turns: int
+) -> Any:
+    """Black rectangles of a marker, turned by quarter turns to the left."""
+    words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    n = words.markerSize + 2 * border
+    black = np.rot90(cv2.aruco.generateImageMarker(words, number, n, None, border) == 0, turns)
+    row, column = np.nonzero(black)
+    cell = side / n
+    x, y = left + cell * column, low + cell * (n - 1 - row)
+    return np.column_stack([x, y, left + cell * (column + 1), low + cell * (n - row)])
+
+
+def chess(columns: int, rows: int, side: float, dark_first: bool = True) -> Print:
+    """A chessboard of squares; its inner corners row by row from the upper left."""
+    row, column = np.divmod(np.arange(columns * rows), columns)
+    black = (row + column) % 2 == (0 if dark_first else 1)
+    x, y = side * (column[black] - 1.0), -side * row[black].astype(float)
+    square = np.column_stack([x, y, x + side, y + side])
+    row, column = np.divmod(np.arange((columns - 1) * (rows - 1)), columns - 1)
+    # With two odd or two even numbers a half turn changes nothing.
+    ways = 2 if (columns + rows) % 2 == 0 else 1
+    xy = side * np.stack([column, -row], axis=1)
+    return Print(tuple(map(str, range(len(xy)))), xy.astype(float), square, symmetries=ways)
+
+
+def charuco(
+    columns: int, rows: int, side: float, marker: float, dictionary: str, legacy: bool = False
+) -> Print:
+    """A ChArUco board; in the old layout with an even number of rows, the upper left square is white."""
+    plain = chess(columns, rows, side, not (legacy and rows % 2 == 0))
+    row, column = np.divmod(np.arange(columns * rows), columns)
+    white = (row + column) % 2 == (0 if legacy and rows % 2 == 0 else 1)
+    away = (side - marker) / 2
+    parts = [
+        _cells(dictionary, k, 1, side * (c - 1) + away, -side * r + away, marker, 0)
+        for k, (r, c) in enumerate(zip(row[white], column[white], strict=True))
+    ]
+    return Print(plain.ids, plain.xy, np.concatenate([plain.black, *parts]))
+
+
+def aprilgrid(columns: int, rows: int, size: float, spacing: float, dictionary: str, border: int) -> Print:
+    """Kalibr's grid: tag 0 is at the lower left; corners anticlockwise from the lower left."""
+    pitch, gap = size * (1 + spacing), size * spacing
+    parts, names, xy = [], [], []
+    for k in range(columns * rows):
+        x, y = pitch * (k % columns), pitch * (k // columns)
+        # Kalibr's words are OpenCV's turned upside down.
+        parts.append(_cells(dictionary, k, border, x, y, size, 2))
+        names += [f"{k}.{corner}" for corner in range(4)]
+        xy += [(x, y), (x + size, y), (x + size, y + size), (x, y + size)]
+    for k in range((columns + 1) * (rows + 1)):
+        x, y = pitch * (k % (columns + 1)) - gap, pitch * (k // (columns + 1)) - gap
+        parts.append(np.array([[x, y, x + gap, y + gap]]))
+    return Print(tuple(names), np.array(xy), np.concatenate(parts))
+
+
+def markers(columns: int, rows: int, size: float, gap: float, dictionary: str) -> Print:
+    """A grid of separate markers as OpenCV's: row by row from the upper left, corners clockwise."""
+    parts, names, xy = [], [], []
+    for k in range(columns * rows):
+        x, y = (size + gap) * (k % columns), -(size + gap) * (k // columns)
+        parts.append(_cells(dictionary, k, 1, x, y - size, size, 0))
+        names += [f"{k}.{corner}" for corner in range(4)]
+        xy += [(x, y), (x + size, y), (x + size, y - size), (x, y - size)]
+    return Print(tuple(names), np.array(xy), np.concatenate(parts))
+
+
+def circles(columns: int, rows: int, pitch: float, size: float, asymmetric: bool = False) -> Print:
+    """Disks row by row from the upper left; every second row is shifted if asymmetric."""
+    row, column = np.divmod(np.arange(columns * rows), columns)
+    xy = pitch * np.stack([2 * column + row % 2 if asymmetric else column, -row], axis=1).astype(float)
+    disks = np.column_stack([xy, np.full(len(xy), size / 2)])
+    # An asymmetric grid with an odd number of rows equals itself turned by 180° if its rows do.
+    ways = (2 if rows % 2 else 1) if asymmetric else (4 if columns == rows else 2)
+    return Print(tuple(map(str, range(len(xy)))), xy, np.zeros((0, 4)), disks, 20.0, ways)

@@ -1,0 +1,144 @@
+"""Tags whose corners touch other black squares, as those of Kalibr's AprilGrid: found by their corners, and read.
+
+A reader that looks for the outlines of separate tags fails where tags touch. Here a tag is a cycle of four
+saddle points (:mod:`reseau.measure.boards.candidates`): from each of them an edge leads to the next, dark on
+the same side all along. Its cells are then sampled through the projectivity of the four corners, and compared
+with all words in all four rotations.
+
+Source: E. Olson, AprilTag: A robust and flexible visual fiducial system, ICRA 2011, for the words and the
+correction of wrong bits by the Hamming distance.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ...core.data import Array, Mask, Rows
+from .candidates import Saddles
+
+__all__ = ["read_tags", "tag_outlines"]
+
+_NEIGHBOURS = 160
+"""Saddles around a corner among which the next corner is looked for."""
+_AIMED = np.deg2rad(7)
+"""Largest angle between an edge and the direction to the next corner."""
+_PARALLEL = np.deg2rad(15)
+"""Largest angle between the edges of a tag at its two ends: lenses bend it."""
+_STRONG = 0.25
+"""Least strength of the next corner as a share of that of a corner: noise has saddles beside straight edges."""
+_ALONG = 9
+"""Places along an edge at which its sides are compared."""
+_BESIDE = 0.055
+"""Their distance from the edge, as a share of its length."""
+_EDGE = 0.35
+"""Least contrast along an edge, as a share of its median."""
+
+
+def tag_outlines(grey: NDArray[np.float32], saddles: Saddles) -> Rows:
+    """Saddles (m, 4) that are the corners of dark quadrilaterals, clockwise in the image.
+
+    Parameters
+    ----------
+    grey : ndarray (h, w), float32
+        Grey values.
+    saddles : Saddles
+        Their saddles.
+    """
+    count = len(saddles)
+    if count < 4:
+        return np.zeros((0, 4), dtype=np.intp)
+    # The dark sectors of a saddle extend from its second edge to the first, turned by 180°, and opposite.
+    first, second = saddles.edges.T
+    turn = np.pi * np.arange(2)[:, None]
+    # Seen from a corner, the interior of a tag is the sector from `leaves` to `arrives`, x into y: a cycle
+    # that is clockwise in the image leaves along the former and arrives against the latter.
+    leaves, arrives = (second + turn).ravel(), (first + np.pi + turn).ravel()
+    near = KDTree(saddles.xy).query(saddles.xy, k=min(_NEIGHBOURS + 1, count))[1][:, 1:]
+    from .compiled_tags import next_corners  # takes half a second to import; not every command needs it
+
+    limits, edge = (_AIMED, _PARALLEL, _STRONG), (_ALONG, _BESIDE, _EDGE)
+    after = next_corners(grey, saddles.xy, saddles.strength, leaves, arrives, near, limits, edge)
+    cycle = [np.arange(2 * count)]
+    for _ in range(4):
+        cycle.append(np.where(cycle[-1] < 0, -1, after[cycle[-1]]))
+    ring = np.stack(cycle[:4], axis=1)
+    closed = (ring >= 0).all(axis=1) & (cycle[4] == cycle[0]) & (ring.argmin(axis=1) == 0)
+    return np.asarray(ring[closed] % count)
+
+
+def _sampled(grey: NDArray[np.float32], xy: Array) -> Array:
+    """Grey values at image points (..., 2), linear between pixels."""
+    at = np.nan_to_num(np.clip(xy, -1e4, 1e6)).reshape(-1, 2).astype(np.float32)
+    # Fewer than 32768 pixels along an axis of the map are allowed.
+    wide = min(len(at), 1024)
+    lines = np.zeros((-(-len(at) // wide) * wide, 2), np.float32)
+    lines[: len(at)] = at
+    values = cv2.remap(
+        grey, lines[:, 0].reshape(-1, wide), lines[:, 1].reshape(-1, wide), cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    return np.asarray(values.ravel()[: len(at)].reshape(xy.shape[:-1]), dtype=np.float64)
+
+
+def read_tags(
+    grey: NDArray[np.float32], corners: Array, words: Mask, border_bits: int, most_wrong: int
+) -> tuple[Rows, Array]:
+    """Read tags.
+
+    Parameters
+    ----------
+    grey : ndarray (h, w), float32
+        Grey values.
+    corners : ndarray (m, 4, 2)
+        Their corners in the image, clockwise.
+    words : ndarray of bool (k, n, n)
+        Black cells of the tags that may be there, with their borders.
+    border_bits : int
+        Width of the border, cells.
+    most_wrong : int
+        Largest number of cells that differ.
+
+    Returns
+    -------
+    index : ndarray of int (m,)
+        Which of the words each tag shows, -1 for none.
+    corners : ndarray (m, 4, 2)
+        The corners, from the upper left of the word.
+    """
+    side = words.shape[1]
+    if not len(corners):
+        return np.zeros(0, dtype=np.intp), corners
+    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
+    cell = (np.arange(side) + 0.5) / side
+    u, v = (part.ravel() for part in np.meshgrid(cell, cell))
+    # Paper beside the tag, where no other square touches it.
+    out = 0.5 / side
+    around = np.array([[0.5, -out], [1 + out, 0.5], [0.5, 1 + out], [-out, 0.5]])
+    places = np.concatenate([np.column_stack([u, v]), around])
+    images = np.empty((len(corners), len(places), 2))
+    for k, quad in enumerate(corners):
+        matrix = cv2.getPerspectiveTransform(unit.astype(np.float32), quad.astype(np.float32))
+        image = np.column_stack([places, np.ones(len(places))]) @ matrix.T
+        images[k] = image[:, :2] / image[:, 2:]
+    levels = _sampled(grey, images)
+    cells, paper = levels[:, : side * side].reshape(-1, side, side), np.median(levels[:, -4:], axis=1)
+    border = np.ones((side, side), dtype=bool)
+    border[border_bits:-border_bits, border_bits:-border_bits] = False
+    ink = np.median(cells[:, border], axis=1)
+    black = cells < ((paper + ink) / 2)[:, None, None]
+    wrong = np.full((len(corners), 4, len(words)), side * side)
+    flat = words.reshape(len(words), -1).astype(np.float32)
+    for turn in range(4):
+        # Turned so that corner `turn` is the upper left one.
+        seen = np.rot90(black, turn, axes=(1, 2)).reshape(len(black), -1).astype(np.float32)
+        differ = seen.sum(axis=1)[:, None] + flat.sum(axis=1) - 2 * seen @ flat.T
+        wrong[:, turn] = np.rint(differ)
+    best = wrong.reshape(len(corners), -1).argmin(axis=1)
+    turn, index = np.divmod(best, len(words))
+    least = wrong[np.arange(len(corners)), turn, index]
+    known = (least <= most_wrong) & (paper > ink)
+    order = (np.arange(4) + turn[:, None]) % 4
+    return np.where(known, index, -1), corners[np.arange(len(corners))[:, None], order]
