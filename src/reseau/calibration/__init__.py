@@ -12,8 +12,10 @@ from .mapping import CalibratedMapping
 from .raster import CorrectedImage, undistorted_camera, write_corrected
 from .reader import parse_calibration, read_calibration
 from .sensor import Fields, SensorCorrection
+from .tables import VIDEOS, remap_tables, undistort_video, write_tables
 
 __all__ = [
+    "VIDEOS",
     "CalibratedMapping",
     "Calibration",
     "CameraCorrection",
@@ -38,8 +40,11 @@ __all__ = [
     "parse_calibration",
     "projection_field",
     "read_calibration",
+    "remap_tables",
     "scan_coordinates",
     "scan_pixels",
+    "undistort_video",
     "undistorted_camera",
     "write_corrected",
+    "write_tables",
 ]

@@ -109,7 +109,11 @@ class CorrectedImage:
 
     @classmethod
     def undistorted(
-        cls, camera: CameraMapping, fov: Literal["keep", "all"] | float = "keep", scale: float = 1.0
+        cls,
+        camera: CameraMapping,
+        fov: Literal["keep", "all"] | float = "keep",
+        scale: float = 1.0,
+        alpha: float | None = None,
     ) -> CorrectedImage:
         """The raster of an image without distortion, as a pinhole camera on the same axis sees it.
 
@@ -124,6 +128,9 @@ class CorrectedImage:
         scale : float
             Pixels of the result per pixel of the image: on the axis, or for a field of view in degrees over
             the width.
+        alpha : float, optional
+            In place of `fov`, from 0, only pixels that the image has, to 1, every pixel of the image; the
+            size stays, as with OpenCV's ``getOptimalNewCameraMatrix``.
 
         Raises
         ------
@@ -134,6 +141,8 @@ class CorrectedImage:
             raise UsageError(f"{scale:g} is not above zero", where="scale")
         axis = camera.mapping.derivatives(np.zeros((1, 2)))
         focal = np.abs(np.diagonal(axis.d_xy[0])) * scale
+        if alpha is not None:
+            return cls._between(camera, alpha, scale)
         if fov == "all":
             uv = camera.mapping.inverse(_border((camera.width, camera.height)))
             uv = uv[np.isfinite(uv).all(axis=1)]
@@ -152,6 +161,28 @@ class CorrectedImage:
         _affordable(width, height)
         x, y = (-centre / focal).tolist()
         return cls(camera, (x, y), (float(focal[0]), float(focal[1])), width, height, False)
+
+    @classmethod
+    def _between(cls, camera: CameraMapping, alpha: float, scale: float) -> CorrectedImage:
+        """The raster between the largest rectangle inside the undistorted image and that around it."""
+        if not 0 <= alpha <= 1:
+            raise UsageError(f"{alpha:g} is not between 0 and 1", where="alpha")
+        border = _border((camera.width, camera.height))
+        uv = camera.mapping.inverse(border)
+        if not np.isfinite(uv).all():
+            raise UsageError("sees no direction at its border", where="camera", do="use `keep`")
+        last = np.array([camera.width, camera.height]) - 1.0
+        first_side, last_side = border == 0, border == last
+        inner = np.array([[uv[first_side[:, k], k].max() for k in (0, 1)],
+                          [uv[last_side[:, k], k].min() for k in (0, 1)]])  # fmt: skip
+        outer = np.stack([uv.min(axis=0), uv.max(axis=0)])
+        low, high = (1 - alpha) * inner + alpha * outer
+        if not (high > low).all():
+            raise UsageError("has no rectangle inside its undistorted image", where="camera", do="use `keep`")
+        width, height = (max(2, round(n * scale)) for n in (camera.width, camera.height))
+        _affordable(width, height)
+        px = (np.array([width, height]) - 1) / (high - low)
+        return cls(camera, (float(low[0]), float(low[1])), (float(px[0]), float(px[1])), width, height, False)
 
     @classmethod
     def of_frame(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
 
 import typer
 
@@ -44,8 +44,12 @@ def apply(
         ),
     ],
     source: Annotated[
-        Path, typer.Argument(metavar="IMAGE|POINTS", help="Image, or image coordinates (JSON, CSV).")
-    ],
+        Path | None,
+        typer.Argument(
+            metavar="IMAGE|FOLDER|VIDEO|POINTS",
+            help="Image, folder of images, video, or image coordinates (JSON, CSV).",
+        ),
+    ] = None,
     out: Out = None,
     scale: Annotated[
         float | None,
@@ -61,6 +65,26 @@ def apply(
             "all (every pixel of the image), or the horizontal angle in degrees."
         ),
     ] = "keep",
+    alpha: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="In place of --fov: from 0, only pixels that the image has, to 1, all pixels of the image; "
+            "the size stays, as in OpenCV.",
+        ),
+    ] = None,
+    tables: Annotated[
+        Path | None,
+        typer.Option(
+            help="Tables of the undistorted image to write: .npz, .yml or .xml for OpenCV's remap, .pgm (two "
+            "files) for the filter remap of ffmpeg."
+        ),
+    ] = None,
+    inverse: Annotated[
+        bool,
+        typer.Option("--inverse", help="Distort points: undistorted pixels, or --directions."),
+    ] = False,
     directions: Annotated[
         bool,
         typer.Option(
@@ -83,24 +107,43 @@ def apply(
     resampled: without distortion (camera), in the system of the reseau (oscilloscope), or in millimetres of
     the frame (film frame, fiducial marks). With the calibration of a sensor, the grey values are corrected.
     """
-    from ..calibration import SensorCorrection, read_calibration
+    from ..calibration import VIDEOS, SensorCorrection, read_calibration
     from ..io import is_points
 
     if scale is not None and not scale > 0:
         raise UsageError(f"{scale:g} is not positive", where="--scale")
-    stored, view = read_calibration(calibration), _view(fov)
-    _only(stored.kind, "camera", {"--fov": fov != "keep", "--directions": directions})
+    stored = read_calibration(calibration)
+    view = _View(_fov(fov), scale, alpha)
+    if alpha is not None and fov != "keep":
+        raise UsageError("cannot be combined", where="--fov and --alpha")
+    of_camera = {
+        "--fov": fov != "keep", "--alpha": alpha is not None, "--directions": directions,
+        "--tables": tables is not None, "--inverse": inverse,
+    }  # fmt: skip
+    _only(stored.kind, "camera", of_camera)
     _only(stored.kind, "oscilloscope", {"--object": object_system})
     _only(stored.kind, "sensor", {"--exposure-ms": exposure_ms is not None})
     mapping = _mapping(stored, object_system)
+    if tables is not None:
+        _tables(mapping, tables, view)
+        if source is None:
+            return
+    if source is None:
+        raise UsageError("is missing", where="SOURCE", do="give an image, a folder, a video or points")
     if is_points(source):
-        _points(mapping, source, out, as_json, None if directions else view, scale)
+        _points(mapping, source, out, as_json, None if directions else view, view, inverse)
+    elif inverse:
+        raise UsageError("applies to points only", where="--inverse")
     elif object_system or directions:
         raise UsageError("applies to points only", where="--object" if object_system else "--directions")
     elif isinstance(mapping, SensorCorrection):
         _frame(mapping, calibration, source, out, exposure_ms, as_json)
+    elif source.is_dir():
+        _folder(stored, mapping, calibration, source, out, view, as_json)
+    elif source.suffix.lower() in VIDEOS:
+        _video(stored, mapping, source, out, view)
     else:
-        _image(stored, mapping, calibration, source, out, view, scale, as_json)
+        _image(stored, mapping, calibration, source, out, view, as_json)
 
 
 def _only(kind: str, required: str, options: dict[str, bool]) -> None:
@@ -116,7 +159,15 @@ def _only(kind: str, required: str, options: dict[str, bool]) -> None:
             raise UsageError(f"needs a calibration of {_OF[required]}, not of {_OF[kind]}", where=name)
 
 
-def _view(text: str) -> View:
+class _View(NamedTuple):
+    """Field of view of an undistorted image, and its resolution."""
+
+    fov: View
+    scale: float | None
+    alpha: float | None
+
+
+def _fov(text: str) -> View:
     """Parse the field of view.
 
     Raises
@@ -156,9 +207,7 @@ def _mapping(stored: Calibration, object_system: bool) -> CalibratedMapping:
     return mapping
 
 
-def _raster(
-    mapping: CalibratedMapping, size: tuple[int, int], view: View, scale: float | None
-) -> CorrectedImage:
+def _raster(mapping: CalibratedMapping, size: tuple[int, int], view: _View) -> CorrectedImage:
     """Return the raster of the corrected image."""
     from ..calibration import (
         CameraCorrection,
@@ -168,8 +217,9 @@ def _raster(
         FilmFrameMapping,
     )
 
+    fov, scale, alpha = view
     if isinstance(mapping, CameraMapping):
-        return CorrectedImage.undistorted(mapping, view, 1.0 if scale is None else scale)
+        return CorrectedImage.undistorted(mapping, fov, 1.0 if scale is None else scale, alpha)
     if isinstance(mapping, FilmFrameMapping | FiducialMapping):
         return CorrectedImage.of_frame(mapping, scale)
     assert isinstance(mapping, CameraCorrection)
@@ -181,10 +231,11 @@ def _points(
     source: Path,
     out: Path | None,
     as_json: bool,
-    view: View | None,
-    scale: float | None,
+    shown: _View | None,
+    view: _View,
+    inverse: bool,
 ) -> None:
-    """Correct points; for a camera, to pixels of the undistorted image, or without view to directions."""
+    """Correct points; for a camera, to pixels of the undistorted image, or without `shown` to directions."""
     from ..calibration import CameraMapping
     from ..core.provenance import canonical_json
     from ..io import read_measurement, write_whole
@@ -193,13 +244,19 @@ def _points(
         raise UsageError("a sensor calibration corrects images, not points", where=source, do="give an image")
     suffix = ".csv" if out is None else suffix_of(writable(out), (".csv", ".json"))
     measured = read_measurement(source).image_points()
-    points, why = mapping.apply(measured), mapping.why_not(measured)
-    unit, system = mapping.unit, mapping.system
     more: dict[str, Any] = {}
-    if isinstance(mapping, CameraMapping) and view is not None:
-        raster = _raster(mapping, mapping.size, view, scale)
-        points, unit, system = _in_pixels(points, raster), "px", "undistorted"
+    raster = None
+    if isinstance(mapping, CameraMapping) and shown is not None:
+        raster = _raster(mapping, mapping.size, view)
         more = {"camera": raster.pinhole}
+    if inverse:
+        points = mapping.inverse(measured if raster is None else _to_directions(measured, raster))
+        why, unit, system = mapping.why_not(points), "px", "image"
+    else:
+        points, why = mapping.apply(measured), mapping.why_not(measured)
+        unit, system = mapping.unit, mapping.system
+        if raster is not None:
+            points, unit, system = _in_pixels(points, raster), "px", "undistorted"
     content, text = points_document(points, unit, system) | more, points.to_csv()
     if any(why):
         content["points"] = _nullable(content["points"]) | {"ok": [not w for w in why], "why": list(why)}
@@ -228,6 +285,73 @@ def _in_pixels(points: ImagePoints, raster: CorrectedImage) -> ImagePoints:
     return ImagePoints(points.names, raster.of_system(points.xy), slope @ points.cov @ slope)
 
 
+def _to_directions(points: ImagePoints, raster: CorrectedImage) -> ImagePoints:
+    """Convert pixels of the undistorted image to directions."""
+    import numpy as np
+
+    from ..core.data import ImagePoints
+
+    slope = np.diag(1 / raster.slope)
+    return ImagePoints(points.names, raster.to_system(points.xy), slope @ points.cov @ slope)
+
+
+def _tables(mapping: CalibratedMapping, path: Path, view: _View) -> None:
+    """Write the tables of the undistorted image."""
+    from ..calibration import CameraMapping, write_tables
+
+    assert isinstance(mapping, CameraMapping)
+    raster = _raster(mapping, mapping.size, view)
+    files = write_tables(writable(path), raster)
+    say("".join(f"{file}: {raster.width} × {raster.height} px\n" for file in files))
+    if len(files) == 2:
+        say(f"ffmpeg -i video.mp4 -i {files[0]} -i {files[1]} -lavfi remap undistorted.mp4\n")
+
+
+def _folder(
+    stored: Calibration,
+    mapping: CalibratedMapping,
+    path: Path,
+    source: Path,
+    out: Path | None,
+    view: _View,
+    as_json: bool,
+) -> None:
+    """Resample the images of a folder into another; one that cannot be read costs one line."""
+    from ..core.errors import ImageError, InputError
+    from ..procedures.exposures import photographs_in
+
+    out = out or source.with_name(f"{source.resolve().name}-undistorted")
+    if out.resolve() == source.resolve():
+        raise UsageError("is the folder of the images", where=out, do="choose another one")
+    images = photographs_in(source)
+    try:
+        out.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be created ({error.strerror})", where=out) from None
+    for image in images:
+        suffix = image.suffix if image.suffix.lower() in _IMAGES else ".png"
+        try:
+            _image(stored, mapping, path, image, out / f"{image.stem}{suffix}", view, as_json)
+        except (ImageError, UsageError) as error:
+            typer.echo(f"left out: {error}", err=True)
+
+
+def _video(
+    stored: Calibration, mapping: CalibratedMapping, source: Path, out: Path | None, view: _View
+) -> None:
+    """Undistort a video."""
+    from ..calibration import CameraMapping, undistort_video
+
+    if not isinstance(mapping, CameraMapping):
+        raise UsageError("needs the calibration of a camera", where=source)
+    suffix = ".mp4" if source.suffix.lower() == ".webm" else source.suffix
+    out = writable(out or source.with_name(f"{source.stem}-undistorted{suffix}"))
+    raster = _raster(mapping, mapping.size, view)
+    with progress(f"undistorting {source.name}", 0) as step:
+        count = undistort_video(source, out, raster, step)
+    say(f"{out}: {count} frames of {raster.width} × {raster.height} px\n")
+
+
 def _nullable(table: dict[str, list[Any]]) -> dict[str, list[Any]]:
     """Replace NaN by None, for points without a position."""
     return {
@@ -250,8 +374,7 @@ def _image(
     path: Path,
     source: Path,
     out: Path | None,
-    view: View,
-    scale: float | None,
+    view: _View,
     as_json: bool,
 ) -> None:
     """Resample an image; for a camera, also write the parameters of the pinhole camera of the result."""
@@ -266,12 +389,12 @@ def _image(
     planes = _planes(source, colours=stored.kind != "oscilloscope")
     height, width = planes[0].shape
     mapping.check_size(width, height, source)
-    raster = _raster(mapping, (width, height), view, scale)
+    raster = _raster(mapping, (width, height), view)
     with progress(f"resampling {source.name}", raster.bands) as step:
         write_corrected(out, planes, raster, step)
     inputs = {source.name: sha256_of(source), path.name: sha256_of(path)}
     if stored.kind == "camera":
-        provenance = Provenance(inputs, {"fov": view, "scale": scale})
+        provenance = Provenance(inputs, {"fov": view.fov, "scale": view.scale, "alpha": view.alpha})
         camera, beside = undistorted_camera(raster, stored, provenance.to_dict()), out.with_suffix(".json")
         camera.write(beside)
         if as_json:
