@@ -45,11 +45,15 @@ if TYPE_CHECKING:
     from ..bundle import BoardChoice, Kind, ModelChoice
     from ..calibration import CameraMapping, FieldDifference, ProjectionField
     from ..core.provenance import Provenance
+    from ..io import BoardDesign, ReseauDesign, TestfieldDesign
     from ..procedures.calibration import Calibrated, CalibrationOptions, CameraOptions
     from ..procedures.exposures import Taken
     from ..procedures.target_measurement import Photograph
 
 __all__ = ["calibrate"]
+
+_TRIED = 3
+"""Photographs in which `--design auto` looks for targets."""
 
 Sigma = Annotated[
     float | None,
@@ -79,7 +83,15 @@ LeaveOut = Annotated[
 
 
 def calibrate(
-    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield, board or reseau.")],
+    design: Annotated[
+        Path,
+        typer.Option(
+            "--design",
+            "-d",
+            help="Design of the testfield, board or reseau; `auto` looks for it: among designs beside the "
+            "photographs, in the folder above and the current one, and those that `reseau design` draws.",
+        ),
+    ],
     images: Annotated[
         list[Path] | None,
         typer.Argument(help="Photographs of the target, folders of them, or measured image coordinates."),
@@ -156,29 +168,34 @@ def calibrate(
     from ..io import parse_design, read_text
     from ..measure import TestfieldOptions
     from ..procedures.calibration import calibrate_camera, measurer_of
+    from ..procedures.exposures import of_another_lens
     from ..procedures.target_measurement import drawing_overlays
 
     outputs(out, report)
     drawn = {} if overlay is None else overlay_files(overlay, files)
     distance = positive(distance)
-    target, kind = parse_design(read_text(design), design), component_kind(components)
+    kind, automatic = component_kind(components), str(design) == "auto"
+    target = _found_target(files, channel, sensor) if automatic else parse_design(read_text(design), design)
     others = {path.name: read_lens(path) for path in against or []}
     if others and taken:
         raise UsageError("requires one camera", where="--against", do="compare the cameras one by one")
     level = level_of(eliminate, "--eliminate")
+    said, zoomed = of_another_lens({} if taken else photographs)
     options = _options(
         sigma, control, refraction, leave_out or [], reject, kind, level, workers, target_points
     )
+    options = replace(options, focal_35_mm=said)
     lens = _camera(model, pitch, side, model_option or [], free)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
     measure = drawing_overlays(
         measure, {name: drawn[path] for name, path in photographs.items() if path in drawn}
     )
     with progress("measuring", len(files)) as step:
-        frames = _frames(photographs, channel, sensor, step)
+        frames = _frames(photographs, channel, sensor, step, zoomed)
         found = calibrate_camera(frames, target, measure, _size(size), lens, options, taken or None)
         done = required(found, design)
-    inputs = {path.name: path for path in (design, control, refraction, sensor) if path} | photographs
+    named = (None if automatic else design, control, refraction, sensor)
+    inputs = {path.name: path for path in named if path} | photographs
     provenance = _provenance(
         inputs,
         model=lens.model, pitch=pitch, options=dict(lens.options), free=free, sigma=sigma,
@@ -199,6 +216,27 @@ def calibrate(
         say("".join(calibration.to_json() for calibration in calibrations))
     else:
         _say(done, differences, distance or [])
+
+
+def _found_target(
+    files: list[Path], channel: Channel, sensor: Path | None
+) -> ReseauDesign | TestfieldDesign | BoardDesign:
+    """The target that the first photographs show."""
+    from ..core.data import Frame
+    from ..io import is_points
+    from ..procedures.which_target import designs_beside, which_target
+
+    folders = dict.fromkeys(folder for path in files for folder in (path.parent, path.parent.parent))
+    frames = list[Frame]()
+    for path in files:
+        if not is_points(path) and len(frames) < _TRIED:
+            try:
+                frames.append(corrected(read_frame(path, channel.value), sensor))
+            except ImageError:
+                continue  # is told with its name when all are measured
+    name, design = required(which_target(frames, designs_beside([*folders, Path()])), "--design auto")
+    typer.echo(f"note: the target is {name}", err=True)
+    return design
 
 
 def _photographs(images: list[Path], cameras: list[str]) -> tuple[dict[str, Path], dict[str, Taken]]:
@@ -295,7 +333,11 @@ def _write_report(
 
 
 def _frames(
-    photographs: Mapping[str, Path], channel: Channel, sensor: Path | None, step: Callable[[str], None]
+    photographs: Mapping[str, Path],
+    channel: Channel,
+    sensor: Path | None,
+    step: Callable[[str], None],
+    zoomed: Mapping[str, str],
 ) -> Iterator[Photograph]:
     """Photographs, or measured image coordinates, in order; why a photograph cannot be used."""
     from ..core.failure import Code, Failure
@@ -303,7 +345,9 @@ def _frames(
 
     for name, path in photographs.items():
         step(f"measuring {name}")
-        if is_points(path):
+        if name in zoomed:
+            yield name, Failure(zoomed[name], Code.DECLINED, where=name)
+        elif is_points(path):
             yield name, read_measurement(path).image_points()
         else:
             try:

@@ -29,6 +29,7 @@ from ..core.provenance import sha256_of
 from ..core.tone import ToneCurve
 from . import write_whole
 from .dicom import is_dicom, open_dicom
+from .photographs import decoded_heic, decoded_raw, is_heic, is_raw
 from .profiles import curve_of_file, curve_of_profile
 from .scans import CHANNELS, Scan, Window, full_scale_of, scan_of
 
@@ -55,8 +56,9 @@ def read_image(path: Path | str, channel: Channel = "luma") -> Frame:
     Parameters
     ----------
     path : path
-        PNG, JPEG, BMP, TIFF or DICOM; see :mod:`reseau.io.images` for the kinds of TIFF. ``loop.dcm#3`` is
-        the third frame of a DICOM file; without a number the first is read, with a note.
+        PNG, JPEG, BMP, TIFF, HEIC, a raw file or DICOM; see :mod:`reseau.io.images` for the kinds of
+        TIFF. ``loop.dcm#3`` is the third frame of a DICOM file; without a number the first is read, with
+        a note.
     channel : {"luma", "red", "green", "blue"}
         Channel of a colour image that is used. A lens images colours at slightly different scales; a single
         channel avoids the shifts that this causes. The pixels of a grey image are the same for every channel.
@@ -140,6 +142,10 @@ def open_scan(path: Path | str) -> Scan:
     if is_dicom(whole, magic):
         return open_dicom(whole, number, MAX_PIXELS)
     path = Path(path)
+    if is_raw(path):
+        return scan_of(decoded_raw(path), path.name)
+    if is_heic(magic):
+        return scan_of(decoded_heic(path), path.name)
     if magic[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return _open_tiff(path, whole, number)
     if number is not None:
@@ -173,7 +179,8 @@ def _decoded(path: Path, magic: bytes) -> NDArray[Any]:
     coded = np.fromfile(path, dtype=np.uint8)
     # The decoder fills the missing part of a truncated file with grey, silently: check the end mark.
     end = {b"\x89P": b"IEND", b"\xff\xd8": b"\xff\xd9"}.get(magic[:2], b"")
-    if end not in coded[-4096:].tobytes():
+    # Telephones append films and previews to a JPEG: its end mark may be far from the end of the file.
+    if end not in coded[-4096:].tobytes() and not _complete_jpeg(coded.tobytes()):
         raise ImageError("is a truncated image", where=path, do=_AGAIN)
     try:
         pixels = cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
@@ -182,6 +189,16 @@ def _decoded(path: Path, magic: bytes) -> NDArray[Any]:
     if pixels is None:
         raise ImageError("is a damaged image", where=path, do=_AGAIN)
     return np.asarray(pixels)
+
+
+def _complete_jpeg(coded: bytes) -> bool:
+    """Whether the end mark of a JPEG follows its first scan; it cannot occur inside of one."""
+    at = 2
+    while coded[:2] == b"\xff\xd8" and coded[at : at + 1] == b"\xff":
+        if coded[at + 1] == 0xDA:
+            return b"\xff\xd9" in coded[at:]
+        at += 2 + int.from_bytes(coded[at + 2 : at + 4], "big")
+    return False
 
 
 def _header_size(magic: bytes, path: Path) -> tuple[int, int]:

@@ -44,6 +44,7 @@ from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
+from ..io.photographs import Exif
 from ..io.refraction import RefractionEntry
 from ..optics import CameraModel, PixelGrid, camera_model
 from ..optics.cameras import default_camera_model
@@ -69,6 +70,8 @@ __all__ = [
 
 _LEAST_POINTS = 8
 _LEAST_IMAGES = 3
+_FOCAL_OFF = 1.5
+"""Factor beyond which the focal length of the homographies contradicts that which the camera says."""
 _CAMERA = "camera"
 """Name of a camera that is alone."""
 # Relative standard deviation of a diagonal of the target.
@@ -183,6 +186,9 @@ class CalibrationOptions:
         calibration is that of the camera in air. Without control points the diagonals of the target are
         distances of the design, known to a ten-thousandth: windows have dimensions, and the scale is not
         free.
+    focal_35_mm : float, optional
+        Approximate focal length as the camera says, for the format of 36 × 24 mm: taken for the start where
+        that of the homographies is far from it.
     target : {"free", "flat", "auto"}
         Whether all points of the target are unknowns, or are held as designed; ``auto`` holds them where
         :func:`reseau.bundle.choose_board` finds the target flat and as designed.
@@ -202,6 +208,7 @@ class CalibrationOptions:
     workers: int = 1
     heights: Heights | None = None
     refraction: RefractionEntry | None = None
+    focal_35_mm: float | None = None
     target: Literal["free", "flat", "auto"] = "free"
 
     def __post_init__(self) -> None:
@@ -449,10 +456,15 @@ def calibrate_camera(
     if options.refraction is not None:
         refraction = options.refraction.refraction(tuple(measured), tuple(cameras[c] for c in of))
     model, larger = model or CameraOptions(), _magnification(refraction)
+    said = Exif(focal_35_mm=options.focal_35_mm)
     entries = []
     for c, name in enumerate(cameras):
         own = {image: points for (image, points), at in zip(measured.items(), of, strict=True) if at == c}
-        entries.append(replace(first_camera(own, design, sizes[name], model, larger), id=name))
+        entries.append(
+            replace(
+                first_camera(own, design, sizes[name], model, larger, said.focal_px(*sizes[name])), id=name
+            )
+        )
     network = replace(network_of(measured, design, entries[0]), refraction=refraction)
     if taken:
         network = _fixed_to_each_other(network, entries, of, [taken[name].exposure for name in measured])
@@ -654,11 +666,13 @@ def first_camera(
     size: tuple[int, int],
     model: CameraOptions,
     magnification: float = 1.0,
+    focal_px: float | None = None,
 ) -> Camera:
     """Return a camera with approximate values, from the homographies of the images (Zhang 2000).
 
     With parallel rays, affine mappings of the plane have the magnification: it is not foreshortened along the
-    axis about which the plane is tilted. `magnification` is that of windows before the camera.
+    axis about which the plane is tilted. `magnification` is that of windows before the camera, `focal_px`
+    what the camera itself says.
     """
     known = dict(zip(design.ids, design.xy, strict=True))
     object_points, image_points = list[Any](), list[Any]()
@@ -672,7 +686,9 @@ def first_camera(
     else:
         f = float(cv2.initCameraMatrix2D(object_points, image_points, size, 1.0)[0, 0])
         if not np.isfinite(f) or not 0.2 * max(size) < f < 100 * max(size):
-            f = 1.2 * max(size)
+            f = focal_px or 1.2 * max(size)
+        if focal_px is not None and not focal_px / _FOCAL_OFF < f < _FOCAL_OFF * focal_px:
+            f = focal_px
     f /= magnification
     pitch = model.pitch_mm or (1.0, 1.0)
     values = model.registered.start_values(f, PixelGrid(*size, pitch))

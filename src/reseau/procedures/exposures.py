@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..core.errors import InputError, UsageError
+from ..io.photographs import PHOTOGRAPHS, read_exif
 
-__all__ = ["Taken", "exposures_of_files", "files_of", "photographs_in"]
+__all__ = ["Taken", "exposures_of_files", "files_of", "of_another_lens", "photographs_in"]
 
-_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".dcm")
 
 _NUMBER = re.compile(r"\d+(?=\D*$)")
 
@@ -64,7 +64,7 @@ def photographs_in(folder: Path) -> list[Path]:
     reseau.core.errors.InputError: src/reseau/optics: has no photograph
     """
     files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    for suffixes in (_IMAGES, (".csv",)):
+    for suffixes in (PHOTOGRAPHS, (".csv",)):
         found = [path for path in files if path.suffix.lower() in suffixes]
         if found:
             return found
@@ -133,3 +133,37 @@ def _number(path: Path) -> str:
             do="name files that were taken at once alike, as left/0001.png and right/0001.png",
         )  # fmt: skip
     return str(int(found[0]))
+
+
+def of_another_lens(photographs: Mapping[str, Path]) -> tuple[float | None, dict[str, str]]:
+    """Find photographs that were taken with another focal length than most, as the camera says.
+
+    Parameters
+    ----------
+    photographs : mapping of str to Path
+        Files of one camera, by their names.
+
+    Returns
+    -------
+    focal_35_mm : float or None
+        Equivalent focal length of most of them; None where the camera does not say.
+    others : dict of str to str
+        Photographs with another focal length, and what is said about each.
+
+    Examples
+    --------
+    >>> of_another_lens({"a.png": Path("a.png")})
+    (None, {})
+    """
+    found = {name: read_exif(path) for name, path in photographs.items()}
+    focal = {name: round(exif.focal_mm, 2) for name, exif in found.items() if exif.focal_mm}
+    if not focal:
+        return None, {}
+    usual = Counter(focal.values()).most_common(1)[0][0]
+    others = {
+        name: f"was taken with a focal length of {length:g} mm, most with {usual:g} mm"
+        for name, length in focal.items()
+        if length != usual
+    }
+    said = [found[name].focal_35_mm for name, length in focal.items() if length == usual]
+    return next((length for length in said if length), None), others

@@ -1,0 +1,158 @@
+"""Photographs as cameras and telephones write them: HEIC, raw files, and what the camera says (Exif).
+
+Pixels are always those of the sensor, in its rows and columns: the orientation in which a viewer shows the
+photograph is ignored, so that upright and sideways photographs are of one camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import ImageError
+from ..core.optional import optional
+
+__all__ = ["PHOTOGRAPHS", "RAW", "Exif", "decoded_heic", "decoded_raw", "is_heic", "is_raw", "read_exif"]
+
+RAW = (
+    ".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".3fr", ".iiq",
+)  # fmt: skip
+"""Suffixes of raw files."""
+PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".dcm", ".heic", ".heif", *RAW)
+"""Suffixes of photographs in a folder."""
+_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
+_ORIENTATION, _EXIF = 0x0112, 0x8769
+_FOCAL, _FOCAL_35 = 0x920A, 0xA405
+_DIAGONAL_35 = float(np.hypot(36.0, 24.0))
+"""Of the format to which the equivalent focal length refers, mm."""
+
+
+@dataclass(frozen=True)
+class Exif:
+    """What a camera says about a photograph.
+
+    Parameters
+    ----------
+    orientation : int
+        How a viewer shows it, 1 to 8; 1 as the sensor has it.
+    focal_mm : float, optional
+        Focal length.
+    focal_35_mm : float, optional
+        Focal length of the same field of view in the format of 36 × 24 mm.
+
+    Examples
+    --------
+    >>> round(Exif(focal_35_mm=28.0).focal_px(4000, 3000))
+    3236
+    """
+
+    orientation: int = 1
+    focal_mm: float | None = None
+    focal_35_mm: float | None = None
+
+    def focal_px(self, width: int, height: int) -> float | None:
+        """Approximate focal length in pixels; None if it is not known."""
+        if not self.focal_35_mm:
+            return None
+        return self.focal_35_mm * float(np.hypot(width, height)) / _DIAGONAL_35
+
+
+def is_heic(magic: bytes) -> bool:
+    """Whether a file begins like a HEIC image."""
+    return magic[4:8] == b"ftyp" and magic[8:12] in _BRANDS
+
+
+def is_raw(path: Path) -> bool:
+    """Whether a file has the suffix of a raw file.
+
+    Examples
+    --------
+    >>> is_raw(Path("DSC_0001.NEF"))
+    True
+    """
+    return path.suffix.lower() in RAW
+
+
+def decoded_heic(path: Path) -> NDArray[Any]:
+    """Red, green and blue (h, w, 3) of a HEIC image, as the sensor has them.
+
+    Raises
+    ------
+    UsageError
+        When pillow-heif is missing.
+    ImageError
+        When the file is damaged.
+    """
+    with optional():
+        import pillow_heif
+    try:
+        file = pillow_heif.open_heif(str(path), convert_hdr_to_8bit=False)
+        pixels = np.asarray(file)
+    except (OSError, ValueError, RuntimeError, SyntaxError, EOFError) as error:
+        raise ImageError("is a damaged HEIC image", where=path, do="copy it again") from error
+    # The decoder turns the image upright.
+    shown = file.info.get("original_orientation") or 1
+    return np.ascontiguousarray(_as_sensor(pixels, int(shown)))
+
+
+def _as_sensor(pixels: NDArray[Any], shown: int) -> NDArray[Any]:
+    """Undo the orientation in which a viewer shows an image."""
+    turned = {3: 2, 6: 1, 8: 3, 5: 1, 7: 3}.get(shown, 0)
+    if shown == 4:
+        return pixels[::-1]
+    if shown in (2, 5, 7):
+        pixels = pixels[:, ::-1]
+    return np.rot90(pixels, turned)
+
+
+def decoded_raw(path: Path) -> NDArray[Any]:
+    """Red, green and blue (h, w, 3) of a raw file: 16 bit, proportional to the light, as the sensor has them.
+
+    Raises
+    ------
+    UsageError
+        When rawpy is missing.
+    ImageError
+        When the file is damaged, or of a camera that is not known.
+    """
+    with optional():
+        import rawpy
+    try:
+        with rawpy.imread(str(path)) as raw:
+            pixels = raw.postprocess(
+                gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0,
+                output_color=rawpy.ColorSpace.raw,
+            )  # fmt: skip
+    except (rawpy.LibRawError, OSError) as error:
+        raise ImageError("is no raw file that can be read", where=path, do="convert it to TIFF") from error
+    return np.asarray(pixels)
+
+
+def read_exif(path: Path) -> Exif:
+    """Read what the camera says; of files without it, or that cannot be read, nothing.
+
+    Examples
+    --------
+    >>> read_exif(Path("missing.jpg"))
+    Exif(orientation=1, focal_mm=None, focal_35_mm=None)
+    """
+    try:
+        from PIL import Image
+
+        if path.suffix.lower() in (".heic", ".heif"):
+            import pillow_heif
+
+            pillow_heif.register_heif_opener()
+        with Image.open(path) as image:
+            found = image.getexif()
+            inner = found.get_ifd(_EXIF)
+            shown = image.info.get("original_orientation") or found.get(_ORIENTATION) or 1
+        numbers = [float(inner[tag]) if tag in inner else None for tag in (_FOCAL, _FOCAL_35)]
+    except (OSError, ValueError, SyntaxError, ZeroDivisionError, TypeError, ImportError):
+        return Exif()
+    focal, equivalent = (v if v is not None and 0.1 < v < 1e4 else None for v in numbers)
+    return Exif(int(shown) if shown in range(1, 9) else 1, focal, equivalent)

@@ -1,0 +1,46 @@
+"""`--design auto`: the target that photographs show, among known ones; photographs with another zoom."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from reseau.core.failure import Failure
+from reseau.designs import board, coded_sheet
+from reseau.io import BoardDesign
+from reseau.procedures.exposures import of_another_lens
+from reseau.procedures.which_target import which_target
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "measure"))
+
+
+def test_a_charuco_board_is_found_among_other_targets() -> None:
+    from board_pictures import picture
+
+    charuco = board("charuco", 7, 6, 24.0)
+    frame, _ = picture(charuco)
+    candidates = {
+        "sheet": coded_sheet(8, 7, 20.0), "chess": board("chess", 7, 6, 24.0),
+        "other": board("charuco", 9, 6, 24.0), "mine": charuco,
+    }  # fmt: skip
+    found = which_target([frame], candidates)
+    assert not isinstance(found, Failure)
+    assert found[0] == "mine"
+    assert isinstance(found[1], BoardDesign)
+    assert not which_target([frame], {"sheet": candidates["sheet"]})
+
+
+def test_photographs_with_another_zoom_are_named(tmp_path: Path) -> None:
+    files = {}
+    for name, focal in (("a.jpg", 24.0), ("b.jpg", 24.0), ("c.jpg", 35.0), ("d.jpg", 24.0)):
+        exif = Image.Exif()
+        inner = exif.get_ifd(0x8769)
+        inner[0x920A], inner[0xA405] = focal, int(1.5 * focal)
+        Image.new("L", (8, 8)).save(tmp_path / name, exif=exif)
+        files[name] = tmp_path / name
+    said, others = of_another_lens(files)
+    assert said == pytest.approx(36)
+    assert others == {"c.jpg": "was taken with a focal length of 35 mm, most with 24 mm"}
