@@ -57,13 +57,15 @@ def test_derivatives_agree_with_finite_differences(model: AdditionalModel) -> No
     np.testing.assert_allclose(mapping.inverse(mapping(xy)), xy, rtol=0, atol=1e-10)
 
 
-def bent_world(model: AdditionalModel, images: int = 8, points: int = 60) -> tuple[networks.World, Array]:
+def bent_world(
+    model: AdditionalModel, images: int = 8, points: int = 60, sigma_px: float = 0.02
+) -> tuple[networks.World, Array]:
     """A world whose camera has these additional parameters, and their values."""
     extra = Additional(BASE, model=model.name)
     free = ("c", "x0", "y0")
     lens = np.array([8.0, 0.03, -0.02] + 7 * [0.0])
     camera = Camera("cam", 640, 480, (0.01, 0.01), "brown", lens, free, {"side": "object"})
-    world = networks.world(images=images, points=points, cameras=(camera,), sigma_px=0.02, size=1.2)
+    world = networks.world(images=images, points=points, cameras=(camera,), sigma_px=sigma_px, size=1.2)
     values = values_of(model)
     ideal = GRID.to_photo(world.network.xy) - CENTRE
     moved = GRID.to_pixels(model.build(values, BASE)(ideal) + CENTRE)
@@ -91,7 +93,8 @@ def result_of(world: networks.World, values: Array, seed: int) -> Result:
 
 def normalised(model: AdditionalModel, seeds: range) -> Array:
     """Squares of the errors of all parameters in their joint covariance, over their number."""
-    world, values = bent_world(model)
+    # With many parameters first order suffices only with little noise.
+    world, values = bent_world(model, sigma_px=0.02 if len(model.names) <= 24 else 0.001)
     true, squares = np.array([8.0, 0.03, -0.02, *values]), []
     for seed in seeds:
         result = result_of(world, values, seed)

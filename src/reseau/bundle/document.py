@@ -16,7 +16,7 @@ from ..core.provenance import Provenance
 from ..io import Document, Strict
 from ..optics.poses import matrix_to_vector
 from ..optics.refraction import Refraction
-from .diagnostics import Result, RigEstimate, sigma_between_images
+from .diagnostics import MotionEstimates, Result, RigEstimate, sigma_between_images
 from .network import Rig
 from .network.network import finite
 
@@ -90,6 +90,18 @@ class RigResult(Strict):
     length: tuple[float, ...]
     length_sigma: tuple[float, ...]
     covariance: tuple[Matrix, ...]
+
+
+class MotionResult(Strict):
+    """Motion of images of cameras with a shutter, in columns: vx, vy, vz (per second), wx, wy, wz (rad/s).
+
+    `sigma` is zero for components that were not estimated; `tests` are against zero.
+    """
+
+    image: tuple[str, ...]
+    motion: Matrix
+    sigma: Matrix
+    tests: dict[str, Significance]
 
 
 class ImagesResult(Strict):
@@ -234,6 +246,7 @@ class ResultDocument(Document):
     bases: DistancesResult | None = None
     refraction: RefractionResult | None = None
     rig: RigResult | None = None
+    motion: MotionResult | None = None
     variance_components: ComponentsResult | None = None
     eliminated: tuple[EliminatedParameter, ...] | None = None
     cross_validation: CrossValidation | None = None
@@ -265,6 +278,8 @@ class ResultDocument(Document):
             more["refraction"] = _refraction(result, result.network.refraction)
         if result.rig is not None:
             more["rig"] = _rig(result.rig)
+        if result.motion is not None:
+            more["motion"] = _motion(result.motion)
         if provenance is not None:
             more["provenance"] = provenance.to_dict()
         return cls(
@@ -382,6 +397,15 @@ def _rig(found: RigEstimate) -> RigResult:
         length=tuple(found.length.tolist()),
         length_sigma=tuple(found.length_sigma.tolist()),
         covariance=tuple(_matrix(cov) for cov in found.cov),
+    )
+
+
+def _motion(found: MotionEstimates) -> MotionResult:
+    return MotionResult(
+        image=found.names,
+        motion=_matrix(found.values),
+        sigma=_matrix(found.sigma),
+        tests={test.name: _significance(test) for test in found.tests},
     )
 
 

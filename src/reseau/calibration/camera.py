@@ -33,7 +33,7 @@ __all__ = [
     "worst",
 ]
 
-_KEYS = ("model", "width", "height", "pitch_mm", "additional")
+_KEYS = ("model", "width", "height", "pitch_mm", "additional", "shutter")
 """Keys of the model in a file; the others are options of the camera model."""
 
 
@@ -135,6 +135,8 @@ class CameraMapping(CalibratedMapping):
         model = cast(dict[str, Any], calibration.model)
         extra: dict[str, Any] | None = model.get("additional")
         values = calibration.values()
+        if (model.get("shutter") or {}).get("mode") == "line":
+            raise FormatError("is that of a line camera: its images have no directions", where=where)
         if extra is not None and extra["per"] != "camera":
             raise FormatError("has several sets of additional parameters", where=where)
         try:

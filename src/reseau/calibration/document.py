@@ -119,6 +119,7 @@ class CameraModel(TypedDict):
     height: int
     pitch_mm: list[float]
     additional: NotRequired[dict[str, Any]]
+    shutter: NotRequired[dict[str, Any]]
 
 
 @with_config(_STRICT)

@@ -20,6 +20,7 @@ from .bundle_options import (
     positive,
     say_left_out,
     say_model,
+    say_motion,
     say_parameters,
     say_refraction,
     say_rig,
@@ -196,6 +197,8 @@ def _say(path: Path, result: Result) -> None:
         say_refraction(result.refraction)
     if result.rig is not None:
         say_rig(result.rig)
+    if result.motion is not None:
+        say_motion(result.motion)
     say_model(result)
     say_left_out(result)
     for warning in result.warnings:

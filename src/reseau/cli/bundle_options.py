@@ -11,7 +11,7 @@ import typer
 from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
-    from ..bundle import CameraEstimate, Kind, RefractionEstimate, Result, RigEstimate
+    from ..bundle import CameraEstimate, Kind, MotionEstimates, RefractionEstimate, Result, RigEstimate
     from ..calibration import FieldDifference
     from ..core.data import Array
 
@@ -29,6 +29,7 @@ __all__ = [
     "say_difference",
     "say_left_out",
     "say_model",
+    "say_motion",
     "say_parameters",
     "say_refraction",
     "say_rig",
@@ -169,6 +170,23 @@ def say_rig(found: RigEstimate) -> None:
             f"{measured(float(found.length[k]), float(found.length_sigma[k]), found.unit)}; turned by "
             f"{measured(float(found.angles[k]), turn, 'deg')}\n"
         )
+
+
+def say_motion(found: MotionEstimates) -> None:
+    """Print how fast the cameras of images with a shutter move, and how much of it is significant."""
+    import numpy as np
+
+    sigma, size = found.sigma, np.abs(found.values)
+    median = np.median(sigma, axis=0)
+    speed = " ".join(f"{np.median(column):.3g}" for column in size.T[:3])
+    turn = " ".join(f"{np.median(column):.3g}" for column in size.T[3:])
+    significant = sum(test.significant for test in found.tests)
+    say(
+        f"motion of {len(found.names)} images, medians: |v| {speed} {found.unit}/s "
+        f"(sigma {' '.join(f'{s:.2g}' for s in median[:3])}), |w| {turn} rad/s "
+        f"(sigma {' '.join(f'{s:.2g}' for s in median[3:])}); {significant} of {len(found.tests)} components "
+        "are significant\n"
+    )
 
 
 def say_left_out(result: Result) -> None:

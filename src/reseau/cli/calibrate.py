@@ -24,6 +24,7 @@ from .bundle_options import (
     say_difference,
     say_left_out,
     say_model,
+    say_motion,
     say_parameters,
     say_refraction,
     say_rig,
@@ -130,6 +131,15 @@ def calibrate(
         typer.Option(help="Option of the camera model, e.g. balance_radius_mm=8; repeatable."),
     ] = None,
     free: Annotated[str, typer.Option(help="Parameters to estimate, e.g. c,x0,y0,K1.")] = "",
+    rolling: Annotated[
+        float | None,
+        typer.Option(
+            "--rolling-shutter",
+            metavar="SECONDS",
+            help="The sensor is read line by line while the camera moves; time from one line to the next "
+            "(negative: from the last line on). The motion during each image is estimated.",
+        ),
+    ] = None,
     size: Annotated[
         str, typer.Option(help="Width×height in pixels, e.g. 640x480; required without photographs.")
     ] = "",
@@ -185,7 +195,7 @@ def calibrate(
         sigma, control, refraction, leave_out or [], reject, kind, level, workers, target_points
     )
     options = replace(options, focal_35_mm=said)
-    lens = _camera(model, pitch, side, model_option or [], free)
+    lens = _camera(model, pitch, side, model_option or [], free, rolling)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
     measure = drawing_overlays(
         measure, {name: drawn[path] for name, path in photographs.items() if path in drawn}
@@ -200,7 +210,7 @@ def calibrate(
         inputs,
         model=lens.model, pitch=pitch, options=dict(lens.options), free=free, sigma=sigma,
         reject=reject, row_jitter=row_jitter, fill=fill, channel=channel.value, eliminate=eliminate,
-        leave_out=list(leave_out or []), components=kind,
+        leave_out=list(leave_out or []), components=kind, rolling_shutter=rolling,
     )  # fmt: skip
     differences = _differences(done, others)
     calibrations = [
@@ -357,8 +367,11 @@ def _frames(
                 yield name, Failure(error.what, Code.DECLINED, where=name)
 
 
-def _camera(model: str, pitch: float | None, side: str | None, more: list[str], free: str) -> CameraOptions:
+def _camera(
+    model: str, pitch: float | None, side: str | None, more: list[str], free: str, rolling: float | None
+) -> CameraOptions:
     """Camera model and parameters from the options of the command."""
+    from ..bundle import Shutter
     from ..procedures.calibration import CameraOptions
 
     options: dict[str, str | float] = {} if side is None else {"side": side}
@@ -368,7 +381,8 @@ def _camera(model: str, pitch: float | None, side: str | None, more: list[str], 
             raise UsageError(f"is {text!r}", where="--model-option", do="write name=value, each name once")
         options[name] = value
     names = tuple(name.strip() for name in free.split(",") if name.strip())
-    return CameraOptions(model, names, None if pitch is None else (pitch, pitch), options)
+    shutter = None if rolling is None else Shutter("rolling", rolling)
+    return CameraOptions(model, names, None if pitch is None else (pitch, pitch), options, shutter)
 
 
 def _size(text: str) -> tuple[int, int] | None:
@@ -433,6 +447,8 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
             )
     if result.rig is not None:
         say_rig(result.rig)
+    if result.motion is not None:
+        say_motion(result.motion)
     if result.refraction is not None:
         say("windows and media\n")
         say_refraction(result.refraction)

@@ -23,10 +23,14 @@ __all__ = [
     "Network1",
     "ObservationColumns",
     "PointColumns",
+    "ShutterEntry",
 ]
 
 T = TypeVar("T")
 Triple = tuple[float, float, float]
+Six = tuple[float, float, float, float, float, float]
+Motion = Literal["vx", "vy", "vz", "wx", "wy", "wz"]
+MOTION: tuple[Motion, ...] = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
 class AdditionalParameters(Strict):
@@ -41,6 +45,35 @@ class AdditionalParameters(Strict):
     @classmethod
     def _registered(cls, name: str) -> str:
         return _known(name, [model.name for model in additional_models()])
+
+
+class ShutterEntry(Strict):
+    """Lines of an image that follow each other while the camera moves.
+
+    `line_s` is the time from one line to the next, `row` the row of the camera model at which a line camera
+    has its sensor elements. `free` and `sigma` are about the components vx, vy, vz (along the axes of the
+    camera), wx, wy, wz (rad) of the motion of each image.
+    """
+
+    mode: Literal["rolling", "line"]
+    line_s: float = 1.0
+    row: float = 0.0
+    free: tuple[Motion, ...] = MOTION
+    sigma: dict[Motion, float] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.line_s == 0:
+            raise ValueError("`line_s` of a shutter must not be zero")
+        twice = _twice(self.free)
+        if twice is not None:
+            raise ValueError(f"`free` of a shutter contains {twice!r} twice")
+        for name, sigma in (self.sigma or {}).items():
+            if sigma <= 0:
+                raise ValueError(f"the sigma of {name!r} must be above zero")
+            if name not in self.free:
+                raise ValueError(f"{name!r} has a sigma but is not free")
+        return self
 
 
 class CameraEntry(Strict):
@@ -62,6 +95,7 @@ class CameraEntry(Strict):
     free: tuple[str, ...]
     sigma: dict[str, float] | None = None
     additional: AdditionalParameters | None = None
+    shutter: ShutterEntry | None = None
 
     @field_validator("model")
     @classmethod
@@ -209,6 +243,8 @@ class ImageColumns(_Columns):
     """Images: the camera of each, and its pose where it is known.
 
     Images with the same `exposure` were taken at once, by cameras that are fixed to each other (a rig).
+    `motion` is the motion of cameras with a shutter, vx, vy, vz, wx, wy, wz per second: observed, held, or
+    approximate values; zero where it is null.
     """
 
     id: tuple[str, ...]
@@ -218,6 +254,7 @@ class ImageColumns(_Columns):
     file: tuple[str | None, ...] | None = None
     group: tuple[str | None, ...] | None = None
     exposure: tuple[str | None, ...] | None = None
+    motion: tuple[Six | None, ...] | None = None
 
 
 class PointColumns(_Columns):
@@ -297,6 +334,7 @@ class Network1(Document):
             if not any(self.images.exposure or ()):
                 raise ValueError("`bases` require the exposures of the images")
         _named("datum_points", self.datum_points or (), points, "points")
+        self._check_motion()
         self._check_points()
         self._check_observations()
         self._check_groups()
@@ -306,6 +344,13 @@ class Network1(Document):
             except UsageError as error:
                 raise ValueError(str(error)) from None
         return self
+
+    def _check_motion(self) -> None:
+        moving = {c.id for c in self.cameras if isinstance(c, CameraEntry) and c.shutter is not None}
+        columns = zip(self.images.id, self.images.camera, self.images.motion or (), strict=False)
+        for image, camera, motion in columns:
+            if motion is not None and camera not in moving:
+                raise ValueError(f"image {image!r} has a motion, but camera {camera!r} has no `shutter`")
 
     def _check_points(self) -> None:
         for name, xyz, sigma, role in zip(

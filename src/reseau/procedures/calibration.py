@@ -31,6 +31,7 @@ from ..bundle import (
     PointEstimates,
     Result,
     Rig,
+    Shutter,
     calibration_of,
     camera_mapping,
     choose_board,
@@ -111,11 +112,14 @@ class CameraOptions:
         Pixel size; required for models whose parameters are in millimetres.
     options : mapping of str to str or float
         Options of the model, such as the side of Brown's distortion.
+    shutter : Shutter, optional
+        For images that are read line by line while the camera moves; of the mode ``rolling``.
 
     Raises
     ------
     UsageError
-        When the model, a parameter or an option is unknown, or the pixel size is missing.
+        When the shutter is that of a line camera, the model, a parameter or an option is unknown, or the
+        pixel size is missing.
 
     Examples
     --------
@@ -127,11 +131,17 @@ class CameraOptions:
     free: tuple[str, ...] = ()
     pitch_mm: tuple[float, float] | None = None
     options: Mapping[str, str | float] = field(default_factory=dict)
+    shutter: Shutter | None = None
 
     def __post_init__(self) -> None:
         if not self.model:
             object.__setattr__(self, "model", default_camera_model(self.pitch_mm is not None).name)
         model = self.registered
+        if self.shutter is not None and self.shutter.mode == "line":
+            # Approximate values of a line camera need points that are not in one plane.
+            raise UsageError(
+                "cannot be calibrated with a plane target", where="a line camera", do="adjust a network of it"
+            )
         if self.automatic and (self.free or self.options):
             raise UsageError("has no parameters or options of its own", where="camera model auto")
         if model.needs_pitch and self.pitch_mm is None:
@@ -692,7 +702,10 @@ def first_camera(
     f /= magnification
     pitch = model.pitch_mm or (1.0, 1.0)
     values = model.registered.start_values(f, PixelGrid(*size, pitch))
-    return Camera(_CAMERA, *size, pitch, model.registered.name, values, model.chosen, model.options)
+    return Camera(
+        _CAMERA, *size, pitch, model.registered.name, values, model.chosen, model.options,
+        shutter=model.shutter,
+    )  # fmt: skip
 
 
 def _scale(object_points: Sequence[Any], image_points: Sequence[Any]) -> float:

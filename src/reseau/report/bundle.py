@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ..bundle import Result, camera_mapping, projection_field_at, sigma_between_images
+from ..bundle.network.shutter import MOTION
 from ..calibration import CameraMapping, FieldDifference, projection_field
 from ..core.data import Rows
 from ..core.failure import Remark
@@ -74,6 +75,7 @@ def bundle_report(
         cameras=cameras,
         refraction=_refraction(result),
         rig=_rig(result),
+        motion=_motion(result),
         more_cameras=max(0, len(_shown(result)) - _CAMERAS),
         images=images_table(result)[:_IMAGES],
         more_images=max(0, len(result.network.images) - _IMAGES),
@@ -210,6 +212,26 @@ def _refraction(result: Result) -> list[dict[str, Any]]:
             found.partners, strict=True,
         )
     ]  # fmt: skip
+
+
+def _motion(result: Result) -> list[dict[str, Any]]:
+    """Rows of the table of the motion of cameras with a shutter: its components in each image."""
+    found = result.motion
+    if found is None:
+        return []
+    units = 3 * [f"{found.unit}/s"] + 3 * ["rad/s"]
+    columns = [k for k in range(6) if (found.sigma[:, k] > 0).any()]
+    return [
+        {
+            "image": image,
+            "name": MOTION[k],
+            "estimate": power(float(found.values[i, k]), float(found.sigma[i, k])),
+            "unit": unit_text(units[k]),
+        }
+        for i, image in enumerate(found.names)
+        for k in columns
+        if found.sigma[i, k] > 0
+    ]
 
 
 def _rig(result: Result) -> list[dict[str, Any]]:

@@ -2,7 +2,14 @@
 
 from .checks import checks
 from .control_check import doubtful_control
-from .estimates import CameraEstimate, ImageEstimates, PointEstimates, RefractionEstimate, RigEstimate
+from .estimates import (
+    CameraEstimate,
+    ImageEstimates,
+    MotionEstimates,
+    PointEstimates,
+    RefractionEstimate,
+    RigEstimate,
+)
 from .fields import camera_mapping, projection_field_at
 from .image_scatter import sigma_between_images
 from .patterns import CommonPattern, by_place, by_point, common_pattern
@@ -13,6 +20,7 @@ __all__ = [
     "CommonPattern",
     "Eliminated",
     "ImageEstimates",
+    "MotionEstimates",
     "PointEstimates",
     "RefractionEstimate",
     "Result",

@@ -271,8 +271,10 @@ def _unit(uv: Array) -> Array:
 def _lines(network: Network, uv: Array) -> list[Remark]:
     """Images whose points lie on one line: they do not determine the pose."""
     bad = []
+    lines = np.array([c.shutter is not None and c.shutter.mode == "line" for c in network.cameras])
     for i, rows in enumerate(_by_image(network, finite(uv))):
-        own = uv[rows]
+        # The points of a line camera are seen in one plane each.
+        own = network.xy[rows] if lines[network.camera_of[i]] else uv[rows]
         if len(own) < 3:
             continue
         size = np.linalg.svd(own - own.mean(axis=0), compute_uv=False)

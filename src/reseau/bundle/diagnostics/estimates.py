@@ -10,8 +10,16 @@ from ...adjust.significance import CoefficientTest
 from ...core.data import Array, Rows
 from ...core.display import Display
 from ...core.numbers import measured
+from ..network.shutter import MOTION
 
-__all__ = ["CameraEstimate", "ImageEstimates", "PointEstimates", "RefractionEstimate", "RigEstimate"]
+__all__ = [
+    "CameraEstimate",
+    "ImageEstimates",
+    "MotionEstimates",
+    "PointEstimates",
+    "RefractionEstimate",
+    "RigEstimate",
+]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -166,6 +174,58 @@ class RigEstimate(Display):
                 self.cameras, self.references, self.length, self.length_sigma, strict=True
             )
         ]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MotionEstimates(Display):
+    """Motions of the images of cameras with a shutter: velocity (vx, vy, vz) and rotation rates (wx, wy, wz).
+
+    Parameters
+    ----------
+    names : tuple of str (k,)
+        Names of the images.
+    values : ndarray (k, 6)
+        Velocity along the axes of the camera, in units of object space per second; rates about them, rad per
+        second.
+    cov : ndarray (k, 6, 6)
+        Their covariances; zero for components that were not estimated.
+    tests : tuple of CoefficientTest
+        Of each component of each image against zero, ``vx of image I``; those that were estimated.
+    unit : str
+        Unit of object space.
+
+    Examples
+    --------
+    >>> motion = MotionEstimates(("i1",), np.ones((1, 6)), 0.01 * np.eye(6)[None], (), "m")
+    >>> motion
+    <MotionEstimates: 1 image, speed 1.7 m/s in the median>
+    >>> motion.sigma.round(3)
+    array([[0.1, 0.1, 0.1, 0.1, 0.1, 0.1]])
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    cov: Array
+    tests: tuple[CoefficientTest, ...]
+    unit: str
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (k, 6)."""
+        sigma: Array = np.sqrt(np.maximum(np.diagonal(self.cov, axis1=1, axis2=2), 0.0))
+        return sigma
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
+            (f"{len(self.names)} image{'s' * (len(self.names) != 1)}", ""),
+            ("speed", _median(self.values[:, :3], f"{self.unit}/s")),
+        ]
+
+    def _columns(self) -> dict[str, list[object]]:
+        found: dict[str, list[object]] = {"image": list(self.names)}
+        for k, name in enumerate(MOTION):
+            found[name], found[f"s_{name}"] = self.values[:, k].tolist(), self.sigma[:, k].tolist()
+        return found
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -22,7 +22,14 @@ from ...optics.refraction import RefractedRays
 from ..network import Network
 from ..solver import BundleFit
 from ..solver.rig_constraints import RigConstraints
-from .estimates import CameraEstimate, ImageEstimates, PointEstimates, RefractionEstimate, RigEstimate
+from .estimates import (
+    CameraEstimate,
+    ImageEstimates,
+    MotionEstimates,
+    PointEstimates,
+    RefractionEstimate,
+    RigEstimate,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -265,6 +272,26 @@ class Result(Display):
         cameras, references = (tuple(names[k] for k in rows) for rows in (at, constraints.references[at]))
         cov = cofactors[each, :, each] * self.fit.variance
         return RigEstimate(cameras, references, places.rotation[at], places.base[at], cov, self.network.unit)
+
+    @cached_property
+    def motion(self) -> MotionEstimates | None:
+        """Velocities and rotation rates of images; None where none was estimated."""
+        unknowns, network, sigma0 = self.fit.unknowns, self.network, self.sigma0
+        images = np.flatnonzero(unknowns.motion >= 0)
+        if not len(images):
+            return None
+        at = unknowns.motion[images, None] + np.arange(6)
+        cofactor, values = self.fit.cofactors.reduced, self.fit.values.motion[images]
+        size = np.sqrt(np.maximum(np.diag(cofactor), 0.0))[at]
+        tests = tuple(
+            ratio_test(
+                unknowns.names[at[k, c]], float(values[k, c] / size[k, c]),
+                sigma0 if self.redundancy > 0 else None, self.redundancy,
+            )
+            for k, c in np.argwhere(network.motion_free[images])
+        )  # fmt: skip
+        cov = cofactor[at[:, :, None], at[:, None, :]] * self.fit.variance
+        return MotionEstimates(tuple(network.images[i] for i in images), values, cov, tests, network.unit)
 
     def _partners(self, columns: Rows) -> tuple[tuple[str, float], ...]:
         """Most correlated other reduced unknown of each of these columns, and the correlation."""

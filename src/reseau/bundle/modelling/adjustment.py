@@ -113,6 +113,7 @@ def _begun(
     found, doubts = approximate(network), tuple[Remark, ...]()
     unknowns = Unknowns.of(network, finite(found.x0))
     start = Values.of_cameras(unknowns, found.rotation, found.x0, found.xyz)
+    start = replace(start, motion=found.motion)
     if network.stage is not None:
         moved, rotation, x0 = network.stage.approximate(start.rotation, start.x0)
         start = replace(start, rotation=rotation, x0=x0, stage=moved)

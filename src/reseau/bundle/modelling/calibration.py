@@ -121,4 +121,7 @@ def _model(camera: Camera) -> CameraModel:
     extra = camera.additional
     if extra is not None:
         model["additional"] = {"model": extra.model, "base_mm": extra.base_mm, "per": extra.per}
+    if camera.shutter is not None:
+        shutter = camera.shutter
+        model["shutter"] = {"mode": shutter.mode, "line_s": shutter.line_s, "row": shutter.row}
     return model

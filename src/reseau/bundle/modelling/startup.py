@@ -136,11 +136,11 @@ def retried(problem: BundleProblem) -> BundleProblem | None:
     known = np.where(given[:, None], start.xyz, network.xyz)
     found = approximate(
         replace(network, cameras=cameras, x0=np.where(kept[:, None], start.x0, np.nan), rotation=rotation,
-                xyz=known)
+                xyz=known, motion=start.motion)
     )  # fmt: skip
     trial = replace(
         problem,
-        start=replace(start, rotation=found.rotation, x0=found.x0,
+        start=replace(start, rotation=found.rotation, x0=found.x0, motion=found.motion,
                       xyz=np.where(finite(start.xyz)[:, None] & given[:, None], start.xyz, found.xyz)),
         rounds=0,
     )  # fmt: skip
@@ -154,7 +154,8 @@ def retried(problem: BundleProblem) -> BundleProblem | None:
     gained |= bool((finite(xyz) & ~finite(start.xyz) & _seen_by(network, finite(x0), 2)).any())
     if not gained:
         return None
-    return replace(trial, start=replace(trial.start, x0=x0, rotation=turn, xyz=xyz))
+    motion = np.where(worse[:, None], start.motion, trial.start.motion)
+    return replace(trial, start=replace(trial.start, x0=x0, rotation=turn, xyz=xyz, motion=motion))
 
 
 def improved(problem: BundleProblem, fit: BundleFit) -> BundleFit:

@@ -5,6 +5,7 @@ from .example import example_network
 from .network import Additional, Camera, ControlPoints, Network
 from .rig import Rig
 from .settings import network_document, with_control, with_datum, with_parameters, with_sigma
+from .shutter import Shutter
 from .stage import Stage
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "ControlPoints",
     "Network",
     "Rig",
+    "Shutter",
     "Stage",
     "calibrated_camera",
     "example_network",

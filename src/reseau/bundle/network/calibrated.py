@@ -19,10 +19,11 @@ from ...core.errors import UsageError
 from ...io import FrameOrientation
 from ...optics.cameras import camera_model
 from .network import Camera
+from .shutter import Shutter
 
 __all__ = ["calibrated_camera", "film_camera"]
 
-_KEYS = ("model", "width", "height", "pitch_mm", "additional")
+_KEYS = ("model", "width", "height", "pitch_mm", "additional", "shutter")
 """Keys of `Calibration.model` for every camera; all others are options of the camera model."""
 
 
@@ -76,6 +77,7 @@ def calibrated_camera(name: str, calibration: Calibration, *, held: bool = False
         options={} if whole else {key: value for key, value in model.items() if key not in _KEYS},
         mapping=mapping.mapping if whole else None,
         covariance=None if held else covariance,
+        shutter=None if model.get("shutter") is None else Shutter(**model["shutter"]),
     )
 
 

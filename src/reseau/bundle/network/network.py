@@ -266,8 +266,13 @@ class Camera:
 
     @property
     def has_plane_mapping(self) -> bool:
-        """Whether :meth:`plane_mapping` is defined; not for cameras with several sets of parameters."""
+        """Whether :meth:`plane_mapping` has an image of its own.
+
+        Not for cameras with several sets of parameters, and not for line cameras, whose y is a time.
+        """
         extra, model = self.additional, self.registered
+        if self.shutter is not None and self.shutter.mode == "line":
+            return False
         if extra is None or model is None or model.combine is None:
             return True
         return extra.per == "camera" and model.combine(self.bare_mapping(), extra.mapping()) is not None
@@ -289,6 +294,7 @@ class Camera:
             additional=None
             if extra is None
             else Additional(extra.base_mm, extra.free, extra.per, model=extra.model),
+            shutter=None if entry.shutter is None else Shutter(**entry.shutter.model_dump()),
         )
 
 
@@ -436,12 +442,16 @@ class Network(Display):
 
     @cached_property
     def motion_free(self) -> Mask:
-        """Components of the motion that are estimated (m, 6); there is none along parallel rays."""
+        """Components of the motion that are estimated (m, 6).
+
+        With parallel rays these are vx, vy, wz at most: nothing depends on vz, and a rotation about the other
+        axes is one about a point at a distance that is not determined.
+        """
         none = np.zeros(6, dtype=bool)
         free = np.array([none if c.shutter is None else c.shutter.is_free for c in self.cameras])[
             self.camera_of
         ]
-        free[self.parallel, 2] = False
+        free[self.parallel, 2:5] = False
         return free
 
     @cached_property
@@ -540,6 +550,8 @@ class Network(Display):
             rig=_rig(document, camera_row),
             refraction=None if document.refraction is None
             else document.refraction.refraction(images.id, images.camera),
+            motion=None if images.motion is None
+            else np.array([6 * [0.0] if row is None else row for row in images.motion], dtype=np.float64),
         )  # fmt: skip
 
     def _facts(self) -> list[tuple[str, str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from ...io.network import (
     Network1,
     ObservationColumns,
     PointColumns,
+    ShutterEntry,
 )
 from .network import Camera, ControlPoints, Datum, Network, finite
 
@@ -224,6 +225,7 @@ def network_document(network: Network) -> Network1:
             group=network.groups if any(network.groups) else None,
             exposure=None if network.rig is None
             else tuple(str(e) if e >= 0 else None for e in network.rig.exposure.tolist()),
+            motion=_motion(network),
         ),
         points=PointColumns(
             id=network.points,
@@ -253,6 +255,16 @@ def network_document(network: Network) -> Network1:
     )  # fmt: skip
 
 
+def _motion(network: Network) -> tuple[Any, ...] | None:
+    """Motion of the images of cameras with a shutter; None where none is known."""
+    if network.motion is None or not network.shutters.any():
+        return None
+    return tuple(
+        tuple(row) if moves else None
+        for row, moves in zip(network.motion.tolist(), network.shutters.tolist(), strict=True)
+    )
+
+
 def _bases(network: Network, ids: list[str]) -> BaseColumns | None:
     rig = network.rig
     if rig is None or not len(rig.base):
@@ -271,6 +283,9 @@ def _entry(camera: Camera) -> CameraEntry:
         additional = AdditionalParameters(
             base_mm=extra.base_mm, free=extra.free, per=extra.per, model=extra.model
         )
+    shutter = None
+    if camera.shutter is not None:
+        shutter = ShutterEntry(**asdict(camera.shutter))
     content: dict[str, Any] = {
         "id": camera.id,
         "width": camera.width,
@@ -281,6 +296,7 @@ def _entry(camera: Camera) -> CameraEntry:
         "free": camera.free,
         "sigma": dict(camera.sigma) or None,
         "additional": additional,
+        "shutter": shutter,
     }
     return CameraEntry(**content | dict(camera.options))
 

@@ -16,6 +16,7 @@ from ..network import Network
 from ..network.network import finite
 from .datum import similarity_onto
 from .parallel import resect_parallel
+from .pushbroom import resect_line
 from .spatial import behind_ports, directions, intersect, relative_orientation, resect, resect_through
 from .values import Values
 
@@ -50,6 +51,8 @@ class Approximate(Display):
         Projection centres, NaN likewise.
     xyz : ndarray (p, 3)
         Points, NaN likewise.
+    motion : ndarray (m, 6)
+        Velocities and rotation rates, as given or found.
     notes : tuple of Remark
         Warnings about the approximate values.
 
@@ -63,6 +66,7 @@ class Approximate(Display):
     rotation: Array
     x0: Array
     xyz: Array
+    motion: Array
     notes: tuple[Remark, ...] = ()
 
     def _facts(self) -> list[tuple[str, str]]:
@@ -126,6 +130,11 @@ class _Block:
         self.rotation[posed] = rotation_matrix(network.rotation[posed])
         self.x0[~posed] = np.nan
         self.refused: set[int] = set()
+        self.motion = network.motions.copy()
+        lines = np.array([c.shutter is not None and c.shutter.mode == "line" for c in network.cameras])
+        self.lines: Mask = lines[network.camera_of]
+        shutter = np.array([c.shutter_columns for c in network.cameras])[network.camera_of[network.image_of]]
+        self.time = (network.xy[:, 1] - shutter[:, 1]) * shutter[:, 0]
         self.angle = np.where(self.known, np.pi / 2, 0.0)
         self._straighten()
 
@@ -153,7 +162,7 @@ class _Block:
             self._scale_to_windows(self.network.refraction)
         given = finite(self.network.xyz)
         xyz = np.where(given[:, None], self.network.xyz, self.xyz)
-        return Approximate(self.rotation, self.x0, xyz, tuple(notes))
+        return Approximate(self.rotation, self.x0, xyz, self.motion, tuple(notes))
 
     def _grow(self) -> None:
         """Intersect points and resect images in turn until nothing is added."""
@@ -172,10 +181,11 @@ class _Block:
         network = self.network
         rows = self.posed[network.image_of] & ~self.known[network.point_of] & finite(self.uv)
         image, point = network.image_of[rows], network.point_of[rows]
-        uv = self.uv[rows]
+        uv, time = self.uv[rows], self.time[rows]
         for _ in range(3):
-            xyz, angle = intersect(image, point, uv, self.rotation, self.x0, len(self.xyz), network.parallel)
-            off = self._misfit(image, point, uv, xyz)
+            rotation, x0 = self._poses(image, time)
+            xyz, angle = intersect(point, uv, rotation, x0, len(self.xyz), network.parallel[image])
+            off = self._misfit(image, point, uv, time, xyz)
             worst = np.zeros(len(xyz))
             np.maximum.at(worst, point, np.nan_to_num(off, posinf=1e9))
             count = np.bincount(point, minlength=len(xyz))
@@ -183,14 +193,21 @@ class _Block:
             bad = (off >= worst[point]) & (off > limit) & (count[point] > 2)
             if not bad.any():
                 break
-            image, point, uv = image[~bad], point[~bad], uv[~bad]
+            image, point, uv, time = image[~bad], point[~bad], uv[~bad], time[~bad]
         free = ~self.known
         self.xyz[free] = xyz[free]
         self.angle = np.where(self.known, np.pi / 2, angle)
 
-    def _misfit(self, image: Rows, point: Rows, uv: Array, xyz: Array) -> Array:
+    def _poses(self, image: Rows, time: Array) -> tuple[Array, Array]:
+        """Rotations (n, 3, 3) and projection centres (n, 3) at the times of rays."""
+        rotation, x0, motion = self.rotation[image], self.x0[image], time[:, None] * self.motion[image]
+        x0 = x0 + np.einsum("nji,nj->ni", rotation, motion[:, :3])
+        return (rotation_matrix(motion[:, 3:]) @ rotation if motion[:, 3:].any() else rotation), x0
+
+    def _misfit(self, image: Rows, point: Rows, uv: Array, time: Array, xyz: Array) -> Array:
         """Angles (sine) between computed and measured directions; infinite behind the camera."""
-        x = np.einsum("nij,nj->ni", self.rotation[image], xyz[point] - self.x0[image])
+        rotation, x0 = self._poses(image, time)
+        x = np.einsum("nij,nj->ni", rotation, xyz[point] - x0)
         # Parallel rays: the distance from the ray, in that from the camera, which stands for its size.
         beside = self.network.parallel[image]
         x[beside, :2] -= uv[beside]
@@ -234,6 +251,8 @@ class _Block:
     def _resect(self, i: int, rows: Mask) -> bool:
         """Orient an image by some of its points; return whether it could be oriented."""
         refraction, xyz = self.network.refraction, self.xyz[self.network.point_of[rows]]
+        if self.lines[i]:
+            return self._resect_line(i, rows)
         if self.network.parallel[i]:
             straight = resect_parallel(xyz, self.uv[rows], _LOOSE)
             if straight is None or straight.agree.sum() < max(4, 0.5 * rows.sum()):
@@ -249,6 +268,19 @@ class _Block:
         if found is None or found.agree.sum() < max(4, 0.5 * rows.sum()):
             return False
         self.rotation[i], self.x0[i] = found.rotation, found.x0
+        return True
+
+    def _resect_line(self, i: int, rows: Mask) -> bool:
+        """Orient an image of a line camera, and find its velocity; return whether it could be oriented."""
+        if self.network.parallel[i]:
+            return False
+        point = self.network.point_of[rows]
+        found = resect_line(self.xyz[point], self.uv[rows][:, 0], self.time[rows])
+        if found is None:
+            return False
+        self.rotation[i], self.x0[i] = found.rotation, found.x0
+        free = self.network.motion_free[i]
+        self.motion[i] = np.where(free, [*found.velocity, 0.0, 0.0, 0.0], self.motion[i])
         return True
 
     def _scale_to_windows(self, refraction: Refraction) -> None:
@@ -336,7 +368,7 @@ class _Block:
     def _pair(self, a: int, b: int) -> tuple[float, Array, Array] | None:
         """Return the score of a pair and its relative orientation."""
         network = self.network
-        if network.parallel[[a, b]].any():
+        if network.parallel[[a, b]].any() or self.lines[[a, b]].any():
             # Two images with parallel rays do not determine their angle.
             return None
         in_a, in_b = np.flatnonzero(network.image_of == a), np.flatnonzero(network.image_of == b)
@@ -349,9 +381,9 @@ class _Block:
             return None
         k = len(first)
         poses = np.stack([np.eye(3), found.rotation]), np.stack([np.zeros(3), found.x0])
-        rays = np.concatenate([np.zeros(k, np.intp), np.ones(k, np.intp)])
+        rays = np.repeat([0, 1], k)
         points = np.concatenate([np.arange(k), np.arange(k)])
-        _, angle = intersect(rays, points, np.concatenate([first, second]), *poses, k)
+        _, angle = intersect(points, np.concatenate([first, second]), poses[0][rays], poses[1][rays], k)
         agree = found.agree
         score = float(agree.sum()) * min(float(np.median(angle[agree])), 0.5) if agree.any() else 0.0
         return score, found.rotation, found.x0

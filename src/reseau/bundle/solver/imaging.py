@@ -115,7 +115,6 @@ def _image(
             u, v = x[0], x[1]
         else:
             u, v = x[0] / x[2], x[1] / x[2]
-        room[0, 0], room[0, 1], room[0, 2] = x[0], x[1], x[2]
         camera(k, c, seen.extra[k], u, v, seen.xy, cameras, by_uv, d, more, off)
         return 0.0
     # The line on which the point is seen, by Newton's method: f(line) = line with a rolling shutter,
@@ -205,7 +204,7 @@ def _derive(
     the camera.
     """
     by_uv, off, x, room = np.empty((2, 2)), np.empty(2), np.empty(3), np.empty((4, 3))
-    back = np.empty(3)
+    back, body = np.empty(3), np.empty(3)
     d, more = np.empty((2, cameras.values.shape[1])), np.empty((2, cameras.extra.shape[1]))
     g, root, turn = np.empty((2, 3)), seen.root, at.rotation
     last = a_out.shape[2] - cameras.extra.shape[1]
@@ -234,6 +233,8 @@ def _derive(
                         g[q, 0] * bent.by[k, 0, 9 + s] + g[q, 1] * bent.by[k, 1, 9 + s]
                     )
                 continue
+            for s in range(3):
+                body[s] = x[s]
             if rays.parallel[c]:
                 g[q, 2] = 0.0
             else:
@@ -249,9 +250,12 @@ def _derive(
                 if moving:
                     for s in range(3):
                         a_out[k, q, last - windows - 6 + s] = -t * g[q, s]
-            a_out[k, q, 0] = g[q, 2] * room[0, 1] - g[q, 1] * room[0, 2]
-            a_out[k, q, 1] = g[q, 0] * room[0, 2] - g[q, 2] * room[0, 0]
-            a_out[k, q, 2] = g[q, 1] * room[0, 0] - g[q, 0] * room[0, 1]
+                # The rotation turns the point before the shift.
+                for s in range(3):
+                    body[s] = room[0, s] + t * at.motion[i, s]
+            a_out[k, q, 0] = g[q, 2] * body[1] - g[q, 1] * body[2]
+            a_out[k, q, 1] = g[q, 0] * body[2] - g[q, 2] * body[0]
+            a_out[k, q, 2] = g[q, 1] * body[0] - g[q, 0] * body[1]
             for s in range(3):
                 along = g[q, 0] * turn[i, 0, s] + g[q, 1] * turn[i, 1, s] + g[q, 2] * turn[i, 2, s]
                 a_out[k, q, 3 + s] = -(g[q, s] if rays.parallel[c] else along)

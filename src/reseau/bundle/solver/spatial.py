@@ -63,7 +63,10 @@ def directions(network: Network) -> Array:
     for c, entry in enumerate(network.cameras):
         rows = camera == c
         if rows.any():
-            found[rows] = _inverse(entry, network.xy[rows])
+            xy = network.xy[rows]
+            if entry.shutter is not None and entry.shutter.mode == "line":
+                xy = np.column_stack([xy[:, 0], np.full(len(xy), entry.shutter.row)])
+            found[rows] = _inverse(entry, xy)
     return found
 
 
@@ -116,36 +119,36 @@ def behind_ports(refraction: Refraction, uv: Array, image_of: Rows) -> Array:
 
 
 def intersect(
-    image: Rows, point: Rows, uv: Array, rotation: Array, x0: Array, points: int, parallel: Mask | None = None
+    point: Rows, uv: Array, rotation: Array, x0: Array, points: int, parallel: Mask | None = None
 ) -> tuple[Array, Array]:
     """Compute the points nearest to all their rays, and the intersection angles of the rays.
 
     Parameters
     ----------
-    image, point : ndarray of int (n,)
-        Rays.
+    point : ndarray of int (n,)
+        Point of each ray.
     uv : ndarray (n, 2)
         Ideal directions.
-    rotation, x0 : ndarray (m, 3, 3), (m, 3)
-        Poses.
+    rotation, x0 : ndarray (n, 3, 3), (n, 3)
+        Pose of the camera of each ray.
     points : int
         Number of points p.
-    parallel : ndarray of bool (m,), optional
-        Images with parallel rays, whose `uv` are xc, yc.
+    parallel : ndarray of bool (n,), optional
+        Rays of cameras with parallel rays, whose `uv` are xc, yc.
 
     Returns
     -------
     ndarray (p, 3), ndarray (p,)
         Points, NaN with fewer than two rays; intersection angles (rad), 0 for parallel rays.
     """
-    beside = np.zeros(len(uv), dtype=bool) if parallel is None else parallel[image]
+    beside = np.zeros(len(uv), dtype=bool) if parallel is None else parallel
     uv3 = np.column_stack([uv, np.zeros(len(uv))])
     ray = np.where(beside[:, None], 0.0, uv3)
     ray[:, 2] = 1.0
-    ray = np.einsum("nji,nj->ni", rotation[image], ray)
+    ray = np.einsum("nji,nj->ni", rotation, ray)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
-    begin = x0[image] + np.einsum("nji,nj->ni", rotation[image], np.where(beside[:, None], uv3, 0.0))
+    begin = x0 + np.einsum("nji,nj->ni", rotation, np.where(beside[:, None], uv3, 0.0))
     centre = begin.mean(axis=0) if len(begin) else np.zeros(3)
     normal, side = np.zeros((points, 3, 3)), np.zeros((points, 3))
     np.add.at(normal, point, across)

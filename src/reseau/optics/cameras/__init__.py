@@ -23,6 +23,7 @@ from .projections import (  # isort: skip
 )
 from .telecentric import Telecentric  # isort: skip
 from .openptv import OpenPtv  # isort: skip
+from .line_scan import LineScan  # isort: skip
 from .convert import Converted, convert
 from .ebner import EbnerCorrection
 from .grid import PixelGrid
@@ -57,6 +58,7 @@ __all__ = [
     "Equisolid",
     "Fisheye",
     "FourierCorrection",
+    "LineScan",
     "Omni",
     "OpenCV",
     "OpenPtv",
