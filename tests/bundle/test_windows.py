@@ -123,9 +123,11 @@ def test_a_free_network_behind_ports_takes_its_scale_from_a_distance(kind: str) 
     assert isinstance(fit, BundleFit)
     base = np.linalg.norm(fit.values.x0[1] - fit.values.x0[0])
     assert base == pytest.approx(np.linalg.norm(world.x0[1] - world.x0[0]), abs=0.01)
-    alone = networks.by_itself(world.noisy(0)).adjusted()
-    assert not alone
-    assert "windows determine the scale" in str(alone)
+    # From seed 2 the dome leads to a small false network in which the scale seems good to 2 %.
+    for seed in (0, 2):
+        alone = networks.by_itself(world.noisy(seed)).adjusted()
+        assert not alone
+        assert "windows determine the scale" in str(alone)
 
 
 def test_a_window_on_the_object_moves_with_a_free_network() -> None:
@@ -198,7 +200,11 @@ def test_a_camera_by_its_mapping_gives_the_same_result_as_the_registered_one() -
     fits = [world.problem(net).adjusted() for net in (network, mapped)]
     assert isinstance(fits[0], BundleFit)
     assert isinstance(fits[1], BundleFit)
-    np.testing.assert_allclose(fits[0].values.refraction, fits[1].values.refraction, rtol=0, atol=1e-8)
+    at = fits[0].unknowns.refraction_columns
+    sigma = np.sqrt(np.diag(fits[0].cofactors.reduced)[at])
+    off = (fits[0].values.refraction - fits[1].values.refraction)[fits[0].unknowns.refracting]
+    # Both end at the minimum within the tolerance of the iteration, which is a part of the sigmas.
+    np.testing.assert_allclose(off / sigma, 0.0, rtol=0, atol=1e-4)
     assert fits[0].sigma0 == pytest.approx(fits[1].sigma0, abs=1e-9)
 
 

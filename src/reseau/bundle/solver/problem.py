@@ -49,6 +49,8 @@ _DAMPING = 1e-5
 LAST_ROUND = 12
 # Iterations, and relative offset, of the first adjustment with windows and media as given.
 _BEFORE_WINDOWS, _ROUGHLY = 30, 1e-2
+# Relative standard deviation of a scale above which covariances of first order say nothing about it.
+_LOOSE = 0.2
 # Iterations after which poorly determined points of an adjustment that has not converged are left out.
 _SLOW = 50
 
@@ -425,7 +427,36 @@ class _Run:
                 left.start.x0[images] = np.nan
                 return left._adjusted(self.options)
             return undetermined(linear, freedom, tuple(found.costs))
+        sigma0 = float(np.sqrt(linear.cost / redundancy)) if redundancy > 0 else 1.0
+        if self._scale_is_loose((start, values), sigma0, chosen if inner else None):
+            return AdjustmentFailure(
+                SCALE_OF_WINDOWS, Code.NOT_IDENTIFIED, iterations=found.iterations, costs=found.costs
+            )
         return self._fit(linear, freedom, cofactors, counts, found, chosen if inner else None)
+
+    def _scale_is_loose(self, at: tuple[Values, ...], sigma0: float, datum: Mask | None) -> bool:
+        """Whether windows alone determine the scale, and worse than covariances of first order can say.
+
+        The standard deviation of the scale is that of the root mean square distance of the projection centres
+        from their mean. It is computed at the approximate values as well: from there an iteration without a
+        scale can reach a small false network that looks determined.
+        """
+        unknowns, part = self.unknowns, self.usable.points
+        images = np.flatnonzero(unknowns.pose >= 0)
+        for values in at:
+            if self.network.refraction is None or not scaled_by_windows(self.system, values, part):
+                return False
+            linear = self.system.linearise(values)
+            try:
+                cofactors = cofactors_of(linear, freedom_of(self.system, values, part), datum, part)
+            except Singular:
+                return True
+            centres = values.x0[images] - values.x0[images].mean(axis=0)
+            along = np.zeros(unknowns.size)
+            along[unknowns.pose[images, None] + np.arange(3, 6)] = centres / (centres**2).sum()
+            if sigma0 * np.sqrt(along @ cofactors.reduced @ along) > _LOOSE:
+                return True
+        return False
 
     def _without_axes(self) -> Failure | None:
         """A failure where the axes of a rig, in which a window is given, would be those of another camera."""
