@@ -2,6 +2,7 @@
 
 from .archive import Archive
 from .export import describe, export
+from .journal import Entry, Journal
 from .objects import LocalObjects, Objects, RemoteObjects, objects_at
 from .picture import frame_of, tiff_of
 from .records import ArchivedFrame, ArchivedResult, SessionSummary, Verdict
@@ -12,6 +13,8 @@ __all__ = [
     "Archive",
     "ArchivedFrame",
     "ArchivedResult",
+    "Entry",
+    "Journal",
     "LocalObjects",
     "Objects",
     "RemoteObjects",

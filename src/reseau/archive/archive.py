@@ -14,6 +14,7 @@ from sqlalchemy.engine import Engine
 from ..core.errors import ArchiveError
 from ..core.version import __version__
 from . import schema
+from .journal import Journal, journals
 from .objects import LocalObjects, Objects, objects_at
 from .records import SessionSummary, utc
 from .session import INPUT, Session
@@ -192,6 +193,14 @@ class Archive:
             SessionSummary(name, plan, utc(begun), frames, results, status or "not ended")
             for name, plan, begun, frames, results, status in rows
         ]
+
+    def journal(self, name: str) -> Journal:
+        """Return the journal of this name, which may be empty yet."""
+        return Journal(self._engine, name)
+
+    def journals(self, prefix: str = "") -> list[str]:
+        """Return the names of the journals that start with `prefix`."""
+        return journals(self._engine, prefix)
 
     def faults(self) -> list[str]:
         """Return the faults that the database finds in the index."""

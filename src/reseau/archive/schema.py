@@ -8,8 +8,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from json import JSONDecodeError
 from pathlib import Path
+from typing import Any
 
 import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import Engine
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
@@ -19,10 +21,14 @@ from ..core.errors import ArchiveError
 __all__ = [
     "connected",
     "ends",
+    "entries",
     "events",
+    "extend",
+    "extended",
     "faults",
     "frames",
     "inputs",
+    "insert_new",
     "make",
     "metadata",
     "results",
@@ -121,6 +127,21 @@ ends = sa.Table(
     sa.Column("at", _TIME, nullable=False),
 )
 
+# Added after the first archives were written: `extend` creates it there before its first entry.
+entries = sa.Table(
+    "entries",
+    metadata,
+    _key(),
+    sa.Column("journal", _TEXT, nullable=False),
+    sa.Column("key", _TEXT, nullable=False),
+    sa.Column("kind", _TEXT, nullable=False),
+    sa.Column("document", _JSON, nullable=False),
+    sa.Column("at", _TIME, nullable=False),
+    sa.UniqueConstraint("journal", "key"),
+)
+_FIRST = set(metadata.tables) - {entries.name}
+"""Tables that every archive has."""
+
 
 def _run(target: sa.Table | sa.MetaData, when: str, dialect: str, statement: str) -> None:
     """Run a statement of one database when tables are created."""
@@ -173,14 +194,44 @@ def make(url: str, *, create: bool, read_only: bool = False) -> Engine:
     except (SQLAlchemyError, ImportError) as error:
         raise ArchiveError(f"cannot be used as an index ({_brief(error)})", where=_shown(url)) from None
     with connected(engine) as connection:
-        if engine.dialect.name == "postgresql":  # one process creates the tables, others wait
-            connection.execute(sa.select(sa.func.pg_advisory_xact_lock(zlib.crc32(b"reseau archive"))))
+        _one_at_a_time(connection)
         there = set(sa.inspect(connection).get_table_names())
-        if not create and not set(metadata.tables) <= there:
+        if not create and not there >= _FIRST:
             raise ArchiveError("is not an archive", where=_shown(url), do="create one with `reseau capture`")
-        if not set(metadata.tables) <= there:
+        if not there >= _FIRST:
             metadata.create_all(connection)
     return engine
+
+
+def _one_at_a_time(connection: sa.Connection) -> None:
+    """Let one process create tables while others wait; SQLite does it for every transaction."""
+    if connection.dialect.name == "postgresql":
+        connection.execute(sa.select(sa.func.pg_advisory_xact_lock(zlib.crc32(b"reseau archive"))))
+
+
+def extended(connection: sa.Connection) -> bool:
+    """Return whether the archive has journals; archives of earlier versions do not."""
+    return sa.inspect(connection).has_table(entries.name)
+
+
+def extend(engine: Engine) -> None:
+    """Add journals to the tables of an archive of an earlier version; its other tables stay as they are.
+
+    Raises
+    ------
+    ArchiveError
+        If the archive is read-only, or its user may not create tables.
+    """
+    with connected(engine) as connection:
+        if not extended(connection):
+            _one_at_a_time(connection)
+            metadata.create_all(connection, tables=[entries])
+
+
+def insert_new(connection: sa.Connection, table: sa.Table, unique: tuple[str, ...]) -> Any:
+    """Return an insertion that does nothing where a row with these unique columns exists."""
+    module = sqlite if connection.dialect.name == "sqlite" else postgresql
+    return module.insert(table).on_conflict_do_nothing(index_elements=list(unique))
 
 
 def _sqlite(path: Path, read_only: bool) -> Engine:

@@ -23,6 +23,7 @@ from . import (
     bundle,
     bundle_compare,
     calibrate,
+    calibrations,
     capture,
     capture_own,
     capture_sensor,
@@ -57,6 +58,7 @@ capture.app.command()(capture_sensor.sensor)
 capture.app.command()(capture_own.own)
 app.add_typer(capture.app, name="capture")
 app.add_typer(archive.app, name="archive")
+app.add_typer(calibrations.app, name="calibrations")
 app.command()(orient.orient)
 app.command()(refine.refine)
 app.command()(apply.apply)

@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
 import typer
 
 from ..core.errors import UsageError
+from .calibrations import time_of
 from .common import (
     AsJson,
+    ObjectsPlace,
     Out,
+    open_archive,
     points_document,
     progress,
     say,
@@ -40,7 +43,8 @@ def apply(
     calibration: Annotated[
         Path,
         typer.Argument(
-            help="Calibration of a camera, an oscilloscope, a film frame, fiducial marks or a sensor."
+            help="Calibration of a camera, an oscilloscope, a film frame, fiducial marks or a sensor; "
+            "with --archive the name of a configuration."
         ),
     ],
     source: Annotated[
@@ -99,6 +103,15 @@ def apply(
         float | None,
         typer.Option(min=0.0, help="Exposure time of the frame (ms). Default: that of the calibration."),
     ] = None,
+    archive: Annotated[
+        str | None,
+        typer.Option("--archive", "-a", help="Archive with the calibrations in force of a configuration."),
+    ] = None,
+    objects: ObjectsPlace = None,
+    at: Annotated[
+        str | None,
+        typer.Option(help="With --archive: when the image was taken, such as 2026-03-29T08:00Z."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Apply a calibration to points or to an image.
@@ -108,11 +121,19 @@ def apply(
     the frame (film frame, fiducial marks). With the calibration of a sensor, the grey values are corrected.
     """
     from ..calibration import VIDEOS, SensorCorrection, read_calibration
+    from ..core.provenance import sha256_of
     from ..io import is_points
 
     if scale is not None and not scale > 0:
         raise UsageError(f"{scale:g} is not positive", where="--scale")
-    stored = read_calibration(calibration)
+    in_archive = {"--at": at, "--objects": objects} if archive is None else {}
+    for name, given in in_archive.items():
+        if given is not None:
+            raise UsageError("needs --archive", where=name)
+    if archive is None:
+        stored, origin = read_calibration(calibration), {calibration.name: sha256_of(calibration)}
+    else:
+        stored, origin = _in_force(archive, objects, str(calibration), at)
     view = _View(_fov(fov), scale, alpha)
     if alpha is not None and fov != "keep":
         raise UsageError("cannot be combined", where="--fov and --alpha")
@@ -137,13 +158,37 @@ def apply(
     elif object_system or directions:
         raise UsageError("applies to points only", where="--object" if object_system else "--directions")
     elif isinstance(mapping, SensorCorrection):
-        _frame(mapping, calibration, source, out, exposure_ms, as_json)
+        _frame(mapping, origin, source, out, exposure_ms, as_json)
     elif source.is_dir():
-        _folder(stored, mapping, calibration, source, out, view, as_json)
+        _folder(stored, mapping, origin, source, out, view, as_json)
     elif source.suffix.lower() in VIDEOS:
         _video(stored, mapping, source, out, view)
     else:
-        _image(stored, mapping, calibration, source, out, view, as_json)
+        _image(stored, mapping, origin, source, out, view, as_json)
+
+
+def _in_force(
+    archive: str, objects: str | None, name: str, at: str | None
+) -> tuple[Calibration, dict[str, str]]:
+    """The calibration of a configuration that applies at a time, and its SHA-256 by its name.
+
+    Raises
+    ------
+    UsageError
+        If no time is given, or no calibration applies.
+    """
+    from ..core.provenance import sha256_of
+    from ..service import Configurations
+
+    time = time_of(at, "--at")
+    if time is None:
+        raise UsageError("is needed with --archive", where="--at", do="say when the image was taken")
+    with open_archive(archive, objects) as found:
+        applied = Configurations(found).applied(name, time)
+    if applied is None:
+        raise UsageError(f"has no calibration in force at {time:%Y-%m-%d %H:%M}Z", where=name)
+    stored = applied.calibration
+    return stored, {f"{name} {applied.key}": sha256_of(stored.to_json().encode("utf-8"))}
 
 
 def _only(kind: str, required: str, options: dict[str, bool]) -> None:
@@ -310,7 +355,7 @@ def _tables(mapping: CalibratedMapping, path: Path, view: _View) -> None:
 def _folder(
     stored: Calibration,
     mapping: CalibratedMapping,
-    path: Path,
+    origin: dict[str, str],
     source: Path,
     out: Path | None,
     view: _View,
@@ -331,7 +376,7 @@ def _folder(
     for image in images:
         suffix = image.suffix if image.suffix.lower() in _IMAGES else ".png"
         try:
-            _image(stored, mapping, path, image, out / f"{image.stem}{suffix}", view, as_json)
+            _image(stored, mapping, origin, image, out / f"{image.stem}{suffix}", view, as_json)
         except (ImageError, UsageError) as error:
             typer.echo(f"left out: {error}", err=True)
 
@@ -371,7 +416,7 @@ def _warn(names: tuple[str, ...], why: tuple[str, ...]) -> None:
 def _image(
     stored: Calibration,
     mapping: CalibratedMapping,
-    path: Path,
+    origin: dict[str, str],
     source: Path,
     out: Path | None,
     view: _View,
@@ -392,7 +437,7 @@ def _image(
     raster = _raster(mapping, (width, height), view)
     with progress(f"resampling {source.name}", raster.bands) as step:
         write_corrected(out, planes, raster, step)
-    inputs = {source.name: sha256_of(source), path.name: sha256_of(path)}
+    inputs = {source.name: sha256_of(source)} | origin
     if stored.kind == "camera":
         provenance = Provenance(inputs, {"fov": view.fov, "scale": view.scale, "alpha": view.alpha})
         camera, beside = undistorted_camera(raster, stored, provenance.to_dict()), out.with_suffix(".json")
@@ -425,7 +470,7 @@ def _planes(source: Path, *, colours: bool) -> tuple[Any, ...]:
 
 def _frame(
     correction: SensorCorrection,
-    calibration: Path,
+    origin: dict[str, str],
     source: Path,
     out: Path | None,
     exposure_ms: float | None,
@@ -434,7 +479,7 @@ def _frame(
     """Correct the grey values of a frame: a TIFF of floats, or a PNG of 16 bit up to the full scale."""
     import numpy as np
 
-    from ..core.provenance import Provenance, canonical_json, sha256_of
+    from ..core.provenance import Provenance, canonical_json
     from ..io.images import read_image, write_image
 
     out = out or source.with_name(f"{source.stem}-corrected.tif")
@@ -449,7 +494,7 @@ def _frame(
         pixels = np.clip(np.rint(pixels / step), 0, 65535).astype(np.uint16)
     write_image(out, pixels)
     used = correction.exposure_us if exposure_us is None else exposure_us
-    inputs = {source.name: frame.sha256, calibration.name: sha256_of(calibration)}
+    inputs = {source.name: frame.sha256} | origin
     if as_json:
         content = {"image": str(out), "dn_per_step": step, "full_scale_dn": found.full_scale}
         provenance = Provenance(inputs, {"exposure_us": used})

@@ -328,7 +328,7 @@ def monitor(
     """
     options = options or ChartOptions()
     x = np.asarray(values, dtype=np.float64)
-    if x.ndim < 2:
+    if x.ndim < 2 or 0 in x.shape[-2:]:
         raise UsageError(f"have the shape {x.shape}, not (..., runs, series)", where="values")
     (n, c), lead = x.shape[-2:], x.shape[:-2]
     z = _design_rows(covariates, lead, n)

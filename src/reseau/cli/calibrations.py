@@ -1,0 +1,307 @@
+"""`reseau calibrations`: calibrations in force, decisions on new ones, history, drift."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..core.errors import EstimationError, UsageError
+from .common import ArchivePlace, AsJson, ObjectsPlace, Out, open_archive, say, suffix_of, writable
+
+if TYPE_CHECKING:
+    from ..service import Configurations, Decision
+
+__all__ = ["app", "time_of"]
+
+app = typer.Typer(no_args_is_help=True, help="Calibrations in force: decide, review, return, history, drift.")
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the configuration.")]
+Key = Annotated[str, typer.Argument(metavar="KEY", help="Decision, by the start of its key; see `history`.")]
+By = Annotated[str, typer.Option(help="By whom. Default: the user.")]
+Comment = Annotated[str, typer.Option("--comment", "-m", help="Why.")]
+Since = Annotated[
+    str | None, typer.Option(help="From when on it applies, such as 2026-03-29T08:00Z. Default: now.")
+]
+
+
+@contextmanager
+def _opened(archive: str, objects: str | None, *, create: bool = False) -> Iterator[Configurations]:
+    from ..service import Configurations
+
+    with open_archive(archive, objects, create=create) as found:
+        yield Configurations(found)
+
+
+def time_of(text: str | None, option: str) -> datetime | None:
+    """A time with its zone.
+
+    Raises
+    ------
+    UsageError
+        If it is not one.
+    """
+    if text is None:
+        return None
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError:
+        raise UsageError(f"{text!r} is not a time", where=option, do="use 2026-03-29T08:00Z") from None
+    if time.tzinfo is None:
+        raise UsageError(f"{text} has no time zone", where=option, do="add one, such as Z or +01:00")
+    return time.astimezone(UTC)
+
+
+@app.command()
+def define(
+    name: Name,
+    part: Annotated[
+        list[str], typer.Option("--part", "-p", help="Part, KEY=VALUE: camera, lens, settings, firmware.")
+    ],
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+) -> None:
+    """Define a configuration of an instrument."""
+    parts = dict(_pair(each) for each in part)
+    with _opened(archive, objects, create=True) as found:
+        found.define(name, parts)
+    say(f"{name}: {', '.join(f'{k} {v}' for k, v in parts.items())}\n")
+
+
+def _pair(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not equals or not key or not value:
+        raise UsageError(f"{text!r} is not KEY=VALUE", where="--part")
+    return key, value
+
+
+@app.command()
+def decide(
+    name: Name,
+    calibration: Annotated[Path, typer.Argument(help="New calibration, reseau-calibration/1.")],
+    rules: Annotated[Path, typer.Option(help="Rules of acceptance, reseau-acceptance/1.")],
+    since: Annotated[
+        str | None,
+        typer.Option(help="From when on it applies. Default: the time of its session, or now."),
+    ] = None,
+    by: By = "",
+    comment: Comment = "",
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+    as_json: AsJson = False,
+) -> None:
+    """Judge a new calibration by rules, and put it in force if they accept it (exit status 0)."""
+    from ..calibration import read_calibration
+    from ..service import AcceptanceRules
+
+    new, judged_by = read_calibration(calibration), AcceptanceRules.read(rules)
+    with _opened(archive, objects) as found:
+        made = found.decide(name, new, judged_by, since=time_of(since, "--since"), by=by, comment=comment)
+    _say_decision(made, as_json)
+    raise typer.Exit(0 if made.outcome.startswith("accepted") else 1)
+
+
+@app.command()
+def review(
+    name: Name,
+    key: Key,
+    outcome: Annotated[str, typer.Argument(metavar="accepted|rejected", help="Outcome of the review.")],
+    comment: Annotated[str, typer.Option("--comment", "-m", help="The reason.")],
+    by: By = "",
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+) -> None:
+    """Decide on a calibration that needs a review."""
+    with _opened(archive, objects) as found:
+        # Another text is refused by `review`.
+        made = found.review(name, key, outcome, by=by, comment=comment)  # type: ignore[arg-type]
+    _say_decision(made, False)
+
+
+@app.command()
+def comment(
+    name: Name,
+    key: Key,
+    text: Annotated[str, typer.Argument(help="Text.")],
+    by: By = "",
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+) -> None:
+    """Add a comment to a decision; the outcome stays as it is."""
+    with _opened(archive, objects) as found:
+        found.comment(name, key, text, by=by)
+
+
+@app.command("return")
+def return_(
+    name: Name,
+    key: Key,
+    since: Since = None,
+    by: By = "",
+    comment: Comment = "",
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+) -> None:
+    """Return to an earlier accepted calibration."""
+    with _opened(archive, objects) as found:
+        applied = found.roll_back(name, key, since=time_of(since, "--since"), by=by, comment=comment)
+    say(f"{name}: {applied.key} applies from {applied.since:%Y-%m-%d %H:%M:%S}Z\n")
+
+
+@app.command()
+def event(
+    name: Name,
+    what: Annotated[str, typer.Argument(help="What happened: lens changed, camera dropped.")],
+    at: Annotated[str | None, typer.Option(help="When. Default: now.")] = None,
+    by: By = "",
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+) -> None:
+    """Note a service event: from then on no calibration applies, and a run is due at once."""
+    with _opened(archive, objects) as found:
+        found.event(name, what, at=time_of(at, "--at"), by=by)
+
+
+@app.command()
+def show(
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Configuration. Default: all.")] = None,
+    at: Annotated[str | None, typer.Option(help="When the frame was taken. Default: now.")] = None,
+    known: Annotated[str | None, typer.Option(help="Use only what had been entered by this time.")] = None,
+    out: Out = None,
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show the calibration that applies at a time; --out writes it."""
+    from ..core.provenance import canonical_json
+
+    time, entered = time_of(at, "--at") or datetime.now(UTC), time_of(known, "--known")
+    if out is not None:
+        suffix_of(writable(out), (".json",))
+        if name is None:
+            raise UsageError("needs the name of a configuration", where="--out")
+    rows: list[dict[str, Any]] = []
+    with _opened(archive, objects) as found:
+        for each in found.names() if name is None else [name]:
+            applied = found.applied(each, time, entered)
+            row: dict[str, Any] = {"name": each, "parts": found.parts(each), "calibration": None}
+            if applied is not None:
+                why = {"since": applied.since.isoformat(), "why": applied.why}
+                row |= {"calibration": applied.key, **why}
+                if out is not None:
+                    applied.calibration.write(out)
+            rows.append(row)
+    if as_json:
+        say(canonical_json({"schema": "reseau-in-force/1", "at": time.isoformat(), "configurations": rows}))
+    else:
+        for row in rows:
+            since = "" if row["calibration"] is None else f" since {row['since'][:16]}Z, by {row['why']}"
+            say(f"{row['name']}: {row['calibration'] or 'no calibration in force'}{since}\n")
+    if out is not None and rows[0]["calibration"] is None:
+        raise EstimationError(f"no calibration applies at {time:%Y-%m-%d %H:%M}Z", where=name)
+
+
+@app.command()
+def history(
+    name: Name, archive: ArchivePlace = "archive", objects: ObjectsPlace = None, as_json: AsJson = False
+) -> None:
+    """Show all decisions with their findings, reviews and comments, and the service events."""
+    from ..core.provenance import canonical_json
+
+    with _opened(archive, objects) as found:
+        decisions, events = found.history(name), found.events(name)
+    if as_json:
+        rows = [_row(each) for each in decisions]
+        said = [{"at": time.isoformat(), "what": what} for time, what in events]
+        say(canonical_json({"schema": "reseau-history/1", "decisions": rows, "events": said}))
+        return
+    for each in decisions:
+        _say_decision(each, False)
+    for time, what in events:
+        say(f"{time:%Y-%m-%d %H:%M}Z  {what}\n")
+
+
+def _row(made: Decision) -> dict[str, Any]:
+    return vars(made) | {
+        "since": made.since.isoformat(),
+        "at": made.at.isoformat(),
+        "judgement": made.judgement.to_dict(),
+        "comments": [list(each) for each in made.comments],
+    }
+
+
+def _say_decision(made: Decision, as_json: bool) -> None:
+    from ..core.provenance import canonical_json
+
+    if as_json:
+        say(canonical_json({"schema": "reseau-decision/1", **_row(made)}))
+        return
+    by = f"by {made.by}, rules {made.judgement.rules['version']}"
+    say(f"{made.key}  {made.since:%Y-%m-%d %H:%M}Z  {made.outcome}, {by}\n")
+    for each in made.judgement.findings:
+        say(f"  {each.level:<8} {each.text}\n")
+    if made.reviewed_by:
+        say(f"  reviewed by {made.reviewed_by}: {made.review}\n")
+    for who, text in (*([(made.by, made.comment)] if made.comment else []), *made.comments):
+        say(f"  {who}: {text}\n")
+
+
+@app.command()
+def drift(
+    name: Name,
+    rate: Annotated[float, typer.Option(min=0.001, help="False alarms per year, of all charts.")] = 0.1,
+    runs_per_year: Annotated[float, typer.Option(min=1, help="Number of runs in a year.")] = 52.0,
+    kind: Annotated[str, typer.Option(help="Chart: cusum, ewma or shewhart.")] = "cusum",
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+    as_json: AsJson = False,
+) -> None:
+    """Chart all parameters and the field since the last service event; exit status 1 if one has drifted."""
+    from ..core.provenance import canonical_json
+    from ..service import ChartOptions
+
+    options = ChartOptions(kind=kind, rate=rate, runs_per_year=runs_per_year)  # type: ignore[arg-type]
+    with _opened(archive, objects) as found:
+        made = found.drift(name, options)
+    charts, last = made.charts, len(made.keys) - 1
+    signals = [
+        {
+            "calibration": made.keys[run], "parameter": made.names[k],
+            "since": made.keys[charts.since(run, k)],
+            "direction": "increase" if charts.alarm[run, k] > 0 else "decrease",
+        }
+        for run in range(last + 1) for k in range(len(made.names)) if charts.alarm[run, k]
+    ]  # fmt: skip
+    rows = [
+        {
+            "parameter": parameter, "learning": bool(charts.learning[last, k]),
+            "width": _number(charts.width[last, k]), "score": _number(charts.score[last, k]),
+            "upper": float(charts.upper[last, k]), "lower": float(charts.lower[last, k]),
+        }
+        for k, parameter in enumerate(made.names)
+    ]  # fmt: skip
+    if as_json:
+        limits = vars(charts.limits) | {"limit": _number(charts.limits.limit)}
+        content = {"runs": last + 1, "limits": limits, "charts": rows, "signals": signals}
+        say(canonical_json({"schema": "reseau-drift/1", **content}))
+    else:
+        say(f"{name}: {last + 1} calibrations since the last service event\n")
+        for row in rows:
+            wide = "" if row["width"] is None else f", {row['width']:.2f} times as wide as when learned"
+            state = f"learning{wide}" if row["learning"] else "in control"
+            state = "signals" if charts.alarm[last, made.names.index(row["parameter"])] else state
+            say(f"  {row['parameter']:<20} {row['upper']:6.2f} {row['lower']:6.2f}  {state}\n")
+        for each in signals:
+            said = f"{each['direction']} of {each['parameter']}, probably from {each['since']} on"
+            say(f"  {each['calibration']}: {said}\n")
+    raise typer.Exit(1 if signals else 0)
+
+
+def _number(value: float) -> float | None:
+    import math
+
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,504 @@
+"""Calibrations in force: for each configuration of an instrument the calibration that applies at a time.
+
+Everything is a journal of an archive: the configuration, decisions on calibrations, reviews, comments,
+returns to earlier calibrations, and service events. Two times belong to each entry: from when on it holds
+(`since`), and when it was entered. "Which calibration applied to this frame?" and "which did we believe to
+apply, last May?" are both answered.
+"""
+
+from __future__ import annotations
+
+import getpass
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any, Literal, cast
+
+import numpy as np
+
+from ..archive import Archive, Entry
+from ..calibration import Calibration, CameraMapping, calibration_difference, parse_calibration
+from ..core.data import Array
+from ..core.errors import UsageError
+from .charts import ChartOptions, Monitored, monitor
+from .rules import AcceptanceRules, Judgement, Outcome, judge
+
+__all__ = ["Applied", "Configurations", "Decision", "Drift", "a_time"]
+
+_PREFIX = "calibrations/"
+_ACCEPTED = ("accepted", "accepted with warning")
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A decision on a calibration of a configuration.
+
+    Parameters
+    ----------
+    key : str
+        Start of the SHA-256 of the calibration, by which the decision is named.
+    outcome : {"accepted", "accepted with warning", "rejected", "needs review"}
+        The outcome by the rules, or by a person where these left it open.
+    since : datetime
+        From when on the calibration applies, if it was accepted.
+    at : datetime
+        When it was decided.
+    by, comment : str
+        By whom or what, and why.
+    judgement : Judgement
+        Findings, with the rules by which it was judged.
+    compared_with : str or None
+        Key of the calibration in force it was compared with.
+    reviewed_by, review : str
+        Who reviewed it, and the reason; empty if nobody did.
+    comments : tuple of (str, str)
+        Later comments: by whom, and text.
+
+    Examples
+    --------
+    >>> Decision.__dataclass_fields__["outcome"].name
+    'outcome'
+    """
+
+    key: str
+    outcome: Outcome
+    since: datetime
+    at: datetime
+    by: str
+    comment: str
+    judgement: Judgement
+    compared_with: str | None
+    reviewed_by: str = ""
+    review: str = ""
+    comments: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Applied:
+    """The calibration that applies to a configuration at a time.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    key : str
+        Name of its decision.
+    since : datetime
+        From when on it applies.
+    why : {"decision", "review", "return"}
+        What put it in force.
+
+    Examples
+    --------
+    >>> Applied.__dataclass_fields__["why"].name
+    'why'
+    """
+
+    calibration: Calibration
+    key: str
+    since: datetime
+    why: Literal["decision", "review", "return"]
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """Control charts of the calibrations of a configuration since its last service event.
+
+    Parameters
+    ----------
+    keys : tuple of str (n,)
+        Decisions on the calibrations, in time order; rejected ones are left out.
+    names : tuple of str (c,)
+        Parameters, and for a camera the norm of the field.
+    values : ndarray (n, c)
+        Their values; of the norm the power 2/3 of the rms difference from the first calibration, px.
+    charts : Monitored
+        The charts.
+
+    Examples
+    --------
+    >>> Drift(("4f2a",), ("c",), np.array([[8.0]]), monitor(np.array([[8.0]]))).keys
+    ('4f2a',)
+    """
+
+    keys: tuple[str, ...]
+    names: tuple[str, ...]
+    values: Array
+    charts: Monitored
+
+
+class Configurations:
+    """Configurations of instruments and their calibrations, in an archive.
+
+    Parameters
+    ----------
+    archive : Archive
+        The archive.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from reseau.service import AcceptanceRules, Limits
+    >>> from reseau.service.covariates import example_calibration
+    >>> rules = AcceptanceRules(version=1, image=Limits(warning=0.1, action=0.3), coverage=0.0)
+    >>> monday, tuesday = (datetime(2026, 3, day, tzinfo=UTC) for day in (2, 3))
+    >>> with tempfile.TemporaryDirectory() as folder, Archive.open(folder, create=True) as archive:
+    ...     known = Configurations(archive)
+    ...     known.define("left", {"camera": "DMK 33", "lens": "8 mm"})
+    ...     first = known.decide("left", example_calibration(), rules, since=monday)
+    ...     _ = known.review("left", first.key, "accepted", by="Ada", comment="first calibration")
+    ...     first.outcome, known.applied("left", tuesday).since == monday
+    ('needs review', True)
+    """
+
+    def __init__(self, archive: Archive) -> None:
+        self._archive = archive
+
+    def names(self) -> list[str]:
+        """Return the names of the configurations."""
+        return [name.removeprefix(_PREFIX) for name in self._archive.journals(_PREFIX)]
+
+    def define(self, name: str, parts: Mapping[str, str]) -> None:
+        """Define a configuration by its parts, such as camera, lens, settings and firmware.
+
+        Raises
+        ------
+        UsageError
+            If it exists with other parts, or another one has the same parts.
+        """
+        given = {key: str(value) for key, value in parts.items()}
+        if not name.strip() or not given:
+            raise UsageError("needs a name and at least one part", where="configuration")
+        for other in self.names():
+            if other != name and self.parts(other) == given:
+                raise UsageError(f"has the parts of {other}", where=name, do=f"use {other}")
+        self._journal(name).append("configuration", "configuration", {"parts": given})
+        if self.parts(name) != given:
+            raise UsageError("exists with other parts", where=name, do="use another name")
+
+    def parts(self, name: str) -> dict[str, str]:
+        """Return the parts of a configuration.
+
+        Raises
+        ------
+        UsageError
+            If there is no such configuration.
+        """
+        return dict(self._entries(name)[0].document["parts"])
+
+    def find(self, parts: Mapping[str, str]) -> str:
+        """Return the configuration whose parts are all among the given ones.
+
+        Raises
+        ------
+        UsageError
+            If there is none, or several.
+        """
+        given = {key: str(value) for key, value in parts.items()}
+        found = [name for name in self.names() if self.parts(name).items() <= given.items()]
+        if len(found) != 1:
+            said = "no configuration has" if not found else f"{', '.join(found)} have"
+            raise UsageError(f"{said} these parts", where=", ".join(f"{k}={v}" for k, v in given.items()))
+        return found[0]
+
+    def decide(
+        self,
+        name: str,
+        calibration: Calibration,
+        rules: AcceptanceRules,
+        *,
+        since: datetime | None = None,
+        by: str = "",
+        comment: str = "",
+    ) -> Decision:
+        """Judge a calibration by the rules, and put it in force if they accept it.
+
+        Parameters
+        ----------
+        name : str
+            Configuration.
+        calibration : Calibration
+            The calibration; the same one is judged once.
+        rules : AcceptanceRules
+            The rules.
+        since : datetime, optional
+            From when on it applies; by default the time of its session, or now.
+        by, comment : str
+            By whom or what (default: the user), and a comment.
+
+        Raises
+        ------
+        UsageError
+            If the configuration is unknown, the rules changed without a new version, or the calibration is of
+            another instrument than the one in force.
+        """
+        entries = self._entries(name)
+        text = calibration.model_copy(update={"times": {}}).to_json()
+        key = hashlib.sha256(text.encode("utf-8")).hexdigest()[:12]
+        if any(each.key == key for each in entries):
+            return self.decision(name, key)
+        _same_version(entries, rules, name)
+        begun = calibration.times.get("begun")
+        start = a_time(since or (datetime.fromisoformat(begun) if begun else datetime.now(UTC)))
+        current = self.applied(name, start)
+        judged = judge(calibration, None if current is None else current.calibration, rules)
+        document = {
+            "calibration": calibration.to_json(),
+            "since": start.isoformat(),
+            "by": by or _user(),
+            "comment": comment,
+            "judgement": judged.to_dict(),
+            "compared_with": None if current is None else current.key,
+        }
+        self._journal(name).append(key, "decision", document)
+        return self.decision(name, key)
+
+    def review(
+        self, name: str, key: str, outcome: Literal["accepted", "rejected"], *, by: str = "", comment: str
+    ) -> Decision:
+        """Decide what the rules left to a person.
+
+        Raises
+        ------
+        UsageError
+            If the decision does not need a review, has one already, or no reason is given.
+        """
+        decision = self.decision(name, key)
+        if outcome not in ("accepted", "rejected"):
+            raise UsageError(
+                f"{outcome!r} is no outcome of a review", where=key, do="use accepted or rejected"
+            )
+        if decision.outcome != "needs review":
+            raise UsageError(f"is {decision.outcome} and needs no review", where=key)
+        if not comment.strip():
+            raise UsageError("needs a reason", where=f"review of {key}", do="give a comment")
+        document = {"key": decision.key, "outcome": outcome, "by": by or _user(), "comment": comment}
+        if self._journal(name).append(f"review {decision.key}", "review", document) is None:
+            raise UsageError("has been reviewed", where=key)
+        return self.decision(name, key)
+
+    def comment(self, name: str, key: str, text: str, *, by: str = "") -> Decision:
+        """Add a comment to a decision; its outcome stays as it is."""
+        decision = self.decision(name, key)
+        document = {"key": decision.key, "by": by or _user(), "comment": text}
+        self._append(name, "comment", document)
+        return self.decision(name, key)
+
+    def roll_back(
+        self, name: str, key: str, *, since: datetime | None = None, by: str = "", comment: str = ""
+    ) -> Applied:
+        """Return to an earlier calibration: it replaces all that apply from `since` (default: now) on.
+
+        Raises
+        ------
+        UsageError
+            If that calibration was not accepted.
+        """
+        decision = self.decision(name, key)
+        if decision.outcome not in _ACCEPTED:
+            raise UsageError(f"was not accepted ({decision.outcome})", where=key)
+        start = a_time(since or datetime.now(UTC))
+        document = {"key": decision.key, "since": start.isoformat(), "by": by or _user(), "comment": comment}
+        self._append(name, "return", document)
+        found = self.applied(name, start)
+        assert found is not None
+        return found
+
+    def event(self, name: str, what: str, *, at: datetime | None = None, by: str = "") -> None:
+        """Note a service event (lens changed, camera dropped): from then on no calibration applies."""
+        if not what.strip():
+            raise UsageError("needs a description", where="service event")
+        time = a_time(at or datetime.now(UTC))
+        self._append(name, "event", {"what": what, "since": time.isoformat(), "by": by or _user()})
+
+    def events(self, name: str) -> list[tuple[datetime, str]]:
+        """Return time and description of the service events, in time order."""
+        found = [(_since(each), str(each.document["what"])) for each in self._entries(name, "event")]
+        return sorted(found)
+
+    def decision(self, name: str, key: str) -> Decision:
+        """Return a decision by the start of its key.
+
+        Raises
+        ------
+        UsageError
+            If there is none, or several.
+        """
+        found = [each for each in self.history(name) if each.key.startswith(key)] if key else []
+        if len(found) != 1:
+            raise UsageError(f"names {len(found)} decisions", where=f"{name}: {key!r}", do="see its history")
+        return found[0]
+
+    def history(self, name: str) -> list[Decision]:
+        """Return all decisions in the order in which they were made."""
+        entries = self._entries(name)
+        reviews = {each.document["key"]: each.document for each in entries if each.kind == "review"}
+        found = []
+        for each in entries:
+            if each.kind != "decision":
+                continue
+            d, review = each.document, reviews.get(each.key)
+            judged = Judgement.from_content(dict(d["judgement"]), where=f"decision {each.key}")
+            comments = [
+                (o.document["by"], o.document["comment"])
+                for o in entries
+                if o.kind == "comment" and o.document["key"] == each.key
+            ]
+            found.append(
+                Decision(
+                    each.key, judged.outcome if review is None else cast(Outcome, review["outcome"]),
+                    _since(each), each.at, d["by"], d["comment"], judged, d["compared_with"],
+                    "" if review is None else review["by"], "" if review is None else review["comment"],
+                    tuple(comments),
+                )
+            )  # fmt: skip
+        return found
+
+    def applied(self, name: str, at: datetime, known: datetime | None = None) -> Applied | None:
+        """Return the calibration that applies to frames of a time.
+
+        Parameters
+        ----------
+        name : str
+            Configuration.
+        at : datetime
+            When the frame was taken.
+        known : datetime, optional
+            Use only what had been entered by this time.
+
+        Returns
+        -------
+        Applied or None
+            None before the first calibration, and after a service event until the next one.
+        """
+        time = a_time(at)
+        last = None if known is None else a_time(known)
+        entries = [each for each in self._entries(name) if last is None or each.at <= last]
+        current = [each for each in _effects(entries) if each[0] <= time]
+        if not current:
+            return None
+        since, _, key, why = max(current, key=lambda each: each[:2])
+        if key is None or why is None:
+            return None
+        return Applied(self.calibration(name, key), key, since, why)
+
+    def calibration(self, name: str, key: str) -> Calibration:
+        """Return the calibration of a decision."""
+        for each in self._entries(name, "decision"):
+            if each.key == key:
+                return parse_calibration(each.document["calibration"], where=f"calibration {key}")
+        raise UsageError("names no decision", where=f"{name}: {key!r}")
+
+    def drift(self, name: str, options: ChartOptions | None = None) -> Drift:
+        """Chart the parameters of the calibrations since the last service event, rejected ones left out.
+
+        Raises
+        ------
+        UsageError
+            If there are none, or they have no parameter in common.
+        """
+        from .covariates import series_of
+
+        events = self.events(name)
+        start = events[-1][0] if events else datetime.min.replace(tzinfo=UTC)
+        decisions = [d for d in self.history(name) if d.outcome != "rejected" and d.since >= start]
+        decisions.sort(key=lambda d: (d.since, d.at))
+        if not decisions:
+            raise UsageError("has no calibrations since its last service event", where=name)
+        calibrations = [self.calibration(name, d.key) for d in decisions]
+        names, values = series_of(calibrations)
+        one_sided: tuple[int, ...] = ()
+        if calibrations[0].kind == "camera":
+            one_sided = (len(names),)
+            names = (*names, "norm of the field")
+            values = np.column_stack([values, _norms(calibrations)])
+        charts = monitor(values, options, one_sided=one_sided)
+        return Drift(tuple(d.key for d in decisions), names, values, charts)
+
+    def _journal(self, name: str) -> Any:
+        return self._archive.journal(_PREFIX + name)
+
+    def _append(self, name: str, kind: str, document: dict[str, Any]) -> None:
+        number = len(self._entries(name))
+        while self._journal(name).append(f"{kind} {number}", kind, document) is None:
+            number += 1
+
+    def _entries(self, name: str, kind: str | None = None) -> list[Entry]:
+        found: list[Entry] = self._journal(name).entries()
+        if not found:
+            do = f"use {', '.join(self.names())}" if self.names() else "define it"
+            raise UsageError("is not a configuration of this archive", where=name, do=do)
+        return [each for each in found if kind is None or each.kind == kind]
+
+
+def a_time(given: datetime) -> datetime:
+    """The time in UTC.
+
+    Raises
+    ------
+    UsageError
+        If it has no time zone.
+
+    Examples
+    --------
+    >>> a_time(datetime.fromisoformat("2026-03-29T03:00:00+02:00")).isoformat()
+    '2026-03-29T01:00:00+00:00'
+    """
+    if given.tzinfo is None:
+        raise UsageError("has no time zone", where=given.isoformat(), do="add one, such as Z or +01:00")
+    return given.astimezone(UTC)
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a user without a name, as in a container
+        return "unknown"
+
+
+def _since(entry: Entry) -> datetime:
+    return datetime.fromisoformat(entry.document["since"])
+
+
+_Effect = tuple[datetime, int, str | None, Literal["decision", "review", "return"] | None]
+
+
+def _effects(entries: Sequence[Entry]) -> list[_Effect]:
+    """What each entry put in force: since when, number of the entry, key of the calibration, and why."""
+    found: list[_Effect] = []
+    since_of = {each.key: _since(each) for each in entries if each.kind == "decision"}
+    for each in entries:
+        d, n = each.document, each.number
+        if each.kind == "decision" and d["judgement"]["outcome"] in _ACCEPTED:
+            found.append((since_of[each.key], n, each.key, "decision"))
+        elif each.kind == "review" and d["outcome"] in _ACCEPTED:
+            found.append((since_of[d["key"]], n, d["key"], "review"))
+        elif each.kind == "return":
+            found = [effect for effect in found if effect[0] < _since(each)]
+            found.append((_since(each), n, d["key"], "return"))
+        elif each.kind == "event":
+            found.append((_since(each), n, None, None))
+    return found
+
+
+def _same_version(entries: Sequence[Entry], rules: AcceptanceRules, name: str) -> None:
+    """Refuse rules that changed but kept their version."""
+    for each in entries:
+        if each.kind == "decision":
+            used = each.document["judgement"]["rules"]
+            if used["version"] == rules.version and used != rules.to_dict():
+                raise UsageError(
+                    f"differ from those of version {rules.version} used before", where=f"{name}: rules",
+                    do="increase `version`",
+                )  # fmt: skip
+
+
+def _norms(calibrations: Sequence[Calibration]) -> Array:
+    """Power 2/3 of the rms differences from the first camera (n,); NaN for the first."""
+    first = CameraMapping.from_calibration(calibrations[0])
+    found = [np.nan]
+    for each in calibrations[1:]:
+        field = calibration_difference(first, CameraMapping.from_calibration(each), 15).difference
+        found.append(float(np.cbrt(np.nanmean(np.square(field).sum(axis=-1)))))
+    return np.array(found)
