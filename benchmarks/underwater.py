@@ -294,9 +294,10 @@ def _row(text: str, rows: list[Figures]) -> str:
     errors = errors[:, np.isfinite(errors).any(axis=(0, 2))]  # points that no seed determined
     bias = np.nanmean(errors, axis=0)
     residuals, over = _rms(column("residuals_px")), _rms(column("over_sigma"))
+    off = _rms(np.sqrt(np.nanmean(errors**2, axis=(1, 2))))
     return (
         f"  {text:<26}{residuals[0]:>8.4f} ± {residuals[1]:.4f}{1e3 * PITCH * residuals[0]:>6.2f}"
-        f"{_rms(column('predicted_px'))[0]:>10.4f}{np.sqrt(np.nanmean(errors**2)):>8.4f}"
+        f"{_rms(column('predicted_px'))[0]:>10.4f}{off[0]:>8.4f} ± {off[1]:.4f}"
         f"{np.sqrt(np.nanmean(bias**2)):>8.4f}{_rms(column('shift_px'))[0]:>8.3f}"
         f"{over[0]:>7.2f} ± {over[1]:.2f}{_rms(column('sigma_px'))[0]:>9.4f}"
         f"{_rms(column('misfit'))[0]:>8.2f}{column('left_out').mean():>10.1f}"
@@ -320,7 +321,7 @@ def main() -> None:
         found = measured(project(strengths[0], 0), camera_of(strengths[0]), "centroid")
         chosen.report.write_text(blurred_network_report(found, title=f"underwater, {strengths[0]}"))
     print(
-        f"{'':<28}{'residuals, px':>17}{'µm':>6}{'predicted':>10}{'mm rms':>8}{'bias':>8}{'shift':>8}"
+        f"{'':<28}{'residuals, px':>17}{'µm':>6}{'predicted':>10}{'mm rms':>17}{'bias':>8}{'shift':>8}"
         f"{'e/σ':>14}{'σ, px':>9}{'misfit':>8}{'left out':>10}"
     )
     # Seed by seed, so that what is kept after a stop is of all strengths.

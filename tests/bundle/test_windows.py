@@ -169,6 +169,21 @@ def test_what_images_cannot_determine_is_named() -> None:
     assert "distance of plate" in str(failure)
 
 
+def test_windows_that_are_not_between_cameras_and_points_are_named() -> None:
+    """A free network has its own coordinate system: the wall is given in another one."""
+    base = networks.world(datum="free", control=0, cameras=LENS)
+    world = with_bars(networks.refracted(base, "tank wall", ("distance of wall",)))
+    network = world.noisy(0)
+    refraction = network.refraction
+    assert refraction is not None
+    (wall,) = refraction.windows
+    far = replace(refraction, windows=(replace(wall, values={**wall.values, "distance": 50.0}),))
+    failure = adjust_network(replace(network, refraction=far))
+    assert not failure
+    assert "no ray depends on distance of wall" in str(failure)
+    assert "must lie between cameras and points" in str(failure)
+
+
 def test_a_point_before_the_window_is_computed_as_in_air_and_named() -> None:
     base = networks.world(cameras=LENS)
     base.xyz[24] = [0.1, 0.2, 1.5]

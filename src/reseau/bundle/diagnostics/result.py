@@ -18,9 +18,9 @@ from ...core.errors import UsageError
 from ...core.failure import Remark
 from ...optics.cameras import distortion_names, unit_of
 from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
-from ...optics.refraction import RefractedRays
 from ..network import Network
 from ..solver import BundleFit
+from ..solver.rank import missing_windows
 from ..solver.rig_constraints import RigConstraints
 from .estimates import (
     CameraEstimate,
@@ -309,18 +309,7 @@ class Result(Display):
     @cached_property
     def misses_windows(self) -> Rows:
         """Image points (k,) without a ray through the windows of their image; straight rays are used."""
-        bent, network, values = self.network.refraction, self.network, self.fit.values
-        if bent is None:
-            return np.zeros(0, dtype=np.intp)
-        rows = np.flatnonzero(self.fit.usable.observations & (bent.path_of[network.image_of] >= 0))
-        bent = bent.with_values(values.refraction)
-        if values.rig is not None:
-            bent = bent.on_cameras(network.camera_of, *values.rig)
-        rays = RefractedRays.of(
-            bent.columns(bent.values), bent.path_of, values.rotation, values.x0, values.xyz,
-            network.image_of[rows], network.point_of[rows],
-        )  # fmt: skip
-        return rows[~rays.reached].astype(np.intp)
+        return missing_windows(self.network, self.fit.values, self.fit.usable.observations)
 
     # -- cameras
 

@@ -28,6 +28,7 @@ from .observations import OtherObservations
 from .posterior import BlockSolution, Cofactors, cofactors_of
 from .rank import (
     SCALE_OF_WINDOWS,
+    missing_windows,
     poorly_determined_points,
     steady_points,
     undetermined,
@@ -410,10 +411,14 @@ class _Run:
         linear = self.system.linearise(values)
         idle = without_effect(linear)
         if idle:
-            return AdjustmentFailure(
-                f"rank defect {len(idle)}: no ray depends on {', '.join(idle)}", Code.RANK_DEFECT,
-                costs=tuple(found.costs),
-            )  # fmt: skip
+            reason = f"rank defect {len(idle)}: no ray depends on {', '.join(idle)}"
+            missed = missing_windows(network, values, np.ones(len(network.xy), dtype=bool))
+            if len(missed):
+                reason += (
+                    f"; {len(missed)} image points are not seen through their windows, which must lie "
+                    "between cameras and points, in the coordinate system of the network"
+                )
+            return AdjustmentFailure(reason, Code.RANK_DEFECT, costs=tuple(found.costs))
         freedom = freedom_of(self.system, values, self.usable.points)
         try:
             cofactors = cofactors_of(linear, freedom, chosen if inner else None, self.usable.points)

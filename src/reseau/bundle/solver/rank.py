@@ -7,13 +7,17 @@ import numpy as np
 from ...adjust import AdjustmentFailure
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
+from ...optics.refraction import RefractedRays
+from ..network import Network
 from .arrow import full
 from .datum import Freedom, held_for, similarity_changes
 from .system import Linear
+from .values import Values
 
 __all__ = [
     "PARALLEL",
     "SCALE_OF_WINDOWS",
+    "missing_windows",
     "poorly_determined_points",
     "steady_points",
     "undetermined",
@@ -142,6 +146,23 @@ def without_effect(linear: Linear) -> list[str]:
     observed = np.isin(unknowns.refracting, system.others.refraction)
     idle = ~observed & (effect * change < _IDLE)
     return [name for name, none in zip(names, idle, strict=True) if none]
+
+
+def missing_windows(network: Network, values: Values, observations: Mask) -> Rows:
+    """Return the image points, of those given (n,), without a ray through the windows of their image."""
+    bent = network.refraction
+    if bent is None:
+        return np.zeros(0, dtype=np.intp)
+    rows = np.flatnonzero(observations & (bent.path_of[network.image_of] >= 0))
+    estimates = values.refraction
+    if values.rig is not None:
+        bent = bent.with_values(estimates).on_cameras(network.camera_of, *values.rig)
+        estimates = bent.values
+    rays = RefractedRays.of(
+        bent.columns(estimates), bent.path_of, values.rotation, values.x0, values.xyz,
+        network.image_of[rows], network.point_of[rows],
+    )  # fmt: skip
+    return rows[~rays.reached].astype(np.intp)
 
 
 def steady_points(linear: Linear, chosen: Mask) -> Mask:
