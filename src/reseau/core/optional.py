@@ -11,6 +11,7 @@ __all__ = ["missing", "optional"]
 
 _DISTRIBUTIONS = {
     "bluesky": "bluesky",
+    "dateutil": "reseau[service]",
     "fsspec": "fsspec",
     "gi": "reseau[aravis]",
     "imagecodecs": "imagecodecs",

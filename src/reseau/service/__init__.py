@@ -7,7 +7,9 @@ The modules :mod:`~reseau.service.runlength`, :mod:`~reseau.service.charts` and
 from .charts import ChartOptions, KnownSeries, Monitored, monitor
 from .covariates import CalibrationFunction, FunctionOptions, explain, fit_function
 from .inforce import Applied, Configurations, Decision, Drift
+from .recurrence import Recurrence
 from .rules import AcceptanceRules, Judgement, Limits, judge
+from .schedule import Run, Schedule, Schedules
 
 __all__ = [
     "AcceptanceRules",
@@ -22,6 +24,10 @@ __all__ = [
     "KnownSeries",
     "Limits",
     "Monitored",
+    "Recurrence",
+    "Run",
+    "Schedule",
+    "Schedules",
     "explain",
     "fit_function",
     "judge",

@@ -1,0 +1,404 @@
+"""Schedules: which runs are due, overdue, missed or blocked, and who starts them.
+
+A schedule is a document in a journal of an archive; what happens to its runs are further entries. The state
+of each run follows from them and from the clock, so that nothing has to be running for a run to be missed
+visibly. A run is named by its time in UTC: a clock that was set back, or a change of daylight saving time,
+does not start it again. A scheduler claims a run for a limited time; of two, the archive lets one succeed.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from ..archive import Archive, Entry
+from ..core.errors import ArchiveError, ReseauError, StateError, UsageError
+from ..io import Document
+from .inforce import Configurations, a_time
+from .recurrence import CalendarEvent, Recurrence, calendar_feed
+
+__all__ = ["Claim", "Run", "Schedule", "Schedules", "State"]
+
+_PREFIX = "schedules/"
+State = Literal["scheduled", "due", "running", "blocked", "overdue", "missed", "done", "failed"]
+
+
+class Schedule(Document):
+    """When a recalibration is due, ``reseau-schedule/1``.
+
+    Parameters
+    ----------
+    name : str
+        Name of the schedule.
+    recalibration : str
+        Recalibration that it starts.
+    configuration : str, optional
+        Configuration whose service events make a run due at once.
+    rule, start, zone, except_for
+        See :class:`~reseau.service.recurrence.Recurrence`; times as ``2026-03-02T08:00``.
+    window_minutes : int
+        A run may start from its time to this time later.
+
+    Examples
+    --------
+    >>> weekly = Schedule(name="weekly", recalibration="left", rule="FREQ=WEEKLY;COUNT=52",
+    ...                   start="2026-03-02T08:00", zone="Europe/Berlin")
+    >>> weekly.recurrence.occurrences()[0].isoformat()
+    '2026-03-02T07:00:00+00:00'
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-schedule/1"
+
+    name: str = Field(min_length=1)
+    recalibration: str = Field(min_length=1)
+    configuration: str | None = None
+    rule: str
+    start: str
+    zone: str
+    except_for: tuple[str, ...] = ()
+    window_minutes: int = Field(default=240, ge=1)
+
+    @model_validator(mode="after")
+    def _valid(self) -> Self:
+        try:
+            _ = self.recurrence
+        except UsageError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    @property
+    def recurrence(self) -> Recurrence:
+        """The rule.
+
+        Raises
+        ------
+        UsageError
+            If it cannot be used.
+        """
+        try:
+            start, *but = (datetime.fromisoformat(each) for each in (self.start, *self.except_for))
+        except ValueError as error:
+            raise UsageError(f"is not a time ({error})", where="start", do="use 2026-03-02T08:00") from None
+        return Recurrence(self.rule, start, self.zone, tuple(but))
+
+    @property
+    def window(self) -> timedelta:
+        """Time in which a run may start."""
+        return timedelta(minutes=self.window_minutes)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of a schedule.
+
+    Parameters
+    ----------
+    schedule : str
+        Name of the schedule.
+    time : datetime
+        When it was due, UTC.
+    state : str
+        ``scheduled``, ``due`` (may start now), ``running``, ``blocked`` (could not start, may start again),
+        ``overdue`` (its window has passed, and no later run was due yet), ``missed`` (a later run was due),
+        ``done`` or ``failed``.
+    why : str
+        Outcome, or the reason why it failed or was blocked; for a run after a service event, the event.
+    attempts : int
+        How often it was started.
+    key : str
+        Name of the run in the journal.
+
+    Examples
+    --------
+    >>> Run("weekly", datetime(2026, 3, 2, 7, tzinfo=UTC), "due", "", 0, "20260302T070000Z").state
+    'due'
+    """
+
+    schedule: str
+    time: datetime
+    state: State
+    why: str
+    attempts: int
+    key: str
+
+    @property
+    def startable(self) -> bool:
+        """Whether it may start now."""
+        return self.state in ("due", "blocked")
+
+
+class Claim:
+    """The right to carry out a run, which is renewed while it is held; see :meth:`Schedules.claim`."""
+
+    def __init__(self, journal: Any, key: str, attempt: int, lease: timedelta) -> None:
+        self.key, self.attempt = key, attempt
+        self._journal, self._lease = journal, lease
+        self._over, self._beat = threading.Event(), 0
+        self._thread = threading.Thread(target=self._renew, daemon=True)
+        self._thread.start()
+
+    def _renew(self) -> None:
+        while not self._over.wait(self._lease.total_seconds() / 3):
+            self._beat += 1
+            name = f"{self.key} attempt {self.attempt} renewal {self._beat}"
+            until = datetime.now(UTC) + self._lease
+            document = {"run": self.key, "attempt": self.attempt, "until": until.isoformat()}
+            try:
+                self._journal.append(name, "renewed", document)
+            except ArchiveError:  # the next renewal tries again; the lease lasts three times as long
+                continue
+
+    def end(
+        self, outcome: Literal["done", "failed", "blocked"], why: str, at: datetime | None = None
+    ) -> None:
+        """Record the outcome, and give the run back."""
+        self._over.set()
+        self._thread.join()
+        name = f"{self.key} attempt {self.attempt} end"
+        document = {"run": self.key, "attempt": self.attempt, "outcome": outcome, "why": why}
+        self._journal.append(name, "ended", document)
+
+
+class Schedules:
+    """Schedules of an archive.
+
+    Parameters
+    ----------
+    archive : Archive
+        The archive.
+    lease : timedelta
+        How long a run whose scheduler has disappeared counts as running.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> weekly = Schedule(name="weekly", recalibration="left", rule="FREQ=WEEKLY;COUNT=52",
+    ...                   start="2026-03-02T08:00", zone="UTC")
+    >>> now = datetime(2026, 3, 9, 9, tzinfo=UTC)
+    >>> with tempfile.TemporaryDirectory() as folder, Archive.open(folder, create=True) as archive:
+    ...     schedules = Schedules(archive)
+    ...     schedules.add(weekly, datetime(2026, 3, 1, tzinfo=UTC))
+    ...     [(f"{run.time:%m-%d}", run.state) for run in schedules.runs("weekly", now)]
+    [('03-02', 'missed'), ('03-09', 'due'), ('03-16', 'scheduled')]
+    """
+
+    def __init__(self, archive: Archive, lease: timedelta = timedelta(minutes=10)) -> None:
+        self._archive, self._lease = archive, lease
+        self._who = {"host": socket.gethostname(), "process": os.getpid()}
+
+    def names(self) -> list[str]:
+        """Return the names of the schedules that were not removed."""
+        names = [name.removeprefix(_PREFIX) for name in self._archive.journals(_PREFIX)]
+        return [name for name in names if self._entries(name)[-1].kind != "removed"]
+
+    def add(self, schedule: Schedule, at: datetime | None = None) -> None:
+        """Add a schedule, or change one: its earlier runs stay as they were.
+
+        Parameters
+        ----------
+        schedule : Schedule
+            The schedule.
+        at : datetime, optional
+            From when on it counts, by default now: earlier occurrences are not shown as missed.
+        """
+        since = a_time(at or datetime.now(UTC))
+        document = {"schedule": schedule.to_dict(), "since": since.isoformat()}
+        self._append(schedule.name, "schedule", document)
+
+    def remove(self, name: str, at: datetime | None = None) -> None:
+        """Remove a schedule; its history stays."""
+        self.get(name)
+        self._append(name, "removed", {"since": a_time(at or datetime.now(UTC)).isoformat()})
+
+    def get(self, name: str) -> Schedule:
+        """Return a schedule.
+
+        Raises
+        ------
+        UsageError
+            If there is none, or it was removed.
+        """
+        schedule = self._versions(name)[-1][1]
+        if schedule is None:
+            raise UsageError("was removed", where=name)
+        return schedule
+
+    def runs(self, name: str, now: datetime | None = None, ahead: int = 1) -> list[Run]:
+        """Return all runs up to now and the next ones, in time order.
+
+        Parameters
+        ----------
+        name : str
+            The schedule.
+        now : datetime, optional
+            The present time.
+        ahead : int
+            Number of later runs.
+        """
+        time = a_time(now or datetime.now(UTC))
+        versions = self._versions(name)
+        ends = [since for since, _ in versions[1:]] + [None]
+        found: dict[str, tuple[datetime, timedelta, str]] = {}
+        for (since, schedule), end in zip(versions, ends, strict=True):
+            if schedule is None:
+                continue
+            later = 0
+            for each in schedule.recurrence.occurrences(since, end):
+                later += each > time
+                if later > ahead:
+                    break
+                found[f"{each:%Y%m%dT%H%M%SZ}"] = each, schedule.window, ""
+            for at, what in self._service_events(schedule):
+                if since <= at and (end is None or at < end):
+                    found[f"event {at:%Y%m%dT%H%M%SZ}"] = at, schedule.window, f"service event: {what}"
+        ordered = sorted(found.items(), key=lambda item: (item[1][0], item[0]))
+        entries = self._entries(name)
+        runs = []
+        for number, (key, (at, window, why)) in enumerate(ordered):
+            following = ordered[number + 1][1][0] if number + 1 < len(ordered) else None
+            runs.append(self._run(name, key, at, window, why, following, entries, time))
+        return runs
+
+    def _service_events(self, schedule: Schedule) -> list[tuple[datetime, str]]:
+        known = Configurations(self._archive)
+        name = schedule.configuration
+        return [] if name is None or name not in known.names() else known.events(name)
+
+    def _run(
+        self, name: str, key: str, at: datetime, window: timedelta, why: str, following: datetime | None,
+        entries: list[Entry], now: datetime,
+    ) -> Run:  # fmt: skip
+        """State of a run by the entries about it and the time."""
+        own = [each for each in entries if each.document.get("run") == key]
+        attempts = [each for each in own if each.kind == "started"]
+        ended = [each.document for each in own if each.kind == "ended"]
+        last = ended[-1] if ended else None
+        if last is not None and last["outcome"] in ("done", "failed"):
+            return Run(name, at, last["outcome"], last["why"] or why, len(attempts), key)
+        open_ones = {each.document["attempt"] for each in attempts} - {each["attempt"] for each in ended}
+        lost = False
+        if open_ones:
+            leases = [
+                datetime.fromisoformat(each.document["until"])
+                for each in own
+                if each.kind in ("started", "renewed") and each.document["attempt"] == max(open_ones)
+            ]
+            if max(leases) > now:
+                return Run(name, at, "running", why, len(attempts), key)
+            lost = True
+        if now < at:
+            return Run(name, at, "scheduled", why, len(attempts), key)
+        if last is not None:
+            why = last["why"]
+        if lost:
+            why = "its process ended without an outcome"
+        # A run after a service event is due until it is carried out, or until the next run is due.
+        if now <= at + window or (key.startswith("event") and (following is None or now < following)):
+            return Run(name, at, "blocked" if last is not None else "due", why, len(attempts), key)
+        state: State = "missed" if following is not None and following <= now else "overdue"
+        return Run(name, at, state, why, len(attempts), key)
+
+    def claim(self, run: Run, now: datetime | None = None) -> Claim | None:
+        """Claim a run that may start.
+
+        Returns
+        -------
+        Claim or None
+            None if another scheduler was faster, or the run may not start (any more).
+        """
+        time = a_time(now or datetime.now(UTC))
+        current = [each for each in self.runs(run.schedule, time) if each.key == run.key]
+        if not current or not current[0].startable:
+            return None
+        attempt = current[0].attempts + 1
+        journal = self._archive.journal(_PREFIX + run.schedule)
+        until = time + self._lease
+        document = {"run": run.key, "attempt": attempt, "until": until.isoformat()} | self._who
+        if journal.append(f"{run.key} attempt {attempt}", "started", document) is None:
+            return None
+        return Claim(journal, run.key, attempt, self._lease)
+
+    def run_due(self, carry_out: Callable[[Schedule, Run], str], now: datetime | None = None) -> list[Run]:
+        """Carry out all runs that may start now.
+
+        Parameters
+        ----------
+        carry_out : callable
+            Carries out a run and returns its outcome in a line. A :class:`StateError` (an instrument or the
+            bench is in use or not ready) blocks the run, which may start again in its window; any other
+            error of the project fails it.
+        now : datetime, optional
+            The present time.
+
+        Returns
+        -------
+        list of Run
+            The runs that were started, with their outcome.
+        """
+        found = []
+        for name in self.names():
+            schedule = self.get(name)
+            for run in self.runs(name, now):
+                claim = self.claim(run, now) if run.startable else None
+                if claim is None:
+                    continue
+                with _ended(claim):
+                    try:
+                        claim.end("done", carry_out(schedule, run))
+                    except StateError as error:
+                        claim.end("blocked", str(error))
+                    except ReseauError as error:
+                        claim.end("failed", str(error))
+                found += [each for each in self.runs(name, now) if each.key == run.key]
+        return found
+
+    def feed(self, name: str, now: datetime | None = None, ahead: int = 52) -> str:
+        """Return the runs of a schedule as an iCalendar feed, with their states."""
+        time = a_time(now or datetime.now(UTC))
+        window = self.get(name).window
+        events = [
+            CalendarEvent(f"{each.key.replace(' ', '-')}-{name}@reseau", each.time, each.time + window,
+                          f"{name}: {each.state}", each.why)
+            for each in self.runs(name, time, ahead)
+        ]  # fmt: skip
+        return calendar_feed(events, time)
+
+    def _versions(self, name: str) -> list[tuple[datetime, Schedule | None]]:
+        """From when on which schedule counts; None: it was removed."""
+        found: list[tuple[datetime, Schedule | None]] = []
+        for each in self._entries(name):
+            if each.kind in ("schedule", "removed"):
+                content = each.document.get("schedule")
+                schedule = None if content is None else Schedule.from_content(dict(content), where=name)
+                found.append((datetime.fromisoformat(each.document["since"]), schedule))
+        return found
+
+    def _append(self, name: str, kind: str, document: dict[str, Any]) -> None:
+        journal = self._archive.journal(_PREFIX + name)
+        number = len(journal.entries())
+        while journal.append(f"{kind} {number}", kind, document) is None:
+            number += 1
+
+    def _entries(self, name: str) -> list[Entry]:
+        found = self._archive.journal(_PREFIX + name).entries()
+        if not found:
+            raise UsageError("is not a schedule of this archive", where=name, do="see `reseau schedule list`")
+        return found
+
+
+@contextmanager
+def _ended(claim: Claim) -> Iterator[None]:
+    """Record a run that ends by anything else than its outcome, such as Ctrl-C, as blocked."""
+    try:
+        yield
+    except BaseException as error:
+        claim.end("blocked", f"stopped ({type(error).__name__})")
+        raise
