@@ -5,8 +5,11 @@ A network that is fine is not accused.
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +18,12 @@ import pytest
 from reseau.bundle import Camera, Network, Options, Result, adjust_network
 from reseau.core.data import Array
 from reseau.core.failure import Code
+from reseau.exchange import read_network
 from reseau.optics.poses import matrix_to_vector
 
 from . import networks
+
+DATA = Path(os.environ.get("RESEAU_DATA", "../shared/data")) / "independent" / "networks"
 
 Change = Callable[[Network, np.random.Generator], Network]
 
@@ -485,6 +491,45 @@ def said(network: Network, outliers: Any) -> tuple[str, set[Code]]:
     if isinstance(found, Result):
         return " | ".join(map(str, found.warnings)), {remark.code for remark in found.warnings}
     return found.reason, {found.code}
+
+
+def few_rays(network: Network, points: range) -> Network:
+    """Only the first two rays of some points."""
+    nth = np.array([np.sum(network.point_of[:k] == j) for k, j in enumerate(network.point_of)])
+    return network.select(~np.isin(network.point_of, points) | (nth < 2))
+
+
+@pytest.mark.parametrize("outliers", ["keep", pytest.param("reject", marks=pytest.mark.slow)])
+def test_misidentified_control_points_are_all_named_and_no_others(outliers: str) -> None:
+    """Five of twelve, two of them in two rays only, one with a gross error of a ray of another beside."""
+    world = networks.world(images=8, points=40, control=12)
+    sound = replace(world.noisy(1), sigma=np.where(world.network.sigma == 0, 1e-3, np.nan))
+    sound = few_rays(sound, range(0, 12, 3))
+    wrong = {1: (0.5, 0, 0), 3: (0, 0.2, 0.1), 4: (0, 0, -0.8), 6: (0.3, 0, 0.3), 8: (-0.1, 0.1, 0)}
+    network = sound
+    for j, by in wrong.items():
+        network = point_moved(network, j, by)
+    network = moved(network, int(np.flatnonzero(network.point_of == 5)[0]), (8.0, 5.0))
+    text, codes = said(network, outliers)
+    assert Code.DOUBTFUL_CONTROL in codes
+    named = text[text.index("the control points") : text.index("contradict the other observations")]
+    assert {int(name) for name in re.findall(r"p(\d+) ", named)} == set(wrong)
+    if outliers == "reject":
+        result = adjust_network(network, Options(outliers="reject")).required()
+        off = result.fit.values.xyz - world.xyz
+        assert np.linalg.norm(off[list(wrong)], axis=1).max() < 0.02
+        assert 0.8 < result.sigma0 < 1.15
+
+
+@pytest.mark.skipif(not DATA.exists(), reason="needs the networks of RESEAU_DATA")
+def test_of_control_points_that_no_test_reaches_it_is_said() -> None:
+    """Published network of eight misidentified points; the images contradict one of them."""
+    text, _ = said(read_network(DATA / "riva5.json"), "keep")
+    first, _, rest = text.partition("contradicts the other observations; ")
+    assert first.rpartition("the control point ")[2].startswith("802 (by 0.6")
+    unchecked = rest.partition(" cannot be found")[0]
+    assert all(f"{name} (up to" in unchecked for name in ("677", "678", "831", "832", "836"))
+    assert "840 (of any size)" in unchecked
 
 
 # Cases of more than a second; all of them, with and without rejection, are run by `make slow`.

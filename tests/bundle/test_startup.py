@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from reseau.bundle import Network, Options, adjust_network
-from reseau.bundle.diagnostics import doubtful_control
+from reseau.bundle.diagnostics import control_shape
 from reseau.exchange import read_network
 from reseau.io.network import Network1
 
@@ -97,7 +97,9 @@ def test_an_image_with_mostly_gross_errors_is_left_out_as_a_whole() -> None:
 @pytest.mark.skipif(not DATA.exists(), reason="needs the networks of RESEAU_DATA")
 def test_an_exchange_that_changes_nothing_is_not_a_finding() -> None:
     """Four corners of a square that disagree in shape: to exchange opposite corners is a rotation."""
-    found = doubtful_control(read_network(DATA / "riva3.json"))
+    shape = control_shape(read_network(DATA / "riva3.json"))
+    assert shape is not None
+    found = shape.doubt()
     assert "exchanged" not in found
     assert all(name in found for name in ("1001", "1002", "1003", "1004"))
 

@@ -1,7 +1,7 @@
 """Results of an adjusted network: estimates, residual patterns, uncertainty over the image, warnings."""
 
 from .checks import checks
-from .control_check import doubtful_control
+from .control_check import ControlCheck, ControlShape, checked_control, control_shape
 from .estimates import (
     CameraEstimate,
     ImageEstimates,
@@ -18,6 +18,8 @@ from .result import Eliminated, Result
 __all__ = [
     "CameraEstimate",
     "CommonPattern",
+    "ControlCheck",
+    "ControlShape",
     "Eliminated",
     "ImageEstimates",
     "MotionEstimates",
@@ -28,9 +30,10 @@ __all__ = [
     "by_place",
     "by_point",
     "camera_mapping",
+    "checked_control",
     "checks",
     "common_pattern",
-    "doubtful_control",
+    "control_shape",
     "projection_field_at",
     "sigma_between_images",
 ]

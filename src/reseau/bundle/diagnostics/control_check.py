@@ -1,35 +1,112 @@
-"""Check the control points against the shape determined by the images alone."""
+"""Check the control points: against the shape determined by the images alone, and by tests of each.
+
+:func:`control_shape` compares them with a free network, which shows what they have in common (exchanged,
+mirrored, another shape); :func:`checked_control` then tests each with all covariances, several at once.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations, islice
 
 import numpy as np
+import scipy.special
 
 from ...core.data import Array, Mask, Rows
+from ...core.failure import Code, Failure, Remark
 from ..network import Network
 from ..network.network import finite
 from ..solver import BundleFit, BundleProblem, approximate
 from ..solver.datum import similarity_onto
 from ..solver.unknowns import Unknowns
 from ..solver.values import Values
+from .checks import listed
 
-__all__ = ["doubtful_control"]
+__all__ = ["ControlCheck", "ControlShape", "checked_control", "control_shape", "suspected", "without_control"]
 
 _TRIPLES, _SIGMAS, _LEAST = 500, 8.0, 4
 # Tolerated error of a control point, as a fraction of their extent.
 _LOOSE = 2e-3
 # Misfits after an exchange of two points that explains those before it, relative to these.
 _SMALLER = 0.2
+# Level of the tests of all control points together, and number of adjustments.
+_ALPHA, _ROUNDS = 1e-4, 20
+# Points are left out together when their test values are at least this part of the largest.
+_LIKEWISE = 0.5
+# Part of the variance of an observation that its residual must have to be tested.
+_UNSEEN = 1e-9
+# Median of the absolute values of normal errors; deviation exceeded with a power of 80 %.
+_MEDIAN, _POWER = 0.6745, 0.84
+# Standard deviation, in the extent of the control, as which held coordinates are tested.
+_TIGHT = 1e-5
+# Part of the control points above which it cannot be said which are wrong.
+_HALF = 0.5
+# Times the median of the smallest errors found, above which errors of a point are said not to be found.
+_HARDLY = 4.0
+_OTHER_SHAPE = "do not agree with the shape determined by the images"
 
 
-def doubtful_control(network: Network) -> str:
-    """Find wrong control points by a free network adjustment.
+@dataclass(frozen=True, eq=False)
+class ControlShape:
+    """Control points and a free network of the images, compared by the similarity that most agree with.
+
+    Parameters
+    ----------
+    names : tuple of str (k,)
+        Control points with three coordinates and at least two rays.
+    points : ndarray of int (k,)
+        Their numbers.
+    given, found : ndarray (k, 3)
+        Given coordinates, and those of the free network.
+    limit : ndarray (k,)
+        Differences that are tolerated.
+    agree : ndarray of bool (k,)
+        Points that agree.
+    """
+
+    names: tuple[str, ...]
+    points: Rows
+    given: Array
+    found: Array
+    limit: Array
+    agree: Mask
+
+    def doubt(self) -> str:
+        """Return what is wrong with the control points as a whole; empty where nothing was found.
+
+        Single points that do not agree are named where no pair of them can have been exchanged.
+        """
+        if self.agree.all():
+            return ""
+        names, found, given, limit = self.names, self.found, self.given, self.limit
+        exchanged = [f"{names[a]} and {names[b]}" for a, b in _exchanged(found, given, limit)]
+        if exchanged:
+            return f"the coordinates of control points {', or '.join(exchanged)} look exchanged"
+        if self.agree.sum() < _LEAST:
+            mirrored = _largest_agreement(found * [1.0, 1.0, -1.0], given, limit)
+            if mirrored.sum() > max(_LEAST - 1, self.agree.sum()):
+                return "the control points are mirrored: their coordinate system is left-handed"
+            return (
+                f"the control points {', '.join(names)} do not agree with the shape determined by the images"
+            )
+        wrong = [names[k] for k in np.flatnonzero(~self.agree)]
+        return (
+            f"control point{'s' * (len(wrong) > 1)} {', '.join(wrong)} "
+            f"contradict{'s' * (len(wrong) == 1)} the others"
+        )
+
+    @property
+    def as_a_whole(self) -> bool:
+        """Whether the doubt is not about single points."""
+        return bool(self.agree.sum() < _LEAST) or bool(_exchanged(self.found, self.given, self.limit))
+
+
+def control_shape(network: Network) -> ControlShape | None:
+    """Compare the control points with a free network.
 
     The network is adjusted without control, as a free network, and transformed to the control points by the
-    similarity of three points with which most others agree. The points that do not agree are reported, or the
-    pair whose exchange makes all agree.
+    similarity of three points with which most others agree.
 
     Parameters
     ----------
@@ -38,8 +115,8 @@ def doubtful_control(network: Network) -> str:
 
     Returns
     -------
-    str
-        What is wrong with the control points; empty where nothing was found.
+    ControlShape or None
+        None with fewer control points, or where the images alone do not determine their shape.
 
     Examples
     --------
@@ -47,40 +124,326 @@ def doubtful_control(network: Network) -> str:
     >>> network = example_network()
     >>> xyz = network.xyz.copy()
     >>> xyz[[0, 19]] = xyz[[19, 0]]
-    >>> doubtful_control(replace(network, xyz=xyz, sigma=np.zeros((20, 3)), datum="control"))
+    >>> control_shape(replace(network, xyz=xyz, sigma=np.zeros((20, 3)), datum="control")).doubt()
     'the coordinates of control points p0 and p19 look exchanged'
     """
     rows = np.flatnonzero(finite(network.xyz) & ~np.isnan(network.sigma).any(axis=1) & (network.rays > 1))
     if len(rows) < _LEAST:
-        return ""
+        return None
     fit = _free(network)
     if fit is None:
-        return ""
-    rows = rows[fit.usable.points[rows]]
+        return None
+    rows = rows[fit.usable.points[rows]].astype(np.intp)
     if len(rows) < _LEAST:
-        return ""
+        return None
     given, found = network.xyz[rows], fit.values.xyz[rows]
     extent = float(np.ptp(given, axis=0).max())
     scale = extent / max(float(np.ptp(found, axis=0).max()), 1e-300)
     trace = np.trace(fit.cofactors.points[rows], axis1=1, axis2=2) * fit.variance
     limit = _SIGMAS * (scale * np.sqrt(trace) + network.sigma[rows].max(axis=1)) + _LOOSE * extent
     agree = _largest_agreement(found, given, limit)
-    if agree.all():
-        return ""
-    names_of = [network.points[j] for j in rows]
-    exchanged = [f"{names_of[a]} and {names_of[b]}" for a, b in _exchanged(found, given, limit)]
-    if exchanged:
-        return f"the coordinates of control points {', or '.join(exchanged)} look exchanged"
-    if agree.sum() < _LEAST:
-        mirrored = _largest_agreement(found * [1.0, 1.0, -1.0], given, limit)
-        if mirrored.sum() > max(_LEAST - 1, agree.sum()):
-            return "the control points are mirrored: their coordinate system is left-handed"
-        return (
-            f"the control points {', '.join(names_of)} do not agree with the shape determined by the images"
+    return ControlShape(tuple(network.points[j] for j in rows), rows, given, found, limit, agree)
+
+
+@dataclass(frozen=True, eq=False)
+class ControlCheck:
+    """Control points tested against the images and the other control points; truthy where some are wrong.
+
+    Parameters
+    ----------
+    points : ndarray of int (k,)
+        Points with given coordinates.
+    wrong : ndarray of bool (k,)
+        Points that contradict the images and the other control points.
+    w : ndarray (k,)
+        Root of the test value: of wrong points for the difference from where the images and the other control
+        points place them, of the others for their residuals.
+    off : ndarray (k,)
+        Lengths of these differences and residuals, in the unit of object space; NaN where unknown.
+    detectable : ndarray (k,)
+        Smallest error in the least favourable direction that the test finds with a power of 80 %; infinite
+        where no other observation depends on it, as along the only ray of a point.
+    """
+
+    points: Rows
+    wrong: Mask
+    w: Array
+    off: Array
+    detectable: Array
+
+    def __bool__(self) -> bool:
+        return bool(self.wrong.any())
+
+    @property
+    def undecided(self) -> bool:
+        """Whether so many are wrong that it cannot be said which are right."""
+        return bool(self.wrong.sum() > _HALF * len(self.wrong))
+
+    def remarks(self, network: Network, *, left_out: bool = False) -> list[Remark]:
+        """Name the points that contradict the others, and those whose errors cannot be found.
+
+        Parameters
+        ----------
+        network : Network
+            The network.
+        left_out : bool
+            Whether the wrong points were left out.
+        """
+        names = [network.points[j] for j in self.points]
+        if not self:
+            return []
+        if self.undecided:
+            text = f"the control points {listed(names)} {_OTHER_SHAPE}"
+            return [Remark(text, Code.DOUBTFUL_CONTROL)]
+        order = np.flatnonzero(self.wrong)
+        order = order[np.argsort(-self.w[order], kind="stable")]
+        wrong = [names[k] + self._size(k, network.unit) for k in order.tolist()]
+        several = len(wrong) > 1
+        text = (
+            f"the control point{'s' * several} {', '.join(wrong)} contradict{'s' * (not several)} the other "
+            f"observations{': left out' if left_out else ''}"
         )
-    wrong = np.flatnonzero(~agree)
-    names = ", ".join(names_of[k] for k in wrong)
-    return f"control point{'s' * (len(wrong) > 1)} {names} contradict{'s' * (len(wrong) == 1)} the others"
+        rest = self.unchecked(names, network.unit)
+        return [Remark(text + (f"; {rest}" if rest else ""), Code.DOUBTFUL_CONTROL)]
+
+    def unchecked(self, names: Sequence[str], unit: str) -> str:
+        """Say of which of the other points errors cannot be found, and how large these may be."""
+        detectable = np.where(self.wrong, np.nan, self.detectable)
+        known = np.isfinite(detectable)
+        if not known.any():
+            return ""
+        usual = known & (detectable <= _HARDLY * np.median(detectable[known]))
+        hardly = np.flatnonzero(~self.wrong & ~usual)
+        more = f"errors up to {detectable[usual].max():.2g} {unit}"
+        if not len(hardly):
+            return f"at the others {more} cannot be found"
+        parts = [
+            f"{names[k]} (up to {detectable[k]:.2g} {unit})" if known[k] else f"{names[k]} (of any size)"
+            for k in hardly.tolist()
+        ]
+        return (
+            f"errors of the control point{'s' * (len(parts) > 1)} {', '.join(parts)} cannot be found, with "
+            f"too few rays or along them; at the others {more} cannot be found"
+        )
+
+    def _size(self, k: int, unit: str) -> str:
+        """Size of the error of a point, where its rays determine it."""
+        return f" (by {self.off[k]:.3g} {unit}, w {self.w[k]:.1f})" if np.isfinite(self.off[k]) else ""
+
+
+def _critical(count: int) -> float:
+    """Critical value of the test of three coordinates of each of some points."""
+    return float(scipy.special.chdtri(3, _ALPHA / count))
+
+
+def suspected(problem: BundleProblem, fit: BundleFit) -> bool:
+    """Whether control points, or their rays, have large test values, or have lost rays or coordinates.
+
+    Parameters
+    ----------
+    problem : BundleProblem
+        The problem, before observations were rejected.
+    fit : BundleFit
+        Its adjustment, perhaps without rejected observations.
+    """
+    network, n = problem.network, 2 * len(problem.network.xy)
+    points = np.flatnonzero((network.observed | network.held).any(axis=1)).astype(np.intp)
+    if network.datum != "control" or not len(points):
+        return False
+    others = problem.others
+    rows = np.isin(network.point_of, points)
+    weights = np.ones(len(problem.observations)) if fit.problem.weights is None else fit.problem.weights
+    given = np.ones(len(problem.observations)) if problem.weights is None else problem.weights
+    lost = (weights == 0) & (given > 0)
+    at = n + others.slices[1].start
+    if lost[:n].reshape(-1, 2)[rows].any() or lost[at : at + len(others.coordinate)].any():
+        return True
+    observed = points[network.observed[points].any(axis=1)]
+    if len(observed):
+        found = _Tested.of(problem, fit, observed, np.zeros(len(observed), dtype=bool))
+        if (found.statistic > _critical(len(points))).any():
+            return True
+    large = _ray_statistic(network, fit)[rows] > scipy.special.chdtri(2, _ALPHA / max(1, int(rows.sum())))
+    return bool(large.any())
+
+
+def checked_control(
+    problem: BundleProblem, fit: BundleFit, shape: ControlShape | None = None
+) -> ControlCheck | None:
+    """Find control points that contradict the images and the other control points, several at once.
+
+    Parameters
+    ----------
+    problem : BundleProblem
+        The problem, with the weights that count.
+    fit : BundleFit
+        An adjustment of the network, for approximate values.
+    shape : ControlShape, optional
+        The control points compared with a free network; the search starts with those that agree.
+
+    Returns
+    -------
+    ControlCheck or None
+        None without control points, or where no adjustment of the network shows which are wrong.
+
+    Notes
+    -----
+    With several gross errors the residuals of all control points are large, and those with few rays take up
+    their errors. The search therefore starts with the points that agree with the shape of a free network, and
+    goes on by the test of all coordinates of a point together (Förstner & Wrobel 2016, sect. 4.6.4):
+    T = vᵀ Qvv⁻¹ v, or T = dᵀ (Q + C)⁻¹ d for the difference d of a point that is left out from its place by
+    the other observations. The worst points are left out, those that agree are taken back, until nothing
+    changes. A ray of a control point that explains more than its coordinates is left out in their stead. Held
+    coordinates are tested as observations with very small standard deviations.
+    """
+    loose = _as_observed(problem)
+    points = np.flatnonzero(loose.network.observed.any(axis=1)).astype(np.intp)
+    if not len(points):
+        return None
+    weights = np.ones(len(loose.observations)) if loose.weights is None else loose.weights.copy()
+    current, critical = loose.continued(fit), _critical(len(points))
+    out = np.zeros(len(points), dtype=bool)
+    if shape is not None and not shape.as_a_whole:
+        out = np.isin(points, shape.points[~shape.agree])
+    seen, last = set[bytes](), None
+    for _ in range(_ROUNDS):
+        seen.add(out.tobytes())
+        again = current.with_weights(_without(loose, weights, points[out])).adjusted()
+        if isinstance(again, Failure):
+            if last is not None or not out.any():
+                break
+            out = np.zeros(len(points), dtype=bool)
+            continue
+        current = current.continued(again)
+        last = _Tested.of(loose, again, points, out)
+        back = out & (last.statistic < critical)
+        if back.any() and (out & ~back).tobytes() not in seen:
+            out = out & ~back
+            continue
+        bad = ~out & (last.statistic > critical)
+        if not bad.any():
+            break
+        worst = bad & (last.statistic >= _LIKEWISE * last.statistic[bad].max())
+        by_ray = worst & (last.ray_statistic > last.statistic)
+        if by_ray.any():
+            weights[2 * last.ray[by_ray]] = weights[2 * last.ray[by_ray] + 1] = 0.0
+        out = out | (worst & ~by_ray)
+        if not by_ray.any() and out.tobytes() in seen:
+            break
+    if last is None:
+        return None
+    # A point that was left out with others, and agrees without them, is not wrong.
+    wrong = out & ~(last.statistic < critical)
+    return ControlCheck(points, wrong, np.sqrt(last.statistic), last.off, last.detectable)
+
+
+def _without(problem: BundleProblem, weights: Array, points: Rows) -> Array:
+    """Weights without the coordinates of some points."""
+    others, weights = problem.others, weights.copy()
+    at = 2 * len(problem.network.xy) + others.slices[1].start
+    weights[at : at + len(others.coordinate)][np.isin(others.coordinate[:, 0], points)] = 0.0
+    return weights
+
+
+def without_control(problem: BundleProblem, points: Rows) -> BundleProblem:
+    """Return the problem with control points as tie points."""
+    network, others = problem.network, problem.others
+    sigma = network.sigma.copy()
+    sigma[points] = np.nan
+    chosen = set(points.tolist())
+    role = tuple("tie" if j in chosen else role for j, role in enumerate(network.role))
+    weights = problem.weights
+    if weights is not None:
+        kept = np.ones(len(weights), dtype=bool)
+        at = 2 * len(network.xy) + others.slices[1].start
+        kept[at : at + len(others.coordinate)] = ~np.isin(others.coordinate[:, 0], points)
+        weights = weights[kept]
+    return replace(problem, network=replace(network, sigma=sigma, role=role), weights=weights)
+
+
+@dataclass(frozen=True, eq=False)
+class _Tested:
+    """Tests (k,) of control points, with the largest test of a ray of each and its number."""
+
+    statistic: Array
+    off: Array
+    detectable: Array
+    ray_statistic: Array
+    ray: Rows
+
+    @classmethod
+    def of(cls, problem: BundleProblem, fit: BundleFit, points: Rows, out: Mask) -> _Tested:
+        network, others, n = problem.network, problem.others, 2 * len(problem.network.xy)
+        unit = _unit(fit.w[:n])
+        statistic, off = np.zeros(len(points)), np.full(len(points), np.nan)
+        detectable = np.full(len(points), np.inf)
+        # Deviation of a normal variable that the test of three coordinates finds with the power chosen.
+        found = np.sqrt(_critical(len(points))) + _POWER
+        residual = fit.residuals[n + others.slices[1].start :][: len(others.coordinate)]
+        for k, j in enumerate(points):
+            own = others.coordinate[:, 0] == j
+            axes = others.coordinate[own, 1]
+            given = np.diag(network.sigma[j, axes] ** 2)
+            if not fit.usable.points[j]:
+                statistic[k] = np.inf if out[k] else 0.0
+                continue
+            adjusted = fit.cofactors.points[j][np.ix_(axes, axes)]
+            v = residual[own]
+            if out[k]:
+                v = fit.values.xyz[j, axes] - network.xyz[j, axes]
+                statistic[k] = v @ np.linalg.solve(given + adjusted, v)
+            else:
+                size = np.sqrt(np.diag(given))
+                share, along = np.linalg.eigh(np.eye(len(axes)) - adjusted / np.outer(size, size))
+                seen = share > _UNSEEN
+                statistic[k] = (((v / size) @ along[:, seen]) ** 2 / share[seen]).sum()
+                if seen.all():
+                    detectable[k] = found * unit * float(size.max()) / np.sqrt(share[0])
+            off[k] = np.linalg.norm(v)
+        rays = _ray_statistic(network, fit)
+        ray = np.zeros(len(points), dtype=np.intp)
+        for k, j in enumerate(points):
+            rows = np.flatnonzero(network.point_of == j)
+            ray[k] = rows[np.argmax(rays[rows])] if len(rows) else -1
+        largest = np.where(ray >= 0, rays[ray], 0.0)
+        return cls(statistic / unit**2, off, detectable, largest / unit**2, ray)
+
+
+def _unit(w: Array) -> float:
+    """Factor on the standard deviations of image coordinates by their median test value, at least one."""
+    seen = np.abs(w[np.isfinite(w) & (w != 0)])
+    return max(1.0, float(np.median(seen)) / _MEDIAN) if len(seen) else 1.0
+
+
+def _ray_statistic(network: Network, fit: BundleFit) -> Array:
+    """Test vᵀ Qvv⁻¹ v (n,) of x and y of each image point together; zero where it is not used."""
+    n = len(network.xy)
+    root = np.linalg.cholesky(network.cov)
+    hat = next(iter(fit.solution.hats()))
+    share, along = np.linalg.eigh(np.eye(2) - np.swapaxes(root, 1, 2) @ hat @ root)
+    v = np.linalg.solve(root, np.nan_to_num(fit.residuals[: 2 * n]).reshape(n, 2)[:, :, None])
+    part = (np.swapaxes(along, 1, 2) @ v)[:, :, 0] ** 2
+    squares = np.where(share > _UNSEEN, part / np.maximum(share, _UNSEEN), 0.0).sum(axis=1)
+    return np.where(fit.usable.observations, squares, 0.0)
+
+
+def _as_observed(problem: BundleProblem) -> BundleProblem:
+    """Return the problem with held coordinates as observations with very small standard deviations."""
+    network = problem.network
+    if not network.held.any():
+        return problem
+    known = network.xyz[network.held.any(axis=1)]
+    extent = float(np.ptp(known, axis=0).max()) or 1.0
+    loose = replace(network, sigma=np.where(network.held, _TIGHT * extent, network.sigma))
+    weights = problem.weights
+    if weights is not None:
+        start = 2 * len(network.xy) + problem.others.slices[1].start
+        before = problem.others.coordinate
+        at = {tuple(row): k for k, row in enumerate(before.tolist())}
+        after = np.argwhere(loose.observed).tolist()
+        mine = [weights[start + at[tuple(row)]] if tuple(row) in at else 1.0 for row in after]
+        weights = np.concatenate([weights[:start], mine, weights[start + len(before) :]])
+    return replace(problem, network=loose, weights=weights)
 
 
 def _free(network: Network) -> BundleFit | None:

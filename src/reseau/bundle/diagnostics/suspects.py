@@ -1,4 +1,4 @@
-"""Elements that contradict the others: scale bars and control points with sigmas, held parameters.
+"""What contradicts the others: scale bars, bases, held parameters, points and images by their rays.
 
 Each is the largest of its kind in test value while those found before are left out, as in data snooping:
 errors of one element appear in the residuals of its neighbours as well.
@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...adjust import critical_w
-from ...core.data import Array, Rows
+from ...core.data import Rows
 from ...core.failure import Code, Failure, Remark
 from ..network import Camera, Network
 from ..network.network import finite
@@ -25,16 +25,17 @@ __all__ = ["contradicting", "doubtful_parameters", "grouped", "without_false_bar
 _ALPHA, _MOST = 1e-4, 12
 # Times by which a false distance is too long or too short at the approximate values.
 _FALSE = 1.5
-# Redundancy number below which an error of an observation can hardly be found.
-_UNCHECKED = 0.05
 # Times by which sigma0 falls when held parameters are estimated, where their values are wrong.
 _FALLS, _SIGMAS = 2.0, 5.0
 # Part of the rays of a point, or of the points of an image, that must be suspected for a common cause.
 _SHARE = 0.4
 
 
-def contradicting(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
-    """Find distances, bases and observed control points that contradict the other observations.
+def contradicting(problem: BundleProblem, fit: BundleFit) -> tuple[BundleProblem, list[Remark]]:
+    """Find distances and bases that contradict the other observations.
+
+    They are tested with observed control points as data snooping does; control points are found by
+    :func:`~reseau.bundle.diagnostics.control_check.checked_control`.
 
     Parameters
     ----------
@@ -45,8 +46,8 @@ def contradicting(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
 
     Returns
     -------
-    list of Remark
-        The elements, the foremost first, and control points that cannot be checked; empty where all agree.
+    BundleProblem, list of Remark
+        The problem without them, and their names, the foremost first; none where all agree.
     """
     network, others, n = problem.network, problem.others, 2 * len(problem.network.xy)
     bars, coordinates, _ = others.slices
@@ -55,8 +56,8 @@ def contradicting(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
     lengths = bars.stop + len(bases)
     element = np.concatenate([np.arange(bars.stop), lengths + others.coordinate[:, 0], bars.stop + bases])
     own = n + np.concatenate([np.arange(coordinates.stop), others.base_lengths.start + bases])
-    if not len(element):
-        return []
+    if not lengths:
+        return problem, []
     weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
     critical = critical_w(_ALPHA / len(element))
     found: list[tuple[int, float, float]] = []
@@ -80,10 +81,11 @@ def contradicting(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
         off = float(np.abs(again.residuals[own[worst]]))
         found.append((int(element[worst]), float(w[worst]), off))
         weights, current = trial, again
-    if not found:
-        return []
-    unchecked = _unchecked(problem, current, weights)
-    return [*_lengths(network, found), *_control(network, found, lengths, unchecked)]
+    named = [one for one in found if one[0] < lengths]
+    false = [k for k, _, off in named if np.isfinite(off)]
+    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+    weights[own[np.isin(element, false)]] = 0.0
+    return problem.with_weights(weights) if false else problem, _lengths(network, named)
 
 
 def without_false_bars(problem: BundleProblem) -> tuple[BundleProblem, list[Remark]]:
@@ -155,34 +157,6 @@ def _lengths(network: Network, found: list[tuple[int, float, float]]) -> list[Re
             Code.DOUBTFUL_CONTROL,
         )
     ]
-
-
-def _control(
-    network: Network, found: list[tuple[int, float, float]], lengths: int, unchecked: list[str]
-) -> list[Remark]:
-    names = [f"{network.points[k - lengths]} (w {w:.1f})" for k, w, _ in found if k >= lengths]
-    if not names:
-        return []
-    verb = "contradicts" if len(names) == 1 else "contradict"
-    rest = (
-        f"; errors of the control point{'s' * (len(unchecked) > 1)} {listed(unchecked)} cannot be found: too "
-        "few rays, or rays along the error"
-        if unchecked
-        else ""
-    )
-    text = f"the control point{'s' * (len(names) > 1)} {listed(names)} {verb} the other observations{rest}"
-    return [Remark(text, Code.DOUBTFUL_CONTROL)]
-
-
-def _unchecked(problem: BundleProblem, fit: BundleFit, weights: Array) -> list[str]:
-    """Control points with an observed coordinate of which an error can hardly be found."""
-    network, n = problem.network, 2 * len(problem.network.xy)
-    _, coordinates, _ = problem.others.slices
-    own = slice(n + coordinates.start, n + coordinates.stop)
-    r = np.nan_to_num(fit.redundancy_numbers[own])
-    point = problem.others.coordinate[:, 0]
-    bad = (weights[own] > 0) & fit.usable.points[point] & (r < _UNCHECKED)
-    return [network.points[j] for j in np.unique(point[bad])]
 
 
 def doubtful_parameters(problem: BundleProblem, fit: BundleFit) -> list[Remark]:

@@ -13,9 +13,10 @@ from ...adjust.outliers import Rejection, SnoopingStep
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
-from ..diagnostics import Result, checks, doubtful_control
+from ..diagnostics import ControlCheck, ControlShape, Result, checked_control, checks, control_shape
 from ..diagnostics.causes import causes, given_poses_that_do_not_fit, seen_frontally
 from ..diagnostics.checks import listed
+from ..diagnostics.control_check import suspected, without_control
 from ..diagnostics.suspects import contradicting, doubtful_parameters, grouped, without_false_bars
 from ..network import Network
 from ..network.network import finite
@@ -234,24 +235,27 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     found += given_poses_that_do_not_fit(network, _misfits_px(problem))
     steps: tuple[SnoopingStep, ...] = ()
     if options.outliers == "reject":
-        careful = _without_gross_errors(problem, options)
+        careful = _rejecting(problem, options)
         if isinstance(careful, Failure):
             return _explained(careful, problem, found)
-        fit, steps, left = careful
+        (fit, steps, left), of_control = careful
+        problem = replace(problem, network=fit.problem.network, weights=fit.problem.weights)
+        network = problem.network
         notes = (*notes, *left)
     else:
         plain = problem.adjusted() if grave else _plain(problem)
         if isinstance(plain, Failure):
             return _explained(plain, problem, found)
         fit = plain
+        _, of_control = (None, []) if grave else _control(problem, fit)
     n = len(network.xy)
     rejected = np.asarray(fit.rejected[: 2 * n].reshape(n, 2).any(axis=1))
     bare = Result(network, fit, rejected, steps)
     if _has_depth(bare):
         found = [remark for remark in found if remark.code is not Code.ONE_STATION]
     if not grave:
-        found += _doubts(problem, fit)
-        found += _rejected_control(network, rejected)
+        found += _doubts(problem, fit, of_control)
+        found += [] if of_control else _rejected_control(network, rejected)
         found += _frontal(network, bare)
     return Result(network, fit, rejected, steps, (*found, *notes, *checks(bare)))
 
@@ -321,7 +325,70 @@ def _plain(problem: BundleProblem) -> BundleFit | Failure:
     return improved(problem, fit)
 
 
-def _doubts(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
+def _rejecting(
+    problem: BundleProblem, options: Options
+) -> tuple[tuple[BundleFit, tuple[SnoopingStep, ...], list[Remark]], list[Remark]] | Failure:
+    """Adjust without gross errors and without wrong control points, and say which these are."""
+    first = _without_gross_errors(problem, options)
+    shape = None
+    if isinstance(first, Failure):
+        shape = _partly_wrong(problem)
+        if shape is None:
+            return first
+        again = _without_gross_errors(without_control(problem, shape.points[~shape.agree]), options)
+        if isinstance(again, Failure):
+            return first
+        check, said = _control(problem, again[0], shape)
+        if not check:
+            return again, [Remark(f"{shape.doubt()}: left out", Code.DOUBTFUL_CONTROL)]
+        first = again
+    else:
+        check, said = _control(problem, first[0])
+    if check and not check.undecided:
+        again = _without_gross_errors(without_control(problem, check.points[check.wrong]), options)
+        if not isinstance(again, Failure):
+            return again, check.remarks(problem.network, left_out=True)
+    return first, said
+
+
+def _partly_wrong(problem: BundleProblem) -> ControlShape | None:
+    """The control points compared with a free network, where some of them do not agree."""
+    if problem.network.datum != "control" or len(problem.observations) > _MANY:
+        return None
+    shape = control_shape(problem.network)
+    return None if shape is None or shape.agree.all() or shape.as_a_whole else shape
+
+
+def _control(
+    problem: BundleProblem, fit: BundleFit, shape: ControlShape | None = None
+) -> tuple[ControlCheck | None, list[Remark]]:
+    """Test the control points where they, or their rays, do not fit; what to say of them.
+
+    With a given `shape` the adjustment is one without the points that do not agree with it.
+    """
+    network, n = problem.network, 2 * len(problem.network.xy)
+    if shape is None:
+        if not suspected(problem, fit):
+            return None, []
+        shape = control_shape(network) if len(problem.observations) <= _MANY else None
+        rejected = np.asarray(fit.rejected[:n].reshape(-1, 2).any(axis=1))
+        poor = fit.sigma0 > _DOUBT or bool(_rejected_control(network, rejected))
+        if poor and shape is not None and shape.as_a_whole:
+            return None, [Remark(shape.doubt(), Code.DOUBTFUL_CONTROL)]
+    # Rays of control points are judged with their coordinates, not before.
+    of_control: Mask = np.asarray((network.observed | network.held).any(axis=1))
+    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+    tie = np.repeat(~of_control[network.point_of], 2)
+    if fit.problem.weights is not None:
+        weights[:n] = np.where(tie, fit.problem.weights[:n], weights[:n])
+    elif fit.sigma0 > _DOUBT and len(problem.observations) <= _MANY:
+        gross = np.isin(np.arange(len(network.xy)), _suspects(problem))
+        weights[:n] = np.where(tie & np.repeat(gross, 2), 0.0, weights[:n])
+    check = checked_control(problem.with_weights(weights), fit, shape)
+    return check, [] if check is None else check.remarks(network)
+
+
+def _doubts(problem: BundleProblem, fit: BundleFit, of_control: list[Remark]) -> list[Remark]:
     """Return remarks on what contradicts the rest, in a network that fits badly."""
     n, weights, every = len(problem.network.xy), fit.problem.weights, fit
     if weights is not None and (weights[2 * n :] == 0).any():
@@ -331,16 +398,16 @@ def _doubts(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
         again = problem.continued(fit).with_weights(weights).adjusted()
         every = fit if isinstance(again, Failure) else again
     current = problem.with_weights(weights)
-    doubts = contradicting(current, every)
+    doubts = [*contradicting(current, every)[1], *of_control]
     if not fit.sigma0 > _DOUBT:
         return doubts
-    control = doubtful_control(problem.network) if problem.network.datum == "control" else ""
-    if control:
-        doubts.append(Remark(control, Code.DOUBTFUL_CONTROL))
     if len(problem.observations) <= _MANY:
         held = doubtful_parameters(current, fit)
         doubts += held
         rows = _suspects(problem)
+        if of_control:
+            # Rays of control points are suspected with them.
+            rows = rows[np.isnan(problem.network.sigma[problem.network.point_of[rows]]).any(axis=1)]
         if len(rows) and not held:
             doubts += [*grouped(problem.network, rows), _gross(problem.network, rows)]
     return doubts
@@ -477,6 +544,20 @@ def _trimmed(problem: BundleProblem) -> BundleProblem:
     return problem
 
 
+def _control_of_failed(problem: BundleProblem) -> list[Remark]:
+    """What is wrong with the control points of an adjustment that failed."""
+    shape = control_shape(problem.network)
+    if shape is None or shape.agree.all():
+        return []
+    if not shape.as_a_whole:
+        fit = without_control(problem, shape.points[~shape.agree]).adjusted()
+        if not isinstance(fit, Failure):
+            check, said = _control(problem, fit, shape)
+            if check:
+                return said
+    return [Remark(shape.doubt(), Code.DOUBTFUL_CONTROL)]
+
+
 def _explained(failure: Failure, problem: BundleProblem, found: list[Remark]) -> Failure:
     """Add the cause to the reason of a failure."""
     network = problem.network
@@ -485,8 +566,8 @@ def _explained(failure: Failure, problem: BundleProblem, found: list[Remark]) ->
     if not found:
         start = problem.start
         found = seen_frontally(network, start.rotation, start.xyz, finite(start.x0))
-    if not found and network.datum == "control" and (doubt := doubtful_control(network)):
-        found = [Remark(doubt, Code.DOUBTFUL_CONTROL)]
+    if not found and network.datum == "control":
+        found = _control_of_failed(problem)
     if not found and failure.code is not Code.TOO_FEW_POINTS and len(problem.observations) <= _MANY:
         rows = _suspects(problem)
         if len(rows):
