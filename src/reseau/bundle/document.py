@@ -16,7 +16,7 @@ from ..core.provenance import Provenance
 from ..io import Document, Strict
 from ..optics.poses import matrix_to_vector
 from ..optics.refraction import Refraction
-from .diagnostics import MotionEstimates, Result, RigEstimate, sigma_between_images
+from .diagnostics import MotionEstimates, PriorInfluence, Result, RigEstimate, sigma_between_images
 from .network import Rig
 from .network.network import finite
 
@@ -50,6 +50,23 @@ class Significance(Strict):
     significant: bool
 
 
+class PriorResult(Strict):
+    """Observed parameters of a camera in columns: their share in the estimates, and sigmas with and without.
+
+    `sigma_images` is the part of `sigma` that the noise of all other observations causes; `determined` the
+    number of parameters that these determine; `sigma0` that without these observations.
+    """
+
+    parameter: tuple[str, ...]
+    given: tuple[float, ...]
+    sigma_given: tuple[float, ...]
+    share: tuple[float, ...]
+    sigma: tuple[float, ...]
+    sigma_images: tuple[float, ...]
+    determined: float
+    sigma0: float | None
+
+
 class CameraResult(Strict):
     """A camera: parameters, their standard deviations from the scatter between images, correlation, tests."""
 
@@ -59,6 +76,7 @@ class CameraResult(Strict):
     sigma_between_images: dict[str, float | None]
     correlation: Correlation
     tests: dict[str, Significance]
+    priors: PriorResult | None = None
 
 
 class RefractionResult(Strict):
@@ -360,13 +378,25 @@ def _camera(result: Result, c: int) -> CameraResult:
         for name, value, s in zip(found.parameters, found.values.tolist(), found.sigma.tolist(), strict=True)
     }
     between = _column(sigma_between_images(result, c))
+    influence = result.priors(c)
+    more = {} if influence is None else {"priors": _priors(influence)}
     return CameraResult(
         id=camera.id,
         parameters=held | estimated,
         sigma_between_images=dict(zip(found.parameters, between, strict=True)),
         correlation=Correlation(names=found.parameters, matrix=_matrix(found.correlation)),
         tests={test.name: _significance(test) for test in result.camera_tests(c)},
+        **more,
     )
+
+
+def _priors(found: PriorInfluence) -> PriorResult:
+    columns = (found.given, found.sigma_given, found.share, found.sigma, found.sigma_images)
+    given, sigma_given, share, sigma, images = (tuple(column.tolist()) for column in columns)
+    return PriorResult(
+        parameter=found.parameters, given=given, sigma_given=sigma_given, share=share, sigma=sigma,
+        sigma_images=images, determined=found.determined, sigma0=_number(found.sigma0),
+    )  # fmt: skip
 
 
 def _refraction(result: Result, bent: Refraction) -> RefractionResult:

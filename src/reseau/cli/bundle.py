@@ -22,6 +22,7 @@ from .bundle_options import (
     say_model,
     say_motion,
     say_parameters,
+    say_priors,
     say_refraction,
     say_rig,
 )
@@ -188,10 +189,11 @@ def _say(path: Path, result: Result) -> None:
         f"redundancy {result.redundancy}\n"
         f"sigma0 {result.sigma0:.4g} after {result.fit.iterations} iterations{left_out}\n"
     )
-    for camera in result.cameras.values():
+    for c, camera in enumerate(result.cameras.values()):
         if camera.parameters:
             say(f"camera {camera.id}\n")
             say_parameters(camera)
+            say_priors(result.priors(c))
     if result.refraction is not None:
         say("windows and media\n")
         say_refraction(result.refraction)

@@ -11,7 +11,15 @@ import typer
 from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
-    from ..bundle import CameraEstimate, Kind, MotionEstimates, RefractionEstimate, Result, RigEstimate
+    from ..bundle import (
+        CameraEstimate,
+        Kind,
+        MotionEstimates,
+        PriorInfluence,
+        RefractionEstimate,
+        Result,
+        RigEstimate,
+    )
     from ..calibration import FieldDifference
     from ..core.data import Array
 
@@ -31,9 +39,13 @@ __all__ = [
     "say_model",
     "say_motion",
     "say_parameters",
+    "say_priors",
     "say_refraction",
     "say_rig",
 ]
+
+# Parameters of a camera that are printed at most.
+_MOST = 60
 
 
 class Components(StrEnum):
@@ -133,10 +145,30 @@ def say_parameters(camera: CameraEstimate, between: Array | None = None) -> None
 
     rows = zip(camera.parameters, camera.values.tolist(), camera.sigma.tolist(), camera.units, strict=True)
     for k, (name, value, sigma, unit) in enumerate(rows):
+        if k == _MOST and len(camera.parameters) > _MOST + 1:
+            say(f"  … and {len(camera.parameters) - k} more\n")
+            break
         by_images = ""
         if between is not None and math.isfinite(between[k]):
             by_images = f" (from scatter between images: {between[k]:.2g})"
         say(f"  {name:<6} {measured(value, sigma, unit)}{by_images}\n")
+
+
+def say_priors(found: PriorInfluence | None) -> None:
+    """Print how much observed parameters determine a camera; nothing without any."""
+    import numpy as np
+
+    if found is None:
+        return
+    count = len(found.parameters)
+    weak = int((found.share > 0.5).sum())
+    ratio = found.sigma_images / np.where(found.sigma > 0, found.sigma, 1.0)
+    say(
+        f"  {count} parameters are observed with a sigma: the image points determine {found.determined:.1f} "
+        f"of them, {weak} are determined mostly by their own observation\n"
+        f"  sigmas that the noise of the image points causes: {np.median(ratio):.2f} of these sigmas in the "
+        f"median; sigma0 without the observed parameters {found.sigma0:.4g}\n"
+    )
 
 
 def say_refraction(found: RefractionEstimate) -> None:

@@ -26,6 +26,7 @@ from .bundle_options import (
     say_model,
     say_motion,
     say_parameters,
+    say_priors,
     say_refraction,
     say_rig,
 )
@@ -439,6 +440,7 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
         if len(result.network.cameras) > 1:
             say(f"camera {entry.id}\n")
         say_parameters(result.camera(c), sigma_between_images(result, c))
+        say_priors(result.priors(c))
         field = _uncertainty(projection_field(camera_mapping(result, c)))
         say(f"uncertainty of the projection: {field.replace(',', ' over the image,')}\n")
         for away in distances:

@@ -100,7 +100,13 @@ class CameraEntry(Strict):
     @field_validator("model")
     @classmethod
     def _registered(cls, name: str) -> str:
-        return _known(name, [model.name for model in camera_models()])
+        try:
+            camera_model(name)
+        except UsageError as error:
+            if "_order=" in name:
+                raise ValueError(str(error)) from None
+            raise ValueError(_not_known(name, [model.name for model in camera_models()])) from None
+        return name
 
     @property
     def on_film(self) -> bool:
@@ -402,8 +408,12 @@ class Network1(Document):
 
 def _known(name: str, names: Sequence[str]) -> str:
     if name not in names:
-        raise ValueError(f"{name!r} is not one of the models {', '.join(names)}")
+        raise ValueError(_not_known(name, names))
     return name
+
+
+def _not_known(name: str, names: Sequence[str]) -> str:
+    return f"{name!r} is not one of the models {', '.join(names)}"
 
 
 def _twice(names: Iterable[T]) -> T | None:

@@ -704,7 +704,7 @@ def first_camera(
     values = model.registered.start_values(f, PixelGrid(*size, pitch))
     return Camera(
         _CAMERA, *size, pitch, model.registered.name, values, model.chosen, model.options,
-        shutter=model.shutter,
+        sigma=model.registered.priors(model.chosen), shutter=model.shutter,
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from .estimates import (
     ImageEstimates,
     MotionEstimates,
     PointEstimates,
+    PriorInfluence,
     RefractionEstimate,
     RigEstimate,
 )
@@ -24,6 +25,7 @@ __all__ = [
     "ImageEstimates",
     "MotionEstimates",
     "PointEstimates",
+    "PriorInfluence",
     "RefractionEstimate",
     "Result",
     "RigEstimate",

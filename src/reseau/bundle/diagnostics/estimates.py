@@ -17,6 +17,7 @@ __all__ = [
     "ImageEstimates",
     "MotionEstimates",
     "PointEstimates",
+    "PriorInfluence",
     "RefractionEstimate",
     "RigEstimate",
 ]
@@ -174,6 +175,62 @@ class RigEstimate(Display):
                 self.cameras, self.references, self.length, self.length_sigma, strict=True
             )
         ]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PriorInfluence(Display):
+    """How much observed parameters of a camera, such as a regularisation, determine its estimates.
+
+    Parameters
+    ----------
+    parameters : tuple of str (u,)
+        Parameters that are observations.
+    given, sigma_given : ndarray (u,)
+        Observed values and their standard deviations.
+    share : ndarray (u,)
+        Share of the observation in the information on each parameter: 0 where the images alone determine it,
+        1 where they say nothing. It is 1 less the redundancy number of the observation.
+    sigma : ndarray (u,)
+        Standard deviations of the estimates.
+    sigma_images : ndarray (u,)
+        The part of these that the noise of all other observations causes. Where the observation is not a
+        measurement, the rest stands for what the regularisation smooths away.
+    sigma0 : float
+        Standard deviation of unit weight without these observations and their share of the redundancy.
+
+    Examples
+    --------
+    >>> one = np.ones(2)
+    >>> found = PriorInfluence(("k1", "k2"), 0 * one, one, np.array([0.1, 1.0]), one, one, 1.0)
+    >>> found, round(found.determined, 1)
+    (<PriorInfluence: 2 observed parameters, the images determine 0.9 of them>, 0.9)
+    """
+
+    parameters: tuple[str, ...]
+    given: Array
+    sigma_given: Array
+    share: Array
+    sigma: Array
+    sigma_images: Array
+    sigma0: float
+
+    @property
+    def determined(self) -> float:
+        """Number of parameters that the images determine: the sum of the redundancy numbers."""
+        return float((1 - self.share).sum())
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
+            (f"{len(self.parameters)} observed parameters", ""),
+            (f"the images determine {self.determined:.1f} of them", ""),
+        ]
+
+    def _columns(self) -> dict[str, list[object]]:
+        return {
+            "parameter": list(self.parameters), "given": self.given.tolist(),
+            "s_given": self.sigma_given.tolist(), "share": self.share.tolist(), "s": self.sigma.tolist(),
+            "s_images": self.sigma_images.tolist(),
+        }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, repr=False)

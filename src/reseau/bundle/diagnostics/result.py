@@ -27,6 +27,7 @@ from .estimates import (
     ImageEstimates,
     MotionEstimates,
     PointEstimates,
+    PriorInfluence,
     RefractionEstimate,
     RigEstimate,
 )
@@ -272,6 +273,31 @@ class Result(Display):
         cameras, references = (tuple(names[k] for k in rows) for rows in (at, constraints.references[at]))
         cov = cofactors[each, :, each] * self.fit.variance
         return RigEstimate(cameras, references, places.rotation[at], places.base[at], cov, self.network.unit)
+
+    def priors(self, c: int) -> PriorInfluence | None:
+        """How much observed parameters of the c-th camera determine it; None where none is observed.
+
+        Single parameters with a sigma, not those of a calibration with a joint covariance.
+        """
+        camera, unknowns = self.network.cameras[c], self.fit.unknowns
+        names = [name for name in camera.free if name in camera.sigma]
+        if not names or unknowns.camera[c] < 0:
+            return None
+        at = unknowns.camera[c] + np.array([camera.free.index(name) for name in names])
+        given = np.array([camera.parameters[name] for name in names])
+        sigma = np.array([camera.sigma[name] for name in names])
+        own = self.fit.cofactors.reduced[np.ix_(at, at)]
+        share = np.clip(np.diag(own) / sigma**2, 0.0, 1.0)
+        images = np.diag(own) - ((own / sigma) ** 2).sum(axis=1)
+        rows = [camera.names.index(name) for name in names]
+        off = self.fit.values.cameras[c, rows] - given
+        left = self.redundancy - float((1 - share).sum())
+        cost = self.fit.cost - float(((off / sigma) ** 2).sum())
+        scale = np.sqrt(self.fit.variance)
+        return PriorInfluence(
+            tuple(names), given, sigma, share, scale * np.sqrt(np.diag(own)),
+            scale * np.sqrt(np.maximum(images, 0.0)), np.sqrt(cost / left) if left > 0 else float("nan"),
+        )  # fmt: skip
 
     @cached_property
     def motion(self) -> MotionEstimates | None:

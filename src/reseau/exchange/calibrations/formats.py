@@ -15,7 +15,7 @@ from ...core.errors import FormatError, UsageError
 from ...core.provenance import Provenance, sha256_of
 from ...io import read_text, write_whole
 from ...optics import PixelGrid
-from ...optics.cameras import camera_model, convert, unit_of
+from ...optics.cameras import SplinedStereographic, camera_model, convert, unit_of
 from ...optics.poses import rotation_matrix
 from . import brown, colmap, matlab, metashape, mrcal, opencv, openptv, yamls
 from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, Mounted, PlainCamera
@@ -109,7 +109,8 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
         ),
         CalibrationFormat(
             "mrcal", (".cameramodel",),
-            (("opencv", _RADTAN), *wide, ("opencv_full", _TWELVE)), mrcal.write, mrcal.recognises, mrcal.read,
+            (("opencv", _RADTAN), *wide, ("opencv_full", _TWELVE), ("stereographic", _CENTRE)), mrcal.write,
+            mrcal.recognises, mrcal.read,
         ),
         CalibrationFormat(
             "metashape", (".xml",), (("opencv", _FIVE),),
@@ -284,6 +285,8 @@ def _in_a_model_of(form: CalibrationFormat, calibration: Calibration, lens: Came
         if plain and same and options == _options(wanted):
             pitch = (given[0], given[1])
             return Exported(PlainCamera(name, width, height, wanted, own, pitch, options), 0.0, 0.0, 1.0)
+    if form.name == "mrcal" and isinstance(lens.mapping, SplinedStereographic):
+        return Exported(PlainCamera(name, width, height, model, own), 0.0, 0.0, 1.0)
     best: Exported | None = None
     why = "no model of the format describes it"
     for wanted, names in form.models:

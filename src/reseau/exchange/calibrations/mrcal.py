@@ -1,15 +1,17 @@
 """mrcal's ``.cameramodel``: a Python dictionary with lens model, intrinsics, extrinsics and image size.
 
-Lens models: ``LENSMODEL_PINHOLE`` and ``LENSMODEL_OPENCV4``, ``5``, ``8``, ``12``. Pixels are counted from
-the centre of the first one.
+Lens models: ``LENSMODEL_PINHOLE``, ``LENSMODEL_OPENCV4``, ``5``, ``8``, ``12``, ``LENSMODEL_STEREOGRAPHIC``
+and ``LENSMODEL_SPLINED_STEREOGRAPHIC_…``. Pixels are counted from the centre of the first one.
 """
 
 from __future__ import annotations
 
 import ast
+from math import isfinite
 from pathlib import Path
 
-from ...core.errors import FormatError
+from ...core.errors import FormatError, UsageError
+from ...optics.cameras import SplinedStereographic, camera_model
 from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, PlainCamera, opencv_camera
 
 __all__ = ["read", "recognises", "write"]
@@ -21,13 +23,22 @@ _MODELS: dict[str, tuple[str, ...]] = {
     "LENSMODEL_OPENCV8": RATIONAL,
     "LENSMODEL_OPENCV12": THIN_PRISM,
 }
+_CENTRE = ("fx", "fy", "cx", "cy")
+_STEREOGRAPHIC, _SPLINED = "LENSMODEL_STEREOGRAPHIC", "LENSMODEL_SPLINED_STEREOGRAPHIC"
+_OURS = "splined_stereographic"
 
 
 def write(camera: PlainCamera) -> str:
     """Return the text of a camera model, with the camera at the origin."""
-    used = {name for name, value in camera.values.items() if value and name not in ("fx", "fy", "cx", "cy")}
-    model = next(name for name, own in _MODELS.items() if own and used <= set(own))
-    values = camera.of("fx", "fy", "cx", "cy", *_MODELS[model])
+    mapping = camera.mapping()
+    if isinstance(mapping, SplinedStereographic):
+        model, values = _SPLINED + mapping.grid.name.removeprefix(_OURS), camera.of(*mapping.names)
+    elif camera.model == "stereographic":
+        model, values = _STEREOGRAPHIC, camera.of(*_CENTRE)
+    else:
+        used = {name for name, value in camera.values.items() if value and name not in _CENTRE}
+        model = next(name for name, own in _MODELS.items() if own and used <= set(own))
+        values = camera.of(*_CENTRE, *_MODELS[model])
     return (
         "{\n"
         f"    'lensmodel':  '{model}',\n\n"
@@ -59,6 +70,8 @@ def read(text: str, path: Path) -> PlainCamera:
         width, height = (int(v) for v in content["imagersize"])
     except (SyntaxError, ValueError, KeyError, TypeError):
         raise FormatError("has no complete lensmodel, intrinsics and imagersize", where=path) from None
+    if model.startswith(_SPLINED) or model == _STEREOGRAPHIC:
+        return _stereographic(path, model, numbers, (width, height))
     names = _MODELS.get(model)
     if names is None:
         raise FormatError(f"has the lens model {model}; known are {', '.join(_MODELS)}", where=path)
@@ -66,3 +79,17 @@ def read(text: str, path: Path) -> PlainCamera:
         raise FormatError(f"has {len(numbers)} intrinsics, not the {4 + len(names)} of {model}", where=path)
     (fx, fy, cx, cy), found = numbers[:4], numbers[4:]
     return opencv_camera(path.stem, (width, height), (fx, fy), (cx, cy), found, path)
+
+
+def _stereographic(path: Path, model: str, numbers: list[float], size: tuple[int, int]) -> PlainCamera:
+    """The stereographic camera, with or without a spline surface."""
+    name = "stereographic" if model == _STEREOGRAPHIC else _OURS + model.removeprefix(_SPLINED)
+    try:
+        names = _CENTRE if model == _STEREOGRAPHIC else camera_model(name).names
+    except UsageError as error:
+        raise FormatError(f"has the lens model {model}: {error}", where=path) from None
+    if len(numbers) != len(names):
+        raise FormatError(f"has {len(numbers)} intrinsics, not the {len(names)} of {model}", where=path)
+    if not all(isfinite(number) for number in numbers) or min(numbers[:2]) <= 0 or min(size) < 1:
+        raise FormatError("has no finite intrinsics and image size", where=path)
+    return PlainCamera(path.stem, *size, name, dict(zip(names, numbers, strict=True)))

@@ -24,6 +24,7 @@ from .projections import (  # isort: skip
 from .telecentric import Telecentric  # isort: skip
 from .openptv import OpenPtv  # isort: skip
 from .line_scan import LineScan  # isort: skip
+from .splined import SplinedStereographic, SplineGrid  # isort: skip
 from .convert import Converted, convert
 from .ebner import EbnerCorrection
 from .grid import PixelGrid
@@ -66,6 +67,8 @@ __all__ = [
     "Orthographic",
     "Parameter",
     "PixelGrid",
+    "SplineGrid",
+    "SplinedStereographic",
     "Stereographic",
     "Telecentric",
     "additional_model",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -33,6 +34,7 @@ __all__ = [
     "distortion_names",
     "register_additional",
     "register_camera",
+    "register_family",
     "unit_of",
 ]
 
@@ -57,6 +59,9 @@ class Parameter:
         Whether a calibration estimates it by default.
     required : bool
         Whether files must give it; otherwise it is zero where it is not given.
+    prior : float
+        Standard deviation of an observation of its start value, with which a calibration estimates it; 0 for
+        none.
 
     Examples
     --------
@@ -69,6 +74,7 @@ class Parameter:
     role: Literal["scale", "centre", "shape", "distortion"] = "distortion"
     usual: bool = False
     required: bool = False
+    prior: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -190,6 +196,11 @@ class CameraModel:
         """Unit of each parameter, as in files."""
         return {p.name: p.unit for p in self.parameters}
 
+    def priors(self, free: Iterable[str]) -> dict[str, float]:
+        """Standard deviations of the observations that regularise some of the parameters."""
+        own = {p.name: p.prior for p in self.parameters if p.prior > 0}
+        return {name: own[name] for name in free if name in own}
+
     def of_role(self, *roles: str) -> tuple[str, ...]:
         """Parameters of some roles: ``scale``, ``centre``, ``shape``, ``distortion``."""
         return tuple(p.name for p in self.parameters if p.role in roles)
@@ -306,6 +317,7 @@ _OTHER_NAMES = {
     "unified": "omni", "ds": "double_sphere", "radtan": "opencv", "affine": "telecentric",
 }  # fmt: skip
 _CAMERAS: dict[str, CameraModel] = {}
+_FAMILIES: dict[str, Callable[[str], CameraModel | None]] = {}
 _ADDITIONAL: dict[str, AdditionalModel] = {}
 
 
@@ -353,6 +365,19 @@ def register_additional(model: AdditionalModel) -> AdditionalModel:
     return model
 
 
+def register_family(prefix: str, member: Callable[[str], CameraModel | None]) -> None:
+    """Register models that differ by numbers in their names.
+
+    Parameters
+    ----------
+    prefix : str
+        Of their names.
+    member : callable
+        ``member(name)`` is the model of a name; None where there is none.
+    """
+    _FAMILIES[prefix] = member
+
+
 def camera_models() -> tuple[CameraModel, ...]:
     """All camera models, in the order of their registration.
 
@@ -389,7 +414,7 @@ def camera_model(name: str) -> CameraModel:
     Traceback (most recent call last):
     reseau.core.errors.UsageError: camera model 'pinhole': is unknown; use one of brown, brown_higher...
     """
-    return _found(_CAMERAS, name, "camera model")
+    return _member(name) or _found(_CAMERAS, name, "camera model")
 
 
 def additional_model(name: str) -> AdditionalModel:
@@ -439,8 +464,7 @@ def distortion_names(names: Iterable[str], model: str = "mapping") -> tuple[str,
     >>> distortion_names(["c", "x0", "K1", "b3"], "brown")
     ('K1', 'b3')
     """
-    models = [_CAMERAS[model]] if model in _CAMERAS else camera_models()
-    interior = {name for each in models for name in each.of_role("scale", "centre", "shape")}
+    interior = {name for each in _own(model) for name in each.of_role("scale", "centre", "shape")}
     return tuple(name for name in names if name not in interior)
 
 
@@ -459,8 +483,24 @@ def unit_of(name: str, model: str = "mapping") -> str:
     >>> unit_of("K1", "brown"), unit_of("b1", "brown"), unit_of("fx")
     ('mm^-2', '', 'px')
     """
-    models = [_CAMERAS[model]] if model in _CAMERAS else camera_models()
-    return next((each.units[name] for each in models if name in each.units), "")
+    return next((each.units[name] for each in _own(model) if name in each.units), "")
+
+
+@cache
+def _member(name: str) -> CameraModel | None:
+    """A model of a family; None for a model of its own."""
+    if name in _CAMERAS:
+        return None
+    found = (member(name) for prefix, member in _FAMILIES.items() if name.startswith(prefix))
+    return next((model for model in found if model is not None), None)
+
+
+def _own(name: str) -> tuple[CameraModel, ...]:
+    """The model of a name; all models for any other mapping."""
+    member = _member(name)
+    if member is not None:
+        return (member,)
+    return (_CAMERAS[name],) if name in _CAMERAS else camera_models()
 
 
 def _found(table: Mapping[str, T], name: str, what: str) -> T:
