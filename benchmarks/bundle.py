@@ -22,12 +22,14 @@ from pathlib import Path
 
 import numpy as np
 from shared import of_the_tests
+from worlds import lenses
 
-from reseau.bundle import BundleFit, BundleProblem, Network, problem_of
+from reseau.bundle import BundleFit, BundleProblem, Camera, Network, problem_of
 from reseau.bundle.solver.posterior import cofactors_of
 from reseau.core.threads import one_thread
 from reseau.exchange import read_bal
 from reseau.io.network import Network1
+from reseau.optics.cameras import Fisheye
 from reseau.optics.poses import rotation_matrix
 
 DATA = (
@@ -104,6 +106,54 @@ def write_shared(problem: BundleProblem, path: Path) -> None:
             file.write(" ".join(map(repr, row)) + "\n")
 
 
+def fisheye_problem() -> BundleProblem:
+    """Forty images by a fisheye of 80°, drawn by OpenCV, from rough approximate values of everything."""
+    networks = of_the_tests("bundle/networks.py")
+    lens, rng = lenses.fisheye(80), np.random.default_rng(5)
+    m, p = 40, 4000
+    xyz = rng.uniform([-2, -2, -0.8], [2, 2, 0.8], (p, 3))
+    angle = np.linspace(0, 4 * np.pi, m, endpoint=False)
+    x0 = np.stack([2.5 * np.cos(angle), 2.5 * np.sin(angle), 1.5 + 0.3 * np.sin(3 * angle)], axis=1)
+    rotation = np.stack([networks.looking_at(x, np.zeros(3), 0.8 * k) for k, x in enumerate(x0)])
+    image_of, point_of, seen = [], [], []
+    for i in range(m):
+        xy = lens.project((xyz - x0[i]) @ rotation[i].T)
+        rows = np.flatnonzero(np.isfinite(xy).all(axis=1) & (rng.uniform(size=p) < 0.5))
+        image_of.append(np.full(len(rows), i))
+        point_of.append(rows)
+        seen.append(xy[rows] + rng.normal(0, 0.2, (len(rows), 2)))
+    f = 1.02 * float(lens.matrix[0, 0])
+    values = np.array([f, f, 639.5, 479.5] + 8 * [0.0])
+    camera = Camera("A", 1280, 960, (1.0, 1.0), "fisheye", values, Fisheye.names[:8])
+    small = networks.world(cameras=(networks.camera(),)).network
+    saw = np.concatenate(point_of)
+    network = replace(
+        small, cameras=(camera,), images=tuple(f"i{k}" for k in range(m)),
+        camera_of=np.zeros(m, dtype=np.intp), x0=x0 + rng.normal(0, 0.02, x0.shape),
+        rotation=networks.matrix_to_vector(rotation_matrix(rng.normal(0, 0.005, x0.shape)) @ rotation),
+        points=tuple(f"p{k}" for k in range(p)), xyz=xyz + rng.normal(0, 0.02, xyz.shape),
+        sigma=np.full((p, 3), np.nan), role=("tie",) * p, image_of=np.concatenate(image_of), point_of=saw,
+        xy=np.concatenate(seen), cov=np.tile(np.eye(2) * 0.04, (len(saw), 1, 1)), datum="free",
+        datum_points=np.ones(p, dtype=bool), groups=(None,) * m, files=(None,) * m,
+    )  # fmt: skip
+    found = problem_of(network)[0]
+    # The same approximate values for all programs.
+    return replace(found, start=replace(found.start, xyz=network.xyz), rounds=99)
+
+
+def write_fisheye(problem: BundleProblem, path: Path) -> None:
+    """A network of one fisheye for the Ceres program."""
+    network, camera = problem.network, problem.network.cameras[0]
+    sigma = float(np.sqrt(network.cov[0, 0, 0]))
+    with path.open("w") as file:
+        file.write(f"{len(network.images)} {len(network.points)} {len(network.xy)}\n{sigma!r}\n")
+        file.write(" ".join(repr(float(v)) for v in camera.values[:8]) + "\n")
+        for i, j, (x, y) in zip(network.image_of, network.point_of, network.xy.tolist(), strict=True):
+            file.write(f"{i} {j} {x!r} {y!r}\n")
+        for row in np.hstack([network.rotation, network.x0]).tolist() + problem.start.xyz.tolist():
+            file.write(" ".join(map(repr, row)) + "\n")
+
+
 def peers() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -112,9 +162,14 @@ def peers() -> None:
         ladybug, roma = problem_of(read_bal(DATA / "bal-ladybug-49.txt"))[0], roma_problem()
         ladybug = replace(ladybug, max_iterations=60, rounds=99)
         write_shared(roma, folder / "roma.txt")
+        wide = fisheye_problem()
+        write_fisheye(wide, folder / "fisheye.txt")
+        best = wide.adjusted()
+        assert isinstance(best, BundleFit)
         cases = (
             ("ladybug-49", "bal", DATA / "bal-ladybug-49.txt", ladybug, LADYBUG),
             ("roma", "shared", folder / "roma.txt", roma, ROMA),
+            ("fisheye", "fisheye", folder / "fisheye.txt", wide, 0.5 * best.cost * (1 + 1e-6)),
         )
         for title, kind, file, problem, target in cases:
             ours(replace(problem, max_iterations=2), target)
@@ -123,7 +178,7 @@ def peers() -> None:
                 mine.append(ours(problem, target))
                 if program is not None:
                     theirs.append(peer(program, kind, file, target))
-                found = colmap(kind, file)
+                found = None if kind == "fisheye" else colmap(kind, file)
                 if found is not None:
                     others.append(found)
             print(f"{title}: to ½Σr² ≤ {target:.8g}")

@@ -2,6 +2,7 @@
 //
 //   bundle bal NETWORK COST      BAL file; each image has f, k1, k2 of its own
 //   bundle shared NETWORK COST   one camera c, x0, y0, K1, K2 (image side) for all, as benchmarks/bundle.py writes it
+//   bundle fisheye NETWORK COST  one camera fx, fy, cx, cy, k1 ... k4 of OpenCV's fisheye for all
 //
 // Prints: seconds until half the sum of squares is at most COST, seconds in all, final cost, iterations.
 #include <ceres/ceres.h>
@@ -48,6 +49,24 @@ struct SharedResidual {
   double x, y, pitch;
 };
 
+struct FisheyeResidual {
+  FisheyeResidual(double x, double y, double sigma) : x(x), y(y), sigma(sigma) {}
+  template <typename T>
+  bool operator()(const T* interior, const T* pose, const T* point, T* residual) const {
+    T d[3], p[3];
+    for (int i = 0; i < 3; ++i) d[i] = point[i] - pose[3 + i];
+    ceres::AngleAxisRotatePoint(pose, d, p);
+    const T r = ceres::sqrt(p[0] * p[0] + p[1] * p[1]);
+    const T angle = ceres::atan2(r, p[2]), s = angle * angle;
+    const T* k = interior + 4;
+    const T scale = angle * (1.0 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3])))) / r;
+    residual[0] = (interior[0] * scale * p[0] + interior[2] - x) / sigma;
+    residual[1] = (interior[1] * scale * p[1] + interior[3] - y) / sigma;
+    return true;
+  }
+  double x, y, sigma;
+};
+
 class Watch : public ceres::IterationCallback {
  public:
   explicit Watch(double target) : target(target), begun(std::chrono::steady_clock::now()) {}
@@ -73,15 +92,16 @@ int main(int argc, char** argv) {
   int images, points, observations;
   double pitch = 1;
   file >> images >> points >> observations;
-  std::vector<double> interior(5);
-  if (kind == "shared") {
+  const bool one = kind != "bal";
+  std::vector<double> interior(kind == "fisheye" ? 8 : 5);
+  if (one) {
     file >> pitch;
     for (double& value : interior) file >> value;
   }
   std::vector<int> image(observations), point(observations);
   std::vector<double> x(observations), y(observations);
   for (int k = 0; k < observations; ++k) file >> image[k] >> point[k] >> x[k] >> y[k];
-  const int width = kind == "shared" ? 6 : 9;
+  const int width = one ? 6 : 9;
   std::vector<double> cameras(width * images), xyz(3 * points);
   for (double& value : cameras) file >> value;
   for (double& value : xyz) file >> value;
@@ -97,6 +117,10 @@ int main(int argc, char** argv) {
       problem.AddResidualBlock(
           new ceres::AutoDiffCostFunction<SharedResidual, 2, 5, 6, 3>(new SharedResidual(x[k], y[k], pitch)),
           nullptr, interior.data(), camera, where);
+    } else if (kind == "fisheye") {
+      problem.AddResidualBlock(
+          new ceres::AutoDiffCostFunction<FisheyeResidual, 2, 8, 6, 3>(new FisheyeResidual(x[k], y[k], pitch)),
+          nullptr, interior.data(), camera, where);
     } else {
       problem.AddResidualBlock(
           new ceres::AutoDiffCostFunction<BalResidual, 2, 9, 3>(new BalResidual(x[k], y[k])), nullptr, camera,
@@ -107,7 +131,7 @@ int main(int argc, char** argv) {
     if (problem.HasParameterBlock(&xyz[3 * j])) ordering->AddElementToGroup(&xyz[3 * j], 0);
   for (int i = 0; i < images; ++i)
     if (problem.HasParameterBlock(&cameras[width * i])) ordering->AddElementToGroup(&cameras[width * i], 1);
-  if (kind == "shared") ordering->AddElementToGroup(interior.data(), 1);
+  if (one) ordering->AddElementToGroup(interior.data(), 1);
   const double built = std::chrono::duration<double>(std::chrono::steady_clock::now() - begun).count();
 
   ceres::Solver::Options options;
