@@ -15,6 +15,7 @@ from .lenses import Lens, read_lens
 from .libmv import read_libmv
 from .metashape import read_metashape
 from .networks import calibration_files, read_foreign, read_network
+from .openptv import read_openptv
 from .photomodeler import read_photomodeler
 from .zemax import read_zemax
 
@@ -40,6 +41,7 @@ __all__ = [
     "read_metashape",
     "read_micmac",
     "read_network",
+    "read_openptv",
     "read_photomodeler",
     "read_zemax",
     "write_micmac",

@@ -18,6 +18,7 @@ from .dbat import is_dbat, read_dbat
 from .libmv import is_libmv, read_libmv
 from .lines import read_head
 from .metashape import is_metashape, read_metashape
+from .openptv import is_openptv, read_openptv
 from .photomodeler import read_photomodeler
 
 __all__ = ["calibration_files", "read_foreign", "read_network"]
@@ -139,7 +140,7 @@ def read_foreign(path: Path | str) -> Network:
     ----------
     path : Path or str
         Text export of PhotoModeler, BAL or Bundler file, XML or ``.psz`` of Metashape, project of DBAT,
-        problem of libmv, or folder with COLMAP's text or binary files.
+        problem of libmv, or folder with COLMAP's text or binary files, or with a calibration of OpenPTV.
 
     Raises
     ------
@@ -159,7 +160,7 @@ def read_foreign(path: Path | str) -> Network:
     """
     path = Path(path)
     if path.is_dir():
-        return read_colmap(path)
+        return read_openptv(path) if is_openptv(path) else read_colmap(path)
     if not path.exists():
         raise InputError("does not exist", where=path)
     head = read_head(path)
@@ -177,5 +178,5 @@ def read_foreign(path: Path | str) -> Network:
     raise FormatError(
         "is not a network of a known program",
         where=path,
-        do="use reseau-network/1, PhotoModeler, BAL, Bundler, COLMAP, Metashape, DBAT or libmv",
+        do="use reseau-network/1, PhotoModeler, BAL, Bundler, COLMAP, Metashape, DBAT, libmv or OpenPTV",
     )
