@@ -1,4 +1,4 @@
-"""Tags whose corners touch other black squares, as those of Kalibr's AprilGrid: found by their corners, and read.
+"""Tags whose corners touch other squares, as those of Kalibr's AprilGrid: found by their corners, and read.
 
 A reader that looks for the outlines of separate tags fails where tags touch. Here a tag is a cycle of four
 saddle points (:mod:`reseau.measure.boards.candidates`): from each of them an edge leads to the next, dark on
@@ -28,7 +28,7 @@ _AIMED = np.deg2rad(7)
 _PARALLEL = np.deg2rad(15)
 """Largest angle between the edges of a tag at its two ends: lenses bend it."""
 _STRONG = 0.25
-"""Least strength of the next corner as a share of that of a corner: noise has saddles beside straight edges."""
+"""Least strength of the next corner as a share of that of a corner: noise has saddles on straight edges."""
 _ALONG = 9
 """Places along an edge at which its sides are compared."""
 _BESIDE = 0.055
