@@ -116,6 +116,7 @@ class CornerMarks(PlaneMarks):
     learnt_from = 24
     precise_start = True
     curve_first = True
+    even = True
     formed_px = 0.0007
     least_seen = 0.4
 

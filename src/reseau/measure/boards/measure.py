@@ -219,6 +219,7 @@ class CircleMarks(DiskMarks):
     precise_start = True
     curve_first = True
     eccentric = True
+    even = True
     formed_px = 0.0015
 
 

@@ -28,6 +28,8 @@ _SIGNIFICANT = 4.0
 """A correlation must exceed this many of its standard deviations to be used."""
 _LEAST = 0.05
 """Errors count as alike if pixels next to each other have at least this correlation."""
+_CANCELLED = 0.3
+"""Least share of the variance of independent errors that remains where they cancel each other."""
 _FEWEST = 20
 """Marks that are needed to learn correlations."""
 _SPREAD = 5
@@ -39,7 +41,7 @@ _TAKEN = 0.7
 what is smooth, so residuals of independent errors are negatively correlated by this share of the leverage."""
 
 
-def with_alike_errors(found: Matches) -> Matches:
+def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     """Matches with covariances that contain what errors of neighbouring pixels have in common.
 
     Where pixels next to each other are not significantly correlated, or too few marks show it, the matches
@@ -49,6 +51,10 @@ def with_alike_errors(found: Matches) -> Matches:
     ----------
     found : Matches
         Marks of one frame; their covariances are those of independent errors.
+    centres : ndarray (k, 2), optional
+        Pixels in the middle of the windows, if the images of the marks are even about their points. What the
+        formed images lack is then even, too, and shifts no mark: only the odd part of residuals counts.
+        Covariances may then become smaller; test them by the scatter of positions.
 
     Returns
     -------
@@ -74,6 +80,8 @@ def with_alike_errors(found: Matches) -> Matches:
         return found
     used = np.isfinite(found.residuals)
     unit = np.where(used, found.residuals, 0.0) / np.maximum(found.noise, 1e-300)[:, None, None]
+    if centres is not None:
+        unit, used = _odd(unit, used, found.xy - centres)
     free = 1 - found.leverage
     influence = found.influence * found.noise[:, None, None, None]
     activity = uniform_filter((influence**2).sum(axis=1), (0, _SPREAD, _SPREAD))
@@ -82,7 +90,7 @@ def with_alike_errors(found: Matches) -> Matches:
     # Beside a mark, where its image is even, residuals show the errors of pixels alone; on it, also what the
     # formed image lacks, which is alike in all marks and symmetric.
     beside = shown & (activity[sure] <= np.median(activity[sure][shown]))
-    if not _neighbours(unit[sure], beside, free[sure]):
+    if not _neighbours(unit[sure], beside, free[sure], both_ways=centres is not None):
         return found
     limits = np.quantile(activity[sure][shown], np.arange(1, _CLASSES) / _CLASSES)
     kind = np.digitize(activity, limits)
@@ -99,11 +107,36 @@ def with_alike_errors(found: Matches) -> Matches:
         here, there = displaced(uneven, *lag)
         together = r * np.einsum("kirc,kjrc->kij", here, there)
         extra += together + np.swapaxes(together, 1, 2)
-    # Errors that cancel each other are not relied upon.
-    cov = found.cov + extra
-    shrunk = np.linalg.eigvalsh(np.nan_to_num(extra))[:, 0] < 0
-    cov[shrunk] = _no_less(cov[shrunk], found.cov[shrunk])
+    # Errors that cancel each other, as after sharpening, are not relied upon without further evidence.
+    cov, least = found.cov + extra, found.cov if centres is None else _CANCELLED * found.cov
+    shrunk = np.linalg.eigvalsh(np.nan_to_num(cov - least))[:, 0] < 0
+    cov[shrunk] = _no_less(cov[shrunk], least[shrunk])
     return replace(found, cov=cov)
+
+
+def _odd(unit: Array, used: Mask, off: Array) -> tuple[Array, Mask]:
+    """Odd part of images about points (k, 2) near their middles, of the same variance, and its pixels.
+
+    An image is reflected at the half pixel that is nearest to its point.
+    """
+    other, both = np.zeros_like(unit), np.zeros_like(used)
+    twice = np.rint(2 * off)
+    for shift in np.unique(twice, axis=0):
+        if not np.isfinite(shift).all() or np.abs(shift).max() >= min(unit.shape[1:]):
+            continue
+        these, (right, down) = (twice == shift).all(axis=1), shift.astype(int)
+        there, here = (
+            tuple(
+                slice(max(0, s * t), n + min(0, s * t))
+                for t, n in zip((down, right), unit.shape[1:], strict=True)
+            )
+            for s in (1, -1)
+        )
+        turned, seen = unit[these, ::-1, ::-1], used[these, ::-1, ::-1]
+        part, mask = np.zeros_like(turned), np.zeros_like(seen)
+        part[:, *there], mask[:, *there] = turned[:, *here], seen[:, *here]
+        other[these], both[these] = part, mask & used[these]
+    return np.where(both, (unit - other) / np.sqrt(2), 0.0), both
 
 
 def _no_less(cov: Array, least: Array) -> Array:
@@ -150,10 +183,10 @@ def _at(lag: tuple[int, int], unit: Array, used: Mask, free: Array) -> tuple[flo
     return float((here * there).sum()) / count / power + _TAKEN * taken, 1 / np.sqrt(count)
 
 
-def _neighbours(unit: Array, used: Mask, free: Array) -> bool:
-    """Whether pixels next to each other have errors in common."""
+def _neighbours(unit: Array, used: Mask, free: Array, both_ways: bool) -> bool:
+    """Whether pixels next to each other have errors in common, or also opposite ones."""
     found = [_at(lag, unit, used, free) for lag in ((0, 1), (1, 0))]
-    return any(r > max(_LEAST, _SIGNIFICANT * sigma) for r, sigma in found)
+    return any((abs(r) if both_ways else r) > max(_LEAST, _SIGNIFICANT * sigma) for r, sigma in found)
 
 
 def _correlation(unit: Array, used: Mask, free: Array) -> dict[tuple[int, int], float]:

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 from scipy.spatial import KDTree
 
 from ...core.data import Array, Frame, Mask, Rows
@@ -84,6 +85,8 @@ _WHOLE = 0.97
 """Share of the pixels of a mark below which it is seen in part."""
 _PER_TERM = 2.0
 """Least number of matched marks for each term of the polynomial of their mapping."""
+_PER_SMOOTH = 2.5
+"""Least number of coordinates for each term of the polynomial about which positions scatter."""
 _PSF_LOG_SIGMA = 0.2
 """Spread of sharpness (logarithm) over the marks of one frame."""
 _BLURRED = 1.8
@@ -199,6 +202,8 @@ class PlaneMarks(ABC):
     """Least share of a mark on pixels that can be used."""
     curve_first: ClassVar[bool] = False
     """Whether a curve between light and grey values is looked for before motion and sharpening."""
+    even: ClassVar[bool] = False
+    """Whether images of marks are even about their points."""
     formed_px: ClassVar[float] = _FORMED_PX
     """Standard deviation of what no formed image contains."""
 
@@ -272,7 +277,8 @@ class PlaneMarks(ABC):
             # Look again where their neighbours predict them, without what lies in front of them.
             self._uncover(rows, found, doubtful, field)
             found = replaced(found, ~doubtful, self._match_all(rows[doubtful]))
-        found = with_alike_errors(found)
+        alike = with_alike_errors(found, np.rint(self.start[rows]) if self.even else None)
+        found = self._tempered(rows, found, alike) if self.even else alike
         if self.precise_start:
             found = self._with_doubtful_light(rows, found)
         found = replace(found, cov=found.cov + self.formed_px**2 * np.eye(2))
@@ -307,6 +313,44 @@ class PlaneMarks(ABC):
         # The change shows the size of the error, not its direction.
         cov[partly] += 0.5 * (change**2).sum(axis=1)[:, None, None] * np.eye(2)
         return replace(found, cov=cov)
+
+    def _tempered(self, rows: Rows, plain: Matches, alike: Matches) -> Matches:
+        """Matches with as much of the errors that pixels have in common as the scatter of positions shows.
+
+        Correlations of residuals are those of the whole frame; what they make of a position is a bound.
+        Positions also scatter about a smooth mapping: with the covariances C + f E, of independent
+        errors and of what they have in common, the weighted square sum of the deviations is the redundancy.
+        """
+        extra = alike.cov - plain.cov
+        good = plain.converged & (plain.t > 8) & (plain.rejected < 0.1) & (plain.seen > _SEEN)
+        good &= np.trace(extra, axis1=1, axis2=2) != 0
+        count = int(good.sum())
+        degree = next((d for d in (5, 4, 3) if _PER_SMOOTH * (d + 1) * (d + 2) <= 2 * count), None)
+        if degree is None:
+            return alike
+        at = self._straight(rows[good])
+        at = (at - at.mean(axis=0)) / np.maximum(np.ptp(at, axis=0) / 2, 1e-9)
+        terms = np.stack(
+            [at[:, 0] ** i * at[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1
+        )
+        c, e = (np.diagonal(cov[good], axis1=1, axis2=2) for cov in (plain.cov, extra))
+        redundancy = 2 * (count - terms.shape[1])
+
+        def excess(share: float) -> float:
+            total = 0.0
+            for k in range(2):
+                root = np.sqrt(c[:, k] + share * e[:, k])
+                weighted = terms / root[:, None]
+                off = plain.xy[good, k] / root
+                total += float(((off - weighted @ np.linalg.lstsq(weighted, off, rcond=None)[0]) ** 2).sum())
+            return float(total - redundancy)
+
+        none, whole = excess(0.0), excess(1.0)
+        if none * whole < 0:
+            share = float(brentq(excess, 0.0, 1.0, xtol=0.01))
+        else:
+            share = 0.0 if abs(none) < abs(whole) else 1.0
+        return replace(alike, cov=plain.cov + share * extra)
 
     def _region_sizes(self, rows: Rows, found: Matches) -> Array:
         """Share (k,) of the pixels of the windows, all of one size, that belong to the marks."""
