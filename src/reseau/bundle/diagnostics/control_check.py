@@ -38,6 +38,8 @@ _LIKEWISE = 0.5
 _UNSEEN = 1e-9
 # Median of the absolute values of normal errors; deviation exceeded with a power of 80 %.
 _MEDIAN, _POWER = 0.6745, 0.84
+# Median of the test of three coordinates.
+_MEDIAN_OF_THREE = 2.366
 # Standard deviation, in the extent of the control, as which held coordinates are tested.
 _TIGHT = 1e-5
 # Part of the control points above which it cannot be said which are wrong.
@@ -102,7 +104,7 @@ class ControlShape:
         return bool(self.agree.sum() < _LEAST) or bool(_exchanged(self.found, self.given, self.limit))
 
 
-def control_shape(network: Network) -> ControlShape | None:
+def control_shape(network: Network, used: Mask | None = None) -> ControlShape | None:
     """Compare the control points with a free network.
 
     The network is adjusted without control, as a free network, and transformed to the control points by the
@@ -112,6 +114,8 @@ def control_shape(network: Network) -> ControlShape | None:
     ----------
     network : Network
         Network with at least four control points with three known coordinates.
+    used : ndarray of bool (n,), optional
+        Image points without gross errors; by default all.
 
     Returns
     -------
@@ -130,7 +134,7 @@ def control_shape(network: Network) -> ControlShape | None:
     rows = np.flatnonzero(finite(network.xyz) & ~np.isnan(network.sigma).any(axis=1) & (network.rays > 1))
     if len(rows) < _LEAST:
         return None
-    fit = _free(network)
+    fit = _free(network if used is None else network.select(used))
     if fit is None:
         return None
     rows = rows[fit.usable.points[rows]].astype(np.intp)
@@ -406,7 +410,10 @@ class _Tested:
             rows = np.flatnonzero(network.point_of == j)
             ray[k] = rows[np.argmax(rays[rows])] if len(rows) else -1
         largest = np.where(ray >= 0, rays[ray], 0.0)
-        return cls(statistic / unit**2, off, detectable, largest / unit**2, ray)
+        statistic = statistic / unit**2
+        # Small errors of most points (a board that is not flat, an imperfect lens) are not those of some.
+        usual = max(1.0, float(np.median(statistic)) / _MEDIAN_OF_THREE) if len(points) >= _LEAST else 1.0
+        return cls(statistic / usual, off, detectable * np.sqrt(usual), largest / unit**2 / usual, ray)
 
 
 def _unit(w: Array) -> float:

@@ -367,23 +367,22 @@ def _control(
     With a given `shape` the adjustment is one without the points that do not agree with it.
     """
     network, n = problem.network, 2 * len(problem.network.xy)
-    if shape is None:
-        if not suspected(problem, fit):
-            return None, []
-        shape = control_shape(network) if len(problem.observations) <= _MANY else None
+    if shape is None and not suspected(problem, fit):
+        return None, []
+    # Rays of control points are judged with their coordinates, not before.
+    tie: Mask = ~np.asarray((network.observed | network.held).any(axis=1))[network.point_of]
+    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+    if fit.problem.weights is not None:
+        weights[:n] = np.where(np.repeat(tie, 2), fit.problem.weights[:n], weights[:n])
+    elif fit.sigma0 > _DOUBT and len(problem.observations) <= _MANY:
+        gross = np.isin(np.arange(len(tie)), _suspects(problem))
+        weights[:n] = np.where(np.repeat(tie & gross, 2), 0.0, weights[:n])
+    if shape is None and len(problem.observations) <= _MANY:
+        shape = control_shape(network, np.asarray(weights[:n:2] > 0))
         rejected = np.asarray(fit.rejected[:n].reshape(-1, 2).any(axis=1))
         poor = fit.sigma0 > _DOUBT or bool(_rejected_control(network, rejected))
         if poor and shape is not None and shape.as_a_whole:
             return None, [Remark(shape.doubt(), Code.DOUBTFUL_CONTROL)]
-    # Rays of control points are judged with their coordinates, not before.
-    of_control: Mask = np.asarray((network.observed | network.held).any(axis=1))
-    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
-    tie = np.repeat(~of_control[network.point_of], 2)
-    if fit.problem.weights is not None:
-        weights[:n] = np.where(tie, fit.problem.weights[:n], weights[:n])
-    elif fit.sigma0 > _DOUBT and len(problem.observations) <= _MANY:
-        gross = np.isin(np.arange(len(network.xy)), _suspects(problem))
-        weights[:n] = np.where(tie & np.repeat(gross, 2), 0.0, weights[:n])
     check = checked_control(problem.with_weights(weights), fit, shape)
     return check, [] if check is None else check.remarks(network)
 
