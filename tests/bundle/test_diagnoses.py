@@ -105,6 +105,12 @@ def plane(tilt: float, seed: int = 6) -> Network:
     return seen_from(centres, aim, xyz, 36, networks.camera(free=("c", "x0", "y0", "K1")))
 
 
+def uneven_board() -> Network:
+    """A plane of held points that are all a little off: the board is not as designed, no point is wrong."""
+    network, rng = plane(0.5), np.random.default_rng(11)
+    return replace(network, xyz=network.xyz + rng.normal(0, 4e-4, network.xyz.shape))
+
+
 def camera_of(network: Network, **values: float) -> Network:
     camera = network.cameras[0]
     at = {camera.names.index(name): value for name, value in values.items()}
@@ -575,6 +581,7 @@ ACCUSING = {
         opencv,
         observed,
         lambda: plane(0.5),
+        uneven_board,
         long_lens,
         lambda: plane(0.15),
         lambda: posed(block()),
