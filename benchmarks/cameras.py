@@ -22,11 +22,18 @@ import cv2
 import numpy as np
 from worlds import lenses
 
-from reseau.bundle import Camera, ModelChoice, Network, adjust_network, choose_model
+from reseau.bundle import Camera, ModelChoice, Network, Result, adjust_network, choose_model
 from reseau.calibration.camera import by_rotation
 from reseau.io.network import Network1
 from reseau.optics import PixelGrid, camera_models
-from reseau.optics.cameras import Division, Fisheye, OpenCV, Stereographic
+from reseau.optics.cameras import (
+    Division,
+    Fisheye,
+    OpenCV,
+    SplinedStereographic,
+    SplineGrid,
+    Stereographic,
+)
 from reseau.optics.cameras.kernels import CameraColumns, camera, compiled, kernel
 from reseau.optics.poses import rotation_matrix
 
@@ -89,6 +96,10 @@ def projections() -> None:
         for count in (4, 5, 8, 12)
     ]
     asked.append(("LENSMODEL_STEREOGRAPHIC", FRAME, Stereographic(FRAME), wide))
+    for grid in (SplineGrid(3, 30, 20, 170), SplineGrid(2, 16, 11, 120)):
+        values = [*FRAME, *np.random.default_rng(4).normal(0, 0.03, 2 * grid.nx * grid.ny)]
+        name = grid.name.replace("splined_stereographic", "LENSMODEL_SPLINED_STEREOGRAPHIC")
+        asked.append((name, values, SplinedStereographic(values, grid), points(0.45 * grid.fov_x_deg)))
     entries = [{"lensmodel": name, "values": v, "points": p.tolist()} for name, v, _, p in asked]
     found = mrcal({"projections": entries, "calibrations": []})
     if found is not None:
@@ -190,6 +201,12 @@ def compare(
         if found is not None:
             theirs["mrcal"] = np.array(found["calibrations"][0]["values"])
     theirs = {"OpenCV": interior(k, d, len(names))} | theirs
+    # COLMAP has no model with five coefficients.
+    counterpart = {("fisheye", 4): "OPENCV_FISHEYE", ("opencv", 8): "FULL_OPENCV"}.get((model, len(names)))
+    if counterpart is not None:
+        found = by_colmap(result, counterpart, board, seen, size, len(names))
+        if found is not None:
+            theirs["COLMAP"] = found
     print(
         f"{title}: {len(seen)} views, sigma0 {result.sigma0 * 0.2:.4f} px, "
         f"fx {ours.values[0]:.3f} ± {ours.sigma[0]:.3f} px"
@@ -198,6 +215,43 @@ def compare(
         off = np.abs(ours.values - values) / ours.sigma
         most, mark = int(off.argmax()), "" if off.max() < 0.1 else "  !"
         print(f"  {who:7} fx {values[0]:.3f}; differs by at most {off.max():.3f} sigma ({free[most]}){mark}")
+
+
+def by_colmap(
+    result: Result, name: str, board: np.ndarray, seen: list[np.ndarray], size: tuple[int, int], count: int
+) -> np.ndarray | None:
+    """Parameters by COLMAP's bundle adjustment of the same corners, the board held; from a rough start."""
+    if importlib.util.find_spec("pycolmap") is None:
+        print("without COLMAP: no pycolmap")
+        return None
+    import pycolmap
+
+    values = result.cameras["A"].values.copy()
+    values[:2] *= 1.02
+    values[4:] = 0.0
+    made = pycolmap.Reconstruction()
+    lens = pycolmap.Camera(model=name, width=size[0], height=size[1], params=values.tolist(), camera_id=1)
+    made.add_camera_with_trivial_rig(lens)
+    rotation, x0 = result.fit.values.rotation, result.fit.values.x0
+    for i, xy in enumerate(seen):
+        turn = rotation_matrix(np.array([0.01, -0.01, 0.01])) @ rotation[i]
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), -turn @ x0[i])
+        image = pycolmap.Image(name=str(i), keypoints=xy, camera_id=1, image_id=i + 1)
+        made.add_image_with_trivial_frame(image, pose)
+    config = pycolmap.BundleAdjustmentConfig()
+    for i in range(len(seen)):
+        config.add_image(i + 1)
+    for j, where in enumerate(board):
+        track = pycolmap.Track()
+        for i in range(len(seen)):
+            track.add_element(i + 1, j)
+        config.add_constant_point(made.add_point3D(where, track, np.zeros(3, dtype=np.uint8)))
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary, options.refine_principal_point = False, True
+    solver = options.ceres.solver_options
+    solver.function_tolerance, solver.max_num_iterations = 1e-15, 500
+    pycolmap.create_default_bundle_adjuster(options, config, made).solve()
+    return np.array(made.cameras[1].params[: 4 + count])
 
 
 def interior(k: np.ndarray, d: np.ndarray, count: int) -> np.ndarray:

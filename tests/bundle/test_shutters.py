@@ -386,7 +386,8 @@ def test_commands_take_shutters(tmp_path: Path, capsys: pytest.CaptureFixture[st
     ]
     motion = rng.uniform(-1, 1, (9, 6)) * [2000.0, 2000.0, 2000.0, 2.0, 2.0, 2.0]
     still = Scene(
-        camera, np.array([t.pose.matrix for t in truths]), near * np.array([t.pose.x0 for t in truths]), motion,
+        camera, np.array([t.pose.matrix for t in truths]), near * np.array([t.pose.x0 for t in truths]),
+        motion,
         np.zeros((0, 3)),
     )  # fmt: skip
     for i, truth in enumerate(truths):

@@ -96,26 +96,53 @@ def _turned(t: float, motion: Array, i: int, x: Array, y: Array, z: Array) -> No
 
 
 @kernel
-def _image(
-    k: int, seen: Seen, at: Orientation, bent: Bent, cameras: CameraColumns, rays: Rays, x: Array,
-    room: Array, by_uv: Array, d: Array, more: Array, off: Array,
-) -> float:  # fmt: skip
-    """Compute misfit and derivatives with the camera kernel; return the time of the image point.
-
-    Writes the point in the camera system at that time to `x`, and at time 0, less t·v, to room[0].
-    """
+def _direct(
+    k: int, seen: Seen, at: Orientation, bent: Bent, cameras: CameraColumns, x: Array, by_uv: Array,
+    d: Array, more: Array, off: Array,
+) -> None:  # fmt: skip
+    """Write the point in the camera system to `x`; compute misfit and derivatives with the camera kernel."""
     i, j, c = seen.image[k], seen.point[k], seen.camera[k]
     dx, dy, dz = at.xyz[j, 0] - at.x0[i, 0], at.xyz[j, 1] - at.x0[i, 1], at.xyz[j, 2] - at.x0[i, 2]
     for q in range(3):
         x[q] = at.rotation[i, q, 0] * dx + at.rotation[i, q, 1] * dy + at.rotation[i, q, 2] * dz
+    u, v = x[0] / x[2], x[1] / x[2]
+    if bent.path[i] >= 0:
+        u, v = bent.uv[k, 0], bent.uv[k, 1]
+    camera(k, c, seen.extra[k], u, v, seen.xy, cameras, by_uv, d, more, off)
+
+
+@kernel
+def _at_once(
+    k: int, seen: Seen, at: Orientation, bent: Bent, cameras: CameraColumns, rays: Rays, x: Array,
+    room: Array, by_uv: Array, d: Array, more: Array, off: Array,
+) -> float:  # fmt: skip
+    """As :func:`_direct`, with the arguments of :func:`_scanned`."""
+    _direct(k, seen, at, bent, cameras, x, by_uv, d, more, off)
+    return 0.0
+
+
+# A slot: with shutters or parallel rays it is `_scanned`, which costs time that others need not spend.
+imaged = _at_once
+
+
+@kernel
+def _scanned(
+    k: int, seen: Seen, at: Orientation, bent: Bent, cameras: CameraColumns, rays: Rays, x: Array,
+    room: Array, by_uv: Array, d: Array, more: Array, off: Array,
+) -> float:  # fmt: skip
+    """As :func:`_direct` for all cameras; return the time of the image point.
+
+    Writes the point at time 0, less t·v, to room[0].
+    """
+    i, j, c = seen.image[k], seen.point[k], seen.camera[k]
+    if rays.shutter[c, 0] == 0.0 and not rays.parallel[c]:
+        _direct(k, seen, at, bent, cameras, x, by_uv, d, more, off)
+        return 0.0
+    dx, dy, dz = at.xyz[j, 0] - at.x0[i, 0], at.xyz[j, 1] - at.x0[i, 1], at.xyz[j, 2] - at.x0[i, 2]
+    for q in range(3):
+        x[q] = at.rotation[i, q, 0] * dx + at.rotation[i, q, 1] * dy + at.rotation[i, q, 2] * dz
     if rays.shutter[c, 0] == 0.0:
-        if bent.path[i] >= 0:
-            u, v = bent.uv[k, 0], bent.uv[k, 1]
-        elif rays.parallel[c]:
-            u, v = x[0], x[1]
-        else:
-            u, v = x[0] / x[2], x[1] / x[2]
-        camera(k, c, seen.extra[k], u, v, seen.xy, cameras, by_uv, d, more, off)
+        camera(k, c, seen.extra[k], x[0], x[1], seen.xy, cameras, by_uv, d, more, off)
         return 0.0
     # The line on which the point is seen, by Newton's method: f(line) = line with a rolling shutter,
     # f(line) = row with a line camera, where f is the y of the camera at the time of the line.
@@ -177,13 +204,38 @@ def _misfit(
     out: Array,
 ) -> None:
     """Write weighted misfits to `out` (n, 2), for observations begin…end by cameras of kind `own`."""
+    by_uv, off, x = np.empty((2, 2)), np.empty(2), np.empty(3)
+    d, more = np.empty((2, cameras.values.shape[1])), np.empty((2, cameras.extra.shape[1]))
+    root = seen.root
+    for k in range(begin, end):
+        if kind[seen.camera[k]] != own:
+            continue
+        _direct(k, seen, at, bent, cameras, x, by_uv, d, more, off)
+        out[k, 0] = root[k, 0, 0] * off[0]
+        out[k, 1] = root[k, 1, 0] * off[0] + root[k, 1, 1] * off[1]
+
+
+@kernel
+def _scanned_misfit(
+    begin: int,
+    end: int,
+    own: int,
+    kind: Rows,
+    seen: Seen,
+    at: Orientation,
+    bent: Bent,
+    cameras: CameraColumns,
+    rays: Rays,
+    out: Array,
+) -> None:
+    """As :func:`_misfit`, for networks with shutters or parallel rays; others are computed faster by that."""
     by_uv, off, x, room = np.empty((2, 2)), np.empty(2), np.empty(3), np.empty((4, 3))
     d, more = np.empty((2, cameras.values.shape[1])), np.empty((2, cameras.extra.shape[1]))
     root = seen.root
     for k in range(begin, end):
         if kind[seen.camera[k]] != own:
             continue
-        _image(k, seen, at, bent, cameras, rays, x, room, by_uv, d, more, off)
+        _scanned(k, seen, at, bent, cameras, rays, x, room, by_uv, d, more, off)
         out[k, 0] = root[k, 0, 0] * off[0]
         out[k, 1] = root[k, 1, 0] * off[0] + root[k, 1, 1] * off[1]
 
@@ -212,7 +264,7 @@ def _derive(
     for k in range(begin, end):
         if kind[seen.camera[k]] != own:
             continue
-        t = _image(k, seen, at, bent, cameras, rays, x, room, by_uv, d, more, off)
+        t = imaged(k, seen, at, bent, cameras, rays, x, room, by_uv, d, more, off)
         w0, w1, w2 = root[k, 0, 0], root[k, 1, 0], root[k, 1, 1]
         for q in range(2):
             g[0, q] = w0 * by_uv[0, q]
@@ -299,14 +351,16 @@ class _Loops(NamedTuple):
 
 
 @cache
-def _loops(model: str, additional: str | None) -> _Loops:
+def _loops(model: str, additional: str | None, scanned: bool) -> _Loops:
     slots: dict[str, Kernel[..., Any]] = {}
     own = camera_model(model).kernel
     if own is not None:
         slots["camera"] = own
     if additional is not None:
         slots["additional"] = additional_model(additional).kernel
-    return _Loops(compiled(_misfit, **slots), compiled(_derive, **slots))
+    if scanned:
+        slots["imaged"] = _scanned
+    return _Loops(compiled(_scanned_misfit if scanned else _misfit, **slots), compiled(_derive, **slots))
 
 
 class Imaging:
@@ -335,7 +389,8 @@ class Imaging:
         kinds = [entry.compiled_kind for entry in network.cameras]
         known = list(dict.fromkeys(kind for kind in kinds if kind is not None))
         extras = [entry.additional for entry in (network.cameras[c] for c, _ in sets) if entry.additional]
-        self._loops = [_loops(*kind) for kind in known]
+        scanned = any(entry.shutter is not None or entry.parallel for entry in network.cameras)
+        self._loops = [_loops(*kind, scanned) for kind in known]
         self.kind: Rows = np.array(
             [_NO_KERNEL if kind is None else known.index(kind) for kind in kinds], dtype=np.intp
         )
