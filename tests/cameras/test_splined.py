@@ -129,7 +129,7 @@ def test_names_with_a_grid_are_models() -> None:
 def test_a_calibration_follows_a_lens_that_no_polynomial_describes() -> None:
     """Board views drawn by OpenCV through a fisheye lens; what the regularisation contributes is stated."""
     lens = lenses.fisheye(50)
-    flat, true = lenses.board(10, 8, 1.0)
+    flat, _ = lenses.board(10, 8, 1.0)
     seen = lenses.views(lens, flat, flat, 16, 0.1, 4)
     f = float(lens.matrix[0, 0])
     start = {"fx": f, "fy": f, "cx": (lens.width - 1) / 2, "cy": (lens.height - 1) / 2}

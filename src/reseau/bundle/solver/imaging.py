@@ -116,8 +116,18 @@ def _at_once(
     k: int, seen: Seen, at: Orientation, bent: Bent, cameras: CameraColumns, rays: Rays, x: Array,
     room: Array, by_uv: Array, d: Array, more: Array, off: Array,
 ) -> float:  # fmt: skip
-    """As :func:`_direct`, with the arguments of :func:`_scanned`."""
-    _direct(k, seen, at, bent, cameras, x, by_uv, d, more, off)
+    """As :func:`_direct`, with the arguments of :func:`_scanned`.
+
+    Written out: with a call of `_direct` the compiled loop takes a third longer.
+    """
+    i, j, c = seen.image[k], seen.point[k], seen.camera[k]
+    dx, dy, dz = at.xyz[j, 0] - at.x0[i, 0], at.xyz[j, 1] - at.x0[i, 1], at.xyz[j, 2] - at.x0[i, 2]
+    for q in range(3):
+        x[q] = at.rotation[i, q, 0] * dx + at.rotation[i, q, 1] * dy + at.rotation[i, q, 2] * dz
+    u, v = x[0] / x[2], x[1] / x[2]
+    if bent.path[i] >= 0:
+        u, v = bent.uv[k, 0], bent.uv[k, 1]
+    camera(k, c, seen.extra[k], u, v, seen.xy, cameras, by_uv, d, more, off)
     return 0.0
 
 
