@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["next_corners"]
+__all__ = ["next_corners", "seen_edges"]
 
 Floats = NDArray[Any]
 
@@ -44,6 +44,38 @@ def _is_edge(grey: Floats, start: Floats, end: Floats, along: int, beside: float
         if contrast[k] <= 0:
             return False
     return bool(contrast.min() > least * np.median(contrast))
+
+
+@numba.njit(cache=True, nogil=True)
+def seen_edges(grey: Floats, xy: Floats, edges: Floats, radius: float, count: int) -> Floats:
+    """Directions of the edges (n, 2) of saddles by where a circle around them crosses their own grey value.
+
+    Second derivatives of a blurred corner are those of a right angle, whatever its angle is. Where the circle
+    does not cross four times, the given directions remain.
+    """
+    found, level, at = edges.copy(), np.empty(count + 1), np.empty(4)
+    for k in range(len(xy)):
+        middle, crossings, rises = _level(grey, xy[k, 0], xy[k, 1]), 0, 0
+        for i in range(count + 1):
+            angle = 2 * np.pi * i / count
+            place = xy[k, 0] + radius * math.cos(angle), xy[k, 1] + radius * math.sin(angle)
+            level[i] = _level(grey, place[0], place[1]) - middle
+        for i in range(count):
+            if (level[i] > 0) != (level[i + 1] > 0):
+                if crossings < 4:
+                    at[crossings] = 2 * np.pi * (i + level[i] / (level[i] - level[i + 1])) / count
+                    if crossings == 0:
+                        rises = level[i + 1] > 0
+                crossings += 1
+        if crossings != 4:
+            continue
+        for side in range(2):
+            # Both crossings of one line, half a turn apart; the first line is where bright begins.
+            one, other = at[side], at[side + 2] - np.pi
+            line = one + ((other - one + np.pi) % (2 * np.pi) - np.pi) / 2
+            # The bright sector extends from the first to the second, less than half a turn.
+            found[k, side if rises else 1 - side] = line if rises or side == 0 else line - np.pi
+    return found
 
 
 @numba.njit(cache=True, nogil=True)

@@ -14,10 +14,12 @@ import cv2
 import numpy as np
 
 from ...core.data import Array, Frame, Mask, Rows
+from ...core.failure import Code
 from ...optics import Chain
 from ...optics.corners import Corners, corner_images
 from ...optics.formation import Outline, PixelResponse
 from ..matching import GrownOutline, Matches, Shape, Window
+from ..points import Reason
 from ..reseau.marks import ReseauOptions
 from ..reseau.plane_marks import Located, PlaneMarks
 from ..screening import Screened
@@ -36,6 +38,8 @@ _EDGE = 1.5
 """Half the width of an edge in widths of the point-spread function."""
 _ALIKE_WIDTH = 0.05
 """Relative change of the sharpness from which markers are formed anew."""
+_FLAT = 0.6
+"""Least sine of the angle between the edges of a corner."""
 _NODES_PX = 1.1
 """Distance of nodes on an outline, in widths of the point-spread function."""
 
@@ -219,6 +223,14 @@ class CornerMarks(PlaneMarks):
         """See :class:`PlaneMarks`."""
         self.look = replace(self.look, psf_px=float(np.median(first.psf_px)))
         return first
+
+    def _objections(self, rows: Rows, found: Matches) -> list[tuple[Mask, Reason]]:
+        """See :class:`PlaneMarks`: where edges nearly coincide, small errors of their directions shift it."""
+        slope, _ = self._steps(rows)
+        tangent = slope / np.linalg.norm(slope, axis=1, keepdims=True)
+        flat = np.abs(np.linalg.det(tangent)) < _FLAT
+        seen = Reason("seen at too flat an angle", Code.UNCERTAIN)
+        return [*super()._objections(rows, found), (flat, seen)]
 
     def _edge_seen(self, rows: Rows, found: Matches) -> Array:
         """See :class:`PlaneMarks`."""

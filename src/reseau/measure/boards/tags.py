@@ -27,6 +27,10 @@ _AIMED = np.deg2rad(7)
 """Largest angle between an edge and the direction to the next corner."""
 _PARALLEL = np.deg2rad(15)
 """Largest angle between the edges of a tag at its two ends: lenses bend it."""
+_WEAK = 0.08
+"""Least strength of a corner as a share of the strong ones of the frame; texture has weaker ones."""
+_RADIUS_PX, _PLACES = 4.0, 48
+"""Circle around a saddle on which its edges are seen: radius, and number of places."""
 _STRONG = 0.25
 """Least strength of the next corner as a share of that of a corner: noise has saddles on straight edges."""
 _ALONG = 9
@@ -47,18 +51,19 @@ def tag_outlines(grey: NDArray[np.float32], saddles: Saddles) -> Rows:
     saddles : Saddles
         Their saddles.
     """
-    count = len(saddles)
-    if count < 4:
+    if len(saddles) < 4:
         return np.zeros((0, 4), dtype=np.intp)
+    strong = np.flatnonzero(saddles.strength > _WEAK * saddles.strength[:30].mean())
+    saddles, count = saddles.select(strong), len(strong)
     # The dark sectors of a saddle extend from its second edge to the first, turned by 180°, and opposite.
-    first, second = saddles.edges.T
+    from .compiled_tags import next_corners, seen_edges  # takes half a second to import
+
+    first, second = seen_edges(grey, saddles.xy, saddles.edges, _RADIUS_PX, _PLACES).T
     turn = np.pi * np.arange(2)[:, None]
     # Seen from a corner, the interior of a tag is the sector from `leaves` to `arrives`, x into y: a cycle
     # that is clockwise in the image leaves along the former and arrives against the latter.
     leaves, arrives = (second + turn).ravel(), (first + np.pi + turn).ravel()
     near = KDTree(saddles.xy).query(saddles.xy, k=min(_NEIGHBOURS + 1, count))[1][:, 1:]
-    from .compiled_tags import next_corners  # takes half a second to import; not every command needs it
-
     limits, edge = (_AIMED, _PARALLEL, _STRONG), (_ALONG, _BESIDE, _EDGE)
     after = next_corners(grey, saddles.xy, saddles.strength, leaves, arrives, near, limits, edge)
     cycle = [np.arange(2 * count)]
@@ -66,7 +71,7 @@ def tag_outlines(grey: NDArray[np.float32], saddles: Saddles) -> Rows:
         cycle.append(np.where(cycle[-1] < 0, -1, after[cycle[-1]]))
     ring = np.stack(cycle[:4], axis=1)
     closed = (ring >= 0).all(axis=1) & (cycle[4] == cycle[0]) & (ring.argmin(axis=1) == 0)
-    return np.asarray(ring[closed] % count)
+    return np.asarray(strong[ring[closed] % count])
 
 
 def _sampled(grey: NDArray[np.float32], xy: Array) -> Array:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
@@ -30,6 +31,8 @@ _LEAST = 0.05
 """Errors count as alike if pixels next to each other have at least this correlation."""
 _CANCELLED = 0.3
 """Least share of the variance of independent errors that remains where they cancel each other."""
+_SHOWN = 40
+"""Most marks from which correlations are learnt."""
 _FEWEST = 20
 """Marks that are needed to learn correlations."""
 _SPREAD = 5
@@ -102,11 +105,18 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     spread = np.sqrt(variance)[kind]
     correlation = _correlation((unit / np.maximum(spread, 1e-6))[sure], shown, free[sure])
     uneven = influence * spread[:, None]
-    extra = np.einsum("kirc,kjrc->kij", uneven, uneven) - np.einsum("kirc,kjrc->kij", influence, influence)
-    for lag, r in correlation.items():
-        here, there = displaced(uneven, *lag)
-        together = r * np.einsum("kirc,kjrc->kij", here, there)
-        extra += together + np.swapaxes(together, 1, 2)
+    # The errors that a pixel has in common with those around it, weighted by their influence.
+    kernel = np.zeros((2 * _LAGS + 1,) * 2, np.float32)
+    kernel[_LAGS, _LAGS] = 1.0
+    for (down, right), r in correlation.items():
+        kernel[_LAGS + down, _LAGS + right] = kernel[_LAGS - down, _LAGS - right] = r
+    wide = np.pad(uneven, ((0, 0), (0, 0), (0, _LAGS), (0, _LAGS))).astype(np.float32)
+    # One window below the other, apart as far as errors extend.
+    column = wide.reshape(-1, wide.shape[-1])
+    together = cv2.filter2D(column, -1, kernel, borderType=cv2.BORDER_CONSTANT).reshape(wide.shape)
+    extra = np.einsum("kirc,kjrc->kij", wide, together).astype(np.float64)
+    extra -= np.einsum("kirc,kjrc->kij", influence, influence)
+    extra = (extra + np.swapaxes(extra, 1, 2)) / 2
     # Errors that cancel each other, as after sharpening, are not relied upon without further evidence.
     cov, least = found.cov + extra, found.cov if centres is None else _CANCELLED * found.cov
     shrunk = np.linalg.eigvalsh(np.nan_to_num(cov - least))[:, 0] < 0
@@ -190,7 +200,21 @@ def _neighbours(unit: Array, used: Mask, free: Array, both_ways: bool) -> bool:
 
 
 def _correlation(unit: Array, used: Mask, free: Array) -> dict[tuple[int, int], float]:
-    """Significant correlations by distance."""
+    """Significant correlations by distance; a part of many marks shows them."""
+    from .compiled_lags import lag_sums  # takes half a second to import; not every command needs it
+
+    some = np.unique(np.linspace(0, len(unit) - 1, _SHOWN).astype(np.intp))
+    unit, used, free = unit[some], used[some], free[some]
+    sums, pairs = lag_sums(np.where(used, unit, 0.0).astype(np.float32), used.astype(np.float32), _LAGS)
+    taken = 1 - float(free[used].mean())
+    power = float((unit[used] ** 2).mean()) / (1 - taken)
     rows, columns = unit.shape[1:]
-    found = {lag: _at(lag, unit, used, free) for lag in _lags() if lag[0] < rows and abs(lag[1]) < columns}
-    return {lag: r for lag, (r, sigma) in found.items() if abs(r) > _SIGNIFICANT * sigma}
+    found = {}
+    for down, right in _lags():
+        if down >= rows or abs(right) >= columns:
+            continue
+        count = max(float(pairs[down, right + _LAGS]), 1.0)
+        r = float(sums[down, right + _LAGS]) / count / power + _TAKEN * taken
+        if abs(r) > _SIGNIFICANT / np.sqrt(count):
+            found[down, right] = r
+    return found

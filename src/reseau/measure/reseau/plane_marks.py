@@ -85,6 +85,8 @@ _WHOLE = 0.97
 """Share of the pixels of a mark below which it is seen in part."""
 _PER_TERM = 2.0
 """Least number of matched marks for each term of the polynomial of their mapping."""
+_BENT_PX = 0.15
+"""Distance of one mark in ten from the mapping through all, from which that is adjusted again."""
 _PER_SMOOTH = 2.5
 """Least number of coordinates for each term of the polynomial about which positions scatter."""
 _PSF_LOG_SIGMA = 0.2
@@ -222,6 +224,7 @@ class PlaneMarks(ABC):
         self.dazzled = np.zeros(len(self.at), dtype=bool)
         self.notes: tuple[Remark, ...] = ()
         self.learning = True
+        self.rough = 0.0  # residuals of the marks that were learnt from
 
     @abstractmethod
     def _images(self, rows: Rows) -> tuple[Shape, Array]:
@@ -261,15 +264,18 @@ class PlaneMarks(ABC):
         if sure.sum() >= _ENOUGH_LIKE:
             self._respond(self._learn(first.select(sure), rows[sure]), rows[sure])
         rows, self.learning = self._in_sight(), False
-        found = self._match_all(rows)
-        if self.eccentric:
-            sure = found.converged & (found.t > 8) & (found.rejected < 0.1) & (found.seen > _SEEN)
+        found = self._match(rows) if self.eccentric else self._match_all(rows)
+        sure = found.converged & (found.t > 8) & (found.rejected < 0.1) & (found.seen > _SEEN)
+        # Marks with something in front of them show neither the mapping nor its errors.
+        plain = sure & ~self._uneasy(found) & (found.seen > _WHOLE) & (found.rejected == 0)
+        if self.eccentric or self._bent(rows[plain], found.select(plain)):
+            sure = sure if self.eccentric else plain
             if sure.sum() >= _ENOUGH_LIKE:
                 self.start[rows[sure]] = found.xy[sure]
                 at, shape = self.at[rows[sure]], self.screened.grey.shape
                 degree = next(d for d in (5, 4, 3, 2, 1) if _PER_TERM * (d + 1) * (d + 2) <= 2 * len(at))
                 self.mapping = through(at, found.xy[sure], shape, degree)
-                found = self._match_all(rows)
+            found = self._match_all(rows)
         why, field = self._judged(rows, found)
         # Where paper is saturated, neighbours do not predict the light.
         doubtful = ((why != "") | self._uneasy(found)) & ~self.dazzled[rows]
@@ -284,6 +290,11 @@ class PlaneMarks(ABC):
         found = replace(found, cov=found.cov + self.formed_px**2 * np.eye(2))
         why, field = self._judged(rows, found)
         return self._spread(rows, found, why, field)
+
+    def _bent(self, rows: Rows, found: Matches) -> bool:
+        """Whether the lens bends the target more than the mapping through the marks found contains."""
+        off = np.abs(found.xy - self.mapping(self.at[rows]))
+        return bool(len(off) >= _ENOUGH_LIKE and np.quantile(off, 0.9) > _BENT_PX)
 
     def _straight(self, rows: Rows) -> Array:
         """Images by the projectivity alone, the source coordinates of smooth fields."""
@@ -356,7 +367,13 @@ class PlaneMarks(ABC):
         """Share (k,) of the pixels of the windows, all of one size, that belong to the marks."""
         high, wide = (n // 2 for n in found.residuals.shape[1:])
         region = self._region(rows, (wide, high))
-        return np.ones(len(rows)) if region is None else np.asarray(region.mean(axis=(1, 2)))
+        if region is None:
+            return np.ones(len(rows))
+        if (beside := self._beside()) is not None:
+            # What is printed there is known, and the same around every mark.
+            x, y = self._pixels(rows, (wide, high))
+            region &= np.abs(beside[y, x]) < _BESIDE
+        return np.asarray(region.mean(axis=(1, 2)))
 
     def _match_all(self, rows: Rows) -> Matches:
         """Match disks; on even paper where paper is saturated all around."""
@@ -367,7 +384,11 @@ class PlaneMarks(ABC):
             self.look = replace(look, kernel=None, psf_px=look.blur_px)
             found = replaced(found, ~lost, self._match(rows[lost], influence=True))
             self.look = look
-        dim = found.converged & (self._edge_seen(rows, found) < _LEAST_RIM)
+        # Only where pixels are lost can the edge be.
+        lost = found.converged & (np.isfinite(found.residuals).mean(axis=(1, 2)) < 1)
+        if not lost.any():
+            return found
+        dim = lost & (self._edge_seen(rows, found) < _LEAST_RIM)
         self.dazzled[rows] |= dim
         if not dim.any():
             return found
@@ -403,7 +424,7 @@ class PlaneMarks(ABC):
                     self._shape(images, part),
                     self.start[rows[part]],
                     options,
-                    noise=self.screened.noise,
+                    noise=max(self.screened.noise, self.rough),
                     form_sigma=self.look.form_sigma,
                     light=self._known_light(rows[part], background),
                     others=self._light_of(beside, rows[part], half),
@@ -547,7 +568,7 @@ class PlaneMarks(ABC):
             whole[rows] = values
             return np.asarray(whole)
 
-        look = self.look
+        look, self.rough = self.look, float(np.median(first.noise))
         self.look = replace(
             look,
             variance=grey_variance(self.screened.grey, self.start[rows], first.residuals),
