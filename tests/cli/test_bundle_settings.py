@@ -150,22 +150,52 @@ def test_exports_of_photomodeler_as_users_send_them(name: str, c: float, reseau:
     assert abs(found["value"] - c) < 3 * found["sigma"] + 1e-4
 
 
-def test_the_exports_need_no_line_that_is_not_there(reseau: Run, tmp_path: Path) -> None:
-    """An export by hand: a mark of no point, sigmas of 0; the observations that remain are counted."""
+def export_by_hand(sigmas: str = "0 0 0 0 0 0 0 0 0 0", name: str = "a") -> list[str]:
+    """Lines of an export: a mark of no point, sigmas of marks of 0."""
     camera = "35.0 18.0 12.0 36.0 24.0 0 0 0 0 0"
-    lines = ["title", "1e-6 20 3600 2400", "1", camera, "1 0 0 0 0 0 0 0 0 0 0"]
+    lines = ["title", "1e-6 20 3600 2400", "1", camera, sigmas]
     for i, x in enumerate((-300.0, 0.0, 300.0)):
-        lines += [f"{i} a{i}.jpg", f"{i} {x} {40.0 * i} 1000 0 0 {5.0 * i}", f"{i} 0 0 0 0 0 0", "",
-                  f"{i} {camera}", f"{i} 0 0 0 0 0 0 0 0 0 0"]  # fmt: skip
+        lines += [f"{i} {name}{i}.jpg", f"{i} {x} {40.0 * i} 1000 0 0 {5.0 * i}", f"{i} 0 0 0 0 0 0", "",
+                  f"{i} {camera}", f"{i} {sigmas}"]  # fmt: skip
     lines += ["", *(f"{j} {100 * (j % 3)} {100 * (j // 3)} {20 * (j % 2)} 1 1 1" for j in range(9)), ""]
     lines += [
         f"{i} {j} {1800 + 100 * (j % 3)} {1200 - 90 * (j // 3)} 0 0" for i in range(3) for j in range(9)
     ]
-    lines += ["0 99 15.0 20.0 0 0"]
+    return [*lines, "0 99 15.0 20.0 0 0"]
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "free"),
+    [
+        ("0 0 0 0 0 0 0 0 0 0", []),
+        ("0 0.02 0.01 0.5 0.5 1e-3 1e-4 1e-4 1e-3 1e-3", ["c", "x0", "y0", "K1", "K2", "K3", "P1", "P2"]),
+    ],
+)
+def test_the_exports_need_no_line_that_is_not_there(
+    sigmas: str, free: list[str], reseau: Run, tmp_path: Path
+) -> None:
+    """The observations that remain are counted; a camera without sigmas is fixed in the project."""
     path, target = tmp_path / "block.txt", tmp_path / "network.json"
-    path.write_text("\n".join(lines))
+    path.write_text("\n".join(export_by_hand(sigmas)))
     status, out, err = reseau("bundle", path, "--convert", target)
     assert (status, out, err) == (0, "", "")
     document = json.loads(target.read_text())
     assert len(document["observations"]["x"]) == 27
     assert set(document["observations"]["sx"]) == {1.0}
+    assert document["cameras"][0]["free"] == free
+
+
+def test_exports_name_files_in_the_encoding_of_their_time(reseau: Run, tmp_path: Path) -> None:
+    path, target = tmp_path / "block.txt", tmp_path / "network.json"
+    path.write_text("\n".join(export_by_hand(name="débruité")), "latin-1")
+    assert reseau("bundle", path, "--convert", target) == (0, "", "")
+    assert json.loads(target.read_text())["images"]["file"][1] == "débruité1.jpg"
+
+
+def test_an_export_without_the_size_of_the_images_says_what_is_missing(reseau: Run, tmp_path: Path) -> None:
+    path = tmp_path / "block.txt"
+    path.write_text("\n".join(["title", "1e-6 20", *export_by_hand()[2:]]))
+    status, _, err = reseau("bundle", path)
+    assert status != 0
+    assert "line 2 lacks the size of the images" in err
+    assert err.count("\n") == 1

@@ -167,13 +167,13 @@ def read_foreign(path: Path | str) -> Network:
     for recognise, read in _BINARY_OR_XML:
         if recognise(head):
             return read(path)
-    lines = read_text(path).splitlines()
+    lines = read_text(path, "latin-1").splitlines()
     first = lines[0].split() if lines else []
     if lines and is_bundler(lines[0]):
         return read_bundler(path)
     if len(first) == 3 and all(word.isdigit() for word in first):
         return read_bal(path)
-    if len(lines) > 4 and len(lines[1].split()) == 4 and len(lines[3].split()) == 10:
+    if len(lines) > 4 and len(lines[1].split()) in (2, 4) and len(lines[3].split()) == 10:
         return read_photomodeler(path)
     raise FormatError(
         "is not a network of a known program",

@@ -7,6 +7,9 @@ lines (number and file; X, Y, Z, kappa, phi, omega in degrees; their sigmas) and
 coordinates have their origin at the corner of the top-left pixel, ours at its centre. Control points are in
 another file: the network is read as a free network.
 
+A camera whose sigmas are all 0 is fixed in the project and held. Otherwise the file does not tell which
+parameters were estimated (that of c is always 0): all are free.
+
 Marks without an object point are left out. A standard deviation of 0 means that none was set: the median of
 the others is used, or 1 px without any.
 """
@@ -63,12 +66,24 @@ def read_photomodeler(path: Path | str) -> Network:
     path = Path(path)
     lines = _Lines(path)
     lines.next()
-    _, _, width, height = numbers(lines.next(), 4, path, lines.number)
+    head = lines.next()
+    if len(head) == 2:
+        raise FormatError(
+            "line 2 lacks the size of the images", where=path,
+            do="add width and height in pixels at its end",
+        )  # fmt: skip
+    _, _, width, height = numbers(head, 4, path, lines.number)
     lines.next()
     default = numbers(lines.next(), 10, path, lines.number)
-    lines.next()
+    free = _free(numbers(lines.next()[-10:], 10, path, lines.number))
     size = int(width), int(height)
-    cameras, poses, files, camera_of, ids = [camera_of_numbers("1", default, *size)], [], [], [], list[str]()
+    cameras, poses, files, camera_of, ids = (
+        [camera_of_numbers("1", default, *size, free)],
+        [],
+        [],
+        [],
+        list[str](),
+    )
     kept = [_printed(default)]
     while (words := lines.peek()) and len(words) >= 2 and not _is_number(words[1]):
         ids.append(lines.next()[0])
@@ -76,10 +91,10 @@ def read_photomodeler(path: Path | str) -> Network:
         poses.append(numbers(lines.next()[1:], 6, path, lines.number))
         lines.next()
         own = numbers(lines.next()[1:], 10, path, lines.number)
-        lines.next()
+        own_free = _free(numbers(lines.next()[-10:], 10, path, lines.number))
         if _printed(own) not in kept:
             kept.append(_printed(own))
-            cameras.append(camera_of_numbers(str(len(kept)), own, *size))
+            cameras.append(camera_of_numbers(str(len(kept)), own, *size, own_free))
         camera_of.append(kept.index(_printed(own)))
     points, xyz = list[str](), []
     while (words := lines.peek()) and len(words) == 7:
@@ -138,7 +153,7 @@ class _Lines:
     """Lines in order, without blank lines."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.lines, self.number = path, read_text(path).splitlines(), 0
+        self.path, self.lines, self.number = path, read_text(path, "latin-1").splitlines(), 0
 
     def peek(self) -> list[str]:
         """Return the words of the next line; empty at the end."""
@@ -168,7 +183,14 @@ def _printed(values: list[float]) -> tuple[float, ...]:
     return tuple(round(v, 3) if k < 3 else v for k, v in enumerate(values))
 
 
-def camera_of_numbers(name: str, values: list[float], width: int, height: int) -> Camera:
+def _free(sigma: list[float]) -> tuple[str, ...]:
+    """Free parameters by the line of sigmas of a camera: none where all are zero."""
+    return _FREE if any(sigma) else ()
+
+
+def camera_of_numbers(
+    name: str, values: list[float], width: int, height: int, free: tuple[str, ...] = _FREE
+) -> Camera:
     """A camera of its line: c, principal point, format, K1, K2, K3, P1, P2; mm.
 
     Examples
@@ -179,4 +201,4 @@ def camera_of_numbers(name: str, values: list[float], width: int, height: int) -
     c, px, py, format_x, format_y, *distortion = values
     pitch = format_x / width, format_y / height
     brown = [c, px - format_x / 2, format_y / 2 - py, *distortion, 0.0, 0.0]
-    return Camera(name, width, height, pitch, "brown", np.array(brown), _FREE, {"side": "image"})
+    return Camera(name, width, height, pitch, "brown", np.array(brown), free, {"side": "image"})

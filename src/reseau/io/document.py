@@ -33,8 +33,15 @@ class Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
-def read_text(path: Path) -> str:
+def read_text(path: Path, otherwise: str | None = None) -> str:
     """Read a UTF-8 text file of at most 1 GB.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    otherwise : str, optional
+        Encoding of files that are not UTF-8, such as those of older programs with the names of their files.
 
     Raises
     ------
@@ -55,6 +62,8 @@ def read_text(path: Path) -> str:
         # Some editors write a byte-order mark.
         return path.read_text("utf-8-sig")
     except UnicodeDecodeError:
+        if otherwise is not None:
+            return path.read_text(otherwise)
         raise InputError("is not UTF-8 text", where=path, do="check the file name") from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
