@@ -150,7 +150,7 @@ def test_a_mirrored_control_point_is_named(reseau: Run, tmp_path: Path) -> None:
     document = block()
     document["points"]["xyz"][3][0] *= -1
     words = said(*reseau("bundle", written(tmp_path, document), "--json"))
-    assert "control point p3 contradicts the others" in words
+    assert "control point p3 (by 1.55 m, w " in words
 
 
 def test_an_image_with_two_points_and_a_camera_without_image_are_named(reseau: Run, tmp_path: Path) -> None:
