@@ -454,14 +454,16 @@ def _as_observed(problem: BundleProblem) -> BundleProblem:
 
 
 def _free(network: Network) -> BundleFit | None:
-    """Adjust the network without control."""
+    """Adjust the network without control; None where images alone do not suffice, or windows are on a rig."""
+    if network.refraction is not None and network.refraction.on_rig.any():
+        return None
     nothing = np.full(network.xyz.shape, np.nan)
     posed = np.full(network.x0.shape, np.nan)
     none: Rows = np.zeros((0, 2), dtype=np.intp)
     free = replace(
         network, xyz=nothing, sigma=nothing, x0=posed, rotation=posed, datum="free",
         datum_points=np.ones(len(network.points), dtype=bool), distance_of=none, distance=np.zeros((0, 2)),
-        stage=None,
+        stage=None, rig=None,
     )  # fmt: skip
     start = approximate(free)
     if not finite(start.x0).any():
