@@ -34,6 +34,8 @@ _MOST_PX = 32
 """Largest distance of a pixel used from its corner along an axis, pixels."""
 _LEARNING_PX = 9
 """The same while the appearance of corners is learnt, beside widths of the point-spread function."""
+_CURVED_FROM = 20
+"""Least number of corners that determine the curvature of edges in the whole of their windows."""
 _EDGE = 1.5
 """Half the width of an edge in widths of the point-spread function."""
 _ALIKE_WIDTH = 0.05
@@ -156,7 +158,9 @@ class CornerMarks(PlaneMarks):
             # The edges end on one side; a window has both.
             sides = np.abs(slope) @ np.array([[self.sectors.along, 0], [0, self.sectors.along]])
             reach = np.maximum(reach, sides.max(axis=2))
-        most = _LEARNING_PX + 2 * self.look.blur_px if self.learning else _MOST_PX
+        # A few corners do not show how a lens bends their edges.
+        small = self.learning or self.found.sum() < _CURVED_FROM
+        most = _LEARNING_PX + 2 * self.look.blur_px if small else _MOST_PX
         return CornerShape(corners), np.minimum(reach, most) - self._ground
 
     @property
