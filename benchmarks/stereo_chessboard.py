@@ -78,7 +78,7 @@ def main() -> int:
                 square.append(((image - b[k]) ** 2).sum(axis=1))
             crossed = float(np.sqrt(np.concatenate(square).mean()))
             print(
-                f"{side:6} {name:10} {len(seen):2} of {len(found)} photographs, {sum(map(len, b)):4} corners: "
+                f"{side:6} {name:10} {len(seen):2} of {len(found)} photographs, {sum(map(len, b))} corners: "
                 f"reprojection {rms:.3f} px, cross-validated {crossed:.3f} px"
             )
     return 0
