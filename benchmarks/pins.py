@@ -211,8 +211,8 @@ def laid(folder: Path) -> int:
             design = ReseauDesign.parse(json.dumps(content), where="wires")
             for options in (
                 PinOptions(),
-                PinOptions(mirrored=True),
-                PinOptions(mirrored=True, max_rotation_deg=30),
+                PinOptions(mirrored=False),
+                PinOptions(mirrored=False, max_rotation_deg=30),
             ):
                 found = measure_pins(frame, design, options)
                 print(f"{record['image']:30} {len(design.ids):5}  {options.mirrored!s:8}", end="")

@@ -154,7 +154,7 @@ def blind_table(all_measured: list[Measured], seed: int) -> None:
         for mirrored in (False, True):
             design, told = disguised(m.case.design, rng, mirrored)
             if blind_row(m, design, told, ReseauOptions()):
-                blind_row(m, design, f"{told}, told", ReseauOptions(mirrored=mirrored))
+                blind_row(m, design, f"{told}, told", ReseauOptions(mirrored=not mirrored))
     print()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -9,11 +11,24 @@ from scipy.ndimage import gaussian_filter
 from reseau.core.data import Array, Frame
 from reseau.core.failure import Code
 from reseau.designs import regular_reseau
-from reseau.io import Mark
+from reseau.io import Mark, ReseauDesign
 from reseau.measure import ReseauOptions, measure_reseau
 from reseau.measure.reseau.orientation import misfit
 
-from .formed import MARKS, Scene, form
+from .formed import MARKS, PX_PER_MM, Scene, form
+
+class Uneven(Scene):
+    """Marks half a pixel beside a regular grid."""
+
+    def design(self) -> ReseauDesign:
+        rng, even = np.random.default_rng(3), super().design()
+        off = rng.normal(0, 0.5 / PX_PER_MM, (len(even.points), 2))
+        points = [
+            point.model_copy(update={"x": point.x + dx, "y": point.y + dy})
+            for point, (dx, dy) in zip(even.points, off, strict=True)
+        ]
+        return even.model_copy(update={"points": tuple(points)})
+
 
 SCENE = Scene(columns=11, rows=9, width=700, height=600)
 
@@ -36,7 +51,7 @@ def test_a_regular_grid_is_found_at_any_turn_and_called_ambiguous(pixels, quarte
 
 
 def test_nothing_is_ambiguous_where_handedness_and_turn_are_known(pixels):
-    known = ReseauOptions(mirrored=True, max_rotation_deg=12.0)
+    known = ReseauOptions(mirrored=False, max_rotation_deg=12.0)
     found = measure_reseau(shown(pixels), SCENE.design(), known).required()
     assert found.found == 99
     assert found.notes == ()
@@ -50,16 +65,34 @@ def test_a_grid_of_which_columns_and_rows_are_cropped_is_found(pixels):
 def test_a_cropped_grid_of_wires_is_not_laid_over_what_lies_along_them():
     scene = Scene(mark=MARKS["line-grid"], columns=11, rows=9, width=700, height=600)
     formed = form(scene, np.random.default_rng(0))
-    known = ReseauOptions(mirrored=True, max_rotation_deg=12.0)
+    known = ReseauOptions(mirrored=False, max_rotation_deg=12.0)
     found = measure_reseau(shown(formed.frame.pixels[110:, 165:]), scene.design(), known).required()
     assert found.found == 72
     assert np.abs(found.xy - (formed.xy - [165, 110]))[found.ok].max() < 0.05
 
 
+def test_a_reseau_seen_from_behind_is_mirrored_and_keeps_its_design(pixels):
+    known = ReseauOptions(mirrored=True, max_rotation_deg=12.0)
+    design, behind = SCENE.design(), shown(np.ascontiguousarray(pixels[:, ::-1]))
+    found = measure_reseau(behind, design, known).required()
+    front = measure_reseau(shown(pixels), design, replace(known, mirrored=False)).required()
+    assert np.abs(found.xy - (front.xy * [-1, 1] + [behind.width - 1, 0])).max() < 0.01
+    assert np.abs(found.field(design.xy) - found.xy).max() < 0.1
+
+
+def test_nominal_positions_from_before_the_frame_was_cropped_are_not_followed():
+    formed = form(Uneven(columns=11, rows=9, width=700, height=600), np.random.default_rng(1))
+    before = formed.design.expected_at(formed.xy)
+    found = measure_reseau(shown(formed.frame.pixels[110:, 180:]), before).required()
+    assert found.found == 72
+    assert np.abs(found.xy - (formed.xy - [180, 110]))[found.ok].max() < 0.05
+    assert "nominal positions do not agree" in found.notes[0].text
+
+
 def test_nominal_positions_wrong_by_one_pitch_are_noticed():
     formed = form(SCENE, np.random.default_rng(1))
     design = SCENE.design()
-    truth = measure_reseau(formed.frame, design, ReseauOptions(mirrored=True)).required()
+    truth = measure_reseau(formed.frame, design, ReseauOptions(mirrored=False)).required()
     wrong = design.expected_at(truth.xy + np.array([52.0, 0.0]))
     found = measure_reseau(formed.frame, wrong).required()
     assert found.found == 99
@@ -120,7 +153,7 @@ def test_a_regular_plate_in_perspective_is_not_numbered_a_row_or_column_off(angl
     # Fields through the marks found first do not reach the last row: shifted by a row, 40 of 48 fit as well.
     grey, centres = plate_in_perspective(*angles)
     design = regular_reseau(8, 6, 10.0, Mark(shape="disk", size=4.0))
-    upright = ReseauOptions(mirrored=True, max_rotation_deg=12.0)
+    upright = ReseauOptions(mirrored=False, max_rotation_deg=12.0)
     found = measure_reseau(shown(grey), design, upright).required()
     assert found.found == 48
     names = np.lexsort((design.xy[:, 0], design.xy[:, 1]))

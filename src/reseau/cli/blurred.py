@@ -17,7 +17,6 @@ from .common import (
     corrected,
     orientation,
     read_frame,
-    seen,
     suffix_of,
     writable,
 )
@@ -135,8 +134,9 @@ def blurred(
         pose = pose_in_network(block, image.name, target)
         view = calibrated_by(camera, block, image.name)
     elif isinstance(target, ReseauDesign):
-        target = seen(target, mirrored)
-        turned = ReseauOptions(**orientation(mirrored, max_rotation))
+        # Where the targets lie is predicted in the design as the image shows it.
+        turned = ReseauOptions(**orientation(None if mirrored is None else False, max_rotation))
+        target = target.from_behind() if mirrored else target
         sharp = partial(measure_reseau, design=target, options=turned)
     elif mirrored:
         target = target.from_behind()

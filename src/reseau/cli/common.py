@@ -61,21 +61,9 @@ MaxRotation = Annotated[
 ]
 
 
-def seen(design: ReseauDesign, mirrored: bool | None) -> ReseauDesign:
-    """The design as the image shows it: from behind if the option says so and it has no nominal positions."""
-    import numpy as np
-
-    placed = np.isfinite(design.nominal_px).all()
-    return design.from_behind() if mirrored and not placed else design
-
-
 def orientation(mirrored: bool | None, max_rotation: float | None) -> dict[str, Any]:
-    """Options of a measurement from those of a command; what is not given keeps its default.
-
-    A design has y up and the image y down: they have opposite handedness, also a design that was reflected
-    because the image shows it from behind.
-    """
-    given: dict[str, Any] = {} if mirrored is None else {"mirrored": True}
+    """Options of a measurement from those of a command; what is not given keeps its default."""
+    given: dict[str, Any] = {} if mirrored is None else {"mirrored": mirrored}
     return given if max_rotation is None else given | {"max_rotation_deg": max_rotation}
 
 

@@ -22,7 +22,6 @@ from .common import (
     read_frame,
     required,
     say,
-    seen,
     suffix_of,
     writable,
 )
@@ -79,7 +78,7 @@ def reseau(
     from ..measure import ReseauOptions, measure_reseau
 
     task = Task(image, out, overlay, as_json, "marks")
-    target = seen(ReseauDesign.read(design), mirrored)
+    target = ReseauDesign.read(design)
     options = ReseauOptions(
         mark_px=mark_px,
         row_jitter_px=row_jitter,
@@ -115,7 +114,7 @@ def pins(
     from ..measure import PinOptions, measure_pins
 
     task = Task(image, out, overlay, as_json, "rods")
-    target = seen(ReseauDesign.read(design), mirrored)
+    target = ReseauDesign.read(design)
     options = PinOptions(most_length_px=max_length_px, **orientation(mirrored, max_rotation))
     task.run(
         lambda: corrected(read_frame(image), sensor),

@@ -23,7 +23,6 @@ from .common import (
     read_photo,
     required,
     say,
-    seen,
     suffix_of,
     writable,
 )
@@ -217,6 +216,7 @@ def _by_photographs(
     from ..core.data import Frame
     from ..core.errors import UsageError
     from ..io import ReseauDesign, write_whole
+    from ..procedures.oscilloscope import photo_i
 
     assert files.photo_i is not None
     assert files.reseau is not None
@@ -229,7 +229,7 @@ def _by_photographs(
     steps = 1 + (files.photo_ii is not None) + len(files.photo_iii)
     photo = read_photo(files.photo_i)
     with progress("correcting", steps) as step:
-        found = _first(files, photo, design)
+        found = photo_i(photo, design, options=files.marks(), alpha=files.alpha, check=files.check)
         files.draw(files.photo_i, photo, found)
         first = required(found, files.photo_i)
         if isinstance(photo, Frame):
@@ -266,23 +266,6 @@ def _by_photographs(
         if second is not None and files.photo_ii is not None:
             _say_second(files.photo_ii, second)
         _say_third(files, third, None if second is None else second.instrument.unit, true)
-
-
-def _first(files: _Files, photo: Frame | ImagePoints, design: ReseauDesign) -> PhotoI | Failure:
-    """Correct PHOTO I; a reseau that is seen from behind is measured as its reflection."""
-    from ..core.data import Frame
-    from ..core.failure import Failure
-    from ..measure import measure_reseau
-    from ..procedures.oscilloscope import photo_i
-
-    shown = seen(design, files.mirrored)
-    if shown is design or not isinstance(photo, Frame):
-        return photo_i(photo, design, options=files.marks(), alpha=files.alpha, check=files.check)
-    measured = measure_reseau(photo, shown, files.marks())
-    if isinstance(measured, Failure):
-        return measured
-    found = photo_i(measured.points, design, alpha=files.alpha, check=files.check)
-    return found if isinstance(found, Failure) else replace(found, measured=measured)
 
 
 def _split(points: ImagePoints, design: ReseauDesign) -> tuple[ImagePoints | None, ImagePoints]:

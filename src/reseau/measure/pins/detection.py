@@ -82,7 +82,8 @@ class PinOptions:
     max_rotation_deg : float
         Largest rotation of the design in the image; a rotation by 180° is tried, too.
     mirrored : bool, optional
-        Whether the image shows the design mirrored; None to determine it.
+        Whether the image shows the design from behind, left and right exchanged, or from the front (x right,
+        y up); None to determine it. Not used with nominal positions.
 
     Examples
     --------

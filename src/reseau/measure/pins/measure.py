@@ -190,8 +190,11 @@ def measure_pins(
             where=f"design {design.name}",
             do="use a design of rods",
         )
+    known = np.flatnonzero(np.isfinite(design.xy).all(axis=1))
+    if o.mirrored and not np.isfinite(design.nominal_px[known]).all():
+        # The image, with y down, and the reflected design, with y up, have opposite handedness.
+        design = design.from_behind()
     source = design.xy
-    known = np.flatnonzero(np.isfinite(source).all(axis=1))
     if len(known) < 4:
         raise UsageError("has fewer than four points with coordinates", where=f"design {design.name}")
     across = np.linalg.svd(source[known] - source[known].mean(axis=0), compute_uv=False)
@@ -225,7 +228,7 @@ def _placed_pattern(design: ReseauDesign, known: Rows, seen: Array, o: PinOption
     ends = design.segments[rows]
     wires = Wires(tuple(design.ids[i] for i in rows), ends[:, 0], ends[:, 1])
     nominal = design.nominal_px[known]
-    options = LayoutOptions(o.gate, float(np.deg2rad(o.max_rotation_deg)), o.mirrored)
+    options = LayoutOptions(o.gate, float(np.deg2rad(o.max_rotation_deg)), None if o.mirrored is None else True)
     start = nominal if np.isfinite(nominal).all() else None
     if start is not None:
         start = np.concatenate([start, np.full((len(slanted), 2), np.nan)])

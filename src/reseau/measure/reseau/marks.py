@@ -85,9 +85,8 @@ class ReseauOptions:
     nominal_within_px : float, optional
         Uncertainty of the nominal positions; by default any smooth distortion and a shift of up to one pitch.
     mirrored : bool, optional
-        Whether the design, with y up, and the image, with y down, have opposite handedness: True for a design
-        seen from the front, False for one seen from behind. By default the design tells, if it is not
-        symmetric.
+        Whether the image shows the design from behind, left and right exchanged, or from the front (x right,
+        y up). By default the design tells, if it is not symmetric. Not used with nominal positions.
     max_rotation_deg : float, optional
         Largest rotation of the design in the image, used without nominal positions. By default any; if a
         symmetric design fits in several ways, it is taken as upright, with a note.

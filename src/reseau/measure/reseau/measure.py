@@ -51,6 +51,8 @@ _BY_CHANCE = 1e-5
 """Largest probability that as many marks are found where there are none; many positions were tried."""
 _DISTORTED = 0.03
 """Largest rms deviation of marks from their prediction, as a share of their spacing."""
+_BEYOND, _MOST = 0.05, 0.75
+"""Share of nominal positions beyond the frame, and share of marks found, from which they are doubted."""
 _BLURRED, _PIXEL = 2.6, 12**-0.5
 """Margin of a shadow over the width of the blur; width (one sigma) of a pixel."""
 
@@ -192,11 +194,15 @@ def measure_reseau(
         )
     nominal = design.nominal_px[known]
     use_nominal = options.nominal and bool(np.isfinite(nominal).all())
+    if options.mirrored and not use_nominal:
+        # The image, with y down, and the reflected design, with y up, have opposite handedness.
+        found = measure_reseau(frame, design.from_behind(), replace(options, mirrored=False))
+        return found if isinstance(found, Failure) else replace(found, field=_reflected(found.field))
     if design.rings is not None and not use_nominal:
         columns = measure_sheet(frame, design, options)
         return columns if isinstance(columns, Failure) else ReseauResult(**columns)
     most = options.max_rotation_deg
-    grid = GridOptions(None if most is None else float(np.deg2rad(most)), options.mirrored)
+    grid = GridOptions(None if most is None else float(np.deg2rad(most)), None if options.mirrored is None else True)
     placed = place(
         frame,
         design,
@@ -221,7 +227,7 @@ def measure_reseau(
             break
         measurement = MarkMeasurement(frame, design, source[known], placed, options)
         at, found, judged = measurement.result()
-    if not use_nominal:
+    if not use_nominal or _beyond(frame, nominal):
         notes += _open_names(source[known], judged, placed.screened.valid)
     why_not = _disagreement(source[known], judged, options) or _chance(measurement, at, judged)
     if why_not:
@@ -232,7 +238,54 @@ def measure_reseau(
             places=judged.xy[judged.why == ""],
         )
     notes += deviating(judged.deviation, judged.cov)
-    return _columns(frame, design, known, at, found, judged, measurement.field, notes)
+    result = _columns(frame, design, known, at, found, judged, measurement.field, notes)
+    if use_nominal and options.nominal_within_px is None and _astray(frame, result, nominal):
+        return _without_nominal(frame, design, result, options)
+    return result
+
+
+def _beyond(frame: Frame, nominal: Array) -> bool:
+    """Whether nominal positions (n, 2) lie beyond the frame: they may be those before it was cropped."""
+    margin, limits = 0.5 * spacing(nominal), np.array([frame.width, frame.height]) - 1
+    return bool(((nominal < -margin) | (nominal > limits + margin)).any(axis=1).mean() > _BEYOND)
+
+
+def _astray(frame: Frame, found: ReseauResult, nominal: Array) -> bool:
+    """Whether the nominal positions (n, 2) seem to be those of another image."""
+    if all(note.code is not Code.INCONSISTENT for note in found.notes):
+        return False
+    return _beyond(frame, nominal) or found.found < _MOST * len(found.ids)
+
+
+def _without_nominal(
+    frame: Frame, design: ReseauDesign, found: ReseauResult, options: ReseauOptions
+) -> ReseauResult:
+    """The marks as found without the nominal positions, if those are where an uneven design has them."""
+    freely = measure_reseau(frame, design, replace(options, nominal=False))
+    if isinstance(freely, Failure) or freely.found < _CLEARLY * found.found:
+        return found
+    rms, before = (np.sqrt(np.nanmean(each.deviation**2)) for each in (freely, found))
+    if not rms < _UNEVEN * before:
+        return found
+    text = (
+        "the nominal positions do not agree with the image, and were not used: without them "
+        f"{freely.found} marks deviate by {rms:.2g} px from the prediction by the others, with them "
+        f"{found.found} by {before:.2g} px"
+    )
+    return replace(freely, notes=(Remark(text, Code.DEVIATES), *freely.notes))
+
+
+def _reflected(field: SmoothField) -> SmoothField:
+    """The mapping from a design to the image, from that of the design as seen from behind."""
+    local = bool(np.isfinite(field.length))
+    return SmoothField.fit(
+        field.source * [-1.0, 1.0],
+        field.target,
+        sigma=field.sigma,
+        degree=field.degree,
+        local=local,
+        length=field.length if local else None,
+    )
 
 
 def _disagreement(source: Array, judged: Verdict, options: ReseauOptions) -> str:
@@ -305,7 +358,7 @@ def _open_names(source: Array, judged: Verdict, valid: Mask) -> tuple[Remark, ..
         if missing <= _ALIKE * len(source) and misfit(source, renamed, known) < chosen / _UNEVEN:
             text = (
                 f"the frame shows {int(good.sum())} of {len(source)} marks of a regular grid, and shifted by "
-                "a step they fit as well: names may be off by a row or column (give nominal positions)"
+                "a step they fit as well: names may be off by a row or column (give nominal positions of this frame)"
             )
             return (Remark(text, Code.AMBIGUOUS),)
     return ()
