@@ -115,7 +115,9 @@ def compressed(folder: Path, quality: int) -> Iterator[tuple[str, Any]]:
         copies = Path(name)
         for path in folder.iterdir():
             if path.suffix == ".png":
-                frame = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+                frame = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+                if frame.dtype == np.uint16:  # 64 numbers per grey level
+                    frame = np.rint(frame / 64).astype(np.uint8)
                 cv2.imwrite(str(copies / path.stem) + ".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])
                 coded = cv2.imread(str(copies / path.stem) + ".jpg", cv2.IMREAD_GRAYSCALE)
                 cv2.imwrite(str(copies / path.name), coded)

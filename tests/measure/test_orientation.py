@@ -17,6 +17,7 @@ from reseau.measure.reseau.orientation import misfit
 
 from .formed import MARKS, PX_PER_MM, Scene, form
 
+
 class Uneven(Scene):
     """Marks half a pixel beside a regular grid."""
 

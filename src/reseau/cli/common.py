@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from ..calibration import SensorCorrection
     from ..core.data import Frame, ImagePoints
     from ..core.failure import Failure
-    from ..io import ReseauDesign
     from ..io.images import Channel
 
 T = TypeVar("T")

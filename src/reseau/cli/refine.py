@@ -30,7 +30,6 @@ from .common import (
 if TYPE_CHECKING:
     from ..calibration import InstrumentCorrection
     from ..core.data import Frame, ImagePoints
-    from ..core.failure import Failure
     from ..core.provenance import Provenance
     from ..io import ReseauDesign
     from ..measure import PinOptions, ReseauOptions

@@ -228,7 +228,9 @@ def _placed_pattern(design: ReseauDesign, known: Rows, seen: Array, o: PinOption
     ends = design.segments[rows]
     wires = Wires(tuple(design.ids[i] for i in rows), ends[:, 0], ends[:, 1])
     nominal = design.nominal_px[known]
-    options = LayoutOptions(o.gate, float(np.deg2rad(o.max_rotation_deg)), None if o.mirrored is None else True)
+    options = LayoutOptions(
+        o.gate, float(np.deg2rad(o.max_rotation_deg)), None if o.mirrored is None else True
+    )
     start = nominal if np.isfinite(nominal).all() else None
     if start is not None:
         start = np.concatenate([start, np.full((len(slanted), 2), np.nan)])

@@ -17,6 +17,7 @@ from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse, mark_outline
 from ..matching import SIZE, Matches, MatchOptions, grey_variance, match, with_alike_errors
 from ..points import Reason
+from ..screening import is_in_blocks
 from .assignment import spacing
 from .placement import Placement
 from .wires import grid_wires
@@ -70,6 +71,10 @@ _ARM_ENDS, _END = 0.85, 1.55
 end itself, where half a per cent of the contrast is missing."""
 _NEAR_PX = 2.5
 """Length of an arm beside a crossing that is used while it is not known where arms end."""
+_FEWEST_SCATTERED = 20
+"""Marks whose deviations show how much compression displaces them."""
+_MOST_LOST = 2.5
+"""Multiple of their sigmas up to which compression is taken for the cause of the deviations of marks."""
 _TURN, _TURNED = 0.12, 0.02
 """Standard deviation (rad) of the direction of an arm: before it is learnt in the frame; and afterwards."""
 
@@ -190,7 +195,34 @@ class MarkMeasurement:
                 break
             found, judged = cleared, self._judged(at, cleared)
         alike = with_alike_errors(found)
-        return (at, found, judged) if alike is found else (at, alike, self._judged(at, alike))
+        if alike is not found:
+            found, judged = alike, self._judged(at, alike)
+        if is_in_blocks(self.frame.pixels):
+            found = self._with_lost_detail(at, found, judged)
+            judged = self._judged(at, found)
+        return at, found, judged
+
+    def _with_lost_detail(self, at: Rows, found: Matches, judged: Verdict) -> Matches:
+        """Matches with covariances that contain what compression has taken from the images of marks.
+
+        It takes the same detail from all pixels of a block, and from the residuals: those of some marks are
+        small by chance. What it does to positions is seen from their deviations from a polynomial; a local
+        model would follow it, as marks at one place in their blocks are displaced together. Residual times
+        leave-one-out deviation has the variance of a position for its mean, whatever the degree.
+        """
+        good = np.flatnonzero(judged.why[at] == "")
+        if len(good) < _FEWEST_SCATTERED:
+            return found
+        least = np.maximum(float(np.median(found.noise[good])) / np.maximum(found.noise, 1e-12), 1.0)
+        cov = found.cov * least[:, None, None] ** 2
+        field = SmoothField.fit(self.source[at[good]], found.xy[good], local=False)
+        off = found.xy[good] - field(self.source[at[good]])
+        variance = np.diagonal(cov[good], axis1=1, axis2=2)
+        factor = (off * field.leave_one_out()[0] / variance).mean(axis=0)
+        if factor.max() > _MOST_LOST**2:  # they lie beside the design, or the distortion is not smooth
+            factor = np.ones(2)
+        root = np.sqrt(np.maximum(factor, 1.0))
+        return replace(found, cov=cov * np.outer(root, root))
 
     def _without_intruders(self, at: Rows, found: Matches, judged: Verdict) -> Matches:
         """Match marks with large residuals again, without the pixels of what lies over or beside them.

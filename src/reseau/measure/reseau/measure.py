@@ -196,13 +196,15 @@ def measure_reseau(
     use_nominal = options.nominal and bool(np.isfinite(nominal).all())
     if options.mirrored and not use_nominal:
         # The image, with y down, and the reflected design, with y up, have opposite handedness.
-        found = measure_reseau(frame, design.from_behind(), replace(options, mirrored=False))
-        return found if isinstance(found, Failure) else replace(found, field=_reflected(found.field))
+        behind = measure_reseau(frame, design.from_behind(), replace(options, mirrored=False))
+        return behind if isinstance(behind, Failure) else replace(behind, field=_reflected(behind.field))
     if design.rings is not None and not use_nominal:
         columns = measure_sheet(frame, design, options)
         return columns if isinstance(columns, Failure) else ReseauResult(**columns)
     most = options.max_rotation_deg
-    grid = GridOptions(None if most is None else float(np.deg2rad(most)), None if options.mirrored is None else True)
+    grid = GridOptions(
+        None if most is None else float(np.deg2rad(most)), None if options.mirrored is None else True
+    )
     placed = place(
         frame,
         design,
@@ -358,7 +360,8 @@ def _open_names(source: Array, judged: Verdict, valid: Mask) -> tuple[Remark, ..
         if missing <= _ALIKE * len(source) and misfit(source, renamed, known) < chosen / _UNEVEN:
             text = (
                 f"the frame shows {int(good.sum())} of {len(source)} marks of a regular grid, and shifted by "
-                "a step they fit as well: names may be off by a row or column (give nominal positions of this frame)"
+                "a step they fit as well: names may be off by a row or column (give nominal "
+                "positions of this frame)"
             )
             return (Remark(text, Code.AMBIGUOUS),)
     return ()
