@@ -45,6 +45,7 @@ from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
+from ..core.numbers import measured as with_sigma
 from ..io.photographs import Exif
 from ..io.refraction import RefractionEntry
 from ..optics import CameraModel, PixelGrid, camera_model
@@ -71,6 +72,8 @@ __all__ = [
 
 _LEAST_POINTS = 8
 _LEAST_IMAGES = 3
+# Relative standard deviation of a principal distance above which nothing follows from a calibration.
+_HARDLY = 0.2
 _FOCAL_OFF = 1.5
 """Factor beyond which the focal length of the homographies contradicts that which the camera says."""
 _CAMERA = "camera"
@@ -501,7 +504,26 @@ def calibrate_camera(
             return bent
         board, network = bent, bent.network
     found = search_model(network, options.adjustment, options.components, options.level)
-    return found if isinstance(found, Failure) else Calibrated(found, measured, declined, choice, board)
+    if isinstance(found, Failure):
+        return found
+    calibrated = Calibrated(found, measured, declined, choice, board)
+    loose = _without_scale(calibrated.result)
+    return calibrated if loose is None else loose
+
+
+def _without_scale(result: Result) -> Failure | None:
+    """A failure where a principal distance, or a magnification, is hardly known at all."""
+    for estimate, camera in zip(result.cameras.values(), result.network.cameras, strict=True):
+        scales = () if camera.registered is None else camera.registered.of_role("scale")
+        rows = zip(estimate.parameters, estimate.values, estimate.sigma, estimate.units, strict=True)
+        for name, value, sigma, unit in rows:
+            if name in scales and sigma > _HARDLY * abs(value):
+                return Failure(
+                    f"{camera.label}: the images do not determine {name} ({with_sigma(value, sigma, unit)}); "
+                    "add images with the camera tilted by 20 to 40 degrees in different directions",
+                    Code.NOT_IDENTIFIED,
+                )
+    return None
 
 
 def _fixed_to_each_other(
