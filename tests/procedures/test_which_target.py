@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,12 +13,10 @@ from reseau.io import BoardDesign
 from reseau.procedures.exposures import of_another_lens
 from reseau.procedures.which_target import which_target
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "measure"))
+from ..measure.board_pictures import picture
 
 
 def test_a_charuco_board_is_found_among_other_targets() -> None:
-    from board_pictures import picture
-
     charuco = board("charuco", 7, 6, 24.0)
     frame, _ = picture(charuco)
     candidates = {
