@@ -213,12 +213,16 @@ def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) 
     original = SearchedFrame(screened.grey, grey, design, options.psf_px, PixelResponse(options.fill))
     seen, read = original, original.read()
     if isinstance(read, Failure) and read.code != Code.MIRRORED:
-        # Lines of one pixel width may be recovered from a blurred frame by sharpening, lines and targets of a
-        # few pixels in a small part of it by interpolation.
-        for other in (original.sharpened(), original.enlarged()):
-            again = read if other is None else other.read()
-            if other is not None and (not isinstance(again, Failure) or again.code == Code.MIRRORED):
-                seen, read = other, again
+        # Lines that are too thin can be between the targets only. Lines of one pixel width may be recovered
+        # from a blurred frame by sharpening, lines and targets of a few pixels in a small part of it by
+        # interpolation.
+        for other in (lambda: original, original.sharpened, original.enlarged):
+            trial = other()
+            if trial is None:
+                continue
+            again = trial.read_by_targets() if trial is original else trial.read()
+            if not isinstance(again, Failure) or again.code == Code.MIRRORED:
+                seen, read = trial, again
                 break
     if isinstance(read, Failure):
         return replace(read, where=frame.name)

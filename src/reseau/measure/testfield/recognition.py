@@ -13,6 +13,7 @@ in the original.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -33,6 +34,7 @@ from .lattice_fit import LatticeFit, lattices
 from .lattice_mapping import images_of, reduced, slope_of, straightened, stretches
 from .line_profiles import blur_of
 from .target_images import flat_outline, stacked
+from .target_lattice import lattices_of_targets
 
 __all__ = ["Kinds", "Placement", "Read", "Reading", "SearchedFrame", "locate", "read_clusters"]
 
@@ -52,6 +54,8 @@ _ENOUGH_PX = 7
 pixels are used."""
 _LEAST_STEP_PX = 2.5
 """Least distance of targets in the image, along either direction, at which they can be told apart."""
+_LEAST_PIXELS = 7
+"""Least number of pixels of a target that is compared with formed images, of five unknowns."""
 _MOST_SQUARES = 4
 """Most squares between the lines that are compared, relative to those of the design; more belong to another
 pattern."""
@@ -59,6 +63,8 @@ _FAINT = 0.3
 """Minimum contrast of a target relative to the usual contrast."""
 _SURE = 3
 """Most targets of a single square that may be hidden or wrong, if there is no other square to confirm it."""
+_AGREE = 8
+"""Number of squares that agree with the design from which the others in sight may be illegible."""
 _ANGLE = 7.5
 """Resolution of the directions of targets, degrees."""
 f32 = np.float32
@@ -201,7 +207,7 @@ class _Clusters:
         frames = slope_of(fit.mapping, self.cell + 0.5) / design.pitch
         seen: Mask = np.asarray(((xy > 1) & (xy < [w - 2, h - 2])).all(axis=2))
         longest, shortest = (self.step * scale for scale in stretches(np.nan_to_num(frames)))
-        legible = seen.any(axis=1) & (shortest > _LEAST_STEP_PX) & (longest < max(h, w) / 2)
+        legible: Mask = seen.any(axis=1) & (shortest > _LEAST_STEP_PX) & (longest < max(h, w) / 2)
         legible &= legible.sum() <= _MOST_SQUARES * len(design.centres)
         self.cell, self.xy, self.visible = self.cell[legible], xy[legible], seen[legible]
         if not legible.any():
@@ -209,7 +215,8 @@ class _Clusters:
         self.group, self.frames = _grouped(frames[legible])
         reach = np.ceil(np.abs(self.frames).sum(axis=2).max(axis=0) * self.step / 2).astype(int)
         # Large targets are told apart by every second pixel, or less.
-        self.each = max(1, round(reach.min() / _ENOUGH_PX))
+        wide = float(shortest[legible].min()) / _LEAST_STEP_PX
+        self.each = max(1, min(round(reach.min() / _ENOUGH_PX), int(wide)))
         reach += -reach % self.each
         self.columns, self.rows = (np.arange(-r, r + 1.0) for r in reach // self.each)
         columns, rows = self.each * self.columns, self.each * self.rows
@@ -227,6 +234,7 @@ class _Clusters:
         # Pixels that are nearer to a neighbour than to the target are ignored.
         on_board = np.einsum("gij,nj->gni", np.linalg.inv(self.frames), offset)
         self.own = (np.abs(on_board) <= self.step / 2).all(axis=2)
+        self.visible &= (self.own.sum(axis=1) >= _LEAST_PIXELS)[self.group][:, None]
 
     def compared(self, psf_px: float) -> _Comparison:
         """Compare every target with all kinds."""
@@ -236,6 +244,9 @@ class _Clusters:
         design = self._design(psf_px)
         for group, own in enumerate(self.own):
             of = self.group == group
+            if pixels[group] < _LEAST_PIXELS:
+                rest[of], x[of] = np.inf, 0.0
+                continue
             seen = self.seen[of][..., own].astype(np.float64)
             # Projection onto the column space of each design: a = q r, x = r⁻¹ qᵀ l, v² = l² − (qᵀ l)².
             q, r = np.linalg.qr(design[group][:, own])
@@ -358,7 +369,8 @@ def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
             f"{most} squares agree with the design {design.name!r}, but {others} contradict them",
             Code.INCONSISTENT,
         )
-    if mirrored or most < 0.3 * in_sight:
+    # At the limit of resolution few of the squares in sight can be read.
+    if mirrored or most < min(0.3 * in_sight, _AGREE):
         return Failure(
             f"only {most} of {in_sight} visible squares belong to the design {design.name!r}",
             Code.OTHER_DESIGN,
@@ -510,10 +522,20 @@ class SearchedFrame:
         found = find_lattices(ridges)
         if isinstance(found, Failure):
             return found
-        design, failure = self.design, None
-        width, blur = design.lines.width / design.pitch, blur_of(self.psf_px, self.response)
+        width = self.design.lines.width / self.design.pitch
         most = _MOST_SHARPENED if self.taken_px2 else _MOST_LATTICES
-        for lattice in lattices(self.dark, ridges, found, width, blur, most):
+        blur = blur_of(self.psf_px, self.response)
+        return self._first(ridges, lattices(self.dark, ridges, found, width, blur, most))
+
+    def read_by_targets(self) -> Read | Failure:
+        """The same with lattices between the targets, where lines are too thin to be found."""
+        ridges = ridge_points(self.dark, self.noise)
+        return self._first(ridges, lattices_of_targets(self.dark, self.noise, self.design))
+
+    def _first(self, ridges: Ridges, tried: Iterable[LatticeFit]) -> Read | Failure:
+        """The first lattice whose squares are those of the design."""
+        design, failure = self.design, None
+        for lattice in tried:
             reading = read_clusters(self.grey, lattice, design, self.psf_px, self.response)
             placed = reading if isinstance(reading, Failure) else locate(reading, design)
             if isinstance(placed, Placement) and isinstance(reading, Reading):
