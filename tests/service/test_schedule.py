@@ -244,7 +244,7 @@ def test_a_run_that_stays_blocked_or_fails_is_shown_with_its_reason(schedules: S
         raise EstimationError("too few points", where="left")
 
     schedules.run_due(dead, week(0, 0.5))
-    assert [(r.state, r.why) for r in schedules.runs("weekly", week(0, 5))][0] == (
+    assert next((r.state, r.why) for r in schedules.runs("weekly", week(0, 5))) == (
         "overdue",
         "camera: is in use",
     )
