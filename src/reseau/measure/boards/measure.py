@@ -109,6 +109,7 @@ def measure_board(
     ------
     ImageError
         When the frame is all black, saturated, or of one grey.
+
     Examples
     --------
     Draw a chessboard with edges half way between pixels, and measure its corners:
