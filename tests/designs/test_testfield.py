@@ -101,7 +101,7 @@ def test_an_invalid_testfield_is_refused_with_the_key(change: str, complaint: st
     [
         ({"columns": 0}, "0 × 8 squares"),
         ({"columns": 13, "rows": 13}, "168 words, not 169"),
-        ({"pitch": 100.0}, "do not fit squares of 100 mm"),
+        ({"pitch": 100.0, "spread": 30.0}, "do not fit squares of 100 mm"),
         ({"spread": 25.0}, "do not fit 25 mm"),
         ({"small": (9, 13, 15)}, "a size for each of four shapes"),
         ({"small": (18, 13, 15, 12)}, "the large ones above the small"),
