@@ -80,6 +80,10 @@ def write_tables(path: Path, raster: CorrectedImage) -> tuple[Path, ...]:
         For another suffix.
     InputError
         When a file cannot be written.
+
+    Examples
+    --------
+    >>> write_tables(Path("tables.npz"), raster)  # doctest: +SKIP
     """
     x, y = remap_tables(raster)
     suffix = path.suffix.lower()
@@ -140,6 +144,10 @@ def undistort_video(
         When it cannot be written.
     UsageError
         When the suffix is not that of a video.
+
+    Examples
+    --------
+    >>> undistort_video(Path("a.mp4"), Path("b.mp4"), raster)  # doctest: +SKIP
     """
     import cv2
 

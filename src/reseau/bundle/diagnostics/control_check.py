@@ -65,6 +65,10 @@ class ControlShape:
         Differences that are tolerated.
     agree : ndarray of bool (k,)
         Points that agree.
+
+    Examples
+    --------
+    >>> control_shape(network)  # doctest: +SKIP
     """
 
     names: tuple[str, ...]
@@ -167,6 +171,10 @@ class ControlCheck:
     detectable : ndarray (k,)
         Smallest error in the least favourable direction that the test finds with a power of 80 %; infinite
         where no other observation depends on it, as along the only ray of a point.
+
+    Examples
+    --------
+    >>> checked_control(problem, fit).wrong  # doctest: +SKIP
     """
 
     points: Rows
@@ -299,6 +307,10 @@ def checked_control(
     the other observations. The worst points are left out, those that agree are taken back, until nothing
     changes. A ray of a control point that explains more than its coordinates is left out in their stead. Held
     coordinates are tested as observations with very small standard deviations.
+
+    Examples
+    --------
+    >>> checked_control(problem, fit)  # doctest: +SKIP
     """
     loose = _as_observed(problem)
     points = np.flatnonzero(loose.network.observed.any(axis=1)).astype(np.intp)
