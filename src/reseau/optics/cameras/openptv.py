@@ -20,24 +20,14 @@ from numpy.typing import ArrayLike
 
 from ...core.data import Array, Mask
 from ..mapping import Derivatives, PlaneMapping, as_points, as_values
-from .brown import BrownDistortion
+from .brown import PARAMETERS, BrownDistortion
 from .grid import PixelGrid
 from .registry import CameraModel, Parameter, register_camera
 
 __all__ = ["OpenPtv"]
 
-_PARAMETERS = (
-    Parameter("c", "mm", "scale", usual=True, required=True),
-    Parameter("x0", "mm", "centre", usual=True),
-    Parameter("y0", "mm", "centre", usual=True),
-    Parameter("K1", "mm^-2", usual=True),
-    Parameter("K2", "mm^-4", usual=True),
-    Parameter("K3", "mm^-6"),
-    Parameter("P1", "mm^-1", usual=True),
-    Parameter("P2", "mm^-1", usual=True),
-    Parameter("B1"),
-    Parameter("she", "rad"),
-)
+# All of Brown's but its last, B2, in whose place there is the shear.
+_PARAMETERS = (*PARAMETERS[:-1], Parameter("she", "rad"))
 
 
 @dataclass(frozen=True, eq=False)
