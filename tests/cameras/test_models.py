@@ -67,14 +67,17 @@ class Case(NamedTuple):
         return self.model.mapping(self.values(), GRID, self.options)
 
 
-def cases() -> list[object]:
+def cases(quick: tuple[str, ...] | None = None) -> list[object]:
+    """Every model with every choice of its options; slow but for the models named, if any are."""
     found = []
     for model in dict.fromkeys((*camera_models(), equidistant.MODEL, division.MODEL)):
         texts = [[(o.name, choice) for choice in o.choices] for o in model.options if o.choices]
         for chosen in product(*texts):
             numbers = {o.name: 1.7 for o in model.options if not o.choices}
             case = Case(model, dict(chosen) | numbers)
-            found.append(pytest.param(case, id="-".join([model.name, *(str(v) for _, v in chosen)])))
+            marks = () if quick is None or model.name in quick else (pytest.mark.slow,)
+            name = "-".join([model.name, *(str(v) for _, v in chosen)])
+            found.append(pytest.param(case, id=name, marks=marks))
     return found
 
 
@@ -392,7 +395,7 @@ def test_standard_deviations_are_right_to_five_percent(case: Case) -> None:
     assert 0.95 < np.sqrt(joint.mean()) < 1.05
 
 
-@EVERY
+@pytest.mark.parametrize("case", cases(quick=("brown", "fisheye", "telecentric")))
 def test_commands_accept_the_model_and_write_report_and_calibration(
     case: Case, reseau: Run, tmp_path: Path
 ) -> None:
@@ -491,6 +494,7 @@ def test_an_unknown_model_or_option_is_named_in_one_line(reseau: Run, tmp_path: 
             CameraEntry.model_validate_json(json.dumps(entry | change))
 
 
+@pytest.mark.slow
 def test_calibrate_says_which_model_it_chose_and_why(reseau: Run, tmp_path: Path) -> None:
     """The lens has no distortion; the table, the document, and an option that cannot be given with it."""
     calibrated(Case(camera_model("opencv"), {}), tmp_path)

@@ -143,6 +143,7 @@ def test_a_bad_frame_is_taken_again_and_both_are_kept(rig: FieldRig, session: Se
     assert rig.camera.exposures == 6
 
 
+@pytest.mark.slow
 def test_retakes_are_limited_and_the_session_continues(rig: FieldRig, session: Session) -> None:
     grey = np.full((240, 240), 120, np.uint8)
     rig.camera.spoil = lambda number, pixels: grey if rig.table.stands["roll"] == 90 else pixels

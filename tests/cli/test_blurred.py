@@ -69,6 +69,7 @@ def measured(files: dict[str, Path], document: str) -> float:
     return float(max(np.hypot(p["x"] - truth[p["id"]][0], p["y"] - truth[p["id"]][1]) for p in points))
 
 
+@pytest.mark.slow
 def test_targets_are_measured_and_the_image_is_oriented_by_them(files, tmp_path: Path, reseau: Run) -> None:
     status, out, _ = reseau(
         "measure", "blurred", files["photo.png"], "-d", files["design.json"], "-l", files["lens.toml"],

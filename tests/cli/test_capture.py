@@ -250,6 +250,7 @@ def test_a_failed_session_is_resumed_where_it_stopped(
     assert "monday: its plan is `testfield`" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_poses_are_chosen_until_the_goal_is_met(rig: FieldRig, capsys: pytest.CaptureFixture[str]) -> None:
     options = [*TESTFIELD[:2], *TESTFIELD[4:], "--checks", "0"]
     assert capture("testfield", *options, "--until", "sigma_c < 6 um", "--name", "a", "--json") == 0
@@ -366,6 +367,7 @@ def test_bad_frames_are_reported_and_stored(rig: FieldRig, capsys: pytest.Captur
     assert [(f["take"], f["ok"]) for f in document["frames"]] == [(0, False), (1, True), (0, True)]
 
 
+@pytest.mark.slow
 def test_the_operator_is_asked_and_a_photograph_without_a_reseau_ends_the_session(
     rig: FieldRig, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

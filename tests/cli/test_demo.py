@@ -41,6 +41,9 @@ FILES = {
 Run = Callable[..., tuple[int, str, str]]
 
 
+pytestmark = pytest.mark.slow  # one run of the whole demo; `make demo` is a part of CI
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Its folder, and its output."""

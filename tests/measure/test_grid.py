@@ -62,6 +62,7 @@ def test_prior_positions_may_be_wrong_by_tens_of_pixels(shift, bend):
     assert np.abs(found.predicted - image).max() < 1.5
 
 
+@pytest.mark.slow
 @settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 @given(
     turn=st.floats(-10, 10),

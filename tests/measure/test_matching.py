@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter
 
 from reseau.measure import MatchOptions, match
 from reseau.measure.matching import matcher
+from reseau.measure.matching.correlation import with_alike_errors
 from reseau.measure.matching.matcher import SIZE
+from reseau.measure.matching.matches import Matches
 from reseau.measure.matching.patches import Patches
 from reseau.measure.matching.shapes import GrownOutline, Window
 from reseau.optics.formation import Outline, PixelResponse, draw, mark_outline
@@ -267,3 +272,20 @@ def test_values_without_an_image_do_not_disturb_other_marks():
     image = shape.image(*given)
     assert np.isnan(image[1]).all()
     assert image[0].sum() == pytest.approx(np.pi * 3.5**2, abs=1e-3)
+
+
+def test_a_mark_without_a_finite_influence_leaves_the_covariances_of_the_others():
+    rng = np.random.default_rng(0)
+    one, none, window = np.ones(30), np.zeros((30, 0)), np.ones((30, 17, 17))
+    alike = 3 * uniform_filter(rng.standard_normal(window.shape), (0, 3, 3))
+    cov, influence = np.tile(np.eye(2), (30, 1, 1)), np.stack([window, window], axis=1) / 17
+    columns = (one, one, one, one, none, one, one, one, 0 * one)
+    found = Matches(np.zeros((30, 2)), cov, *columns, one > 0, alike, none, influence, 0 * window)
+    others = np.setdiff1d(np.arange(30), 3)
+    usual = with_alike_errors(found.select(others))
+    influence = influence.copy()
+    influence[3], influence[7] = np.nan, 1e6 * influence[7]
+    unusual = with_alike_errors(replace(found, influence=influence)).select(others)
+    assert usual.cov[0, 0, 0] > 5
+    rest = others != 7
+    np.testing.assert_allclose(unusual.cov[rest], usual.cov[rest], atol=1e-3)

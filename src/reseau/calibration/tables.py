@@ -49,8 +49,8 @@ def remap_tables(raster: CorrectedImage) -> tuple[NDArray[np.float32], NDArray[n
     >>> lens = OpenCV.from_parameters({"fx": 80.0, "fy": 80.0, "cx": 31.5, "cy": 23.5, "k1": -0.1})
     >>> camera = CameraMapping(lens, 64, 48, np.zeros(0, dtype=np.intp), np.zeros((0, 0)))
     >>> x, y = remap_tables(CorrectedImage.undistorted(camera))
-    >>> x.shape, float(x[0, 0].round(2)), float(y[0, 0].round(2))
-    ((48, 64), 0.75, 0.57)
+    >>> x.shape, round(float(x[0, 0]), 1), round(float(y[0, 0]), 1)
+    ((48, 64), 0.8, 0.6)
     """
     columns, rows = (np.arange(n, dtype=np.float64) for n in (raster.width, raster.height))
     x, y = on_lattice(raster.to_source, columns, rows)

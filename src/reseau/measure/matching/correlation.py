@@ -79,6 +79,7 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     with np.errstate(invalid="ignore"):
         sure = found.converged & (found.rejected < 0.1) & (found.seen > 0.9) & (found.noise > 0)
         sure &= found.noise < 2 * np.median(found.noise[sure]) if sure.any() else False
+    sure &= np.isfinite(found.influence).all(axis=(1, 2, 3))
     if sure.sum() < _FEWEST:
         return found
     used = np.isfinite(found.residuals)
@@ -110,12 +111,17 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     kernel[_LAGS, _LAGS] = 1.0
     for (down, right), r in correlation.items():
         kernel[_LAGS + down, _LAGS + right] = kernel[_LAGS - down, _LAGS - right] = r
-    wide = np.pad(uneven, ((0, 0), (0, 0), (0, _LAGS), (0, _LAGS))).astype(np.float32)
-    # One window below the other, apart as far as errors extend.
+    # One window below the other, apart as far as errors extend, each in units of its largest value: the
+    # filter works on all of them at once, and one without finite values would take the others with it.
+    largest = np.abs(uneven).max(axis=(1, 2, 3))
+    known = np.isfinite(largest) & (largest > 0)
+    unity = np.where(known, largest, 1.0)
+    scaled = np.where(known[:, None, None, None], uneven, 0.0) / unity[:, None, None, None]
+    wide = np.pad(scaled, ((0, 0), (0, 0), (0, _LAGS), (0, _LAGS))).astype(np.float32)
     column = wide.reshape(-1, wide.shape[-1])
     together = cv2.filter2D(column, -1, kernel, borderType=cv2.BORDER_CONSTANT).reshape(wide.shape)
-    extra = np.einsum("kirc,kjrc->kij", wide, together).astype(np.float64)
-    extra -= np.einsum("kirc,kjrc->kij", influence, influence)
+    extra = np.einsum("kirc,kjrc->kij", wide, together) * unity[:, None, None] ** 2
+    extra -= np.where(known[:, None, None], np.einsum("kirc,kjrc->kij", influence, influence), 0.0)
     extra = (extra + np.swapaxes(extra, 1, 2)) / 2
     # Errors that cancel each other, as after sharpening, are not relied upon without further evidence.
     cov, least = found.cov + extra, found.cov if centres is None else _CANCELLED * found.cov
