@@ -108,6 +108,7 @@ def within(count, trials, probability, sigmas=4.0):
     return abs(count - trials * probability) < sigmas * spread
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sigmas", "blocks", "full"])
 def test_blunders_of_the_minimal_detectable_size_are_found_at_the_power_of_theory(kind):
     alpha, power, trials, at = 0.01, 0.8, 1500, 4
@@ -124,6 +125,7 @@ def test_blunders_of_the_minimal_detectable_size_are_found_at_the_power_of_theor
     assert within(false, trials, alpha)
 
 
+@pytest.mark.slow
 def test_blunders_in_conditions_are_found_at_the_power_of_theory():
     """Gauss–Helmert: both coordinates of points on a circle observed; errors along the first."""
     alpha, power, trials, at = 0.01, 0.8, 600, 0

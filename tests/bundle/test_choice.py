@@ -90,6 +90,7 @@ def test_what_the_wrong_model_costs_at_the_corners_is_what_it_costs() -> None:
     assert simple.share > 0.2
 
 
+@pytest.mark.slow
 def test_a_wide_lens_gets_a_projection_of_wide_lenses() -> None:
     found = chosen(lenses.fisheye(70), WIDE)
     assert found.chosen.candidate.label == "fisheye: k1 k2"
@@ -97,6 +98,7 @@ def test_a_wide_lens_gets_a_projection_of_wide_lenses() -> None:
     assert standard.length > 1000
 
 
+@pytest.mark.slow
 def test_gross_errors_do_not_change_the_choice() -> None:
     lens = lens_of(-0.2, 0.1, 1e-3, -5e-4)
     found = choose_model(network_of(lens, gross=12), LADDER, Options(outliers="reject"))

@@ -118,6 +118,7 @@ def test_the_dense_engine_gives_the_same_estimates_and_statistics() -> None:
     np.testing.assert_allclose(fit.cofactors.points[j], block, rtol=0, atol=1e-6 * np.abs(block).max())
 
 
+@pytest.mark.slow
 def test_the_dense_engine_gives_the_same_reliability_of_every_observation() -> None:
     world = mixed()
     network = world.noisy(3)
@@ -134,6 +135,7 @@ def test_the_dense_engine_gives_the_same_reliability_of_every_observation() -> N
     np.testing.assert_allclose(fit.w[n:], twin.prior_w, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_joint_covariance_of_any_unknowns_is_that_of_the_dense_engine() -> None:
     world = mixed()
     network = world.noisy(3)

@@ -359,6 +359,7 @@ def test_points_in_a_plane_do_not_determine_pose_and_velocity_of_a_line() -> Non
     assert "of image" in singular.reason
 
 
+@pytest.mark.slow
 def test_commands_take_shutters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`reseau bundle` of a network file, and `reseau calibrate --rolling-shutter` of a testfield."""
     scene = scene_of_kind("line")

@@ -126,6 +126,7 @@ def test_names_with_a_grid_are_models() -> None:
         camera_model("splined_stereographic_order=3")
 
 
+@pytest.mark.slow
 def test_a_calibration_follows_a_lens_that_no_polynomial_describes() -> None:
     """Board views drawn by OpenCV through a fisheye lens; what the regularisation contributes is stated."""
     lens = lenses.fisheye(50)

@@ -82,6 +82,7 @@ def test_targets_are_measured_and_the_image_is_oriented_by_them(files, tmp_path:
     assert measured(files, (tmp_path / "m.json").read_text()) < 0.1
 
 
+@pytest.mark.slow
 def test_a_focus_that_was_stated_wrong_is_estimated(files, tmp_path: Path, reseau: Run) -> None:
     block = network(tmp_path / "network.json", POSE.x0.tolist())
     status, out, err = reseau(

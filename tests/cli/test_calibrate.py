@@ -166,6 +166,7 @@ def test_a_point_can_be_left_out_by_name(reseau: Run, measured: tuple[Path, ...]
         assert words in err
 
 
+@pytest.mark.slow
 def test_components_and_elimination_search_the_model(
     reseau: Run, measured: tuple[Path, ...], tmp_path: Path
 ) -> None:
@@ -286,6 +287,7 @@ def test_coordinates_without_a_size_are_refused(reseau: Run, measured: tuple[Pat
     assert "size of the images" in err
 
 
+@pytest.mark.slow
 def test_documents_of_measurements_are_accepted_as_images(
     reseau: Run, measured: tuple[Path, ...], tmp_path: Path
 ) -> None:
@@ -317,6 +319,7 @@ def checked(answer: tuple[int, str, str]) -> str:
     return out
 
 
+@pytest.mark.slow
 def test_windows_before_the_target_are_taken_from_a_file(
     reseau: Run, measured: tuple[Path, ...], tmp_path: Path
 ) -> None:

@@ -58,6 +58,7 @@ def both(folder: Path) -> tuple[object, ...]:
     return ("--camera", f"left={folder / 'left'}", "--camera", f"right={folder / 'right' / '*.csv'}")
 
 
+@pytest.mark.slow
 def test_each_camera_and_its_place_are_within_their_sigmas(
     reseau: Run, measured: Path, tmp_path: Path
 ) -> None:
@@ -93,6 +94,7 @@ def exchanged(measured: Path, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_images_that_were_not_taken_at_once_are_named(reseau: Run, exchanged: Path, tmp_path: Path) -> None:
     said = "images left/02.csv, left/05.csv, right/02.csv, right/05.csv were not taken at once"
     command = ("calibrate", *both(exchanged), "-d", exchanged / "disks.json", *FREE)

@@ -79,6 +79,7 @@ def test_a_second_run_continues_where_the_first_ended(roll: Path, tmp_path: Path
     assert (tmp_path / "0.json").stat().st_mtime_ns > written
 
 
+@pytest.mark.slow
 def test_calibrated_corners_give_a_transformation_and_its_residuals_if_there_are_any(
     roll: Path, tmp_path: Path, reseau: Run
 ) -> None:

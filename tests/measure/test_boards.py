@@ -61,6 +61,7 @@ def test_corners_are_measured_to_their_sigmas_and_named(
     assert np.abs(error.mean(axis=0)).max() < 0.003  # no half pixel
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("design", "rms_px"), [(APRIL, 0.005), (APRIL_ONE, 0.006), (MARKERS, 0.012)])
 @pytest.mark.parametrize("pixel", [0.0, 0.4])
 def test_corners_of_tags_follow_known_shifts(design: BoardDesign, rms_px: float, pixel: float) -> None:

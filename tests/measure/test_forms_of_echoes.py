@@ -36,6 +36,7 @@ def test_echoes_of_every_kind_are_found_behind_wires_and_within_their_sigmas(kin
     assert np.sqrt((error**2).mean(axis=0)).max() < 0.2
 
 
+@pytest.mark.slow
 def test_lines_cut_by_turned_wires_are_measured_as_well_as_whole_ones():
     error, sigma, wanted = errors(draw("even", seed=1, turn=-0.1))
     assert len(error) >= 0.85 * wanted
@@ -45,6 +46,7 @@ def test_lines_cut_by_turned_wires_are_measured_as_well_as_whole_ones():
     assert np.sqrt((error**2).mean(axis=0)).max() < 0.06
 
 
+@pytest.mark.slow
 def test_lines_along_a_wire_that_hides_parts_of_both_ends_are_measured():
     error, sigma, wanted = errors(draw("even", seed=3))
     assert len(error) >= 0.9 * wanted

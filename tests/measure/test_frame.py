@@ -116,6 +116,7 @@ def test_a_line_beside_an_edge_is_suspected_where_another_line_crosses_its_end()
     assert result.code is Code.UNCERTAIN, result.why
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "frame", [FilmFrame(320035, contrast=0.3), FilmFrame(320035, contrast=0.3, colour=True)]
 )
@@ -141,6 +142,7 @@ def test_a_trunk_as_dark_as_film_at_one_end_of_an_edge_is_not_its_bow(fade: floa
         assert result.code is Code.UNCERTAIN, result.why
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lines", [1, 2])
 def test_a_channel_of_less_contrast_does_not_overrule_a_line_that_another_suspects(lines: int) -> None:
     frame = FilmFrame(320035, colour=True, beside=Beside(lines=lines))  # green and blue were wrong by 1 px
@@ -160,6 +162,7 @@ def test_a_trunk_in_the_picture_is_no_edge_of_a_frame_that_stands_upright(seed: 
     assert bool(result) or not stated
 
 
+@pytest.mark.slow
 def test_certain_frames_of_a_roll_locate_an_edge_hidden_by_a_line() -> None:
     """The line is parallel to the edge: in a single frame they cannot be distinguished."""
     frame = FilmFrame(320035, beside=Beside(lines=1))

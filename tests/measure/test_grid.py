@@ -83,6 +83,7 @@ def test_without_prior_positions_shift_scale_rotation_and_handedness_are_found(
     assert (found.candidate[inside] >= 0).mean() > 0.85
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bend", [-60.0, 60.0])
 def test_a_strong_barrel_or_pincushion_is_followed(bend):
     rng, xy = np.random.default_rng(4), design()

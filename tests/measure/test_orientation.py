@@ -81,6 +81,7 @@ def test_a_reseau_seen_from_behind_is_mirrored_and_keeps_its_design(pixels):
     assert np.abs(found.field(design.xy) - found.xy).max() < 0.1
 
 
+@pytest.mark.slow
 def test_nominal_positions_from_before_the_frame_was_cropped_are_not_followed():
     formed = form(Uneven(columns=11, rows=9, width=700, height=600), np.random.default_rng(1))
     before = formed.design.expected_at(formed.xy)

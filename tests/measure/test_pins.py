@@ -372,6 +372,7 @@ def test_four_rods_that_fit_exactly_are_found_among_others():
     assert (np.sort(layout.row) == [5, 6, 7, 8]).all()
 
 
+@pytest.mark.slow
 def test_four_rods_of_a_turned_phantom_are_found_or_declined(reference_data: Callable[[str], Path]):
     folder = reference_data("independent") / "pins"
     reference = json.loads((folder / "reference.json").read_text("utf-8"))
@@ -412,6 +413,7 @@ def test_slanted_wires_are_derived_from_their_segments():
     assert np.abs(layout.inverse(seen)[wires.fixed] - start[wires.fixed]).max() < 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sequence", "every"), [("VLCUS_6pt", 5), ("fCal20_3NWires_cal", 6)], ids=["characters", "plain"]
 )

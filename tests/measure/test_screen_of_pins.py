@@ -39,6 +39,7 @@ def _glowing(lines: float = 0.0, fall: float = 0.0, seed: int = 0) -> tuple[Arra
     return truth, light + NOISE * rng.standard_normal(_SIZE)
 
 
+@pytest.mark.slow
 def test_with_one_flank_hidden_the_sigma_includes_the_raster_lines():
     normalised, unveiled = [], []
     for seed in range(3):
@@ -59,6 +60,7 @@ def test_with_one_flank_hidden_the_sigma_includes_the_raster_lines():
     assert np.median(np.concatenate(unveiled)) < 0.05
 
 
+@pytest.mark.slow
 def test_light_falloff_known_from_the_raster_does_not_shift_echoes():
     truth, pixels = _glowing(fall=0.3)
     hidden = _reseau(np.array([5.0, 595.0]))

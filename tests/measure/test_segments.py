@@ -61,6 +61,7 @@ def test_three_points_do_not_test_a_mapping() -> None:
     assert found.why[0].code == "too-few-points"
 
 
+@pytest.mark.slow
 def test_slanted_wires_of_a_real_phantom_are_those_found_by_plus(
     reference_data: Callable[[str], Path],
 ) -> None:

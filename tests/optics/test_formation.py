@@ -189,6 +189,7 @@ PERSPECTIVE = RationalPolynomial.projective().with_values(
 )
 
 
+@pytest.mark.slow
 def test_a_disk_in_perspective_agrees_with_supersampling() -> None:
     disk = mark_outline("disk", 1.4, None, SPACING / 12).mapped(lambda xy: PERSPECTIVE.derivatives(xy)[:2])
     step = 1 / 60

@@ -13,6 +13,7 @@ from reseau.procedures.turntable import Mount
 POSITIONS = [step.position | {"z": 10.0 * (k % 3)} for k, step in enumerate(paper_steps())]
 
 
+@pytest.mark.slow
 @given(
     about=st.sampled_from([0, 1]),
     signs=st.tuples(*[st.sampled_from([1.0, -1.0])] * 3),

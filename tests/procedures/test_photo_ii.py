@@ -61,6 +61,7 @@ def test_a_bench_without_faults_gives_no_remarks(bench):
     assert len(second.pins) >= 30
 
 
+@pytest.mark.slow
 def test_true_coordinates_of_a_body_lie_within_their_sigmas(world, bench):
     _, second = bench
     third = photo_iii(world.photo_iii(), second.instrument, world.design).required()
@@ -76,6 +77,7 @@ def test_a_missing_row_of_rods_is_reported(bench):
     assert [str(note) for note in found.notes] == ["the whole row of rods at y = -60 mm is missing"]
 
 
+@pytest.mark.slow
 def test_a_rotated_test_object_is_reported(bench):
     found = photo_of(at_fault(object_turned_deg=3.0), bench)
     assert len(found.notes) == 1
@@ -101,6 +103,7 @@ def test_a_displaced_camera_is_detected_and_corrected(pushed: float, bench):
     assert np.abs(off).max() < 0.6
 
 
+@pytest.mark.slow
 def test_swapped_marks_of_the_common_system_are_reported(world, bench):
     confused = swapped(world.design)
     first = photo_i(world.photo_i(), confused).required()
@@ -108,6 +111,7 @@ def test_swapped_marks_of_the_common_system_are_reported(world, bench):
     assert any("are O and S swapped?" in note.text for note in found.notes)
 
 
+@pytest.mark.slow
 def test_a_gap_between_reseau_and_screen_has_no_effect_from_one_position():
     world = at_fault(parallax_mm=2.0)
     first = photo_i(world.photo_i(), world.design).required()
@@ -132,6 +136,7 @@ def test_a_gap_between_reseau_and_screen_is_reported_from_two_positions():
     assert any("a gap between reseau and screen (parallax)" in note.text for note in found.notes)
 
 
+@pytest.mark.slow
 def test_stored_coefficients_are_valid_in_a_new_photograph_of_the_same_bench(world, bench):
     _, second = bench
     again = world.photograph("PHOTO II anew", world.show(world.rods, "PHOTO II anew"))

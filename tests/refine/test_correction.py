@@ -212,6 +212,7 @@ def truth(camera: CameraCorrection) -> RationalPolynomial:
     return camera.model.with_values(adjust(problem).required().values)
 
 
+@pytest.mark.slow
 def test_the_covariance_of_model_and_corrected_marks_is_that_of_repeated_measurement():
     held = GRID.ids[3::9]
     squares, degrees, marks, passed = 0.0, 0, [], []

@@ -17,6 +17,7 @@ def _camera(seed: int = 0):
     return correct_camera(reseau_marks(np.random.default_rng(seed)), RESEAU, trials=0).required()
 
 
+@pytest.mark.slow
 def test_a_stationary_camera_is_not_reported_as_moved():
     # PHOTO I anew for each: its own errors are part of the test's level.
     found = [register(reseau_marks(np.random.default_rng(100 + s)), RESEAU, _camera(s)) for s in range(40)]

@@ -143,6 +143,7 @@ def test_a_bent_edge_is_detected_and_modelled() -> None:
     assert 0.75 < rms(np.array(curves)) < 1.3
 
 
+@pytest.mark.slow
 def test_an_edge_blurred_only_by_the_pixels_is_measured() -> None:
     over = []
     for seed in range(8):
@@ -219,6 +220,7 @@ def gaussian_edge(rng: np.random.Generator, psf: float, turned: bool) -> Frame:
     return Frame(np.clip(pixels, 0, 255).astype(np.uint8), 255.0)
 
 
+@pytest.mark.slow
 def test_the_sharpness_of_an_edge_is_recovered_within_its_sigmas() -> None:
     widths, halves = [], []
     for seed in range(24):

@@ -89,6 +89,7 @@ def test_the_test_object_determines_the_sixteen_coefficients() -> None:
     np.testing.assert_allclose(design.xy[n] - design.xy[m], [100.0, 0.0])
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_photographs_in_any_order(world: World, photo_ii: Frame) -> None:
     again = World.standard(3)
     iii = again.photo_iii()

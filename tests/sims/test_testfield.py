@@ -119,6 +119,7 @@ def test_stains_hide_or_saturate_targets_and_a_mirror_reflects_the_field() -> No
     np.testing.assert_allclose(turned + plain.light(Station(0)), 200 * (2 - 0.85), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_blur_of_other_forms_does_not_move_the_centroid_of_a_target() -> None:
     field = coded_testfield()
     only = "28.06"
