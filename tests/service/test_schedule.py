@@ -266,7 +266,7 @@ def test_after_a_service_event_a_run_is_due_at_once(schedules: Schedules) -> Non
     known = Configurations(schedules._archive)
     known.define("left", {"camera": "DMK 33"})
     known.event("left", "lens changed", at=week(0.5))
-    run = next(each for each in schedules.runs("weekly", week(0.6)) if each.state == "due")
+    (run,) = (each for each in schedules.runs("weekly", week(0.6)) if each.state == "due")
     assert (run.time, run.why) == (week(0.5), "service event: lens changed")
     assert len(schedules.run_due(lambda *_: "accepted", week(0.6))) == 1
     assert "due" not in states(schedules, week(0.7))

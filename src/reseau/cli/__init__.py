@@ -35,6 +35,7 @@ from . import (
     orient,
     perforations,
     refine,
+    schedule,
 )
 
 __all__ = ["app", "main"]
@@ -59,6 +60,9 @@ capture.app.command()(capture_own.own)
 app.add_typer(capture.app, name="capture")
 app.add_typer(archive.app, name="archive")
 app.add_typer(calibrations.app, name="calibrations")
+app.command()(schedule.recalibrate)
+app.add_typer(schedule.app, name="schedule")
+app.add_typer(schedule.alarms, name="alarms")
 app.command()(orient.orient)
 app.command()(refine.refine)
 app.command()(apply.apply)

@@ -16,7 +16,7 @@ from .common import ArchivePlace, AsJson, ObjectsPlace, Out, open_archive, say, 
 if TYPE_CHECKING:
     from ..service import Configurations, Decision
 
-__all__ = ["app", "time_of"]
+__all__ = ["app", "say_decision", "time_of"]
 
 app = typer.Typer(no_args_is_help=True, help="Calibrations in force: decide, review, return, history, drift.")
 
@@ -101,7 +101,7 @@ def decide(
     new, judged_by = read_calibration(calibration), AcceptanceRules.read(rules)
     with _opened(archive, objects) as found:
         made = found.decide(name, new, judged_by, since=time_of(since, "--since"), by=by, comment=comment)
-    _say_decision(made, as_json)
+    say_decision(made, as_json)
     raise typer.Exit(0 if made.outcome.startswith("accepted") else 1)
 
 
@@ -119,7 +119,7 @@ def review(
     with _opened(archive, objects) as found:
         # Another text is refused by `review`.
         made = found.review(name, key, outcome, by=by, comment=comment)  # type: ignore[arg-type]
-    _say_decision(made, False)
+    say_decision(made, False)
 
 
 @app.command()
@@ -220,7 +220,7 @@ def history(
         say(canonical_json({"schema": "reseau-history/1", "decisions": rows, "events": said}))
         return
     for each in decisions:
-        _say_decision(each, False)
+        say_decision(each, False)
     for time, what in events:
         say(f"{time:%Y-%m-%d %H:%M}Z  {what}\n")
 
@@ -234,7 +234,8 @@ def _row(made: Decision) -> dict[str, Any]:
     }
 
 
-def _say_decision(made: Decision, as_json: bool) -> None:
+def say_decision(made: Decision, as_json: bool) -> None:
+    """Print a decision with its findings, review and comments."""
     from ..core.provenance import canonical_json
 
     if as_json:

@@ -10,6 +10,7 @@ from .errors import UsageError
 __all__ = ["missing", "optional"]
 
 _DISTRIBUTIONS = {
+    "apprise": "reseau[service]",
     "bluesky": "bluesky",
     "dateutil": "reseau[service]",
     "fsspec": "fsspec",

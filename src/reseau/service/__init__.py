@@ -4,15 +4,19 @@ The modules :mod:`~reseau.service.runlength`, :mod:`~reseau.service.charts` and
 :mod:`~reseau.service.covariates` are statistics of series, without an archive.
 """
 
+from .alarms import Alarm, Alarms, sender
 from .charts import ChartOptions, KnownSeries, Monitored, monitor
 from .covariates import CalibrationFunction, FunctionOptions, explain, fit_function
 from .inforce import Applied, Configurations, Decision, Drift
+from .recalibration import Recalibrated, Recalibration, Recalibrations
 from .recurrence import Recurrence
 from .rules import AcceptanceRules, Judgement, Limits, judge
 from .schedule import Run, Schedule, Schedules
 
 __all__ = [
     "AcceptanceRules",
+    "Alarm",
+    "Alarms",
     "Applied",
     "CalibrationFunction",
     "ChartOptions",
@@ -24,6 +28,9 @@ __all__ = [
     "KnownSeries",
     "Limits",
     "Monitored",
+    "Recalibrated",
+    "Recalibration",
+    "Recalibrations",
     "Recurrence",
     "Run",
     "Schedule",
@@ -32,4 +39,5 @@ __all__ = [
     "fit_function",
     "judge",
     "monitor",
+    "sender",
 ]

@@ -105,7 +105,7 @@ class AcceptanceRules(Document):
     redundancy: int = Field(default=10, ge=0)
     coverage: float = Field(default=0.6, ge=0, le=1)
     refused_warnings: tuple[str, ...] = (
-        "camera-moved", "camera-unstable", "inconsistent", "not-identified", "rank-defect", "unmodelled",
+        "camera-moved", "camera-unstable", "inconsistent", "not-identified", "unmodelled",
         "weak-geometry",
     )  # fmt: skip
 

@@ -20,7 +20,7 @@ from typing import Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from ..archive import Archive, Entry
-from ..core.errors import ArchiveError, ReseauError, StateError, UsageError
+from ..core.errors import ArchiveError, InstrumentError, ReseauError, UsageError
 from ..io import Document
 from .inforce import Configurations, a_time
 from .recurrence import CalendarEvent, Recurrence, calendar_feed
@@ -332,9 +332,9 @@ class Schedules:
         Parameters
         ----------
         carry_out : callable
-            Carries out a run and returns its outcome in a line. A :class:`StateError` (an instrument or the
-            bench is in use or not ready) blocks the run, which may start again in its window; any other
-            error of the project fails it.
+            Carries out a run and returns its outcome in a line. An :class:`InstrumentError` (an instrument
+            is in use, not ready, or does not answer) blocks the run, which may start again in its window;
+            any other error of the project fails it.
         now : datetime, optional
             The present time.
 
@@ -353,7 +353,7 @@ class Schedules:
                 with _ended(claim):
                     try:
                         claim.end("done", carry_out(schedule, run))
-                    except StateError as error:
+                    except InstrumentError as error:
                         claim.end("blocked", str(error))
                     except ReseauError as error:
                         claim.end("failed", str(error))

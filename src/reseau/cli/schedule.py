@@ -1,0 +1,275 @@
+"""`reseau schedule`, `reseau recalibrate`, `reseau alarms`: runs that are due, carried out, and reported."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from datetime import timedelta
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ..core.errors import ReseauError, UsageError
+from .calibrations import time_of
+from .common import ArchivePlace, AsJson, ObjectsPlace, open_archive, say, suffix_of, writable
+
+__all__ = ["alarms", "app", "recalibrate"]
+
+app = typer.Typer(no_args_is_help=True, help="Schedules of recalibrations: add, show, export, run.")
+alarms = typer.Typer(no_args_is_help=True, help="Alarms: list, acknowledge, send.")
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the schedule.")]
+
+
+@app.command()
+def add(
+    schedule: Annotated[Path, typer.Argument(help="Schedule, reseau-schedule/1.")],
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+) -> None:
+    """Add a schedule to an archive, or change one of the same name."""
+    from ..service import Recalibrations, Schedule, Schedules
+
+    given = Schedule.read(schedule)
+    with open_archive(archive, objects) as found:
+        Recalibrations(found).get(given.recalibration)
+        Schedules(found).add(given)
+    say(f"{given.name}: {given.rule}, from {given.start} {given.zone}\n")
+
+
+@app.command()
+def remove(name: Name, archive: ArchivePlace = "archive", objects: ObjectsPlace = None) -> None:
+    """Remove a schedule; its history stays in the archive."""
+    from ..service import Schedules
+
+    with open_archive(archive, objects) as found:
+        Schedules(found).remove(name)
+
+
+@app.command("list")
+def list_(archive: ArchivePlace = "archive", objects: ObjectsPlace = None) -> None:
+    """List the schedules with the last and the next run."""
+    from ..service import Schedules
+
+    with open_archive(archive, objects) as found:
+        schedules = Schedules(found)
+        for name in schedules.names():
+            say(f"{name}\n")
+            for run in schedules.runs(name)[-2:]:
+                say(f"  {run.time:%Y-%m-%d %H:%M}Z  {run.state:<10} {run.why}\n")
+
+
+@app.command()
+def show(
+    name: Name,
+    at: Annotated[str | None, typer.Option(help="State at this time. Default: now.")] = None,
+    ahead: Annotated[int, typer.Option(min=0, help="Number of later runs.")] = 3,
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show all runs of a schedule; exit status 1 if one is overdue, or the last one failed."""
+    from ..core.provenance import canonical_json
+    from ..service import Schedules
+
+    with open_archive(archive, objects) as found:
+        runs = Schedules(found).runs(name, time_of(at, "--at"), ahead)
+    if as_json:
+        rows = [vars(each) | {"time": each.time.isoformat()} for each in runs]
+        say(canonical_json({"schema": "reseau-runs/1", "runs": rows}))
+    else:
+        for run in runs:
+            say(f"{run.time:%Y-%m-%d %H:%M}Z  {run.state:<10} {run.why}\n")
+    past = [each.state for each in runs if each.state != "scheduled"]
+    raise typer.Exit(1 if past and past[-1] in ("overdue", "failed", "blocked") else 0)
+
+
+@app.command()
+def export(
+    name: Name,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Calendar to write (.ics).")],
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+) -> None:
+    """Export the runs of a schedule as an iCalendar feed."""
+    from ..io import write_whole
+    from ..service import Schedules
+
+    suffix_of(writable(out), (".ics",))
+    with open_archive(archive, objects) as found:
+        write_whole(out, Schedules(found).feed(name))
+
+
+@app.command("run")
+def run_(
+    once: Annotated[bool, typer.Option("--once", help="Carry out what is due now, and end.")] = False,
+    every: Annotated[float, typer.Option(min=1, help="Time between two looks at the schedules (s).")] = 300.0,
+    to: Annotated[list[str] | None, typer.Option(help="Where to send alarms: a URL of apprise.")] = None,
+    repeat: Annotated[float, typer.Option(min=0.01, help="Repeat alarms after this time (h).")] = 24.0,
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+) -> None:
+    """Carry out the runs that are due: as a daemon, or --once from cron or a timer of systemd."""
+    from ..service import Alarms, Recalibrations, Schedules, sender
+
+    deliver = None if not to else sender(to)
+    over = threading.Event()
+    if not once:
+        for each in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(each, lambda *_: over.set())
+    failed = False
+    while True:
+        try:
+            with open_archive(archive, objects) as found:
+                recalibrations = Recalibrations(found)
+
+                def carry_out(schedule: Any, run: Any, by: Any = recalibrations) -> str:
+                    made = by.run(schedule.recalibration, f"{schedule.name}-{run.key.replace(' ', '-')}")
+                    return f"{made.decision.outcome}: {made.decision.key}"
+
+                for run in Schedules(found).run_due(carry_out):
+                    failed = failed or run.state != "done"
+                    say(f"{run.schedule}: {run.time:%Y-%m-%d %H:%M}Z {run.state}: {run.why}\n")
+                if deliver is not None:
+                    Alarms(found).send(deliver, timedelta(hours=repeat))
+        except ReseauError as error:
+            if once:
+                raise
+            typer.echo(f"reseau: {error}", err=True)
+        if once or over.wait(every):
+            break
+    raise typer.Exit(1 if once and failed else 0)
+
+
+_SERVICE = """\
+# {folder}/reseau-schedule.service: carries out the recalibrations that are due.
+[Unit]
+Description=Recalibrations that are due
+After=network.target
+
+[Service]
+Type=oneshot
+WorkingDirectory={where}
+ExecStart={program} schedule run --once --archive {archive}
+
+# {folder}/reseau-schedule.timer
+[Unit]
+Description=Look for recalibrations that are due
+
+[Timer]
+OnCalendar=*:0/5
+Persistent=true
+
+[Install]
+WantedBy=timers.target
+"""
+
+
+@app.command()
+def units(archive: ArchivePlace = "archive") -> None:
+    """Print a service and a timer for systemd."""
+    import shutil
+
+    if any(each in archive for each in ' "%\n'):
+        raise UsageError("contains characters with a meaning for systemd", where="--archive")
+    program = shutil.which("reseau") or "/usr/local/bin/reseau"
+    place = archive if "://" in archive else str(Path(archive).absolute())
+    say(_SERVICE.format(folder="/etc/systemd/system", where=Path.cwd(), program=program, archive=place))
+
+
+def recalibrate(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the recalibration.")],
+    source: Annotated[
+        str | None, typer.Option("--from", help="Define it: the session of the archive that it repeats.")
+    ] = None,
+    configuration: Annotated[
+        str | None, typer.Option(help="With --from: the configuration that it calibrates.")
+    ] = None,
+    rules: Annotated[
+        Path | None, typer.Option(help="With --from: rules of acceptance, reseau-acceptance/1.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the one that is not done.")] = False,
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+    as_json: AsJson = False,
+) -> None:
+    """Check the bench, acquire, measure, adjust, compare with the calibration in force, and decide.
+
+    With --from it is defined and not carried out. The exit status is 0 if the new calibration is accepted.
+    """
+    from ..service import AcceptanceRules, Recalibrations
+    from .calibrations import say_decision
+
+    if source is None and (configuration is not None or rules is not None):
+        raise UsageError("needs --from", where="--configuration, --rules")
+    if source is not None and (configuration is None or rules is None or resume):
+        raise UsageError("needs --configuration and --rules, and no --resume", where="--from")
+    with open_archive(archive, objects) as found:
+        known = Recalibrations(found)
+        if source is not None:
+            assert configuration is not None
+            assert rules is not None
+            made = known.define(name, found.session(source), configuration, AcceptanceRules.read(rules))
+            say(f"{name}: repeats {source}, plan {made.plan}, for {configuration}\n")
+            return
+        unfinished = known.unfinished(name)
+        if resume and unfinished is None:
+            raise UsageError("has no session that can be continued", where=name)
+        if not resume and unfinished is not None:
+            typer.echo(f"note: {unfinished} is not done; --resume continues it", err=True)
+        done = known.run(name, unfinished or "" if resume else "")
+    say_decision(done.decision, as_json)
+    raise typer.Exit(0 if done.decision.outcome.startswith("accepted") else 1)
+
+
+@alarms.command("list")
+def list_alarms(
+    everything: Annotated[bool, typer.Option("--all", help="Also acknowledged ones.")] = False,
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the alarms that nobody acknowledged; exit status 1 if there are any."""
+    from ..core.provenance import canonical_json
+    from ..service import Alarms
+
+    with open_archive(archive, objects) as found:
+        known = Alarms(found).all() if everything else Alarms(found).open()
+    if as_json:
+        rows = [vars(each) | {"sent": [at.isoformat() for at in each.sent]} for each in known]
+        say(canonical_json({"schema": "reseau-alarms/1", "alarms": rows}))
+    else:
+        for each in known:
+            by = f", acknowledged by {each.acknowledged}" if each.acknowledged else ""
+            say(f"{each.text}; sent {len(each.sent)} times{by}\n  {each.key}\n")
+    raise typer.Exit(1 if any(not each.acknowledged for each in known) else 0)
+
+
+@alarms.command()
+def acknowledge(
+    key: Annotated[str, typer.Argument(help="Key of the alarm; see `list`.")],
+    by: Annotated[str, typer.Option(help="By whom.")],
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+) -> None:
+    """Acknowledge an alarm: it is not repeated."""
+    from ..service import Alarms
+
+    with open_archive(archive, objects) as found:
+        Alarms(found).acknowledge(key, by)
+
+
+@alarms.command()
+def send(
+    to: Annotated[list[str], typer.Option(help="Where to: a URL of apprise; may be repeated.")],
+    repeat: Annotated[float, typer.Option(min=0.01, help="Repeat after this time (h).")] = 24.0,
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+) -> None:
+    """Send the open alarms, each once, and again while nobody acknowledges it."""
+    from ..service import Alarms, sender
+
+    with open_archive(archive, objects) as found:
+        sent = Alarms(found).send(sender(to), timedelta(hours=repeat))
+    say(f"{len(sent)} sent\n")

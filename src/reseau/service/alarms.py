@@ -1,0 +1,203 @@
+"""Alarms: what somebody should look at, sent once and repeated until it is acknowledged.
+
+Alarms are not raised by the code in which something happens. They are collected from what the archive says:
+runs that were missed or failed, calibrations that were rejected or need a review, charts that signal. Each
+has a key; what was sent and what was acknowledged are entries of a journal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from ..archive import Archive
+from ..core.errors import InputError, UsageError
+from ..core.optional import optional
+from .inforce import Configurations, a_time
+from .schedule import Schedules
+
+__all__ = ["Alarm", "Alarms", "sender"]
+
+_JOURNAL = "alarms"
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """An alarm.
+
+    Parameters
+    ----------
+    key : str
+        Name of the event; the same event has the same key.
+    text : str
+        One line: what happened.
+    sent : tuple of datetime
+        When it was sent.
+    acknowledged : str
+        By whom it was acknowledged; empty if it was not.
+
+    Examples
+    --------
+    >>> Alarm("weekly 20260302T070000Z missed", "weekly: the run of 2026-03-02 07:00Z was missed").sent
+    ()
+    """
+
+    key: str
+    text: str
+    sent: tuple[datetime, ...] = ()
+    acknowledged: str = ""
+
+
+class Alarms:
+    """Alarms of an archive.
+
+    Parameters
+    ----------
+    archive : Archive
+        The archive.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder, Archive.open(folder, create=True) as archive:
+    ...     Alarms(archive).open()
+    []
+    """
+
+    def __init__(self, archive: Archive) -> None:
+        self._archive, self._journal = archive, archive.journal(_JOURNAL)
+
+    def all(self, now: datetime | None = None) -> list[Alarm]:
+        """Return all alarms with what was sent and acknowledged."""
+        entries = self._journal.entries()
+        sent = [(each.document["alarm"], each.at) for each in entries if each.kind == "sent"]
+        seen = {
+            each.document["alarm"]: each.document["by"] for each in entries if each.kind == "acknowledged"
+        }
+        return [
+            Alarm(key, text, tuple(at for other, at in sent if other == key), seen.get(key, ""))
+            for key, text in {**self._runs(now), **self._calibrations()}.items()
+        ]
+
+    def open(self, now: datetime | None = None) -> list[Alarm]:
+        """Return the alarms that nobody acknowledged."""
+        return [each for each in self.all(now) if not each.acknowledged]
+
+    def acknowledge(self, key: str, by: str) -> None:
+        """Acknowledge an alarm: it is not repeated.
+
+        Raises
+        ------
+        UsageError
+            If there is no such alarm, or nobody is named.
+        """
+        if not by.strip():
+            raise UsageError("needs a name", where="acknowledgement")
+        if key not in {each.key for each in self.all()}:
+            raise UsageError("is no alarm", where=repr(key), do="see `reseau alarms list`")
+        self._journal.append(f"acknowledged {key}", "acknowledged", {"alarm": key, "by": by})
+
+    def send(
+        self, deliver: Callable[[str, str], bool], repeat: timedelta, now: datetime | None = None
+    ) -> list[Alarm]:
+        """Send the open alarms that were not sent in the last time, in one message.
+
+        Parameters
+        ----------
+        deliver : callable
+            Takes title and text, and returns whether they were delivered; see :func:`sender`.
+        repeat : timedelta
+            Time after which an alarm that was not acknowledged is sent again.
+        now : datetime, optional
+            The present time.
+
+        Returns
+        -------
+        list of Alarm
+            What was sent; nothing is sent if there is nothing to say.
+
+        Raises
+        ------
+        InputError
+            If they could not be delivered; they are sent with the next call.
+        """
+        time = a_time(now or datetime.now(UTC))
+        due = [each for each in self.open(time) if not each.sent or each.sent[-1] + repeat <= time]
+        if not due:
+            return []
+        plural = "s" if len(due) > 1 else ""
+        lines = [each.text + (" (repeated)" if each.sent else "") for each in due]
+        if not deliver(f"reseau: {len(due)} alarm{plural}", "\n".join(lines)):
+            raise InputError("could not be delivered", where="alarms", do="check the addresses")
+        for each in due:
+            document = {"alarm": each.key}
+            self._journal.append(f"sent {len(each.sent) + 1} {each.key}", "sent", document, time)
+        return due
+
+    def _runs(self, now: datetime | None) -> dict[str, str]:
+        """Alarms about runs, by key; an overdue run that is then missed is one event."""
+        found, schedules = {}, Schedules(self._archive)
+        for name in schedules.names():
+            for run in schedules.runs(name, now, ahead=0):
+                if run.state in ("overdue", "missed", "failed"):
+                    what = "failed" if run.state == "failed" else "was not carried out"
+                    why = f" ({run.why})" if run.why else ""
+                    found[f"run {name} {run.key}"] = (
+                        f"{name}: the run of {run.time:%Y-%m-%d %H:%M}Z {what}{why}"
+                    )
+        return found
+
+    def _calibrations(self) -> dict[str, str]:
+        """Alarms about calibrations, by key."""
+        found, known = {}, Configurations(self._archive)
+        for name in known.names():
+            history = known.history(name)
+            for each in history:
+                if each.outcome == "needs review" or (each.outcome == "rejected" and not each.reviewed_by):
+                    found[f"calibration {name} {each.key}"] = (
+                        f"{name}: calibration {each.key} {_said(each.outcome)}"
+                    )
+            events = known.events(name)
+            since = events[-1][0] if events else None
+            if not [d for d in history if d.outcome != "rejected" and (since is None or d.since >= since)]:
+                continue
+            drift = known.drift(name)
+            for run, k in zip(*drift.charts.alarm.nonzero(), strict=True):
+                direction = "increases" if drift.charts.alarm[run, k] > 0 else "decreases"
+                first = drift.keys[drift.charts.since(int(run), int(k))]
+                text = f"{name}: {drift.names[k]} {direction}, probably since calibration {first}"
+                found[f"drift {name} {drift.names[k]} {drift.keys[run]}"] = text
+        return found
+
+
+def _said(outcome: str) -> str:
+    return "was rejected" if outcome == "rejected" else "needs a review"
+
+
+def sender(addresses: Sequence[str]) -> Callable[[str, str], bool]:
+    """Return a function that sends by apprise: mail, webhooks, chat.
+
+    Parameters
+    ----------
+    addresses : sequence of str
+        URLs of apprise, such as ``mailto://user:password@example.org``.
+
+    Raises
+    ------
+    UsageError
+        If one is not a URL of apprise, or apprise is not installed.
+
+    Examples
+    --------
+    >>> deliver = sender(["json://127.0.0.1:8080/alarms"])  # doctest: +SKIP
+    """
+    with optional():
+        import apprise
+
+    service = apprise.Apprise()
+    for number, each in enumerate(addresses, start=1):
+        if not service.add(each):
+            # The address itself may contain a password.
+            raise UsageError("cannot be used", where=f"address {number}", do="see the URLs of apprise")
+    return lambda title, body: bool(service.notify(title=title, body=body))

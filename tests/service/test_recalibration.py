@@ -1,0 +1,302 @@
+"""Recalibrations on a simulated bench, from the command line; alarms, which a mail server receives."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from reseau.archive import Archive
+from reseau.cli import run
+from reseau.core.errors import InputError, StateError, UsageError
+from reseau.service import AcceptanceRules, Alarms, Configurations, Limits, Schedule, Schedules, sender
+
+from ..capture.fieldrig import DESIGN, FieldRig
+from .test_inforce import RULES as CAMERA_RULES
+from .test_inforce import camera
+
+BENCH = """\
+schema = "reseau-bench/1"
+name = "field"
+[instruments.table]
+driver = "table"
+address = "sim-table"
+[instruments.camera]
+driver = "camera"
+address = "sim-camera"
+"""
+RULES = AcceptanceRules(version=1, image=Limits(warning=0.2, action=0.5), coverage=0.3)
+POSES = "tilt,roll,camera_roll\n0,0,0\n30,90,90\n30,180,180\n30,270,270\n30,0,0\n"
+CAPTURE = ("capture", "testfield", "--design", "field.json", "--poses", "poses.csv", "--pitch", "0.027",
+           "--free", "c,x0,y0,K1", "--row-jitter", "0.0086", "--fill", "0.8", "--name", "first")  # fmt: skip
+
+
+def on(rig: FieldRig, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work in a folder with the instruments of a bench."""
+    made = {"table": rig.table, "camera": rig.camera}
+    monkeypatch.setattr("reseau.capture.bench.plugin", lambda group, name: lambda *args, **more: made[name])
+    monkeypatch.setattr("tempfile.tempdir", str(folder))  # locks of parallel tests are apart
+    monkeypatch.chdir(folder)
+
+
+@pytest.fixture(scope="module")
+def defined(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a first session, its calibration in force, and a recalibration that repeats it."""
+    folder = tmp_path_factory.mktemp("defined")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        on(FieldRig(), folder, monkeypatch)
+        Path("bench.toml").write_text(BENCH)
+        Path("poses.csv").write_text(POSES)
+        DESIGN.write("field.json")
+        RULES.write("rules.json")
+        assert run([*CAPTURE]) == 0
+        assert run(["archive", "show", "first", "--out", "first"]) == 0
+        assert run(["calibrations", "define", "left", "-p", "camera=vidicon"]) == 0
+        decide = ["calibrations", "decide", "left", "first/calibration.json", "--rules", "rules.json"]
+        assert run([*decide, "--since", "2026-01-01T00:00Z"]) == 1
+        with Archive.open("archive") as archive:
+            known = Configurations(archive)
+            known.review("left", known.history("left")[0].key, "accepted", comment="first")
+        define = [
+            "recalibrate",
+            "left",
+            "--from",
+            "first",
+            "--configuration",
+            "left",
+            "--rules",
+            "rules.json",
+        ]
+        assert run(define) == 0
+    return folder
+
+
+@pytest.fixture
+def rig(defined: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FieldRig:
+    """The bench of a recalibration that is defined, in a folder of its own."""
+    rig = FieldRig()
+    shutil.copytree(defined, tmp_path, dirs_exist_ok=True)
+    on(rig, tmp_path, monkeypatch)
+    return rig
+
+
+def test_a_recalibration_is_acquired_adjusted_compared_and_put_in_force(
+    rig: FieldRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    assert run(["recalibrate", "left", "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    assert made["judgement"]["outcome"].startswith("accepted")
+    findings = {each["rule"]: each["level"] for each in made["judgement"]["findings"]}
+    assert findings["image"] == findings["significance"] == "ok"
+    with Archive.open("archive") as archive:
+        assert len(archive.sessions()) == 2
+        applied = Configurations(archive).applied("left", datetime.now(UTC))
+        assert applied is not None
+        assert (applied.key, made["by"]) == (made["key"], "recalibration left")
+
+
+def test_a_recalibration_that_stops_is_continued_where_it_stopped(
+    rig: FieldRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moved: list[str] = []
+
+    def stall(axis: str, position: float) -> None:
+        moved.append(axis)
+        if len(moved) == 6:
+            raise StateError("is stalled", where="table")
+
+    usual, rig.table.before = rig.table.before, stall
+    assert run(["recalibrate", "left"]) == 1
+    assert "is stalled" in capsys.readouterr().err
+    rig.table.before = usual
+    with Archive.open("archive") as archive:
+        session = archive.session(archive.sessions()[-1].name)
+        taken = {each.sha256 for each in session.frames(kind="frame")}
+        assert 0 < len(taken) < 8
+    assert run(["recalibrate", "left", "--resume"]) == 0
+    with Archive.open("archive") as archive:
+        assert len(archive.sessions()) == 2
+        kept = {each.sha256 for each in archive.session(archive.sessions()[-1].name).frames(kind="frame")}
+        assert taken <= kept
+    assert run(["recalibrate", "left", "--resume"]) == 2
+    assert "has no session that can be continued" in capsys.readouterr().err
+
+
+def test_a_schedule_carries_out_what_is_due_once_and_exports_a_calendar(
+    rig: FieldRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start = datetime.now(UTC) - timedelta(minutes=1)
+    content = Schedule(name="weekly", recalibration="left", configuration="left", rule="FREQ=WEEKLY;COUNT=52",
+                       start=f"{start:%Y-%m-%dT%H:%M:%S}", zone="UTC")  # fmt: skip
+    content.write("weekly.json")
+    with Archive.open("archive") as archive:
+        Schedules(archive).add(content, start - timedelta(hours=1))
+    capsys.readouterr()
+    assert run(["schedule", "run", "--once"]) == 0
+    assert "done: accepted" in capsys.readouterr().out
+    assert run(["schedule", "run", "--once"]) == 0
+    assert capsys.readouterr().out == ""
+    assert run(["schedule", "show", "weekly"]) == 0
+    assert "done       accepted" in capsys.readouterr().out.splitlines()[0]
+    assert run(["calibrations", "event", "left", "camera dropped"]) == 0
+    assert run(["schedule", "show", "weekly"]) == 0
+    assert "due        service event: camera dropped" in capsys.readouterr().out
+    assert run(["schedule", "run", "--once"]) == 0
+    assert "done: needs review" in capsys.readouterr().out
+    assert run(["schedule", "export", "weekly", "--out", "weekly.ics"]) == 0
+    assert Path("weekly.ics").read_text().count("BEGIN:VEVENT") > 50
+    assert run(["alarms", "list"]) == 1
+    assert "needs a review" in capsys.readouterr().out
+
+
+def test_a_bench_in_use_blocks_the_run_and_nothing_is_begun(
+    rig: FieldRig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from reseau.capture import BenchLock
+
+    start = datetime.now(UTC) - timedelta(minutes=1)
+    content = Schedule(name="weekly", recalibration="left", rule="FREQ=WEEKLY;COUNT=52",
+                       start=f"{start:%Y-%m-%dT%H:%M:%S}", zone="UTC")  # fmt: skip
+    with Archive.open("archive") as archive:
+        Schedules(archive).add(content, start - timedelta(hours=1))
+    with BenchLock(["sim-camera"], "somebody"):
+        assert run(["schedule", "run", "--once"]) == 1
+    assert "blocked: sim-camera: is in use by somebody" in capsys.readouterr().out
+    with Archive.open("archive") as archive:
+        assert len(archive.sessions()) == 1
+    assert run(["schedule", "run", "--once"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["recalibrate", "left"], "left: is not a recalibration of this archive"),
+        (["recalibrate", "left", "--from", "x"], "--from: needs --configuration and --rules"),
+        (["schedule", "show", "weekly"], "weekly: is not a schedule of this archive"),
+        (["schedule", "add", "endless.json"], "has no end"),
+        (["schedule", "add", "weekly.json"], "left: is not a recalibration of this archive"),
+        (["alarms", "acknowledge", "x", "--by", "Ada"], "'x': is no alarm"),
+        (["schedule", "run", "--once", "--to", "nowhere"], "address 1: cannot be used"),
+        (["schedule", "units", "--archive", "my archive"], "--archive: contains characters"),
+    ],
+)
+def test_impossible_requests_are_refused_in_one_line(
+    arguments: list[str], part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    pytest.importorskip("apprise", reason="needs apprise (extra `service`)")
+    monkeypatch.chdir(tmp_path)
+    Archive.open("archive", create=True).close()
+    content = {
+        "schema": "reseau-schedule/1", "name": "weekly", "recalibration": "left",
+        "rule": "FREQ=WEEKLY;COUNT=9", "start": "2026-03-02T08:00", "zone": "UTC",
+    }  # fmt: skip
+    Path("weekly.json").write_text(json.dumps(content))
+    Path("endless.json").write_text(json.dumps(content | {"rule": "FREQ=WEEKLY"}))
+    assert run(arguments) == 2
+    error = capsys.readouterr().err
+    assert part in error
+    assert len(error.splitlines()) == 1
+
+
+def test_a_daemon_ends_when_it_is_asked_to(tmp_path: Path) -> None:
+    Archive.open(tmp_path / "archive", create=True).close()
+    code = "import sys; from reseau.cli import run; print('up', flush=True); sys.exit(run(sys.argv[1:]))"
+    arguments = ["schedule", "run", "--every", "1", "--archive", str(tmp_path / "archive")]
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, text=True
+    ) as daemon:
+        assert daemon.stdout is not None
+        assert daemon.stdout.readline() == "up\n"
+        with pytest.raises(subprocess.TimeoutExpired):
+            daemon.wait(5)
+        daemon.terminate()
+        assert daemon.wait(60) == 0
+
+
+@pytest.fixture
+def mailbox() -> Iterator[tuple[str, list[Any]]]:
+    """Address of a mail server on this computer, and the messages that it received."""
+    controller = pytest.importorskip("aiosmtpd.controller", reason="needs aiosmtpd")
+    received: list[Any] = []
+
+    class Handler:
+        async def handle_DATA(self, server: Any, session: Any, envelope: Any) -> str:
+            received.append(envelope)
+            return "250 OK"
+
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    server = controller.Controller(Handler(), hostname="127.0.0.1", port=port, ready_timeout=30.0)
+    server.start()
+    yield f"mailto://127.0.0.1:{port}?from=bench@example.org&to=ada@example.org&mode=insecure", received
+    server.stop()
+
+
+def body(message: Any) -> str:
+    import email
+
+    parsed = email.message_from_bytes(message.content)
+    parts = [each for each in parsed.walk() if each.get_content_maintype() == "text"]
+    return "".join(each.get_payload(decode=True).decode() for each in parts)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_alarms_are_sent_once_and_repeated_until_they_are_acknowledged(
+    tmp_path: Path, mailbox: tuple[str, list[Any]]
+) -> None:
+    pytest.importorskip("apprise", reason="needs apprise (extra `service`)")
+    address, received = mailbox
+    start = datetime(2026, 3, 2, 8, tzinfo=UTC)
+    with Archive.open(tmp_path / "archive", create=True) as archive:
+        alarms, deliver, day = Alarms(archive), sender([address]), timedelta(days=1)
+        assert alarms.send(deliver, day, start) == []
+        assert received == []
+        known = Configurations(archive)
+        known.define("left", {"camera": "DMK 33"})
+        first = known.decide("left", camera(), CAMERA_RULES, since=start)
+        assert [each.text for each in alarms.send(deliver, day, start)] == [
+            f"left: calibration {first.key} needs a review"
+        ]
+        assert alarms.send(deliver, day, start + day / 2) == []
+        assert len(alarms.send(deliver, day, start + day)) == 1
+        assert len(received) == 2
+        assert first.key in body(received[0])
+        assert "(repeated)" in body(received[1])
+        known.review("left", first.key, "accepted", comment="first")
+        assert alarms.send(deliver, day, start + 3 * day) == []
+        bad = known.decide("left", camera(c=8.2), CAMERA_RULES, since=start + day)
+        schedule = Schedule(name="weekly", recalibration="left", rule="FREQ=WEEKLY;COUNT=9",
+                            start="2026-03-04T08:00", zone="UTC")  # fmt: skip
+        Schedules(archive).add(schedule, start)
+        (one, other) = alarms.send(deliver, day, start + 3 * day)
+        assert {one.text, other.text} == {
+            f"left: calibration {bad.key} was rejected",
+            "weekly: the run of 2026-03-04 08:00Z was not carried out",
+        }
+        alarms.acknowledge(f"calibration left {bad.key}", "Ada")
+        (again,) = alarms.send(deliver, day, start + 5 * day)
+        assert again.key.startswith("run weekly")
+        assert len(received) == 4
+        with pytest.raises(UsageError, match="is no alarm"):
+            alarms.acknowledge("something", "Ada")
+
+
+def test_alarms_that_cannot_be_delivered_are_sent_later(tmp_path: Path) -> None:
+    start, day = datetime(2026, 3, 2, 8, tzinfo=UTC), timedelta(days=1)
+    with Archive.open(tmp_path / "archive", create=True) as archive:
+        known, alarms = Configurations(archive), Alarms(archive)
+        known.define("left", {"camera": "DMK 33"})
+        known.decide("left", camera(), CAMERA_RULES, since=start)
+        with pytest.raises(InputError, match="could not be delivered"):
+            alarms.send(lambda title, text: False, day, start)
+        assert len(alarms.send(lambda title, text: True, day, start)) == 1
