@@ -104,6 +104,24 @@ class Journal:
             number = connection.scalar(insert)
         return None if number is None else Entry(number, key, kind, content, time)
 
+    def add(self, kind: str, document: Mapping[str, Any]) -> Entry:
+        """Append an entry whose key is its kind and the next free number.
+
+        Parameters
+        ----------
+        kind, document
+            See :class:`Entry`.
+
+        Raises
+        ------
+        ArchiveError
+            If the archive cannot store it.
+        """
+        number = len(self.entries())
+        while (made := self.append(f"{kind} {number}", kind, document)) is None:
+            number += 1
+        return made
+
     def entries(self, kind: str | None = None) -> list[Entry]:
         """Return the entries in the order in which they were appended, of one kind or all."""
         e = schema.entries.c

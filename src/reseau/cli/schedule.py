@@ -5,14 +5,19 @@ from __future__ import annotations
 import signal
 import threading
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ..core.errors import ReseauError, UsageError
-from .calibrations import time_of
+from .calibrations import say_decision, time_of
 from .common import ArchivePlace, AsJson, ObjectsPlace, open_archive, say, suffix_of, writable
+
+if TYPE_CHECKING:
+    from ..archive import Archive
+    from ..service import Run, Schedule
 
 __all__ = ["alarms", "app", "recalibrate"]
 
@@ -57,7 +62,7 @@ def list_(archive: ArchivePlace = "archive", objects: ObjectsPlace = None) -> No
         for name in schedules.names():
             say(f"{name}\n")
             for run in schedules.runs(name)[-2:]:
-                say(f"  {run.time:%Y-%m-%d %H:%M}Z  {run.state:<10} {run.why}\n")
+                say(f"  {_row(run)}")
 
 
 @app.command()
@@ -80,9 +85,13 @@ def show(
         say(canonical_json({"schema": "reseau-runs/1", "runs": rows}))
     else:
         for run in runs:
-            say(f"{run.time:%Y-%m-%d %H:%M}Z  {run.state:<10} {run.why}\n")
+            say(_row(run))
     past = [each.state for each in runs if each.state != "scheduled"]
     raise typer.Exit(1 if past and past[-1] in ("overdue", "failed", "blocked") else 0)
+
+
+def _row(run: Run) -> str:
+    return f"{run.time:%Y-%m-%d %H:%M}Z  {run.state:<10} {run.why}\n"
 
 
 @app.command()
@@ -111,7 +120,7 @@ def run_(
     objects: ObjectsPlace = None,
 ) -> None:
     """Carry out the runs that are due: as a daemon, or --once from cron or a timer of systemd."""
-    from ..service import Alarms, Recalibrations, Schedules, sender
+    from ..service import Alarms, Schedules, sender
 
     deliver = None if not to else sender(to)
     over = threading.Event()
@@ -122,13 +131,7 @@ def run_(
     while True:
         try:
             with open_archive(archive, objects) as found:
-                recalibrations = Recalibrations(found)
-
-                def carry_out(schedule: Any, run: Any, by: Any = recalibrations) -> str:
-                    made = by.run(schedule.recalibration, f"{schedule.name}-{run.key.replace(' ', '-')}")
-                    return f"{made.decision.outcome}: {made.decision.key}"
-
-                for run in Schedules(found).run_due(carry_out):
+                for run in Schedules(found).run_due(partial(_carried_out, found)):
                     failed = failed or run.state != "done"
                     say(f"{run.schedule}: {run.time:%Y-%m-%d %H:%M}Z {run.state}: {run.why}\n")
                 if deliver is not None:
@@ -140,6 +143,15 @@ def run_(
         if once or over.wait(every):
             break
     raise typer.Exit(1 if once and failed else 0)
+
+
+def _carried_out(archive: Archive, schedule: Schedule, run: Run) -> str:
+    """Carry out a run, or continue it: its session has the name of the run."""
+    from ..service import Recalibrations
+
+    name = f"{schedule.name}-{run.key.replace(' ', '-')}"
+    decision = Recalibrations(archive).run(schedule.recalibration, name).decision
+    return f"{decision.outcome}: {decision.key}"
 
 
 _SERVICE = """\
@@ -199,7 +211,6 @@ def recalibrate(
     With --from it is defined and not carried out. The exit status is 0 if the new calibration is accepted.
     """
     from ..service import AcceptanceRules, Recalibrations
-    from .calibrations import say_decision
 
     if source is None and (configuration is not None or rules is not None):
         raise UsageError("needs --from", where="--configuration, --rules")

@@ -155,9 +155,8 @@ class Alarms:
             history = known.history(name)
             for each in history:
                 if each.outcome == "needs review" or (each.outcome == "rejected" and not each.reviewed_by):
-                    found[f"calibration {name} {each.key}"] = (
-                        f"{name}: calibration {each.key} {_said(each.outcome)}"
-                    )
+                    said = "was rejected" if each.outcome == "rejected" else "needs a review"
+                    found[f"calibration {name} {each.key}"] = f"{name}: calibration {each.key} {said}"
             events = known.events(name)
             since = events[-1][0] if events else None
             if not [d for d in history if d.outcome != "rejected" and (since is None or d.since >= since)]:
@@ -169,10 +168,6 @@ class Alarms:
                 text = f"{name}: {drift.names[k]} {direction}, probably since calibration {first}"
                 found[f"drift {name} {drift.names[k]} {drift.keys[run]}"] = text
         return found
-
-
-def _said(outcome: str) -> str:
-    return "was rejected" if outcome == "rejected" else "needs a review"
 
 
 def sender(addresses: Sequence[str]) -> Callable[[str, str], bool]:

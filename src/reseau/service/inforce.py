@@ -282,7 +282,7 @@ class Configurations:
         """Add a comment to a decision; its outcome stays as it is."""
         decision = self.decision(name, key)
         document = {"key": decision.key, "by": by or _user(), "comment": text}
-        self._append(name, "comment", document)
+        self._journal(name).add("comment", document)
         return self.decision(name, key)
 
     def roll_back(
@@ -300,7 +300,7 @@ class Configurations:
             raise UsageError(f"was not accepted ({decision.outcome})", where=key)
         start = a_time(since or datetime.now(UTC))
         document = {"key": decision.key, "since": start.isoformat(), "by": by or _user(), "comment": comment}
-        self._append(name, "return", document)
+        self._journal(name).add("return", document)
         found = self.applied(name, start)
         assert found is not None
         return found
@@ -309,8 +309,9 @@ class Configurations:
         """Note a service event (lens changed, camera dropped): from then on no calibration applies."""
         if not what.strip():
             raise UsageError("needs a description", where="service event")
+        self._entries(name)  # refuses an unknown configuration
         time = a_time(at or datetime.now(UTC))
-        self._append(name, "event", {"what": what, "since": time.isoformat(), "by": by or _user()})
+        self._journal(name).add("event", {"what": what, "since": time.isoformat(), "by": by or _user()})
 
     def events(self, name: str) -> list[tuple[datetime, str]]:
         """Return time and description of the service events, in time order."""
@@ -418,11 +419,6 @@ class Configurations:
 
     def _journal(self, name: str) -> Any:
         return self._archive.journal(_PREFIX + name)
-
-    def _append(self, name: str, kind: str, document: dict[str, Any]) -> None:
-        number = len(self._entries(name))
-        while self._journal(name).append(f"{kind} {number}", kind, document) is None:
-            number += 1
 
     def _entries(self, name: str, kind: str | None = None) -> list[Entry]:
         found: list[Entry] = self._journal(name).entries()

@@ -123,10 +123,7 @@ class Recalibrations:
             inputs={each: session.input(each) for each in session.inputs()}, bench=session.bench,
             rules=rules.to_dict(),
         )  # fmt: skip
-        journal = self._archive.journal(_PREFIX + name)
-        number = len(journal.entries())
-        while journal.append(f"definition {number}", "definition", made.to_dict()) is None:
-            number += 1
+        self._archive.journal(_PREFIX + name).add("definition", made.to_dict())
         return made
 
     def get(self, name: str) -> Recalibration:

@@ -211,12 +211,13 @@ class Schedules:
         """
         since = a_time(at or datetime.now(UTC))
         document = {"schedule": schedule.to_dict(), "since": since.isoformat()}
-        self._append(schedule.name, "schedule", document)
+        self._archive.journal(_PREFIX + schedule.name).add("schedule", document)
 
     def remove(self, name: str, at: datetime | None = None) -> None:
         """Remove a schedule; its history stays."""
         self.get(name)
-        self._append(name, "removed", {"since": a_time(at or datetime.now(UTC)).isoformat()})
+        since = a_time(at or datetime.now(UTC)).isoformat()
+        self._archive.journal(_PREFIX + name).add("removed", {"since": since})
 
     def get(self, name: str) -> Schedule:
         """Return a schedule.
@@ -380,12 +381,6 @@ class Schedules:
                 schedule = None if content is None else Schedule.from_content(dict(content), where=name)
                 found.append((datetime.fromisoformat(each.document["since"]), schedule))
         return found
-
-    def _append(self, name: str, kind: str, document: dict[str, Any]) -> None:
-        journal = self._archive.journal(_PREFIX + name)
-        number = len(journal.entries())
-        while journal.append(f"{kind} {number}", kind, document) is None:
-            number += 1
 
     def _entries(self, name: str) -> list[Entry]:
         found = self._archive.journal(_PREFIX + name).entries()
