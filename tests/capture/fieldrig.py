@@ -7,9 +7,11 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from reseau.archive import Session
 from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry
@@ -26,6 +28,19 @@ from reseau_sims import FieldBench, Station
 
 AXES = ("tilt", "roll", "camera_roll")
 DESIGN = coded_testfield()
+BENCH = """\
+schema = "reseau-bench/1"
+name = "field"
+[instruments.table]
+driver = "table"
+address = "sim-table"
+[instruments.camera]
+driver = "camera"
+address = "sim-camera"
+"""
+POSES = "tilt,roll,camera_roll\n0,0,0\n30,90,90\n30,180,180\n30,270,270\n30,0,0\n"
+TESTFIELD = ("--design", "field.json", "--poses", "poses.csv", "--pitch", "0.027", "--free", "c,x0,y0,K1",
+             "--row-jitter", "0.0086", "--fill", "0.8")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -186,3 +201,18 @@ class FieldRig:
             watch=lambda kind, facts: self.events.append((kind, facts)),
             **more,
         )
+
+
+def enter(folder: Path, monkeypatch: pytest.MonkeyPatch, rig: FieldRig, **more: Device[Any]) -> None:
+    """Work in a folder, where the drivers of bench files are the instruments of a rig and others."""
+    made = {"table": rig.table, "camera": rig.camera, **more}
+    monkeypatch.setattr("reseau.capture.bench.plugin", lambda group, name: lambda *args, **given: made[name])
+    monkeypatch.setattr("tempfile.tempdir", str(folder))  # locks of parallel tests are apart
+    monkeypatch.chdir(folder)
+
+
+def write_inputs(poses: str = POSES) -> None:
+    """Write what a session of the testfield needs: bench file, poses and design."""
+    Path("bench.toml").write_text(BENCH)
+    Path("poses.csv").write_text(poses)
+    DESIGN.write("field.json")

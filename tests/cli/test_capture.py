@@ -14,34 +14,15 @@ from reseau.cli import run
 from reseau.core.data import Frame
 from reseau.core.errors import StateError
 
-from ..capture.fieldrig import DESIGN, FieldRig, Sweeper
-
-BENCH = """\
-schema = "reseau-bench/1"
-name = "field"
-[instruments.table]
-driver = "table"
-address = "sim-table"
-[instruments.camera]
-driver = "camera"
-address = "sim-camera"
-"""
-POSES = "tilt,roll,camera_roll\n0,0,0\n30,90,90\n30,180,180\n30,270,270\n30,0,0\n"
-TESTFIELD = ("--design", "field.json", "--poses", "poses.csv", "--pitch", "0.027", "--free", "c,x0,y0,K1",
-             "--row-jitter", "0.0086", "--fill", "0.8")  # fmt: skip
+from ..capture.fieldrig import BENCH, POSES, TESTFIELD, FieldRig, Sweeper, enter, write_inputs
 
 
 @pytest.fixture
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FieldRig:
     """A folder with a bench file, a design and poses; and the simulated instruments."""
     rig = FieldRig()
-    made = {"table": rig.table, "camera": rig.camera, "near": Sweeper("near"), "far": Sweeper("far")}
-    monkeypatch.setattr("reseau.capture.bench.plugin", lambda group, name: lambda *args, **more: made[name])
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # locks of parallel tests are apart
-    monkeypatch.chdir(tmp_path)
-    Path("bench.toml").write_text(BENCH)
-    Path("poses.csv").write_text(POSES)
-    DESIGN.write("field.json")
+    enter(tmp_path, monkeypatch, rig, near=Sweeper("near"), far=Sweeper("far"))
+    write_inputs()
     return rig
 
 

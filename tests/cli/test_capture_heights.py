@@ -8,8 +8,7 @@ import pytest
 from reseau.cli import run
 from reseau_sims import FieldBench
 
-from ..capture.fieldrig import AXES, DESIGN, FieldRig
-from .test_capture import BENCH
+from ..capture.fieldrig import AXES, FieldRig, enter, write_inputs
 
 HEIGHTS = ("--heights", "0,150,300", "--height-sigma", "0.05", "--axis-sigma", "5", "--field-sigma", "0.001")
 
@@ -19,13 +18,8 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FieldRig:
     """A bench whose table lifts the board along an axis that is not its normal."""
     field = FieldBench(seed=4, bend_mm=0.0, stage_tilt=(4e-3, -3e-3), stage_sigma_mm=0.05)
     rig = FieldRig(field, (*AXES, "z"))
-    made = {"table": rig.table, "camera": rig.camera}
-    monkeypatch.setattr("reseau.capture.bench.plugin", lambda group, name: lambda *args, **more: made[name])
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
-    Path("bench.toml").write_text(BENCH)
-    Path("poses.csv").write_text("name,tilt,roll,camera_roll\nfrontal,0,0,0\n")
-    DESIGN.write("field.json")
+    enter(tmp_path, monkeypatch, rig)
+    write_inputs("name,tilt,roll,camera_roll\nfrontal,0,0,0\n")
     return rig
 
 

@@ -19,32 +19,11 @@ from reseau.cli import run
 from reseau.core.errors import InputError, StateError, UsageError
 from reseau.service import AcceptanceRules, Alarms, Configurations, Limits, Schedule, Schedules, sender
 
-from ..capture.fieldrig import DESIGN, FieldRig
+from ..capture.fieldrig import TESTFIELD, FieldRig, enter, write_inputs
 from .test_inforce import RULES as CAMERA_RULES
 from .test_inforce import camera
 
-BENCH = """\
-schema = "reseau-bench/1"
-name = "field"
-[instruments.table]
-driver = "table"
-address = "sim-table"
-[instruments.camera]
-driver = "camera"
-address = "sim-camera"
-"""
 RULES = AcceptanceRules(version=1, image=Limits(warning=0.2, action=0.5), coverage=0.3)
-POSES = "tilt,roll,camera_roll\n0,0,0\n30,90,90\n30,180,180\n30,270,270\n30,0,0\n"
-CAPTURE = ("capture", "testfield", "--design", "field.json", "--poses", "poses.csv", "--pitch", "0.027",
-           "--free", "c,x0,y0,K1", "--row-jitter", "0.0086", "--fill", "0.8", "--name", "first")  # fmt: skip
-
-
-def on(rig: FieldRig, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Work in a folder with the instruments of a bench."""
-    made = {"table": rig.table, "camera": rig.camera}
-    monkeypatch.setattr("reseau.capture.bench.plugin", lambda group, name: lambda *args, **more: made[name])
-    monkeypatch.setattr("tempfile.tempdir", str(folder))  # locks of parallel tests are apart
-    monkeypatch.chdir(folder)
 
 
 @pytest.fixture(scope="module")
@@ -52,12 +31,10 @@ def defined(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a first session, its calibration in force, and a recalibration that repeats it."""
     folder = tmp_path_factory.mktemp("defined")
     with pytest.MonkeyPatch.context() as monkeypatch:
-        on(FieldRig(), folder, monkeypatch)
-        Path("bench.toml").write_text(BENCH)
-        Path("poses.csv").write_text(POSES)
-        DESIGN.write("field.json")
+        enter(folder, monkeypatch, FieldRig())
+        write_inputs()
         RULES.write("rules.json")
-        assert run([*CAPTURE]) == 0
+        assert run(["capture", "testfield", *TESTFIELD, "--name", "first"]) == 0
         assert run(["archive", "show", "first", "--out", "first"]) == 0
         assert run(["calibrations", "define", "left", "-p", "camera=vidicon"]) == 0
         decide = ["calibrations", "decide", "left", "first/calibration.json", "--rules", "rules.json"]
@@ -84,7 +61,7 @@ def rig(defined: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Field
     """The bench of a recalibration that is defined, in a folder of its own."""
     rig = FieldRig()
     shutil.copytree(defined, tmp_path, dirs_exist_ok=True)
-    on(rig, tmp_path, monkeypatch)
+    enter(tmp_path, monkeypatch, rig)
     return rig
 
 
