@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import threading
 import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -204,8 +205,11 @@ def test_after_a_pause_nothing_is_exposed_or_stored_twice(rig: FieldRig, session
 
 
 def _end_by_signal(rig: FieldRig, number: signal.Signals) -> None:
-    """Send the signal, and expose no further before the run has taken it: it then stops the table."""
-    os.kill(os.getpid(), number)
+    """Send the signal, and expose no further before the run has taken it: it then stops the table.
+
+    Here the signal reaches the thread that exposes, as it may: a system chooses among the threads.
+    """
+    signal.pthread_kill(threading.get_ident(), number)
     until = time.monotonic() + 10
     while not rig.table.stops and time.monotonic() < until:
         time.sleep(0.01)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 from bluesky import RunEngine
 from bluesky import plan_stubs as bps
 from bluesky import preprocessors as bpp
-from bluesky.utils import FailedStatus, RunEngineInterrupted
+from bluesky.utils import DuringTask, FailedStatus, RunEngineInterrupted
 
 from ..archive import ArchivedResult, Session
 from ..core.errors import InstrumentError, ReseauError
@@ -182,11 +182,28 @@ def rerun(session: Session, procedure: Procedure) -> list[Rerun]:
 def _engine(run: Acquisition, in_main: bool) -> Any:
     """The engine, with the messages of an acquisition, storing its documents."""
     # Signals are handled in the main thread only.
-    engine: Any = RunEngine({}, call_returns_result=True, context_managers=None if in_main else [])
+    engine: Any = RunEngine(
+        {},
+        call_returns_result=True,
+        context_managers=None if in_main else [],
+        during_task=_Awake(),  # type: ignore[no-untyped-call]
+    )
     for name, command in run.commands.items():
         engine.register_command(name, command)
     engine.subscribe(_Recorder(run.session))
     return engine
+
+
+class _Awake(DuringTask):
+    """Waits for the engine, and runs handlers of signals meanwhile.
+
+    The system may deliver a signal to any thread; its handler runs in the main thread, once that wakes.
+    """
+
+    def block(self, blocking_event: threading.Event) -> None:
+        """Wait for the event."""
+        while not blocking_event.wait(0.1):
+            pass
 
 
 def _whole(run: Acquisition, plan: Plan, park: Mapping[str, float]) -> Plan:
