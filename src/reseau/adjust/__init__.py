@@ -13,6 +13,7 @@ from .parameters import Constraint, Parameters, Prior
 from .problem import Adjustment, GaussHelmert, GaussMarkov, Problem, adjust, check_jacobian
 from .reliability import ExternalReliability, critical_tau, critical_w, noncentrality
 from .significance import CoefficientTest, GlobalTest, NestedTest
+from .uncertainty import Contribution, Simulated, UncertaintyBudget, Validation, propagate, simulate, validate
 
 __all__ = [
     "Adjustment",
@@ -22,6 +23,7 @@ __all__ = [
     "BatchReason",
     "CoefficientTest",
     "Constraint",
+    "Contribution",
     "Elimination",
     "EliminationStep",
     "ExternalReliability",
@@ -36,7 +38,10 @@ __all__ = [
     "Problem",
     "Rejection",
     "Robust",
+    "Simulated",
     "SnoopingStep",
+    "UncertaintyBudget",
+    "Validation",
     "VarianceComponents",
     "adjust",
     "adjust_batch",
@@ -47,7 +52,10 @@ __all__ = [
     "data_snooping",
     "eliminate",
     "noncentrality",
+    "propagate",
     "robust",
+    "simulate",
+    "validate",
     "variance_components",
     "weight_function",
 ]
