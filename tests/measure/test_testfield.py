@@ -14,8 +14,10 @@ from reseau.core.errors import ImageError
 from reseau.core.failure import Failure
 from reseau.core.tone import ToneCurve
 from reseau.designs import coded_testfield
+from reseau.designs.topology import TopologicalCode
 from reseau.io import TestfieldDesign
 from reseau.measure import TestfieldOptions, TestfieldResult, measure_testfield
+from reseau.measure.testfield.recognition import Placement, Reading, locate
 from reseau.optics import Brown, PixelGrid, Sensor
 from reseau_sims import FieldBench, Stain, Station
 from reseau_sims.testfield import DISTANCE_MM, JITTER_PX
@@ -114,9 +116,15 @@ def test_the_curve_that_a_file_states_is_used_unless_targets_contradict_it(gamma
     assert abs(error.mean(axis=0)).max() < 0.002
 
 
-def test_a_field_of_140_by_160_pixels_whose_lines_cannot_be_seen_is_read_by_its_targets() -> None:
-    result, error = measured(FieldBench(seed=3, distance_mm=2.6 * DISTANCE_MM), Station(30))
+@pytest.mark.parametrize(
+    ("farther", "station", "read"), [(2.6, Station(30), 28), (3.0, Station(45), 0)], ids=["140 px", "97 px"]
+)
+def test_a_small_field_whose_lines_cannot_be_seen_is_read_by_its_targets(
+    farther: float, station: Station, read: int
+) -> None:
+    result, error = measured(FieldBench(seed=3, distance_mm=farther * DISTANCE_MM), station)
     assert result.ok.sum() > 1000
+    assert abs(sum(map(bool, result.reading.decoded)) - read) < 5
     assert np.abs(error[result.ok]).max() < 0.15
     normalised = error[result.ok] ** 2 / np.diagonal(result.cov[result.ok], axis1=1, axis2=2)
     assert 0.8 < np.sqrt(normalised.mean()) < 1.15
@@ -162,6 +170,34 @@ def test_a_frame_of_more_pixels_shows_every_target() -> None:
     assert np.abs(error).max() < 0.05
 
 
+@pytest.mark.parametrize(("right", "placed"), [(0.35, True), (0.0, False)], ids=["a third", "none"])
+@pytest.mark.parametrize("quarters", range(4))
+def test_squares_that_cannot_be_read_are_placed_by_all_targets_together(
+    right: float, placed: bool, quarters: int
+) -> None:
+    rng, code = np.random.default_rng(quarters), TopologicalCode.of(DESIGN)
+    # The squares in rows from the upper left, as they are seen.
+    grid = np.rot90(np.lexsort((DESIGN.centres[:, 0], -DESIGN.centres[:, 1])).reshape(8, 8), quarters)
+    row, column = np.indices((8, 8)).reshape(2, -1)
+    seen = code.appearances[quarters, grid.ravel()]
+    wrong = rng.random(seen.shape) > right
+    seen = np.where(wrong, rng.integers(0, 8, seen.shape), seen)
+    none = np.zeros((64, 16))
+    decoded = tuple(code.decode(one) for one in seen)
+    cell = np.column_stack([column, 7 - row])
+    reading = Reading(cell, seen, seen, decoded, np.zeros((64, 16, 2)), none, none, 0.8)
+    found = locate(reading, DESIGN)
+    assert bool(found) is placed
+    if placed:
+        assert isinstance(found, Placement)
+        assert found.squares > 51
+        at = DESIGN.centres[grid.ravel()] @ found.frame.T + found.origin
+        assert np.abs(at - cell - 0.5).max() < 0.01
+        # Half of the squares in other places contradict the others.
+        mixed = np.concatenate([seen[:32], rng.permutation(seen[32:])])
+        assert not locate(replace(reading, joint=mixed), DESIGN)
+
+
 def answer(pixels: Array, design: TestfieldDesign = DESIGN) -> Any:
     return measure_testfield(Frame(pixels, 255.0, "frame"), design, OPTIONS)
 
@@ -182,7 +218,7 @@ FRAME = PLAIN.record(STATION).pixels
             "not-found",
         ),
         (FRAME[:, ::-1], DESIGN, "mirrored"),
-        (np.hstack([FRAME, FRAME]), DESIGN, "other-design|inconsistent|not-found"),
+        (np.hstack([FRAME, FRAME]), DESIGN, "several-targets"),
         (np.hstack([PLAIN.record(Station(0)).pixels] * 2), DESIGN, "several-targets"),
         (
             np.hstack([PLAIN.record(s).pixels for s in (Station(30, 0, 37), Station(30, 90))]),

@@ -213,11 +213,13 @@ def numberings(
     limits: tuple[float, float, float, int],
     most: tuple[int, int],
     alike: float,
+    strongest: tuple[int, int],
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Numberings of parallel lines as projective functions n = α t / (1 + β t) of their places t.
 
     Every function through three lines, with numbers 0, 1 to 3 and 1 to 3 more, is tried; lines that agree
-    with it count with their weights, in relation to the gaps that it leaves.
+    with it count with their weights, in relation to the gaps that it leaves. The three are near each other
+    among all lines, or among the strongest: there may be many false ones between neighbouring lines.
 
     Parameters
     ----------
@@ -230,6 +232,8 @@ def numberings(
         Most functions that are compared, the likeliest first, and most numberings.
     alike : float
         Share of lines with the same numbers from which two numberings are the same.
+    strongest : (int, int)
+        Numbers of the strongest lines among which the three are chosen, too.
 
     Returns
     -------
@@ -238,48 +242,58 @@ def numberings(
     """
     n, none = len(at), -(2**40)
     off_step, nearest, smooth, widest = limits
-    numbers, worths, tried = np.empty((144 * n, n), np.int64), np.empty(144 * n), 0
+    by_weight = np.argsort(-weight, kind="mergesort")
+    groups = [np.arange(n)]
+    groups += [np.sort(by_weight[:size]) for size in strongest if size < n]
+    most_tried = 0
+    for group in groups:
+        most_tried += 144 * len(group)
+    numbers, worths, tried = np.empty((most_tried, n), np.int64), np.empty(most_tried), 0
     value = np.empty(n)
-    for one in range(n):
-        for code in range(144):  # the next two lines, at most four further each, and two gaps up to three
-            two = one + 1 + code // 36
-            three, gap = two + 1 + code // 9 % 4, 1 + code // 3 % 3
-            if three >= n:
-                continue
-            wide, near, far = gap + 1 + code % 3, at[two] - at[one], at[three] - at[one]
-            # gap (1 + β near) = α near, wide (1 + β far) = α far.
-            beta = (wide * near - gap * far) / (near * far * (gap - wide))
-            alpha = gap / near + gap * beta
-            # Gaps change slowly from one to the next in any perspective in which all can be seen.
-            if not abs(math.log((far - near) / (wide - gap) / (near / gap))) < smooth * wide:
-                continue
-            worth, count, low, high, last = 0.0, 0, 0, 0, -1
-            found = numbers[tried]
-            for i in range(n):
-                t = at[i] - at[one]
-                depth = 1 + beta * t
-                number = alpha * t / depth
-                found[i] = none
-                if not (depth > nearest and abs(number) < 1e6):
+    for group in groups:
+        for first in range(len(group)):
+            for code in range(144):  # the next two lines, at most four further each, and two gaps up to three
+                second = first + 1 + code // 36
+                third, gap = second + 1 + code // 9 % 4, 1 + code // 3 % 3
+                if third >= len(group):
                     continue
-                whole = np.rint(number)
-                off = number - whole
-                if not abs(off) < off_step:
+                one, two, three = group[first], group[second], group[third]
+                wide, near, far = gap + 1 + code % 3, at[two] - at[one], at[three] - at[one]
+                # gap (1 + β near) = α near, wide (1 + β far) = α far.
+                beta = (wide * near - gap * far) / (near * far * (gap - wide))
+                alpha = gap / near + gap * beta
+                # Gaps change slowly from one to the next in any perspective in which all can be seen.
+                if not abs(math.log((far - near) / (wide - gap) / (near / gap))) < smooth * wide:
                     continue
-                found[i], value[i] = int(whole), weight[i] * (1 - (off / off_step) ** 2)
-                worth += value[i]
-                low, high = (found[i], found[i]) if count == 0 else (min(low, found[i]), max(high, found[i]))
-                count += 1
-                # Of two lines with one number the stronger one counts.
-                if last == i - 1 and last >= 0 and found[last] == found[i]:
-                    worth -= min(value[last], value[i])
-                    count -= 1
-                last = i
-            # With a sufficiently small step any lines fit; therefore gaps are penalized.
-            span = high - low + 1
-            if count >= 2 and span <= widest and math.isfinite(worth):
-                worths[tried] = worth * count / span
-                tried += 1
+                worth, count, low, high, last = 0.0, 0, 0, 0, -1
+                found = numbers[tried]
+                for i in range(n):
+                    t = at[i] - at[one]
+                    depth = 1 + beta * t
+                    number = alpha * t / depth
+                    found[i] = none
+                    if not (depth > nearest and abs(number) < 1e6):
+                        continue
+                    whole = np.rint(number)
+                    off = number - whole
+                    if not abs(off) < off_step:
+                        continue
+                    found[i], value[i] = int(whole), weight[i] * (1 - (off / off_step) ** 2)
+                    worth += value[i]
+                    low, high = (
+                        (found[i], found[i]) if count == 0 else (min(low, found[i]), max(high, found[i]))
+                    )
+                    count += 1
+                    # Of two lines with one number the stronger one counts.
+                    if last == i - 1 and last >= 0 and found[last] == found[i]:
+                        worth -= min(value[last], value[i])
+                        count -= 1
+                    last = i
+                # With a sufficiently small step any lines fit; therefore gaps are penalized.
+                span = high - low + 1
+                if count >= 2 and span <= widest and math.isfinite(worth):
+                    worths[tried] = worth * count / span
+                    tried += 1
     kept, made = np.empty(most[1], np.int64), 0
     order = np.argsort(-worths[:tried], kind="mergesort")
     for k in order[: most[0]]:

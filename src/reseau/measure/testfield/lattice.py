@@ -62,6 +62,9 @@ _WIDEST = 200
 """Most lines of a family, found or not; a step that asks for more fits any lines."""
 _ALIKE = 0.7
 """Share of lines with the same numbers from which two numberings are the same."""
+_STRONGEST = (12, 24)
+"""Numbers of the strongest lines of a family that alone begin numberings, too: rows of targets whose images
+blend pass as lines, up to seven between two lines, but have fewer votes."""
 _MOST_TRIED, _NUMBERINGS, _MOST_PAIRS, _CONSISTENT = 300, 5, 6, 0.04
 """Numberings of a family that are compared, that are kept, and pairs of both families that are tried; rms
 deviation of lines from a common lattice, in steps, that halves the worth of a pair."""
@@ -355,7 +358,7 @@ def _numbered(lines: _Lines, rows: Rows) -> list[_Numbering]:
     from .compiled import numberings  # takes half a second to import; not every command needs it
 
     limits = _OFF_STEP, _NEAREST, 0.5 * float(np.log(_NEXT_GAP)), _WIDEST
-    given = at, weight, limits, (_MOST_TRIED, _NUMBERINGS), _ALIKE
+    given = at, weight, limits, (_MOST_TRIED, _NUMBERINGS), _ALIKE, _STRONGEST
     found = []
     for there, numbers, worth in zip(*numberings(*given), strict=True):
         lines_found = np.flatnonzero(there)

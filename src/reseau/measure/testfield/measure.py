@@ -128,7 +128,8 @@ class TestfieldResult(Measured):
     reading : Reading
         Classification of the clusters.
     squares : int
-        Number of clusters that were read and agree with each other.
+        Number of squares that agree with the design; where too few can be read, those that agree better than
+        by chance.
     notes : tuple of Remark
         How grey values that are not proportional to the light were linearised, and by which curve.
 

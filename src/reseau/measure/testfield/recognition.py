@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -65,6 +66,14 @@ _SURE = 3
 """Most targets of a single square that may be hidden or wrong, if there is no other square to confirm it."""
 _AGREE = 8
 """Number of squares that agree with the design from which the others in sight may be illegible."""
+_SHARE_READ, _CONTRADICT = 0.3, 0.2
+"""Share of the squares in sight that must agree with the design, and number of others, relative to those that
+agree, that may contradict them."""
+_CHANCE, _TOGETHER, _MOSTLY = 1 / 8, 9.0, 0.8
+"""Share of targets that have the symbol of the design by chance; agreement of all squares together, in
+standard deviations, from which it cannot be by chance (wrong positions reach 5 in a lattice that is shifted
+by one target); least share of squares that agree better than by chance (it is two thirds where one half of
+the squares belongs elsewhere)."""
 _ANGLE = 7.5
 """Resolution of the directions of targets, degrees."""
 f32 = np.float32
@@ -321,11 +330,24 @@ def _grouped(frames: Array) -> tuple[Rows, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Position of the lattice on the board: lattice = frame · design + origin."""
+    """Position of the lattice on the board: lattice = frame · design + origin.
+
+    `squares` is the number of squares that agree with the design: those read that are expected there or, if
+    too few can be read, those whose targets agree better than by chance.
+    """
 
     frame: Array
     origin: Array
     squares: int
+
+    def identified(self, reading: Reading, design: TestfieldDesign) -> Rows:
+        """Cells (n, 2) with the squares expected there, or all those on the board if none can be read."""
+        off = reading.cell[:, None] + 0.5 - self.origin - design.centres @ self.frame.T
+        expected = 1 + np.abs(off).sum(axis=2).argmin(axis=1)
+        found = np.array([decoded.square if decoded else 0 for decoded in reading.decoded])
+        on_board = np.abs(off).sum(axis=2).min(axis=1) < 0.5
+        agree = on_board & (found == expected)
+        return np.asarray(reading.cell[agree if agree.any() else on_board])
 
 
 def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
@@ -347,14 +369,21 @@ def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
             votes[vote] += 1
             best[vote] = min(best.get(vote, 16), decoded.corrections + decoded.hidden)
     in_sight = int(((reading.joint != HIDDEN).sum(axis=1) >= 8).sum())
+    least = min(_SHARE_READ * in_sight, _AGREE)
+    likely, most = votes.most_common(1)[0] if votes else ((False, 0, 0, 0), 0)
+    mirrored, quarters, *doubled = likely
+    others = votes.total() - most
+    if most < least and (together := _placed_together(reading, design)) is not None:
+        # At the limit of resolution few of the squares in sight can be read, each by itself.
+        turns, *origin = together[0]
+        agreeing = votes[(False, turns, *origin)]
+        if votes.total() - agreeing <= max(1, _CONTRADICT * agreeing):
+            return Placement(_quarter(turns) / design.pitch, np.array(origin) / 2, together[1])
     if not votes:
         return Failure(
             f"{in_sight} squares are visible, but none belongs to the design {design.name!r}",
             Code.OTHER_DESIGN,
         )
-    likely, most = votes.most_common(1)[0]
-    mirrored, quarters, *doubled = likely
-    others = sum(votes.values()) - most
     if most == 1 and (alone := best[likely]) > _SURE:
         return Failure(
             f"{in_sight} squares are visible, and only one resembles a square of the design {design.name!r}, "
@@ -362,20 +391,64 @@ def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
             Code.OTHER_DESIGN,
         )
     # In a mirrored image the squares contradict each other about the position.
-    if mirrored and sum(n for vote, n in votes.items() if vote[0]) >= max(2, 0.3 * in_sight):
+    if mirrored and sum(n for vote, n in votes.items() if vote[0]) >= max(2, _SHARE_READ * in_sight):
         return Failure("shows the testfield mirrored", Code.MIRRORED)
-    if others > max(1, 0.2 * most):
+    if others > max(1, _CONTRADICT * most):
         return Failure(
             f"{most} squares agree with the design {design.name!r}, but {others} contradict them",
             Code.INCONSISTENT,
         )
-    # At the limit of resolution few of the squares in sight can be read.
-    if mirrored or most < min(0.3 * in_sight, _AGREE):
+    if mirrored or most < least:
         return Failure(
             f"only {most} of {in_sight} visible squares belong to the design {design.name!r}",
             Code.OTHER_DESIGN,
         )
     return Placement(_quarter(quarters) / design.pitch, np.array(doubled) / 2, most)
+
+
+def _placed_together(reading: Reading, design: TestfieldDesign) -> tuple[tuple[int, int, int], int] | None:
+    """The position of the lattice with which the targets of all squares together agree best.
+
+    In a wrong position a target has the symbol of the design by chance: one in eight, so that of n targets
+    n/8 agree with a variance of 7 n/64. In the right one most squares agree better than that, even where none
+    of them can be read.
+
+    Returns
+    -------
+    ((int, int, int), int) or None
+        Number of quarter turns and doubled origin; number of squares that agree better than by chance. None
+        if the agreement is not significant, or other positions are possible.
+    """
+    known = TopologicalCode.of(design).appearances[:4].reshape(-1, 16)
+    one = np.eye(8, dtype=np.float32)
+    visible = reading.joint != HIDDEN
+    looks = np.where(visible[..., None], one[reading.joint], f32(0))
+    agree = looks.reshape(len(looks), -1) @ one[known].reshape(len(known), -1).T
+    seen = visible.sum(axis=1)
+    # The origin of the lattice that each square of the design, in each rotation, gives to each cell.
+    centres = np.concatenate([design.centres @ _quarter(turns).T for turns in range(4)]) / design.pitch
+    origin = np.rint(2 * (reading.cell[:, None] + 0.5 - centres)).astype(np.int64)
+    turns = np.repeat(np.arange(4), len(design.centres))
+    first, span = origin.min(axis=(0, 1)), np.ptp(origin, axis=(0, 1)) + 1
+    place = (turns * span[0] + origin[..., 0] - first[0]) * span[1] + origin[..., 1] - first[1]
+    places, which = np.unique(place, return_inverse=True)
+
+    def total(values: NDArray[Any]) -> Array:
+        return np.asarray(
+            np.bincount(which.ravel(), np.broadcast_to(values, place.shape).ravel()), np.float64
+        )
+
+    count, squares = total(seen[:, None]), total(seen[:, None] > 0)
+    score = (total(agree) - _CHANCE * count) / np.sqrt(_CHANCE * (1 - _CHANCE) * np.maximum(count, 1))
+    better = total(agree > _CHANCE * seen[:, None])
+    best = int(score.argmax())
+    rival = float(np.delete(score, best).max(initial=0.0))
+    significant = score[best] > max(_TOGETHER, 2 * rival) and better[best] > _MOSTLY * squares[best]
+    if not significant or count[best] < 0.5 * seen.sum():
+        return None
+    quarters, rest = divmod(int(places[best]), int(span[0] * span[1]))
+    right, up = np.array(divmod(rest, int(span[1]))) + first
+    return (quarters, int(right), int(up)), int(better[best])
 
 
 def _quarter(turns: int) -> Array:
@@ -550,7 +623,7 @@ class SearchedFrame:
 
     def shows_second(self, read: Read) -> bool:
         """Whether a second testfield is visible beyond the one that was read."""
-        identified = read.reading.cell[[bool(decoded) for decoded in read.reading.decoded]]
+        identified = read.placed.identified(read.reading, self.design)
         # Keep a margin of half a square; the projectivity is accurate enough to locate the border.
         low, high = identified.min(axis=0) - 0.5, identified.max(axis=0) + 1.5
         at = straightened(read.lattice.mapping, read.ridges.xy)
