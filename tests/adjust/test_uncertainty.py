@@ -68,7 +68,7 @@ def test_contributions_that_share_a_variance_factor_have_its_degrees_of_freedom(
 
 
 def test_the_ellipsoid_covers_what_it_promises() -> None:
-    """Variances are estimated with 9 degrees of freedom: the ellipsoid holds the truth in 95 % of the trials."""
+    """Variances are estimated with 9 degrees of freedom: the ellipsoid holds the truth in 95 %."""
     rng = np.random.default_rng(8)
     shape = np.array([[1.0, 0.6, 0.0], [0.6, 2.0, 0.3], [0.0, 0.3, 0.5]])
     root, inside, trials = np.linalg.cholesky(shape), 0, 2000

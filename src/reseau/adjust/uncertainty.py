@@ -4,9 +4,9 @@ The law of propagation of uncertainty (JCGM 100:2008, eq. 13; JCGM 102:2011, eq.
 J = ∂f/∂x and independent contributions C₁ … C_G to the covariance of the inputs x, the results y = f(x)
 have the covariance Σ J C_g Jᵀ. Each contribution has its degrees of freedom ν_g, and those of a result follow
 from u⁴/ν = Σ u_g⁴/ν_g (Welch–Satterthwaite; JCGM 100, eq. G.2b). Jointly, with the parts S_g of the
-covariance, whitened by the whole, ν = (m² + m) / Σ (tr²S_g + tr S_g²)/ν_g (Nel & van der Merwe 1986). Where
-f is not linear, :func:`simulate` draws the inputs instead (JCGM 101:2008, JCGM 102:2011), and :func:`validate`
-compares both.
+covariance, whitened by the whole, ν = (m² + m) / Σ (tr²S_g + tr S_g²)/ν_g (Nel & van der Merwe 1986).
+Where f is not linear, :func:`simulate` draws the inputs instead (JCGM 101:2008, JCGM 102:2011), and
+:func:`validate` compares both.
 """
 
 from __future__ import annotations

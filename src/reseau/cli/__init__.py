@@ -27,6 +27,7 @@ from . import (
     capture,
     capture_own,
     capture_sensor,
+    certificates,
     demo,
     design,
     export,
@@ -63,6 +64,8 @@ app.add_typer(calibrations.app, name="calibrations")
 app.command()(schedule.recalibrate)
 app.add_typer(schedule.app, name="schedule")
 app.add_typer(schedule.alarms, name="alarms")
+app.add_typer(certificates.app, name="certificate")
+app.command()(certificates.uncertainty)
 app.command()(orient.orient)
 app.command()(refine.refine)
 app.command()(apply.apply)

@@ -24,7 +24,7 @@ from ..core.errors import UsageError
 from .charts import ChartOptions, Monitored, monitor
 from .rules import AcceptanceRules, Judgement, Outcome, judge
 
-__all__ = ["Applied", "Configurations", "Decision", "Drift", "a_time"]
+__all__ = ["Applied", "Configurations", "Decision", "Drift", "a_time", "key_of"]
 
 _PREFIX = "calibrations/"
 _ACCEPTED = ("accepted", "accepted with warning")
@@ -234,8 +234,7 @@ class Configurations:
             another instrument than the one in force.
         """
         entries = self._entries(name)
-        text = calibration.model_copy(update={"times": {}}).to_json()
-        key = hashlib.sha256(text.encode("utf-8")).hexdigest()[:12]
+        key = key_of(calibration)
         if any(each.key == key for each in entries):
             return self.decision(name, key)
         _same_version(entries, rules, name)
@@ -426,6 +425,19 @@ class Configurations:
             do = f"use {', '.join(self.names())}" if self.names() else "define it"
             raise UsageError("is not a configuration of this archive", where=name, do=do)
         return [each for each in found if kind is None or each.kind == kind]
+
+
+def key_of(calibration: Calibration) -> str:
+    """Name of a calibration: start of its SHA-256 without clock times.
+
+    Examples
+    --------
+    >>> from reseau.service.covariates import example_calibration
+    >>> len(key_of(example_calibration()))
+    12
+    """
+    text = calibration.model_copy(update={"times": {}}).to_json()
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:12]
 
 
 def a_time(given: datetime) -> datetime:

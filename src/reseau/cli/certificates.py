@@ -1,0 +1,365 @@
+"""`reseau certificate`, `reseau uncertainty`: certificates of calibrations, and their uncertainty budgets."""
+
+from __future__ import annotations
+
+import os
+from datetime import UTC, date, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import numpy as np
+import typer
+
+from ..core.errors import UsageError
+from .calibrations import time_of
+from .common import AsJson, ObjectsPlace, Out, open_archive, say, suffix_of, writable
+
+if TYPE_CHECKING:
+    from ..adjust import Simulated, UncertaintyBudget
+    from ..calibration import Calibration
+    from ..service import Decision
+    from ..service.certificates import CertificateData
+
+__all__ = ["app", "uncertainty"]
+
+app = typer.Typer(no_args_is_help=True, help="Certificates of calibrations: create, verify, vocabulary.")
+
+Source = Annotated[
+    str,
+    typer.Argument(
+        metavar="CALIBRATION|NAME",
+        help="File of a calibration, or with --archive the name of a configuration.",
+    ),
+]
+Archive = Annotated[
+    str | None,
+    typer.Option(
+        "--archive", "-a", envvar="RESEAU_ARCHIVE", help="Archive with decisions and earlier calibrations."
+    ),
+]
+At = Annotated[str | None, typer.Option(help="The calibration in force at this time. Default: now.")]
+Key = Annotated[str | None, typer.Option("--decision", help="Decision, by the start of its key.")]
+Probability = Annotated[float, typer.Option(help="Coverage probability.")]
+
+
+class _Found(NamedTuple):
+    """A calibration, the decision on it, and those of other sessions."""
+
+    calibration: Calibration
+    decision: Decision | None
+    configuration: str
+    earlier: list[Calibration]
+
+
+def _find(source: str, archive: str | None, objects: str | None, at: str | None, key: str | None) -> _Found:
+    """Read a calibration from a file or an archive, with what the archive knows of it.
+
+    Raises
+    ------
+    UsageError
+        If there is none.
+    """
+    from ..calibration import read_calibration
+    from ..service import Configurations
+    from ..service.inforce import key_of
+
+    file = Path(source)
+    stored = read_calibration(file) if file.is_file() or archive is None else None
+    if archive is None:
+        assert stored is not None
+        return _Found(stored, None, "", [])
+    with open_archive(archive, objects) as opened:
+        known = Configurations(opened)
+        if stored is None:
+            name, time = source, time_of(at, "--at") or datetime.now(UTC)
+            if key is None:
+                applied = known.applied(name, time)
+                if applied is None:
+                    raise UsageError(f"has no calibration in force at {time:%Y-%m-%d %H:%M}Z", where=name)
+                key = applied.key
+            decision: Decision | None = known.decision(name, key)
+            assert decision is not None
+            calibration = known.calibration(name, decision.key)
+        else:
+            calibration, own = stored, key_of(stored)
+            decided = [(each, d) for each in known.names() for d in known.history(each) if d.key == own]
+            # Any rejection counts, whatever another configuration says.
+            decided.sort(key=lambda pair: pair[1].outcome.startswith("accepted"))
+            name, decision = decided[0] if decided else ("", None)
+        earlier = []
+        if name:
+            events = [time for time, _ in known.events(name)]
+            start = max(events, default=datetime.min.replace(tzinfo=UTC))
+            earlier = [
+                known.calibration(name, each.key)
+                for each in known.history(name)
+                if each.outcome.startswith("accepted") and each.since >= start
+                and decision is not None and each.key != decision.key and decision.since >= start
+            ]  # fmt: skip
+        return _Found(calibration, decision, name, earlier)
+
+
+@app.command()
+def create(
+    source: Source,
+    data: Annotated[Path, typer.Option(help="Laboratory, item, standards: reseau-certificate-data/1.")],
+    out: Annotated[
+        list[Path],
+        typer.Option("--out", "-o", help="File to write: .pdf (with the XML embedded), .xml (DCC), .html."),
+    ],
+    key: Annotated[
+        Path | None, typer.Option(help="Private key to sign with (PEM); its password: RESEAU_KEY_PASSWORD.")
+    ] = None,
+    certificate: Annotated[Path | None, typer.Option(help="Certificate of the signer (PEM).")] = None,
+    issued: Annotated[
+        str | None, typer.Option(help="Date of issue, such as 2026-03-29. Default: today.")
+    ] = None,
+    probability: Probability = 0.95,
+    undecided: Annotated[
+        bool,
+        typer.Option(
+            "--undecided", help="Also if nobody decided on the calibration; the certificate says so."
+        ),
+    ] = False,
+    archive: Archive = None,
+    objects: ObjectsPlace = None,
+    at: At = None,
+    decision: Key = None,
+) -> None:
+    """Create the certificate of a calibration.
+
+    A calibration that was rejected, or still needs a review, gets none.
+    """
+    from ..io import write_whole
+    from ..service.certificates import CertificateData, certify, dcc_of, html_of, pdf_of, sign
+
+    kinds = [suffix_of(writable(each), (".pdf", ".xml", ".html")) for each in out]
+    if len(set(kinds)) < len(kinds):
+        raise UsageError("has two files of one kind", where="--out")
+    if (key is None) != (certificate is None):
+        raise UsageError("must be given together", where="--key and --certificate")
+    given = CertificateData.read(data)
+    found = _find(source, archive, objects, at, decision)
+    if found.decision is None and not undecided:
+        where = f"calibration {found.calibration.name}"
+        raise UsageError("was not decided on", where=where,
+                         do="give the --archive in which it was accepted, or --undecided")  # fmt: skip
+    made = certify(
+        found.calibration, given, issued=_date(issued), decision=found.decision,
+        configuration=found.configuration, earlier=found.earlier, probability=probability,
+    )  # fmt: skip
+
+    def xml(pages: str = "") -> bytes:
+        content = dcc_of(made, pages)
+        if key is None or certificate is None:
+            return content
+        return sign(content, key, certificate, os.environ.get("RESEAU_KEY_PASSWORD"))
+
+    contents: dict[str, bytes] = {}
+    if ".pdf" in kinds:
+        contents[".pdf"], contents[".xml"] = pdf_of(made, xml)
+    elif ".xml" in kinds:
+        contents[".xml"] = xml()
+    if ".html" in kinds:
+        contents[".html"] = html_of(made).encode("utf-8")
+    for path, kind in zip(out, kinds, strict=True):
+        write_whole(path, contents[kind])
+    say(f"{made.identifier}: {', '.join(str(each) for each in out)}\n")
+    for line in made.traceability:
+        say(f"  {line}\n")
+    say(f"  {made.conformity}\n")
+    for what, why in made.uncertainty.missing.items():
+        say(f"  not included: {what}; {why}\n")
+
+
+def _date(text: str | None) -> date:
+    try:
+        return datetime.now(UTC).date() if text is None else date.fromisoformat(text)
+    except ValueError:
+        raise UsageError(f"{text!r} is not a date", where="--issued", do="use 2026-03-29") from None
+
+
+@app.command()
+def verify(
+    file: Annotated[Path, typer.Argument(help="Certificate: DCC (XML), or PDF in which it is embedded.")],
+    schema: Annotated[
+        Path | None,
+        typer.Option(envvar="RESEAU_DCC", help="Folder with dcc.xsd, what it includes, and dcc.sch, of PTB."),
+    ] = None,
+    without_schema: Annotated[
+        bool, typer.Option("--without-schema", help="Check neither the schema nor the rules.")
+    ] = False,
+    trust: Annotated[
+        list[Path] | None, typer.Option(help="Certificate of a trusted signer (PEM); it must be signed then.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Verify a certificate: syntax, schema, rules, signature, numbers, pages; exit status 1 if refused."""
+    from ..core.provenance import canonical_json
+    from ..service.certificates import verify as verified
+
+    if schema is None and not without_schema:
+        raise UsageError("needs the schema of PTB", where="verify", do="give --schema, or --without-schema")
+    found = verified(file, schema=None if without_schema else schema, trusted=trust or ())
+    refused = any(each.state == "failed" for each in found)
+    if as_json:
+        rows = [vars(each) | {"more": list(each.more)} for each in found]
+        say(canonical_json({"schema": "reseau-verification/1", "refused": refused, "checks": rows}))
+    else:
+        for each in found:
+            say(f"{each.state:<12} {each.check:<11} {each.text}\n")
+        say(f"{file}: {'refused' if refused else 'nothing is wrong'}\n")
+    raise typer.Exit(1 if refused else 0)
+
+
+@app.command()
+def vocabulary(out: Out = None) -> None:
+    """Write our vocabulary of reference types (refType) in digital certificates."""
+    from ..io import write_whole
+    from ..service.certificates.vocabulary import vocabulary_text
+
+    if out is None:
+        say(vocabulary_text())
+    else:
+        write_whole(writable(out), vocabulary_text())
+
+
+def uncertainty(
+    source: Source,
+    points: Annotated[
+        Path | None,
+        typer.Argument(metavar="POINTS", help="Image coordinates measured with it. Default: its parameters."),
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Temperature and further contributions: reseau-certificate-data/1.")
+    ] = None,
+    draws: Annotated[
+        int, typer.Option(min=0, help="Draws of Monte Carlo to compare with; at least 4000, or 0 for none.")
+    ] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the draws.")] = 0,
+    probability: Probability = 0.95,
+    out: Out = None,
+    archive: Archive = None,
+    objects: ObjectsPlace = None,
+    at: At = None,
+    decision: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show the uncertainty budget of a calibration, or of points measured with it.
+
+    After the GUM: contributions, effective degrees of freedom, coverage factors, covariance; with --draws
+    compared with Monte Carlo after its Supplements 1 and 2.
+    """
+    from ..adjust import simulate
+    from ..core.provenance import canonical_json
+    from ..io import read_measurement, write_whole
+    from ..service.certificates import (
+        CertificateData,
+        measurement_budget,
+        simulate_measurement,
+        uncertainty_of,
+    )
+
+    if out is not None:
+        suffix_of(writable(out), (".json",))
+    given: CertificateData | None = None if data is None else CertificateData.read(data)
+    found = _find(source, archive, objects, at, decision)
+    sources = uncertainty_of(found.calibration, found.earlier, given)
+    simulated: Simulated | None = None
+    if points is None:
+        budget = sources.budget()
+        if draws:
+            simulated = simulate(
+                lambda x: x,
+                budget.values,
+                budget.contributions,
+                probability=probability,
+                draws=draws,
+                seed=seed,
+            )
+    else:
+        measured = read_measurement(points).image_points()
+        budget = measurement_budget(sources, measured)
+        if draws:
+            simulated = simulate_measurement(
+                sources, measured, probability=probability, draws=draws, seed=seed
+            )
+    document = _document(budget, probability, dict(sources.missing), simulated)
+    if out is not None:
+        write_whole(out, canonical_json(document))
+    if as_json:
+        say(canonical_json(document))
+    else:
+        _say_budget(budget, probability, simulated)
+        for what, why in sources.missing.items():
+            say(f"not included: {what}; {why}\n")
+
+
+def _document(
+    budget: UncertaintyBudget, probability: float, missing: dict[str, str], simulated: Simulated | None
+) -> dict[str, Any]:
+    from ..adjust import validate
+
+    def finite(values: Any) -> list[float | None]:
+        return [float(v) if np.isfinite(v) else None for v in values]
+
+    found: dict[str, Any] = {
+        "schema": "reseau-uncertainty/1",
+        "probability": probability,
+        "results": {
+            "name": list(budget.names), "unit": list(budget.units), "value": budget.values.tolist(),
+            "sigma": budget.sigma.tolist(), "degrees": finite(budget.degrees),
+            "factor": budget.factor(probability).tolist(), "expanded": budget.expanded(probability).tolist(),
+        },
+        "covariance": budget.covariance.tolist(),
+        "joint": {"degrees": finite([budget.joint_degrees])[0],
+                  "factor": finite([budget.joint_factor(probability)])[0]},
+        "inputs": list(budget.inputs),
+        "sensitivities": budget.sensitivities.tolist(),
+        "contributions": [
+            {"name": each.name, "degrees": finite([each.degrees])[0], "distribution": each.distribution,
+             "group": each.group, "sigma": u.tolist()}
+            for each, u in zip(budget.contributions, budget.by_contribution, strict=True)
+        ],
+        "missing": missing,
+    }  # fmt: skip
+    if simulated is not None:
+        told = validate(budget, simulated)
+        found["monte_carlo"] = {
+            "draws": simulated.draws, "lost": simulated.lost, "mean": simulated.mean.tolist(),
+            "sigma": simulated.sigma.tolist(), "low": simulated.low.tolist(), "high": simulated.high.tolist(),
+            "covariance": simulated.covariance.tolist(), "joint_factor": simulated.joint_factor,
+            "difference": {"low": told.low.tolist(), "high": told.high.tolist(),
+                           "error": told.error.tolist(), "tolerance": told.tolerance.tolist(),
+                           "joint_factor": told.joint_factor},
+            "verdict": list(told.verdicts),
+        }  # fmt: skip
+    return found
+
+
+def _say_budget(budget: UncertaintyBudget, probability: float, simulated: Simulated | None) -> None:
+    from ..adjust import validate
+    from ..core.numbers import measured
+
+    columns = zip(
+        budget.names, budget.units, budget.values, budget.expanded(probability), budget.sigma,
+        budget.factor(probability), budget.degrees, strict=True,
+    )  # fmt: skip
+    say(f"expanded uncertainties, {100 * probability:g} %\n")
+    for i, (name, unit, value, expanded, u, k, nu) in enumerate(columns):
+        shown = measured(float(value), float(expanded), "" if unit == "1" else unit)
+        degrees = "∞" if not np.isfinite(nu) else f"{nu:.0f}"
+        say(f"{name:<8} {shown}  u {u:.2g}, k {k:.2f}, ν {degrees}\n")
+        for each, part in zip(budget.contributions, budget.by_contribution[:, i], strict=True):
+            if part > 0:
+                say(f"    {100 * (part / u) ** 2:5.1f} %  {part:9.2g}  {each.name}\n")
+    joint = budget.joint_factor(probability)
+    say(f"all together: ellipsoid of the covariance with the factor {joint:.3f}\n")
+    if simulated is not None:
+        told = validate(budget, simulated)
+        say(f"Monte Carlo, {simulated.draws} draws: ends of the intervals minus those above\n")
+        for name, low, high, error, verdict in zip(
+            budget.names, told.low, told.high, told.error, told.verdicts, strict=True
+        ):
+            say(f"{name:<8} {low:+.1e}, {high:+.1e} (± {error:.0e}): {verdict}\n")
+        say(f"factor of the ellipsoid: {told.joint_factor:+.3f}\n")

@@ -1,0 +1,332 @@
+"""The uncertainty of a calibration, by its sources, and that of measurements made with it.
+
+Sources of the uncertainty of the parameters p, with covariance C of the adjustment, a posteriori:
+
+* *grey values*: C less the part of the observed target coordinates;
+* *target coordinates*: Q_pt P_t Q_tp σ₀², Q_pt being the cofactors of parameters and targets;
+* *temperature*: the coefficients times the uncertainty of the temperature;
+* *model*: what errors that images have in common add: with the scatter between images s_b, F C F,
+  f² = max(0, s_b²/s² − 1). Of measured points also the misfit of the model;
+* *reproducibility*: the covariance of the parameters between sessions beyond that within, both by the
+  calibrations of a configuration since its last service event.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from ...adjust import Contribution, Simulated, UncertaintyBudget, propagate, simulate
+from ...calibration import Calibration
+from ...core.data import Array, ImagePoints
+from ...core.errors import UsageError
+from .data import CertificateData
+
+__all__ = [
+    "SOURCES",
+    "CalibrationUncertainty",
+    "measurement_budget",
+    "simulate_measurement",
+    "uncertainty_of",
+]
+
+SOURCES = ("grey values", "target coordinates", "temperature", "model", "reproducibility")
+# The scatter between images is estimated from six of them or more.
+_LEAST_IMAGES = 6
+_LEAST_SESSIONS = 3
+_ADJUSTMENT = "adjustment"
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationUncertainty:
+    """Contributions to the uncertainty of the estimated parameters of a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    names, units : tuple of str (u,)
+        Estimated parameters.
+    values : ndarray (u,)
+        Their estimates.
+    contributions : tuple of Contribution (g,)
+        Contributions.
+    sources : tuple of str (g,)
+        Source of each: one of `SOURCES`, or "other".
+    missing : mapping of str to str
+        Sources of which nothing is known, and why.
+
+    Examples
+    --------
+    >>> from reseau.service.covariates import example_calibration
+    >>> found = uncertainty_of(example_calibration())
+    >>> found.names, found.sources, sorted(found.missing)
+    (('c',), ('grey values',), ['model', 'reproducibility', 'target coordinates', 'temperature'])
+    """
+
+    calibration: Calibration
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    contributions: tuple[Contribution, ...]
+    sources: tuple[str, ...]
+    missing: Mapping[str, str]
+
+    def budget(self) -> UncertaintyBudget:
+        """Budget of the parameters themselves."""
+        return propagate(
+            lambda x: x, self.values, self.contributions, names=self.names, inputs=self.names,
+            units=self.units, sensitivities=np.eye(len(self.values)),
+        )  # fmt: skip
+
+
+def uncertainty_of(
+    calibration: Calibration, earlier: Sequence[Calibration] = (), data: CertificateData | None = None
+) -> CalibrationUncertainty:
+    """Collect the contributions to the uncertainty of a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    earlier : sequence of Calibration
+        Calibrations of the same configuration in other sessions, for the reproducibility.
+    data : CertificateData, optional
+        Temperature and further contributions.
+
+    Raises
+    ------
+    UsageError
+        If no parameter was estimated, or a contribution names a parameter that was not.
+    """
+    names = calibration.covariance.names
+    where = f"calibration {calibration.name}"
+    if not names:
+        raise UsageError("has no estimated parameters", where=where)
+    values = np.array([calibration.parameters[name].value for name in names])
+    covariance = np.array(calibration.covariance.matrix, dtype=np.float64).reshape(len(names), len(names))
+    degrees = float(calibration.redundancy) if calibration.sigma0 is not None else np.inf
+    found: list[tuple[str, Contribution]] = []
+    missing: dict[str, str] = {}
+
+    part = calibration.validity.get("covariance_of_targets")
+    targets = np.zeros_like(covariance) if part is None else np.array(part, dtype=np.float64)
+    if targets.shape != covariance.shape:
+        raise UsageError("has a damaged `covariance_of_targets`", where=where)
+    grey = Contribution("grey values", covariance - targets, degrees, group=_ADJUSTMENT)
+    found.append(("grey values", grey))
+    if part is None:
+        missing["target coordinates"] = "they were held, or estimated without observations of them"
+    else:
+        found.append(
+            ("target coordinates", Contribution("target coordinates", targets, degrees, group=_ADJUSTMENT))
+        )
+    _add_temperature(found, missing, names, data)
+    _add_model(found, missing, calibration, covariance)
+    _add_reproducibility(found, missing, calibration, earlier)
+    for each in () if data is None else data.contributions:
+        row = _row(each.sensitivities, names, each.name)
+        cov = each.sigma**2 * np.outer(row, row)
+        nu = np.inf if each.degrees is None else each.degrees
+        found.append((each.kind, Contribution(each.name, cov, nu, each.distribution)))
+        missing.pop(each.kind, None)
+    sources, contributions = zip(*found, strict=True)
+    units = tuple(calibration.parameters[name].unit for name in names)
+    return CalibrationUncertainty(calibration, names, units, values, contributions, sources, missing)
+
+
+_Found = list[tuple[str, Contribution]]
+
+
+def _add_temperature(
+    found: _Found, missing: dict[str, str], names: tuple[str, ...], data: CertificateData | None
+) -> None:
+    given = None if data is None else data.temperature
+    if given is None:
+        missing["temperature"] = "it was not recorded"
+        return
+    if not given.coefficients:
+        missing["temperature"] = "no coefficients of the parameters are given"
+        return
+    row = _row(given.coefficients, names, "temperature")
+    nu = np.inf if given.degrees is None else given.degrees
+    cov = given.sigma**2 * np.outer(row, row)
+    found.append(("temperature", Contribution("temperature", cov, nu, given.distribution)))
+
+
+def _add_model(found: _Found, missing: dict[str, str], calibration: Calibration, covariance: Array) -> None:
+    between = calibration.validity.get("sigma_between_images") or {}
+    names = calibration.covariance.names
+    if not any(name in between for name in names):
+        missing["model"] = f"the scatter between images needs {_LEAST_IMAGES} of them"
+        return
+    formal = np.diag(covariance)
+    ratio = np.array([between.get(name, 0.0) ** 2 for name in names]) / np.where(formal > 0, formal, np.inf)
+    f = np.sqrt(np.maximum(ratio - 1.0, 0.0))
+    images = int(calibration.validity.get("images", _LEAST_IMAGES))
+    cov = covariance * np.outer(f, f)
+    found.append(("model", Contribution("model: scatter between images", cov, max(images - 1.0, 1.0))))
+
+
+def _add_reproducibility(
+    found: _Found, missing: dict[str, str], calibration: Calibration, earlier: Sequence[Calibration]
+) -> None:
+    names = calibration.covariance.names
+    every = [calibration, *(each for each in earlier if each.covariance.names == names)]
+    if len(every) < _LEAST_SESSIONS:
+        missing["reproducibility"] = f"needs {_LEAST_SESSIONS} sessions; there are {len(every)}"
+        return
+    values = np.array([[each.parameters[name].value for name in names] for each in every])
+    within = np.mean([each.covariance.matrix for each in every], axis=0)
+    cov = _between(np.atleast_2d(np.cov(values.T)), within)
+    contribution = Contribution("reproducibility between sessions", cov, len(every) - 1.0)
+    found.append(("reproducibility", contribution))
+
+
+def _between(total: Array, within: Array) -> Array:
+    """The positive part of total − within, in the directions in which `within` is a unit matrix."""
+    size = np.sqrt(np.diag(within))
+    scale = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(within / np.outer(scale, scale))
+    keep = values > 1e-12 * values[-1]
+    root = scale[:, None] * vectors[:, keep] * np.sqrt(values[keep])
+    white = (vectors[:, keep] / np.sqrt(values[keep])).T / scale
+    ratio, turn = scipy.linalg.eigh(white @ total @ white.T)
+    back = root @ turn
+    found: Array = (back * np.maximum(ratio - 1.0, 0.0)) @ back.T
+    return found
+
+
+def _row(given: Mapping[str, float], names: tuple[str, ...], where: str) -> Array:
+    unknown = sorted(set(given) - set(names))
+    if unknown:
+        raise UsageError(f"names {unknown[0]!r}, which is not an estimated parameter", where=where,
+                         do=f"use {', '.join(names)}")  # fmt: skip
+    return np.array([given.get(name, 0.0) for name in names])
+
+
+def measurement_budget(uncertainty: CalibrationUncertainty, points: ImagePoints) -> UncertaintyBudget:
+    """Budget of points measured with the calibrated instrument, with the covariance of all of them.
+
+    Parameters
+    ----------
+    uncertainty : CalibrationUncertainty
+        Of the calibration.
+    points : ImagePoints
+        In pixels.
+
+    Returns
+    -------
+    UncertaintyBudget
+        Results are x and y of each point in the system of the calibration (directions, for a camera); they
+        are correlated by the calibration.
+
+    Raises
+    ------
+    UsageError
+        If the calibration has no value at a point, or its parameters are not those of its mapping.
+
+    Examples
+    --------
+    >>> from reseau.service.covariates import example_calibration
+    >>> pair = ImagePoints.with_sigma(["a", "b"], [[400.0, 300.0], [420.0, 300.0]], 0.02)
+    >>> found = measurement_budget(uncertainty_of(example_calibration()), pair)
+    >>> found.names, found.covariance.shape
+    (('a.x', 'a.y', 'b.x', 'b.y'), (4, 4))
+    """
+    mapping = uncertainty.calibration.mapping()
+    value, slope, by_parameters = mapping.derivatives(points.xy)
+    n, u = len(points), len(uncertainty.values)
+    lost = [name for name, xy in zip(points.names, value, strict=True) if not np.isfinite(xy).all()]
+    if lost:
+        raise UsageError("has no value under the calibration", where=f"point {lost[0]}")
+    if by_parameters.shape[2] != u:
+        raise UsageError("has no derivatives by its parameters", where=uncertainty.calibration.name)
+    sensitivities = np.zeros((2 * n, 2 * n + u))
+    for k in range(n):
+        own = slice(2 * k, 2 * k + 2)
+        sensitivities[own, own], sensitivities[own, 2 * n :] = slope[k], by_parameters[k]
+    of_points = [f"{name}.{axis}" for name in points.names for axis in "xy"]
+    return propagate(
+        lambda x: np.broadcast_to(value.ravel(), (len(x), 2 * n)), _inputs(uncertainty, points),
+        _of_measurement(uncertainty, points), names=of_points, inputs=[*of_points, *uncertainty.names],
+        units=[mapping.unit] * (2 * n), sensitivities=sensitivities,
+    )  # fmt: skip
+
+
+def simulate_measurement(
+    uncertainty: CalibrationUncertainty,
+    points: ImagePoints,
+    *,
+    probability: float = 0.95,
+    draws: int = 10_000,
+    seed: int = 0,
+) -> Simulated:
+    """Draw points and parameters, and map the points with the calibration of the drawn parameters.
+
+    Parameters
+    ----------
+    uncertainty, points
+        As for :func:`measurement_budget`.
+    probability, draws, seed
+        As for :func:`reseau.adjust.simulate`.
+
+    Raises
+    ------
+    UsageError
+        If a calibration of this kind does not follow its parameters.
+    """
+    calibration, n = uncertainty.calibration, len(points)
+
+    def one(x: Array) -> Array:
+        return _mapped(calibration, uncertainty.names, x[2 * n :], x[: 2 * n].reshape(n, 2)).ravel()
+
+    x = _inputs(uncertainty, points)
+    contributions = _of_measurement(uncertainty, points)
+    budget = measurement_budget(uncertainty, points)
+    step = np.zeros(len(x))
+    step[2 * n :] = np.sqrt(np.diag(sum(each.covariance for each in contributions)))[2 * n :]
+    moved, expected = one(x + step) - one(x), budget.sensitivities @ step
+    if np.abs(moved - expected).max() > 0.1 * np.abs(expected).max(initial=0.0):
+        raise UsageError(f"a calibration of the kind {calibration.kind!r} does not follow its parameters",
+                         where="Monte Carlo", do="leave it out")  # fmt: skip
+    return simulate(
+        lambda rows: np.array([one(row) for row in rows]), x, contributions, probability=probability,
+        draws=draws, seed=seed,
+    )  # fmt: skip
+
+
+def _mapped(calibration: Calibration, names: tuple[str, ...], values: Array, xy: Array) -> Array:
+    parameters = dict(calibration.parameters)
+    for name, value in zip(names, values.tolist(), strict=True):
+        parameters[name] = parameters[name].model_copy(update={"value": value})
+    return calibration.model_copy(update={"parameters": parameters}).mapping().derivatives(xy)[0]
+
+
+def _inputs(uncertainty: CalibrationUncertainty, points: ImagePoints) -> Array:
+    return np.concatenate([points.xy.ravel(), uncertainty.values])
+
+
+def _of_measurement(uncertainty: CalibrationUncertainty, points: ImagePoints) -> list[Contribution]:
+    """Contributions to points and parameters."""
+    n, u = len(points), len(uncertainty.values)
+
+    def placed(part: Array, begin: int) -> Array:
+        full = np.zeros((2 * n + u, 2 * n + u))
+        full[begin : begin + len(part), begin : begin + len(part)] = part
+        return full
+
+    found = [Contribution("grey values of the measurement", placed(scipy.linalg.block_diag(*points.cov), 0))]
+    assessed: dict[str, Any] = uncertainty.calibration.validity.get("assessment") or {}
+    misfit = assessed.get("misfit_px")
+    if misfit:
+        found.append(Contribution("model: misfit", placed(float(misfit) ** 2 * np.eye(2 * n), 0)))
+    for each in uncertainty.contributions:
+        name = f"calibration: {each.name}"
+        cov = placed(each.covariance, 2 * n)
+        found.append(Contribution(name, cov, each.degrees, each.distribution, each.group))
+    return found
