@@ -6,9 +6,11 @@ share neither the camera nor the formation of pixels with the project. Poses are
 every picture has its own row. ``--others`` also measures the pictures of all other targets with the design:
 they must be declined. ``--squares`` cuts single squares with their lines from the pictures of the testfield,
 and measures each. ``--worlds`` draws and measures N sets of 15 views, near and wide to 65° and k1 to -0.3,
-with ``benchmarks/worlds/boards.py``. ``--calibrate`` draws 12 views of the testfield for each of ``--seeds``
-20, calibrates the camera as ``reseau calibrate`` does with its defaults, and compares the errors of its
-parameters with their sigmas. ``--keep FOLDER`` keeps the pictures of the calibrations for the next run.
+with ``benchmarks/worlds/boards.py``, and compares the errors with their Cramér–Rao bound (contrast,
+background and blur of every target unknown). ``--calibrate`` draws 12 views of the testfield for each of
+``--seeds`` 20, calibrates the camera as ``reseau calibrate`` does with its defaults, and compares the errors
+of its parameters with their sigmas. ``--keep FOLDER`` keeps the pictures of the calibrations for the next
+run.
 
 A target counts as inside where its whole image, and two pixels more, lies in the picture and nothing hides
 it. Wrong is a position in error by more than 0.15 px and 5 sigma.
@@ -31,7 +33,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from worlds.boards import OPENCV, picture, poses
+from worlds.boards import OPENCV, bounds, picture, poses
 
 from reseau.core.data import Array, Frame, ImagePoints, Mask
 from reseau.core.failure import Failure
@@ -47,6 +49,8 @@ ROUGH = {"jpeg60", "sharpened", "motion3", "motion6", "specular"}
 MARGIN_PX, LEAST_FOUND, WRONG_PX, WRONG_SIGMA = 2.0, 0.95, 0.15, 5.0
 NORMALISED, NORMALISED_ROUGH = (0.85, 1.2), (0.7, 1.25)
 SQUARE_MARGIN_PX = 8
+BOUND_EACH = 16
+"""One in so many targets is compared with its Cramér–Rao bound."""
 LABELS = {"tn": "near", "td": "near, distorted"}
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
@@ -58,10 +62,11 @@ Measure = Callable[[Frame], Any]
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Errors and sigmas (n, 2) of the measured points of a picture, and counts."""
+    """Errors and sigmas (n, 2) of the measured points `ok` of a picture, and counts."""
 
     error: Array
     sigma: Array
+    ok: Mask
     inside: int
     found: int
     seconds: float
@@ -101,7 +106,7 @@ def measured(frame: Frame, measure: Measure, xy: Array, whole: Mask) -> Measured
         return f"declined: {found.reason} [{found.code}] ({seconds:.2f} s)"
     sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))[found.ok]
     error = (found.xy - xy)[found.ok]
-    return Measured(error, sigma, int(whole.sum()), int((found.ok & whole).sum()), seconds)
+    return Measured(error, sigma, found.ok, int(whole.sum()), int((found.ok & whole).sum()), seconds)
 
 
 def pictures(folder: Path, target: str) -> Iterator[tuple[str, str, Any]]:
@@ -221,7 +226,7 @@ def worlds(design_path: Path, count: int) -> bool:
     """
     contents = json.loads(design_path.read_text())
     measure, _ = measurers("tf", parse_design(design_path.read_text(), design_path))
-    parts, good = [], True
+    parts, good, ratios = [], True, []
     for seed in range(count):
         for k, (k1, tilt) in enumerate(product((0.0, -0.15, -0.3), (30.0, 53.0, 57.0, 61.0, 65.0))):
             camera = replace(OPENCV, k1=k1, k2=0.06 if k1 else 0.0)
@@ -236,7 +241,18 @@ def worlds(design_path: Path, count: int) -> bool:
                 continue
             line(name, [found], rough=False)
             parts.append(found)
-    return (line("own worlds", parts, rough=False) if parts else False) and good
+            some = np.flatnonzero(found.ok & whole)[seed % BOUND_EACH :: BOUND_EACH]
+            least = bounds(contents, camera, pose, some)
+            ratios.append((found.error[np.cumsum(found.ok)[some] - 1], least))
+    if not parts:
+        return False
+    error, least = (np.concatenate(column) for column in zip(*ratios, strict=True))
+    rms, bound = (float(np.sqrt((values**2).mean())) for values in (error, least))
+    print(
+        f"{len(error)} of the targets: rms {rms:.4f} px, bound {bound:.4f} px, "
+        f"errors over their bounds {np.sqrt(((error / least) ** 2).mean()):.3f}"
+    )
+    return line("own worlds", parts, rough=False) and good
 
 
 def views(contents: dict[str, Any], seed: int, keep: Path | None) -> Iterator[tuple[Frame, Array]]:

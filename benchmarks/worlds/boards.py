@@ -13,9 +13,9 @@ from typing import Any
 import numba
 import numpy as np
 
-from .pixels import Array, form, interpolated
+from .pixels import Array, Scene, form, form_at, interpolated
 
-__all__ = ["OPENCV", "Camera", "Field", "Pose", "picture", "poses"]
+__all__ = ["OPENCV", "Camera", "Field", "Pose", "bounds", "picture", "poses"]
 
 
 @dataclass(frozen=True)
@@ -241,8 +241,62 @@ def picture(
         Standard deviation of the grey values before they are rounded.
     """
     field = Field(design)
-    r, t = pose.rotation, pose.translation
-    back = np.linalg.inv(np.column_stack([r[:, :2], t]))
+    light = form(_seen(field, camera, pose), camera.width, camera.height, sigma, oversampling=oversampling)
+    light += np.random.default_rng(seed).normal(0, noise, light.shape)
+    return np.clip(np.rint(light), 0, 255), _images(field, camera, pose)
+
+
+def bounds(
+    design: dict[str, Any],
+    camera: Camera,
+    pose: Pose,
+    rows: Array,
+    sigma: float = 0.7,
+    noise: float = 1.5,
+) -> Array:
+    """Cramér–Rao bounds (n, 2) of the coordinates of some targets in a picture; see `picture`.
+
+    Contrast, level and slopes of the background and the width of the point-spread function are unknown, for
+    each target alone. Only pixels count that are nearer to the target than to others, up to half a step.
+
+    Parameters
+    ----------
+    rows : ndarray of int (n,)
+        Targets wanted.
+    """
+    field = Field(design)
+    seen, at = _seen(field, camera, pose), _images(field, camera, pose)
+    step = min(float(np.diff(np.unique(np.round(place, 6))).min()) for place in field.xy.T)
+    found = []
+    for k in rows:
+        around = field.xy[k] + step / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        ends = _images(field, camera, pose, around)
+        first, last = np.floor(ends.min(axis=0)).astype(int), np.ceil(ends.max(axis=0)).astype(int)
+        size = last - first + 1
+        light, *slopes = form_at(
+            seen, (int(first[0]), int(first[1])), (int(size[0]), int(size[1])), sigma, derivatives=True
+        )
+        column, row = (first[axis] + np.arange(size[axis]) for axis in (0, 1))
+        u, v = np.meshgrid(column - at[k, 0], row - at[k, 1])
+        # Inside the image of the square around the target, whose sides are almost straight.
+        own = np.ones(u.shape, dtype=bool)
+        middle = at[k]
+        for a, b in zip(ends, np.roll(ends, -1, axis=0), strict=True):
+            side = (b[0] - a[0]) * (v + middle[1] - a[1]) - (b[1] - a[1]) * (u + middle[0] - a[0])
+            inner = (b[0] - a[0]) * (middle[1] - a[1]) - (b[1] - a[1]) * (middle[0] - a[0])
+            own &= side * inner >= 0
+        own &= ((column >= 0) & (column < camera.width))[None, :]
+        own &= ((row >= 0) & (row < camera.height))[:, None]
+        columns = [*slopes, light, np.ones_like(u), u, v]
+        jacobian = np.stack([part[own] for part in columns], axis=1)
+        normal = jacobian.T @ jacobian / (noise**2 + 1 / 12)
+        found.append(np.sqrt(np.diag(np.linalg.inv(normal))[:2]))
+    return np.array(found)
+
+
+def _seen(field: Field, camera: Camera, pose: Pose) -> Scene:
+    """Brightness of the testfield, and of what is behind it, at positions in a picture."""
+    back = np.linalg.inv(np.column_stack([pose.rotation[:, :2], pose.translation]))
 
     def place(u: Array, v: Array) -> Array:
         p, q = camera.directions(u, v)
@@ -254,6 +308,10 @@ def picture(
         board, ink = field.printed(x / z, y / z)
         return np.asarray(30 + board * (180 - 170 * ink))
 
-    light = form(scene, camera.width, camera.height, sigma, oversampling=oversampling)
-    light += np.random.default_rng(seed).normal(0, noise, light.shape)
-    return np.clip(np.rint(light), 0, 255), camera.image(np.pad(field.xy, ((0, 0), (0, 1))) @ r.T + t)
+    return scene
+
+
+def _images(field: Field, camera: Camera, pose: Pose, xy: Array | None = None) -> Array:
+    """Images (n, 2) of points of the board (n, 2), of all targets by default."""
+    points = np.pad(field.xy if xy is None else xy, ((0, 0), (0, 1)))
+    return camera.image(points @ pose.rotation.T + pose.translation)
