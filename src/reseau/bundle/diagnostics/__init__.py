@@ -15,6 +15,7 @@ from .fields import camera_mapping, projection_field_at
 from .image_scatter import sigma_between_images
 from .patterns import CommonPattern, by_place, by_point, common_pattern
 from .result import Eliminated, Result
+from .target_part import covariance_by_targets
 
 __all__ = [
     "CameraEstimate",
@@ -36,6 +37,7 @@ __all__ = [
     "checks",
     "common_pattern",
     "control_shape",
+    "covariance_by_targets",
     "projection_field_at",
     "sigma_between_images",
 ]

@@ -11,7 +11,7 @@ from ...calibration.document import Calibration, CameraModel, Covariance, Place,
 from ...core.errors import UsageError
 from ...optics.cameras import unit_of
 from ...optics.poses import matrix_to_vector
-from ..diagnostics import Result, sigma_between_images
+from ..diagnostics import Result, covariance_by_targets, sigma_between_images
 from ..network import Camera
 
 __all__ = ["calibration_of"]
@@ -73,6 +73,8 @@ def calibration_of(
     between = zip(names, sigma_between_images(result, c).tolist(), strict=True)
     used = result.fit.usable.observations & ~result.rejected
     xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
+    targets = covariance_by_targets(result, c)
+    by_targets = {} if targets is None else {"covariance_of_targets": targets.tolist()}
     place = _place(result, camera)
     more = {} if place is None else {"place": place}
     return Calibration(
@@ -86,6 +88,8 @@ def calibration_of(
         tests=tuple(vars(test) for test in result.camera_tests(c)),
         validity={"extent": [*xy.min(axis=0).tolist(), *xy.max(axis=0).tolist()], "unit": "px",
                   "sigma_between_images": {key: s for key, s in between if np.isfinite(s)},
+                  "images": int(np.count_nonzero(result.fit.usable.images & (result.network.camera_of == c))),
+                  **by_targets,
                   "warnings": [remark.text for remark in result.warnings],
                   "warning_codes": [remark.code.value for remark in result.warnings]},
         provenance=dict(provenance or {}),

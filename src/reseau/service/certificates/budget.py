@@ -21,7 +21,7 @@ import numpy as np
 import scipy.linalg
 
 from ...adjust import Contribution, Simulated, UncertaintyBudget, propagate, simulate
-from ...calibration import Calibration
+from ...calibration import Calibration, CameraMapping
 from ...core.data import Array, ImagePoints
 from ...core.errors import UsageError
 from .data import CertificateData
@@ -39,6 +39,7 @@ SOURCES = ("grey values", "target coordinates", "temperature", "model", "reprodu
 _LEAST_IMAGES = 6
 _LEAST_SESSIONS = 3
 _ADJUSTMENT = "adjustment"
+_ROUNDS, _CONVERGED_PX = 30, 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,9 +282,14 @@ def simulate_measurement(
         If a calibration of this kind does not follow its parameters.
     """
     calibration, n = uncertainty.calibration, len(points)
+    mapping = calibration.mapping()
+    start, slope, _ = mapping.derivatives(points.xy)
 
     def one(x: Array) -> Array:
-        return _mapped(calibration, uncertainty.names, x[2 * n :], x[: 2 * n].reshape(n, 2)).ravel()
+        xy, values = x[: 2 * n].reshape(n, 2), x[2 * n :]
+        if isinstance(mapping, CameraMapping):
+            return _directions(mapping, values, xy, start, slope).ravel()
+        return _mapped(calibration, uncertainty.names, values, xy).ravel()
 
     x = _inputs(uncertainty, points)
     contributions = _of_measurement(uncertainty, points)
@@ -298,6 +304,20 @@ def simulate_measurement(
         lambda rows: np.array([one(row) for row in rows]), x, contributions, probability=probability,
         draws=draws, seed=seed,
     )  # fmt: skip
+
+
+def _directions(camera: CameraMapping, values: Array, xy: Array, start: Array, slope: Array) -> Array:
+    """Directions of pixels with other parameters: Newton's method with constant derivatives, from nearby."""
+    given = camera.mapping.values.copy()
+    given[camera.rows] = values
+    mapping, uv = camera.mapping.with_values(given), start
+    for _ in range(_ROUNDS):
+        off = mapping(uv) - xy
+        uv = uv - np.einsum("nij,nj->ni", slope, off)
+        if np.abs(off).max() < _CONVERGED_PX:
+            found: Array = uv
+            return found
+    return np.full_like(start, np.nan)
 
 
 def _mapped(calibration: Calibration, names: tuple[str, ...], values: Array, xy: Array) -> Array:

@@ -84,7 +84,7 @@ class Certificate:
             )
         lines = []
         for each in self.data.standards:
-            named = f"{each.kind} {each.name} ({each.identification})"
+            named = f"{each.name} ({each.kind} {each.identification})"
             if each.certificate is None:
                 lines.append(
                     f"The scale rests on {named}, which has no certificate: it is not traceable to the SI."

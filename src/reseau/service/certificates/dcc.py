@@ -194,9 +194,9 @@ def _results(parent: Any, made: Certificate) -> None:
     _text(method, "name", "Expanded uncertainty")
     _text(
         method, "description",
-        "The expanded uncertainty is the standard uncertainty times the coverage factor of the t distribution "
-        "with the effective degrees of freedom (Welch-Satterthwaite), for a coverage probability of "
-        f"{made.probability:g}.",
+        "The expanded uncertainty is the standard uncertainty times the coverage factor of the t "
+        "distribution with the effective degrees of freedom (Welch-Satterthwaite), for a coverage "
+        f"probability of {made.probability:g}.",
     )  # fmt: skip
     _sub(method, "norm", "JCGM 100:2008")
     _sub(method, "norm", "JCGM 102:2011")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from ...core.errors import FormatError
 from ...core.numbers import power
 from ...core.optional import optional
 from ...core.version import __version__
-from ...report.template import rendered
 from .certificate import Certificate
 
 __all__ = ["attached", "html_of", "pages_digest", "pdf_of"]
@@ -28,11 +28,13 @@ _CATALOG = {
     "/StructTreeRoot", "/ViewerPreferences", "/Outlines", "/Version", "/Extensions", "/PageLabels",
     "/PageMode",
 }  # fmt: skip
-_FAMILY, _VARIANT = "DejaVu Serif", "pdf/a-3b"
+_FAMILY, _MONO, _VARIANT = "DejaVu Serif", "DejaVu Sans Mono", "pdf/a-3b"
 
 
 def html_of(certificate: Certificate) -> str:
     """Return the certificate as HTML page, without external resources."""
+    from ...report.template import rendered  # brings matplotlib
+
     made, found = certificate, certificate.parameters
     probability, at = made.probability, made.places
     return rendered(
@@ -120,9 +122,11 @@ def pdf_of(certificate: Certificate, xml: Callable[[str], bytes]) -> tuple[bytes
     with optional():
         import pypdf  # noqa: F401
         import weasyprint
+        from weasyprint.text.fonts import FontConfiguration
     page = weasyprint.HTML(string=html_of(certificate), url_fetcher=_no_resource)
-    style = weasyprint.CSS(string=_PAGE, url_fetcher=_no_resource)
-    document = page.render(stylesheets=[style], pdf_variant=_VARIANT)
+    fonts = FontConfiguration()
+    style = weasyprint.CSS(string=_style(), font_config=fonts)
+    document = page.render(stylesheets=[style], font_config=fonts, pdf_variant=_VARIANT)
     content = xml(pages_digest(document.write_pdf(pdf_variant=_VARIANT), "certificate"))
     document.metadata.attachments = [
         weasyprint.Attachment(
@@ -133,11 +137,33 @@ def pdf_of(certificate: Certificate, xml: Callable[[str], bytes]) -> tuple[bytes
     return document.write_pdf(pdf_variant=_VARIANT), content
 
 
-_PAGE = f"""
+def _style() -> str:
+    """Style of the printed pages, with the fonts of matplotlib: a machine may have none."""
+    import matplotlib
+
+    folder = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
+    faces = [
+        (_FAMILY, "", "normal", "normal"), (_FAMILY, "-Bold", "bold", "normal"),
+        (_FAMILY, "-Italic", "normal", "italic"), (_FAMILY, "-BoldItalic", "bold", "italic"),
+        (_MONO, "", "normal", "normal"),
+    ]  # fmt: skip
+    declared = [
+        f'@font-face {{ font-family: "{family}"; font-weight: {weight}; font-style: {slant}; '
+        f'src: url("{(folder / (family.replace(" ", "") + suffix + ".ttf")).as_uri()}"); }}'
+        for family, suffix, weight, slant in faces
+    ]
+    return (
+        "\n".join(declared)
+        + f"""
 body {{ font-family: "{_FAMILY}", serif; }}
+code {{ font-family: "{_MONO}", monospace; }}
+table {{ min-width: 120mm; }}
 @page {{ size: A4; margin: 16mm 14mm 18mm;
+  @bottom-left {{ content: string(identifier); font: 8pt "{_FAMILY}", serif; }}
   @bottom-right {{ content: counter(page) " / " counter(pages); font: 8pt "{_FAMILY}", serif; }} }}
+dl.first dd:first-of-type {{ string-set: identifier content(); }}
 """
+    )
 
 
 def _time(certificate: Certificate) -> Any:
