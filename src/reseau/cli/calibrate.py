@@ -46,6 +46,7 @@ from .measure import Channel
 if TYPE_CHECKING:
     from ..bundle import BoardChoice, Kind, ModelChoice
     from ..calibration import CameraMapping, FieldDifference, ProjectionField
+    from ..core.data import Frame
     from ..core.provenance import Provenance
     from ..io import BoardDesign, ReseauDesign, TestfieldDesign
     from ..procedures.calibration import Calibrated, CalibrationOptions, CameraOptions
@@ -219,7 +220,9 @@ def calibrate(
         for entry in done.result.network.cameras
     ]
     if report is not None:
-        _write_report(report, done, f"Calibration with {target.name}", provenance, differences, distance)
+        pictures = _pictures(photographs, channel)
+        title = f"Calibration with {target.name}"
+        _write_report(report, done, title, provenance, differences, distance, pictures)
     if out is not None:
         for calibration, path in zip(calibrations, done.files(out).values(), strict=True):
             calibration.write(path)
@@ -332,15 +335,27 @@ def _write_report(
     provenance: Provenance,
     differences: dict[str, FieldDifference],
     distances: list[float] | None,
+    pictures: Callable[[str], Frame | None],
 ) -> None:
     from ..io import write_whole
     from ..report.bundle import bundle_report
 
     page = bundle_report(
         done.result, title=title, provenance=provenance, against=differences, distances=distances or (),
-        assessments=done.assessments,
+        assessments=done.assessments, photograph=pictures,
     )  # fmt: skip
     write_whole(path, page)
+
+
+def _pictures(photographs: Mapping[str, Path], channel: Channel) -> Callable[[str], Frame | None]:
+    """The photographs, read again one by one: all of them would fill the memory."""
+    from ..io import is_points
+
+    def read(name: str) -> Frame | None:
+        path = photographs[name]
+        return None if is_points(path) else read_frame(path, channel.value)
+
+    return read
 
 
 def _frames(
@@ -420,7 +435,7 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
 
     from ..bundle import camera_mapping, projection_field_at, sigma_between_images
     from ..calibration import projection_field
-    from ..core.failure import Code
+    from ..procedures.assessment import sorted_remarks
 
     result = done.result
     for name, assessed in done.assessments.items():
@@ -460,13 +475,9 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     say_left_out(result)
     for name, why in done.declined.items():
         say(f"left out: {name}: {why}\n")
-    # Remarks concern the whole network; without an assessment all are warnings.
-    every = list(done.assessments.values())
-    tests = [remark for remark in result.warnings if every and all(remark in each.tests for each in every)]
-    covered = [remark for remark in result.warnings if every and remark.code is Code.COVERAGE]
-    for warning in result.warnings:
-        if warning not in tests and warning not in covered:
-            say(f"warning: {warning}\n")
+    warnings, tests = sorted_remarks(result, done.assessments.values())
+    for warning in warnings:
+        say(f"warning: {warning}\n")
     if tests:
         say("tests that are not passed, by amounts that the errors above contain:\n")
     for remark in tests:

@@ -7,6 +7,7 @@ noise. It is a size in pixels, not a test: with many points, a test finds errors
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -20,7 +21,7 @@ from ..core.errors import UsageError
 from ..core.failure import Code, Remark
 from .next_pose import NextPose, next_photograph
 
-__all__ = ["Assessment", "Use", "assess"]
+__all__ = ["Assessment", "Use", "assess", "sorted_remarks"]
 
 
 class Use(StrEnum):
@@ -105,15 +106,17 @@ class Assessment:
         """The verdict in two lines."""
         first = f"{_FOR[self.use]}: "
         if np.isfinite(self.corners_px):
-            first += f"{self.centre_px:.2g} px at the centre, {self.corners_px:.2g} px in the corners"
+            first += f"{_two(self.centre_px)} px at the centre, {_two(self.corners_px)} px in the corners"
             far = 1e3 * self.corners_px / self.focal_px
-            first += f" ({far:.2g} mm at 1 m)" if np.isfinite(far) else ""
+            first += f" ({_two(far)} mm at 1 m)" if np.isfinite(far) else ""
         else:
             first += "the projection is not determined in the corners"
-        if self.fits:
+        if self.use is Use.NOTHING and self.fits:
+            first += "; the photographs do not determine the camera"
+        elif self.fits:
             first += f"; the model fits (to {_rounded(self.misfit_px)})"
         else:
-            first += f"; the model does not fit by {self.misfit_px:.2g} px: try --model auto"
+            first += f"; the model does not fit by {_two(self.misfit_px)} px: try --model auto"
         second = "the image is covered"
         if self.uncovered:
             second = f"not covered, and extrapolated there: {_listed(self.uncovered)}"
@@ -123,7 +126,7 @@ class Assessment:
             then = self.next_photograph
             enough = self.use is Use.MEASUREMENT and not self.uncovered and self.images >= _ENOUGH
             second += "; more photographs are not needed; most would help" if enough else "; photograph next"
-            second += f": {then.words} (then {then.worst_px:.2g} px at most)"
+            second += f": {then.words} (then {_two(then.worst_px)} px at most)"
         elif not self.uncovered:
             second += "; no further photograph is needed"
         return first, second
@@ -209,6 +212,34 @@ def assess(result: Result, camera: int = 0) -> Assessment:
     )  # fmt: skip
 
 
+def sorted_remarks(
+    result: Result, assessments: Iterable[Assessment]
+) -> tuple[tuple[Remark, ...], tuple[Remark, ...]]:
+    """Warnings about an adjustment, and remarks of tests whose effect the errors of all cameras contain.
+
+    Parameters
+    ----------
+    result : Result
+        The adjustment.
+    assessments : iterable of Assessment
+        Those of its cameras. Without any, all remarks are warnings.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> result = adjust_network(example_network())
+    >>> len(sorted_remarks(result, ())[0]) == len(result.warnings)
+    True
+    """
+    every = tuple(assessments)
+    if not every:
+        return tuple(result.warnings), ()
+    tests = tuple(remark for remark in result.warnings if all(remark in each.tests for each in every))
+    # What is not covered is part of the verdict.
+    rest = (remark for remark in result.warnings if remark not in tests)
+    return tuple(remark for remark in rest if remark.code is not Code.COVERAGE), tests
+
+
 def _covered(xy: Array, lens: CameraMapping) -> Mask:
     """Cells of the image that have points, or a neighbour that has."""
     cell = np.clip((xy / np.array(lens.size) * _CELLS).astype(int), 0, _CELLS - 1)
@@ -260,6 +291,11 @@ def _few_gross_errors(result: Result, count: int) -> bool:
     """Whether fewer than a hundredth of the image points have test values above the limit of snooping."""
     w = result.test_values[~result.rejected]
     return bool((np.nan_to_num(w) > 4).sum() < max(0.01 * count, 5))
+
+
+def _two(value: float) -> str:
+    """Two significant digits, never with an exponent for large values."""
+    return f"{value:.0f}" if value >= 99.5 else f"{value:.2g}"
 
 
 def _rounded(value: float) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,15 +11,16 @@ from markupsafe import Markup
 from ..bundle import Result, camera_mapping, projection_field_at, sigma_between_images
 from ..bundle.network.shutter import MOTION
 from ..calibration import CameraMapping, FieldDifference, projection_field
-from ..core.data import Rows
-from ..core.failure import Remark
+from ..core.data import Frame, Rows
+from ..core.figures import nice
 from ..core.numbers import plain, power
 from ..core.provenance import Provenance
 from ..optics.cameras import unit_of
-from ..procedures.assessment import Assessment
+from ..procedures.assessment import Assessment, sorted_remarks
 from .bundle_figures import distortion_figure, network_figure, next_figure, residual_figure
 from .bundle_tables import components_table, dropped_table, images_table, left_out_table, worst_points
 from .fields import difference_figure, uncertainty_figure
+from .overlay import Marks, frame_overlay
 from .patterns import patterns_of
 from .tables import unit_text
 from .template import rendered
@@ -27,6 +28,10 @@ from .template import rendered
 __all__ = ["bundle_report"]
 
 _IMAGES, _CAMERAS, _PLACES = 200, 20, 45
+_PHOTOGRAPHS, _ACROSS = 8, 800
+"""Number of photographs that are shown, and their width in pixels."""
+_LONG = 0.03
+"""Length of a large residual in a photograph, of its width."""
 
 
 def bundle_report(
@@ -37,6 +42,7 @@ def bundle_report(
     against: Mapping[str, FieldDifference] | None = None,
     distances: Sequence[float] = (),
     assessments: Mapping[str, Assessment] | None = None,
+    photograph: Callable[[str], Frame | None] | None = None,
 ) -> str:
     """Render the report of a bundle adjustment.
 
@@ -55,6 +61,9 @@ def bundle_report(
         default the median distance of the points.
     assessments : mapping of str to Assessment, optional
         What the calibrations of the cameras are good for, by their names.
+    photograph : callable, optional
+        Returns the photograph of an image, or None where there is none; those with the largest residuals are
+        shown.
 
     Returns
     -------
@@ -62,13 +71,14 @@ def bundle_report(
         An HTML page without any external resource and without clock times.
     """
     cameras = [_camera(result, c, distances) for c in _shown(result)[:_CAMERAS]]
+    warnings, tests = sorted_remarks(result, (assessments or {}).values())
     return rendered(
         "bundle.html.j2",
         title=title,
         summary=_summary(result),
         verdicts=[_verdict(result, name, each) for name, each in (assessments or {}).items()],
-        warnings=_warnings(result, assessments or {}),
-        tests=_tests(result, assessments or {}),
+        warnings=warnings,
+        tests=tests,
         network=Markup(network_figure(result)),
         components=components_table(result),
         dropped=dropped_table(result),
@@ -80,6 +90,8 @@ def bundle_report(
         images=images_table(result)[:_IMAGES],
         more_images=max(0, len(result.network.images) - _IMAGES),
         worst=worst_points(result),
+        photographs=[] if photograph is None else _photographs(result, photograph),
+        more_photographs=max(0, int(result.fit.usable.images.sum()) - _PHOTOGRAPHS),
         patterns=patterns_of(result),
         differences=[_difference(name, found) for name, found in (against or {}).items()],
         left_out=left_out_table(result)[:_IMAGES],
@@ -101,15 +113,36 @@ def _verdict(result: Result, name: str, assessed: Assessment) -> dict[str, Any]:
     }
 
 
-def _tests(result: Result, assessments: Mapping[str, Assessment]) -> list[Remark]:
-    """Remarks whose effect is contained in the errors of all cameras."""
-    every = list(assessments.values())
-    return [remark for remark in result.warnings if every and all(remark in each.tests for each in every)]
-
-
-def _warnings(result: Result, assessments: Mapping[str, Assessment]) -> list[Remark]:
-    tests = _tests(result, assessments)
-    return [remark for remark in result.warnings if remark not in tests]
+def _photographs(result: Result, photograph: Callable[[str], Frame | None]) -> list[dict[str, Any]]:
+    """Photographs with the largest residuals, in their order, with their marks."""
+    network = result.network
+    good = result.fit.usable.observations & ~result.rejected
+    squares = np.where(good, np.nan_to_num(result.residuals**2).sum(axis=1), 0.0)
+    count = np.bincount(network.image_of[good], minlength=len(network.images))
+    mean = np.bincount(network.image_of, squares, len(network.images)) / np.maximum(count, 1)
+    usable = np.flatnonzero(result.fit.usable.images & (count > 0))
+    large = float(np.quantile(np.sqrt(squares[good]), 0.95)) if good.any() else 0.0
+    found = []
+    for i in sorted(usable[np.argsort(-mean[usable], kind="stable")][:_PHOTOGRAPHS]):
+        frame = photograph(network.images[i])
+        if frame is None:
+            continue
+        rows = np.flatnonzero(network.image_of == i)
+        enlarged = nice(_LONG * frame.width / large) if large > 0 else 1.0
+        shifts = np.where(good[rows, None], enlarged * result.residuals[rows], np.nan)
+        names = tuple(network.points[j] for j in network.point_of[rows])
+        marks = Marks(names, network.xy[rows], good[rows], shifts=shifts)
+        found.append(
+            {
+                "name": network.images[i],
+                "picture": frame_overlay(frame, marks, _ACROSS),
+                "points": int(good[rows].sum()),
+                "rejected": int((~good[rows]).sum()),
+                "enlarged": f"{enlarged:g}",
+                "longest": f"{np.sqrt(squares[rows].max()):.2g}",
+            }
+        )
+    return found
 
 
 def _shown(result: Result) -> list[int]:

@@ -99,7 +99,7 @@ def residual_figure(result: Result, c: int, rows: Rows) -> str:
             gx, gy, mean[:, 0].reshape(gx.shape), mean[:, 1].reshape(gx.shape), color=ACCENT, angles="xy",
             scale_units="xy", scale=scale, width=0.004,
         )  # fmt: skip
-        left.set_title(f"coverage and mean residuals (longest {longest:.3f} px)")
+        image_axes(left, camera.width, camera.height, f"mean residuals; longest {longest:.2g} px")
         w = result.test_values[rows]
         w = w[np.isfinite(w)]
         bins = np.linspace(0, 5, 41)
@@ -107,7 +107,9 @@ def residual_figure(result: Result, c: int, rows: Rows) -> str:
             np.minimum(w, 5), bins=list(bins), density=True, color=PALE, edgecolor=FAINT, linewidth=0.4
         )
         right.plot(bins, np.sqrt(2 / np.pi) * np.exp(-(bins**2) / 2), color=INK, linewidth=1)
-        right.set_title("test values w and the normal distribution")
+        right.set_title("test values and normal distribution", loc="left")
+        right.set_xlabel("|w|")
+        right.set_ylabel("density")
         return to_svg(figure)
 
 
@@ -155,11 +157,15 @@ def distortion_figure(lens: CameraMapping) -> str | None:
         )
         left.plot(r, curve, color=INK, linewidth=1)
         left.axhline(0, color=FAINT, linewidth=0.6, zorder=0)
-        left.set_title(f"radial distortion ± {_BAND:g} σ [px] by radius [px]")
+        left.set_title(f"radial distortion ± {_BAND:g} σ", loc="left")
+        left.set_ylabel("px")
+        for axes in (left, right):
+            axes.set_xlabel("radius / px")
         right.fill_between(r, 0, _BAND * sigma, color=PALE, linewidth=0)
         right.plot(r, sigma, color=ACCENT, linewidth=1)
         right.set_ylim(bottom=0)
-        right.set_title(f"its σ [px]; up to {_BAND:g} σ in grey")
+        right.set_title(f"its σ; up to {_BAND:g} σ in grey", loc="left")
+        right.set_ylabel("px")
         return to_svg(figure)
 
 

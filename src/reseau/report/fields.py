@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..calibration import FieldDifference, ProjectionField
 from ..core.data import Array
-from ..core.figures import ACCENT, FAINT, INK, draw_contours, drawing, nice, to_svg
+from ..core.figures import ACCENT, FAINT, INK, draw_contours, drawing, image_axes, nice, to_svg
 
 __all__ = ["difference_figure", "uncertainty_figure"]
 
@@ -39,7 +40,7 @@ def uncertainty_figure(field: ProjectionField, points: Array | None = None) -> s
         if points is not None:
             axes.plot(*points[:: max(1, len(points) // 4000)].T, ",", color=FAINT, alpha=0.6, zorder=3)
         draw_contours(axes, field.xy, field.sigma)
-        axes.set_title("σ of the projection in the worst direction [px]")
+        _label_axes(axes, field.xy, "σ of the projection in the worst direction [px]")
         return to_svg(figure)
 
 
@@ -78,5 +79,12 @@ def difference_figure(found: FieldDifference) -> str:
                 *xy[chosen].T, *(enlarged * d[chosen]).T, color=colour, angles="xy", scale_units="xy",
                 scale=1, width=0.003, zorder=4,
             )  # fmt: skip
-        axes.set_title(f"difference × {enlarged:g} over its σ [px]; longest {longest:.2g} px")
+        _label_axes(axes, found.xy, f"difference × {enlarged:g} over its σ [px]; longest {longest:.2g} px")
         return to_svg(figure)
+
+
+def _label_axes(axes: Axes, xy: Array, title: str) -> None:
+    """Title and axes in pixels, within the places (rows, columns, 2) of the field."""
+    limits = axes.axis()
+    image_axes(axes, xy[..., 0].max(), xy[..., 1].max(), title)
+    axes.axis(limits)

@@ -57,6 +57,8 @@ class Marks:
         Arcs to draw instead of circles.
     labels : dict
         Labels by name.
+    shifts : ndarray (n, 2), optional
+        Lines from the marks, in pixels of the frame; none for NaN.
     """
 
     ids: tuple[str, ...]
@@ -65,6 +67,7 @@ class Marks:
     check: tuple[str, ...] = ()
     arcs: Arcs | None = None
     labels: dict[str, str] = field(default_factory=dict)
+    shifts: Array | None = None
 
 
 def preview(frame: Frame, width: int = _WIDTH) -> NDArray[np.uint8]:
@@ -80,7 +83,7 @@ def preview(frame: Frame, width: int = _WIDTH) -> NDArray[np.uint8]:
     return grey
 
 
-def frame_overlay(frame: Frame, marks: Marks) -> str:
+def frame_overlay(frame: Frame, marks: Marks, across: int = _WIDTH) -> str:
     """Draw marks over the frame.
 
     Parameters
@@ -89,18 +92,20 @@ def frame_overlay(frame: Frame, marks: Marks) -> str:
         The frame.
     marks : Marks
         The marks.
+    across : int
+        Largest width of the picture, pixels; the marks keep their places.
 
     Returns
     -------
     str
         An SVG element in the pixels of the frame.
     """
-    _, coded = cv2.imencode(".jpg", preview(frame), [cv2.IMWRITE_JPEG_QUALITY, 82])
+    _, coded = cv2.imencode(".jpg", preview(frame, across), [cv2.IMWRITE_JPEG_QUALITY, 82])
     picture = base64.b64encode(coded.tobytes()).decode()
     unit = frame.width / 1000
     width, height = frame.width, frame.height
     parts = [
-        f'<svg class="frame" viewBox="-0.5 -0.5 {width} {height}" role="img">',
+        f'<svg class="frame" viewBox="-0.5 -0.5 {width} {height}">',
         f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" '
         f'href="data:image/jpeg;base64,{picture}"/>',
     ]
@@ -119,6 +124,9 @@ def frame_overlay(frame: Frame, marks: Marks) -> str:
             shape = f'<circle cx="{x:.2f}" cy="{y:.2f}" r="{7.5 * unit:.2f}"/>'
         else:
             shape = _arc(x, y, marks.arcs, i, 3.5 * unit)
+        if marks.shifts is not None and np.isfinite(marks.shifts[i]).all():
+            dx, dy = marks.shifts[i]
+            shape += f'<path d="M{x:.2f} {y:.2f}l{dx:.2f} {dy:.2f}" stroke="{ACCENT}"/>'
         parts.append(f'<g fill="none" stroke="{colours[i]}" stroke-width="{1.7 * unit:.2f}">{shape}</g>')
     for row, x, y in _placed(marks, 12.0 * unit):
         parts.append(_label(x, y, marks.labels[marks.ids[row]], colours[row], 12.0 * unit))

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from itertools import count
 
 import jinja2
+from markupsafe import Markup
 
-__all__ = ["rendered"]
+__all__ = ["TEMPLATES", "environment", "rendered"]
+
+TEMPLATES = (
+    "applied.html.j2",
+    "blurred_network.html.j2",
+    "bundle.html.j2",
+    "oscilloscope.html.j2",
+    "roll.html.j2",
+    "sensor.html.j2",
+)
+"""Those of pages; the others are parts."""
+_WIDE_PT = 450.0
 
 
 def rendered(template: str, **content: object) -> str:
@@ -20,13 +33,30 @@ def rendered(template: str, **content: object) -> str:
     content : object
         Values of the template; a missing one is an error.
     """
-    environment = jinja2.Environment(
+    # Numbered in order of appearance, which depends on the steps done.
+    counters = {"figure": partial(next, count(1)), "table": partial(next, count(1))}
+    return environment().get_template(template).render(content, **counters)
+
+
+def environment() -> jinja2.Environment:
+    """Return the templates, and what they may use."""
+    found = jinja2.Environment(
         loader=jinja2.PackageLoader("reseau.report"),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    # Numbered in order of appearance, which depends on the steps done.
-    counters = {"figure": partial(next, count(1)), "table": partial(next, count(1))}
-    return environment.get_template(template).render(content, **counters)
+    found.filters["named_by"] = _named_by
+    return found
+
+
+def _named_by(svg: str, element: str) -> Markup:
+    """An SVG element as one picture for screen readers, with the text of another element as its name.
+
+    Wide drawings are scrolled on a narrow page: their text would be too small.
+    """
+    named = str(svg).replace("<svg", f'<svg role="img" aria-labelledby="{element}"', 1)
+    width = re.search(r'^<svg [^>]*?\bwidth="([\d.]+)pt"', named)
+    wide = width is not None and float(width[1]) > _WIDE_PT
+    return Markup(f'<div class="wide" tabindex="0">{named}</div>' if wide else named)

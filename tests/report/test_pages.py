@@ -1,0 +1,107 @@
+"""Pages for everybody: alternative texts, headings in order, a dark scheme, nothing from outside."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from reseau.bundle import adjust_network, example_network
+from reseau.core.data import Frame
+from reseau.procedures.assessment import assess
+from reseau.report import applied_report, oscilloscope_report
+from reseau.report.bundle import bundle_report
+from reseau.report.template import TEMPLATES, environment
+
+from .conftest import Bench
+
+FRAME = Frame(np.random.default_rng(2).integers(0, 255, (120, 160)).astype(np.uint8), 255.0, "photo")
+
+
+class Outline(HTMLParser):
+    """Levels of the headings, the names of pictures, texts by their ids, and links to other files."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.levels: list[int] = []
+        self.named_by: list[str | None] = []
+        self.unnamed = 0
+        self.texts: dict[str, str] = {}
+        self.links: list[str] = []
+        self._inside: str | None = None
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        if re.fullmatch("h[1-6]", tag):
+            self.levels.append(int(tag[1]))
+        if tag == "svg":
+            self.named_by.append(given.get("aria-labelledby") if given.get("role") == "img" else None)
+        if tag == "img":
+            self.unnamed += not given.get("alt")
+        if tag == "figcaption":
+            self._inside = given.get("id") or ""
+            self.texts[self._inside] = ""
+        self.links += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+
+    def handle_data(self, data: str) -> None:
+        if self._inside is not None:
+            self.texts[self._inside] += data
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag == "figcaption":
+            self._inside = None
+
+
+def bundle_page() -> str:
+    result = adjust_network(example_network()).required()
+    return bundle_report(
+        result, title="Block", assessments={"camera": assess(result)}, photograph=lambda name: FRAME
+    )
+
+
+@pytest.mark.parametrize("kind", ["bundle", "oscilloscope", "applied"])
+def test_a_page_has_named_pictures_headings_in_order_and_nothing_from_outside(
+    bench: Bench, kind: str
+) -> None:
+    if kind == "bundle":
+        page = bundle_page()
+    elif kind == "oscilloscope":
+        page = oscilloscope_report(
+            bench.first, bench.world.design, bench.second, bench.world.test_object, (bench.third,),
+            frames=(FRAME, FRAME, FRAME), truth=bench.truth,
+        )  # fmt: skip
+    else:
+        page = applied_report(bench.world.test_object, (bench.third,), frames=(FRAME,))
+    found = Outline(page)
+    assert len(found.named_by) >= (2 if kind == "applied" else 6)
+    for name in found.named_by:
+        assert name is not None
+        assert len(found.texts[name].split()) > 5
+    assert found.unnamed == 0
+    assert found.levels[0] == 1
+    assert found.levels.count(1) == 1
+    steps = np.diff(found.levels)
+    assert steps.max(initial=0) <= 1
+    assert all(link.startswith(("#", "data:")) for link in found.links)
+    assert "@media screen and (prefers-color-scheme: dark)" in page
+    assert not re.search(r"url\((?!#)|@import|<script", page)
+
+
+def test_all_pages_have_one_frame_and_one_way_to_show_figures_and_tables() -> None:
+    loader = environment().loader
+    assert loader is not None
+    names = [name for name in loader.list_templates() if not name.startswith("_")]
+    assert len(names) > 10
+    for name in names:
+        text = loader.get_source(environment(), name)[0]
+        assert "<figure" not in text
+        assert "<html" not in text
+        assert text.count("<table") == text.count('<div class="wide" tabindex="0"><table')
+        if name in TEMPLATES:
+            assert text.startswith('{% extends "_page.html.j2" %}')
