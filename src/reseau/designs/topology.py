@@ -189,13 +189,22 @@ class TopologicalCode:
         Decoded
             Falsy, with the reason, if no cluster or more than one matches.
         """
-        symbols = np.asarray(seen).reshape(_PLACES)
-        visible = symbols != HIDDEN
-        hidden = int(_PLACES - visible.sum())
-        wrong = ((self.appearances != symbols) & visible).sum(axis=2)
-        best = int(wrong.argmin())
+        return self.decoded(np.asarray(seen).reshape(1, _PLACES))[0]
+
+    def decoded(self, seen: Symbols) -> tuple[Decoded, ...]:
+        """Identify clusters (s, 16); see :meth:`decode`."""
+        visible = seen != HIDDEN
+        hidden = (_PLACES - visible.sum(axis=1)).tolist()
+        every = self.appearances.reshape(-1, _PLACES)
+        wrong = ((every != seen[:, None]) & visible[:, None]).sum(axis=2)
+        best = wrong.argmin(axis=1)
+        least = np.take_along_axis(wrong, best[:, None], 1)[:, 0].tolist()
+        given = zip(best.tolist(), least, hidden, strict=True)
+        return tuple(self._decoded(*one) for one in given)
+
+    def _decoded(self, best: int, corrections: int, hidden: int) -> Decoded:
+        """A cluster that differs least from one appearance, in `corrections` targets."""
         way, square = divmod(best, len(self.clusters))
-        corrections = int(wrong.flat[best])
         if 2 * corrections + hidden >= self.distance:
             # Within half the distance there is at most one word; beyond it there may be two, or none.
             why = f"{corrections} of its {_PLACES - hidden} visible targets fit no square of the design"

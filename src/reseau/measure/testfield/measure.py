@@ -24,6 +24,7 @@ from ..points import Measured, Reason
 from ..response import Samples
 from ..screening import screen
 from ..tone import FoundCurve, find_curve
+from .lattice import median
 from .lattice_fit import LatticeFit, common_part, refit
 from .lattice_mapping import images_of, slope_of, stretches
 from .motion import MovedShape, anisotropy, path_of, spread_of
@@ -384,8 +385,8 @@ class _Measurement:
         depth = found.contrast[large] * (found.level[large] if scene.design.polarity == "dark" else 1.0)
         if not large.any():
             return True
-        wider = float(np.median(found.psf_px[large])) - scene.psf_px
-        return abs(float(np.median(depth / amplitude)) - 1) < _SAME_LIGHT and abs(wider) < _SAME_PSF_PX
+        wider = median(found.psf_px[large]) - scene.psf_px
+        return abs(median(depth / amplitude) - 1) < _SAME_LIGHT and abs(wider) < _SAME_PSF_PX
 
     def _reshaped(
         self, wanted: Rows, found: Matches, why: Array, predicted: Array
@@ -450,7 +451,7 @@ class _Measurement:
         bright = curve.light(level, full_scale)
         amplitude = sign * (curve.light(level + sign * contrast, full_scale) - bright)
         light = Light.through(xy, bright, amplitude, scene.light.size)
-        scale = float(np.median(amplitude / contrast))
+        scale = median(amplitude / contrast)
         grey = curve.light(scene.grey, full_scale)
         return replace(scene, grey=grey, light=light, noise=scene.noise * scale)
 
@@ -492,7 +493,7 @@ class _Measurement:
     def _spread(self, first: Matches, sure: Mask, rows: Rows) -> Array:
         """Anisotropy of the point-spread function, from the residuals of matched targets."""
         # What lies over a target looks like motion, too.
-        some = np.flatnonzero(sure & (first.noise <= np.median(first.noise[sure])))
+        some = np.flatnonzero(sure & (first.noise <= median(first.noise[sure])))
         some = some[np.linspace(0, len(some) - 1, min(_MOST_FIRST, len(some))).astype(np.intp)]
         samples, formed = _samples(self.scene, rows[some], first.select(some))
         left = np.where(samples.used, samples.grey - formed, np.nan) / samples.depth[:, None, None]
@@ -521,10 +522,10 @@ class _Measurement:
         plain = large if large.sum() >= _LEAST_FIRST else sure
         amplitude = first.contrast * (first.level if scene.design.polarity == "dark" else 1.0)
         light = Light.through(first.xy[plain], first.level[plain], amplitude[plain], scene.light.size)
-        psf_px = float(np.median(first.psf_px[plain]))
+        psf_px = median(first.psf_px[plain])
         # The light of neighbours was not known well yet: the targets with small residuals give the noise.
         noise = float(np.quantile(first.noise[sure], 0.2))
-        self.growth = float(np.median(first.form[plain, 0]))
+        self.growth = median(first.form[plain, 0])
         self.scene = replace(scene, mapping=mapping, light=light, psf_px=psf_px, noise=noise)
         self._place()
 
@@ -541,7 +542,7 @@ class _Measurement:
             found = replaced(found, ~amiss, match_targets(self.scene, self.rows, self._among(amiss)))
         if not found.converged.any():
             return found
-        usual = np.median(found.contrast[found.converged])
+        usual = median(found.contrast[found.converged])
         # The contrast itself has a relative standard deviation of 1/t.
         doubt = 4 / np.maximum(found.t, 1.0)
         veiled = found.converged & (np.abs(found.contrast / usual - 1) > _VEILED + doubt)
@@ -566,7 +567,7 @@ class _Measurement:
     @staticmethod
     def _uneasy(found: Matches) -> Mask:
         """Targets with larger residuals than the others, or that did not converge."""
-        ordinary = np.median(found.noise[found.converged]) if found.converged.any() else np.inf
+        ordinary = median(found.noise[found.converged]) if found.converged.any() else np.inf
         uneasy = ~found.converged | (found.noise > _HIGH_RESIDUALS * ordinary) | (found.rejected > 0.02)
         return np.asarray(uneasy)
 
@@ -610,7 +611,7 @@ class _Measurement:
         predicted = images_of(mapping, self.at)
         off = np.hypot(*(found.xy - predicted[wanted]).T)
         # The median distance in a plane is 1.18 standard deviations of a coordinate.
-        ordinary = float(np.median(off[good])) / 1.18 if good.any() else 0.0
+        ordinary = median(off[good]) / 1.18 if good.any() else 0.0
         sigma = np.sqrt(np.trace(found.cov, axis1=1, axis2=2) / 2)
         limit = np.maximum(self.options.neighbour_px, _FAR * np.hypot(ordinary, np.nan_to_num(sigma)))
         for k in np.flatnonzero(good & (off > limit)):
@@ -633,8 +634,7 @@ class _Measurement:
             ]
         amplitude = found.contrast * found.level
         width, contrast, noise, usual = (
-            float(np.median(values[sure]))
-            for values in (found.psf_px, found.contrast, found.noise, amplitude)
+            median(values[sure]) for values in (found.psf_px, found.contrast, found.noise, amplitude)
         )
         # Light that is added to that of a target changes its contrast, but not its depth.
         pale = np.minimum(np.abs(found.contrast / contrast - 1), np.abs(amplitude / usual - 1))

@@ -30,7 +30,7 @@ from ...io import TestfieldDesign
 from ...optics.formation import Outline, PixelResponse
 from ..matching import SIZE, GrownOutline, Window
 from ..screening import quiet_noise
-from .lattice import Ridges, find_lattices, ridge_points
+from .lattice import Ridges, find_lattices, median, ridge_points
 from .lattice_fit import LatticeFit, lattices
 from .lattice_mapping import images_of, reduced, slope_of, straightened, stretches
 from .line_profiles import blur_of
@@ -178,7 +178,7 @@ def read_clusters(
         psf_px = better
     alone, joint = work.classified(found)
     code = TopologicalCode.of(design)
-    decoded = tuple(code.decode(symbols) for symbols in joint)
+    decoded = code.decoded(joint)
     level, contrast = (np.where(joint == HIDDEN, np.nan, values) for values in (found.level, found.contrast))
     return Reading(work.cell, alone, joint, decoded, work.xy, level, contrast, better)
 
@@ -266,15 +266,15 @@ class _Clusters:
             left = (seen**2).sum(axis=2)[:, :, None] - (part**2).sum(axis=3)
             rest[of] = np.maximum(left, 0) / pixels[group]
         best = rest.argmin(axis=2)[..., None]
-        noise = max(float(np.median(np.take_along_axis(rest, best, 2)[self.visible])), _LEAST_VARIANCE)
+        noise = max(median(np.take_along_axis(rest, best, 2)[self.visible].ravel()), _LEAST_VARIANCE)
         amplitude = self.sign * x[..., 1]
         level, contrast, _, _, wider = np.moveaxis(np.take_along_axis(x, best[..., None], 2)[:, :, 0], 2, 0)
-        ordinary = np.median(np.abs(contrast[self.visible]))
+        ordinary = median(np.abs(contrast[self.visible]))
         shift = np.hypot(x[..., 2], x[..., 3]) / np.maximum(amplitude, 1e-9)
         cost = 0.5 * pixels[self.group][:, None, None] * rest / noise + 0.5 * (shift / _SHIFT_PX) ** 2
         cost[amplitude < _FAINT * ordinary] = np.inf
         by_symbol = [cost[..., self.kinds.symbol == symbol].min(axis=2) for symbol in range(8)]
-        widening = float(np.median((wider / np.where(contrast == 0, np.inf, contrast))[self.visible]))
+        widening = median((wider / np.where(contrast == 0, np.inf, contrast))[self.visible])
         left = np.maximum(_UNLIKE, _UNEXPLAINED * self.variance / noise)
         none = 0.5 * pixels[self.group][:, None] * left
         return _Comparison(np.stack(by_symbol, axis=2), none, level, np.abs(contrast), widening)
@@ -285,11 +285,9 @@ class _Clusters:
         cost = np.minimum(cost, 1e6 * found.none.max())
         alone = np.where(cost.min(axis=2) < found.none, cost.argmin(axis=2), HIDDEN)
         joint = np.full(alone.shape, HIDDEN)
-        for square, each in enumerate(cost):
-            # Each symbol occurs twice, or the target is unknown.
-            choices = np.concatenate(
-                [np.repeat(each, 2, axis=1), np.repeat(found.none[square, :, None], 16, axis=1)], axis=1
-            )
+        # Each symbol occurs twice, or the target is unknown.
+        unknown = np.broadcast_to(found.none[..., None], (*found.none.shape, 16))
+        for square, choices in enumerate(np.concatenate([np.repeat(cost, 2, axis=2), unknown], axis=2)):
             row, column = linear_sum_assignment(choices)
             joint[square, row] = np.where(column < 16, column // 2, HIDDEN)
         return alone, joint
@@ -360,14 +358,15 @@ def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
     """
     votes: Counter[tuple[bool, int, int, int]] = Counter()
     best: dict[tuple[bool, int, int, int], int] = {}
-    for cell, decoded in zip(reading.cell, reading.decoded, strict=True):
-        if decoded:
-            turn = _quarter(decoded.quarter_turns)
-            origin = cell + 0.5 - turn @ design.centres[decoded.square - 1] / design.pitch
-            key = np.rint(2 * origin).astype(int)
-            vote = decoded.mirrored, decoded.quarter_turns, int(key[0]), int(key[1])
-            votes[vote] += 1
-            best[vote] = min(best.get(vote, 16), decoded.corrections + decoded.hidden)
+    known = [k for k, decoded in enumerate(reading.decoded) if decoded]
+    squares = [reading.decoded[k] for k in known]
+    turned = _QUARTERS[[decoded.quarter_turns for decoded in squares]].reshape(-1, 2, 2)
+    centres = design.centres[[decoded.square - 1 for decoded in squares]].reshape(-1, 2)
+    origins = reading.cell[known] + 0.5 - np.einsum("sij,sj->si", turned, centres) / design.pitch
+    for decoded, (right, up) in zip(squares, np.rint(2 * origins).astype(int).tolist(), strict=True):
+        vote = decoded.mirrored, decoded.quarter_turns, right, up
+        votes[vote] += 1
+        best[vote] = min(best.get(vote, 16), decoded.corrections + decoded.hidden)
     in_sight = int(((reading.joint != HIDDEN).sum(axis=1) >= 8).sum())
     least = min(_SHARE_READ * in_sight, _AGREE)
     likely, most = votes.most_common(1)[0] if votes else ((False, 0, 0, 0), 0)
@@ -375,10 +374,10 @@ def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
     others = votes.total() - most
     if most < least and (together := _placed_together(reading, design)) is not None:
         # At the limit of resolution few of the squares in sight can be read, each by itself.
-        turns, *origin = together[0]
-        agreeing = votes[(False, turns, *origin)]
+        turns, right, up = together[0]
+        agreeing = votes[False, turns, right, up]
         if votes.total() - agreeing <= max(1, _CONTRADICT * agreeing):
-            return Placement(_quarter(turns) / design.pitch, np.array(origin) / 2, together[1])
+            return Placement(_QUARTERS[turns] / design.pitch, np.array([right, up]) / 2, together[1])
     if not votes:
         return Failure(
             f"{in_sight} squares are visible, but none belongs to the design {design.name!r}",
@@ -403,7 +402,7 @@ def locate(reading: Reading, design: TestfieldDesign) -> Placement | Failure:
             f"only {most} of {in_sight} visible squares belong to the design {design.name!r}",
             Code.OTHER_DESIGN,
         )
-    return Placement(_quarter(quarters) / design.pitch, np.array(doubled) / 2, most)
+    return Placement(_QUARTERS[quarters] / design.pitch, np.array(doubled) / 2, most)
 
 
 def _placed_together(reading: Reading, design: TestfieldDesign) -> tuple[tuple[int, int, int], int] | None:
@@ -426,7 +425,7 @@ def _placed_together(reading: Reading, design: TestfieldDesign) -> tuple[tuple[i
     agree = looks.reshape(len(looks), -1) @ one[known].reshape(len(known), -1).T
     seen = visible.sum(axis=1)
     # The origin of the lattice that each square of the design, in each rotation, gives to each cell.
-    centres = np.concatenate([design.centres @ _quarter(turns).T for turns in range(4)]) / design.pitch
+    centres = np.concatenate([design.centres @ turn.T for turn in _QUARTERS]) / design.pitch
     origin = np.rint(2 * (reading.cell[:, None] + 0.5 - centres)).astype(np.int64)
     turns = np.repeat(np.arange(4), len(design.centres))
     first, span = origin.min(axis=(0, 1)), np.ptp(origin, axis=(0, 1)) + 1
@@ -451,9 +450,8 @@ def _placed_together(reading: Reading, design: TestfieldDesign) -> tuple[tuple[i
     return (quarters, int(right), int(up)), int(better[best])
 
 
-def _quarter(turns: int) -> Array:
-    """Rotation matrix for a number of quarter turns from x to y."""
-    return np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), turns)
+_QUARTERS = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]], float)
+"""Rotation matrices for 0 to 3 quarter turns from x to y."""
 
 
 _BLURRED_PX, _SHARP_PX = 1.8, 0.7

@@ -22,6 +22,7 @@ from ...io import TestfieldDesign
 from ...optics import Chain
 from ...optics.formation import PixelResponse
 from ..matching import FormedShape, Matches, MatchOptions, Shape, ShapeSubset, Window, match
+from .lattice import median
 from .lattice_mapping import images_of, slope_of
 from .line_profiles import blur_of
 from .motion import MovedShape, steps_of
@@ -49,22 +50,10 @@ class Light:
     @classmethod
     def through(cls, xy: Array, level: Array, contrast: Array, size: tuple[float, float]) -> Light:
         """Fit to values at points (n, 2), twice: the second time without outliers."""
-        design = _quadratic(xy, size)
-        found = []
-        for values in (level, contrast):
-            finite = keep = np.isfinite(values)
-            for _ in range(3):
-                some = design[keep]
-                # A few points, or points on a line, do not determine all coefficients.
-                normal, right = some.T @ some, some.T @ values[keep]
-                normal.flat[::7] += _UNDETERMINED * (1.0 + np.trace(normal))
-                fitted: Array = np.linalg.solve(normal, right).astype(np.float64)
-                off = np.abs(values - design @ fitted)
-                before, keep = keep, finite & (off <= 4 * np.median(off[keep]) + 1e-9)
-                if (keep == before).all():
-                    break
-            found.append(fitted)
-        return cls(found[0], found[1], size)
+        from .compiled import illumination  # takes half a second to import; not every command needs it
+
+        level, contrast = illumination(_quadratic(xy, size), np.stack([level, contrast]), _UNDETERMINED)
+        return cls(level, contrast, size)
 
     def at(self, xy: Array) -> tuple[Array, Array]:
         """Level and contrast (n,) at points (n, 2)."""
@@ -355,7 +344,7 @@ class _Canvas:
         if len(bend) < _LEAST_FLAT:
             return scene.noise
         # The median of normal deviates is 0.6745 of their σ; the variance of such a difference is 3/2 σ².
-        return float(np.median(bend) / (0.6745 * np.sqrt(1.5)))
+        return median(bend) / (0.6745 * float(np.sqrt(1.5)))
 
     def _match(
         self,
