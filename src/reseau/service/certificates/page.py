@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...adjust import UncertaintyBudget
-from ...core.errors import FormatError
+from ...core.errors import FormatError, UsageError
 from ...core.numbers import power
 from ...core.optional import optional
 from ...core.version import __version__
@@ -117,24 +118,35 @@ def pdf_of(certificate: Certificate, xml: Callable[[str], bytes]) -> tuple[bytes
     Raises
     ------
     UsageError
-        If WeasyPrint or pypdf is missing.
+        If WeasyPrint, its library Pango, or pypdf is missing.
     """
-    with optional():
-        import pypdf  # noqa: F401
-        import weasyprint
-        from weasyprint.text.fonts import FontConfiguration
+    try:
+        with optional():
+            import pypdf  # noqa: F401
+            import weasyprint
+            from weasyprint.text.fonts import FontConfiguration
+    except OSError as error:
+        raise UsageError(f"needs the library Pango ({error})", where="PDF", do="install libpango") from None
     page = weasyprint.HTML(string=html_of(certificate), url_fetcher=_no_resource)
     fonts = FontConfiguration()
     style = weasyprint.CSS(string=_style(), font_config=fonts)
     document = page.render(stylesheets=[style], font_config=fonts, pdf_variant=_VARIANT)
-    content = xml(pages_digest(document.write_pdf(pdf_variant=_VARIANT), "certificate"))
+    content = xml(pages_digest(_written(document), "certificate"))
     document.metadata.attachments = [
         weasyprint.Attachment(
             string=content, name=NAME, description="Digital calibration certificate (DCC 3.3.0)",
             relationship="Alternative", created=_time(certificate), modified=_time(certificate),
         )
     ]  # fmt: skip
-    return document.write_pdf(pdf_variant=_VARIANT), content
+    return _written(document), content
+
+
+def _written(document: Any) -> bytes:
+    with warnings.catch_warnings():
+        # WeasyPrint leaves the file of the colour profile to the garbage collector.
+        warnings.simplefilter("ignore", ResourceWarning)
+        found: bytes = document.write_pdf(pdf_variant=_VARIANT)
+    return found
 
 
 def _style() -> str:
