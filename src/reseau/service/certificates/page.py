@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -45,7 +46,7 @@ def html_of(certificate: Certificate) -> str:
         percent=f"{100 * probability:g}",
         parameters=_rows(found, probability),
         held=[
-            (name, f"{q.value:.7g}", "" if q.unit == "1" else q.unit)
+            (name, f"{q.value:.7g}", _unit(q.unit))
             for name, q in made.calibration.parameters.items()
             if name not in found.names
         ],
@@ -74,10 +75,16 @@ def _rows(budget: UncertaintyBudget, probability: float) -> list[dict[str, Any]]
     return [
         {
             "name": name, "value": power(float(value), float(expanded)), "sigma": f"{u:.2g}",
-            "factor": f"{k:.2f}", "degrees": _degrees(float(nu)), "unit": "" if unit == "1" else unit,
+            "factor": f"{k:.2f}", "degrees": _degrees(float(nu)), "unit": _unit(unit),
         }
         for name, value, u, expanded, k, nu, unit in columns
     ]  # fmt: skip
+
+
+def _unit(unit: str) -> str:
+    """A unit as printed: mm⁻² for mm^-2."""
+    raised = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+    return re.sub(r"\^(-?\d+)", lambda found: found[1].translate(raised), "" if unit == "1" else unit)
 
 
 def _degrees(nu: float) -> str:
@@ -170,6 +177,7 @@ def _style() -> str:
 body {{ font-family: "{_FAMILY}", serif; }}
 code {{ font-family: "{_MONO}", monospace; }}
 table {{ min-width: 120mm; }}
+caption {{ padding-top: 1.6rem; }}
 @page {{ size: A4; margin: 16mm 14mm 18mm;
   @bottom-left {{ content: string(identifier); font: 8pt "{_FAMILY}", serif; }}
   @bottom-right {{ content: counter(page) " / " counter(pages); font: 8pt "{_FAMILY}", serif; }} }}
