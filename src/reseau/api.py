@@ -7,8 +7,8 @@ is a falsy :class:`~reseau.core.failure.Failure` with its reason; its ``required
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -44,6 +44,7 @@ from .measure import (
 from .measure.points import Measured
 from .procedures import oscilloscope as _procedure
 from .procedures.calibration import Calibrated, CalibrationOptions, CameraOptions, calibrate_camera
+from .procedures.exposures import photographs_of
 from .procedures.film_frame import FrameOptions, FrameResult, orient_scan
 from .procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
 from .procedures.target_measurement import measurer_of
@@ -325,18 +326,20 @@ def calibrate(
         pitch = None if pitch_mm is None else (pitch_mm, pitch_mm)
         model = CameraOptions(model or "", tuple(free), pitch)
 
-    def photographs() -> Iterator[Frame | tuple[str, ImagePoints]]:
-        for number, image in enumerate(photos, start=1):
-            photo = _photo(image, channel)
-            if isinstance(photo, Frame):
-                named = isinstance(image, np.ndarray)
-                frame = Frame(photo.pixels, photo.full_scale, f"image {number}") if named else photo
-                yield _corrected(frame, sensor)
-            else:
-                name = Path(image).name if isinstance(image, str | Path) else f"image {number}"
-                yield name, photo
+    named = list[tuple[str, Path | Frame | ImagePoints]]()
+    for number, image in enumerate(photos, start=1):
+        photo = Path(image) if isinstance(image, str | Path) else _photo(image, channel)
+        name = photo.name if isinstance(photo, Path | Frame) and not isinstance(image, np.ndarray) else ""
+        named.append((name or f"image {number}", photo))
 
-    return calibrate_camera(photographs(), target, measurer_of(target), size, model, options)
+    def opened(image: Path | Frame) -> Frame:
+        return _corrected(read_image(image, channel) if isinstance(image, Path) else image, sensor)
+
+    said, photographs = photographs_of(named, opened)
+    options = options or CalibrationOptions()
+    if options.focal_35_mm is None:
+        options = replace(options, focal_35_mm=said)
+    return calibrate_camera(photographs, target, measurer_of(target), size, model, options)
 
 
 def orient(

@@ -104,6 +104,32 @@ def test_a_printed_sheet_calibrates_a_camera_whose_result_opencv_uses(
     assert np.abs(own - expected).max() < 0.15
 
 
+def test_the_target_is_found_among_the_designs_beside_the_photographs(
+    reseau: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Those that `reseau design` draws are tried, too, which takes long.
+    monkeypatch.setattr("reseau.procedures.which_target.known_designs", dict)
+    monkeypatch.chdir(tmp_path)
+    lens = replace(LENS, width=320, height=240, fx=300.0, fy=300.0, cx=160.2, cy=119.1)
+    for kind, size in (("charuco", (5, 7)), ("chess", (6, 9))):
+        files = ("--pdf", tmp_path / f"{kind}.pdf", "--json", tmp_path / f"{kind}.json")
+        board = ("--kind", kind, "--columns", size[0], "--rows", size[1])
+        assert reseau("design", "board", *board, *files)[0] == 0
+    sheet, rng = print_out(tmp_path / "charuco.pdf"), np.random.default_rng(2)
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for k, pose in enumerate(poses(4, PAPER, rng)):
+        cv2.imwrite(str(photos / f"{k}.png"), photograph(sheet, lens, lens.rays(), pose, rng, noise=1.0))
+    status, out, err = reseau("calibrate", photos, "--design", "auto", "--jobs", 1)
+    assert status == 0
+    assert "note: the target is" in err
+    assert "charuco" in err
+    assert abs(float(out.split("fx")[1].split()[0]) - 300.0) < 3.0
+    status, _, err = reseau("calibrate", tmp_path / "photos" / "0.png", "--design", tmp_path / "none.json")
+    assert status == 2
+    assert "none.json" in err
+
+
 @pytest.mark.slow
 def test_true_parameters_are_within_their_sigmas_over_twenty_evenings(
     reseau: Run,

@@ -42,6 +42,7 @@ from .modelling import (
     problem_of,
     reweighted,
     search_model,
+    with_estimates,
 )
 from .network import (
     Additional,
@@ -110,4 +111,5 @@ __all__ = [
     "reweighted",
     "search_model",
     "sigma_between_images",
+    "with_estimates",
 ]

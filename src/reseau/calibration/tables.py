@@ -83,7 +83,15 @@ def write_tables(path: Path, raster: CorrectedImage) -> tuple[Path, ...]:
 
     Examples
     --------
-    >>> write_tables(Path("tables.npz"), raster)  # doctest: +SKIP
+    >>> import tempfile
+    >>> from reseau.calibration import CameraMapping
+    >>> from reseau.optics import OpenCV
+    >>> lens = OpenCV.from_parameters({"fx": 80.0, "fy": 80.0, "cx": 31.5, "cy": 23.5, "k1": -0.1})
+    >>> camera = CameraMapping(lens, 64, 48, np.zeros(0, dtype=np.intp), np.zeros((0, 0)))
+    >>> raster = CorrectedImage.undistorted(camera)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [path.name for path in write_tables(Path(folder) / "maps.pgm", raster)]
+    ['maps-x.pgm', 'maps-y.pgm']
     """
     x, y = remap_tables(raster)
     suffix = path.suffix.lower()
@@ -147,7 +155,21 @@ def undistort_video(
 
     Examples
     --------
-    >>> undistort_video(Path("a.mp4"), Path("b.mp4"), raster)  # doctest: +SKIP
+    >>> import tempfile
+    >>> from reseau.calibration import CameraMapping
+    >>> from reseau.optics import OpenCV
+    >>> lens = OpenCV.from_parameters({"fx": 80.0, "fy": 80.0, "cx": 31.5, "cy": 23.5, "k1": -0.1})
+    >>> camera = CameraMapping(lens, 64, 48, np.zeros(0, dtype=np.intp), np.zeros((0, 0)))
+    >>> raster = CorrectedImage.undistorted(camera)
+    >>> import cv2
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     bent, flat = Path(folder) / "bent.avi", Path(folder) / "flat.avi"
+    ...     video = cv2.VideoWriter(str(bent), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 48))
+    ...     for level in (50, 100, 150):
+    ...         _ = video.write(np.full((48, 64, 3), level, dtype=np.uint8))
+    ...     _ = video.release()
+    ...     undistort_video(bent, flat, raster)
+    3
     """
     import cv2
 

@@ -82,6 +82,12 @@ def bundle(
         Path | None,
         typer.Option(help="Write the network as reseau-network/1 with these settings; nothing is adjusted."),
     ] = None,
+    export: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the adjusted network: .json (reseau-network/1), .bal, or a folder for COLMAP."
+        ),
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
     distance: Distances = None,
     as_json: AsJson = False,
@@ -124,10 +130,24 @@ def bundle(
         write_whole(report, page)
     if out is not None:
         document.write(out)
+    if export is not None:
+        _export(result, export)
     if as_json:
         say(document.to_json())
     else:
         _say(network, result)
+
+
+def _export(result: Result, path: Path) -> None:
+    """Write the adjusted network, and say where cameras had to be converted."""
+    from ..exchange import write_network
+
+    for name, done in write_network(result, path).items():
+        if done.greatest_px > 0:
+            typer.echo(
+                f"note: camera {name} as {done.camera.model} differs by {done.greatest_px:.2g} px at most",
+                err=True,
+            )
 
 
 def _with_settings(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from ..io import BoardDesign, ReseauDesign, TestfieldDesign
     from ..procedures.calibration import Calibrated, CalibrationOptions, CameraOptions
     from ..procedures.exposures import Taken
-    from ..procedures.target_measurement import Photograph
 
 __all__ = ["calibrate"]
 
@@ -180,7 +179,7 @@ def calibrate(
     from ..io import parse_design, read_text
     from ..measure import TestfieldOptions
     from ..procedures.calibration import calibrate_camera, measurer_of
-    from ..procedures.exposures import of_another_lens
+    from ..procedures.exposures import photographs_of
     from ..procedures.target_measurement import drawing_overlays
 
     outputs(out, report)
@@ -192,18 +191,23 @@ def calibrate(
     if others and taken:
         raise UsageError("requires one camera", where="--against", do="compare the cameras one by one")
     level = level_of(eliminate, "--eliminate")
-    said, zoomed = of_another_lens({} if taken else photographs)
+
+    def opened(image: Path | Frame) -> Frame:
+        assert isinstance(image, Path)
+        step(f"measuring {image.name}")
+        return corrected(read_frame(image, channel.value), sensor)
+
     options = _options(
         sigma, control, refraction, leave_out or [], reject, kind, level, workers, target_points
     )
-    options = replace(options, focal_35_mm=said)
     lens = _camera(model, pitch, side, model_option or [], free, rolling)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
     measure = drawing_overlays(
         measure, {name: drawn[path] for name, path in photographs.items() if path in drawn}
     )
     with progress("measuring", len(files)) as step:
-        frames = _frames(photographs, channel, sensor, step, zoomed)
+        said, frames = photographs_of(list(photographs.items()), opened, one_lens=not taken)
+        options = replace(options, focal_35_mm=said)
         found = calibrate_camera(frames, target, measure, _size(size), lens, options, taken or None)
         done = required(found, design)
     named = (None if automatic else design, control, refraction, sensor)
@@ -356,31 +360,6 @@ def _pictures(photographs: Mapping[str, Path], channel: Channel) -> Callable[[st
         return None if is_points(path) else read_frame(path, channel.value)
 
     return read
-
-
-def _frames(
-    photographs: Mapping[str, Path],
-    channel: Channel,
-    sensor: Path | None,
-    step: Callable[[str], None],
-    zoomed: Mapping[str, str],
-) -> Iterator[Photograph]:
-    """Photographs, or measured image coordinates, in order; why a photograph cannot be used."""
-    from ..core.failure import Code, Failure
-    from ..io import is_points, read_measurement
-
-    for name, path in photographs.items():
-        step(f"measuring {name}")
-        if name in zoomed:
-            yield name, Failure(zoomed[name], Code.DECLINED, where=name)
-        elif is_points(path):
-            yield name, read_measurement(path).image_points()
-        else:
-            try:
-                yield replace(corrected(read_frame(path, channel.value), sensor), name=name)
-            except ImageError as error:
-                # One photograph does not end the calibration.
-                yield name, Failure(error.what, Code.DECLINED, where=name)
 
 
 def _camera(

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from .bal import read_bal
+from .bal import read_bal, write_bal
 from .boards import read_board
 from .bundler import read_bundler
 from .calibrations import export_calibration, export_rig, import_calibration
 from .codev import read_codev
-from .colmap import read_colmap
+from .colmap import read_colmap, write_colmap
 from .control import read_control
 from .dbat import read_dbat
 from .film import FilmMarks, metashape_script, read_film_marks, read_micmac, write_micmac
 from .lenses import Lens, read_lens
 from .libmv import read_libmv
 from .metashape import read_metashape
-from .networks import calibration_files, read_foreign, read_network
+from .networks import calibration_files, read_foreign, read_network, write_network
 from .openptv import read_openptv
 from .photomodeler import read_photomodeler
 from .zemax import read_zemax
@@ -44,5 +44,8 @@ __all__ = [
     "read_openptv",
     "read_photomodeler",
     "read_zemax",
+    "write_bal",
+    "write_colmap",
     "write_micmac",
+    "write_network",
 ]

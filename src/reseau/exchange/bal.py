@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ..bundle import Camera, Network
+from ..bundle import Camera, Network, Result, camera_mapping
 from ..core.data import Array, Rows
-from ..core.errors import FormatError
-from ..io import read_text
+from ..core.errors import FormatError, UsageError
+from ..io import read_text, write_whole
 from ..optics.poses import matrix_to_vector, rotation_matrix
 from .lines import network_of
 
-__all__ = ["centred_network", "read_bal"]
+__all__ = ["centred_network", "read_bal", "write_bal"]
 
 _VIEW = np.diag([1.0, -1.0, -1.0])
 
@@ -72,6 +72,84 @@ def read_bal(path: Path | str) -> Network:
         (image, point, table[:, 2:]),
         tuple(str(i) for i in range(cameras)),
     )
+
+
+def write_bal(result: Result, path: Path | str) -> None:
+    """Write an adjusted network as a BAL file, with one camera for each image.
+
+    BAL has no principal point and two radial coefficients only. Brown's camera without others is written as
+    it is, with image coordinates from its principal point; image coordinates of other cameras are corrected
+    for their distortion.
+
+    Parameters
+    ----------
+    result : Result
+        The adjustment; rejected image points, and what is not determined, are left out.
+    path : path
+        File to write.
+
+    Raises
+    ------
+    UsageError
+        When the network has windows, or a camera has parallel rays.
+    InputError
+        When the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_bal(adjust_network(example_network()), f"{folder}/block.bal")
+    ...     read_bal(f"{folder}/block.bal")
+    <Network: 8 cameras, 8 images, 20 points, 160 image points, datum free>
+    """
+    network, fit = result.network, result.fit
+    if network.refraction is not None or network.parallel.any():
+        raise UsageError("cannot be written as BAL", where="network with windows or parallel rays")
+    used = fit.usable.observations & ~result.rejected
+    rows = np.flatnonzero(used & fit.usable.points[network.point_of] & fit.usable.images[network.image_of])
+    image, point = (np.unique(of[rows], return_inverse=True) for of in (network.image_of, network.point_of))
+    turns = fit.values.rotation
+    xy, interior = np.full((len(rows), 2), np.nan), np.zeros((len(image[0]), 3))
+    for c, camera in enumerate(network.cameras):
+        mine = np.flatnonzero(network.camera_of[network.image_of[rows]] == c)
+        lens = camera_mapping(result, c)
+        radial = _radial(camera, result)
+        uv = lens.mapping.inverse(network.xy[rows[mine]])
+        f = float(np.sqrt(abs(np.linalg.det(lens.mapping.derivatives(np.zeros((1, 2))).d_xy[0]))))
+        if radial is None:
+            xy[mine], radial = f * uv * [1.0, -1.0], (f, 0.0, 0.0)
+        else:
+            centre = lens.mapping.derivatives(np.zeros((1, 2))).value[0]
+            xy[mine] = (network.xy[rows[mine]] - centre) * [1.0, -1.0]
+        interior[network.camera_of[image[0]] == c] = radial
+    good = np.isfinite(xy).all(axis=1)
+    lines = [f"{len(image[0])} {len(point[0])} {int(good.sum())}"]
+    for i, j, at in zip(image[1][good], point[1][good], xy[good], strict=True):
+        lines.append(f"{i} {j} {float(at[0])!r} {float(at[1])!r}")
+    numbers = list[float]()
+    for k, i in enumerate(image[0]):
+        turn = _VIEW @ turns[i]
+        numbers += [*matrix_to_vector(turn[None])[0], *(-turn @ fit.values.x0[i]), *interior[k]]
+    numbers += fit.values.xyz[point[0]].ravel().tolist()
+    lines += [repr(float(number)) for number in numbers]
+    write_whole(Path(path), "\n".join(lines) + "\n")
+
+
+def _radial(camera: Camera, result: Result) -> tuple[float, float, float] | None:
+    """f, k1 and k2 of Brown's camera on the object side with square pixels and no other distortion."""
+    if camera.model != "brown" or camera.additional is not None or camera.options.get("side") != "object":
+        return None
+    c = result.network.cameras.index(camera)
+    names = () if camera.registered is None else camera.registered.names
+    values = dict(zip(names, result.fit.values.cameras[c, : len(names)].tolist(), strict=True))
+    others = [value for name, value in values.items() if name not in ("c", "x0", "y0", "K1", "K2")]
+    if any(others) or camera.pitch_mm[0] != camera.pitch_mm[1]:
+        return None
+    # Radii are in mm: K1 r² with r = c·ρ.
+    c_mm = values["c"]
+    return c_mm / camera.pitch_mm[0], values["K1"] * c_mm**2, values["K2"] * c_mm**4
 
 
 def centred_network(

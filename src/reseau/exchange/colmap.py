@@ -14,15 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bundle import Camera, Network
+from ..bundle import Camera, Network, Result, camera_mapping
 from ..core.data import Array
-from ..core.errors import FormatError
-from ..io import read_text
+from ..core.errors import FormatError, UsageError
+from ..io import read_text, write_whole
 from ..optics import camera_model
 from ..optics.poses import matrix_to_vector
+from .calibrations import Exported, calibration_formats, exported_lens
 from .lines import network_of, numbers, read_bytes
 
-__all__ = ["read_colmap"]
+__all__ = ["read_colmap", "write_colmap"]
 
 # Parameters of each model, in COLMAP's order.
 _MODELS = {
@@ -100,6 +101,86 @@ def read_colmap(folder: Path | str) -> Network:
         (np.array(image_of, np.intp), np.array(point_of, np.intp), pixels, np.ones(pixels.shape)),
         files=names,
     )
+
+
+def write_colmap(result: Result, folder: Path | str) -> dict[str, Exported]:
+    """Write an adjusted network as COLMAP's text files.
+
+    Image points that were rejected, and points and images that are not determined, are left out. A camera
+    model that COLMAP lacks is converted, as by :func:`~reseau.exchange.export_calibration`.
+
+    Parameters
+    ----------
+    result : Result
+        The adjustment.
+    folder : path
+        Folder for ``cameras.txt``, ``images.txt`` and ``points3D.txt``; it is made.
+
+    Returns
+    -------
+    dict of str to Exported
+        The cameras as they were written, with the differences of converted models.
+
+    Raises
+    ------
+    UsageError
+        When no model of COLMAP describes a camera, or the network has windows.
+    InputError
+        When a file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     done = write_colmap(adjust_network(example_network()), folder)
+    ...     again = read_colmap(folder)
+    >>> again
+    <Network: 1 camera, 8 images, 20 points, 160 image points, datum free>
+    """
+    network, fit, folder = result.network, result.fit, Path(folder)
+    if network.refraction is not None:
+        raise UsageError("cannot be written: COLMAP has no windows", where="network with windows")
+    form, written, cameras = calibration_formats()["colmap"], dict[str, Exported](), list[str]()
+    for c, camera in enumerate(network.cameras):
+        written[camera.id] = exported_lens(form, camera.id, camera_mapping(result, c))
+        line = form.write(written[camera.id].camera).splitlines()[-1]
+        cameras.append(f"{c + 1} {line.split(maxsplit=1)[1]}")
+    turns = fit.values.rotation
+    used = fit.usable.observations & ~result.rejected
+    seen = used & fit.usable.points[network.point_of] & fit.usable.images[network.image_of]
+    lines, place = list[str](), np.full(len(network.xy), -1)
+    for i in np.flatnonzero(fit.usable.images):
+        rows = np.flatnonzero(seen & (network.image_of == i))
+        place[rows] = np.arange(len(rows))
+        pose = [*_quaternion(turns[i]), *(-turns[i] @ fit.values.x0[i])]
+        name = network.images[i]
+        lines.append(f"{i + 1} {_words(pose)} {network.camera_of[i] + 1} {name}")
+        marks = zip(network.xy[rows] + 0.5, network.point_of[rows] + 1, strict=True)
+        lines.append(" ".join(f"{_words(xy)} {point}" for xy, point in marks))
+    size = np.linalg.norm(np.nan_to_num(result.residuals), axis=1)
+    points = []
+    for j in np.flatnonzero(fit.usable.points):
+        rows = np.flatnonzero(seen & (network.point_of == j))
+        track = " ".join(f"{network.image_of[k] + 1} {place[k]}" for k in rows)
+        error = float(size[rows].mean()) if len(rows) else -1.0
+        points.append(f"{j + 1} {_words(fit.values.xyz[j])} 128 128 128 {error!r} {track}")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in (("cameras", cameras), ("images", lines), ("points3D", points)):
+        write_whole(folder / f"{name}.txt", "".join(f"{line}\n" for line in text))
+    return written
+
+
+def _words(values: Sequence[float] | Array) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _quaternion(matrix: Array) -> Array:
+    """Quaternion of a rotation matrix, scalar first and not negative."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(matrix).as_quat(canonical=True)
+    return np.array([w, x, y, z])
 
 
 class _Image(NamedTuple):

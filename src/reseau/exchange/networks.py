@@ -6,14 +6,16 @@ import json
 from collections.abc import Callable, Mapping, Set
 from pathlib import Path
 
-from ..bundle import Camera, Network, calibrated_camera, film_camera
+from ..bundle import Camera, Network, Result, calibrated_camera, film_camera, with_estimates
+from ..bundle.network import network_document
 from ..calibration import read_calibration
 from ..core.errors import FormatError, InputError, UsageError
 from ..io import FrameOrientation, read_text
 from ..io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Network1
-from .bal import read_bal
+from .bal import read_bal, write_bal
 from .bundler import is_bundler, read_bundler
-from .colmap import read_colmap
+from .calibrations import Exported
+from .colmap import read_colmap, write_colmap
 from .dbat import is_dbat, read_dbat
 from .libmv import is_libmv, read_libmv
 from .lines import read_head
@@ -21,7 +23,7 @@ from .metashape import is_metashape, read_metashape
 from .openptv import is_openptv, read_openptv
 from .photomodeler import read_photomodeler
 
-__all__ = ["calibration_files", "read_foreign", "read_network"]
+__all__ = ["calibration_files", "read_foreign", "read_network", "write_network"]
 
 # Formats that the first bytes tell, and their readers.
 _BINARY_OR_XML: tuple[tuple[Callable[[bytes], bool], Callable[[Path], Network]], ...] = (
@@ -180,3 +182,51 @@ def read_foreign(path: Path | str) -> Network:
         where=path,
         do="use reseau-network/1, PhotoModeler, BAL, Bundler, COLMAP, Metashape, DBAT, libmv or OpenPTV",
     )
+
+
+def write_network(result: Result, path: Path | str) -> dict[str, Exported]:
+    """Write an adjusted network: its estimates, and the image points that were used.
+
+    Parameters
+    ----------
+    result : Result
+        The adjustment.
+    path : path
+        ``.json`` for ``reseau-network/1``, with the estimates as approximate values; ``.bal`` for BAL; a
+        folder, without a suffix, for COLMAP's text files.
+
+    Returns
+    -------
+    dict of str to Exported
+        Cameras whose model was converted, with the differences.
+
+    Raises
+    ------
+    UsageError
+        When the suffix is another one, or the format lacks what the network has.
+    InputError
+        When a file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = write_network(adjust_network(example_network()), f"{folder}/block.json")
+    ...     read_network(f"{folder}/block.json")
+    <Network: 1 camera, 8 images, 20 points, 160 image points, datum free>
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".bal":
+        write_bal(result, path)
+        return {}
+    if suffix == ".json":
+        network_document(with_estimates(result).select(~result.rejected)).write(path)
+        return {}
+    if suffix:
+        raise UsageError(
+            f"has the suffix {suffix!r}", where=path,
+            do="use .json (reseau-network/1), .bal, or a folder without a suffix (COLMAP)",
+        )  # fmt: skip
+    return write_colmap(result, path)

@@ -76,6 +76,7 @@ _LEAST_IMAGES = 3
 _HARDLY = 0.2
 _FOCAL_OFF = 1.5
 """Factor beyond which the focal length of the homographies contradicts that which the camera says."""
+_MORE_TILTED = "add images with the camera tilted by 20 to 40 degrees in different directions"
 _CAMERA = "camera"
 """Name of a camera that is alone."""
 # Relative standard deviation of a diagonal of the target.
@@ -505,6 +506,8 @@ def calibrate_camera(
         board, network = bent, bent.network
     found = search_model(network, options.adjustment, options.components, options.level)
     if isinstance(found, Failure):
+        if found.code is Code.NOT_CONVERGED:
+            return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
         return found
     calibrated = Calibrated(found, measured, declined, choice, board)
     loose = _without_scale(calibrated.result)
@@ -520,7 +523,7 @@ def _without_scale(result: Result) -> Failure | None:
             if name in scales and sigma > _HARDLY * abs(value):
                 return Failure(
                     f"{camera.label}: the images do not determine {name} ({with_sigma(value, sigma, unit)}); "
-                    "add images with the camera tilted by 20 to 40 degrees in different directions",
+                    + _MORE_TILTED,
                     Code.NOT_IDENTIFIED,
                 )
     return None

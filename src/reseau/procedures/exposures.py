@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from glob import glob
 from pathlib import Path
 from typing import NamedTuple
 
-from ..core.errors import InputError, UsageError
+from ..core.data import Frame, ImagePoints
+from ..core.errors import ImageError, InputError, UsageError
+from ..core.failure import Code, Failure
+from ..io import is_points, read_measurement
 from ..io.photographs import PHOTOGRAPHS, read_exif
+from .target_measurement import Photograph
 
-__all__ = ["Taken", "exposures_of_files", "files_of", "of_another_lens", "photographs_in"]
+__all__ = ["Taken", "exposures_of_files", "files_of", "of_another_lens", "photographs_in", "photographs_of"]
 
 
 _NUMBER = re.compile(r"\d+(?=\D*$)")
@@ -167,3 +172,55 @@ def of_another_lens(photographs: Mapping[str, Path]) -> tuple[float | None, dict
     }
     said = [found[name].focal_35_mm for name, length in focal.items() if length == usual]
     return next((length for length in said if length), None), others
+
+
+def photographs_of(
+    images: Sequence[tuple[str, Path | Frame | ImagePoints]],
+    read: Callable[[Path | Frame], Frame],
+    *,
+    one_lens: bool = True,
+) -> tuple[float | None, Iterator[Photograph]]:
+    """Open photographs one after another; one that cannot be used does not end the series.
+
+    Parameters
+    ----------
+    images : sequence of (str, Path or Frame or ImagePoints)
+        Names, and files of photographs or of measured image coordinates, frames, or image points.
+    read : callable
+        Returns the frame of a file, or of a frame, with the corrections that are wanted.
+    one_lens : bool
+        Whether all are of one camera: those that were taken with another focal length are left out.
+
+    Returns
+    -------
+    focal_35_mm : float or None
+        Equivalent focal length, as the camera says.
+    photographs : iterator
+        Frames, image points, or why a photograph cannot be used.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> frame = Frame(np.zeros((2, 3), np.uint8), 255.0)
+    >>> focal, frames = photographs_of([("a", frame)], lambda image: image)
+    >>> focal, [each.name for each in frames]
+    (None, ['a'])
+    """
+    files = {name: image for name, image in images if isinstance(image, Path) and not is_points(image)}
+    said, zoomed = of_another_lens(files if one_lens else {})
+
+    def opened() -> Iterator[Photograph]:
+        for name, image in images:
+            if isinstance(image, ImagePoints):
+                yield name, image
+            elif isinstance(image, Path) and name in zoomed:
+                yield name, Failure(zoomed[name], Code.DECLINED, where=name)
+            elif isinstance(image, Path) and is_points(image):
+                yield name, read_measurement(image).image_points()
+            else:
+                try:
+                    yield replace(read(image), name=name)
+                except ImageError as error:
+                    yield name, Failure(error.what, Code.DECLINED, where=name)
+
+    return said, opened()

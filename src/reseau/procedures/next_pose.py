@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..bundle import Network, Result, Stage, adjust_network, camera_mapping
+from ..bundle import Network, Result, Stage, adjust_network, camera_mapping, with_estimates
 from ..calibration import CameraMapping, projection_field
 from ..calibration.camera import by_rotation
 from ..core.data import Array, Mask
@@ -25,7 +25,7 @@ from ..core.failure import Failure
 from ..optics import Pose
 from ..optics.poses import matrix_to_vector, rotation_matrix
 
-__all__ = ["PREDICTED", "NextPose", "adjusted", "next_photograph", "with_image"]
+__all__ = ["PREDICTED", "NextPose", "next_photograph", "with_image"]
 
 _MARGIN_PX = 6.0
 """Points closer to the edge of the image are not expected to be measured."""
@@ -80,24 +80,6 @@ class NextPose:
     outline: Array
     xy: Array
     worst_px: float
-
-
-def adjusted(result: Result) -> Network:
-    """Return the network with its estimates as approximate values, for fast convergence."""
-    network, values = result.network, result.fit.values
-    cameras = tuple(
-        replace(camera, values=values.cameras[c, : len(camera.values)])
-        for c, camera in enumerate(network.cameras)
-    )
-    bent = network.refraction
-    return replace(
-        network,
-        cameras=cameras,
-        x0=values.x0,
-        rotation=result.rotation,
-        xyz=values.xyz,
-        refraction=None if bent is None else bent.with_values(values.refraction),
-    )
 
 
 def with_image(
@@ -206,7 +188,7 @@ def next_photograph(result: Result, empty: Mask) -> NextPose | None:
     if best is None or not best[0] < _WORTH * before:
         return None
     _, pose, words = best
-    joined = with_image(adjusted(result), lens, pose, _directions(result.fit.values.xyz, pose))
+    joined = with_image(with_estimates(result), lens, pose, _directions(result.fit.values.xyz, pose))
     found = None if joined is None else adjust_network(joined)
     if found is None or isinstance(found, Failure):
         return None

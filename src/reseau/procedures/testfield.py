@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 import numpy as np
 
 from ..archive import Verdict
-from ..bundle import Network, Result, adjust_network, calibration_of, camera_mapping
+from ..bundle import Network, Result, adjust_network, calibration_of, camera_mapping, with_estimates
 from ..core.data import Array, Frame, ImagePoints
 from ..core.errors import EstimationError
 from ..core.failure import Code, Failure
@@ -24,7 +24,7 @@ from ..optics import Pose
 from ..optics.poses import rotation_matrix
 from ..optics.refraction import RefractedRays
 from .calibration import Calibrated, CalibrationOptions, CameraOptions, PlaneDesign, calibrate_camera
-from .next_pose import PREDICTED, adjusted, with_image
+from .next_pose import PREDICTED, with_image
 from .target_measurement import Measurer
 from .turntable import HEIGHT, Mount
 from .z_stage import Heights
@@ -196,7 +196,7 @@ class TestfieldProcedure:
             do = f"use {', '.join(names)}"
             raise EstimationError("is not estimated", where=f"sigma_{wanted}", do=do)
         column = names.index(wanted)
-        network, result = adjusted(found.result), found.result
+        network, result = with_estimates(found.result), found.result
         mount = Mount.of(
             [self._places[name] for name in network.images],
             np.array([rotation_matrix(vector) for vector in result.rotation]),

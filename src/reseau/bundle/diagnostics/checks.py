@@ -207,8 +207,8 @@ def _large(result: Result) -> list[Remark]:
     ]
     return [
         Remark(
-            f"{len(rows)} image {_plural('point', rows)} with test values above "
-            f"{critical:.1f}: {listed(names)}",
+            f"{len(rows)} image {_plural('point', rows)} deviate{'s' * (len(rows) == 1)} more than chance "
+            f"explains (test value w above {critical:.1f}): {listed(names)}",
             Code.GROSS_ERRORS,
         )
     ]

@@ -68,7 +68,10 @@ class ControlShape:
 
     Examples
     --------
-    >>> control_shape(network)  # doctest: +SKIP
+    >>> three = np.eye(3)
+    >>> shape = ControlShape(("a", "b", "c"), np.arange(3), three, three, np.ones(3), np.ones(3, dtype=bool))
+    >>> shape.doubt()
+    ''
     """
 
     names: tuple[str, ...]
@@ -174,7 +177,9 @@ class ControlCheck:
 
     Examples
     --------
-    >>> checked_control(problem, fit).wrong  # doctest: +SKIP
+    >>> one = np.zeros(1)
+    >>> bool(ControlCheck(np.array([3]), np.array([True]), one + 9.1, one + 0.02, one + 0.01))
+    True
     """
 
     points: Rows
@@ -310,7 +315,15 @@ def checked_control(
 
     Examples
     --------
-    >>> checked_control(problem, fit)  # doctest: +SKIP
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> network = example_network()
+    >>> xyz = network.xyz.copy()
+    >>> xyz[7, 2] += 0.1
+    >>> given = replace(network, xyz=xyz, sigma=np.full((20, 3), 1e-3), datum="control")
+    >>> found = adjust_network(given)
+    >>> check = checked_control(found.fit.problem, found.fit)
+    >>> [network.points[k] for k in check.points[check.wrong]]
+    ['p7']
     """
     loose = _as_observed(problem)
     points = np.flatnonzero(loose.network.observed.any(axis=1)).astype(np.intp)

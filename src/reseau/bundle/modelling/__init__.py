@@ -2,7 +2,7 @@
 
 from .adjustment import Options, adjust_network, problem_of
 from .board import BoardChoice, BoardModel, choose_board, held_as_designed
-from .calibration import calibration_of
+from .calibration import calibration_of, with_estimates
 from .choice import Candidate, Compared, ModelChoice, camera_candidates, choose_model
 from .search import (
     Kind,
@@ -35,4 +35,5 @@ __all__ = [
     "problem_of",
     "reweighted",
     "search_model",
+    "with_estimates",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -12,9 +13,9 @@ from ...core.errors import UsageError
 from ...optics.cameras import unit_of
 from ...optics.poses import matrix_to_vector
 from ..diagnostics import Result, covariance_by_targets, sigma_between_images
-from ..network import Camera
+from ..network import Camera, Network
 
-__all__ = ["calibration_of"]
+__all__ = ["calibration_of", "with_estimates"]
 
 
 def calibration_of(
@@ -129,3 +130,28 @@ def _model(camera: Camera) -> CameraModel:
         shutter = camera.shutter
         model["shutter"] = {"mode": shutter.mode, "line_s": shutter.line_s, "row": shutter.row}
     return model
+
+
+def with_estimates(result: Result) -> Network:
+    """Return the network with its estimates as approximate values, for fast convergence.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> bool(np.isfinite(with_estimates(adjust_network(example_network())).x0).all())
+    True
+    """
+    network, values = result.network, result.fit.values
+    cameras = tuple(
+        replace(camera, values=values.cameras[c, : len(camera.values)])
+        for c, camera in enumerate(network.cameras)
+    )
+    bent = network.refraction
+    return replace(
+        network,
+        cameras=cameras,
+        x0=values.x0,
+        rotation=result.rotation,
+        xyz=values.xyz,
+        refraction=None if bent is None else bent.with_values(values.refraction),
+    )

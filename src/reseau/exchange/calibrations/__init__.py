@@ -10,6 +10,7 @@ from .formats import (
     calibration_formats,
     export_calibration,
     export_rig,
+    exported_lens,
     import_calibration,
 )
 from .plain import Mounted, PlainCamera
@@ -22,5 +23,6 @@ __all__ = [
     "calibration_formats",
     "export_calibration",
     "export_rig",
+    "exported_lens",
     "import_calibration",
 ]

@@ -26,6 +26,7 @@ __all__ = [
     "calibration_formats",
     "export_calibration",
     "export_rig",
+    "exported_lens",
     "import_calibration",
 ]
 
@@ -287,10 +288,40 @@ def _in_a_model_of(form: CalibrationFormat, calibration: Calibration, lens: Came
             return Exported(PlainCamera(name, width, height, wanted, own, pitch, options), 0.0, 0.0, 1.0)
     if form.name == "mrcal" and isinstance(lens.mapping, SplinedStereographic):
         return Exported(PlainCamera(name, width, height, model, own), 0.0, 0.0, 1.0)
+    return exported_lens(form, name, lens, given[0])
+
+
+def exported_lens(form: CalibrationFormat, name: str, lens: CameraMapping, pitch_mm: float = 1.0) -> Exported:
+    """The camera, converted to the model of a format that describes it best.
+
+    Parameters
+    ----------
+    form : CalibrationFormat
+        The format.
+    name : str
+        Name of the camera.
+    lens : CameraMapping
+        Its mapping.
+    pitch_mm : float
+        Pixel size, for models in mm; 1 where it is not known.
+
+    Raises
+    ------
+    UsageError
+        When no model of the format describes it.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, camera_mapping, example_network
+    >>> lens = camera_mapping(adjust_network(example_network()), 0)
+    >>> exported_lens(calibration_formats()["colmap"], "camera", lens).camera.model
+    'opencv'
+    """
+    width, height = lens.size
     best: Exported | None = None
     why = "no model of the format describes it"
     for wanted, names in form.models:
-        pitch = _pitch(lens, given[0]) if camera_model(wanted).needs_pitch else (1.0, 1.0)
+        pitch = _pitch(lens, pitch_mm) if camera_model(wanted).needs_pitch else (1.0, 1.0)
         try:
             done = convert(
                 lens.mapping, PixelGrid(width, height, pitch), wanted, _options(wanted), free=names

@@ -1,0 +1,98 @@
+"""Adjusted networks in files of other programs: the peers project the same points to the same pixels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reseau.bundle import Result, adjust_network, example_network
+from reseau.bundle.network import network_document
+from reseau.cli import run
+from reseau.core.data import Array
+from reseau.core.errors import UsageError
+from reseau.exchange import read_network, write_network
+
+from .scene import residuals
+
+EXACT_PX = 0.01
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    return adjust_network(example_network()).required()
+
+
+def projected(result: Result) -> Array:
+    """Image coordinates (n, 2) of the adjusted network."""
+    return np.asarray(result.network.xy + result.residuals)
+
+
+def test_the_residuals_are_computed_minus_observed(result: Result) -> None:
+    from reseau.bundle import with_estimates
+
+    assert np.abs(residuals(with_estimates(result)) - result.residuals).max() < 1e-6
+
+
+def test_colmap_projects_the_same_points(result: Result, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap (extra `peers`)")
+    (done,) = write_network(result, tmp_path / "sparse").values()
+    assert done.greatest_px < EXACT_PX
+    peer = pycolmap.Reconstruction(str(tmp_path / "sparse"))
+    network, own, count = result.network, projected(result), 0
+    for image in peer.images.values():
+        i = network.images.index(image.name)
+        for mark in image.points2D:
+            xyz = peer.points3D[mark.point3D_id].xyz
+            j = int(
+                np.flatnonzero((network.image_of == i) & (np.abs(network.xy + 0.5 - mark.xy).max(1) < 1e-9))[
+                    0
+                ]
+            )
+            assert np.abs(image.project_point(xyz) - 0.5 - own[j]).max() < EXACT_PX
+            count += 1
+    assert count == len(network.xy)
+
+
+def test_bal_has_the_same_residuals_by_its_own_formula(result: Result, tmp_path: Path) -> None:
+    write_network(result, tmp_path / "block.bal")
+    cv2 = pytest.importorskip("cv2")
+    words = (tmp_path / "block.bal").read_text().split()
+    cameras, points, count = map(int, words[:3])
+    table = np.array(words[3 : 3 + 4 * count], dtype=float).reshape(-1, 4)
+    values = np.array(words[3 + 4 * count :], dtype=float)
+    view, xyz = values[: 9 * cameras].reshape(-1, 9), values[9 * cameras :].reshape(-1, 3)
+    assert len(xyz) == points
+    for row, expected in zip(table, result.residuals, strict=True):
+        of = view[int(row[0])]
+        x = cv2.Rodrigues(of[:3])[0] @ xyz[int(row[1])] + of[3:6]
+        p = -x[:2] / x[2]
+        f, k1, k2 = of[6:]
+        r2 = p @ p
+        off = f * (1 + k1 * r2 + k2 * r2 * r2) * p - row[2:]
+        assert np.abs(off * [1, -1] - expected).max() < EXACT_PX
+
+
+@pytest.mark.parametrize("name", ["block.json", "block.bal", "sparse"])
+def test_what_is_written_is_read_back(result: Result, tmp_path: Path, name: str) -> None:
+    write_network(result, tmp_path / name)
+    again = read_network(tmp_path / name)
+    size = np.linalg.norm(residuals(again), axis=1)
+    assert len(again.xy) == len(result.network.xy)
+    assert abs(size.mean() - np.linalg.norm(result.residuals, axis=1).mean()) < EXACT_PX
+
+
+def test_the_command_exports_and_refuses_other_suffixes(
+    result: Result, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network_document(result.network).write(tmp_path / "network.json")
+    assert run(["bundle", str(tmp_path / "network.json"), "--export", str(tmp_path / "sparse")]) == 0
+    assert {file.name for file in (tmp_path / "sparse").iterdir()} == {
+        "cameras.txt", "images.txt", "points3D.txt"
+    }  # fmt: skip
+    capsys.readouterr()
+    assert run(["bundle", str(tmp_path / "network.json"), "--export", str(tmp_path / "block.ply")]) == 2
+    assert "block.ply: has the suffix" in capsys.readouterr().err
+    with pytest.raises(UsageError):
+        write_network(result, tmp_path / "block.ply")
