@@ -47,9 +47,19 @@ from reseau.core.data import Frame
 from reseau.io.targets import SpaceTargets, TargetColumns
 from reseau.measure.blurred import BlurredOptions
 from reseau.measure.ordinary import ordinary_coordinates
-from reseau.optics.lenses import AIR, LensCamera, Paraxial, Prescription, SensorPlane, glass, in_order
+from reseau.optics.lenses import (
+    AIR,
+    LensCamera,
+    Paraxial,
+    Prescription,
+    SensorPlane,
+    ThinLens,
+    glass,
+    in_order,
+)
 from reseau.optics.poses import matrix_to_vector
 from reseau.optics.refraction import Refraction, RefractiveIndex, Window
+from reseau.procedures.blurred import thin_lens_of
 from reseau.procedures.blurred_network import BlurredNetwork, NetworkOptions, measure_blurred_network
 
 CENTRE_PX = 350.0
@@ -95,7 +105,7 @@ def camera_of(strength: str, change: Callable[[Prescription], Prescription] | No
     return LensCamera(lens if change is None else change(lens), SensorPlane((PITCH, PITCH), PRINCIPAL))
 
 
-def network_of(drawn: Project, camera: LensCamera) -> Network:
+def network_of(drawn: Project, camera: LensCamera | ThinLens) -> Network:
     """The network with coordinates rounded to pixels, which any measurement replaces."""
     images, m, p = tuple(drawn.images), len(drawn.images), len(drawn.points)
     image_of, point_of = np.repeat(np.arange(m), p), np.tile(np.arange(p), m)
@@ -145,11 +155,14 @@ def targets_of(drawn: Project) -> SpaceTargets:
     )  # fmt: skip
 
 
-def measured(drawn: Project, camera: LensCamera, initial: str) -> BlurredNetwork:
+def measured(
+    drawn: Project, camera: LensCamera | ThinLens, initial: str, known: LensCamera | None = None
+) -> BlurredNetwork:
     """The procedure, begun with ordinary coordinates of a kind."""
     frames = {name: Frame(pixels, 255.0, name) for name, pixels in drawn.images.items()}
     options = NetworkOptions(BlurredOptions(psf_px=PSF, search_px=8.0), initial=initial)  # type: ignore[arg-type]
-    found = measure_blurred_network(network_of(drawn, camera), frames, targets_of(drawn), camera, options)
+    network = network_of(drawn, known if isinstance(camera, ThinLens) and known is not None else camera)
+    found = measure_blurred_network(network, frames, targets_of(drawn), camera, options)
     assert isinstance(found, BlurredNetwork), str(found)
     return found
 
@@ -189,9 +202,9 @@ def figures(drawn: Project, result: Result, shift_px: float = 0.0) -> Figures:
     )
 
 
-def by_rays(drawn: Project, camera: LensCamera) -> Figures:
+def by_rays(drawn: Project, camera: LensCamera | ThinLens, known: LensCamera | None = None) -> Figures:
     """Figures of the procedure."""
-    found = measured(drawn, camera, "centroid")
+    found = measured(drawn, camera, "centroid", known)
     chosen = found.rounds[found.chosen]
     return replace(
         figures(drawn, found.result, chosen.shift_px),
@@ -249,10 +262,21 @@ def blurred_figures(strength: str, seed: int) -> dict[str, Figures]:
     }
 
 
+def stand_in(strength: str, drawn: Project) -> ThinLens:
+    """A thin lens with the principal distance of the camera, the focus and the aperture of the true lens."""
+    camera = camera_of(strength)
+    true, lens = Paraxial(camera.lens), camera.lens
+    f = abs(true.focal_length)
+    defocus = float(lens.surfaces[-1].vertex[2] - lens.surfaces[-2].vertex[2]) - true.back_focus
+    f_number = f / (2 * (lens.stop_radius or 1.0) * abs(true.entrance_pupil[1]))
+    return thin_lens_of(network_of(drawn, camera).cameras[0], distance=f + f**2 / defocus, f_number=f_number)
+
+
 def assumed_figures(strength: str, seed: int) -> dict[str, Figures]:
     """Figures of one seed with wrong designs of the lens."""
     drawn = project(strength, seed)
-    return {text: by_rays(drawn, camera_of(strength, change)) for text, change in ASSUMED.items()}
+    designs = {text: by_rays(drawn, camera_of(strength, change)) for text, change in ASSUMED.items()}
+    return designs | {"thin lens (no design)": by_rays(drawn, stand_in(strength, drawn), camera_of(strength))}
 
 
 def sharp_figures(strength: str, seed: int) -> dict[str, Figures]:

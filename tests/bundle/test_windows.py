@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -166,7 +167,30 @@ def test_what_images_cannot_determine_is_named() -> None:
     network = replace(world.network, refraction=Refraction(indices, (plate,), ((0,),), np.zeros(6, np.intp)))
     failure = world.problem(network).adjusted()
     assert not failure
-    assert "distance of plate" in str(failure)
+    assert str(failure) == (
+        "rank defect 1: no ray depends on distance of plate; window plate has air on both sides, where rays "
+        "are parallel: images from one side do not determine where along them it stands"
+    )
+
+
+def test_what_windows_leave_undetermined_is_told_with_the_element_and_the_cause() -> None:
+    free = ("index of air", "index of glass", "index of water")
+    world = networks.refracted(networks.world(cameras=CALIBRATED, control=25), "plane port", free)
+    failure = world.problem(world.noisy(0)).adjusted()
+    assert not failure
+    assert str(failure).startswith(
+        "rank defect 1: rays depend on the ratios of the indices of air, glass and water"
+    )
+
+
+def test_a_window_that_noise_alone_determines_is_told_with_the_element() -> None:
+    """Distance, thickness and index together: seen from one side, a pane shifts rays as another one does."""
+    free = ("thickness of port", "distance of port", "index of glass")
+    world = networks.refracted(networks.world(cameras=CALIBRATED, control=25), "plane port", free)
+    result = adjust_network(world.noisy(0))
+    said = " ".join(remark.text for remark in result.warnings) if isinstance(result, Result) else str(result)
+    assert re.search("images from one side (hardly|do not) determine .*thickness of (window )?port", said)
+    assert "give it a sigma" in said
 
 
 def test_windows_that_are_not_between_cameras_and_points_are_named() -> None:

@@ -12,10 +12,12 @@ from reseau.core.errors import UsageError
 from reseau.optics.lenses import (
     AIR,
     Aiming,
+    Constant,
     LensCamera,
     Prescription,
     PupilElements,
     SensorPlane,
+    ThinLens,
     Water,
     behind_windows,
     glass,
@@ -111,3 +113,32 @@ def test_an_image_in_air_keeps_its_lens_and_a_cylinder_is_refused() -> None:
     tank = Window("tank", "cylinder", "object", {"radius": 100.0, "thickness": 5.0}, PANE)
     with pytest.raises(UsageError, match="cylinders"):
         behind_windows(BARE, Refraction(MEDIA, (tank,), ((0,),), np.array([0])), 0, np.eye(3), np.zeros(3))
+
+
+def test_a_thin_lens_behind_windows_defocuses_like_a_lens_that_is_traced() -> None:
+    """A weak singlet near the axis, at f/40: the tracing of the design knows nothing of the thin lens."""
+    lens = Prescription(in_order([(0.02, 0.01, Constant(1.5)), (0.0, 104.0, AIR)]), stop=0, stop_radius=1.25)
+    sensor = SensorPlane((0.001, 0.001), (0.0, 0.0))
+    traced, thin = LensCamera(lens, sensor), ThinLens(100.0, 2.5, 104.0, sensor)
+    media = (RefractiveIndex("air", 1.0), RefractiveIndex("glass", 1.52), RefractiveIndex("water", 1.333))
+    port = Window("port", "plane", "camera", {"distance": 30.0, "thickness": 25.0}, ("air", "glass", "water"))
+    wall = Window(
+        "port", "plane", "object", {"distance": -30.0, "thickness": 25.0}, port.media, direction=(0, 0, 1)
+    )
+    points = np.array([[0.0, 0.0, 1500.0], [60.0, 0.0, 1500.0], [0.0, -40.0, 900.0]])
+    ring = np.repeat([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]], 3, axis=0)
+    wide = []
+    for window, x0 in ((port, np.zeros(3)), (wall, np.array([0.0, 0.0, -60.0]))):
+        refraction = Refraction(media, (window,), ((0,),), np.array([0]))
+        both = [behind_windows(each, refraction, 0, np.eye(3), x0) for each in (traced, thin)]
+        spots = [
+            each.rays(np.tile(points, (3, 1)), ring, 550.0)[0].reshape(3, 3, 2) - each.corresponding(points)
+            for each in both
+        ]
+        # Of 20 to 40 px, what the singlet's own aberrations are not.
+        np.testing.assert_allclose(spots[1], spots[0], rtol=0, atol=0.4)
+        wide.append(spots[1])
+        places = [each.corresponding(points) for each in both]
+        np.testing.assert_allclose(places[1], places[0], rtol=2e-3, atol=1.0)
+    np.testing.assert_allclose(wide[0], wide[1], rtol=0, atol=1e-6)
+    assert np.abs(wide[0]).max() > 15

@@ -13,9 +13,9 @@ import pytest
 from reseau.core.errors import UsageError
 from reseau.core.failure import Failure
 from reseau.io.targets import SpaceTargets
-from reseau.optics.lenses import LensCamera, in_order
+from reseau.optics.lenses import LensCamera, Paraxial, in_order
 from reseau.optics.refraction import RefractedRays
-from reseau.procedures.blurred import focused
+from reseau.procedures.blurred import focused, thin_lens_of
 from reseau.procedures.blurred_network import (
     BlurredNetwork,
     NetworkOptions,
@@ -24,6 +24,8 @@ from reseau.procedures.blurred_network import (
 )
 
 from . import underwater
+
+LENS_F = abs(Paraxial(underwater.LENS).focal_length)
 
 
 @cache
@@ -105,6 +107,46 @@ def test_every_coordinate_is_accounted_for_in_every_round() -> None:
         counts = entry.replaced.astype(int) + entry.kept + entry.declined
         assert (counts == 1).all()
         assert len(entry.result.network.xy) == int((~entry.declined).sum())
+
+
+@pytest.mark.parametrize(
+    ("off", "initial", "stays"), [(0.02, "given", True), (0.02, "edge", False), (0.5, "given", False)]
+)
+def test_coordinates_given_by_hand_are_kept_at_sharp_targets_where_they_do_not_differ(
+    off: float, initial: Any, stays: bool
+) -> None:
+    """Their sigmas are 0.05 px, those by rays smaller; 0.5 px is a significant difference."""
+    project, last = drawn(), measured().rounds[1]
+    found = last.measured["i0"]
+    k = int(np.flatnonzero(found.ok)[0])
+    sharp = replace(found, blur_px=np.full_like(found.blur_px, 0.5))
+    (own,) = np.flatnonzero(
+        (project.network.image_of == 0)
+        & (project.network.point_of == project.network.points.index(found.ids[k]))
+    )
+    xy = project.network.xy.copy()
+    xy[own] = found.xy[k] + [off, 0.0]
+    network = replace(project.network, xy=xy)
+    run = _Run(network, {}, project.targets, underwater.CAMERA, NetworkOptions(initial=initial))
+    assert run._stays(sharp, k, int(own)) == stays
+    assert not run._stays(found, k, int(own))
+
+
+def test_a_thin_lens_stands_in_for_a_design_that_is_not_known() -> None:
+    project = drawn()
+    thin = thin_lens_of(project.network.cameras[0], distance=900.0, f_number=LENS_F / 11.0)
+    options = NetworkOptions(rounds=1)
+    found = measure_blurred_network(project.network, project.frames, project.targets, thin, options)
+    assert isinstance(found, BlurredNetwork)
+    last = found.rounds[1]
+    # The images of this lens have so much coma that some are not like those of a thin one.
+    assert last.replaced.sum() >= 15
+    assert any("thin lens stands in" in note.text for note in found.notes)
+    # Its sigmas contain what it does not know.
+    rows = last.replaced[~last.declined]
+    off = (found.network.xy - project.true[~last.declined])[rows]
+    over = np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.network.cov[rows]), off) / 2
+    assert np.sqrt(over.mean()) < 1.5
 
 
 def test_images_without_a_photograph_keep_their_coordinates() -> None:

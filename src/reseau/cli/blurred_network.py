@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from .blurred import FNumber, Focus, LensFile, Pitch, Psf, Search
+from .blurred import FNumber, Focus, Pitch, Psf, Search
 from .common import SensorFile, corrected, progress, read_frame, required, say
 
 if TYPE_CHECKING:
     from ..bundle import Network
     from ..core.data import Frame
+    from ..optics.lenses import LensCamera, ThinLens
     from ..procedures.blurred_network import BlurredNetwork
 
 __all__ = ["blurred_network"]
@@ -33,13 +34,21 @@ def blurred_network(
         Path,
         typer.Option("--targets", "-t", help="Targets, reseau-targets/1: shape, size and direction."),
     ],
-    lens: LensFile,
     out: Annotated[
         Path,
         typer.Option(
             "--out", "-o", help="Folder to write: every round, the final network, its result, a report."
         ),
     ],
+    lens: Annotated[
+        Path | None,
+        typer.Option(
+            "--lens",
+            "-l",
+            help="Lens: lens/1 (TOML), Zemax .zmx or CODE V .seq. Without it a thin lens with the principal "
+            "distance of the camera stands in: give --focus and --f-number.",
+        ),
+    ] = None,
     focus: Focus = None,
     pitch: Pitch = None,
     f_number: FNumber = None,
@@ -53,18 +62,25 @@ def blurred_network(
             "near the given ones."
         ),
     ] = "given",
+    keep_sharp: Annotated[
+        bool,
+        typer.Option(
+            "--keep-sharp/--replace-sharp",
+            help="Whether sharp targets keep coordinates that do not differ significantly from those by "
+            "rays: given ones always, others where they are as certain.",
+        ),
+    ] = True,
     sensor: SensorFile = None,
 ) -> None:
     """Measure the blurred targets of a network by rays and adjust it, until sigma0 no longer falls."""
     from ..bundle import ResultDocument
     from ..core.errors import UsageError
     from ..core.provenance import Provenance, sha256_of
-    from ..exchange import calibration_files, read_lens, read_network
+    from ..exchange import calibration_files, read_network
     from ..io import write_whole
     from ..io.network import Network1
     from ..io.targets import SpaceTargets
     from ..measure.blurred import BlurredOptions
-    from ..procedures.blurred import lens_camera
     from ..procedures.blurred_network import NetworkOptions, final_document, measure_blurred_network
     from ..report.blurred_network import blurred_network_report
 
@@ -72,25 +88,19 @@ def blurred_network(
         raise UsageError(f"is {initial!r}", where="--initial", do="use given, centroid or edge")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError("exists already", where=out, do="give a new or an empty folder")
-    document, optics = Network1.read(network), read_lens(lens)
-    content = read_network(network)
+    document, content = Network1.read(network), read_network(network)
+    lenses, fill = _lenses(content, lens, focus, pitch, f_number)
     space = SpaceTargets.read(targets)
     frames: dict[str, Frame] = {}
     for image, file in _photographs(images, content).items():
         frames[image] = corrected(read_frame(file), sensor)
     if not frames:
         raise UsageError("has no photograph of an image of the network", where=images)
-    cameras = {
-        camera.id: lens_camera(
-            optics, (camera.width, camera.height), pitch_um=pitch, distance=focus, f_number=f_number
-        )
-        for camera in content.cameras
-    }
     matching = BlurredOptions(
         polarity=space.polarity,
         psf_px=psf,
         search_px=search,
-        fill=1.0 if optics.sensor is None else optics.sensor.fill,
+        fill=fill,
     )
     with progress("measuring", 5) as step:
         found = required(
@@ -98,13 +108,13 @@ def blurred_network(
                 content,
                 frames,
                 space,
-                cameras,
-                NetworkOptions(matching, rounds, initial=cast(Any, initial)),
+                lenses,
+                NetworkOptions(matching, rounds, keep_sharp, initial=cast(Any, initial)),
                 watch=step,
             ),
             network,
         )
-    inputs = [network, *calibration_files(network), targets, lens]
+    inputs = [network, *calibration_files(network), targets, *([] if lens is None else [lens])]
     provenance = Provenance(
         {file.name: sha256_of(file) for file in inputs},
         {
@@ -114,6 +124,7 @@ def blurred_network(
             "psf": psf,
             "search": search,
             "initial": initial,
+            "keep sharp": keep_sharp,
         },
     )
     out.mkdir(parents=True, exist_ok=True)
@@ -123,6 +134,32 @@ def blurred_network(
     final_document(document, found).write(out / "network.json")
     write_whole(out / "report.html", blurred_network_report(found, title=network.name, provenance=provenance))
     _say(found, out)
+
+
+def _lenses(
+    network: Network, lens: Path | None, focus: float | None, pitch: float | None, f_number: float | None
+) -> tuple[dict[str, LensCamera | ThinLens], float]:
+    """Lenses by camera, and the light-sensitive share of a pixel."""
+    from ..core.errors import UsageError
+    from ..exchange import read_lens
+    from ..procedures.blurred import lens_camera, thin_lens_of
+
+    if lens is not None:
+        optics = read_lens(lens)
+        known = {
+            camera.id: lens_camera(
+                optics, (camera.width, camera.height), pitch_um=pitch, distance=focus, f_number=f_number
+            )
+            for camera in network.cameras
+        }
+        return dict(known), 1.0 if optics.sensor is None else optics.sensor.fill
+    if focus is None or f_number is None:
+        raise UsageError("no design of the lens", do="give --lens, or --focus and --f-number for a thin lens")
+    if pitch is not None:
+        raise UsageError("is that of the cameras of the network", where="--pitch", do="leave it out")
+    return {
+        camera.id: thin_lens_of(camera, distance=focus, f_number=f_number) for camera in network.cameras
+    }, 1.0
 
 
 def _photographs(folder: Path, network: Network) -> dict[str, Path]:

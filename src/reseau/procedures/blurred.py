@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..adjust import GaussMarkov, Options, Parameters, adjust
-from ..bundle import Network
+from ..bundle import Camera, Network
 from ..bundle.solver.datum import similarity_onto
 from ..bundle.solver.spatial import resect
 from ..core.data import Array, Frame, ImagePoints
@@ -33,6 +33,7 @@ from ..optics.lenses import (
     Prescription,
     RayMap,
     SensorPlane,
+    ThinLens,
     image_scale,
 )
 from ..optics.newton import newton
@@ -51,6 +52,7 @@ __all__ = [
     "pose_in_network",
     "refocused",
     "targets_of",
+    "thin_lens_of",
 ]
 
 Design = ReseauDesign | TestfieldDesign
@@ -202,6 +204,42 @@ def lens_camera(
             f"forms no image of a point on the axis: {camera.why_dark(far)}", where=prescription.name
         )
     return camera
+
+
+def thin_lens_of(camera: Camera, *, distance: float, f_number: float) -> ThinLens:
+    """Stand-in for the lens of a camera from its calibration: a thin lens with its principal distance.
+
+    Parameters
+    ----------
+    camera : Camera
+        With a principal distance.
+    distance : float
+        Distance from the lens at which objects are sharp, mm.
+    f_number : float
+        Focal length over the diameter of the entrance pupil.
+
+    Raises
+    ------
+    UsageError
+        When the camera has no principal distance.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> thin_lens_of(example_network().cameras[0], distance=1000.0, f_number=4.0).focal_length
+    7.936507936507936
+    """
+    mapping = camera.bare_mapping(camera.values)
+    pitch = np.array([*camera.pitch_mm])
+    small = 1e-4
+    across = np.diff(mapping(np.array([[0.0, 0.0], [small, 0.0], [0.0, small]])), axis=0)
+    away = float(np.abs(across[0, 0]) * pitch[0] / small)
+    if not 0 < away < np.inf:
+        raise UsageError("has no principal distance", where=camera.label, do="give the design of the lens")
+    focal = 1 / (1 / away + 1 / distance)
+    middle = mapping(np.zeros((1, 2)))[0]
+    plane = SensorPlane((float(pitch[0]), float(pitch[1])), (float(middle[0]), float(middle[1])))
+    return ThinLens(focal, focal / f_number, away, plane)
 
 
 def targets_of(design: Design, pose: Pose, camera: RayMap) -> tuple[tuple[str, ...], list[PlaneTarget]]:

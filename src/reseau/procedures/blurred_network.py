@@ -3,7 +3,8 @@
 Approximate image coordinates give the orientation by a multi-media bundle adjustment. From it follow the
 images of all targets by rays through windows and lens; matching them with the photographs gives better image
 coordinates, these a better orientation, and so on until sigma0 no longer falls. Where a target is sharp and
-its ordinary coordinates are as certain and do not differ significantly, these are kept.
+its ordinary coordinates do not differ significantly, these are kept: given ones always, those that the
+procedure measured itself where they are as certain.
 """
 
 from __future__ import annotations
@@ -25,7 +26,15 @@ from ..io.network import Network1, ObservationColumns
 from ..io.targets import SpaceTargets
 from ..measure.blurred import BlurredOptions, BlurredResult, measure_blurred
 from ..measure.ordinary import ordinary_coordinates
-from ..optics.lenses import LensCamera, PlaneTarget, behind_windows, image_scale
+from ..optics.lenses import (
+    CalibratedLens,
+    LensCamera,
+    PlaneTarget,
+    RayMap,
+    ThinLens,
+    behind_windows,
+    image_scale,
+)
 from ..optics.refraction import RefractedRays, Refraction
 from .blurred import SPACING_PX
 
@@ -64,8 +73,8 @@ class NetworkOptions:
     rounds : int
         Largest number of rounds.
     keep_sharp : bool
-        Whether ordinary coordinates of sharp targets are kept where they do not differ significantly, and
-        are not less certain than those by rays.
+        Whether ordinary coordinates of sharp targets are kept where they do not differ significantly from
+        those by rays. Coordinates that `initial` measures must not be less certain either.
     initial : {"given", "centroid", "edge"}
         Ordinary coordinates: those of the network, or measured near these as centres of gravity or of
         ellipses through the edges. A target that this does not find keeps the coordinates given.
@@ -174,7 +183,7 @@ def measure_blurred_network(
     network: Network,
     frames: Mapping[str, Frame],
     targets: SpaceTargets,
-    cameras: LensCamera | Mapping[str, LensCamera],
+    cameras: LensCamera | ThinLens | Mapping[str, LensCamera | ThinLens],
     options: NetworkOptions | None = None,
     *,
     watch: Callable[[str], None] | None = None,
@@ -191,8 +200,10 @@ def measure_blurred_network(
     targets : SpaceTargets
         Shape, size and direction of the targets, by the names of the points; points without one keep their
         coordinates.
-    cameras : LensCamera, or mapping of str to LensCamera
-        Lens and sensor, of all cameras or by their names; in the medium next to the camera.
+    cameras : LensCamera or ThinLens, or mapping of str to these
+        Lens and sensor, of all cameras or by their names; in the medium next to the camera. A thin lens
+        stands in for a lens whose design is not known: images lie where the camera of the network has them,
+        and are blurred as by defocus.
     options : NetworkOptions, optional
     watch : callable, optional
         Called with a line about what is done.
@@ -358,7 +369,7 @@ class _Run:
         network: Network,
         frames: Mapping[str, Frame],
         targets: SpaceTargets,
-        cameras: LensCamera | Mapping[str, LensCamera],
+        cameras: LensCamera | ThinLens | Mapping[str, LensCamera | ThinLens],
         options: NetworkOptions,
     ) -> None:
         unit = {"mm": 1.0, "m": 1000.0}.get(network.unit)
@@ -367,9 +378,9 @@ class _Run:
         self.network, self.frames, self.targets, self.options = network, frames, targets, options
         self.unit_mm = unit
         self.row = {name: k for k, name in enumerate(targets.targets.id)}
-        self.cameras: dict[str, LensCamera] = {}
+        self.cameras: dict[str, LensCamera | ThinLens] = {}
         for camera in network.cameras:
-            lens = cameras if isinstance(cameras, LensCamera) else cameras.get(camera.id)
+            lens = cameras.get(camera.id) if isinstance(cameras, Mapping) else cameras
             if lens is None:
                 raise UsageError("has no lens", where=f"camera {camera.id}")
             self.cameras[camera.id] = lens
@@ -510,22 +521,30 @@ class _Run:
                 found.append(Remark(text, Code.UNMODELLED))
         return tuple(found)
 
-    def _camera(self, last: Result, i: int) -> tuple[LensCamera, LensCamera]:
-        """Lens of an image, and the same behind its windows, with the principal point of the adjustment."""
+    def _camera(self, last: Result, i: int) -> tuple[RayMap, RayMap]:
+        """Lens of an image, and the same behind its windows, with the principal point of the adjustment.
+
+        A stand-in has no distortion: its images lie where the camera of the adjustment has them.
+        """
         network, values = self.network, last.fit.values
         c = int(network.camera_of[i])
         entry = network.cameras[c]
         mapping = entry.bare_mapping(values.cameras[c, : len(entry.names)])
-        lens = self.cameras[entry.id]
+        lens, windows = self.cameras[entry.id], self._windows(last)
+        path = -1 if windows is None else int(windows.path_of[i])
+        pose = values.rotation[i], values.x0[i]
+        if isinstance(lens, ThinLens):
+            dry = CalibratedLens(lens, mapping)
+            if windows is None:
+                return dry, dry
+            thin = behind_windows(lens, windows, path, *pose, unit_mm=self.unit_mm)
+            return dry, CalibratedLens(thin, mapping, thin.directions)
         middle = mapping(np.zeros((1, 2)))[0]
         sensor = replace(lens.sensor, principal_px=(float(middle[0]), float(middle[1])))
         lens = replace(lens, sensor=sensor)
-        windows = self._windows(last)
         if windows is None:
             return lens, lens
-        return lens, behind_windows(
-            lens, windows, int(windows.path_of[i]), values.rotation[i], values.x0[i], unit_mm=self.unit_mm
-        )
+        return lens, behind_windows(lens, windows, path, *pose, unit_mm=self.unit_mm)
 
     def _windows(self, last: Result) -> Refraction | None:
         """Windows and media of an adjustment; those of a rig as windows of its cameras."""
@@ -540,17 +559,33 @@ class _Run:
         sharp = bool(found.blur_px[k] <= _SHARP_PX)
         if not found.ok[k]:
             return sharp
-        surer = np.trace(self.network.cov[own]) <= np.trace(found.cov[k])
-        if not (sharp and surer and self.options.keep_sharp):
+        # Coordinates given by hand are kept, as in Meid's figure 6; those measured here need not be.
+        given = self.options.initial == "given"
+        worthy = given or np.trace(self.network.cov[own]) <= np.trace(found.cov[k])
+        if not (sharp and worthy and self.options.keep_sharp):
             return False
         difference = found.xy[k] - self.network.xy[own]
         both = found.cov[k] + self.network.cov[own]
         return bool(difference @ np.linalg.solve(both, difference) <= _DIFFERS)
 
+    def _stand_ins(self) -> tuple[Remark, ...]:
+        """Say which cameras have a stand-in for their lens, and what it does not know."""
+        found = []
+        for entry in self.network.cameras:
+            lens = self.cameras[entry.id]
+            if isinstance(lens, ThinLens):
+                text = (
+                    f"{entry.label}: a thin lens stands in for its design: aberrations are not known; sigmas "
+                    f"contain {lens.unknown:.0%} of the blur for them, but distortion and object points take "
+                    "up unseen what they shift smoothly over the image"
+                )
+                found.append(Remark(text, Code.UNMODELLED))
+        return tuple(found)
+
     def notes(self, rounds: list[BlurredRound], best: int) -> tuple[Remark, ...]:
         """Return what a user should know."""
         last = rounds[best]
-        found = [*_misfits(last), *self._unfollowed(last.result)]
+        found = [*self._stand_ins(), *_misfits(last), *self._unfollowed(last.result)]
         missing = [name for name in self.network.images if name not in self.frames]
         if missing:
             found.append(

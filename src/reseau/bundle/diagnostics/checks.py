@@ -267,6 +267,22 @@ def _refraction(result: Result) -> list[Remark]:
         ]
         if pairs:
             found.append(Remark(f"windows and media: correlated are {listed(pairs)}", Code.CORRELATED))
+        xyz = result.points.xyz
+        size = float(np.nanmax(np.abs(xyz - np.nanmean(xyz, axis=0))))
+        loose = [
+            f"{name} (± {sigma:.2g}{' ' * bool(unit)}{unit})"
+            for name, value, sigma, unit in zip(
+                named.parameters, named.values.tolist(), named.sigma.tolist(), named.units, strict=True
+            )
+            if sigma > _known_to(name, value, size)
+        ]
+        if loose:
+            found.append(
+                Remark(
+                    f"images from one side hardly determine {listed(loose)}: hold it, or give it a sigma",
+                    Code.NOT_IDENTIFIED,
+                )
+            )
     rows, network = result.misses_windows, result.network
     if len(rows):
         names = [
@@ -281,6 +297,16 @@ def _refraction(result: Result) -> list[Remark]:
             )
         )
     return found
+
+
+def _known_to(name: str, value: float, size: float) -> float:
+    """How well a parameter of windows or media is known before any adjustment of a network of this size."""
+    if name.startswith("index of"):
+        return 0.5
+    if name.startswith(("thickness of", "radius of")):
+        return abs(value)
+    # Tangents, curvatures and lengths.
+    return 1.0 if name.startswith("tilt") else 1 / size if name.startswith("curvature") else size
 
 
 def _weak(result: Result) -> list[Remark]:

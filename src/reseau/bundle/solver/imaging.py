@@ -429,7 +429,14 @@ class Imaging:
         return np.asarray(self.kind[camera_of] != _NO_KERNEL)
 
     def bent(
-        self, seen: Seen, at: Orientation, values: Array, rig: RigValues | None, *, derivatives: bool
+        self,
+        seen: Seen,
+        at: Orientation,
+        values: Array,
+        rig: RigValues | None,
+        *,
+        derivatives: bool,
+        crossings: Array | None = None,
     ) -> tuple[Bent, Callable[[int, int], None]]:
         """Return room for the rays through windows, and a function that computes them for a part of `seen`.
 
@@ -445,6 +452,8 @@ class Imaging:
             Places of the cameras on a rig.
         derivatives : bool
             Whether derivatives are needed.
+        crossings : ndarray (n, k, 3), optional
+            See :meth:`RefractedRays.worker`.
         """
         if self.refraction is None:
             return Bent(self._air, np.zeros((0, 2)), np.zeros((0, 2, 0))), lambda begin, end: None
@@ -452,7 +461,7 @@ class Imaging:
         width = 9 + columns.by_parameters.shape[3] if derivatives else 0
         rays = RefractedRays.empty(len(seen.image), width)
         work = RefractedRays.worker(
-            columns, self._path_of, at.rotation, at.x0, at.xyz, seen.image, seen.point, rays
+            columns, self._path_of, at.rotation, at.x0, at.xyz, seen.image, seen.point, rays, crossings
         )
         return Bent(self._path_of, rays.uv, rays.by), work
 

@@ -34,6 +34,7 @@ from .rank import (
     undetermined,
     weak_images,
     weak_points,
+    why_without_effect,
     without_effect,
 )
 from .system import Linear, System, residuals
@@ -394,6 +395,9 @@ class _Run:
             if found.converged or again:
                 return again
         if not found.converged:
+            idle = self._idle(found.linear, found.costs)
+            if idle is not None:
+                return idle
             reason = f"not converged in {found.iterations} iterations"
             if network.refraction is not None and scaled_by_windows(self.system, start, self.usable.points):
                 reason += f": {SCALE_OF_WINDOWS}"
@@ -409,16 +413,9 @@ class _Run:
                 chosen = steady_points(self.system.linearise(values), chosen)
             values = self._aligned(values, freedom, chosen)
         linear = self.system.linearise(values)
-        idle = without_effect(linear)
-        if idle:
-            reason = f"rank defect {len(idle)}: no ray depends on {', '.join(idle)}"
-            missed = missing_windows(network, values, np.ones(len(network.xy), dtype=bool))
-            if len(missed):
-                reason += (
-                    f"; {len(missed)} image points are not seen through their windows, which must lie "
-                    "between cameras and points, in the coordinate system of the network"
-                )
-            return AdjustmentFailure(reason, Code.RANK_DEFECT, costs=tuple(found.costs))
+        idle = self._idle(linear, found.costs)
+        if idle is not None:
+            return idle
         freedom = freedom_of(self.system, values, self.usable.points)
         try:
             cofactors = cofactors_of(linear, freedom, chosen if inner else None, self.usable.points)
@@ -438,6 +435,22 @@ class _Run:
                 SCALE_OF_WINDOWS, Code.NOT_IDENTIFIED, iterations=found.iterations, costs=found.costs
             )
         return self._fit(linear, freedom, cofactors, counts, found, chosen if inner else None)
+
+    def _idle(self, linear: Linear, costs: tuple[float, ...]) -> Failure | None:
+        """A failure where no ray depends on a free parameter of windows or media."""
+        network, values = self.problem.network, linear.values
+        idle = without_effect(linear)
+        if not idle or network.refraction is None:
+            return None
+        reason = f"rank defect {len(idle)}: no ray depends on {', '.join(idle)}"
+        reason += why_without_effect(network.refraction, values.refraction, idle)
+        missed = missing_windows(network, values, np.ones(len(network.xy), dtype=bool))
+        if len(missed):
+            reason += (
+                f"; {len(missed)} image points are not seen through their windows, which must lie between "
+                "cameras and points, in the coordinate system of the network"
+            )
+        return AdjustmentFailure(reason, Code.RANK_DEFECT, costs=tuple(costs))
 
     def _scale_is_loose(self, at: tuple[Values, ...], sigma0: float, datum: Mask | None) -> bool:
         """Whether windows alone determine the scale, and worse than covariances of first order can say.

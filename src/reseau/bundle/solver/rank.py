@@ -7,7 +7,7 @@ import numpy as np
 from ...adjust import AdjustmentFailure
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
-from ...optics.refraction import RefractedRays
+from ...optics.refraction import RefractedRays, Refraction
 from ..network import Network
 from .arrow import full
 from .datum import Freedom, held_for, similarity_changes
@@ -23,6 +23,7 @@ __all__ = [
     "undetermined",
     "weak_images",
     "weak_points",
+    "why_without_effect",
     "without_effect",
 ]
 
@@ -38,6 +39,8 @@ _ZERO = 1e-11
 # than 3e-5 rad.
 PARALLEL = 1e-9
 _LISTED = 8
+# Indices that differ by less are equal: no ray is bent by 1e-9 rad.
+_SAME = 1e-9
 # A point with this many times the median uncertainty is poorly determined.
 _POOR = 50.0
 # Greatest part of a change of the projection centres that is left by a similarity which explains it.
@@ -74,9 +77,82 @@ def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> 
         return AdjustmentFailure(reason, Code.RANK_DEFECT, costs=costs, null_space=tuple(vectors))
     if not vectors:
         return AdjustmentFailure("the normal equations are numerically singular", Code.SINGULAR, costs=costs)
-    listed = "; ".join(" with ".join(list(vector)[:_LISTED]) for vector in vectors)
-    reason = f"rank defect {len(vectors)}: the observations do not determine {listed}"
+    listed = "; ".join(_said(linear.system.unknowns.network.refraction, list(vector)) for vector in vectors)
+    reason = f"rank defect {len(vectors)}: {listed}"
     return AdjustmentFailure(reason, Code.RANK_DEFECT, costs=costs, null_space=tuple(vectors))
+
+
+def _said(bent: Refraction | None, names: list[str]) -> str:
+    """Say what a combination of unknowns that is not determined means, with windows and media first."""
+    own = [name for name in names if bent is not None and name in bent.names]
+    if bent is None or not own:
+        return f"the observations do not determine {' with '.join(names[:_LISTED])}"
+    others = [name for name in names if name not in own]
+    rest = f" (with {', '.join(others[:_LISTED])}{' …' if len(others) > _LISTED else ''})" if others else ""
+    indices = [medium.name for medium in bent.media if medium.label in own]
+    if len(indices) == len(own) > 1 and not others:
+        return (
+            f"rays depend on the ratios of the indices of {_and(indices)} only, not on their size; "
+            "hold one of them"
+        )
+    parts = [f"the {quantity} of window {window}" for quantity, window in _of_windows(bent, own)]
+    parts += [f"the index of {name}" for name in indices]
+    if len(own) == 1 and not others:
+        return f"images from one side do not determine {parts[0]}; hold it, or give it a sigma"
+    return (
+        f"images from one side do not determine {_and(parts)}: changed together{rest}, they leave every "
+        "image coordinate as it is; hold one of them, or give it a sigma"
+    )
+
+
+def _of_windows(bent: Refraction, names: list[str]) -> list[tuple[str, str]]:
+    """Quantities with the names of their windows, in the order of the windows."""
+    return [
+        (quantity, window.name)
+        for window in bent.windows
+        for quantity, label in zip(window.names, window.labels, strict=True)
+        if label in names
+    ]
+
+
+def _and(parts: list[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def why_without_effect(bent: Refraction, values: Array, names: list[str]) -> str:
+    """Say of parameters of windows on which no ray depends (:func:`without_effect`) why that is so.
+
+    Parameters
+    ----------
+    bent : Refraction
+        Windows and media of the network.
+    values : ndarray (u,)
+        Their parameters.
+    names : list of str
+        Parameters without effect.
+    """
+    index = dict(zip(bent.names, values.tolist(), strict=True))
+    reasons = []
+    for quantity, name in _of_windows(bent, names):
+        window = next(each for each in bent.windows if each.name == name)
+        along = [index[f"index of {medium}"] for medium in window.media]
+        if quantity == "thickness" and abs(along[1] - along[2]) < _SAME:
+            one, two = window.media[1:]
+            reasons.append(
+                f"{one} and {two} have the same index, so that the second surface of window {name} does not "
+                "refract"
+            )
+        elif quantity == "thickness" and abs(along[0] - along[1]) < _SAME:
+            reasons.append(
+                f"{window.media[0]} and {window.media[1]} have the same index, so that the first surface of "
+                f"window {name} does not refract"
+            )
+        elif window.shape == "plane" and abs(along[0] - along[-1]) < _SAME:
+            reasons.append(
+                f"window {name} has {_and(sorted({window.media[0], window.media[-1]}))} on both sides, where "
+                "rays are parallel: images from one side do not determine where along them it stands"
+            )
+    return "".join(f"; {reason}" for reason in dict.fromkeys(reasons))
 
 
 def _is_scale(linear: Linear, vector: dict[str, float]) -> bool:

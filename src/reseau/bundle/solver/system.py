@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +14,7 @@ from ..network import Network
 from .arrow import Arrow, full
 from .camera_basis import CameraBasis, camera_bases, with_bases
 from .compiled import chunks_of, in_parallel
-from .imaging import Imaging, Seen, mapped
+from .imaging import Bent, Imaging, Seen, mapped
 from .normal import Sums, assemble, reduce_sides, substitute
 from .observations import OtherObservations
 from .rig_constraints import RigConstraints
@@ -83,7 +84,7 @@ class System:
         out = np.empty((len(self.seen.image), 2))
         at, first = values.orientation, self.unknowns.first
 
-        bent, bend = self.imaging.bent(self.seen, at, values.refraction, values.rig, derivatives=False)
+        bent, bend = self._bent(values, derivatives=False)
 
         def work(_: int, a: int, b: int) -> None:
             begin, end = int(first[a]), int(first[b])
@@ -95,6 +96,21 @@ class System:
             xy, *_more = mapped(mapping, at, self.seen.image[rows], self.seen.point[rows], bent, rows)
             out[rows] = self._weighted(rows, (xy - self.seen.xy[rows])[:, :, None])[:, :, 0]
         return out, (self.others.computed(values) - self.others.value) * self.sigma_root
+
+    def _bent(self, values: Values, *, derivatives: bool) -> tuple[Bent, Callable[[int, int], None]]:
+        """See :meth:`Imaging.bent`; rays begin where those of the last values were."""
+        return self.imaging.bent(
+            self.seen, values.orientation, values.refraction, values.rig, derivatives=derivatives,
+            crossings=self._crossings,
+        )  # fmt: skip
+
+    @cached_property
+    def _crossings(self) -> Array | None:
+        """Where the rays of the observations cross the surfaces of their windows (n, k, 3), NaN at first."""
+        refraction = self.imaging.refraction
+        if refraction is None:
+            return None
+        return np.full((len(self.seen.image), max(refraction.longest, 1), 3), np.nan)
 
     def mappings(self, values: Values) -> list[tuple[PlaneMapping, int, Rows]]:
         """Return mapping, number and rows of the observations of each camera without a kernel."""
@@ -111,7 +127,7 @@ class System:
         at, first = values.orientation, unknowns.first
         a_out, b_out = rows[:, :, :-3], rows[:, :, -3:]
 
-        bent, bend = self.imaging.bent(self.seen, at, values.refraction, values.rig, derivatives=True)
+        bent, bend = self._bent(values, derivatives=True)
 
         def work(_: int, a: int, b: int) -> None:
             begin, end = int(first[a]), int(first[b])

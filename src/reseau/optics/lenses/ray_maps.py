@@ -7,6 +7,7 @@ projection centre.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
@@ -244,6 +245,8 @@ class CalibratedLens:
     camera : RayMap
     mapping : PlaneMapping
         From directions X/Z, Y/Z to pixels.
+    directions : callable, optional
+        From points (n, 3) to directions (n, 2); those behind windows are not X/Z, Y/Z.
 
     Examples
     --------
@@ -257,6 +260,7 @@ class CalibratedLens:
 
     camera: RayMap
     mapping: PlaneMapping
+    directions: Callable[[Array], Array] | None = None
 
     @property
     def unknown(self) -> float:
@@ -267,7 +271,8 @@ class CalibratedLens:
         """See :class:`RayMap`."""
         if (points[:, 2] <= 0).any():
             raise UsageError("a point of the object lies behind the lens")
-        return np.asarray(self.mapping(points[:, :2] / points[:, 2:]))
+        uv = points[:, :2] / points[:, 2:] if self.directions is None else self.directions(points)
+        return np.asarray(self.mapping(uv))
 
     def spots(self, points: Array, elements: PupilElements) -> tuple[Array, Array]:
         """See :class:`RayMap`."""

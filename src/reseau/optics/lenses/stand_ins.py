@@ -58,6 +58,15 @@ class ThinLens(ByRays):
         """All; without dispersion they differ in nothing."""
         return self.colours
 
+    def directions(self, points: Array) -> Array:
+        """Directions (n, 2) in which the projection centre sees points (n, 3)."""
+        return np.asarray(points[:, :2] / points[:, 2:])
+
+    def stop_points(self, points: Array, pupil: Array) -> Array:
+        """Points of the stop (n, 3) in camera axes, mm, through which rays from points (n, 3) pass."""
+        at = 0.5 * self.diameter * pupil
+        return np.column_stack([at[:, 0], -at[:, 1], np.zeros(len(at))])
+
     def rays(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
         """Rays in the geometry of a thin lens."""
         x, y, depth = points.T
@@ -126,11 +135,24 @@ class AberratedLens(ThinLens):
         """See :class:`RayMap`; a value of experience, with aberrations estimated from photographs."""
         return 0.02
 
+    def stop_points(self, points: Array, pupil: Array) -> Array:
+        """See :class:`ThinLens`."""
+        return super().stop_points(points, self._narrowed(pupil, self._field(points)))
+
+    def _field(self, points: Array) -> Array:
+        """Places of the images (n, 2), in parts of the field."""
+        away = np.array([-self.image_distance, self.image_distance]) / self.field_mm
+        return np.asarray(points[:, :2] / points[:, 2:] * away)
+
+    def _narrowed(self, pupil: Array, field: Array) -> Array:
+        along = (pupil * field).sum(axis=1, keepdims=True)
+        return np.asarray(pupil - 0.5 * self.narrowing * along * field)
+
     def rays(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
         """Rays of a thin lens with aberrations."""
-        field = points[:, :2] * [-self.image_distance, self.image_distance] / points[:, 2:] / self.field_mm
+        field = self._field(points)
         square = (field**2).sum(axis=1, keepdims=True)
-        pupil = pupil - 0.5 * self.narrowing * (pupil * field).sum(axis=1, keepdims=True) * field
+        pupil = self._narrowed(pupil, field)
         xy, light = super().rays(points, pupil, wavelength_nm)
         across, radius = (pupil * field).sum(axis=1, keepdims=True), (pupil**2).sum(axis=1, keepdims=True)
         shorter = 10 * (1 - wavelength_nm / self.wavelength_nm)

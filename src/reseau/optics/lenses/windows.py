@@ -1,20 +1,28 @@
-"""A lens behind the windows of a network: one prescription of both, for images formed by rays."""
+"""A lens behind the windows of a network, for images formed by rays.
+
+A lens whose design is known becomes one prescription with the windows. Before a
+stand-in, rays are refracted by the windows first.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import overload
 
 import numpy as np
 
-from ...core.data import Array
+from ...core.data import Array, Mask
 from ...core.errors import UsageError
-from ..refraction import Refraction, RefractiveIndex
+from ..refraction import RefractedRays, Refraction, RefractiveIndex
+from ..refraction.windows import RefractionColumns
 from .media import Constant, Medium
 from .prescription import Surface
-from .ray_maps import LensCamera
+from .ray_maps import ByRays, LensCamera
+from .stand_ins import ThinLens
 
-__all__ = ["behind_windows"]
+__all__ = ["ThinLensBehindWindows", "behind_windows"]
 
 
 @dataclass(frozen=True)
@@ -30,20 +38,110 @@ class _Adjusted:
         return self.value + self.dispersion(wavelength_nm) - self.dispersion(self.wavelength_nm)
 
 
+@dataclass(frozen=True, eq=False)
+class ThinLensBehindWindows(ByRays):
+    """A stand-in for a lens, seen through windows.
+
+    A ray from a point of the stop is refracted by the windows. Before them it is a straight line, which the
+    lens images as that of a point in air.
+
+    Parameters
+    ----------
+    lens : ThinLens
+    refraction, path, rotation, x0, unit_mm
+        See :func:`behind_windows`.
+
+    Examples
+    --------
+    See :func:`behind_windows`.
+    """
+
+    lens: ThinLens
+    refraction: Refraction
+    path: int
+    rotation: Array
+    x0: Array
+    unit_mm: float = 1.0
+
+    @property
+    def unknown(self) -> float:
+        """See :class:`RayMap`."""
+        return self.lens.unknown
+
+    @property
+    def wavelengths(self) -> tuple[tuple[float, float], ...]:
+        """Those of the lens."""
+        return self.lens.wavelengths
+
+    @property
+    def wavelength_nm(self) -> float:
+        """That of the lens."""
+        return self.lens.wavelength_nm
+
+    def directions(self, points: Array) -> Array:
+        """Directions (n, 2) before the windows of the rays from points to the projection centre, or NaN."""
+        seen, reached = self._seen(np.zeros_like(points), points, self.wavelength_nm)
+        return np.where(reached[:, None], seen, np.nan)
+
+    def rays(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
+        """Rays by refraction at the windows, and the geometry of the lens."""
+        depth = points[:, 2:]
+        if (depth <= 0).any():
+            raise UsageError("a point of the object lies behind the lens")
+        middle, _ = self._seen(np.zeros_like(points), points, wavelength_nm)
+        stop = self.lens.stop_points(depth * np.column_stack([middle, np.ones(len(middle))]), pupil)
+        seen, reached = self._seen(stop, points, wavelength_nm)
+        before = stop + depth * np.column_stack([seen, np.ones(len(seen))])
+        xy, light = self.lens.rays(before, pupil, wavelength_nm)
+        return np.where(reached[:, None], xy, np.nan), light * reached[:, None]
+
+    def _seen(self, stop: Array, points: Array, wavelength_nm: float) -> tuple[Array, Mask]:
+        """Directions (n, 2) from points of the stop, and whether there is a ray (n,)."""
+        if wavelength_nm not in self._columns:
+            values = self.refraction.values.copy()
+            for medium in self.refraction.media:
+                at = self.refraction.names.index(medium.label)
+                adjusted = replace(medium, value=float(values[at]), free=False, sigma=None)
+                values[at] = _medium(adjusted, self.wavelength_nm).index(wavelength_nm)
+            self._columns[wavelength_nm] = self.refraction.columns(values)
+        rays = RefractedRays.beside(
+            self._columns[wavelength_nm], self.path, self.rotation, self.x0, stop / self.unit_mm,
+            points / self.unit_mm,
+        )  # fmt: skip
+        return rays.uv, rays.reached
+
+    @cached_property
+    def _columns(self) -> dict[float, RefractionColumns]:
+        """Windows by wavelength."""
+        return {}
+
+
+@overload
 def behind_windows(
-    camera: LensCamera,
+    camera: LensCamera, refraction: Refraction, path: int, rotation: Array, x0: Array, *, unit_mm: float = ...
+) -> LensCamera: ...
+
+
+@overload
+def behind_windows(
+    camera: ThinLens, refraction: Refraction, path: int, rotation: Array, x0: Array, *, unit_mm: float = ...
+) -> ThinLens | ThinLensBehindWindows: ...
+
+
+def behind_windows(
+    camera: LensCamera | ThinLens,
     refraction: Refraction,
     path: int,
     rotation: Array,
     x0: Array,
     *,
     unit_mm: float = 1.0,
-) -> LensCamera:
+) -> LensCamera | ThinLens | ThinLensBehindWindows:
     """Put the windows that the rays of an image pass in front of a lens.
 
     Parameters
     ----------
-    camera : LensCamera
+    camera : LensCamera or ThinLens
         The lens with its sensor, in the first medium of the path.
     refraction : Refraction
         Windows and media, with the values to be used. Media with a dispersion keep it; their index at the
@@ -57,13 +155,13 @@ def behind_windows(
 
     Returns
     -------
-    LensCamera
+    LensCamera, or ThinLens or ThinLensBehindWindows
         Its object points are in the last medium; the projection centre is where it was.
 
     Raises
     ------
     UsageError
-        For a cylinder, which the tracing of lenses does not know, and for a window on a rig.
+        For a cylinder before a design, which the tracing of lenses does not know, and for a window on a rig.
 
     Examples
     --------
@@ -78,9 +176,22 @@ def behind_windows(
     >>> far = np.array([[100.0, 0.0, 1000.0]])
     >>> bool(wet.corresponding(far)[0, 0] > camera.corresponding(far)[0, 0])
     True
+
+    A thin lens in place of it, with the surface of the water at its stop: directions follow Snell's law.
+
+    >>> from reseau.optics.lenses import ThinLens
+    >>> near = Window("surface", "plane", "camera", {"distance": 1e-6}, ("air", "water"))
+    >>> thin = ThinLens(50.0, 12.5, 50.0, SensorPlane((0.005, 0.005), (999.5, 749.5)))
+    >>> refraction = Refraction(media, (near,), ((0,),), np.array([0]))
+    >>> wet = behind_windows(thin, refraction, 0, np.eye(3), np.zeros(3))
+    >>> sine = 1.333 * np.sin(np.arctan(0.1))
+    >>> bool(abs(wet.corresponding(far)[0, 0] - 999.5 - 1e4 * sine / np.sqrt(1 - sine**2)) < 1e-3)
+    True
     """
     if path < 0:
         return camera
+    if isinstance(camera, ThinLens):
+        return ThinLensBehindWindows(camera, refraction, path, rotation, x0, unit_mm)
     lens, centre = camera.lens, camera.projection_centre
     named = {medium.name: _medium(medium, lens.wavelength_nm) for medium in refraction.media}
     found: list[Surface] = []

@@ -34,6 +34,8 @@ __all__ = ["RefractedRays"]
 
 # Largest tangential component of Snell's condition at the solution; an image point is exact to 1e-9 px.
 _CONVERGED = 1e-12
+# Rounding, beside which another step gains nothing.
+_EXACT = 1e-14
 _ITERATIONS, _HALVINGS = 60, 30
 
 
@@ -159,34 +161,30 @@ def _matrix(
     """Write the blocks of the matrix: d (k, 2, 2) on the diagonal, o (k, 2, 2) to its right."""
     for j in range(count):
         before, after = index[j] / length[j], index[j + 1] / length[j + 1]
-        for k in range(2):
-            for m in range(2):
-                tt = t[j, k, 0] * t[j, m, 0] + t[j, k, 1] * t[j, m, 1] + t[j, k, 2] * t[j, m, 2]
-                te = tf = se = sf = tu = su = 0.0
-                for i in range(3):
-                    te += t[j, k, i] * e[j, i]
-                    se += t[j, m, i] * e[j, i]
-                    tf += t[j, k, i] * e[j + 1, i]
-                    sf += t[j, m, i] * e[j + 1, i]
-                    tu += t[j, k, i] * s[j, i]
-                    su += t[j, m, i] * s[j, i]
-                value = before * (tt - te * se) + after * (tt - tf * sf)
-                if kind[j] == 0:
-                    value -= mu[j] * s[j, 6] * tt
-                elif kind[j] == 1:
-                    value += mu[j] / s[j, 6] * tt
-                else:
-                    value += mu[j] / s[j, 6] * (tt - tu * su)
-                d[j, k, m] = value
+        bend = -mu[j] * s[j, 6] if kind[j] == 0 else mu[j] / s[j, 6]
+        # The tangents are perpendicular unit vectors.
+        e0 = t[j, 0, 0] * e[j, 0] + t[j, 0, 1] * e[j, 1] + t[j, 0, 2] * e[j, 2]
+        e1 = t[j, 1, 0] * e[j, 0] + t[j, 1, 1] * e[j, 1] + t[j, 1, 2] * e[j, 2]
+        f0 = t[j, 0, 0] * e[j + 1, 0] + t[j, 0, 1] * e[j + 1, 1] + t[j, 0, 2] * e[j + 1, 2]
+        f1 = t[j, 1, 0] * e[j + 1, 0] + t[j, 1, 1] * e[j + 1, 1] + t[j, 1, 2] * e[j + 1, 2]
+        d[j, 0, 0] = before * (1.0 - e0 * e0) + after * (1.0 - f0 * f0) + bend
+        d[j, 1, 1] = before * (1.0 - e1 * e1) + after * (1.0 - f1 * f1) + bend
+        d[j, 0, 1] = -before * e0 * e1 - after * f0 * f1
+        if kind[j] == 2:
+            u0 = t[j, 0, 0] * s[j, 0] + t[j, 0, 1] * s[j, 1] + t[j, 0, 2] * s[j, 2]
+            u1 = t[j, 1, 0] * s[j, 0] + t[j, 1, 1] * s[j, 1] + t[j, 1, 2] * s[j, 2]
+            d[j, 0, 0] -= bend * u0 * u0
+            d[j, 1, 1] -= bend * u1 * u1
+            d[j, 0, 1] -= bend * u0 * u1
+        d[j, 1, 0] = d[j, 0, 1]
         if j + 1 < count:
-            for k in range(2):
-                for m in range(2):
-                    tt = tf = sf = 0.0
+            for m in range(2):
+                a = t[j + 1, m, 0] * e[j + 1, 0] + t[j + 1, m, 1] * e[j + 1, 1] + t[j + 1, m, 2] * e[j + 1, 2]
+                for k in range(2):
+                    tt = 0.0
                     for i in range(3):
                         tt += t[j, k, i] * t[j + 1, m, i]
-                        tf += t[j, k, i] * e[j + 1, i]
-                        sf += t[j + 1, m, i] * e[j + 1, i]
-                    o[j, k, m] = -after * (tt - tf * sf)
+                    o[j, k, m] = -after * (tt - (f0 if k == 0 else f1) * a)
 
 
 @kernel
@@ -238,13 +236,20 @@ def _solve(count: int, o: Array, inverse: Array, right: Array) -> None:
 def _ray(
     count: int, kind: Rows, side: Array, s: Array, index: Array, x: Array, q: Array, trial: Array, e: Array,
     length: Array, g: Array, t: Array, mu: Array, f: Array, d: Array, o: Array, inverse: Array, step: Array,
+    begun: bool,
 ) -> bool:  # fmt: skip
-    """Find the ray to x; write its points q and all else at them. False where there is none."""
+    """Find the ray to x; write its points q and all else at them. False where there is none.
+
+    Newton's method begins at the points q if they are near those of the ray, otherwise on the straight line.
+    """
     for j in range(count):
-        _crossing(kind[j], side[j], s[j], x, q[j])
+        if begun:
+            _on_surface(kind[j], s[j], q[j])
+        else:
+            _crossing(kind[j], side[j], s[j], x, q[j])
     _segments(count, q, x, e, length)
     worst = _conditions(count, kind, s, index, q, e, g, t, mu, f)
-    found = False
+    found, near = worst <= _EXACT, False
     for _ in range(_ITERATIONS):
         _matrix(count, kind, s, index, e, length, t, mu, d, o)
         if not _eliminate(count, d, o, inverse):
@@ -290,7 +295,9 @@ def _ray(
         for j in range(count):
             for i in range(3):
                 q[j, i] = trial[j, i]
-        found = worst <= _CONVERGED
+        # A ray must not depend on where its search began: one more step where this one was long.
+        found = worst <= _EXACT or (near and worst <= _CONVERGED)
+        near = worst <= _CONVERGED
     if not found:
         return False
     # The surfaces lie between camera and object, in their order.
@@ -386,8 +393,12 @@ def _by_adjoint(
 def _rays(
     begin: int, end: int, image: Rows, point: Rows, columns: RefractionColumns, path_of: Rows, placed: Array,
     rotation: Array, x0: Array, xyz: Array, derivatives: bool, uv: Array, by: Array, reached: Mask,
+    crossings: Array,
 ) -> None:  # fmt: skip
-    """Compute the rays begin…end; `placed` (m, k, 7) are the surfaces of each image in its camera system."""
+    """Compute the rays begin…end; `placed` (m, k, 7) are the surfaces of each image in its camera system.
+
+    Rays begin at `crossings` (n, k, 3), which are not NaN where they are known, and write theirs.
+    """
     longest, parameters = columns.kind.shape[1], columns.by_parameters.shape[3]
     x, to, by_x = np.empty(3), np.empty(3), np.empty(3)
     q, trial, g = np.empty((longest, 3)), np.empty((longest, 3)), np.empty((longest, 3))
@@ -410,9 +421,20 @@ def _rays(
             x[r] = rotation[i, r, 0] * a + rotation[i, r, 1] * b + rotation[i, r, 2] * c
         count, s = columns.surfaces[p], placed[i]
         kind, side, index = columns.kind[p], columns.side[p], columns.indices[p]
+        begun = len(crossings) > 0 and not np.isnan(crossings[k, 0, 0])
+        if begun:
+            q[:] = crossings[k]
         reached[k] = _ray(
-            count, kind, side, s, index, x, q, trial, e, length, g, t, mu, f, d, o, inverse, step
+            count, kind, side, s, index, x, q, trial, e, length, g, t, mu, f, d, o, inverse, step, begun
         )  # fmt: skip
+        if begun and not reached[k]:
+            reached[k] = _ray(
+                count, kind, side, s, index, x, q, trial, e, length, g, t, mu, f, d, o, inverse, step, False
+            )  # fmt: skip
+        if len(crossings) > 0:
+            crossings[k] = q
+            if not reached[k]:
+                crossings[k, 0, 0] = np.nan
         first = q[0]
         if not reached[k]:
             first = x
@@ -542,18 +564,50 @@ class RefractedRays(NamedTuple):
     @staticmethod
     def worker(
         columns: RefractionColumns, path_of: Rows, rotation: Array, x0: Array, xyz: Array, image: Rows,
-        point: Rows, rays: RefractedRays,
+        point: Rows, rays: RefractedRays, crossings: Array | None = None,
     ) -> Callable[[int, int], None]:  # fmt: skip
-        """Return a function that computes the rays begin…end, for threads; see :meth:`of`."""
+        """Return a function that computes the rays begin…end, for threads; see :meth:`of`.
+
+        `crossings` (n, k, 3) are points in camera axes where the rays cross the surfaces, NaN where they are
+        not known; each ray is sought from there first, and its own are written. They save more than half of
+        the time where the same rays are computed again for slightly different poses and points.
+        """
         placed = _placed(columns, path_of, rotation, x0)
+        known = np.zeros((0, 1, 3)) if crossings is None else crossings
 
         def work(begin: int, end: int) -> None:
             _compiled_rays()(
                 begin, end, image, point, columns, path_of, placed, rotation, x0, xyz, rays.by.shape[2] > 0,
-                rays.uv, rays.by, rays.reached,
+                rays.uv, rays.by, rays.reached, known,
             )  # fmt: skip
 
         return work
+
+    @classmethod
+    def beside(
+        cls, columns: RefractionColumns, path: int, rotation: Array, x0: Array, begin: Array, end: Array
+    ) -> Self:  # fmt: skip
+        """Compute rays from points near the projection centre of an image: through points of its stop.
+
+        Parameters
+        ----------
+        columns : RefractionColumns
+            Paths of windows.
+        path : int
+            Path of the image.
+        rotation, x0 : ndarray (3, 3), (3,)
+            Its pose.
+        begin, end : ndarray (n, 3)
+            Ends of the rays in camera axes: near the projection centre, and behind the windows.
+        """
+        n, path_of = len(begin), np.full(1, path, np.intp)
+        primitives, moving = columns.primitives.copy(), columns.on_object.copy()
+        # Camera axes are those of an object system in which every ray has a centre of its own.
+        primitives[path], moving[path] = _placed(columns, path_of, rotation[None], x0[None])[0], True
+        still = columns._replace(primitives=primitives, on_object=moving)
+        every = np.arange(n)
+        turned = np.tile(np.eye(3), (n, 1, 1))
+        return cls.of(still, np.full(n, path, np.intp), turned, begin, end, every, every)
 
 
 def _placed(columns: RefractionColumns, path_of: Rows, rotation: Array, x0: Array) -> Array:

@@ -659,6 +659,12 @@ class Refraction(Display):
         found[:, 6] -= found[:, :3] @ origin
         return found
 
+    @property
+    def longest(self) -> int:
+        """Number of surfaces of the longest path."""
+        surfaces = [len(window.media) - 1 for window in self.windows]
+        return max((sum(surfaces[k] for k in path) for path in self.paths), default=0)
+
     def columns(
         self, values: Array, origin: ArrayLike = (0.0, 0.0, 0.0), mounts: Mounts | None = None
     ) -> RefractionColumns:
@@ -686,7 +692,7 @@ class Refraction(Display):
         described = [window.surfaces(self.of_window(k, values)) for k, window in enumerate(self.windows)]
         number = np.cumsum(self.free) - 1
         media = {medium.name: self.starts[-1] + k for k, medium in enumerate(self.media)}
-        longest = max([sum(len(described[k]) for k in path) for path in paths], default=0)
+        longest = self.longest
         shape = len(paths), longest
         columns = RefractionColumns(
             np.zeros(len(paths), np.intp),
