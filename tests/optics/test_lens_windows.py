@@ -125,7 +125,7 @@ def test_a_thin_lens_behind_windows_defocuses_like_a_lens_that_is_traced() -> No
     wall = Window(
         "port", "plane", "object", {"distance": -30.0, "thickness": 25.0}, port.media, direction=(0, 0, 1)
     )
-    points = np.array([[0.0, 0.0, 1500.0], [60.0, 0.0, 1500.0], [0.0, -40.0, 900.0]])
+    points = np.array([[0.0, 0.0, 1500.0], [6.0, 0.0, 1500.0], [0.0, -4.0, 900.0]])
     ring = np.repeat([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]], 3, axis=0)
     wide = []
     for window, x0 in ((port, np.zeros(3)), (wall, np.array([0.0, 0.0, -60.0]))):
@@ -135,10 +135,10 @@ def test_a_thin_lens_behind_windows_defocuses_like_a_lens_that_is_traced() -> No
             each.rays(np.tile(points, (3, 1)), ring, 550.0)[0].reshape(3, 3, 2) - each.corresponding(points)
             for each in both
         ]
-        # Of 20 to 40 px, what the singlet's own aberrations are not.
-        np.testing.assert_allclose(spots[1], spots[0], rtol=0, atol=0.4)
+        # Of 65 and 141 px, all but the singlet's own aberrations.
+        np.testing.assert_allclose(spots[1], spots[0], rtol=0, atol=1.0)
         wide.append(spots[1])
         places = [each.corresponding(points) for each in both]
-        np.testing.assert_allclose(places[1], places[0], rtol=2e-3, atol=1.0)
+        np.testing.assert_allclose(places[1], places[0], rtol=0, atol=2.0)
     np.testing.assert_allclose(wide[0], wide[1], rtol=0, atol=1e-6)
     assert np.abs(wide[0]).max() > 15
