@@ -417,12 +417,15 @@ def _line_light(scene: Scene) -> NDArray[np.float32]:
 def merged(parts: list[Rows], found: list[Matches]) -> Matches:
     """Matches of several parts in the order of their rows; smaller windows are padded."""
     order = np.argsort(np.concatenate(parts), kind="stable")
+    # Windows of large marks take much memory: they are copied only where it is necessary.
+    ordered = bool((np.diff(order) > 0).all())
     columns: dict[str, Any] = {}
     for name in Matches.__dataclass_fields__:
         values = [getattr(matches, name) for matches in found]
         if len({v.shape[1:] for v in values}) > 1:
             values = _padded(values, np.nan if name == "residuals" else 0.0)
-        columns[name] = np.concatenate(values)[order]
+        joined = values[0] if len(values) == 1 else np.concatenate(values)
+        columns[name] = joined if ordered else joined[order]
     return Matches(**columns)
 
 
