@@ -5,14 +5,18 @@ from __future__ import annotations
 import importlib
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from reseau.bundle import Candidate, ModelChoice, Network, Options, camera_candidates, choose_model
+from reseau.bundle import Camera, Candidate, ModelChoice, Network, Options, camera_candidates, choose_model
+from reseau.bundle.modelling import choice
 from reseau.core.errors import UsageError
 from reseau.io.network import Network1
+from reseau.optics.cameras import camera_model
+from reseau.optics.poses import rotation_matrix
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 lenses = importlib.import_module("worlds.lenses")
@@ -120,3 +124,81 @@ def test_candidates_are_of_the_model_that_the_pixel_size_allows() -> None:
     assert not {"opencv", "opencv_full"} & {each.model for each in camera_candidates(pitch_known=True)}
     with pytest.raises(UsageError, match="there are none"):
         choose_model(network_of(lens_of()), [])
+
+
+def waved(network: Network, length_px: float = 560.0) -> Network:
+    """Image points moved by waves of 1 px over the image, as no polynomial of low degree does."""
+    waves = np.sin(2 * np.pi * network.xy[:, ::-1] / length_px)
+    return replace(network, xy=network.xy + waves)
+
+
+def in_millimetres(network: Network) -> Network:
+    """The same with Brown's model and pixels of 5 µm."""
+    old, model = network.cameras[0], camera_model("brown")
+    values = np.zeros(len(model.names))
+    values[0] = 0.005 * old.values[0]
+    camera = Camera("A", old.width, old.height, (0.005, 0.005), "brown", values, model.usual)
+    return replace(network, cameras=(camera,))
+
+
+SPLINE = "splined_stereographic_order=3_Nx=10_Ny=8_fov_x_deg=60"
+
+
+def test_a_spline_surface_is_chosen_where_no_polynomial_describes_the_lens() -> None:
+    spline = Candidate(SPLINE, camera_model(SPLINE).usual)
+    plain = network_of(lens_of(-0.1))
+    found = choose_model(waved(plain), [LADDER[1], LADDER[4], spline])
+    assert isinstance(found, ModelChoice)
+    assert found.chosen.candidate == spline
+    assert found.chosen.sigma0 < 0.5 * found.alternatives[0].sigma0
+    assert set(found.camera.sigma) == set(spline.free)
+    found = choose_model(plain, [LADDER[1], spline])
+    assert isinstance(found, ModelChoice)
+    assert found.chosen.candidate.label == "opencv: k1"
+
+
+def test_series_are_compared_and_predict_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choice, "_HOPELESS", np.inf)
+    frame = ("c", "x0", "y0")
+    series = Candidate("brown", (*frame, "K1"), additional="fourier1")
+    plain = Candidate("brown", (*frame, "K1"))
+    assert plain.within(series)
+    assert not series.within(plain)
+    found = choose_model(in_millimetres(waved(network_of(lens_of(-0.1)), 1280.0)), [plain, series])
+    assert isinstance(found, ModelChoice)
+    assert found.chosen.candidate.label == "brown: K1 fourier1"
+    assert found.alternatives[0].p < 1e-6
+    assert found.chosen.predicted < 0.8 * found.alternatives[0].predicted
+    assert found.camera.additional is not None
+
+
+@pytest.mark.slow
+def test_what_the_usual_models_give_no_reason_for_is_left_out_and_said() -> None:
+    found = choose_model(in_millimetres(network_of(lens_of(-0.1))))
+    assert isinstance(found, ModelChoice)
+    assert found.chosen.candidate.label == "brown: K1"
+    reasons = {each.candidate.model: each.reason for each in found.compared if np.isnan(each.sigma0)}
+    assert "perspective is significant" in reasons["telecentric"]
+    assert any("no residual pattern" in reason for reason in reasons.values())
+
+
+@pytest.mark.slow
+def test_what_the_usual_models_leave_is_taken_up_by_a_surface_or_a_series() -> None:
+    found = choose_model(in_millimetres(waved(network_of(lens_of(-0.1)))))
+    assert isinstance(found, ModelChoice)
+    assert "spline" in found.chosen.candidate.model or found.chosen.candidate.additional is not None
+
+
+@pytest.mark.slow
+def test_a_lens_without_perspective_is_telecentric() -> None:
+    rng = np.random.default_rng(3)
+    network = in_millimetres(network_of(lens_of()))
+    turn = rng.uniform(-0.6, 0.6, (len(network.images), 3))
+    shift = np.array([640, 480]) + rng.uniform(-40, 40, (len(network.images), 2))
+    xy = np.empty_like(network.xy)
+    for k, (i, j) in enumerate(zip(network.image_of, network.point_of, strict=True)):
+        xy[k] = 100 * (rotation_matrix(turn[i][None])[0] @ network.xyz[j])[:2] * [1, -1] + shift[i]
+    found = choose_model(replace(network, xy=xy + rng.normal(0, 0.2, xy.shape)))
+    assert isinstance(found, ModelChoice)
+    assert found.chosen.candidate.model == "telecentric"
+    assert found.camera.values[0] == pytest.approx(0.5, rel=1e-3)

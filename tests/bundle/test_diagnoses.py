@@ -527,6 +527,15 @@ def test_misidentified_control_points_are_all_named_and_no_others(outliers: str)
         assert 0.8 < result.sigma0 < 1.15
 
 
+def test_a_control_point_is_not_accused_for_one_of_its_rays() -> None:
+    """A ray that is far off displaces the point in a free network; its coordinates are right."""
+    network = block()
+    row = int(np.flatnonzero((network.point_of == 3) & (network.image_of == 3))[0])
+    text, codes = said(moved(network, row, (-900.0, 0.0)), "reject")
+    assert Code.OUTSIDE in codes
+    assert Code.DOUBTFUL_CONTROL not in codes, text
+
+
 @pytest.mark.skipif(not DATA.exists(), reason="needs the networks of RESEAU_DATA")
 def test_of_control_points_that_no_test_reaches_it_is_said() -> None:
     """Published network of eight misidentified points; the images contradict one of them."""

@@ -53,6 +53,7 @@ class Code(StrEnum):
     MIRRORED = "mirrored"  # the target is seen from behind or the image is mirrored
     NONLINEAR = "nonlinear"  # grey values are not proportional to the light, or the file says so wrongly
     NOT_CONVERGED = "not-converged"  # the iteration ended before its minimum
+    NOT_CONSIDERED = "not-considered"  # nothing gives a reason to compute it
     NOT_FINITE = "not-finite"  # the model has no finite value at the approximate values
     NOT_FOUND = "not-found"  # the target or the feature is not in the image
     NOT_IDENTIFIED = "not-identified"  # the observations do not determine a point or a parameter

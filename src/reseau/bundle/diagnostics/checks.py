@@ -14,10 +14,10 @@ from ...core.failure import Code, Remark
 from ..network import Network
 from ..solver import BundleFit
 from .image_scatter import sigma_between_images
-from .patterns import by_place, common_pattern
+from .patterns import CommonPattern, by_place, common_pattern
 from .result import Result
 
-__all__ = ["LISTED", "checks", "listed"]
+__all__ = ["LISTED", "checks", "listed", "unmodelled_pattern"]
 
 LISTED = 8
 _CORRELATED, _WEAK, _ALPHA = 0.95, 5.0, 1e-4
@@ -385,25 +385,38 @@ def _scatter(result: Result) -> list[Remark]:
     return found
 
 
+def unmodelled_pattern(result: Result, camera: int) -> CommonPattern | None:
+    """Return the residual pattern that the images of a camera have in common, where it is significant.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> unmodelled_pattern(adjust_network(example_network()), 0) is None
+    True
+    """
+    if (result.network.camera_of[result.fit.usable.images] == camera).sum() < _MIN_IMAGES:
+        return None
+    try:
+        pattern = common_pattern(result, by_place(result, camera))
+    except UsageError:
+        return None
+    return pattern if pattern.p < _ALPHA else None
+
+
 def _patterns(result: Result) -> list[Remark]:
     """Cameras whose images have a common residual pattern, by position in the image."""
-    network, found = result.network, []
-    images = np.bincount(network.camera_of[result.fit.usable.images], minlength=len(network.cameras))
-    for c in np.flatnonzero(images >= _MIN_IMAGES)[:LISTED]:
-        try:
-            pattern = common_pattern(result, by_place(result, int(c)))
-        except UsageError:
-            continue
-        if pattern.p < _ALPHA:
-            found.append(
-                Remark(
-                    f"{network.cameras[c].label}: common residual pattern of its images "
-                    f"(F {pattern.statistic:.1f}, {pattern.rms:.2g} px rms): the model does not describe it, "
-                    "and the sigmas do not include it",
-                    Code.UNMODELLED,
-                )
-            )
-    return found
+    cameras = result.network.cameras
+    patterns = [(camera, unmodelled_pattern(result, c)) for c, camera in enumerate(cameras)]
+    found = [
+        Remark(
+            f"{camera.label}: common residual pattern of its images (F {pattern.statistic:.1f}, "
+            f"{pattern.rms:.2g} px rms): the model does not describe it, and the sigmas do not include it",
+            Code.UNMODELLED,
+        )
+        for camera, pattern in patterns
+        if pattern is not None
+    ]
+    return found[:LISTED]
 
 
 def _between(result: Result) -> list[Remark]:

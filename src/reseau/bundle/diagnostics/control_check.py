@@ -345,6 +345,11 @@ def checked_control(
             continue
         current = current.continued(again)
         last = _Tested.of(loose, again, points, out)
+        # A ray that contradicts the other rays of its point displaces a point that is left out.
+        gross = out & (last.rays > 2) & (last.ray_statistic > np.maximum(last.statistic, critical))
+        if gross.any():
+            weights[2 * last.ray[gross]] = weights[2 * last.ray[gross] + 1] = 0.0
+            continue
         back = out & (last.statistic < critical)
         if back.any() and (out & ~back).tobytes() not in seen:
             out = out & ~back
@@ -392,13 +397,14 @@ def without_control(problem: BundleProblem, points: Rows) -> BundleProblem:
 
 @dataclass(frozen=True, eq=False)
 class _Tested:
-    """Tests (k,) of control points, with the largest test of a ray of each and its number."""
+    """Tests (k,) of control points, the largest test of a ray of each, its row, and the rays used."""
 
     statistic: Array
     off: Array
     detectable: Array
     ray_statistic: Array
     ray: Rows
+    rays: Rows
 
     @classmethod
     def of(cls, problem: BundleProblem, fit: BundleFit, points: Rows, out: Mask) -> _Tested:
@@ -431,6 +437,7 @@ class _Tested:
             off[k] = np.linalg.norm(v)
         rays = _ray_statistic(network, fit)
         ray = np.zeros(len(points), dtype=np.intp)
+        used = np.bincount(network.point_of[fit.usable.observations], minlength=len(network.points))
         for k, j in enumerate(points):
             rows = np.flatnonzero(network.point_of == j)
             ray[k] = rows[np.argmax(rays[rows])] if len(rows) else -1
@@ -438,7 +445,9 @@ class _Tested:
         statistic = statistic / unit**2
         # Small errors of most points (a board that is not flat, an imperfect lens) are not those of some.
         usual = max(1.0, float(np.median(statistic)) / _MEDIAN_OF_THREE) if len(points) >= _LEAST else 1.0
-        return cls(statistic / usual, off, detectable * np.sqrt(usual), largest / unit**2 / usual, ray)
+        return cls(
+            statistic / usual, off, detectable * np.sqrt(usual), largest / unit**2 / usual, ray, used[points]
+        )  # fmt: skip
 
 
 def _unit(w: Array) -> float:

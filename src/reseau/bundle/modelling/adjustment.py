@@ -239,6 +239,7 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         if isinstance(careful, Failure):
             return _explained(careful, problem, found)
         (fit, steps, left), of_control = careful
+        given = _given_weights(problem, fit)
         problem = replace(problem, network=fit.problem.network, weights=fit.problem.weights)
         network = problem.network
         notes = (*notes, *left)
@@ -246,7 +247,7 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         plain = problem.adjusted() if grave else _plain(problem)
         if isinstance(plain, Failure):
             return _explained(plain, problem, found)
-        fit = plain
+        fit, given = plain, problem.weights
         _, of_control = (None, []) if grave else _control(problem, fit)
     n = len(network.xy)
     rejected = np.asarray(fit.rejected[: 2 * n].reshape(n, 2).any(axis=1))
@@ -254,7 +255,7 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     if _has_depth(bare):
         found = [remark for remark in found if remark.code is not Code.ONE_STATION]
     if not grave:
-        found += _doubts(problem, fit, of_control)
+        found += _doubts(problem, fit, of_control, given)
         found += [] if of_control else _rejected_control(network, rejected)
         found += _frontal(network, bare)
     return Result(network, fit, rejected, steps, (*found, *notes, *checks(bare)))
@@ -387,13 +388,24 @@ def _control(
     return check, [] if check is None else check.remarks(network)
 
 
-def _doubts(problem: BundleProblem, fit: BundleFit, of_control: list[Remark]) -> list[Remark]:
-    """Return remarks on what contradicts the rest, in a network that fits badly."""
+def _given_weights(problem: BundleProblem, fit: BundleFit) -> Array | None:
+    """Weights before the rejection that led to an adjustment, perhaps without some control points."""
+    lost = (problem.network.observed & ~fit.problem.network.observed).any(axis=1)
+    return without_control(problem, np.flatnonzero(lost).astype(np.intp)).weights
+
+
+def _doubts(
+    problem: BundleProblem, fit: BundleFit, of_control: list[Remark], given: Array | None
+) -> list[Remark]:
+    """Return remarks on what contradicts the rest, in a network that fits badly.
+
+    `given` are the weights before rejection.
+    """
     n, weights, every = len(problem.network.xy), fit.problem.weights, fit
     if weights is not None and (weights[2 * n :] == 0).any():
         # Elements are named one by one, also those of which data snooping left out coordinates.
-        given = np.ones(len(weights)) if problem.weights is None else problem.weights
-        weights = np.concatenate([weights[: 2 * n], given[2 * n :]])
+        before = np.ones(len(weights)) if given is None else given
+        weights = np.concatenate([weights[: 2 * n], before[2 * n :]])
         again = problem.continued(fit).with_weights(weights).adjusted()
         every = fit if isinstance(again, Failure) else again
     current = problem.with_weights(weights)

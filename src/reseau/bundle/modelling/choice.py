@@ -22,10 +22,11 @@ from ...core.data import Array, Mask
 from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure
-from ...optics import PixelGrid
-from ...optics.cameras import camera_model, convert
+from ...optics import PixelGrid, PlaneMapping
+from ...optics.cameras import SplineGrid, camera_model, convert
 from ..diagnostics import Result, camera_mapping
-from ..network import Camera, Network
+from ..diagnostics.checks import unmodelled_pattern
+from ..network import Additional, Camera, Network
 from ..network.network import finite
 from ..solver import BundleFit, BundleProblem
 from .adjustment import Options, adjust_network
@@ -41,6 +42,8 @@ _VALIDATED, _LEVEL = 6, 0.01
 _STEPS, _BETTER = 60, 0.02
 # Least number of images for which images can be left out, and of points by which one is predicted.
 _LEAST_IMAGES, _LEAST_POINTS = 4, 5
+# Size of the reciprocal of a focal length, in standard deviations, above which there is perspective.
+_SIGNIFICANT = 2.6
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,8 @@ class Candidate:
         Parameters to estimate.
     options : mapping
         Options of the model.
+    additional : str, optional
+        Model of additional parameters, all of which are estimated.
 
     Examples
     --------
@@ -65,18 +70,34 @@ class Candidate:
     model: str
     free: tuple[str, ...]
     options: Mapping[str, str | float] = field(default_factory=dict)
+    additional: str | None = None
 
     @property
     def label(self) -> str:
         """Model, and parameters other than those of the interior orientation."""
-        plain = camera_model(self.model).of_role("scale", "centre")
-        more = " ".join(name for name in self.free if name not in plain)
-        return f"{self.model}: {more or 'no distortion'}"
+        model = camera_model(self.model)
+        if model.priors(self.free):
+            return f"{self.model}: {len(self.free)} parameters"
+        plain = model.of_role("scale", "centre")
+        more = [name for name in self.free if name not in plain]
+        more += [] if self.additional is None else [self.additional]
+        return f"{self.model}: {' '.join(more) or 'no distortion'}"
 
     def within(self, other: Candidate) -> bool:
         """Whether it is the other candidate without some of its parameters."""
-        same = self.model == other.model and self.options == other.options
-        return same and set(self.free) < set(other.free)
+        if (self.model, self.options) != (other.model, other.options):
+            return False
+        if self.additional not in (None, other.additional):
+            return False
+        own, all_ = ({*c.free, *([] if c.additional is None else [c.additional])} for c in (self, other))
+        return own < all_
+
+
+# Series contain the terms of the lens of low degree; of the affinity a Fourier series has none.
+_SERIES = (
+    Candidate("brown", ("c", "x0", "y0"), additional="chebyshev5"),
+    Candidate("brown", ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2"), additional="fourier1"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +149,7 @@ class Compared:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModelChoice(Display):
-    """The chosen camera model and the others; truthy.
+    """The chosen camera model and the others, also those that were not adjusted and why; truthy.
 
     Parameters
     ----------
@@ -174,6 +195,7 @@ class ModelChoice(Display):
             {
                 "model": each.candidate.model,
                 "free": list(each.candidate.free),
+                "additional": each.candidate.additional,
                 "reason": each.reason,
                 "sigma0": number(each.sigma0),
                 "length": number(each.length),
@@ -257,7 +279,9 @@ def choose_model(
     network : Network
         Network with one camera, of any registered model.
     candidates : sequence of Candidate, optional
-        By default :func:`camera_candidates`.
+        By default :func:`camera_candidates`. Where the best of these leaves a residual pattern that the
+        images have in common, a spline surface and, with a pixel size, series of additional parameters are
+        compared too; where perspective is not significant, the telecentric camera.
     options : Options, optional
         Options of the adjustments. Gross errors are rejected with the candidate of least residuals, so that
         no good observation is rejected because a model is too simple; all are then compared without them.
@@ -297,16 +321,14 @@ def choose_model(
             where="choice of a model",
         )
     camera = network.cameras[0]
-    if candidates is None:
-        own = camera.registered
-        candidates = camera_candidates(pitch_known=own is not None and own.needs_pitch)
+    own = camera.registered
+    usual, pitch_known = candidates is None, own is not None and own.needs_pitch
+    candidates = camera_candidates(pitch_known=pitch_known) if candidates is None else list(candidates)
     if not candidates:
         raise UsageError("there are none", where="candidates of the choice of a model")
     options = options or Options()
     first = _first(network, candidates, options)
-    if isinstance(first, Failure):
-        return first
-    fits = _adjusted(first, candidates)
+    fits = [first] * len(candidates) if isinstance(first, Failure) else _adjusted(first, candidates)
     if options.outliers == "reject" and (best := _least(fits)) is not None:
         result = adjust_network(best.problem.network, options)
         if isinstance(result, Failure):
@@ -314,9 +336,12 @@ def choose_model(
         weights = result.fit.problem.weights
         first = best.problem.continued(best).with_weights(weights)
         fits = _adjusted(first, candidates)
-    best = _least(fits)
-    if best is None:
-        return Failure("no camera model can be adjusted", Code.NOT_CONVERGED)
+    more = _further(network, _least(fits), options, pitch_known=pitch_known) if usual else []
+    candidates = [*candidates, *(candidate for candidate, _ in more)]
+    fits = [*fits, *(fit for _, fit in more)]
+    if _least(fits) is None:
+        reason = first.reason if isinstance(first, Failure) else "no camera model can be adjusted"
+        return Failure(reason, Code.NOT_CONVERGED)
     return _chosen(network, candidates, fits, folds, seed)
 
 
@@ -384,27 +409,145 @@ def _from(problem: BundleProblem, candidate: Candidate) -> BundleFit | Failure:
         # The other model has no directions in most of the image.
         slope = given.bare_mapping().derivatives([[0.0, 0.0]]).d_xy[0, 0, 0]
         values = _started(given, candidate, float(slope)).values
-    full = np.zeros(len(camera_model(candidate.model).names))
+    model = camera_model(candidate.model)
+    full = np.zeros(len(model.names))
     full[: len(values)] = values
+    sigma = model.priors(candidate.free)
+    extra = None
+    if candidate.additional is not None:
+        longer = max(given.width * given.pitch_mm[0], given.height * given.pitch_mm[1])
+        extra = Additional(longer / 2, model=candidate.additional)
+    # Corrections that are observed, are observed as zero.
+    observed = np.where([name in sigma for name in model.names], 0.0, full)
     camera = replace(
-        given, model=candidate.model, values=full, free=candidate.free, options=candidate.options
-    )
-    start = replace(problem.start, cameras=full[None])
+        given, model=candidate.model, values=observed, free=candidate.free, options=candidate.options,
+        sigma=sigma, additional=extra,
+    )  # fmt: skip
+    series = np.zeros((1, 0 if extra is None else len(extra.names)))
+    start = replace(problem.start, cameras=full[None], extra=series)
     trial = replace(problem, network=replace(network, cameras=(camera,)), start=start, rounds=0)
+    if len(trial.observations) != len(problem.observations):
+        trial = replace(trial, weights=_with_priors(problem, trial))
     fit = trial.adjusted()
     if isinstance(fit, BundleFit):
         return _checked(fit)
     return fit
 
 
+def _with_priors(problem: BundleProblem, trial: BundleProblem) -> Array | None:
+    """Weights of a problem with observed parameters, from those of one without."""
+    if problem.weights is None:
+        return None
+    n = 2 * len(problem.network.xy)
+    weights = np.ones(len(trial.observations))
+    weights[:n] = problem.weights[:n]
+    return weights
+
+
 def _checked(fit: BundleFit) -> BundleFit | Failure:
     """The adjustment, unless its camera folds within the observations or is not determined."""
-    network = fit.problem.network
-    camera = replace(network.cameras[0], values=fit.values.cameras[0, : len(network.cameras[0].values)])
-    xy = network.xy[fit.usable.observations]
-    if not np.isfinite(camera.plane_mapping().inverse(xy)).all():
+    xy = fit.problem.network.xy[fit.usable.observations]
+    if not np.isfinite(_whole(fit).inverse(xy)).all():
         return Failure("the image folds within the observations", Code.NOT_IDENTIFIED)
     return fit
+
+
+def _whole(fit: BundleFit) -> PlaneMapping:
+    """The adjusted camera with its additional parameters."""
+    camera = fit.problem.network.cameras[0]
+    camera = replace(camera, values=fit.values.cameras[0, : len(camera.values)])
+    extra = camera.additional
+    if extra is None:
+        return camera.plane_mapping()
+    series = extra.mapping(fit.values.extra[0, : len(extra.names)])
+    return camera_model(camera.model).mapping(camera.values, camera.grid, camera.options, series)
+
+
+def _further(
+    network: Network, best: BundleFit | None, options: Options, *, pitch_known: bool
+) -> list[tuple[Candidate, BundleFit | Failure]]:
+    """Candidates beyond the usual ones, adjusted where these give a reason to, or why they were left out."""
+    found: list[tuple[Candidate, BundleFit | Failure]] = []
+    if best is not None:
+        pattern = unmodelled_pattern(_result(best), 0)
+        why = "not needed: the usual models leave no residual pattern that the images have in common"
+        surface = _surface(best)
+        flexible = [*([] if surface is None else [surface]), *(_SERIES if pitch_known else ())]
+        start = best.problem.continued(best)
+        unneeded = Failure(why, Code.NOT_CONSIDERED)
+        found += [(each, unneeded if pattern is None else _from(start, each)) for each in flexible]
+        if pattern is not None and not pitch_known:
+            why = "needs the size of a pixel"
+            found += [(candidate, Failure(why, Code.NOT_CONSIDERED)) for candidate in _SERIES]
+    parallel = camera_model("telecentric")
+    size = _perspective(best)
+    for candidate in (Candidate("telecentric", names) for names in (("m",), parallel.usual)):
+        if size > _SIGNIFICANT:
+            why = f"perspective is significant: 1/focal length is {size:.3g} times its sigma"
+            found.append((candidate, Failure(why, Code.NOT_CONSIDERED)))
+        elif not pitch_known:
+            found.append((candidate, Failure("needs the size of a pixel", Code.NOT_CONSIDERED)))
+        else:
+            weights = None if best is None else best.problem.weights
+            found.append((candidate, _with_parallel_rays(network, candidate, options, weights)))
+    return found
+
+
+def _perspective(fit: BundleFit | None) -> float:
+    """The reciprocal of a focal length in its standard deviations; 0 where there is none."""
+    if fit is None:
+        return 0.0
+    camera, result = fit.problem.network.cameras[0], _result(fit)
+    names, _, values = result.camera_columns(0)
+    sigma = np.sqrt(np.diag(result.camera_covariance(0)))
+    scales = () if camera.registered is None else camera.registered.of_role("scale")
+    ratios = [abs(v) / s for name, v, s in zip(names, values, sigma, strict=True) if name in scales]
+    return float(min(ratios, default=np.inf))
+
+
+def _surface(fit: BundleFit) -> Candidate | None:
+    """A spline surface over the angle of view; None where the camera has no image at the edges."""
+    network = fit.problem.network
+    width, height = network.cameras[0].width, network.cameras[0].height
+    x, y = (width - 1) / 2, (height - 1) / 2
+    uv = _whole(fit).inverse([[0.0, y], [width - 1.0, y], [x, 0.0], [x, height - 1.0]])
+    if not np.isfinite(uv).all() or fit.problem.network.cameras[0].parallel:
+        return None
+    half = np.arctan(np.hypot(*uv.T))
+    fov = int(np.ceil(np.degrees(2 * half[:2].max()))) + 1
+    order, across = 3, 8
+    per_u = SplineGrid(order, across, across, fov).per_u
+    down = int(np.ceil(4 * np.tan(half[2:].max() / 2) * per_u)) + order
+    name = SplineGrid(order, across, down, fov).name
+    return Candidate(name, camera_model(name).usual)
+
+
+def _with_parallel_rays(
+    network: Network, candidate: Candidate, options: Options, weights: Array | None
+) -> BundleFit | Failure:
+    """Adjust a telecentric camera, from its magnification by affine mappings of known points."""
+    scales = []
+    for image in range(len(network.images)):
+        own = (network.image_of == image) & finite(network.xyz)[network.point_of]
+        if own.sum() >= _LEAST_POINTS:
+            points = network.xyz[network.point_of[own]]
+            mapping = np.linalg.pinv(points - points.mean(axis=0)) @ (
+                network.xy[own] - network.xy[own].mean(axis=0)
+            )
+            scales.append(float(np.linalg.svd(mapping, compute_uv=False)[0]))
+    if not scales:
+        return Failure("no image shows enough points with known coordinates", Code.TOO_FEW_POINTS)
+    camera = _started(network.cameras[0], candidate, float(np.median(scales)))
+    trial = replace(network, cameras=(camera,))
+    result = adjust_network(trial, replace(options, outliers="keep"))
+    if isinstance(result, Failure):
+        return result
+    if weights is None:
+        return result.fit
+    n, problem = 2 * len(network.xy), result.fit.problem.continued(result.fit)
+    kept = np.ones(len(problem.observations))
+    kept[:n] = weights[:n]
+    return problem.with_weights(kept).adjusted()
 
 
 def _chosen(
@@ -416,26 +559,28 @@ def _chosen(
 ) -> ModelChoice:
     """Compare the adjusted candidates."""
     good = [k for k, fit in enumerate(fits) if isinstance(fit, BundleFit)]
-    length = np.full(len(fits), np.inf)
+    length, number = np.full(len(fits), np.inf), np.zeros(len(fits))
     for k in good:
         fit = fits[k]
         assert isinstance(fit, BundleFit)
         count = 2 * int(fit.usable.observations.sum())
-        length[k] = count * np.log(fit.cost / count) + len(candidates[k].free) * np.log(count)
+        number[k] = _determined(fit)
+        length[k] = count * np.log(fit.cost / count) + number[k] * np.log(count)
     length -= length.min()
     order = sorted(range(len(fits)), key=lambda k: (length[k], k))
     close = [k for k in order if length[k] < _HOPELESS][:_VALIDATED]
     squares = _predicted([fits[k] for k in close], folds, seed) if len(close) > 1 else None
     worse = _worse(squares)
     equal = [k for row, k in enumerate(close) if length[k] <= _EQUAL and row not in worse] or close[:1]
-    best = min(equal, key=lambda k: (len(candidates[k].free), length[k], k))
+    best = min(equal, key=lambda k: (number[k], length[k], k))
     fit = fits[best]
     assert isinstance(fit, BundleFit)
     found = []
     for k in order:
         other = fits[k]
         if isinstance(other, Failure):
-            found.append(Compared(candidates[k], f"not adjusted: {other.reason}", np.nan, np.nan, np.nan))
+            why = "" if other.code is Code.NOT_CONSIDERED else "not adjusted: "
+            found.append(Compared(candidates[k], f"{why}{other.reason}", np.nan, np.nan, np.nan))
             continue
         row = close.index(k) if k in close else None
         predicted = np.nan if squares is None or row is None else float(np.sqrt(_mean(squares[row])))
@@ -444,8 +589,19 @@ def _chosen(
             _test(candidates[k], other, candidates[best], fit), **_difference(fit, other),
         )  # fmt: skip
         found.append(replace(one, reason=_reason(one, k == best, row in worse, candidates[best], len(equal))))
-    camera = replace(fit.problem.network.cameras[0], values=fit.values.cameras[0])
+    camera = fit.problem.network.cameras[0]
+    observed = np.array([name in camera.sigma for name in camera.names])
+    camera = replace(camera, values=np.where(observed, camera.values, fit.values.cameras[0, : len(observed)]))
     return ModelChoice(replace(camera, id=network.cameras[0].id), tuple(found))
+
+
+def _determined(fit: BundleFit) -> float:
+    """Number of parameters of the camera that the images determine, without what is only regularised."""
+    camera = fit.problem.network.cameras[0]
+    extra = 0 if camera.additional is None else len(camera.additional.names)
+    prior = _result(fit).priors(0)
+    regularised = 0.0 if prior is None else len(prior.parameters) - prior.determined
+    return len(camera.free) + extra - regularised
 
 
 def _reason(one: Compared, best: bool, worse: bool, chosen: Candidate, equal: int) -> str:
@@ -507,9 +663,12 @@ def _difference(best: BundleFit, other: BundleFit) -> dict[str, float]:
 
 def _mapping(fit: BundleFit) -> CameraMapping:
     """The camera with its covariance."""
+    return camera_mapping(_result(fit), 0)
+
+
+def _result(fit: BundleFit) -> Result:
     network = fit.problem.network
-    result = Result(network, fit, np.zeros(len(network.xy), dtype=bool), ())
-    return camera_mapping(result, 0)
+    return Result(network, fit, np.zeros(len(network.xy), dtype=bool), ())
 
 
 def _predicted(fits: Sequence[BundleFit | Failure], folds: int, seed: int) -> Array | None:
@@ -543,7 +702,12 @@ def _left_out(fit: BundleFit, out: Mask) -> Iterator[tuple[int, float, int]]:
     if isinstance(without, Failure):
         return
     camera = network.cameras[0]
-    held = replace(camera, values=without.values.cameras[0, : len(camera.values)], free=())
+    held = replace(camera, values=without.values.cameras[0, : len(camera.values)], free=(), sigma={})
+    if camera.additional is not None:
+        whole = _whole(without)
+        held = replace(
+            held, model="mapping", mapping=whole, values=np.array(whole.values), options={}, additional=None
+        )
     known = finite(without.values.xyz)
     mine = network.select(out[network.image_of] & used & known[network.point_of])
     if not len(mine.xy):
@@ -553,7 +717,7 @@ def _left_out(fit: BundleFit, out: Mask) -> Iterator[tuple[int, float, int]]:
         sigma=np.where(known, 0.0, np.nan)[:, None] * np.ones(3),
         datum="control", distance_of=network.distance_of[:0], distance=network.distance[:0],
     )  # fmt: skip
-    start = replace(problem.start, cameras=held.values[None], xyz=without.values.xyz)
+    start = replace(problem.start, cameras=held.values[None], xyz=without.values.xyz, extra=np.zeros((1, 0)))
     again = replace(problem, network=control, start=start, weights=None).adjusted()
     if isinstance(again, Failure):
         return

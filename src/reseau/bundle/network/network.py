@@ -279,7 +279,10 @@ class Camera:
 
     @classmethod
     def from_entry(cls, entry: CameraEntry) -> Self:
-        """Create the camera of an entry in ``reseau-network/1``; missing parameters are zero."""
+        """Create the camera of an entry in ``reseau-network/1``.
+
+        Missing parameters are zero; those that the model regularises are observed.
+        """
         model, extra = camera_model(entry.model), entry.additional
         return cls(
             id=entry.id,
@@ -290,7 +293,7 @@ class Camera:
             values=np.array([entry.parameters.get(name, 0.0) for name in model.names]),
             free=tuple(name for name in model.names if name in entry.free),
             options=entry.options,
-            sigma=dict(entry.sigma or {}),
+            sigma=model.priors(entry.free) | dict(entry.sigma or {}),
             additional=None
             if extra is None
             else Additional(extra.base_mm, extra.free, extra.per, model=extra.model),

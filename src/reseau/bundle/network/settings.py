@@ -81,8 +81,11 @@ def _cameras_with(network: Network, name: str) -> list[int]:
 
 
 def _with_free(camera: Camera, free: tuple[str, ...]) -> Camera:
-    sigma = {name: s for name, s in camera.sigma.items() if name in free}
-    return camera if free == camera.free else replace(camera, free=free, sigma=sigma)
+    if free == camera.free:
+        return camera
+    sigma = {} if camera.registered is None else camera.registered.priors(set(free) - set(camera.free))
+    sigma |= {name: s for name, s in camera.sigma.items() if name in free}
+    return replace(camera, free=free, sigma=sigma)
 
 
 def with_control(network: Network, control: ControlPoints) -> Network:

@@ -119,6 +119,9 @@ def _blocks(k: int, rows: Array, misfits: Array, pattern: Pattern, sums: Sums) -
         sa, ca = start[k, a], column[k, a]
         for i in range(width[k, a]):
             x0, x1, at = rows[k, 0, ca + i], rows[k, 1, ca + i], sa + i
+            if x0 == 0.0 and x1 == 0.0:
+                # Most control points of a spline surface.
+                continue
             sums.diagonal[at] += x0 * x0 + x1 * x1
             sums.gradient[at] += x0 * r0 + x1 * r1
             for b in range(SEGMENTS):
@@ -141,6 +144,8 @@ def _eliminate(j: int, w: Array, t: Array, pattern: Pattern, sums: Sums) -> None
         sa, oa = pattern.at[a], pattern.offset[a]
         for i in range(pattern.size[a]):
             t0, t1, t2, at = t[oa + i, 0], t[oa + i, 1], t[oa + i, 2], sa + i
+            if t0 == 0.0 and t1 == 0.0 and t2 == 0.0:
+                continue
             for b in range(first, a + 1):
                 sb, ob = pattern.at[b], pattern.offset[b]
                 if at >= bands:
