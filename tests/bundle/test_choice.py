@@ -144,6 +144,7 @@ def in_millimetres(network: Network) -> Network:
 SPLINE = "splined_stereographic_order=3_Nx=10_Ny=8_fov_x_deg=60"
 
 
+@pytest.mark.slow
 def test_a_spline_surface_is_chosen_where_no_polynomial_describes_the_lens() -> None:
     spline = Candidate(SPLINE, camera_model(SPLINE).usual)
     plain = network_of(lens_of(-0.1))

@@ -341,6 +341,14 @@ def _rejecting(
             return first
         check, said = _control(problem, again[0], shape)
         if not check:
+            # A ray of the point may be wrong, not its coordinates.
+            rays = (
+                Failure("", Code.GROSS_ERRORS)
+                if check is None
+                else _without_gross_errors(problem.continued(again[0]), options)
+            )
+            if not isinstance(rays, Failure):
+                return rays, []
             return again, [Remark(f"{shape.doubt()}: left out", Code.DOUBTFUL_CONTROL)]
         first = again
     else:

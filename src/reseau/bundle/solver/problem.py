@@ -142,9 +142,12 @@ class BundleProblem(Display):
 
     @cached_property
     def groups(self) -> NDArray[np.intp]:
-        """Object point of each observation: errors of different points hardly affect each other."""
-        points = len(self.network.points)
-        more = points + np.arange(len(self.others.value))
+        """Object point of each observation: errors of different points hardly affect each other.
+
+        Distances are one group: a wrong one changes the scale, and with it the residuals of all others.
+        """
+        points, bars = len(self.network.points), len(self.network.distance)
+        more = points + np.maximum(np.arange(len(self.others.value)) - bars + 1, 0)
         return np.concatenate([np.repeat(self.network.point_of, 2), more])
 
     def with_weights(self, weights: ArrayLike | None) -> Self:
