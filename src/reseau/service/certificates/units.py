@@ -13,7 +13,7 @@ __all__ = ["DigitalUnit", "digital_unit"]
 
 # Name in D-SI and power of ten of the units that calibrations have. Pixels and grey values are counts.
 _KNOWN = {
-    "1": ("", 0), "": ("", 0), "px": ("", 0), "DN": ("", 0), "e": ("", 0), "%": ("", -2),
+    "1": ("", 0), "": ("", 0), "px": ("", 0), "DN": ("", 0), "e": ("", 0), "e-": ("", 0), "%": ("", -2),
     "mm": ("metre", -3), "µm": ("metre", -6), "um": ("metre", -6), "nm": ("metre", -9), "m": ("metre", 0),
     "rad": ("radian", 0), "mrad": ("radian", -3), "deg": ("degree", 0), "°": ("degree", 0),
     "s": ("second", 0), "ms": ("second", -3), "K": ("kelvin", 0), "°C": ("degreecelsius", 0),

@@ -89,6 +89,10 @@ def verify(path: Path, *, schema: Path | None = None, trusted: Sequence[Path] = 
         return [Verdict("syntax", "failed", "has a document type, which a certificate must not have")]
     if root.tag != f"{{{DCC}}}digitalCalibrationCertificate":
         return [Verdict("syntax", "failed", f"is no digital calibration certificate, but {root.tag}")]
+    for each in root.iter(etree.Comment, etree.ProcessingInstruction):
+        # A signature does not cover comments; within a value they change what programs read.
+        if each.getparent() is not None and not len(each.getparent().findall("*")):
+            return [Verdict("syntax", "failed", f"line {each.sourceline}: has a comment within a value")]
     found.append(Verdict("syntax", "passed", "well-formed"))
     if schema is None:
         found += [Verdict(name, "not checked", "no schema was given") for name in ("schema", "rules")]
