@@ -407,8 +407,14 @@ def test_budgets_from_the_command_line(opened: Path, capsys: pytest.CaptureFixtu
     printed = json.loads(capsys.readouterr().out)
     assert printed == json.loads(Path("u.json").read_text("utf-8"))
     assert printed["results"]["name"] == ["a.x", "a.y", "b.x", "b.y"]
+    with Archive.open("archive") as archive:  # the third session of which the calibration was accepted
+        Configurations(archive).decide("left", calibration(c=8.0003), RULES)
     assert run(["uncertainty", "left", "-a", "archive", "--draws", "4000"]) == 0
     told = capsys.readouterr().out
     assert "Monte Carlo, 4000 draws" in told
+    assert "reproducibility between sessions" in told
+    assert run(["calibrations", "event", "left", "lens changed", "--at", "2026-02-01T00:00Z"]) == 0
+    assert run(["uncertainty", "accepted.json", "-a", "archive"]) == 0
+    assert "reproducibility; needs 3 sessions" not in capsys.readouterr().out
     assert run(["uncertainty", "accepted.json", "--draws", "10"]) == 2
     assert "at least 4000 draws" in capsys.readouterr().err
