@@ -32,6 +32,7 @@ from reseau.core.tone import ToneCurve
 from reseau.designs import HIDDEN, coded_testfield
 from reseau.io import SHAPES
 from reseau.measure import TestfieldOptions, TestfieldResult, measure_testfield
+from reseau.measure.testfield.measure import FORMED_PX
 from reseau_sims import FieldBench, Photograph, Stain, Station, paper_stations
 from reseau_sims.testfield import DISTANCE_MM, JITTER_PX
 
@@ -201,7 +202,8 @@ def table(done: list[Recording]) -> bool:
     """Print rms and bound for each kind of target; return whether all satisfy the limits."""
     error = np.stack([r.error[CENTRAL] for r in done])
     bound = np.stack([np.diagonal(r.bound[CENTRAL], axis1=1, axis2=2) for r in done])
-    cov = np.stack([np.diagonal(r.result.cov[CENTRAL], axis1=1, axis2=2) for r in done])
+    # What formation by other programs may add is not in pictures of the own simulator.
+    cov = np.stack([np.diagonal(r.result.cov[CENTRAL], axis1=1, axis2=2) for r in done]) - FORMED_PX**2
     shape, large = np.array(DESIGN.targets.shape)[CENTRAL], DESIGN.large[CENTRAL]
     binary = np.stack([binary_centroids(r)[CENTRAL] for r in done])
     print(

@@ -82,8 +82,9 @@ def _measured(frame: Frame, design: ReseauDesign, options: ReseauOptions) -> dic
         )
     # Whether a pixel beside a clipped one is itself clipped depends on its noise.
     clipped = cv2.dilate((frame.pixels >= frame.full_scale).astype(np.uint8), np.ones((3, 3), np.uint8))
-    valid = screened.valid & (clipped == 0)
-    return _Sheet(frame, replace(screened, valid=valid), disks, design, placed, options).columns()
+    screened = replace(screened, valid=screened.valid & (clipped == 0))
+    del grey, clipped  # of large frames they take much memory
+    return _Sheet(frame, screened, disks, design, placed, options).columns()
 
 
 def _placed(

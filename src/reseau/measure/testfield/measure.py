@@ -32,7 +32,7 @@ from .recognition import Reading, SearchedFrame
 from .target_images import form_targets
 from .targets import Light, Scene, match_targets, pixels_of_targets, replaced
 
-__all__ = ["TestfieldOptions", "TestfieldResult", "measure_testfield"]
+__all__ = ["FORMED_PX", "TestfieldOptions", "TestfieldResult", "measure_testfield"]
 
 _LEAST_FIRST, _MOST_FIRST, _FIRST_SHARE = 8, 36, 0.125
 """Minimum and maximum number of large targets matched first, to improve the mapping and the sharpness; more
@@ -75,7 +75,7 @@ the standard deviation of this change over half a window."""
 _UNLIKE, _UNLIKE_BESIDE, _ALIKE = 2.0, 3.5, 0.08
 """Multiple of the usual residuals from which an image is that of another object; the same for targets whose
 sharpness, contrast and size differ from the usual by less than this share."""
-_FORMED_PX = 0.002
+FORMED_PX = 0.002
 """Standard deviation of a coordinate from what no image shows: edges of prints, unequal pixels, formation of
 images. Other programs for the formation of images agree with ours to this."""
 _BLURRED, _PALE, _GROWN = 1.5, 0.25, 0.15
@@ -370,7 +370,7 @@ class _Measurement:
         good = why == ""
         return {
             "xy": spread(found.xy, good),
-            "cov": spread(found.cov + _FORMED_PX**2 * np.eye(2), good),
+            "cov": spread(found.cov + FORMED_PX**2 * np.eye(2), good),
             "ok": ok,
             "why": tuple(reasons),
             "predicted": predicted,
