@@ -37,6 +37,7 @@ from . import (
     perforations,
     refine,
     schedule,
+    watch,
 )
 
 __all__ = ["app", "main"]
@@ -59,6 +60,7 @@ app.add_typer(measure.app, name="measure")
 capture.app.command()(capture_sensor.sensor)
 capture.app.command()(capture_own.own)
 app.add_typer(capture.app, name="capture")
+app.command()(watch.watch)
 app.add_typer(archive.app, name="archive")
 app.add_typer(calibrations.app, name="calibrations")
 app.command()(schedule.recalibrate)

@@ -1,0 +1,93 @@
+"""`reseau watch`: take photographs of a target from a live picture, and see the calibration grow."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ..core.errors import UsageError
+from .common import say
+
+if TYPE_CHECKING:
+    from ..capture import Bench
+
+__all__ = ["watch"]
+
+
+def watch(
+    design: Annotated[
+        Path,
+        typer.Option("--design", "-d", help="Design of the testfield, board or sheet before the camera."),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the frames; new or empty.")] = Path(
+        "photos"
+    ),
+    camera: Annotated[
+        str | None,
+        typer.Option(help="Camera of the bench, or a video device, as /dev/video0. Default: the only one."),
+    ] = None,
+    bench: Annotated[Path, typer.Option("--bench", "-b", help="Bench file.")] = Path("bench.toml"),
+    count: Annotated[int, typer.Option(min=3, help="Number of frames to take.")] = 15,
+    model: Annotated[str, typer.Option(metavar="NAME", help="Camera model, as for calibrate.")] = "",
+    pitch: Annotated[float | None, typer.Option(min=1e-6, help="Pixel size, mm.")] = None,
+    free: Annotated[str, typer.Option(help="Parameters to estimate, e.g. c,x0,y0,K1.")] = "",
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of the page on 127.0.0.1; 0: a free one.")
+    ] = 0,
+    seconds: Annotated[float, typer.Option(min=0.0, help="End after this time (s); 0: no limit.")] = 0.0,
+) -> None:
+    """Show the live picture of a camera on a page, and take a frame when it is sharp and new."""
+    import time
+
+    from ..instruments import Camera
+    from ..io import parse_design, read_text
+    from ..io.images import write_image
+    from ..procedures.calibration import CameraOptions, measurer_of
+    from ..procedures.watching import Watching
+    from ..service.live import LivePage
+
+    target = parse_design(read_text(design), design)
+    names = tuple(name.strip() for name in free.split(",") if name.strip())
+    options = CameraOptions(model, names, None if pitch is None else (pitch, pitch))
+    if options.automatic:
+        raise UsageError("is chosen from all photographs", where="--model auto", do="give it to calibrate")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError("is not empty", where=out, do="give a new folder")
+    instruments = _bench(bench, camera)
+    chosen = None if camera is None or camera.startswith("/dev/") else camera
+    source, watching = instruments.one(Camera, chosen), Watching(target, measurer_of(target), options)
+    with (
+        instruments.lock("reseau watch"),
+        instruments,
+        LivePage(f"{source.name}: {target.name}", port) as page,
+    ):
+        out.mkdir(parents=True, exist_ok=True)
+        typer.echo(f"{page.url}  (Ctrl-C ends)", err=True)
+        end, taken = time.monotonic() + (seconds or float("inf")), 0
+        with suppress(KeyboardInterrupt):
+            while taken < count and time.monotonic() < end:
+                frame = source.expose().frame
+                name = f"{taken + 1:03d}.png"
+                seen = watching.on_frame(frame, name)
+                if seen.taken:
+                    write_image(out / name, frame.pixels)
+                    taken += 1
+                    reached = "".join(f"  {key} {value:.2g}" for key, value in seen.sigmas.items())
+                    say(f"{out / name}: {len(seen.xy)} points{reached}\n")
+                page.show(frame, seen, count)
+    for line in () if not taken else seen.verdict:
+        say(f"{line}\n")
+    say(f"{taken} frames in {out}; next: reseau calibrate {out} --design {design}\n")
+
+
+def _bench(path: Path, camera: str | None) -> Bench:
+    """The bench of a file, or one with a video device alone."""
+    from ..capture import Bench, BenchFile, InstrumentEntry
+
+    if camera is None or not camera.startswith("/dev/"):
+        return Bench.read(path)
+    entry = InstrumentEntry(driver="v4l2", address=camera)
+    return Bench(BenchFile(name=camera, instruments={"camera": entry}))

@@ -1,0 +1,122 @@
+"""`reseau watch` on the simulated bench: still, sharp and new frames; a page for this machine only."""
+
+from __future__ import annotations
+
+import http.client
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.cli import run
+from reseau.core.data import Frame, ImagePoints
+from reseau.core.failure import Code, Failure
+from reseau.designs import board
+from reseau.optics import OpenCV, Pose, project
+from reseau.procedures.calibration import CameraOptions
+from reseau.procedures.watching import Seen, Watching
+from reseau.service.live import LivePage
+
+from ..capture.fieldrig import FieldRig, Sweeper, enter, write_inputs
+
+SIZE = (640, 480)
+DESIGN = board("chess", 9, 7, 20.0)
+
+
+class _Points:
+    """A measurement by true positions."""
+
+    def __init__(self, points: ImagePoints) -> None:
+        self.points = points
+
+
+def seen_from(omega: float, phi: float, kappa: float, *, sigma: float = 0.02, away: float = 260.0) -> Any:
+    lens = OpenCV.from_parameters({"fx": 700.0, "fy": 700.0, "cx": 319.5, "cy": 239.5})
+    turned = Pose.from_angles(omega, phi, kappa, [0.0, 0.0, 0.0])
+    middle = np.append(DESIGN.xy.mean(axis=0), 0.0)
+    pose = Pose(turned.rotation, middle - turned.matrix.T @ [0.0, 0.0, away])
+    xyz = np.column_stack([DESIGN.xy, np.zeros(len(DESIGN.ids))])
+    noise = np.random.default_rng(int(1e3 * (omega + phi + kappa + 9))).normal(0, 0.02, (len(xyz), 2))
+    return _Points(ImagePoints.with_sigma(DESIGN.ids, project(lens, pose, xyz).xy + noise, sigma))
+
+
+def test_frames_are_taken_when_still_sharp_and_new() -> None:
+    answers: list[Any] = []
+    watching = Watching(DESIGN, lambda frame: answers[-1], CameraOptions(free=("fx", "fy", "cx", "cy")))
+    frame = Frame(np.zeros((SIZE[1], SIZE[0]), np.uint8), 255.0)
+
+    def look(answer: Any) -> Seen:
+        answers.append(answer)
+        return watching.on_frame(frame, f"{len(answers)}.png")
+
+    assert "not seen" in look(Failure("no board", Code.NOT_FOUND)).words
+    first = seen_from(0.4, 0.0, 0.0)
+    assert look(first).words == "hold still"  # nothing to compare with yet
+    assert look(first).taken
+    assert look(first).words.startswith("seen before")
+    second = seen_from(-0.4, 0.2, 1.5)
+    assert look(second).words == "hold still"
+    assert look(second).taken
+    blurred = seen_from(0.0, 0.5, 3.0, sigma=0.2)
+    look(blurred)
+    assert look(blurred).words.startswith("not sharp")
+    third = look(seen_from(0.0, 0.5, 3.0))
+    assert third.taken
+    assert "do not determine" in third.verdict[0]
+    look(seen_from(0.1, -0.4, 4.5))
+    last = look(seen_from(0.1, -0.4, 4.5))
+    assert last.frames == 4
+    assert 0 < last.sigmas["sigma_fx"] < 5
+    assert last.verdict[0]
+    assert 0.2 < last.covered.mean() < 1
+
+
+def asked(port: int, path: str, host: str | None = None, method: str = "GET") -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request(method, path, headers={} if host is None else {"Host": host})
+    answer = connection.getresponse()
+    return answer.status, answer.read()
+
+
+def test_the_page_answers_this_machine_alone_and_changes_nothing() -> None:
+    frame = Frame(np.arange(120, dtype=np.uint8).reshape(10, 12), 255.0)
+    seen = Seen(True, "taken", np.array([[3.0, 4.0]]), np.ones((9, 12), dtype=bool), 1, {"sigma_c": 0.01})
+    with LivePage("camera: <board>") as page:
+        assert asked(page.port, "/frame.jpg")[0] == 404
+        page.show(frame, seen, 15)
+        assert asked(page.port, "/frame.jpg")[1].startswith(b"\xff\xd8")
+        state = json.loads(asked(page.port, "/state.json")[1])
+        assert state["points"] == [[3.0, 4.0]]
+        assert state["sigmas"] == {"sigma_c": "0.01"}
+        for path in ("/", "/live.js", "/live.css"):
+            status, content = asked(page.port, path)
+            assert status == 200
+            assert b"http://" not in content.replace(b"http://www.w3.org/2000/svg", b"")
+        for host in ("evil.example", f"evil.example:{page.port}", "127.0.0.1", "localhost:1"):
+            assert asked(page.port, "/state.json", host)[0] == 403
+        assert asked(page.port, "/", f"localhost:{page.port}")[0] == 200
+        assert asked(page.port, "/", method="POST")[0] == 501
+        assert asked(page.port, "/../live.py")[0] == 404
+
+
+def test_watching_the_simulated_bench_leaves_frames_for_a_calibration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = FieldRig()
+    enter(tmp_path, monkeypatch, rig, near=Sweeper("near"), far=Sweeper("far"))
+    write_inputs()
+
+    def moved(number: int) -> None:  # two exposures of each pose
+        rig.table.stands.update(tilt=30.0, roll=90.0 * ((number - 1) // 2))
+
+    rig.camera.during = moved
+    how = ("--pitch", "0.027", "--free", "c,x0,y0,K1", "--count", "3", "--seconds", "200")
+    assert run(["watch", "--design", "field.json", "--camera", "camera", "-o", "photos", *how]) == 0
+    printed = capsys.readouterr()
+    assert printed.err.startswith("http://127.0.0.1:")
+    assert "3 frames in photos; next: reseau calibrate photos --design field.json" in printed.out
+    assert sorted(file.name for file in Path("photos").iterdir()) == ["001.png", "002.png", "003.png"]
+    assert run(["watch", "--design", "field.json", "-o", "photos"]) == 2
+    assert "photos: is not empty" in capsys.readouterr().err
