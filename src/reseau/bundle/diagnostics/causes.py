@@ -16,7 +16,7 @@ from ..network.network import finite
 from ..solver.spatial import directions
 from .checks import listed
 
-__all__ = ["causes", "given_poses_that_do_not_fit", "seen_frontally"]
+__all__ = ["causes", "given_poses_that_do_not_fit", "outside_image", "seen_frontally"]
 
 # Half the diagonal of the image in the principal distance: tangents of half angles of view of real cameras.
 _NARROWEST, _WIDEST = 6e-4, 12.0
@@ -148,6 +148,31 @@ def _within(value: float, limits: tuple[float, float]) -> bool:
     return limits[0] <= value <= limits[1]
 
 
+def outside_image(network: Network) -> Rows:
+    """Return the image points outside their image, where exchanged coordinates do not explain them.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> outside_image(example_network())
+    array([], dtype=int64)
+    """
+    found = [np.zeros(0, dtype=np.intp)]
+    for c, camera in enumerate(network.cameras):
+        rows = np.flatnonzero(network.camera_of[network.image_of] == c)
+        out, swapped = _beyond(network.xy[rows], np.array([camera.width, camera.height], dtype=np.float64))
+        found += [] if swapped else [rows[out]]
+    return np.concatenate(found)
+
+
+def _beyond(xy: Array, size: Array) -> tuple[Mask, bool]:
+    """Which coordinates are outside an image, and whether several are inside it on its side."""
+    far = (xy < -0.5 - _OUTSIDE * size) | (xy > size * (1 + _OUTSIDE) - 0.5)
+    out: Mask = np.asarray(far.any(axis=1))
+    turned = ((xy > -0.5 - _OUTSIDE * size) & (xy < size[::-1] * (1 + _OUTSIDE) - 0.5)).all()
+    return out, bool(turned and out.sum() > 2)
+
+
 def _outside(network: Network) -> list[Remark]:
     """Image coordinates outside the image, or in another unit."""
     found = []
@@ -168,11 +193,11 @@ def _outside(network: Network) -> list[Remark]:
                 )
             )
             continue
-        out = rows[((xy < -0.5 - _OUTSIDE * size) | (xy > size * (1 + _OUTSIDE) - 0.5)).any(axis=1)]
+        beyond, swapped = _beyond(xy, size)
+        out = rows[beyond]
         if not len(out):
             continue
-        swapped = ((xy > -0.5 - _OUTSIDE * size) & (xy < size[::-1] * (1 + _OUTSIDE) - 0.5)).all()
-        if swapped and len(out) > 2:
+        if swapped:
             found.append(
                 Remark(
                     f"{camera.label}: {len(out)} image points are outside the {camera.width}×{camera.height} "

@@ -14,7 +14,7 @@ from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ..diagnostics import ControlCheck, ControlShape, Result, checked_control, checks, control_shape
-from ..diagnostics.causes import causes, given_poses_that_do_not_fit, seen_frontally
+from ..diagnostics.causes import causes, given_poses_that_do_not_fit, outside_image, seen_frontally
 from ..diagnostics.checks import listed
 from ..diagnostics.control_check import suspected, without_control
 from ..diagnostics.suspects import contradicting, doubtful_parameters, grouped, without_false_bars
@@ -230,6 +230,8 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     problem, notes, doubts = _begun(network, options, settle=not grave)
     network = problem.network
     found += doubts
+    if options.outliers == "reject":
+        problem = _within_the_images(problem)
     problem, false_bars = without_false_bars(problem)
     found += false_bars
     found += given_poses_that_do_not_fit(network, _misfits_px(problem))
@@ -259,6 +261,16 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         found += [] if of_control else _rejected_control(network, rejected)
         found += _frontal(network, bare)
     return Result(network, fit, rejected, steps, (*found, *notes, *checks(bare)))
+
+
+def _within_the_images(problem: BundleProblem) -> BundleProblem:
+    """Return the problem without image points outside their images."""
+    rows = outside_image(problem.network)
+    if not len(rows):
+        return problem
+    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+    weights[2 * rows] = weights[2 * rows + 1] = 0.0
+    return problem.with_weights(weights)
 
 
 def _has_depth(result: Result) -> bool:
@@ -364,7 +376,8 @@ def _partly_wrong(problem: BundleProblem) -> ControlShape | None:
     """The control points compared with a free network, where some of them do not agree."""
     if problem.network.datum != "control" or len(problem.observations) > _MANY:
         return None
-    shape = control_shape(problem.network)
+    n = 2 * len(problem.network.xy)
+    shape = control_shape(problem.network, None if problem.weights is None else problem.weights[:n:2] > 0)
     return None if shape is None or shape.agree.all() or shape.as_a_whole else shape
 
 
@@ -554,8 +567,9 @@ def _trimmed(problem: BundleProblem) -> BundleProblem:
         far = ~(size <= limit)
         if (far == out).all():
             break
-        out, weights = far, np.ones(len(problem.observations))
-        weights[: 2 * n] = np.repeat(~out, 2)
+        out = far
+        weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+        weights[: 2 * n][np.repeat(out, 2)] = 0.0
         fit = problem.with_weights(weights).adjusted()
         if isinstance(fit, Failure):
             break

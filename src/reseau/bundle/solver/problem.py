@@ -146,7 +146,7 @@ class BundleProblem(Display):
 
         Distances are one group: a wrong one changes the scale, and with it the residuals of all others.
         """
-        points, bars = len(self.network.points), len(self.network.distance)
+        points, bars = len(self.network.points), self.others.slices[0].stop
         more = points + np.maximum(np.arange(len(self.others.value)) - bars + 1, 0)
         return np.concatenate([np.repeat(self.network.point_of, 2), more])
 
