@@ -104,6 +104,7 @@ def test_a_printed_sheet_calibrates_a_camera_whose_result_opencv_uses(
     assert np.abs(own - expected).max() < 0.15
 
 
+@pytest.mark.slow
 def test_the_target_is_found_among_the_designs_beside_the_photographs(
     reseau: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

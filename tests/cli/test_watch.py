@@ -22,7 +22,7 @@ from reseau.service.live import LivePage
 from ..capture.fieldrig import FieldRig, Sweeper, enter, write_inputs
 
 SIZE = (640, 480)
-DESIGN = board("chess", 9, 7, 20.0)
+DESIGN = board("chess", 7, 6, 26.0)
 
 
 class _Points:
@@ -101,6 +101,7 @@ def test_the_page_answers_this_machine_alone_and_changes_nothing() -> None:
         assert asked(page.port, "/../live.py")[0] == 404
 
 
+@pytest.mark.slow
 def test_watching_the_simulated_bench_leaves_frames_for_a_calibration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
