@@ -158,6 +158,7 @@ def test_blunders_in_conditions_are_found_at_the_power_of_theory():
     assert within(false, trials, alpha)
 
 
+@pytest.mark.slow
 def test_tau_keeps_its_level_when_the_sigmas_are_unknown():
     alpha, trials = 0.05, 2000
     rng = np.random.default_rng(11)
@@ -214,6 +215,7 @@ def holds(trials):
     assert abs(variance - 1.0) < 4.0 * np.sqrt(2.0 / (len(T) - 3) / trials)
 
 
+@pytest.mark.slow
 def test_predicted_sigmas_and_ellipses_cover_at_their_probability():
     holds(1500)
 
@@ -240,6 +242,7 @@ def test_the_global_test_finds_sigmas_that_are_too_small():
     assert test.statistic > test.upper
 
 
+@pytest.mark.slow
 def test_t_and_chi2_tests_of_a_coefficient_keep_their_level():
     trials, alpha = 1000, 0.05
     rng = np.random.default_rng(9)

@@ -67,6 +67,7 @@ def test_gross_errors_that_are_kept_are_named() -> None:
         assert where in remark
 
 
+@pytest.mark.slow
 def test_too_many_gross_errors_are_refused() -> None:
     world = networks.world(images=8, points=60, seed=2, cameras=(SIMPLE,))
     network, _ = disturbed(world.noisy(1), 0.2, 1)

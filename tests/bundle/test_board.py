@@ -62,6 +62,7 @@ def test_the_simplest_sufficient_model_is_chosen(warp: tuple[float, float], roug
     assert json.loads(json.dumps(found.entries()))["chosen"] == name
 
 
+@pytest.mark.slow
 def test_deflection_and_camera_are_covered_by_their_sigmas() -> None:
     """Ten draws of seven numbers; the interval has a probability of 0.9999 for independent ones."""
     warp, off = np.array([0.3, -0.1]), list[Array]()

@@ -84,6 +84,7 @@ def test_the_model_of_the_lens_is_chosen(k: tuple[float, ...], label: str) -> No
             assert each.reason.startswith("too many")
 
 
+@pytest.mark.slow
 def test_what_the_wrong_model_costs_at_the_corners_is_what_it_costs() -> None:
     """The reported difference of the model without k2, beside that from the lens itself."""
     k = (-0.2, 0.1, 0.0, 0.0)
@@ -111,6 +112,7 @@ def test_gross_errors_do_not_change_the_choice() -> None:
     assert found.chosen.sigma0 == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_the_comparison_is_written_as_json() -> None:
     found = chosen(lens_of(-0.1), [])
     entries = json.loads(json.dumps(found.entries()))

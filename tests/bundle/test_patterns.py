@@ -30,6 +30,7 @@ def with_pattern(network: Network, size_px: float) -> Network:
     return replace(network, xy=network.xy + pattern[of, network.point_of])
 
 
+@pytest.mark.slow
 def test_noise_has_no_common_pattern() -> None:
     """The test keeps its level: of thirty small networks with a level of 5 % not more than six fail it."""
     world = networks.world(points=30, images=8)
@@ -42,6 +43,7 @@ def test_noise_has_no_common_pattern() -> None:
     assert 0.3 < np.mean(p) < 0.7
 
 
+@pytest.mark.slow
 def test_a_pattern_of_pairs_of_images_is_found_and_measured() -> None:
     """Common shifts of 0.02 px with noise of 0.04 px: 0.02 px are found, and sigma0 is one with them."""
     network = with_pattern(paper(seed=4), 0.02)

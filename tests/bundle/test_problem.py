@@ -94,6 +94,7 @@ def mixed() -> networks.World:
     return replace(world, network=replace(network, sigma=sigma, xyz=xyz, distance_of=ends, distance=distance))
 
 
+@pytest.mark.slow
 def test_the_dense_engine_gives_the_same_estimates_and_statistics() -> None:
     world = mixed()
     network = world.noisy(3)

@@ -179,6 +179,7 @@ def test_a_known_base_gives_the_scale(cold: bool) -> None:
     assert result.redundancy == free.redundancy
 
 
+@pytest.mark.slow
 def test_errors_with_known_bases_have_their_covariances() -> None:
     q, rng = [], np.random.default_rng(9)
     for seed in range(25):

@@ -343,6 +343,7 @@ def test_a_network_with_a_shutter_is_written_and_read() -> None:
         Network1.from_content(content, where="test")
 
 
+@pytest.mark.slow
 def test_points_in_a_plane_do_not_determine_pose_and_velocity_of_a_line() -> None:
     scene = scene_of_kind("line")
     flat = scene._replace(xyz=scene.xyz * [1, 1, 0])

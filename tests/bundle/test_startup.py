@@ -66,6 +66,7 @@ def test_eight_coefficients_of_a_bent_board_converge() -> None:
     assert abs(result.cameras["A"].values[0] - lens.matrix[0, 0]) < 5.0
 
 
+@pytest.mark.slow
 def test_an_observed_point_without_rays_does_not_stop_the_adjustment() -> None:
     """Robust weights and data snooping leave out all rays of points with observed coordinates."""
     world = networks.world(points=25, control=0)

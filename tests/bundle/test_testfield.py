@@ -133,6 +133,7 @@ def test_a_bend_that_rotates_with_the_mount_is_removed_by_groups() -> None:
     assert any(test.significant for test in groups.camera_tests(0, alpha=0.001))
 
 
+@pytest.mark.slow
 def test_the_bend_of_the_mount_appears_in_common_residuals_of_images() -> None:
     network = paper(bend_mm=0.8)
     camera = network.cameras[0]

@@ -27,6 +27,7 @@ def folder(reference_data: Callable[[str], Path]) -> Path:
     return reference_data("multimedia_cavity")
 
 
+@pytest.mark.slow
 def test_the_stored_calibration_of_the_cavity_is_reproduced(folder: Path) -> None:
     network = cavity.cavity(folder)
     off = cavity.misfits(network)
@@ -36,6 +37,7 @@ def test_the_stored_calibration_of_the_cavity_is_reproduced(folder: Path) -> Non
         assert float(np.sqrt((off[rows] ** 2).mean())) == pytest.approx(rms, abs=5e-4)
 
 
+@pytest.mark.slow
 def test_cameras_of_the_cavity_adjusted_jointly_agree_with_each_by_itself(folder: Path) -> None:
     network = cavity.cavity(folder, cavity.INTERIOR + cavity.ADDITIONAL)
     joint = problem_of(network)[0].adjusted()

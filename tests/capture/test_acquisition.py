@@ -72,6 +72,7 @@ def test_a_plan_stores_frames_verdicts_documents_and_results(rig: FieldRig, sess
     assert rig.table.stops > 0
 
 
+@pytest.mark.slow
 def test_the_precision_after_the_next_pose_is_predicted(rig: FieldRig, session: Session) -> None:
     run = rig.acquisition(session, rig.procedure())
     carry_out(run, plans.poses(run, FEW))
@@ -102,6 +103,7 @@ def test_a_full_disk_stops_the_session_which_can_be_resumed(
     assert [f.step for f in session.frames()] == [step.name for step in FEW]
 
 
+@pytest.mark.slow
 def test_a_clock_that_jumps_changes_neither_order_nor_result(
     rig: FieldRig, session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -133,6 +135,7 @@ def test_offline_equals_live_to_the_byte(rig: FieldRig, session: Session) -> Non
     assert not rerun(session, other)[0].same
 
 
+@pytest.mark.slow
 def test_a_bad_frame_is_taken_again_and_both_are_kept(rig: FieldRig, session: Session) -> None:
     rig.camera.spoil = lambda number, pixels: np.full_like(pixels, 255) if number == 2 else pixels
     run = rig.acquisition(session, rig.procedure())
@@ -372,6 +375,7 @@ def test_failed_checks_stop_the_acquisition(rig: FieldRig, session: Session) -> 
     assert not session.frames(kind="frame")
 
 
+@pytest.mark.slow
 def test_the_closed_loop_chooses_poses_until_the_goal_is_met(rig: FieldRig, session: Session) -> None:
     """The precision predicted from the design matrix is reached."""
     run = rig.acquisition(session, rig.procedure())
@@ -423,12 +427,14 @@ def test_the_search_for_the_next_pose_can_be_stopped(rig: FieldRig, session: Ses
     assert len(looked) < 6
 
 
+@pytest.mark.slow
 def test_the_closed_loop_reports_when_no_pose_is_left(rig: FieldRig, session: Session) -> None:
     run = rig.acquisition(session, rig.procedure())
     why = carry_out(run, plans.until(run, Goal("c", 1e-9, "mm"), FEW[:3], FEW[3:]))
     assert "no pose is left" in why
 
 
+@pytest.mark.slow
 def test_a_goal_for_a_parameter_that_is_not_estimated_is_refused(rig: FieldRig, session: Session) -> None:
     run = rig.acquisition(session, rig.procedure())
     with pytest.raises(EstimationError, match="is not estimated; use c, x0, y0, K1"):

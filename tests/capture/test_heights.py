@@ -30,6 +30,7 @@ def new_session(folder: Path) -> Session:
     return Archive.open(folder, create=True).begin("monday", "testfield", {"design": "field"})
 
 
+@pytest.mark.slow
 def test_frontal_frames_at_several_heights_give_the_principal_distance(tmp_path: Path) -> None:
     rig, session, live = make_rig(), new_session(tmp_path / "archive"), make_rig().procedure(sigmas=SIGMAS)
     run = rig.acquisition(session, live)
@@ -48,6 +49,7 @@ def test_frontal_frames_at_several_heights_give_the_principal_distance(tmp_path:
         rerun(session, rig.procedure())
 
 
+@pytest.mark.slow
 def test_a_session_stopped_between_heights_is_resumed_with_the_same_result(tmp_path: Path) -> None:
     rig, session, straight = make_rig(), new_session(tmp_path / "archive"), new_session(tmp_path / "straight")
     rig.camera.during = lambda number: os.kill(os.getpid(), signal.SIGTERM) if number == 3 else None

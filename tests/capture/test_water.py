@@ -37,6 +37,7 @@ def described(simulated: SimulatedBench) -> str:
     return simulated.toml.replace("speed = 50.0", "speed = 1000.0") + CAMERA + simulated.refraction
 
 
+@pytest.mark.slow
 def test_a_session_under_water_gives_the_calibration_of_the_camera_in_air(tmp_path: Path) -> None:
     design = coded_testfield()
     with SimulatedBench(

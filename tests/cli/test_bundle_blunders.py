@@ -211,6 +211,7 @@ def test_reliability_is_in_columns(reseau: Run, tmp_path: Path) -> None:
     np.testing.assert_allclose(effect, 4.1321 * np.sqrt((1 - r) / r), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_unnecessary_parameters_are_dropped_and_cross_validated(reseau: Run, tmp_path: Path) -> None:
     document = block()
     document["cameras"][0]["free"] += ["K2", "K3", "P1", "P2", "B1", "B2"]

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from reseau.bundle.network import network_document
 
@@ -15,6 +16,7 @@ from ..bundle.rigs import PLACES, drawn
 Run = Callable[..., tuple[int, str, str]]
 
 
+@pytest.mark.slow
 def test_the_command_prints_relative_orientations(tmp_path: Path, reseau: Run) -> None:
     file = tmp_path / "stereo.json"
     file.write_text(network_document(drawn()).to_json())

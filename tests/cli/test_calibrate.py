@@ -64,6 +64,7 @@ def test_the_calibration_is_within_its_sigmas_of_the_truth(
     assert "<svg" in (tmp_path / "F.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_calibration_is_compared_with_another_of_the_same_recordings(
     reseau: Run, measured: tuple[Path, ...], tmp_path: Path
 ) -> None:
@@ -73,6 +74,7 @@ def test_a_calibration_is_compared_with_another_of_the_same_recordings(
     assert "p = 1\n" in out
 
 
+@pytest.mark.slow
 def test_two_calibrations_are_compared_as_a_field(
     reseau: Run, measured: tuple[Path, ...], tmp_path: Path
 ) -> None:
@@ -108,6 +110,7 @@ def test_files_that_are_not_calibrations_are_not_compared(
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_control_points_define_the_datum(reseau: Run, measured: tuple[Path, ...], tmp_path: Path) -> None:
     """Three corners of the board, one of them in its height alone: no freedom left, nothing redundant."""
     names, xy = BENCH.design.targets.id, BENCH.design.xy
@@ -153,6 +156,7 @@ def test_a_bad_table_of_control_points_is_refused(
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_point_can_be_left_out_by_name(reseau: Run, measured: tuple[Path, ...]) -> None:
     name = measured[3].read_text().splitlines()[5].partition(",")[0]
     point = f"{measured[3].name}:{name}"
@@ -197,6 +201,7 @@ def test_components_and_elimination_search_the_model(
         assert words in page
 
 
+@pytest.mark.slow
 def test_photographs_are_measured_and_blank_ones_are_named(reseau: Run, tmp_path: Path) -> None:
     """Four photographs with OpenCV's model and nothing known of the camera; one that shows no testfield."""
     bench = FieldBench(seed=4, bend_mm=0.0)

@@ -38,6 +38,7 @@ def sheet(reference_data: Callable[[str], Path], tmp_path: Path) -> tuple[object
     return ("-d", tmp_path / "sheet.json", "--control", tmp_path / "control.csv")
 
 
+@pytest.mark.slow
 def test_the_published_marks_give_the_published_sigma_naught(
     reseau: Run, reference_data: Callable[[str], Path], sheet: tuple[object, ...], tmp_path: Path
 ) -> None:

@@ -210,6 +210,7 @@ def test_events_for_programs_are_json_lines(rig: FieldRig, capsys: pytest.Captur
     assert failed == f"reseau: {events[-1]['why']}\n"
 
 
+@pytest.mark.slow
 def test_a_failed_session_is_resumed_where_it_stopped(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -23,6 +23,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FieldRig:
     return rig
 
 
+@pytest.mark.slow
 def test_one_frontal_pose_at_three_heights_gives_a_reproducible_calibration(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:

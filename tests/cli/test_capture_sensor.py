@@ -112,6 +112,7 @@ def test_a_sensor_is_calibrated_on_the_bench(
     assert len(curve["sigma"]) == len(curve["gaussian"]) == len(curve["mtf"])
 
 
+@pytest.mark.slow
 def test_every_raw_frame_is_archived_and_the_calibration_can_be_recomputed(
     asked: list[str], camera: VideoCamera, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -134,6 +135,7 @@ def test_every_raw_frame_is_archived_and_the_calibration_can_be_recomputed(
     assert run(["archive", "verify"]) == 0
 
 
+@pytest.mark.slow
 def test_an_interrupted_session_is_resumed_where_it_stopped(
     asked: list[str], lamp: LampScene, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -66,6 +66,7 @@ def test_a_roll_gives_documents_marked_copies_corners_and_an_overview(
     assert helped.corners["ul"].sx < 0.5 * alone["corners"]["ul"]["sx"]
 
 
+@pytest.mark.slow
 def test_a_second_run_continues_where_the_first_ended(roll: Path, tmp_path: Path, reseau: Run) -> None:
     images = [roll / "0.tif", roll / "1.tif"]
     arguments = ("--frame", "36x24", "--out", tmp_path, "--jobs", 1, "--no-marked")

@@ -86,6 +86,7 @@ def test_several_scans_have_one_picture_each(reseau: Run, tmp_path: Path) -> Non
     assert {path.name for path in (tmp_path / "folder").iterdir()} == {"a-overlay.png", "b-overlay.png"}
 
 
+@pytest.mark.slow
 def test_a_mirrored_frame_is_numbered_as_the_option_says(reseau: Run, photo: Any, tmp_path: Path) -> None:
     write_image(tmp_path / "back.png", np.ascontiguousarray(np.rint(photo.pixels[:, ::-1]).astype(np.uint8)))
     found = {}

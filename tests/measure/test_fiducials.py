@@ -79,6 +79,7 @@ def test_symmetric_marks_are_said_to_fit_in_several_orientations() -> None:
     assert np.abs(told.xy - places).max() < 0.05  # px
 
 
+@pytest.mark.slow
 def test_a_missing_mark_is_said_and_predicted() -> None:
     image, places = photograph(UNEVEN, without=("2",))
     found = measured(image, camera(UNEVEN), transform="similarity")

@@ -131,6 +131,7 @@ def test_a_line_all_along_an_edge_is_suspected_in_a_picture_of_little_contrast(
         assert np.abs(errors(result, frame)).max() < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fade", [0.0, 0.75])
 def test_a_trunk_as_dark_as_film_at_one_end_of_an_edge_is_not_its_bow(fade: float) -> None:
     frame = FilmFrame(700011, scene="trees", fade=fade)  # a corner was wrong by 2.2 px at 13 sigma
@@ -152,6 +153,7 @@ def test_a_channel_of_less_contrast_does_not_overrule_a_line_that_another_suspec
         assert (np.abs(errors(result, frame)) < 3 * sigma + 0.1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [700003, 700019])
 @pytest.mark.parametrize("stated", [True, False], ids=["resolution stated", "not stated"])
 def test_a_trunk_in_the_picture_is_no_edge_of_a_frame_that_stands_upright(seed: int, stated: bool) -> None:
@@ -191,6 +193,7 @@ def test_edges_of_any_softness_and_grain_are_found(frame: FilmFrame) -> None:
     assert np.abs(errors(result, frame)).max() < 0.4
 
 
+@pytest.mark.slow
 def test_a_curve_that_leaves_a_dark_edge_is_not_measured_as_its_bow() -> None:
     frame = FilmFrame(
         6010, dpi=1200, blur_px=2.5, beside=Beside(rods=1)
@@ -325,6 +328,7 @@ def test_a_sharp_edge_is_not_displaced_by_the_grid_of_the_pixels() -> None:
     assert np.abs(errors(result, frame)).max() < 0.15
 
 
+@pytest.mark.slow
 def test_the_resolution_of_the_file_decides_between_rectangles() -> None:
     frame = FilmFrame(32, dpi=300.0)
     scan, options = frame.scan(), FrameOptions(((36.0, 24.0),))
@@ -353,6 +357,7 @@ def test_a_scan_that_is_sharper_in_one_direction_has_no_lines_beside_its_edges()
     assert np.abs(errors(result, frame)).max() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("negative", [False, True])
 def test_grey_values_are_measured_with_the_curve_that_the_file_states(negative: bool) -> None:
     frame = FilmFrame(32, srgb=True, blur_px=1.2, negative=negative)

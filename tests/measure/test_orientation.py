@@ -58,11 +58,13 @@ def test_nothing_is_ambiguous_where_handedness_and_turn_are_known(pixels):
     assert found.notes == ()
 
 
+@pytest.mark.slow
 def test_a_grid_of_which_columns_and_rows_are_cropped_is_found(pixels):
     found = measure_reseau(shown(pixels[110:, 165:]), SCENE.design()).required()
     assert found.found == 72
 
 
+@pytest.mark.slow
 def test_a_cropped_grid_of_wires_is_not_laid_over_what_lies_along_them():
     scene = Scene(mark=MARKS["line-grid"], columns=11, rows=9, width=700, height=600)
     formed = form(scene, np.random.default_rng(0))
@@ -103,6 +105,7 @@ def test_nominal_positions_wrong_by_one_pitch_are_noticed():
     assert "wrong by about 52 px" in found.notes[0].text
 
 
+@pytest.mark.slow
 def test_a_picture_of_something_else_is_not_the_reseau():
     rng = np.random.default_rng(2)
     light = rng.normal(0, 1, (500, 600)).cumsum(axis=0).cumsum(axis=1)

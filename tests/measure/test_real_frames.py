@@ -75,6 +75,7 @@ def test_the_flat_frame_is_more_accurate_than_published(measured):
     assert ours[1] < 0.081
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [JRINGS, IO])
 def test_the_frame_resampled_by_our_marks_agrees_with_nasa_s_corrected_frame(measured, name):
     case, result = measured(name)
@@ -84,6 +85,7 @@ def test_the_frame_resampled_by_our_marks_agrees_with_nasa_s_corrected_frame(mea
     assert found.mad.max() <= mad
 
 
+@pytest.mark.slow
 def test_without_nominal_positions_the_same_marks_are_measured(measured):
     case, result = measured(JRINGS)
     points = tuple(p.model_copy(update={"nominal_px": None}) for p in case.design.points)

@@ -74,6 +74,7 @@ def test_with_known_row_jitter_sigmas_are_not_too_small():
     assert s.ratio.max() < 1.15 + 0.25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quality", [60, 10])
 def test_sigmas_contain_the_errors_of_compression(quality):
     scene = Scene(mark=MARKS["cross"], columns=11, rows=9, width=700, height=600)
@@ -251,6 +252,7 @@ def clutter(kind: str, seed: int) -> np.ndarray:
     return np.clip(170 * (1 - 0.7 * np.clip(share, 0, 1)) + random.normal(0, 2.5, share.shape), 0, 255)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nominal", [True, False])
 @pytest.mark.parametrize("kind", ["noise", "specks"])
 def test_a_frame_without_the_reseau_is_a_failure_with_the_reason(kind, nominal):
@@ -328,3 +330,14 @@ def test_crossings_of_short_arms_reach_the_bound_of_what_lies_near_them(arm_px):
     assert np.sqrt((error**2).mean()) < 1.1 * sigma * np.sqrt(np.trace(cov) / 2)
     variance = np.diagonal(found.cov, axis1=1, axis2=2)
     assert np.sqrt((error**2 / variance).mean()) == pytest.approx(1, abs=0.25)
+
+
+def test_weak_wires_are_known_to_be_continuous_though_blur_is_brighter_where_they_cross():
+    """Thin wires of 17 grey values, blurred to half of that beside crossings, in noise of two."""
+    scene = small(
+        mark=Mark(shape="line-grid", line_width=0.18), polarity="bright", contrast=0.12, psf_px=1.8, sigma=2.0
+    )
+    s = measure_many(scene, 1, seed=3)
+    assert len(s.error) == s.expected
+    assert np.sqrt((s.ratio**2).mean()) < 1.05
+    assert np.sqrt((s.normalised**2).mean()) == pytest.approx(1.0, abs=0.25)

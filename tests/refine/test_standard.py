@@ -25,6 +25,7 @@ def stored() -> tuple[InstrumentCorrection, np.ndarray]:
     return correct_instrument(measured(RODS.ids, displayed(real), rng), RODS, camera).required(), real
 
 
+@pytest.mark.slow
 def test_an_unchanged_instrument_is_rejected_at_the_level_of_the_test(stored):
     correction, real = stored
     rng, trials = np.random.default_rng(2), 300

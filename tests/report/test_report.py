@@ -122,6 +122,7 @@ def test_the_page_needs_no_other_files_and_is_well_formed(bench: Bench, whole: b
     assert "A &lt;title&gt; &amp; more" in page
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_bytes_without_clock_times(bench: Bench) -> None:
     assert first_page(bench) == first_page(bench)
     page = whole_page(bench)

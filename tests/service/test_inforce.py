@@ -106,6 +106,7 @@ def test_outcomes_follow_from_size_significance_and_completeness(
     assert AcceptanceRules.from_content(dict(judged.rules), where="rules") == RULES
 
 
+@pytest.mark.slow
 def test_the_congruence_test_keeps_its_level_with_the_covariances_of_both() -> None:
     rng, found = np.random.default_rng(1), []
     for _ in range(400):

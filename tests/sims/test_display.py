@@ -110,6 +110,7 @@ def test_a_point_is_drawn_at_the_inverse_of_the_correction() -> None:
     np.testing.assert_allclose(centre, [(20.4 - 0.02 * 11.0) / 1.02, 11.0], rtol=0, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_photo_i_does_not_depend_on_scanner_and_display() -> None:
     one = World.standard(3)
     other = World.standard(3, display="polynomial", scanner=Scanner(), rods=one.test_object)

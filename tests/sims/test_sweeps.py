@@ -167,6 +167,7 @@ def test_a_parallax_shifts_the_echoes_but_not_the_reseau() -> None:
     assert np.abs(errors(echoes(far, far.rods), far.truth_ii(), alone(far))).max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_displaced_camera_shifts_everything_after_photo_i() -> None:
     still, pushed = (World.standard(2, faults=Faults(camera_moved_mm=d)) for d in (0.0, 1.0))
     assert still.photo_i().sha256 == pushed.photo_i().sha256

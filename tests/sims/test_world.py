@@ -147,6 +147,7 @@ def test_marks_of_every_shape_are_centred_on_their_truth(mark: Mark, polarity: s
         np.testing.assert_allclose(centroid + np.array([column, row]), at, rtol=0, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_faults_have_the_specified_effect() -> None:
     faults = Faults(missing=3, false_marks=4, bit_errors=500, lost_rows=6, scene=40.0)
     with_faults, without = World.standard(5, faults=faults), World.standard(5)

@@ -14,7 +14,7 @@ from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code
 from ...io import ReseauDesign
 from ...optics.field import SmoothField
-from ...optics.formation import Outline, PixelResponse, mark_outline
+from ...optics.formation import Outline, PixelResponse, coverage, mark_outline
 from ..matching import SIZE, Matches, MatchOptions, grey_variance, match, with_alike_errors
 from ..points import Reason
 from ..screening import is_in_blocks
@@ -420,23 +420,28 @@ class MarkMeasurement:
 
         Crossings of short bars end within the window, and where they end is no property of the crossing.
         """
-        half = max(self._first_options().half)
+        options = self._first_options()
+        half = max(options.half)
         distance = np.arange(0.0, 1.5 * half, 0.5)
         along = self._axes(at)
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
         along = np.swapaxes(np.concatenate([along, -along], axis=2), 1, 2)
-        points = first.xy[:, None, None] + along[:, :, None] * distance[:, None]
-        x, y = np.moveaxis(points.astype(np.float32), -1, 0).reshape(2, len(at), -1)
-        grey = self.screened.grey.astype(np.float32)
-        seen = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(
-            points.shape[:3]
-        )
-        profile = np.median(seen - first.level[:, None, None], axis=(0, 1))
+        steps = along[:, :, None] * distance[:, None]
+        seen = _values(self.screened.grey, first.xy[:, None, None] + steps)
+        # Blurred wires are brighter where they cross than elsewhere.
+        reach = float(np.ceil(distance[-1])) + 1
+        pixels = np.arange(-reach, reach + 1)
+        psf_px = float(np.median(first.psf_px))
+        outline = self._outline(at, replace(options, psf_px=psf_px)).oriented()
+        wires = coverage(outline, pixels, pixels, psf_px, options.response)
+        formed = np.stack([_values(image, reach + each) for image, each in zip(wires, steps, strict=True)])
+        share = first.contrast[:, None, None] * formed
+        profile = np.median(seen - first.level[:, None, None], axis=(0, 1)) / np.median(share, axis=(0, 1))
         profile = profile / np.median(profile[distance <= 0.7 * half])
         ended = np.flatnonzero(profile < _ARM_ENDS)
         if not len(ended):
             return np.inf
-        blur = float(np.hypot(np.median(first.psf_px), 12**-0.5))  # of the optics and of a pixel
+        blur = float(np.hypot(psf_px, 12**-0.5))  # of the optics and of a pixel
         return float(distance[ended[0]] - _END * blur)
 
     def _turned(self, turns: Array) -> Array:
@@ -600,6 +605,14 @@ class MarkMeasurement:
         variance = np.trace(cov, axis1=1, axis2=2) / 2 + _UNMODELLED_PX**2
         relative: Array = np.sqrt(variance / np.median(variance))
         return relative
+
+
+def _values(image: ArrayLike, xy: Array) -> Array:
+    """Values (...) of an image between its pixels, at positions (..., 2)."""
+    x, y = np.moveaxis(xy.astype(np.float32), -1, 0).reshape(2, len(xy), -1)
+    grey = np.asarray(image, dtype=np.float32)
+    values = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, dtype=np.float64).reshape(xy.shape[:-1])
 
 
 def _of_each(options: MatchOptions, rows: Rows) -> dict[str, Any]:
