@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dctn
 from scipy.ndimage import median_filter
 
 from ..core.data import Array, Frame, Mask
 from ..core.errors import ImageError
 
-__all__ = ["Screened", "is_in_blocks", "quiet_noise", "screen"]
+__all__ = ["Screened", "lost_in_blocks", "quiet_noise", "screen"]
 
 _BORDER = 3
 """Outermost lines of a frame whose level is compared with that of the lines further inside."""
@@ -24,6 +26,9 @@ _BLOCK = 6
 _SPIKE = 6.0
 """A pixel is a bit error if it leaves the range of its neighbours by more than this many noise sigmas."""
 
+_LOW, _ROUNDED, _TOLD = 4, 1.5, 8
+"""Frequencies of the cosine transform along an axis that images of marks have; coefficients that rounding of
+grey values does not make; fewest of one frequency that tell its step."""
 _SIDE, _STEEP, _STEPS = 8, 8.0, 1.15
 """Side of the blocks of JPEG; grey levels above which a step is one of the scene; least ratio of the steps
 between blocks to those elsewhere (along both axes at most 1.09 without compression in frames of reseaux, 1.1
@@ -169,30 +174,50 @@ def _running_median(line: NDArray[Any]) -> Array:
     return smooth
 
 
-def is_in_blocks(pixels: NDArray[Any]) -> bool:
-    """Whether an image was compressed in blocks of 8 × 8 pixels, as by JPEG, wherever they begin.
+def lost_in_blocks(pixels: NDArray[Any]) -> float | None:
+    """Largest rms of the detail that compression in blocks of 8 × 8 pixels, as by JPEG, has taken.
 
     Between blocks, grey values have steps; elsewhere there are as many in one column of pixels as in the
-    next. Steps of the scene count little: they are limited.
+    next. Steps of the scene count little: they are limited. Within a block, each coefficient of the cosine
+    transform is a multiple of a step: what is lost is uniform within half of it, with the rms step ÷ √12.
+    The least coefficients that are not zero tell the steps.
 
     Parameters
     ----------
     pixels : ndarray (h, w)
         Grey values.
 
+    Returns
+    -------
+    float or None
+        Grey values; None for an image that was not compressed so, wherever its blocks begin.
+
     Examples
     --------
     >>> grey = np.random.default_rng(0).normal(100, 3, (200, 200))
     >>> coded = cv2.imencode(".jpg", grey.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 60])[1]
-    >>> is_in_blocks(grey), is_in_blocks(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE)[3:, 5:])
-    (False, True)
+    >>> lost_in_blocks(grey)
+    >>> bool(2 < lost_in_blocks(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE)[3:, 5:]) < 8)
+    True
     """
     grey = pixels.astype(np.float32)
+    first = []
     for values in (grey, grey.T):
         steps = np.minimum(np.abs(np.diff(values, axis=0)), _STEEP).mean(axis=1)
         if len(steps) < 2 * _SIDE:
-            return False
-        second, most = np.sort([steps[first::_SIDE].mean() for first in range(_SIDE)])[-2:]
+            return None
+        means = np.array([steps[start::_SIDE].mean() for start in range(_SIDE)])
+        second, most = np.sort(means)[-2:]
         if not most > _STEPS * second:
-            return False
-    return True
+            return None
+        first.append((int(means.argmax()) + 1) % _SIDE)
+    whole = grey[first[0] :, first[1] :]
+    rows, columns = (n // _SIDE for n in whole.shape)
+    blocks = whole[: rows * _SIDE, : columns * _SIDE].reshape(rows, _SIDE, columns, _SIDE)
+    coefficients = np.abs(dctn(blocks, axes=(1, 3), norm="ortho")).transpose(1, 3, 0, 2)
+    found = []
+    for u, v in list(product(range(_LOW), repeat=2))[1:]:
+        told = coefficients[u, v][coefficients[u, v] > _ROUNDED]
+        if len(told) >= _TOLD:
+            found.append(np.quantile(told, 0.1))
+    return float(np.median(found) / np.sqrt(12)) if found else 0.0

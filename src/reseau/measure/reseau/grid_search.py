@@ -20,7 +20,7 @@ from ...optics.field import SmoothField, monomials, trend_degree
 from .assignment import Assignment, assign, in_sight, nearest_candidates, spacing, voted
 from .candidates import Candidates
 
-__all__ = ["NEARLY", "UPRIGHT", "GridOptions", "climbed", "grid_steps", "place_grid"]
+__all__ = ["NEARLY", "UPRIGHT", "GridOptions", "climbed", "grid_steps", "place_grid", "settled"]
 
 _NEIGHBOURS = 6
 UPRIGHT = np.deg2rad(12.0)
@@ -144,12 +144,12 @@ def climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mas
     """
     steps, uneven = grid_steps(source), _unevenness(source)
     for _ in range(len(source)):
+        found = settled(found, source, candidates, valid)
         moved = [assign(source, found.field(source + step), candidates, valid, shifts=1) for step in steps]
         plane = _homography(source, found.at)
         if plane is not None:
             moved += [
-                _projected(source, _on_plane(plane, source + step), candidates, valid)
-                for step in (np.zeros(2), *steps)
+                _projected(source, _on_plane(plane, source + step), candidates, valid) for step in steps
             ]
         better = [
             m for m in moved if m is not None and _is_better(m, found, source, uneven, m.score > found.score)
@@ -157,6 +157,17 @@ def climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mas
         if not better:
             break
         found = max(better, key=lambda m: m.score)
+    return found
+
+
+def settled(found: Assignment, source: Array, candidates: Candidates, valid: Mask) -> Assignment:
+    """The same position of the design, with the marks that a projective mapping predicts in addition."""
+    for _ in range(len(source)):
+        plane = _homography(source, found.at)
+        again = None if plane is None else _projected(source, _on_plane(plane, source), candidates, valid)
+        if again is None or again.score <= found.score:
+            break
+        found = again
     return found
 
 

@@ -17,7 +17,7 @@ from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse, coverage, mark_outline
 from ..matching import SIZE, Matches, MatchOptions, grey_variance, match, with_alike_errors
 from ..points import Reason
-from ..screening import is_in_blocks
+from ..screening import lost_in_blocks
 from .assignment import spacing
 from .placement import Placement
 from .wires import grid_wires
@@ -74,7 +74,8 @@ _NEAR_PX = 2.5
 _FEWEST_SCATTERED = 20
 """Marks whose deviations show how much compression displaces them."""
 _MOST_LOST = 2.5
-"""Multiple of their sigmas up to which compression is taken for the cause of the deviations of marks."""
+"""Multiple of their sigmas up to which compression is taken for the cause of the deviations of marks, if it
+has not taken more than that multiple of the residuals."""
 _TURN, _TURNED = 0.12, 0.02
 """Standard deviation (rad) of the direction of an arm: before it is learnt in the frame; and afterwards."""
 
@@ -197,13 +198,16 @@ class MarkMeasurement:
         alike = with_alike_errors(found)
         if alike is not found:
             found, judged = alike, self._judged(at, alike)
-        if is_in_blocks(self.frame.pixels):
-            found = self._with_lost_detail(at, found, judged)
+        lost = lost_in_blocks(self.frame.pixels)
+        if lost is not None:
+            found = self._with_lost_detail(at, found, judged, lost)
             judged = self._judged(at, found)
         return at, found, judged
 
-    def _with_lost_detail(self, at: Rows, found: Matches, judged: Verdict) -> Matches:
+    def _with_lost_detail(self, at: Rows, found: Matches, judged: Verdict, lost: float) -> Matches:
         """Matches with covariances that contain what compression has taken from the images of marks.
+
+        At most `lost` grey values (rms) in all pixels.
 
         It takes the same detail from all pixels of a block, and from the residuals: those of some marks are
         small by chance. What it does to positions is seen from their deviations from a polynomial; a local
@@ -219,7 +223,8 @@ class MarkMeasurement:
         off = found.xy[good] - field(self.source[at[good]])
         variance = np.diagonal(cov[good], axis1=1, axis2=2)
         factor = (off * field.leave_one_out()[0] / variance).mean(axis=0)
-        if factor.max() > _MOST_LOST**2:  # they lie beside the design, or the distortion is not smooth
+        most = max(_MOST_LOST, lost / max(float(np.median(found.noise[good])), 1e-12))
+        if factor.max() > most**2:  # they lie beside the design, or the distortion is not smooth
             factor = np.ones(2)
         root = np.sqrt(np.maximum(factor, 1.0))
         return replace(found, cov=cov * np.outer(root, root))

@@ -13,7 +13,7 @@ from ...optics.formation import coverage, mark_outline
 from ..screening import Screened, screen
 from .assignment import Assignment, assign, spacing
 from .candidates import Candidates, find_candidates
-from .grid_search import NEARLY, UPRIGHT, GridOptions, climbed, place_grid
+from .grid_search import NEARLY, UPRIGHT, GridOptions, climbed, place_grid, settled
 from .wires import grid_wires
 
 __all__ = ["Placement", "PlacingOptions", "place"]
@@ -174,8 +174,9 @@ def _despite_nominal(best: Placement | None, source: Array, options: PlacingOpti
     n = len(source)
     if best is None:
         return None
-    better = climbed(best.assignment, source, best.candidates, best.screened.valid)
-    if better.score >= best.assignment.score + _BETTER * n:
+    here = settled(best.assignment, source, best.candidates, best.screened.valid)
+    better = climbed(here, source, best.candidates, best.screened.valid)
+    if better.score >= here.score + _BETTER * n:
         best = replace(best, assignment=better)
     off = np.hypot(*np.median(best.assignment.predicted - options.nominal, axis=0))
     if off < 0.5 * spacing(options.nominal):
