@@ -74,8 +74,8 @@ _NEAR_PX = 2.5
 _FEWEST_SCATTERED = 20
 """Marks whose deviations show how much compression displaces them."""
 _MOST_LOST = 2.5
-"""Multiple of their sigmas up to which compression is taken for the cause of the deviations of marks, if it
-has not taken more than that multiple of the residuals."""
+"""Multiple of their sigmas up to which compression is taken for the cause of the deviations of marks; or that
+of what it has taken at most over the residuals, where that is larger."""
 _TURN, _TURNED = 0.12, 0.02
 """Standard deviation (rad) of the direction of an arm: before it is learnt in the frame; and afterwards."""
 
@@ -223,9 +223,10 @@ class MarkMeasurement:
         off = found.xy[good] - field(self.source[at[good]])
         variance = np.diagonal(cov[good], axis1=1, axis2=2)
         factor = (off * field.leave_one_out()[0] / variance).mean(axis=0)
-        most = max(_MOST_LOST, lost / max(float(np.median(found.noise[good])), 1e-12))
-        if factor.max() > most**2:  # they lie beside the design, or the distortion is not smooth
-            factor = np.ones(2)
+        share = lost / max(float(np.median(found.noise[good])), 1e-12)
+        if factor.max() > max(_MOST_LOST, share) ** 2:
+            # They lie beside the design, or the distortion is not smooth.
+            factor = np.full(2, share**2)
         root = np.sqrt(np.maximum(factor, 1.0))
         return replace(found, cov=cov * np.outer(root, root))
 
