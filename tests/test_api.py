@@ -148,7 +148,7 @@ def test_the_lines_of_the_readme_make_a_calibration_of_photographs(
     (tmp_path / "photos").mkdir()
     for frame in photographs:
         write_image(tmp_path / "photos" / f"{frame.name}.jpg", frame.pixels)
-    FieldBench().design.write(tmp_path / "sheet.json")
+    FieldBench().design.write(tmp_path / "board.json")
     monkeypatch.chdir(tmp_path)
     exec(compile(lines, "README.md", "exec"), {})
     assert reseau.read_calibration("camera.json").kind == "camera"

@@ -76,6 +76,9 @@ _FEWEST_SCATTERED = 20
 _MOST_LOST = 2.5
 """Multiple of their sigmas up to which compression is taken for the cause of the deviations of marks; or that
 of what it has taken at most over the residuals, where that is larger."""
+_ABOVE_LOST = 4.0
+"""Least contrast of a mark, in rms values of the detail that compression may have taken: what is left of
+weaker ones has another shape."""
 _TURN, _TURNED = 0.12, 0.02
 """Standard deviation (rad) of the direction of an arm: before it is learnt in the frame; and afterwards."""
 
@@ -167,6 +170,7 @@ class MarkMeasurement:
         # Until it is known whether arms end, crossings are matched by what lies near them.
         self.reach_px = self.extent_px / 2 + _NEAR_PX if mark.shape == "line-grid" else np.inf
         self.covered = np.zeros(len(source), dtype=bool)
+        self.lost = lost_in_blocks(frame.pixels)
 
     def result(self) -> tuple[Rows, Matches, Verdict]:
         """Match, learn the appearance of marks, match again, test."""
@@ -198,16 +202,13 @@ class MarkMeasurement:
         alike = with_alike_errors(found)
         if alike is not found:
             found, judged = alike, self._judged(at, alike)
-        lost = lost_in_blocks(self.frame.pixels)
-        if lost is not None:
-            found = self._with_lost_detail(at, found, judged, lost)
+        if self.lost is not None:
+            found = self._with_lost_detail(at, found, judged)
             judged = self._judged(at, found)
         return at, found, judged
 
-    def _with_lost_detail(self, at: Rows, found: Matches, judged: Verdict, lost: float) -> Matches:
+    def _with_lost_detail(self, at: Rows, found: Matches, judged: Verdict) -> Matches:
         """Matches with covariances that contain what compression has taken from the images of marks.
-
-        At most `lost` grey values (rms) in all pixels.
 
         It takes the same detail from all pixels of a block, and from the residuals: those of some marks are
         small by chance. What it does to positions is seen from their deviations from a polynomial; a local
@@ -223,10 +224,9 @@ class MarkMeasurement:
         off = found.xy[good] - field(self.source[at[good]])
         variance = np.diagonal(cov[good], axis1=1, axis2=2)
         factor = (off * field.leave_one_out()[0] / variance).mean(axis=0)
-        share = lost / max(float(np.median(found.noise[good])), 1e-12)
+        share = (self.lost or 0.0) / max(float(np.median(found.noise[good])), 1e-12)
         if factor.max() > max(_MOST_LOST, share) ** 2:
-            # They lie beside the design, or the distortion is not smooth.
-            factor = np.full(2, share**2)
+            factor = np.ones(2)  # they lie beside the design, or the distortion is not smooth
         root = np.sqrt(np.maximum(factor, 1.0))
         return replace(found, cov=cov * np.outer(root, root))
 
@@ -539,6 +539,8 @@ class MarkMeasurement:
         )
         unlike &= ~(strong & (found.correlation > _CERTAIN))
         moved = np.hypot(*(found.xy - predicted).T) > max(2.5, 0.6 * self.extent_px)
+        height = np.abs(found.contrast * (found.level if self.design.polarity == "dark" else 1.0))
+        least = _ABOVE_LOST * (self.lost or 0.0)
         # A dark mark takes no more than all the light; in the dark any noise looks like a larger share.
         impossible = found.contrast > _ALL_LIGHT + 3 * contrast_sigma
         impossible &= self.design.polarity == "dark"
@@ -549,6 +551,7 @@ class MarkMeasurement:
                 ~(found.t >= o.least_t) | impossible,
                 Reason("no mark is distinct from its surroundings", Code.LOW_CONTRAST),
             ),
+            (height < least, Reason("too weak for the compression of the image", Code.LOW_CONTRAST)),
             (
                 self._image_width(found.psf_px) > _BLURRED * self._image_width(ordinary),
                 Reason("less sharp than the other marks", Code.BLURRED),
