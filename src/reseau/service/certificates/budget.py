@@ -103,6 +103,13 @@ def uncertainty_of(
     ------
     UsageError
         If no parameter was estimated, or a contribution names a parameter that was not.
+
+    Examples
+    --------
+    >>> from reseau.service.covariates import example_calibration
+    >>> found = uncertainty_of(example_calibration())
+    >>> [each.name for each in found.contributions][0], sorted(found.missing)[0]
+    ('grey values', 'model')
     """
     names = calibration.covariance.names
     where = f"calibration {calibration.name}"
@@ -280,6 +287,14 @@ def simulate_measurement(
     ------
     UsageError
         If a calibration of this kind does not follow its parameters.
+
+    Examples
+    --------
+    >>> from reseau.service.covariates import example_calibration
+    >>> one = ImagePoints.with_sigma(["a"], [[400.0, 300.0]], 0.02)
+    >>> found = simulate_measurement(uncertainty_of(example_calibration()), one, draws=4000)
+    >>> found.draws, found.mean.shape
+    (4000, (2,))
     """
     calibration, n = uncertainty.calibration, len(points)
     mapping = calibration.mapping()

@@ -14,7 +14,7 @@ from ...core.data import ImagePoints
 from ...core.errors import UsageError
 from ..inforce import Decision, key_of
 from .budget import CalibrationUncertainty, measurement_budget, uncertainty_of
-from .data import CertificateData
+from .data import CertificateData, Contact, Item
 
 __all__ = ["Certificate", "certify"]
 
@@ -45,6 +45,12 @@ class Certificate:
         Of a camera: budget of the directions of pixels at the centre and the corners of the observations.
     places : ndarray (5, 2)
         These pixels.
+
+    Examples
+    --------
+    >>> made = example_certificate()
+    >>> made.issued.isoformat(), made.parameters.names[0]
+    ('2026-03-03', 'c')
     """
 
     uncertainty: CalibrationUncertainty
@@ -195,3 +201,15 @@ def _places(calibration: Calibration) -> ImagePoints | None:
     known = np.isfinite(CameraMapping.from_calibration(calibration).derivatives(np.array(xy))[0]).all(axis=1)
     kept = np.flatnonzero(known)
     return ImagePoints.with_sigma([_PLACES[k] for k in kept], np.array(xy)[kept], 0.0) if len(kept) else None
+
+
+def example_certificate() -> Certificate:
+    """A certificate as examples use it."""
+    from ..covariates import example_calibration
+
+    lab = Contact(name="Institute of Photogrammetry", city="Bonn", country="DE")
+    data = CertificateData(
+        laboratory=lab, customer=lab, responsible=("Ada Byron",), item=Item(name="camera", serial="4711"),
+        begin=date(2026, 3, 2),
+    )  # fmt: skip
+    return certify(example_calibration(), data, issued=date(2026, 3, 3))

@@ -56,6 +56,12 @@ def dcc_of(certificate: Certificate, pages: str = "") -> bytes:
     ------
     UsageError
         If lxml is missing, or a unit has no form in D-SI.
+
+    Examples
+    --------
+    >>> from reseau.service.certificates.certificate import example_certificate
+    >>> dcc_of(example_certificate())[:38]  # doctest: +SKIP
+    b"<?xml version='1.0' encoding='UTF-8'?>"
     """
     from ...core.optional import optional
 

@@ -34,7 +34,14 @@ _FAMILY, _MONO, _VARIANT = "DejaVu Serif", "DejaVu Sans Mono", "pdf/a-3b"
 
 
 def html_of(certificate: Certificate) -> str:
-    """Return the certificate as HTML page, without external resources."""
+    """Return the certificate as HTML page, without external resources.
+
+    Examples
+    --------
+    >>> from reseau.service.certificates.certificate import example_certificate
+    >>> "Institute of Photogrammetry" in html_of(example_certificate())
+    True
+    """
     from ...report.template import rendered  # brings matplotlib
 
     made, found = certificate, certificate.parameters
@@ -126,6 +133,14 @@ def pdf_of(certificate: Certificate, xml: Callable[[str], bytes]) -> tuple[bytes
     ------
     UsageError
         If WeasyPrint, its library Pango, or pypdf is missing.
+
+    Examples
+    --------
+    >>> from reseau.service.certificates import dcc_of
+    >>> from reseau.service.certificates.certificate import example_certificate
+    >>> made = example_certificate()
+    >>> pdf_of(made, lambda pages: dcc_of(made, pages))[0][:5]  # doctest: +SKIP
+    b'%PDF-'
     """
     try:
         with optional():

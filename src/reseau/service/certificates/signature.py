@@ -53,6 +53,10 @@ def sign(xml: bytes, key: Path, certificate: Path, password: str | None = None) 
         If key or certificate cannot be read.
     UsageError
         If they do not belong together, or packages are missing.
+
+    Examples
+    --------
+    >>> signed = sign(xml, Path("key.pem"), Path("certificate.pem"))  # doctest: +SKIP
     """
     xmlsec, etree = _modules()
     private = _private(key, password)

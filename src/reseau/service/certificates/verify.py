@@ -70,6 +70,11 @@ def verify(path: Path, *, schema: Path | None = None, trusted: Sequence[Path] = 
         If a file cannot be read.
     UsageError
         If the folder has no schema.
+
+    Examples
+    --------
+    >>> for each in verify(Path("camera.pdf"), trusted=[Path("certificate.pem")]):  # doctest: +SKIP
+    ...     print(each.check, each.state, each.text)
     """
     with optional():
         from lxml import etree
