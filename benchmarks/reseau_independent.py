@@ -6,7 +6,7 @@ Run from the checkout: ``RESEAU_DATA=… python benchmarks/reseau_independent.py
 shares no formation of images with the project: crosses, disks and short crossings of three contrasts in one
 frame, and wires at any rotation with slopes to 0.1. The bound is that of position, contrast, background and
 blur. `compressed` measures JPEG copies of such sheets, one for each quality: their errors compared with their
-sigmas.
+sigmas. The exit status is 1 where a figure is beyond its limit.
 """
 
 from __future__ import annotations
@@ -32,7 +32,12 @@ from reseau.measure import measure_reseau
 
 QUALITIES = (90, 60, 30, 10, 3)
 KINDS = ("cross", "disk", "line-grid", "wires")
-MOST_RATIO, NORMALISED = 1.05, (0.85, 1.15)
+MOST_RATIO, MOST_OF_FILE, NORMALISED = 1.05, 1.12, (0.85, 1.15)
+"""Largest ratio of errors to their bound, of 2000 marks and of one frame; limits of errors ÷ sigmas."""
+FEWEST, WRONG = 0.98, 5.0
+"""Least share of the marks that is measured; multiple of its sigma from which a coordinate is wrong."""
+COMPRESSED = 1.3
+"""Largest errors ÷ sigmas of what is measured after compression; where detail is lost, marks are declined."""
 
 
 def measured(image: Path, design: Path, ids: list[str]) -> tuple[Array, Array, Array] | str:
@@ -77,36 +82,39 @@ def crossings_of(folder: Path) -> Iterator[tuple[str, Any]]:
             yield f"{name} {photo}", (error[ok], sigma[ok], None, len(ok))
 
 
-def line(name: str, parts: list[Any]) -> bool:
+def line(name: str, parts: list[Any], ratio_to: float = MOST_RATIO, coded: bool = False) -> bool:
     """Print a row of the table; whether its figures are within their limits."""
     whole = [np.concatenate([part[k] for part in parts]) for k in (0, 1)]
     error, sigma = whole
     rms, scaled = np.sqrt((error**2).mean()), np.sqrt(((error / sigma) ** 2).mean())
-    ratio, good = "", NORMALISED[0] <= scaled <= NORMALISED[1]
+    ratio, good = "", scaled <= COMPRESSED if coded else NORMALISED[0] <= scaled <= NORMALISED[1]
     if parts[0][2] is not None:
         over = np.sqrt(((error / np.concatenate([part[2] for part in parts])) ** 2).mean())
-        ratio, good = f"{over:.3f}", good and over <= MOST_RATIO
+        ratio, good = f"{over:.3f}", good and over <= ratio_to
     worst = np.abs(error / sigma).max()
     all_marks = sum(part[3] for part in parts)
+    good &= bool(worst <= WRONG) and (coded or len(error) >= FEWEST * all_marks)
     print(
-        f"{name:24} {len(error):5} of {all_marks:5}  {rms:.4f} px  {ratio:>6}  {scaled:.3f}  {worst:.1f}",
+        f"{name:24} {len(error):5} of {all_marks:5}  {rms:.4f} px  {ratio:>6}  {scaled:.3f}  {worst:.1f}"
+        f"{'' if good else '  MISSED'}",
         flush=True,
     )
     return good
 
 
-def table(title: str, frames: Iterator[tuple[str, Any]], each: bool = True) -> bool:
-    """Measure frames and print their rows and that of all."""
+def table(title: str, frames: Iterator[tuple[str, Any]], each: bool = True, coded: bool = False) -> bool:
+    """Measure frames and print their rows and that of all; whether all are within their limits."""
     parts, good = [], True
     for name, found in frames:
         if isinstance(found, str):
             print(f"{name:24} {found}")
-            good = False
+            good &= coded
             continue
         parts.append(found)
         if each:
-            line(name, [found])
-    return (line(title, parts) if parts else False) and good
+            # Some 200 marks: errors ÷ sigmas are known to 5 per cent.
+            good &= line(name, [found], MOST_OF_FILE)
+    return (line(title, parts, coded=coded) if parts else coded) and good
 
 
 def compressed(folder: Path, quality: int) -> Iterator[tuple[str, Any]]:
@@ -139,6 +147,7 @@ def main() -> int:
         root = os.environ.get("RESEAU_DATA")
         if root is None:
             print("RESEAU_DATA is not set: the frames of other programs are not measured")
+            good = options.part is None
         else:
             independent = Path(root) / "independent"
             good &= table("all marks", marks_of(independent / "marks"))
@@ -158,7 +167,7 @@ def main() -> int:
                 folder = Path(name)
                 write(folder, kind, Sheet.drawn_from(kind, np.random.default_rng(0)), 0)
                 for quality in QUALITIES:
-                    table(f"{kind}, quality {quality}", compressed(folder, quality), each=False)
+                    good &= table(f"{kind}, quality {quality}", compressed(folder, quality), False, True)
     return 0 if good else 1
 
 

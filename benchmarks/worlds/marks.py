@@ -152,22 +152,26 @@ class Sheet:
         else:
             skew = float(rng.uniform(-6, 6)) if kind == "line-grid" else 0.0
             shape = Shape(kind, 10.0, float(rng.uniform(1.25, 3.5)), skew)
-        return cls(
+        pitch = round(2 * shape.reach + float(rng.uniform(8, 14)))
+        sheet = cls(
             shape,
-            pitch=round(2 * shape.reach + float(rng.uniform(8, 14))),
+            pitch=pitch,
             sigma=float(rng.uniform(0.5, 1.2)),
             fill=float(rng.choice([0.64, 1.0])),
             bits=int(rng.choice([8, 16])),
             background=50.0 if bright else 190.0,
-            contrasts=tuple(
-                (1.0 if bright else -1.0) * c for c in ((150.0,) if kind == "wires" else (30, 80, 150))
-            ),
+            contrasts=tuple((1.0 if bright else -1.0) * c for c in (30, 80, 150)),
             slope=tuple(float(s) for s in rng.uniform(-0.02, 0.02, 2)),  # type: ignore[arg-type]
             kappa_deg=float(rng.uniform(-180, 180) if kind == "wires" else rng.uniform(-30, 30)),
             tilt_deg=float(rng.choice([0.0, rng.uniform(0, 8)])),
             rho_deg=float(rng.uniform(-90, 90)),
             slopes=0.1 if kind == "wires" else 0.0,
         )
+        if kind != "wires":
+            return sheet
+        # All wires of a frame are of one kind of thread, in any light.
+        contrasts, noise = (float(rng.choice(sheet.contrasts)),), float(rng.uniform(0.5, 2.0))
+        return replace(sheet, contrasts=contrasts, noise=noise, sigma=float(rng.uniform(0.5, 1.8)))
 
 
 @dataclass(frozen=True, eq=False)
