@@ -5,8 +5,8 @@ Run from the checkout: ``RESEAU_DATA=… python benchmarks/reseau_independent.py
 ``independent/oscilloscope``; `worlds` draws N sheets of each kind with ``benchmarks/worlds/marks.py``, which
 shares no formation of images with the project: crosses, disks and short crossings of three contrasts in one
 frame, and wires at any rotation with slopes to 0.1. The bound is that of position, contrast, background and
-blur. `compressed` measures JPEG copies of such sheets, one for each quality: their errors compared with their
-sigmas. The exit status is 1 where a figure is beyond its limit.
+blur, in own sheets, whose background slopes, also of its slopes. `compressed` measures JPEG copies of such
+sheets, one for each quality: their errors compared with their sigmas. The exit status is 1 where a figure is beyond its limit.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def measured(image: Path, design: Path, ids: list[str]) -> tuple[Array, Array, A
     return found.xy[rows], sigma, found.ok[rows]
 
 
-def marks_of(folder: Path) -> Iterator[tuple[str, Any]]:
+def marks_of(folder: Path, bounds: str = "crlb") -> Iterator[tuple[str, Any]]:
     """Name, and errors, sigmas, bounds (n, 2) of the measured marks and the number of all, of each frame."""
     for path in sorted(folder.glob("*.truth.json")):
         name = path.name.removesuffix(".truth.json")
@@ -60,7 +60,7 @@ def marks_of(folder: Path) -> Iterator[tuple[str, Any]]:
             yield name, seen
             continue
         xy, sigma, ok = seen
-        bound = np.stack([truth["crlb"]["sigma_x"], truth["crlb"]["sigma_y"]], axis=1)
+        bound = np.stack([truth[bounds]["sigma_x"], truth[bounds]["sigma_y"]], axis=1)
         error = xy - np.stack([truth["x"], truth["y"]], axis=1)
         yield name, (error[ok], sigma[ok], bound[ok], len(ok))
 
@@ -160,7 +160,7 @@ def main() -> int:
                     write(
                         folder, f"{kind}-{seed:02}", Sheet.drawn_from(kind, np.random.default_rng(seed)), seed
                     )
-                good &= table(f"{kind}, own worlds", marks_of(folder), each=False)
+                good &= table(f"{kind}, own worlds", marks_of(folder, "crlb_slopes"), each=False)
     if options.part in (None, "compressed"):
         for kind in KINDS if options.kind is None else (options.kind,):
             with tempfile.TemporaryDirectory() as name:
