@@ -6,7 +6,8 @@ Run from the checkout: ``RESEAU_DATA=… python benchmarks/reseau_independent.py
 shares no formation of images with the project: crosses, disks and short crossings of three contrasts in one
 frame, and wires at any rotation with slopes to 0.1. The bound is that of position, contrast, background and
 blur, in own sheets, whose background slopes, also of its slopes. `compressed` measures JPEG copies of such
-sheets, one for each quality: their errors compared with their sigmas. The exit status is 1 where a figure is beyond its limit.
+sheets, one for each quality: their errors compared with their sigmas. The exit status is 1 where a figure is
+beyond its limit.
 """
 
 from __future__ import annotations
