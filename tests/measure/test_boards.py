@@ -6,6 +6,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -142,6 +143,28 @@ def test_old_and_new_layout_differ_with_an_even_number_of_rows(legacy: bool) -> 
     assert np.abs(measured(frame, design).xy - truth).max() < 0.03
     other = measure_board(frame, CHARUCO.model_copy(update={"legacy": not legacy}))
     assert isinstance(other, Failure)
+
+
+def test_a_few_markers_beside_a_plane_in_perspective_are_no_other_layout() -> None:
+    """As with the distortion of wide lenses: the column of markers at the border lies some pixels aside."""
+    frame, truth = picture(CHARUCO)
+    height, width = frame.pixels.shape
+    left, right = truth[:, 0].min(), truth[:, 0].max()
+
+    def bend(x: Array) -> Array:
+        return 9.0 * np.clip((x - left) / (right - left), 0, 1.2) ** 9
+
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    bent = cv2.remap(frame.pixels.astype(np.float32), x, y + bend(x).astype(np.float32), cv2.INTER_CUBIC)
+    found = measured(replace(frame, pixels=np.clip(bent, 0, frame.full_scale)), CHARUCO)
+    assert found.ok.mean() > 0.8
+    expected = truth - np.stack([np.zeros(len(truth)), bend(truth[:, 0])], axis=-1)
+    assert np.abs(found.xy - expected)[found.ok].max() < 0.3
+    other = measure_board(
+        replace(frame, pixels=np.clip(bent, 0, frame.full_scale)), CHARUCO.model_copy(update={"legacy": True})
+    )
+    assert isinstance(other, Failure)
+    assert other.code is Code.OTHER_DESIGN
 
 
 def test_a_mirrored_charuco_board_is_declined_or_measured_as_such() -> None:

@@ -45,8 +45,8 @@ _NEAR_PX = 2.5
 """Distance within which a saddle is the corner that markers predict, pixels; or in steps of the lattice."""
 _NEAR = 0.2
 Integers = NDArray[np.signedinteger[Any]]
-_ASTRAY = 0.1
-"""Largest share of the markers read that do not lie where the board has them: misread, not another layout."""
+_ASTRAY = 0.25
+"""Largest share of the markers read that do not lie where the board has them: misread, or bent aside."""
 _EVEN = 0.5
 """Largest difference of two dark sectors, as a share of their contrast to the paper."""
 _QUARTER = np.array([[0, -1], [1, 0]])
@@ -254,6 +254,19 @@ def _lattice_of(design: BoardDesign) -> Integers:
     return np.array([[1, 1], [-1, 1]]) if design.asymmetric else np.eye(2, dtype=np.intp)
 
 
+def _plane_of_markers(
+    plane: Array, image: Array, shape: tuple[int, int]
+) -> tuple[Array | None, NDArray[np.bool_]]:
+    """Projectivity from the board to the corners of markers (4 m, 2), and which of them agree with it."""
+    if len(plane) == 4:
+        matrix = cv2.getPerspectiveTransform(plane.astype(np.float32), image.astype(np.float32))
+        return np.asarray(matrix), np.ones(4, dtype=bool)
+    # Good to two pixels: distortion bends the board.
+    found, inlier = cv2.findHomography(plane, image, cv2.RANSAC, max(3.0, 0.006 * max(shape)))
+    good = np.zeros(len(plane), dtype=bool) if inlier is None else np.asarray(inlier.ravel() > 0)
+    return None if found is None else np.asarray(found, dtype=np.float64), good
+
+
 def lay_marked(
     grey: NDArray[np.float32],
     saddles: Saddles,
@@ -288,22 +301,20 @@ def lay_marked(
         return Failure("no marker of the board was read", Code.NOT_FOUND)
     corners, rows = corners[keep], np.array([row_of[int(number)] for number in numbers[keep]])
     plane, image = at[rows].reshape(-1, 2) / design.pitch, corners.reshape(-1, 2)
-    if len(rows) == 1:
-        matrix = cv2.getPerspectiveTransform(plane.astype(np.float32), image.astype(np.float32))
-        good = np.ones(4, dtype=bool)
-    else:
-        # Good to two pixels: distortion bends the board.
-        matrix, inlier = cv2.findHomography(plane, image, cv2.RANSAC, max(3.0, 0.006 * max(shape)))
-        good = inlier.ravel() > 0 if inlier is not None else np.zeros(len(plane), dtype=bool)
+    matrix, good = _plane_of_markers(plane, image, shape)
     if matrix is None or good.sum() < 4:
         return Failure("the markers read do not agree with the board", Code.INCONSISTENT)
     whole = good.reshape(-1, 4).all(axis=1)
-    if len(rows) > 3 and (~whole).sum() > max(1.0, _ASTRAY * len(rows)):
-        return Failure(
-            f"{int((~whole).sum())} of {len(rows)} markers lie at other places than on the board: it has "
-            "another layout (old or new) or number of columns",
-            Code.OTHER_DESIGN,
-        )
+    astray = int((~whole).sum())
+    if len(rows) > 3 and astray > 1:
+        other = design.model_copy(update={"legacy": not design.legacy}).markers[1][rows].reshape(-1, 2)
+        alike = _plane_of_markers(other / design.pitch, image, shape)[1].reshape(-1, 4).all(axis=1)
+        if astray > _ASTRAY * len(rows) or (~alike).sum() < astray:
+            return Failure(
+                f"{astray} of {len(rows)} markers lie at other places than on the board: it has "
+                "another layout (old or new) or number of columns",
+                Code.OTHER_DESIGN,
+            )
     use = np.repeat(whole, 4) if whole.any() else good
     if np.linalg.det(matrix[:2, :2] - np.outer(matrix[:2, 2], matrix[2, :2]) / matrix[2, 2]) > 0:
         return Failure("the board is seen mirrored", Code.MIRRORED)

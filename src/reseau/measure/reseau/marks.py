@@ -22,7 +22,10 @@ from .assignment import spacing
 from .placement import Placement
 from .wires import grid_wires
 
-__all__ = ["MarkMeasurement", "ReseauOptions", "Verdict"]
+__all__ = ["TOO_WEAK", "MarkMeasurement", "ReseauOptions", "Verdict"]
+
+TOO_WEAK = "too weak for the compression of the image"
+"""Why a mark is declined whose image has lost its shape."""
 
 _UNMODELLED_PX = 0.07
 """Scatter of positions in real frames beyond their own sigmas; balances the weights in fields."""
@@ -551,7 +554,7 @@ class MarkMeasurement:
                 ~(found.t >= o.least_t) | impossible,
                 Reason("no mark is distinct from its surroundings", Code.LOW_CONTRAST),
             ),
-            (height < least, Reason("too weak for the compression of the image", Code.LOW_CONTRAST)),
+            (height < least, Reason(TOO_WEAK, Code.LOW_CONTRAST)),
             (
                 self._image_width(found.psf_px) > _BLURRED * self._image_width(ordinary),
                 Reason("less sharp than the other marks", Code.BLURRED),

@@ -29,7 +29,7 @@ from ..matching import Matches
 from ..points import Measured, Reason, deviating
 from .assignment import in_sight, spacing
 from .grid_search import GridOptions, grid_steps
-from .marks import MarkMeasurement, ReseauOptions, Verdict
+from .marks import TOO_WEAK, MarkMeasurement, ReseauOptions, Verdict
 from .orientation import misfit, rival_orientations
 from .placement import Placement, PlacingOptions, place
 from .sheet import measure_sheet
@@ -47,6 +47,8 @@ _FEW, _SAME = 10, 0.2
 """Marks that predict a further row of the grid; distance, in pitches, of two marks at one place."""
 _CLEARLY = 0.6
 """Share of the visible marks from which nobody doubts that they are those of the design."""
+_LEGIBLE = 0.25
+"""Least share of the visible marks in a compressed image: where most are lost, others have other shapes."""
 _BY_CHANCE = 1e-5
 """Largest probability that as many marks are found where there are none; many positions were tried."""
 _DISTORTED = 0.03
@@ -377,6 +379,8 @@ def _chance(measurement: MarkMeasurement, at: Rows, judged: Verdict) -> str:
     visible = at[[why == "" or getattr(why, "code", None) != Code.OUTSIDE for why in judged.why[at]]]
     if good > _CLEARLY * len(visible):
         return ""
+    if good < _LEGIBLE * len(visible) and (judged.why[visible] == TOO_WEAK).any():
+        return f"the compression of the image has left {good} of {len(visible)} marks"
     passed, tried = measurement.found_by_chance(visible)
     share = (passed + 1) / (tried + 2)
     if bdtrc(good - 1, len(visible), share) < _BY_CHANCE:
