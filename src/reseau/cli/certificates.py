@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import numpy as np
 import typer
 
 from ..core.errors import UsageError
@@ -301,7 +301,7 @@ def _document(
     from ..adjust import validate
 
     def finite(values: Any) -> list[float | None]:
-        return [float(v) if np.isfinite(v) else None for v in values]
+        return [float(v) if math.isfinite(v) else None for v in values]
 
     found: dict[str, Any] = {
         "schema": "reseau-uncertainty/1",
@@ -348,7 +348,7 @@ def _say_budget(budget: UncertaintyBudget, probability: float, simulated: Simula
     say(f"expanded uncertainties, {100 * probability:g} %\n")
     for i, (name, unit, value, expanded, u, k, nu) in enumerate(columns):
         shown = measured(float(value), float(expanded), "" if unit == "1" else unit)
-        degrees = "∞" if not np.isfinite(nu) else f"{nu:.0f}"
+        degrees = "∞" if not math.isfinite(nu) else f"{nu:.0f}"
         say(f"{name:<8} {shown}  u {u:.2g}, k {k:.2f}, ν {degrees}\n")
         for each, part in zip(budget.contributions, budget.by_contribution[:, i], strict=True):
             if part > 0:

@@ -226,8 +226,8 @@ def thin_lens_of(camera: Camera, *, distance: float, f_number: float) -> ThinLen
     Examples
     --------
     >>> from reseau.bundle import example_network
-    >>> thin_lens_of(example_network().cameras[0], distance=1000.0, f_number=4.0).focal_length
-    7.936507936507936
+    >>> round(thin_lens_of(example_network().cameras[0], distance=1000.0, f_number=4.0).focal_length, 5)
+    7.93651
     """
     mapping = camera.bare_mapping(camera.values)
     pitch = np.array([*camera.pitch_mm])
