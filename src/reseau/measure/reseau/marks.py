@@ -17,7 +17,6 @@ from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse, coverage, mark_outline
 from ..matching import SIZE, Matches, MatchOptions, grey_variance, match, with_alike_errors
 from ..points import Reason
-from ..screening import lost_in_blocks
 from .assignment import spacing
 from .placement import Placement
 from .wires import grid_wires
@@ -151,8 +150,15 @@ class MarkMeasurement:
     """The two rounds of matching, and the tests of every mark."""
 
     def __init__(
-        self, frame: Frame, design: ReseauDesign, source: Array, placed: Placement, options: ReseauOptions
+        self,
+        frame: Frame,
+        design: ReseauDesign,
+        source: Array,
+        placed: Placement,
+        options: ReseauOptions,
+        lost: float | None,
     ) -> None:
+        self.lost = lost  # by compression, see `lost_in_blocks`
         self.frame, self.design, self.source, self.options = frame, design, source, options
         self.placed, self.screened, self.assignment = placed, placed.screened, placed.assignment
         self.field, self.predicted = placed.assignment.field, placed.assignment.predicted
@@ -173,7 +179,6 @@ class MarkMeasurement:
         # Until it is known whether arms end, crossings are matched by what lies near them.
         self.reach_px = self.extent_px / 2 + _NEAR_PX if mark.shape == "line-grid" else np.inf
         self.covered = np.zeros(len(source), dtype=bool)
-        self.lost = lost_in_blocks(frame.pixels)
 
     def result(self) -> tuple[Rows, Matches, Verdict]:
         """Match, learn the appearance of marks, match again, test."""

@@ -27,6 +27,7 @@ from ...optics.field import SmoothField
 from ..fitting import on_one_line
 from ..matching import Matches
 from ..points import Measured, Reason, deviating
+from ..screening import lost_in_blocks
 from .assignment import in_sight, spacing
 from .grid_search import GridOptions, grid_steps
 from .marks import TOO_WEAK, MarkMeasurement, ReseauOptions, Verdict
@@ -221,7 +222,8 @@ def measure_reseau(
     )
     if isinstance(placed, Failure):
         return placed
-    measurement = MarkMeasurement(frame, design, source[known], placed, options)
+    lost = lost_in_blocks(frame.pixels)
+    measurement = MarkMeasurement(frame, design, source[known], placed, options, lost)
     at, found, judged = measurement.result()
     notes = placed.notes
     for _ in range(0 if use_nominal else _ORIENTATIONS):
@@ -229,7 +231,7 @@ def measure_reseau(
         if placed is measurement.placed:
             notes += oriented
             break
-        measurement = MarkMeasurement(frame, design, source[known], placed, options)
+        measurement = MarkMeasurement(frame, design, source[known], placed, options, lost)
         at, found, judged = measurement.result()
     if not use_nominal or _beyond(frame, nominal):
         notes += _open_names(source[known], judged, placed.screened.valid)
