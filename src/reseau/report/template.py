@@ -15,6 +15,7 @@ TEMPLATES = (
     "applied.html.j2",
     "blurred_network.html.j2",
     "bundle.html.j2",
+    "certificate.html.j2",
     "oscilloscope.html.j2",
     "roll.html.j2",
     "sensor.html.j2",

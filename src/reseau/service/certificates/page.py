@@ -48,6 +48,7 @@ def html_of(certificate: Certificate) -> str:
     probability, at = made.probability, made.places
     return rendered(
         "certificate.html.j2",
+        title="Calibration certificate",
         made=made,
         data=made.data,
         percent=f"{100 * probability:g}",
