@@ -40,15 +40,17 @@ def correlated() -> Array:
 
 
 def years(
-    rng: np.random.Generator, count: int, runs: int, phi: float, matrix: Array, heavy: bool = False
+    rng: np.random.Generator,
+    count: int,
+    runs: int,
+    phi: float | Array,
+    matrix: Array,
+    degrees: float = np.inf,
 ) -> Array:
-    """Ten parameters and the norm of the field (count, runs, 11), without drift."""
+    """Ten parameters and the norm of the field (count, runs, 11), without drift; normal or t distributed."""
     root = np.linalg.cholesky(matrix)
-    drawn = (
-        rng.standard_t(8, size=(count, runs, PARAMETERS))
-        if heavy
-        else rng.normal(size=(count, runs, PARAMETERS))
-    )
+    shape = (count, runs, PARAMETERS)
+    drawn = rng.normal(size=shape) if np.isinf(degrees) else rng.standard_t(degrees, size=shape)
     x = drawn @ root.T
     for k in range(1, runs):
         x[:, k] = phi * x[:, k - 1] + np.sqrt(1.0 - phi * phi) * x[:, k]
@@ -104,24 +106,31 @@ def _cases() -> Iterator[tuple[str, str, float]]:
 def false_alarms(count: int, seed: int) -> None:
     """Alarms a year without drift."""
     print(f"{count} years of {YEAR} runs without drift, ten parameters and the norm; limit 0.1 a year")
-    print("  parameters   φ     runs before  alarms a year  upper 95 % limit  width  learning")
-    cases = [
-        (name, phi, m) for name in ("independent", "correlated") for phi in (0.0, 0.15, 0.3) for m in (20, 52)
+    print(
+        "  parameters     φ         runs before  alarms a year  upper 95 % limit  width  learning  correlated"
+    )
+    normal, both, one = np.inf, (20, 52), np.where(np.arange(PARAMETERS) == 0, 0.5, 0.0)
+    cases: list[tuple[str, str, float | Array, float]] = [
+        *(("independent", f"{phi:.2f}", phi, normal) for phi in (0.0, 0.15, 0.3, 0.5)),
+        *(("correlated", f"{phi:.2f}", phi, normal) for phi in (0.0, 0.15, 0.3, 0.5)),
+        ("independent", "one 0.50", one, normal),
+        *(("t, 8 degrees", f"{phi:.2f}", phi, 8.0) for phi in (0.0, 0.3, 0.5)),
+        *(("t, 4 degrees", f"{phi:.2f}", phi, 4.0) for phi in (0.0, 0.3)),
     ]
-    for name, phi, m in [*cases, ("t, 8 degrees", 0.0, 20), ("φ above limit", 0.5, 20)]:
+    for (name, written, phi, tails), m in ((case, m) for case in cases for m in both):
         rng = np.random.default_rng(seed)
         matrix = correlated() if name == "correlated" else np.eye(PARAMETERS)
-        alarms, width, learning = 0, 0.0, 0.0
+        alarms, told = 0, np.zeros(3)
         for _ in range(0, count, AT_ONCE):
-            x = years(rng, AT_ONCE, m + YEAR, phi, matrix, name.startswith("t,"))
-            found = monitor(x, one_sided=(PARAMETERS,))
+            found = monitor(years(rng, AT_ONCE, m + YEAR, phi, matrix, tails), one_sided=(PARAMETERS,))
             alarms += int(found.alarms[:, m:].sum())
-            width += float(found.width[:, -1].mean()) / (count / AT_ONCE)
-            learning += float(found.learning[:, -1].mean()) / (count / AT_ONCE)
+            beyond = found.autocorrelation[:, -1] > ChartOptions().autocorrelation
+            told += [each.mean() for each in (found.width[:, -1], found.learning[:, -1], beyond)]
         rate, most = alarms / count, upper_limit(alarms) / count
+        width, learning, beyond = told * [1, 100, 100] / (count / AT_ONCE)
         note = "" if most <= 0.105 else " !"
-        counted = f"{m:10d}{rate:16.4f}{most:16.4f}{note}"
-        print(f"  {name:<13}{phi:4.2f}{counted}{width:12.2f}{100 * learning:7.0f} %", flush=True)
+        counted = f"{m:12d}{rate:15.4f}{most:18.4f}{note:2}"
+        print(f"  {name:<15}{written:<8}{counted}{width:7.2f}{learning:8.0f} %{beyond:9.0f} %", flush=True)
 
 
 def upper_limit(events: int) -> float:

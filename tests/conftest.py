@@ -1,13 +1,17 @@
-"""Shared by the tests: the reference data, which is not part of the project, and no limits of time."""
+"""Shared by the tests: reference data, which is not part of the project, archives, and no limits of time."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import uuid
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
 from hypothesis import settings
+
+from reseau.archive import Archive
 
 # A loaded machine, or code that is compiled at its first call, is not an error.
 settings.register_profile("untimed", deadline=None)
@@ -28,3 +32,28 @@ def reference_data() -> Callable[[str], Path]:
         return path
 
     return find
+
+
+@pytest.fixture
+def postgres() -> Iterator[str]:
+    """URL of an empty schema of the PostgreSQL server that RESEAU_POSTGRES names (`.ci/with_postgres`)."""
+    url = os.environ.get("RESEAU_POSTGRES", "")
+    if not url:
+        pytest.skip("RESEAU_POSTGRES names no server")
+    name = f"test_{uuid.uuid4().hex}"
+    server = sa.create_engine(url)
+    with server.begin() as connection:
+        connection.execute(sa.text(f"CREATE SCHEMA {name}"))
+    yield f"{url}?options=-csearch_path%3D{name}"
+    with server.begin() as connection:
+        connection.execute(sa.text(f"DROP SCHEMA {name} CASCADE"))
+    server.dispose()
+
+
+@pytest.fixture(params=["SQLite", "PostgreSQL"])
+def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[], Archive]:
+    """Opens the same archive, with either index, as often as it is called."""
+    if request.param == "SQLite":
+        return lambda: Archive.open(tmp_path / "archive", create=True)
+    url = request.getfixturevalue("postgres")
+    return lambda: Archive.open(url, tmp_path / "objects", create=True)

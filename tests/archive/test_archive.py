@@ -7,7 +7,7 @@ import sys
 import textwrap
 import uuid
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -31,9 +31,6 @@ from reseau.archive import (
 from reseau.core.data import Frame
 from reseau.core.errors import ArchiveError
 
-POSTGRES = os.environ.get("RESEAU_POSTGRES", "")
-"""URL of a server on which schemas may be made; `.ci/run` starts one."""
-
 
 def frame(seed: int = 0, dtype: type = np.uint8) -> Frame:
     rng = np.random.default_rng(seed)
@@ -42,26 +39,13 @@ def frame(seed: int = 0, dtype: type = np.uint8) -> Frame:
 
 
 @pytest.fixture(params=["folder", "object store", "PostgreSQL"])
-def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[[], Archive]]:
+def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[], Archive]:
     """Opens the same archive as often as it is called."""
-    store = f"memory://{uuid.uuid4().hex}"
-    if request.param == "folder":
-        yield lambda: Archive.open(tmp_path / "archive", create=True)
-    elif request.param == "object store":
-        yield lambda: Archive.open(tmp_path / "archive", store, create=True)
-    else:
-        if not POSTGRES:
-            pytest.skip("RESEAU_POSTGRES names no server")
-        name = f"test_{uuid.uuid4().hex}"
-        server = sa.create_engine(POSTGRES)
-        with server.begin() as connection:
-            connection.execute(sa.text(f"CREATE SCHEMA {name}"))
-        yield lambda: Archive.open(
-            f"{POSTGRES}?options=-csearch_path%3D{name}", tmp_path / "objects", create=True
-        )
-        with server.begin() as connection:
-            connection.execute(sa.text(f"DROP SCHEMA {name} CASCADE"))
-        server.dispose()
+    if request.param == "PostgreSQL":
+        url = request.getfixturevalue("postgres")
+        return lambda: Archive.open(url, tmp_path / "objects", create=True)
+    store = f"memory://{uuid.uuid4().hex}" if request.param == "object store" else None
+    return lambda: Archive.open(tmp_path / "archive", store, create=True)
 
 
 def test_stored_content_is_present_after_reopening(opened: Callable[[], Archive]) -> None:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 import pytest
-import sqlalchemy as sa
 
 from reseau.archive import Archive
 from reseau.calibration import Calibration, Covariance, Quantity
@@ -20,7 +17,6 @@ from reseau.core.errors import FormatError, UsageError
 from reseau.service import AcceptanceRules, Configurations, Limits, judge
 from reseau.service.rules import difference
 
-POSTGRES = os.environ.get("RESEAU_POSTGRES", "")
 START = datetime(2026, 3, 2, 8, 0, tzinfo=UTC)
 RULES = AcceptanceRules(version=1, image=Limits(warning=0.1, action=0.4))
 FIRST = {"c": 8.0, "x0": 0.02, "y0": -0.01, "K1": 1e-3}
@@ -49,24 +45,10 @@ def camera(*, size: tuple[int, int] = (640, 480), redundancy: int = 400, codes: 
     )  # fmt: skip
 
 
-@pytest.fixture(params=["SQLite", "PostgreSQL"])
-def archive(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Archive]:
-    if request.param == "SQLite":
-        with Archive.open(tmp_path / "archive", create=True) as made:
-            yield made
-        return
-    if not POSTGRES:
-        pytest.skip("RESEAU_POSTGRES names no server")
-    name = f"test_{uuid.uuid4().hex}"
-    server = sa.create_engine(POSTGRES)
-    with server.begin() as connection:
-        connection.execute(sa.text(f"CREATE SCHEMA {name}"))
-    url = f"{POSTGRES}?options=-csearch_path%3D{name}"
-    with Archive.open(url, tmp_path / "objects", create=True) as made:
+@pytest.fixture
+def archive(opened: Callable[[], Archive]) -> Iterator[Archive]:
+    with opened() as made:
         yield made
-    with server.begin() as connection:
-        connection.execute(sa.text(f"DROP SCHEMA {name} CASCADE"))
-    server.dispose()
 
 
 def started(archive: Archive) -> tuple[Configurations, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -130,11 +131,11 @@ def week(number: float, hours: float = 0.0) -> datetime:
 
 
 @pytest.fixture
-def schedules(tmp_path: Path) -> Schedules:
-    archive = Archive.open(tmp_path / "archive", create=True)
-    made = Schedules(archive)
-    made.add(WEEKLY, week(-0.5))
-    return made
+def schedules(opened: Callable[[], Archive]) -> Iterator[Schedules]:
+    with opened() as archive:
+        made = Schedules(archive)
+        made.add(WEEKLY, week(-0.5))
+        yield made
 
 
 def states(schedules: Schedules, now: datetime) -> list[str]:
@@ -176,7 +177,9 @@ def test_summer_time_moves_a_run_and_keeps_its_local_time(schedules: Schedules) 
     assert {each.utcoffset() for each in times} == {timedelta(hours=1), timedelta(hours=2)}
 
 
-def test_of_schedulers_at_once_one_carries_out_the_run(tmp_path: Path, schedules: Schedules) -> None:
+def test_of_schedulers_at_once_one_carries_out_the_run(
+    opened: Callable[[], Archive], schedules: Schedules
+) -> None:
     inside, most, count, lock = 0, 0, 0, threading.Lock()
 
     def carry_out(*_: object) -> str:
@@ -190,7 +193,7 @@ def test_of_schedulers_at_once_one_carries_out_the_run(tmp_path: Path, schedules
         return "ok"
 
     def scheduler(_: int) -> int:
-        with Archive.open(tmp_path / "archive") as archive:
+        with opened() as archive:
             return len(Schedules(archive).run_due(carry_out, week(0, 1)))
 
     with ThreadPoolExecutor(6) as pool:

@@ -199,7 +199,7 @@ class Archive:
         return Journal(self._engine, name)
 
     def journals(self, prefix: str = "") -> list[str]:
-        """Return the names of the journals that start with `prefix`."""
+        """Return the names of the journals that start with `prefix`, without it, oldest first."""
         return journals(self._engine, prefix)
 
     def faults(self) -> list[str]:

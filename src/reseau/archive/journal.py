@@ -134,10 +134,11 @@ class Journal:
 
 
 def journals(engine: Engine, prefix: str) -> list[str]:
-    """Names of the journals that start with `prefix`, in the order of their first entries."""
+    """Names of the journals that start with `prefix`, without it, in the order of their first entries."""
     e = schema.entries.c
     query = sa.select(e.journal).where(e.journal.startswith(prefix, autoescape=True)).group_by(e.journal)
     with schema.connected(engine) as connection:
         if not schema.extended(connection):
             return []
-        return list(connection.scalars(query.order_by(sa.func.min(e.id))))
+        found = connection.scalars(query.order_by(sa.func.min(e.id)))
+        return [name.removeprefix(prefix) for name in found]

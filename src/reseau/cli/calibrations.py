@@ -281,6 +281,7 @@ def drift(
         {
             "parameter": parameter, "learning": bool(charts.learning[last, k]),
             "width": _number(charts.width[last, k]), "score": _number(charts.score[last, k]),
+            "autocorrelation": _number(charts.autocorrelation[last, k]),
             "upper": float(charts.upper[last, k]), "lower": float(charts.lower[last, k]),
         }
         for k, parameter in enumerate(made.names)
@@ -294,6 +295,9 @@ def drift(
         for row in rows:
             wide = "" if row["width"] is None else f", {row['width']:.2f} times as wide as when learned"
             state = f"learning{wide}" if row["learning"] else "in control"
+            phi = charts.autocorrelation[last, made.names.index(row["parameter"])]
+            if phi > options.autocorrelation:
+                state = f"correlated, φ up to {phi:.2f}; {state}"
             state = "signals" if charts.alarm[last, made.names.index(row["parameter"])] else state
             say(f"  {row['parameter']:<20} {row['upper']:6.2f} {row['lower']:6.2f}  {state}\n")
         for each in signals:

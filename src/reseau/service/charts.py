@@ -9,7 +9,8 @@ there are, so that limits for known parameters hold their rate of false alarms a
 
 φ is not known. The charts use an upper limit of it: with a φ that is too large the scores alternate in sign,
 and a sum of them signals too rarely instead of too often. This costs power; :attr:`Monitored.width` tells
-how much.
+how much. Nor is it known that the series are normal: a score counts no more than it would in a t distribution
+of a few degrees of freedom, so that a single bad run is no drift.
 """
 
 from __future__ import annotations
@@ -52,7 +53,12 @@ class ChartOptions:
     weight : float
         λ of an EWMA chart.
     autocorrelation : float
-        Largest autocorrelation φ of consecutive runs that is considered; 0: runs are independent.
+        Autocorrelation φ of consecutive runs that is always considered; 0: runs are independent.
+    correlated : float
+        Largest φ that is considered where the series show more than that, by their median.
+    tails : float
+        Degrees of freedom (above 2) of the t distribution with the heaviest tails that are considered;
+        infinite: series are normal, as those are whose parameters are known.
     confidence : float
         That of the upper limit of φ.
     least : int
@@ -72,6 +78,8 @@ class ChartOptions:
     shift: float = 1.0
     weight: float = 0.12
     autocorrelation: float = 0.3
+    correlated: float = 0.7
+    tails: float = 8.0
     confidence: float = 0.95
     least: int = 8
     learned: float = 1.2
@@ -84,6 +92,12 @@ class ChartOptions:
             raise UsageError(f"{self.rate:g} a year is a false alarm in every other run", where="rate")
         if not 0 <= self.autocorrelation < 1:
             raise UsageError(f"{self.autocorrelation:g} is not from 0 to below 1", where="autocorrelation")
+        if self.autocorrelation and not self.autocorrelation <= self.correlated < 1:
+            raise UsageError(
+                f"{self.correlated:g} is not from `autocorrelation` to below 1", where="correlated"
+            )
+        if not self.tails > 2:
+            raise UsageError(f"{self.tails:g} is not above 2", where="tails")
         if not 0.5 <= self.confidence < 1:
             raise UsageError(f"{self.confidence:g} is not from 0.5 to below 1", where="confidence")
         if self.least < 4:
@@ -179,6 +193,9 @@ class Monitored:
         How much larger than with known parameters a shift must be to have the same effect on the scores.
     learning : ndarray (..., n, c) of bool
         Whether the chart is wider than `ChartOptions.learned`, or does not judge yet.
+    autocorrelation : ndarray (..., n, c)
+        Autocorrelation φ that the chart uses; above `ChartOptions.autocorrelation` where the series are
+        correlated.
 
     Examples
     --------
@@ -186,7 +203,7 @@ class Monitored:
     >>> values[40:, 1] += 2.0
     >>> found = monitor(values, ChartOptions(autocorrelation=0.0))
     >>> np.argwhere(found.alarm)[0].tolist(), found.first_alarm()
-    ([43, 1], (43, 1))
+    ([44, 1], (44, 1))
     """
 
     limits: Limits
@@ -198,6 +215,7 @@ class Monitored:
     sigma: Array
     width: Array
     learning: Mask
+    autocorrelation: Array
 
     @property
     def alarms(self) -> Mask:
@@ -337,13 +355,13 @@ def monitor(
     limits = design(2 * c - len(one_sided), options)
     predictor = _Predictor(x, z, options, limits.single) if known is None else _KnownPredictor(known)
     shape = (*lead, n, c)
-    score, upper, lower, expected, sigma, width = (np.full(shape, np.nan) for _ in range(6))
+    score, upper, lower, expected, sigma, width, phi = (np.full(shape, np.nan) for _ in range(7))
     alarm = np.zeros(shape, dtype=np.intp)
     up, down = np.zeros((*lead, c)), np.zeros((*lead, c))
     for k in range(n):
         now = x[..., k, :]
         at = (..., k, slice(None))
-        score[at], expected[at], sigma[at], width[at] = predictor.predict(now, z[..., k, :])
+        score[at], expected[at], sigma[at], width[at], phi[at] = predictor.predict(now, z[..., k, :])
         up, down = _updated(limits, up, down, score[at])
         upper[at], lower[at] = up, down
         signal = _signals(limits, up, down, score[at])
@@ -351,7 +369,8 @@ def monitor(
         alarm[at] = signal
         up, down = np.where(signal != 0, 0.0, up), np.where(signal != 0, 0.0, down)
         predictor.learn(now, z[..., k, :])
-    return Monitored(limits, score, upper, lower, alarm, expected, sigma, width, ~(width <= options.learned))
+    learning = ~(width <= options.learned)
+    return Monitored(limits, score, upper, lower, alarm, expected, sigma, width, learning, phi)
 
 
 def _design_rows(covariates: Array | None, lead: tuple[int, ...], n: int) -> Array:
@@ -397,12 +416,12 @@ class _KnownPredictor:
     def __init__(self, known: KnownSeries) -> None:
         self._known, self._last = known, np.array(np.nan)
 
-    def predict(self, now: Array, _: Array) -> tuple[Array, Array, Array, Array]:
+    def predict(self, now: Array, _: Array) -> tuple[Array, Array, Array, Array, Array]:
         mean, sigma, phi = self._known.mean, self._known.sigma, self._known.autocorrelation
         follows = np.isfinite(self._last)
         expected = np.where(follows, mean + phi * (np.nan_to_num(self._last) - mean), mean)
         spread = np.broadcast_to(np.where(follows, sigma * np.sqrt(1.0 - phi * phi), sigma), now.shape)
-        return (now - expected) / spread, expected, spread, np.ones(now.shape)
+        return (now - expected) / spread, expected, spread, np.ones(now.shape), phi
 
     def learn(self, now: Array, _: Array) -> None:
         self._last = np.where(np.isfinite(now), now, self._last)
@@ -429,8 +448,8 @@ class _Predictor:
         degrees = np.maximum(np.arange(n + 1), 1)
         self._wider = -scipy.stats.t.ppf(scipy.special.ndtr(-single), degrees) / single
 
-    def predict(self, now: Array, row: Array) -> tuple[Array, Array, Array, Array]:
-        """Scores, predicted values, their standard deviations and the widths of the charts."""
+    def predict(self, now: Array, row: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Scores, predicted values, their standard deviations, the widths of the charts, and φ."""
         p = row.shape[-1]
         judged = (self._pairs + 1 >= max(self._options.least, p + 3)) & np.isfinite(now)
         degrees = np.maximum(self._pairs - p, 1)
@@ -447,18 +466,26 @@ class _Predictor:
         with np.errstate(divide="ignore", invalid="ignore"):
             t = (now - self._origin - expected) / spread
         t[~judged | ~(spread > 0)] = np.nan
-        score = -np.sign(t) * scipy.special.ndtri(scipy.special.stdtr(degrees, -np.abs(t)))
-        # Beyond the smallest probability of doubles.
-        score = np.clip(score, -37.0, 37.0)
+        size = -scipy.special.ndtri(scipy.special.stdtr(degrees, -np.abs(t)))
+        # 37: the smallest probability of doubles.
+        score = np.sign(t) * self._in_tails(np.minimum(size, 37.0))
         width = _visible(estimate, estimate) / _visible(phi, estimate)
         width = width * self._wider[degrees] * np.sqrt(1.0 + leverage)
         hidden = np.where(judged, 0.0, np.nan)
-        return score, expected + self._origin + hidden, spread + hidden, width + hidden
+        return score, expected + self._origin + hidden, spread + hidden, width + hidden, phi + hidden
+
+    def _in_tails(self, size: Array) -> Array:
+        """Normal scores of values of `size` standard deviations of a t distribution, at most `size`."""
+        nu = self._options.tails
+        if np.isinf(nu):
+            return size
+        found: Array = -scipy.special.ndtri(scipy.special.stdtr(nu, -size * np.sqrt(nu / (nu - 2.0))))
+        return np.minimum(size, found)
 
     def _autocorrelation(self, judged: Mask) -> tuple[Array, Array]:
         """φ estimated from the residuals, corrected for its bias, and its upper limit (..., c)."""
-        largest, p = self._options.autocorrelation, self._z.shape[-1]
-        if largest == 0:
+        usual, p = self._options.autocorrelation, self._z.shape[-1]
+        if usual == 0:
             return np.zeros(judged.shape), np.zeros(judged.shape)
         pairs = np.maximum(self._pairs, 1)
         normal = self._zz[0] + np.where(judged, 0.0, 1.0)[..., None, None] * np.eye(p)
@@ -470,8 +497,11 @@ class _Predictor:
         size = own + before
         raw = np.clip(np.where(size > 0, lagged / np.where(size > 0, size, 1.0), 0.0), -1.0, 1.0)
         corrected = raw + (p + (p + 2) * raw) / pairs  # Kendall (1954), for p = 1
+        # A shift of one series resembles autocorrelation; the median of all series is not moved by it.
+        together = _median(np.where(judged, corrected, np.nan))
+        largest = np.clip(together, usual, max(usual, self._options.correlated))
         bound = corrected + self._normal * np.sqrt((1.0 - raw * raw) / pairs)
-        bound = np.where(judged, np.clip(bound, 0.0, largest), largest)
+        bound = np.where(judged, np.clip(bound, 0.0, largest), usual)
         return np.clip(corrected, 0.0, bound), bound
 
     def learn(self, now: Array, row: Array) -> None:
@@ -504,6 +534,15 @@ def _solve(matrix: Array, right: Array) -> Array:
     if matrix.shape[-1] == 1:
         return right / np.where(matrix == 0, 1.0, matrix)
     found: Array = np.linalg.pinv(matrix, hermitian=True) @ right
+    return found
+
+
+def _median(values: Array) -> Array:
+    """Median over the series (..., 1) of those that have a value; 0 where none has."""
+    ordered = np.sort(values, axis=-1)  # NaN last
+    count = np.isfinite(values).sum(axis=-1, keepdims=True)
+    ends = [np.take_along_axis(ordered, np.maximum(k, 0), axis=-1) for k in ((count - 1) // 2, count // 2)]
+    found: Array = np.where(count > 0, (ends[0] + ends[1]) / 2, 0.0)
     return found
 
 

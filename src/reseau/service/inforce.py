@@ -13,11 +13,11 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
 import numpy as np
 
-from ..archive import Archive, Entry
+from ..archive import Archive, Entry, Journal
 from ..calibration import Calibration, CameraMapping, calibration_difference, parse_calibration
 from ..core.data import Array
 from ..core.errors import UsageError
@@ -157,7 +157,7 @@ class Configurations:
 
     def names(self) -> list[str]:
         """Return the names of the configurations."""
-        return [name.removeprefix(_PREFIX) for name in self._archive.journals(_PREFIX)]
+        return self._archive.journals(_PREFIX)
 
     def define(self, name: str, parts: Mapping[str, str]) -> None:
         """Define a configuration by its parts, such as camera, lens, settings and firmware.
@@ -416,11 +416,11 @@ class Configurations:
         charts = monitor(values, options, one_sided=one_sided)
         return Drift(tuple(d.key for d in decisions), names, values, charts)
 
-    def _journal(self, name: str) -> Any:
+    def _journal(self, name: str) -> Journal:
         return self._archive.journal(_PREFIX + name)
 
     def _entries(self, name: str, kind: str | None = None) -> list[Entry]:
-        found: list[Entry] = self._journal(name).entries()
+        found = self._journal(name).entries()
         if not found:
             do = f"use {', '.join(self.names())}" if self.names() else "define it"
             raise UsageError("is not a configuration of this archive", where=name, do=do)

@@ -93,7 +93,7 @@ class Recalibrations:
 
     def names(self) -> list[str]:
         """Return the names of the recalibrations."""
-        return [name.removeprefix(_PREFIX) for name in self._archive.journals(_PREFIX)]
+        return self._archive.journals(_PREFIX)
 
     def define(
         self, name: str, session: Session, configuration: str, rules: AcceptanceRules

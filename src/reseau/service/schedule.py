@@ -15,11 +15,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from ..archive import Archive, Entry
+from ..archive import Archive, Entry, Journal
 from ..core.errors import ArchiveError, InstrumentError, ReseauError, UsageError
 from ..io import Document
 from .inforce import Configurations, a_time
@@ -138,7 +138,7 @@ class Run:
 class Claim:
     """The right to carry out a run, which is renewed while it is held; see :meth:`Schedules.claim`."""
 
-    def __init__(self, journal: Any, key: str, attempt: int, lease: timedelta) -> None:
+    def __init__(self, journal: Journal, key: str, attempt: int, lease: timedelta) -> None:
         self.key, self.attempt = key, attempt
         self._journal, self._lease = journal, lease
         self._over, self._beat = threading.Event(), 0
@@ -196,8 +196,8 @@ class Schedules:
 
     def names(self) -> list[str]:
         """Return the names of the schedules that were not removed."""
-        names = [name.removeprefix(_PREFIX) for name in self._archive.journals(_PREFIX)]
-        return [name for name in names if self._entries(name)[-1].kind != "removed"]
+        every = self._archive.journals(_PREFIX)
+        return [name for name in every if self._entries(name)[-1].kind != "removed"]
 
     def add(self, schedule: Schedule, at: datetime | None = None) -> None:
         """Add a schedule, or change one: its earlier runs stay as they were.
