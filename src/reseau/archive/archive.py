@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from datetime import UTC, datetime
+from collections.abc import Callable, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,7 +16,7 @@ from ..core.version import __version__
 from . import schema
 from .journal import Journal, journals
 from .objects import LocalObjects, Objects, objects_at
-from .records import SessionSummary, utc
+from .records import SessionSummary, utc, utc_now
 from .session import INPUT, Session
 
 __all__ = ["Archive"]
@@ -35,6 +35,8 @@ class Archive:
         Store of the files.
     place : str
         Name of the place, for messages.
+    clock : callable
+        Returns the present time, UTC: that of what is stored, and of what is due.
 
     Examples
     --------
@@ -45,11 +47,20 @@ class Archive:
     ['monday']
     """
 
-    def __init__(self, engine: Engine, objects: Objects, place: str) -> None:
-        self._engine, self.objects, self.place = engine, objects, place
+    def __init__(
+        self, engine: Engine, objects: Objects, place: str, clock: Callable[[], datetime] = utc_now
+    ) -> None:
+        self._engine, self.objects, self.place, self.clock = engine, objects, place, clock
 
     @classmethod
-    def open(cls, place: str | Path, objects: str | Path | None = None, *, create: bool = False) -> Self:
+    def open(
+        cls,
+        place: str | Path,
+        objects: str | Path | None = None,
+        *,
+        create: bool = False,
+        clock: Callable[[], datetime] = utc_now,
+    ) -> Self:
         """Open an archive.
 
         Parameters
@@ -60,6 +71,8 @@ class Archive:
             Folder or URL of the files; required with the URL of a database.
         create : bool
             Whether to create it if it does not exist.
+        clock : callable
+            Returns the present time, UTC; by default that of this computer.
 
         Raises
         ------
@@ -69,7 +82,7 @@ class Archive:
         if "://" in str(place):
             if objects is None:
                 raise ArchiveError("needs a store for the files", where=place, do="name one with --objects")
-            return cls(schema.make(str(place), create=create), objects_at(objects), str(place))
+            return cls(schema.make(str(place), create=create), objects_at(objects), str(place), clock)
         folder = Path(place).absolute()
         index = folder / _INDEX
         if create:
@@ -85,7 +98,7 @@ class Archive:
             raise ArchiveError("is read-only", where=folder, do="name another archive")
         engine = schema.make(f"sqlite:///{index}", create=create, read_only=read_only)
         kept = LocalObjects(folder / _OBJECTS) if objects is None else objects_at(objects)
-        return cls(engine, kept, str(folder))
+        return cls(engine, kept, str(folder), clock)
 
     def close(self) -> None:
         """Close the index."""
@@ -139,7 +152,7 @@ class Archive:
             "parameters": dict(parameters),
             "bench": bench,
             "software": f"reseau {__version__}",
-            "begun": datetime.now(UTC),
+            "begun": self.clock(),
         }
         with schema.connected(self._engine) as connection:
             if connection.scalar(sa.select(schema.sessions.c.id).where(schema.sessions.c.name == name)):
@@ -169,7 +182,7 @@ class Archive:
             ).one_or_none()
         if row is None:
             raise ArchiveError("is not a session of this archive", where=name, do="see `reseau archive list`")
-        return Session(self._engine, self.objects, row._asdict())
+        return Session(self._engine, self.objects, row._asdict(), self.clock)
 
     def sessions(self) -> list[SessionSummary]:
         """Return a summary of each session, in the order in which they were begun."""
@@ -196,7 +209,7 @@ class Archive:
 
     def journal(self, name: str) -> Journal:
         """Return the journal of this name, which may be empty yet."""
-        return Journal(self._engine, name)
+        return Journal(self._engine, name, self.clock)
 
     def journals(self, prefix: str = "") -> list[str]:
         """Return the names of the journals that start with `prefix`, without it, oldest first."""

@@ -6,7 +6,7 @@ its journal; of two processes that append the same key at once, the database let
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -15,7 +15,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Engine
 
 from . import schema
-from .records import utc
+from .records import utc, utc_now
 
 __all__ = ["Entry", "Journal", "journals"]
 
@@ -57,6 +57,8 @@ class Journal:
         Database engine of the index.
     name : str
         Name of the journal.
+    clock : callable
+        Returns the present time, UTC.
 
     Examples
     --------
@@ -69,8 +71,8 @@ class Journal:
     ({'text': 'warm'}, None, 1)
     """
 
-    def __init__(self, engine: Engine, name: str) -> None:
-        self._engine, self.name = engine, name
+    def __init__(self, engine: Engine, name: str, clock: Callable[[], datetime] = utc_now) -> None:
+        self._engine, self.name, self._clock = engine, name, clock
 
     def append(
         self, key: str, kind: str, document: Mapping[str, Any], at: datetime | None = None
@@ -96,7 +98,7 @@ class Journal:
         """
         e = schema.entries
         content = dict(document)
-        time = datetime.now(UTC) if at is None else at.astimezone(UTC)
+        time = self._clock() if at is None else at.astimezone(UTC)
         row = {"journal": self.name, "key": key, "kind": kind, "document": content, "at": time}
         schema.extend(self._engine)
         with schema.connected(self._engine) as connection:

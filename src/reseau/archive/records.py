@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
-__all__ = ["ArchivedFrame", "ArchivedResult", "SessionSummary", "Verdict", "utc"]
+__all__ = ["ArchivedFrame", "ArchivedResult", "SessionSummary", "Verdict", "utc", "utc_now"]
 
 
 @dataclass(frozen=True)
@@ -142,3 +142,14 @@ class SessionSummary:
 def utc(time: datetime) -> datetime:
     """Return a time of the index with its zone; SQLite does not store it."""
     return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
+
+
+def utc_now() -> datetime:
+    """Time of this computer, UTC.
+
+    Examples
+    --------
+    >>> utc_now().tzinfo == UTC
+    True
+    """
+    return datetime.now(UTC)

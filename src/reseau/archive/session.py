@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime
+from collections.abc import Callable, Iterator, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from ..io import write_whole
 from . import schema
 from .objects import Objects
 from .picture import frame_of, tiff_of
-from .records import ArchivedFrame, ArchivedResult, Verdict, utc
+from .records import ArchivedFrame, ArchivedResult, Verdict, utc, utc_now
 
 __all__ = ["INPUT", "Session"]
 
@@ -36,6 +36,8 @@ class Session:
         Store of the files.
     row : mapping
         Row of the session in the index.
+    clock : callable
+        Returns the present time, UTC.
 
     Examples
     --------
@@ -50,8 +52,14 @@ class Session:
     ([('00000/frame', True)], 'done')
     """
 
-    def __init__(self, engine: Engine, objects: Objects, row: Mapping[str, Any]) -> None:
-        self._engine, self.objects = engine, objects
+    def __init__(
+        self,
+        engine: Engine,
+        objects: Objects,
+        row: Mapping[str, Any],
+        clock: Callable[[], datetime] = utc_now,
+    ) -> None:
+        self._engine, self.objects, self._clock = engine, objects, clock
         self._id: int = row["id"]
         self.name: str = row["name"]
         self.plan: str = row["plan"]
@@ -128,7 +136,7 @@ class Session:
             "size": size,
             "facts": facts,
             "clock": clock,
-            "stored": datetime.now(UTC),
+            "stored": self._clock(),
         }
         with schema.connected(self._engine) as connection:
             made = connection.execute(schema.frames.insert().values(values)).inserted_primary_key
@@ -252,7 +260,7 @@ class Session:
             "size": len(data),
             "parameters": known,
             "software": software,
-            "stored": datetime.now(UTC),
+            "stored": self._clock(),
         }
         made_of = dict(inputs or {})
         with schema.connected(self._engine) as connection:
@@ -322,7 +330,7 @@ class Session:
 
     def end(self, status: str, why: str = "") -> None:
         """Store the status at the end; a session that is resumed ends again."""
-        row = {"session_id": self._id, "status": status, "why": why, "at": datetime.now(UTC)}
+        row = {"session_id": self._id, "status": status, "why": why, "at": self._clock()}
         with schema.connected(self._engine) as connection:
             connection.execute(schema.ends.insert().values(row))
 

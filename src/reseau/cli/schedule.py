@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import threading
 from datetime import timedelta
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,8 +15,7 @@ from .calibrations import say_decision, time_of
 from .common import ArchivePlace, AsJson, ObjectsPlace, open_archive, say, suffix_of, writable
 
 if TYPE_CHECKING:
-    from ..archive import Archive
-    from ..service import Run, Schedule
+    from ..service import Run
 
 __all__ = ["alarms", "app", "recalibrate"]
 
@@ -120,7 +118,7 @@ def run_(
     objects: ObjectsPlace = None,
 ) -> None:
     """Carry out the runs that are due: as a daemon, or --once from cron or a timer of systemd."""
-    from ..service import Alarms, Schedules, sender
+    from ..service import Alarms, Recalibrations, Schedules, sender
 
     deliver = None if not to else sender(to)
     over = threading.Event()
@@ -131,7 +129,7 @@ def run_(
     while True:
         try:
             with open_archive(archive, objects) as found:
-                for run in Schedules(found).run_due(partial(_carried_out, found)):
+                for run in Schedules(found).run_due(Recalibrations(found).carry_out):
                     failed = failed or run.state != "done"
                     say(f"{run.schedule}: {run.time:%Y-%m-%d %H:%M}Z {run.state}: {run.why}\n")
                 if deliver is not None:
@@ -143,15 +141,6 @@ def run_(
         if once or over.wait(every):
             break
     raise typer.Exit(1 if once and failed else 0)
-
-
-def _carried_out(archive: Archive, schedule: Schedule, run: Run) -> str:
-    """Carry out a run, or continue it: its session has the name of the run."""
-    from ..service import Recalibrations
-
-    name = f"{schedule.name}-{run.key.replace(' ', '-')}"
-    decision = Recalibrations(archive).run(schedule.recalibration, name).decision
-    return f"{decision.outcome}: {decision.key}"
 
 
 _SERVICE = """\

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 
 from ..archive import Archive
 from ..core.errors import InputError, UsageError
@@ -122,7 +122,7 @@ class Alarms:
         InputError
             If they could not be delivered; they are sent with the next call.
         """
-        time = a_time(now or datetime.now(UTC))
+        time = a_time(now or self._archive.clock())
         due = [each for each in self.open(time) if not each.sent or each.sent[-1] + repeat <= time]
         if not due:
             return []

@@ -239,7 +239,7 @@ class Configurations:
             return self.decision(name, key)
         _same_version(entries, rules, name)
         begun = calibration.times.get("begun")
-        start = a_time(since or (datetime.fromisoformat(begun) if begun else datetime.now(UTC)))
+        start = a_time(since or (datetime.fromisoformat(begun) if begun else self._archive.clock()))
         current = self.applied(name, start)
         judged = judge(calibration, None if current is None else current.calibration, rules)
         document = {
@@ -297,7 +297,7 @@ class Configurations:
         decision = self.decision(name, key)
         if decision.outcome not in _ACCEPTED:
             raise UsageError(f"was not accepted ({decision.outcome})", where=key)
-        start = a_time(since or datetime.now(UTC))
+        start = a_time(since or self._archive.clock())
         document = {"key": decision.key, "since": start.isoformat(), "by": by or _user(), "comment": comment}
         self._journal(name).add("return", document)
         found = self.applied(name, start)
@@ -309,7 +309,7 @@ class Configurations:
         if not what.strip():
             raise UsageError("needs a description", where="service event")
         self._entries(name)  # refuses an unknown configuration
-        time = a_time(at or datetime.now(UTC))
+        time = a_time(at or self._archive.clock())
         self._journal(name).add("event", {"what": what, "since": time.isoformat(), "by": by or _user()})
 
     def events(self, name: str) -> list[tuple[datetime, str]]:

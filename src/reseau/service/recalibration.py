@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from functools import partial
 from typing import Any, ClassVar
 
 from pydantic import Field
@@ -20,6 +20,7 @@ from ..core.errors import InstrumentError, UsageError
 from ..io import Document
 from .inforce import Configurations, Decision
 from .rules import AcceptanceRules
+from .schedule import Run, Schedule
 
 __all__ = ["Recalibrated", "Recalibration", "Recalibrations"]
 
@@ -157,6 +158,7 @@ class Recalibrations:
         *,
         watch: Watch = lambda kind, facts: None,
         bench: Callable[[BenchFile], Bench] = Bench,
+        capture: Callable[..., Any] = sessions.capture,
     ) -> Recalibrated:
         """Carry out a recalibration, or continue it.
 
@@ -171,6 +173,8 @@ class Recalibrations:
             Called with events of the acquisition.
         bench : callable
             Makes the bench of its file.
+        capture : callable
+            Carries out the session on the bench.
 
         Raises
         ------
@@ -181,12 +185,12 @@ class Recalibrations:
         """
         made = self.get(name)
         rules = AcceptanceRules.from_content(dict(made.rules), where=f"rules of {name}")
-        title = session or f"{name}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+        title = session or f"{name}-{self._archive.clock():%Y%m%dT%H%M%SZ}"
         there = any(each.name == title for each in self._archive.sessions())
         if there and self._archive.session(title).status == "done":
             found = self._archive.session(title)
         else:
-            found = self._carried_out(made, title, there, watch, bench)
+            found = self._carried_out(made, title, there, bench, partial(capture, watch=watch))
         calibration = sessions.calibration_of(found)
         decision = Configurations(self._archive).decide(
             made.configuration, calibration, rules, since=found.begun, by=f"recalibration {name}",
@@ -194,8 +198,37 @@ class Recalibrations:
         )  # fmt: skip
         return Recalibrated(title, calibration, decision)
 
+    def carry_out(self, schedule: Schedule, run: Run, **options: Any) -> str:
+        """Carry out a run of a schedule, or continue it: its session has the name of the run.
+
+        Parameters
+        ----------
+        schedule, run
+            As given by :meth:`~reseau.service.Schedules.run_due`.
+        **options
+            `watch`, `bench` and `capture`, as for :meth:`run`.
+
+        Returns
+        -------
+        str
+            Outcome and name of the decision.
+
+        Raises
+        ------
+        ReseauError
+            As :meth:`run`.
+        """
+        name = f"{schedule.name}-{run.key.replace(' ', '-')}"
+        decision = self.run(schedule.recalibration, name, **options).decision
+        return f"{decision.outcome}: {decision.key}"
+
     def _carried_out(
-        self, made: Recalibration, title: str, there: bool, watch: Watch, bench: Callable[[BenchFile], Bench]
+        self,
+        made: Recalibration,
+        title: str,
+        there: bool,
+        bench: Callable[[BenchFile], Bench],
+        capture: Callable[[Session, Bench], Any],
     ) -> Session:
         """Begin or resume the session, and carry it out to its end."""
         instruments = bench(BenchFile.parse_toml(made.bench, where=f"bench of {made.name}"))
@@ -210,7 +243,7 @@ class Recalibrations:
                 found = sessions.begin(
                     self._archive, title, made.plan, made.parameters, made.inputs, bench=made.bench
                 )
-            sessions.capture(found, instruments, watch=watch)
+            capture(found, instruments)
         if found.status != "done":
             raise InstrumentError(
                 f"is {found.status}", where=f"session {title}", do="continue it with --resume"

@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
@@ -118,7 +118,8 @@ class Run:
 
     Examples
     --------
-    >>> Run("weekly", datetime(2026, 3, 2, 7, tzinfo=UTC), "due", "", 0, "20260302T070000Z").state
+    >>> at = datetime.fromisoformat("2026-03-02T07:00Z")
+    >>> Run("weekly", at, "due", "", 0, "20260302T070000Z").state
     'due'
     """
 
@@ -138,9 +139,11 @@ class Run:
 class Claim:
     """The right to carry out a run, which is renewed while it is held; see :meth:`Schedules.claim`."""
 
-    def __init__(self, journal: Journal, key: str, attempt: int, lease: timedelta) -> None:
+    def __init__(
+        self, journal: Journal, key: str, attempt: int, lease: timedelta, clock: Callable[[], datetime]
+    ) -> None:
         self.key, self.attempt = key, attempt
-        self._journal, self._lease = journal, lease
+        self._journal, self._lease, self._clock = journal, lease, clock
         self._over, self._beat = threading.Event(), 0
         self._thread = threading.Thread(target=self._renew, daemon=True)
         self._thread.start()
@@ -149,16 +152,14 @@ class Claim:
         while not self._over.wait(self._lease.total_seconds() / 3):
             self._beat += 1
             name = f"{self.key} attempt {self.attempt} renewal {self._beat}"
-            until = datetime.now(UTC) + self._lease
+            until = self._clock() + self._lease
             document = {"run": self.key, "attempt": self.attempt, "until": until.isoformat()}
             try:
                 self._journal.append(name, "renewed", document)
             except ArchiveError:  # the next renewal tries again; the lease lasts three times as long
                 continue
 
-    def end(
-        self, outcome: Literal["done", "failed", "blocked"], why: str, at: datetime | None = None
-    ) -> None:
+    def end(self, outcome: Literal["done", "failed", "blocked"], why: str) -> None:
         """Record the outcome, and give the run back."""
         self._over.set()
         self._thread.join()
@@ -182,10 +183,10 @@ class Schedules:
     >>> import tempfile
     >>> weekly = Schedule(name="weekly", recalibration="left", rule="FREQ=WEEKLY;COUNT=52",
     ...                   start="2026-03-02T08:00", zone="UTC")
-    >>> now = datetime(2026, 3, 9, 9, tzinfo=UTC)
+    >>> begin, now = (datetime.fromisoformat(each) for each in ("2026-03-01T00:00Z", "2026-03-09T09:00Z"))
     >>> with tempfile.TemporaryDirectory() as folder, Archive.open(folder, create=True) as archive:
     ...     schedules = Schedules(archive)
-    ...     schedules.add(weekly, datetime(2026, 3, 1, tzinfo=UTC))
+    ...     schedules.add(weekly, begin)
     ...     [(f"{run.time:%m-%d}", run.state) for run in schedules.runs("weekly", now)]
     [('03-02', 'missed'), ('03-09', 'due'), ('03-16', 'scheduled')]
     """
@@ -209,14 +210,14 @@ class Schedules:
         at : datetime, optional
             From when on it counts, by default now: earlier occurrences are not shown as missed.
         """
-        since = a_time(at or datetime.now(UTC))
+        since = a_time(at or self._archive.clock())
         document = {"schedule": schedule.to_dict(), "since": since.isoformat()}
         self._archive.journal(_PREFIX + schedule.name).add("schedule", document)
 
     def remove(self, name: str, at: datetime | None = None) -> None:
         """Remove a schedule; its history stays."""
         self.get(name)
-        since = a_time(at or datetime.now(UTC)).isoformat()
+        since = a_time(at or self._archive.clock()).isoformat()
         self._archive.journal(_PREFIX + name).add("removed", {"since": since})
 
     def get(self, name: str) -> Schedule:
@@ -244,7 +245,7 @@ class Schedules:
         ahead : int
             Number of later runs.
         """
-        time = a_time(now or datetime.now(UTC))
+        time = a_time(now or self._archive.clock())
         versions = self._versions(name)
         ends = [since for since, _ in versions[1:]] + [None]
         found: dict[str, tuple[datetime, timedelta, str]] = {}
@@ -315,7 +316,7 @@ class Schedules:
         Claim or None
             None if another scheduler was faster, or the run may not start (any more).
         """
-        time = a_time(now or datetime.now(UTC))
+        time = a_time(now or self._archive.clock())
         current = [each for each in self.runs(run.schedule, time) if each.key == run.key]
         if not current or not current[0].startable:
             return None
@@ -325,7 +326,7 @@ class Schedules:
         document = {"run": run.key, "attempt": attempt, "until": until.isoformat()} | self._who
         if journal.append(f"{run.key} attempt {attempt}", "started", document) is None:
             return None
-        return Claim(journal, run.key, attempt, self._lease)
+        return Claim(journal, run.key, attempt, self._lease, self._archive.clock)
 
     def run_due(self, carry_out: Callable[[Schedule, Run], str], now: datetime | None = None) -> list[Run]:
         """Carry out all runs that may start now.
@@ -363,7 +364,7 @@ class Schedules:
 
     def feed(self, name: str, now: datetime | None = None, ahead: int = 52) -> str:
         """Return the runs of a schedule as an iCalendar feed, with their states."""
-        time = a_time(now or datetime.now(UTC))
+        time = a_time(now or self._archive.clock())
         window = self.get(name).window
         events = [
             CalendarEvent(f"{each.key.replace(' ', '-')}-{name}@reseau", each.time, each.time + window,
