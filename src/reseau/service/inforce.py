@@ -385,10 +385,15 @@ class Configurations:
 
     def calibration(self, name: str, key: str) -> Calibration:
         """Return the calibration of a decision."""
-        for each in self._entries(name, "decision"):
-            if each.key == key:
-                return parse_calibration(each.document["calibration"], where=f"calibration {key}")
-        raise UsageError("names no decision", where=f"{name}: {key!r}")
+        return self._calibrations(name, [key])[0]
+
+    def _calibrations(self, name: str, keys: Sequence[str]) -> list[Calibration]:
+        """Calibrations of several decisions; the archive is read once."""
+        texts = {each.key: each.document["calibration"] for each in self._entries(name, "decision")}
+        for key in keys:
+            if key not in texts:
+                raise UsageError("names no decision", where=f"{name}: {key!r}")
+        return [parse_calibration(texts[key], where=f"calibration {key}") for key in keys]
 
     def drift(self, name: str, options: ChartOptions | None = None) -> Drift:
         """Chart the parameters of the calibrations since the last service event, rejected ones left out.
@@ -406,7 +411,7 @@ class Configurations:
         decisions.sort(key=lambda d: (d.since, d.at))
         if not decisions:
             raise UsageError("has no calibrations since its last service event", where=name)
-        calibrations = [self.calibration(name, d.key) for d in decisions]
+        calibrations = self._calibrations(name, [d.key for d in decisions])
         names, values = series_of(calibrations)
         one_sided: tuple[int, ...] = ()
         if calibrations[0].kind == "camera":
