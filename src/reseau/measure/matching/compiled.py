@@ -306,7 +306,7 @@ def linearised(
     monomials, across, columns = window
     dark, variance, jitter = light
     residuals, kept, normals, gradients, cofactors, slope, weighted = work
-    (count, n), u, ground = observed.shape, x.shape[1], len(monomials)
+    (count, n), u, ground, forms = observed.shape, x.shape[1], len(monomials), slopes.shape[1] - 3
     plane, contrast, grey = np.empty(n), np.empty(n), np.empty(n)
     by_share, rest, jacobian = np.empty(n, f32), np.empty(n, f32), np.empty((u, n), f32)
     scale, lower, left = np.empty(u), np.empty((u, u)), np.empty(n, f32)
@@ -376,6 +376,41 @@ def linearised(
                 cofactors[k, m, i] *= scale[i] * scale[m]
         limit = share_of_sigma**2 * cost / max(freedom, 1)
         _next(k, normals[k], gradients[k], limit, x, trial, iteration, state)
+        # What the first correction leaves is smaller than itself by half the relative change of the mark.
+        total = math.hypot(psf[k], wide)
+        change = max(abs(trial[k, 0] - x[k, 0]), abs(trial[k, 1] - x[k, 1])) / total
+        change = max(change, abs(trial[k, _WIDTH] - x[k, _WIDTH]) * (wide / total) ** 2)
+        change = max(change, abs(trial[k, _CONTRAST] / x[k, _CONTRAST] - 1.0))
+        for m in range(u - forms, u):
+            change = max(change, abs(trial[k, m] - x[k, m]))
+        left_over = iteration[k, 2]
+        if state[k] == ACTIVE and left_over * (change / 4) ** 2 <= limit * (1 - left_over / cost):
+            _extrapolated(x[k], trial[k], jacobian, slopes[k], wide * wide / total, covered, residuals[k])
+            iteration[k, 0], state[k] = cost - left_over, DONE
+
+
+@_compiled
+def _extrapolated(
+    x: Floats,
+    trial: Floats,
+    jacobian: Floats,
+    slopes: Floats,
+    widened: float,
+    share: Floats,
+    residuals: Floats,
+) -> None:
+    """Change `x` to `trial`, and share and residuals (n,) of a window by their derivatives."""
+    n, u = len(share), len(x)
+    for m in range(u):
+        factor, row = f32(trial[m] - x[m]), jacobian[m]
+        for i in range(n):
+            residuals[i] += factor * row[i]
+    for m in range(len(slopes)):
+        at = m if m <= _WIDTH else u - len(slopes) + m
+        factor, row = f32((trial[at] - x[at]) * (widened if m == _WIDTH else 1.0)), slopes[m]
+        for i in range(n):
+            share[i] += factor * row[i]
+    x[:] = trial
 
 
 @_compiled

@@ -50,6 +50,8 @@ _MOST_PEAKS, _MOST_LINES = 250, 48
 _SURROUNDED, _SAMPLED = 480, 500
 """Size of the frame, in pixels, from which not all are used to find the brightest surroundings; number of
 samples along its longest side from which they are more than a pixel apart on a line."""
+_STRIP_PX = 60_000
+"""Number of pixels of the strips in which derivatives are formed."""
 _APART_PX = 5.0
 """Distance below which two lines are the same."""
 _OWN = 0.5
@@ -132,32 +134,43 @@ def ridge_points(grey: NDArray[np.float32], noise: float, sigma: float = 1.0) ->
     """
     from .compiled import ridges as compiled_ridges  # takes half a second to import
 
-    offset = np.arange(-int(np.ceil(4 * sigma)), int(np.ceil(4 * sigma)) + 1)
+    reach = int(np.ceil(4 * sigma))
+    offset = np.arange(-reach, reach + 1)
     bell = np.exp(-0.5 * (offset / sigma) ** 2)
     bell /= bell.sum()
     slope, bend = offset / sigma**2 * bell, (offset**2 / sigma**4 - 1 / sigma**2) * bell
-
-    def filtered(x: Array, y: Array) -> NDArray[np.float32]:
-        smooth: Any = cv2.sepFilter2D(grey, cv2.CV_32F, x.astype(np.float32), y.astype(np.float32))
-        return np.asarray(smooth, dtype=np.float32)
-
-    xx, yy, xy = filtered(bend, bell), filtered(bell, bend), filtered(slope, slope)
     least = _SIGNIFICANT * noise * float(np.sqrt((bend**2).sum() * (bell**2).sum()))
-    points, normal = compiled_ridges(xx, yy, xy, filtered(slope, bell), filtered(bell, slope), least)
+    found = []
+    # Strips of rows whose derivatives fit into a cache: those of a large frame would take long to allocate.
+    high = max(4 * reach, _STRIP_PX // grey.shape[1])
+    for first in range(0, len(grey), high):
+        begin, end = max(first - reach, 0), min(first + high + reach, len(grey))
+        inner = slice(first - begin, first - begin + high)
+
+        def filtered(x: Array, y: Array, strip: NDArray[Any], inner: slice) -> NDArray[Any]:
+            smooth = cv2.sepFilter2D(strip, cv2.CV_32F, x.astype(np.float32), y.astype(np.float32))
+            return np.asarray(smooth)[inner]
+
+        kernels = (bend, bell), (bell, bend), (slope, slope), (slope, bell), (bell, slope)
+        xx, yy, xy, along, down = (filtered(x, y, grey[begin:end], inner) for x, y in kernels)
+        points, normal = compiled_ridges(xx, yy, xy, along, down, least)
+        points[:, 1] += first
+        found.append((points, normal))
+    points, normal = (np.concatenate(columns) for columns in zip(*found, strict=True))
     return Ridges(points, normal, _darkness(grey))
 
 
 def _darkness(grey: NDArray[np.float32]) -> NDArray[np.float32]:
     """Difference between the brightest value around each pixel and its own."""
-    smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
-    # Of a smooth image, and for surroundings much wider than a pixel, some pixels are enough.
-    each = max(1, max(grey.shape) // _SURROUNDED)
+    (h, w), each = grey.shape, max(1, max(grey.shape) // _SURROUNDED)
+    # Of a smooth image, and for surroundings much wider than a pixel, means of some pixels are enough.
+    few = cv2.resize(grey, (w // each, h // each), interpolation=cv2.INTER_AREA) if each > 1 else grey
+    few = cv2.GaussianBlur(few, (0, 0), max(1.0 / each, 0.5))
     size = max(grey.shape) // (14 * each) | 1
-    few = np.ascontiguousarray(smooth[::each, ::each])
     bright: Any = cv2.blur(cv2.dilate(few, np.ones((size, size), np.uint8)), (size, size))
     if each > 1:
-        bright = cv2.resize(bright, (each * few.shape[1], each * few.shape[0]))[: len(grey), : grey.shape[1]]
-    lack: NDArray[np.float32] = bright - grey
+        bright = cv2.resize(bright, (w, h))
+    lack: NDArray[np.float32] = np.subtract(bright, grey, out=bright)
     return lack
 
 
