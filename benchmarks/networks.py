@@ -1,8 +1,8 @@
 """Networks of wide lenses from cold and from warm: `python benchmarks/networks.py`.
 
 Boards seen through lenses drawn by OpenCV's fisheye camera (`benchmarks/worlds/lenses.py`), calibrated with
-five and with eight coefficients: images used, sigma0, focal length and time, from a rough focal length
-without distortion (cold) and from the result of `cv2.calibrateCamera` (warm).
+five and with eight coefficients: images used, sigma0, focal length and processor time, from a rough focal
+length without distortion (cold) and from the result of `cv2.calibrateCamera` (warm).
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ def calibrated(lens: lenses.Lens, flat: np.ndarray, seen: list[Any], eight: bool
 def run(name: str, document: dict[str, Any]) -> None:
     """Adjust and print a line."""
     network = Network.from_document(Network1.from_content(json.loads(json.dumps(document)), where=name))
-    begin = time.perf_counter()
+    begin = time.process_time()
     found = adjust_network(network)
-    seconds = time.perf_counter() - begin
+    seconds = time.process_time() - begin
     if not found:
         print(f"  {name:6} {seconds:6.2f} s  no result: {found.reason[:90]}")
         return

@@ -462,7 +462,7 @@ def test_a_joint_prior_of_a_camera_adds_its_inverse_to_the_normal_equations() ->
 @pytest.mark.parametrize("banded", [False, True])
 def test_a_diagonal_prior_is_that_of_single_sigmas(banded: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if banded:
-        monkeypatch.setattr("reseau.bundle.solver.unknowns._DENSE", 0)
+        monkeypatch.setattr("reseau.bundle.solver.unknowns._BANDS", ((0, 1 / 4),))
     cams = tuple(replace(networks.camera(), id=f"cam{k}") for k in range(20))
     world = networks.world(images=20, points=100, cameras=cams, control=100)
     network = world.noisy(2)

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, islice
+from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 import scipy.special
@@ -26,6 +27,8 @@ from .checks import listed
 __all__ = ["ControlCheck", "ControlShape", "checked_control", "control_shape", "suspected", "without_control"]
 
 _TRIPLES, _SIGMAS, _LEAST = 500, 8.0, 4
+# Points that agree, from which on a figure is not symmetric in them.
+_SYMMETRIC = 20
 # Tolerated error of a control point, as a fraction of their extent.
 _LOOSE = 2e-3
 # Misfits after an exchange of two points that explains those before it, relative to these.
@@ -46,6 +49,12 @@ _TIGHT = 1e-5
 _HALF = 0.5
 # Times the median of the smallest errors found, above which errors of a point are said not to be found.
 _HARDLY = 4.0
+# Iterations of a free network; relative offset at which all adjustments end: what they find is compared with
+# multiples of its standard deviation.
+_FREE_ITERATIONS, _ROUGHLY = 50, 1e-2
+# Thickness of a plane figure in its extent, its least number of points, part of the differences that a
+# deflection of second degree explains, and its size in the standard deviations of the points.
+_PLANE, _BENT_POINTS, _BENT_PART, _BENT_SIGMAS = 1e-3, 12, 0.7, 4.0
 _OTHER_SHAPE = "do not agree with the shape determined by the images"
 
 
@@ -61,6 +70,8 @@ class ControlShape:
         Their numbers.
     given, found : ndarray (k, 3)
         Given coordinates, and those of the free network.
+    sigma : ndarray (k,)
+        Standard deviations of the differences between both.
     limit : ndarray (k,)
         Differences that are tolerated.
     agree : ndarray of bool (k,)
@@ -69,7 +80,8 @@ class ControlShape:
     Examples
     --------
     >>> three = np.eye(3)
-    >>> shape = ControlShape(("a", "b", "c"), np.arange(3), three, three, np.ones(3), np.ones(3, dtype=bool))
+    >>> one = np.ones(3)
+    >>> shape = ControlShape(("a", "b", "c"), np.arange(3), three, three, one, 8 * one, one > 0)
     >>> shape.doubt()
     ''
     """
@@ -78,6 +90,7 @@ class ControlShape:
     points: Rows
     given: Array
     found: Array
+    sigma: Array
     limit: Array
     agree: Mask
 
@@ -89,7 +102,7 @@ class ControlShape:
         if self.agree.all():
             return ""
         names, found, given, limit = self.names, self.found, self.given, self.limit
-        exchanged = [f"{names[a]} and {names[b]}" for a, b in _exchanged(found, given, limit)]
+        exchanged = [f"{names[a]} and {names[b]}" for a, b in self._exchanged]
         if exchanged:
             return f"the coordinates of control points {', or '.join(exchanged)} look exchanged"
         if self.agree.sum() < _LEAST:
@@ -105,13 +118,53 @@ class ControlShape:
             f"contradict{'s' * (len(wrong) == 1)} the others"
         )
 
+    @cached_property
+    def _exchanged(self) -> list[tuple[int, int]]:
+        """Pairs whose exchange makes all points agree; several pairs where the control is symmetric."""
+        found, given, off = self.found, self.given, np.flatnonzero(~self.agree)
+        if len(off) > 2 and self.agree.sum() >= _LEAST:
+            return []
+        # In a symmetric figure the points that do not agree can be others than those exchanged.
+        candidates = off if self.agree.sum() >= _SYMMETRIC else np.arange(len(found))
+        pairs, every = list[tuple[int, int]](), np.ones(len(found), dtype=bool)
+        as_given = _misfits(found, given, every)
+        for a, b in combinations(candidates.tolist(), 2):
+            order = np.arange(len(found))
+            order[[a, b]] = b, a
+            misfit = _misfits(found, given[order], every)
+            # In a symmetric figure an exchange can leave the shape as it is.
+            if (misfit < self.limit).all() and np.linalg.norm(misfit) < _SMALLER * np.linalg.norm(as_given):
+                pairs.append((a, b))
+        return pairs
+
+    def bent(self) -> float:
+        """Return the deflection of a figure that is given as plane, in its unit; 0 where it is not bent.
+
+        The difference between the smallest and the largest value of a polynomial of second degree in the
+        plane, less the plane that fits it best.
+        """
+        middle = self.given.mean(axis=0)
+        _, extent, axes = np.linalg.svd(self.given - middle, full_matrices=False)
+        if len(self.given) < _BENT_POINTS or extent[2] > _PLANE * extent[1]:
+            return 0.0
+        off = (_onto(self.found, self.given, np.ones(len(self.given), dtype=bool)) - self.given) @ axes.T
+        u, v = ((self.given - middle) @ axes[:2].T / extent[0]).T
+        plane, bend = np.stack([np.ones_like(u), u, v], axis=1), np.stack([u * u, u * v, v * v], axis=1)
+        bend = bend - plane @ np.linalg.lstsq(plane, bend, rcond=None)[0]
+        deflection = bend @ np.linalg.lstsq(bend, off[:, 2], rcond=None)[0]
+        explained = float((deflection**2).sum())
+        large = explained > _BENT_SIGMAS**2 * float((self.sigma**2).sum())
+        return float(np.ptp(deflection)) if large and explained > _BENT_PART * (off**2).sum() else 0.0
+
     @property
     def as_a_whole(self) -> bool:
         """Whether the doubt is not about single points."""
-        return bool(self.agree.sum() < _LEAST) or bool(_exchanged(self.found, self.given, self.limit))
+        return bool(self.agree.sum() < _LEAST) or bool(self._exchanged)
 
 
-def control_shape(network: Network, used: Mask | None = None) -> ControlShape | None:
+def control_shape(
+    network: Network, used: Mask | None = None, fitted: Values | None = None
+) -> ControlShape | None:
     """Compare the control points with a free network.
 
     The network is adjusted without control, as a free network, and transformed to the control points by the
@@ -123,6 +176,9 @@ def control_shape(network: Network, used: Mask | None = None) -> ControlShape | 
         Network with at least four control points with three known coordinates.
     used : ndarray of bool (n,), optional
         Image points without gross errors; by default all.
+    fitted : Values, optional
+        Estimates with the control points, where there are any: the free network begins with these if they
+        are closer than its own approximate values, as they are in cameras with strong distortion.
 
     Returns
     -------
@@ -141,7 +197,7 @@ def control_shape(network: Network, used: Mask | None = None) -> ControlShape | 
     rows = np.flatnonzero(finite(network.xyz) & ~np.isnan(network.sigma).any(axis=1) & (network.rays > 1))
     if len(rows) < _LEAST:
         return None
-    fit = _free(network if used is None else network.select(used))
+    fit = _free(network if used is None else network.select(used), fitted)
     if fit is None:
         return None
     rows = rows[fit.usable.points[rows]].astype(np.intp)
@@ -151,9 +207,10 @@ def control_shape(network: Network, used: Mask | None = None) -> ControlShape | 
     extent = float(np.ptp(given, axis=0).max())
     scale = extent / max(float(np.ptp(found, axis=0).max()), 1e-300)
     trace = np.trace(fit.cofactors.points[rows], axis1=1, axis2=2) * fit.variance
-    limit = _SIGMAS * (scale * np.sqrt(trace) + network.sigma[rows].max(axis=1)) + _LOOSE * extent
+    sigma = scale * np.sqrt(trace) + network.sigma[rows].max(axis=1)
+    limit = _SIGMAS * sigma + _LOOSE * extent
     agree = _largest_agreement(found, given, limit)
-    return ControlShape(tuple(network.points[j] for j in rows), rows, given, found, limit, agree)
+    return ControlShape(tuple(network.points[j] for j in rows), rows, given, found, sigma, limit, agree)
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,7 +382,7 @@ def checked_control(
     >>> [network.points[k] for k in check.points[check.wrong]]
     ['p7']
     """
-    loose = _as_observed(problem)
+    loose = _as_observed(replace(problem, tolerance=max(problem.tolerance, _ROUGHLY)))
     points = np.flatnonzero(loose.network.observed.any(axis=1)).astype(np.intp)
     if not len(points):
         return None
@@ -487,7 +544,7 @@ def _as_observed(problem: BundleProblem) -> BundleProblem:
     return replace(problem, network=loose, weights=weights)
 
 
-def _free(network: Network) -> BundleFit | None:
+def _free(network: Network, fitted: Values | None) -> BundleFit | None:
     """Adjust the network without control; None where images alone do not suffice, or windows are on a rig."""
     if network.refraction is not None and network.refraction.on_rig.any():
         return None
@@ -499,27 +556,30 @@ def _free(network: Network) -> BundleFit | None:
         datum_points=np.ones(len(network.points), dtype=bool), distance_of=none, distance=np.zeros((0, 2)),
         stage=None, rig=None,
     )  # fmt: skip
-    start = approximate(free)
-    if not finite(start.x0).any():
+    problem = _approximate(free)
+    if fitted is not None:
+        begun = BundleProblem(free, replace(fitted, stage=None, rig=None), fitted.xyz)
+        problem = begun if problem is None else min(problem, begun, key=_typical_misfit)
+    if problem is None:
         return None
-    unknowns = Unknowns.of(free, finite(start.x0))
-    values = Values.of_cameras(unknowns, start.rotation, start.x0, start.xyz)
-    fit = BundleProblem(free, values, start.xyz, max_iterations=50, tolerance=1e-4).adjusted()
+    fit = replace(problem, max_iterations=_FREE_ITERATIONS, tolerance=_ROUGHLY).adjusted()
     return fit if isinstance(fit, BundleFit) else None
 
 
-def _exchanged(found: Array, given: Array, limit: Array) -> list[tuple[int, int]]:
-    """Return pairs whose exchange makes all points agree; several pairs where the control is symmetric."""
-    pairs, every = [], np.ones(len(found), dtype=bool)
-    as_given = _misfits(found, given, every)
-    for a, b in combinations(range(len(found)), 2):
-        order = np.arange(len(found))
-        order[[a, b]] = b, a
-        misfit = _misfits(found, given[order], every)
-        # In a symmetric figure an exchange can leave the shape as it is.
-        if (misfit < limit).all() and np.linalg.norm(misfit) < _SMALLER * np.linalg.norm(as_given):
-            pairs.append((a, b))
-    return pairs
+def _approximate(network: Network) -> BundleProblem | None:
+    """Return the problem with approximate values; None where no image can be oriented."""
+    start = approximate(network)
+    if not finite(start.x0).any():
+        return None
+    unknowns = Unknowns.of(network, finite(start.x0))
+    values = Values.of_cameras(unknowns, start.rotation, start.x0, start.xyz)
+    return BundleProblem(network, values, start.xyz)
+
+
+def _typical_misfit(problem: BundleProblem) -> float:
+    """Median of the weighted misfits at the approximate values; infinite for images without these."""
+    size = np.linalg.norm(problem.misfits_at_start(), axis=1)
+    return float(np.median(np.where(np.isfinite(size), size, np.inf)))
 
 
 def _agreeing(found: Array, given: Array, limit: Array, chosen: Mask) -> Mask:
@@ -529,16 +589,20 @@ def _agreeing(found: Array, given: Array, limit: Array, chosen: Mask) -> Mask:
 
 def _misfits(found: Array, given: Array, chosen: Mask) -> Array:
     """Distances of all points after the similarity of the chosen ones."""
+    return np.asarray(np.linalg.norm(_onto(found, given, chosen) - given, axis=1))
+
+
+def _onto(found: Array, given: Array, chosen: Mask) -> Array:
+    """Return the points after the similarity of the chosen ones."""
     nothing = np.zeros((1, 12))
     values = Values(np.zeros((0, 3, 3)), np.zeros((0, 3)), found, nothing, nothing)
-    moved = similarity_onto(values.xyz[chosen], given[chosen], scaled=True)(values).xyz
-    return np.asarray(np.linalg.norm(moved - given, axis=1))
+    return similarity_onto(values.xyz[chosen], given[chosen], scaled=True)(values).xyz
 
 
 def _largest_agreement(found: Array, given: Array, limit: Array) -> Mask:
     """Return the points that agree with the best similarity of three points."""
     best = np.zeros(len(found), dtype=bool)
-    for three in islice(combinations(range(len(found)), 3), _TRIPLES):
+    for three in _triples(len(found)):
         chosen = np.zeros(len(found), dtype=bool)
         chosen[list(three)] = True
         for _ in range(2):
@@ -549,3 +613,11 @@ def _largest_agreement(found: Array, given: Array, limit: Array) -> Mask:
         if agree.sum() > best.sum():
             best = agree
     return best
+
+
+def _triples(count: int) -> list[tuple[int, ...]]:
+    """Return triples of points: all, or where these are too many, random ones."""
+    if count * (count - 1) * (count - 2) // 6 <= _TRIPLES:
+        return list(combinations(range(count), 3))
+    rng = np.random.default_rng(0)
+    return [tuple(rng.choice(count, 3, replace=False).tolist()) for _ in range(_TRIPLES)]

@@ -396,17 +396,28 @@ def _control(
     weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
     if fit.problem.weights is not None:
         weights[:n] = np.where(np.repeat(tie, 2), fit.problem.weights[:n], weights[:n])
-    elif fit.sigma0 > _DOUBT and len(problem.observations) <= _MANY:
+    elif tie.any() and fit.sigma0 > _DOUBT and len(problem.observations) <= _MANY:
         gross = np.isin(np.arange(len(tie)), _suspects(problem))
         weights[:n] = np.where(np.repeat(tie & gross, 2), 0.0, weights[:n])
     if shape is None and len(problem.observations) <= _MANY:
-        shape = control_shape(network, np.asarray(weights[:n:2] > 0))
+        shape = control_shape(network, np.asarray(weights[:n:2] > 0), fit.values)
         rejected = np.asarray(fit.rejected[:n].reshape(-1, 2).any(axis=1))
+        deflection = 0.0 if shape is None else shape.bent()
+        if deflection:
+            return None, [Remark(_bent(deflection, network.unit), Code.DOUBTFUL_CONTROL)]
         poor = fit.sigma0 > _DOUBT or bool(_rejected_control(network, rejected))
         if poor and shape is not None and shape.as_a_whole:
             return None, [Remark(shape.doubt(), Code.DOUBTFUL_CONTROL)]
     check = checked_control(problem.with_weights(weights), fit, shape)
     return check, [] if check is None else check.remarks(network)
+
+
+def _bent(deflection: float, unit: str) -> str:
+    """What to say of a plane figure that is bent in the images."""
+    return (
+        f"the control points are given in a plane, but the images show them bent by {deflection:.2g} {unit}: "
+        "estimate their coordinates (`--datum free`), or give them standard deviations of this size"
+    )
 
 
 def _given_weights(problem: BundleProblem, fit: BundleFit) -> Array | None:
@@ -436,10 +447,10 @@ def _doubts(
     if len(problem.observations) <= _MANY:
         held = doubtful_parameters(current, fit)
         doubts += held
-        rows = _suspects(problem)
-        if of_control:
-            # Rays of control points are suspected with them.
-            rows = rows[np.isnan(problem.network.sigma[problem.network.point_of[rows]]).any(axis=1)]
+        # Rays of control points are suspected with them.
+        tie = np.isnan(problem.network.sigma).any(axis=1)[problem.network.point_of]
+        rows = _suspects(problem) if not of_control or tie.any() else np.zeros(0, dtype=np.intp)
+        rows = rows[tie[rows]] if of_control else rows
         if len(rows) and not held:
             doubts += [*grouped(problem.network, rows), _gross(problem.network, rows)]
     return doubts

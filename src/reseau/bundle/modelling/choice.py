@@ -234,13 +234,17 @@ def camera_candidates(*, pitch_known: bool) -> tuple[Candidate, ...]:
     Examples
     --------
     >>> [candidate.label for candidate in camera_candidates(pitch_known=True)][:3]
-    ['brown: no distortion', 'brown: K1', 'brown: K1 K2']
+    ['brown: no distortion', 'brown: K1', 'brown: K1 B1']
     """
+    # Brown's B1 stands for what OpenCV's cameras have two focal lengths for.
     if pitch_known:
         steps = [
             ("brown", more.split())
-            for more in ("", "K1", "K1 K2", "K1 K2 P1 P2", "K1 K2 K3 P1 P2", "K1 K2 K3 P1 P2 B1 B2")
-        ]
+            for more in (
+                "", "K1", "K1 B1", "K1 K2", "K1 K2 B1", "K1 K2 P1 P2", "K1 K2 P1 P2 B1", "K1 K2 K3 P1 P2",
+                "K1 K2 K3 P1 P2 B1 B2",
+            )
+        ]  # fmt: skip
         steps.append(("brown_higher", ["K1", "K2", "K3", "P1", "P2", "B1", "B2", "K4", "K5"]))
     else:
         radial = ("", "k1", "k1 k2", "k1 k2 p1 p2", "k1 k2 p1 p2 k3", "k1 k2 p1 p2 k3 k4 k5 k6")

@@ -16,8 +16,9 @@ from .normal import SEGMENTS, Pattern, locals_of
 
 __all__ = ["Unknowns"]
 
-# Fewer unknowns than this are factorised as a full matrix.
-_DENSE = 1500
+# A matrix of more unknowns than the first number is factorised as a band where this is narrower than the part
+# of them that follows: above many unknowns, and above few.
+_BANDS = ((1500, 1 / 4), (200, 1 / 16))
 _POINT = ("X", "Y", "Z")
 _POSE = ("dx", "dy", "dz", "X0", "Y0", "Z0")
 # With parallel rays the projection centre moves along the axes of the camera.
@@ -104,7 +105,7 @@ class Unknowns:
             ends.append(at)
         begins = np.array([0, *ends[:-1]])
         bandwidth = int(max((ends[b] - 1 - begins[a] for a, b in enumerate(reach)), default=0))
-        bands = at if at > _DENSE and 4 * bandwidth < at else 0
+        bands = at if any(at > least and bandwidth < part * at for least, part in _BANDS) else 0
         for c in np.flatnonzero(users > 1):
             camera[c] = at
             at += counts[c]
@@ -313,11 +314,15 @@ def _extra_sets(network: Network, active: Mask) -> tuple[Rows, tuple[tuple[int, 
 def _ordered(network: Network, active: Mask) -> tuple[Rows, Rows]:
     """Order the active images for a small bandwidth; return also the last neighbour of each in this order."""
     images = np.flatnonzero(active)
-    if 6 * len(images) <= _DENSE:
+    if 6 * len(images) <= min(least for least, _ in _BANDS):
         return images, np.full(len(images), len(images) - 1)
-    n = len(network.image_of)
+    # Held points, and those of distances, are not eliminated and couple no images.
+    eliminated = ~network.held.all(axis=1)
+    eliminated[network.distance_of.ravel()] = False
+    rows = np.flatnonzero(eliminated[network.point_of])
+    at = (network.image_of[rows], network.point_of[rows])
     shape = (len(network.images), len(network.points))
-    sees = scipy.sparse.csr_array((np.ones(n, np.int32), (network.image_of, network.point_of)), shape=shape)
+    sees = scipy.sparse.csr_array((np.ones(len(rows), np.int32), at), shape=shape)
     common = scipy.sparse.csr_array(sees @ sees.T)[images][:, images]
     order = scipy.sparse.csgraph.reverse_cuthill_mckee(scipy.sparse.csr_matrix(common), symmetric_mode=True)
     turned = scipy.sparse.coo_array(common[order][:, order])
