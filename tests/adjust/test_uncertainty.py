@@ -111,6 +111,53 @@ def test_monte_carlo_agrees_with_closed_forms_and_the_difference_is_told() -> No
         )  # fmt: skip
 
 
+def test_the_mass_calibration_of_supplement_1_is_drawn_until_it_is_stable() -> None:
+    """JCGM 101:2008, 9.3: u 0.0754 mg, shortest interval [1.0834, 1.3825] mg; by linear terms u 0.0539."""
+    x = np.array([100_000.0, 1.234, 1.20, 8e3, 8e3])
+    rectangular = (0.1, 1e3, 50.0)
+    u = [0.05, 0.02, *(half / np.sqrt(3.0) for half in rectangular)]
+    kinds = ("normal", "normal", "rectangular", "rectangular", "rectangular")
+    inputs = [
+        Contribution(f"x{k}", np.diag(np.eye(5)[k] * u[k] ** 2), distribution=kind)  # type: ignore[arg-type]
+        for k, kind in enumerate(kinds)
+    ]
+
+    def difference(x: np.ndarray) -> np.ndarray:
+        m, dm, air, w, r = x.T
+        return ((m + dm) * (1 + (air - 1.2) * (1 / w - 1 / r)) - 100_000.0)[:, None]
+
+    drawn = simulate(difference, x, inputs, draws=2_000_000, digits=2)
+    assert drawn.stable
+    assert drawn.draws < 2_000_000
+    # Half of a unit of the second digit of u, as asked; our interval leaves out as much below as above.
+    assert [drawn.sigma[0], drawn.high[0] - drawn.low[0]] == pytest.approx([0.0754, 0.2991], abs=5e-4)
+    assert [drawn.low[0], drawn.high[0]] == pytest.approx([1.0834, 1.3825], abs=2e-3)
+    budget = propagate(difference, x, inputs, names=("dm",), inputs=tuple("mdawr"))
+    assert budget.sigma[0] == pytest.approx(0.0539, abs=5e-5)
+    told = validate(budget, drawn, digits=2)
+    assert told.verdicts == ("not linear",)
+    # The differences of table 6.
+    assert [-told.low[0], told.high[0]] == pytest.approx([0.0451, 0.0430], abs=2e-3)
+
+
+def test_drawing_stops_when_asked_digits_are_stable_and_says_when_they_are_not() -> None:
+    pair = [Contribution("c", np.array([[2.0, 0.5], [0.5, 3.0]]))]
+    one, two = (
+        simulate(lambda x: x, np.zeros(2), pair, draws=1_500_000, digits=digits, part=part)
+        for digits, part in ((1, 1.0), (2, 0.2))
+    )
+    assert one.stable
+    assert two.stable
+    assert one.draws < two.draws < 1_500_000
+    # Half of a unit of the last digit of 1.4, 1.7 and the joint factor √χ²(2) = 2.4, and a fifth of it.
+    for found, off in ((one, 0.5), (two, 0.01)):
+        assert np.abs(found.sigma - np.sqrt([2.0, 3.0])).max() < off
+        assert found.joint_factor == pytest.approx(np.sqrt(scipy.stats.chi2.ppf(0.95, 2)), abs=off)
+    few = simulate(lambda x: x, np.zeros(2), pair, draws=20_000, digits=3)
+    assert few.stable is False
+    assert few.draws == 20_000
+
+
 def test_impossible_input_is_refused() -> None:
     def f(x: np.ndarray) -> np.ndarray:
         return x

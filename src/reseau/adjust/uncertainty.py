@@ -40,6 +40,8 @@ Model = Callable[[Array], Array]
 _BATCH = 10_000
 # Draws of a batch at least, so that the ends of its intervals are quantiles.
 _LEAST = 400
+# Fewer batches may agree by chance, and drawing would stop too early.
+_LEAST_BATCHES = 10
 _ZERO = 1e-12
 
 
@@ -278,6 +280,8 @@ class Simulated:
     joint_factor : float
         Coverage factor of the ellipsoid around the mean, of the shape of the covariance, that covers all
         results together (JCGM 102, 7.7).
+    stable : bool or None
+        Whether the numbers are stable to the digits that were asked for; None: for none.
 
     Examples
     --------
@@ -297,6 +301,7 @@ class Simulated:
     high: Array
     errors: Array
     joint_factor: float
+    stable: bool | None = None
 
 
 def simulate(
@@ -306,6 +311,8 @@ def simulate(
     *,
     probability: float = 0.95,
     draws: int = 100_000,
+    digits: int | None = None,
+    part: float = 1.0,
     seed: int = 0,
 ) -> Simulated:
     """Draw inputs from their distributions, and describe the results.
@@ -321,7 +328,13 @@ def simulate(
     probability : float
         Coverage probability.
     draws : int
-        Number of draws, at least 4000.
+        Number of draws, at least 4000; with `digits` the largest number.
+    digits : int, optional
+        Draw until the results are stable to so many significant digits of their standard uncertainties (see
+        Notes), at most `draws`.
+    part : float
+        Part of the tolerance that must be reached: 1/5 where the results are to judge those of
+        :func:`propagate` (JCGM 101, 8.2).
     seed : int
         Seed of the draws.
 
@@ -329,6 +342,14 @@ def simulate(
     ------
     UsageError
         If there are too few draws, or more than one in a hundred has no result.
+
+    Notes
+    -----
+    The adaptive procedure of JCGM 101, 7.9, and JCGM 102, 7.8: batches are drawn until twice the standard
+    errors of mean, standard deviation and both ends of the interval of every result are at most half of a
+    unit of the last digit of its standard deviation, and those of the factor of the ellipsoid and of the
+    largest eigenvalue of the correlations at most half of a unit of their own last digit. There are at least
+    ten batches, since few of them may agree by chance.
 
     Examples
     --------
@@ -343,32 +364,73 @@ def simulate(
     _check_contributions(contributions, len(x))
     if draws < 10 * _LEAST:
         raise UsageError(f"needs at least {10 * _LEAST} draws, not {draws}", where="Monte Carlo")
+    if digits is not None and not (digits >= 1 and 0 < part <= 1):
+        raise UsageError(
+            f"{digits} digits, {part:g} of the tolerance", where="Monte Carlo", do="ask for 1 or 2"
+        )
     rng = np.random.default_rng(seed)
     size = min(_BATCH, draws // 10)
-    with np.errstate(all="ignore"):  # what has no result is NaN
-        found = [model(x + _drawn(rng, contributions, size)) for _ in range(draws // size)]
-    known = [np.isfinite(each).all(axis=1) for each in found]
-    y = np.concatenate([each[ok] for each, ok in zip(found, known, strict=True)])
-    lost = len(found) * size - len(y)
-    if lost > 0.01 * len(found) * size:
-        raise UsageError(f"has no result for {lost} of {len(found) * size} draws", where="Monte Carlo")
-    ends = [(1.0 - probability) / 2, (1.0 + probability) / 2]
-    of_batches = np.array(
-        [
-            [each[ok].mean(axis=0), each[ok].std(axis=0, ddof=1), *np.quantile(each[ok], ends, axis=0)]
-            for each, ok in zip(found, known, strict=True)
-        ]
-    )
-    low, high = np.quantile(y, ends, axis=0)
+    batches: list[Array] = []
+    each: list[Array] = []
+    joint: list[Array] = []
+    stable: bool | None = None
+    while (len(batches) + 1) * size <= draws and not stable:
+        with np.errstate(all="ignore"):  # what has no result is NaN
+            y = model(x + _drawn(rng, contributions, size))
+        batches.append(y[np.isfinite(y).all(axis=1)])
+        total, known = len(batches) * size, sum(map(len, batches))
+        if total - known > 0.01 * total:
+            raise UsageError(f"has no result for {total - known} of {total} draws", where="Monte Carlo")
+        each.append(_described(batches[-1], probability))
+        if digits is not None:
+            joint.append(_joint(batches[-1], probability))
+            stable = len(batches) >= _LEAST_BATCHES and _stable(np.array(each), np.array(joint), digits, part)
+    y = np.concatenate(batches)
+    mean, sigma, low, high = _described(y, probability)
+    return Simulated(
+        len(y), total - len(y), probability, mean, sigma, np.atleast_2d(np.cov(y.T)), low, high,
+        _standard_error(np.array(each)), float(_joint(y, probability)[0]), stable,
+    )  # fmt: skip
+
+
+def _described(y: Array, probability: float) -> Array:
+    """Mean, standard deviation and ends of the interval of each result (4, m)."""
+    ends = np.quantile(y, [(1.0 - probability) / 2, (1.0 + probability) / 2], axis=0)
+    found: Array = np.stack([y.mean(axis=0), y.std(axis=0, ddof=1), *ends])
+    return found
+
+
+def _joint(y: Array, probability: float) -> Array:
+    """Factor of the ellipsoid, and the largest eigenvalue of the correlations."""
     covariance = np.atleast_2d(np.cov(y.T))
     white, _ = _whitening(covariance)
-    mean = y.mean(axis=0)
-    squares = np.square((y - mean) @ white.T).sum(axis=1)
-    errors = of_batches.std(axis=0, ddof=1) / np.sqrt(len(found))
-    return Simulated(
-        len(y), lost, probability, mean, y.std(axis=0, ddof=1), covariance, low, high,
-        errors, float(np.sqrt(np.quantile(squares, probability))),
-    )  # fmt: skip
+    squares = np.square((y - y.mean(axis=0)) @ white.T).sum(axis=1)
+    size = _sigma(covariance)
+    scale = np.where(size > 0, size, 1.0)
+    largest = np.linalg.eigvalsh(covariance / np.outer(scale, scale))[-1]
+    return np.array([np.sqrt(np.quantile(squares, probability)), largest])
+
+
+def _stable(each: Array, joint: Array, digits: int, part: float) -> bool:
+    """Whether twice the standard errors of the numbers of batches are within part of their tolerances."""
+    own = part * _tolerance(np.sqrt(np.square(each[:, 1]).mean(axis=0)), digits)
+    together = part * _tolerance(joint.mean(axis=0), digits)
+    inside = (2.0 * _standard_error(each) <= own).all()
+    # Of a single result the factor says nothing that its interval does not say.
+    return bool(inside and (each.shape[2] == 1 or (2.0 * _standard_error(joint) <= together).all()))
+
+
+def _standard_error(of_batches: Array) -> Array:
+    """Standard errors of the means of the numbers of batches."""
+    found: Array = of_batches.std(axis=0, ddof=1) / np.sqrt(len(of_batches))
+    return found
+
+
+def _tolerance(u: Array, digits: int) -> Array:
+    """Half of a unit of the last of the significant digits of u (JCGM 101, 7.9.2)."""
+    known = np.where(u > 0, u, 1.0)
+    found: Array = np.where(u > 0, 0.5 * 10.0 ** (np.floor(np.log10(known)) - digits + 1), 0.5)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -437,11 +499,9 @@ def validate(budget: UncertaintyBudget, simulated: Simulated, digits: int = 1) -
     # Where the derivatives vanish, the budget has no uncertainty to round.
     u = np.where(budget.sigma > 0, budget.sigma, simulated.sigma)
     expanded = budget.expanded(simulated.probability)
-    with np.errstate(divide="ignore"):
-        power = np.where(u > 0, np.floor(np.log10(np.where(u > 0, u, 1.0))), 0.0)
     return Validation(
         simulated.low - (budget.values - expanded), simulated.high - (budget.values + expanded),
-        0.5 * 10.0 ** (power - digits + 1), simulated.errors[2:].max(axis=0),
+        _tolerance(u, digits), simulated.errors[2:].max(axis=0),
         simulated.joint_factor - budget.joint_factor(simulated.probability),
     )  # fmt: skip
 

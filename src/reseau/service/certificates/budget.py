@@ -272,6 +272,8 @@ def simulate_measurement(
     *,
     probability: float = 0.95,
     draws: int = 10_000,
+    digits: int | None = None,
+    part: float = 1.0,
     seed: int = 0,
 ) -> Simulated:
     """Draw points and parameters, and map the points with the calibration of the drawn parameters.
@@ -280,7 +282,7 @@ def simulate_measurement(
     ----------
     uncertainty, points
         As for :func:`measurement_budget`.
-    probability, draws, seed
+    probability, draws, digits, part, seed
         As for :func:`reseau.adjust.simulate`.
 
     Raises
@@ -317,7 +319,7 @@ def simulate_measurement(
                          where="Monte Carlo", do="leave it out")  # fmt: skip
     return simulate(
         lambda rows: np.array([one(row) for row in rows]), x, contributions, probability=probability,
-        draws=draws, seed=seed,
+        draws=draws, digits=digits, part=part, seed=seed,
     )  # fmt: skip
 
 
