@@ -75,7 +75,7 @@ def define(
 def _pair(text: str) -> tuple[str, str]:
     key, equals, value = text.partition("=")
     if not equals or not key or not value:
-        raise UsageError(f"{text!r} is not KEY=VALUE", where="--part")
+        raise UsageError(f"{text!r} is not KEY=VALUE", where="option")
     return key, value
 
 
@@ -257,18 +257,30 @@ def drift(
     rate: Annotated[float, typer.Option(min=0.001, help="False alarms per year, of all charts.")] = 0.1,
     runs_per_year: Annotated[float, typer.Option(min=1, help="Number of runs in a year.")] = 52.0,
     kind: Annotated[str, typer.Option(help="Chart: cusum, ewma or shewhart.")] = "cusum",
+    covariates: Annotated[
+        Path | None,
+        typer.Option(help="Table with the columns calibration and, for example, temperature [°C]."),
+    ] = None,
     archive: ArchivePlace = "archive",
     objects: ObjectsPlace = None,
     as_json: AsJson = False,
 ) -> None:
-    """Chart all parameters and the field since the last service event; exit status 1 if one has drifted."""
+    """Chart all parameters and the field since the last service event; exit status 1 if one has drifted.
+
+    With covariates, drift that they explain is told from drift.
+    """
     from ..core.provenance import canonical_json
-    from ..service import ChartOptions
+    from ..service import ChartOptions, CovariateTable
 
     options = ChartOptions(kind=kind, rate=rate, runs_per_year=runs_per_year)  # type: ignore[arg-type]
+    table = None if covariates is None else CovariateTable.read(covariates)
     with _opened(archive, objects) as found:
-        made = found.drift(name, options)
+        made = found.drift(name, options, table)
     charts, last = made.charts, len(made.keys) - 1
+    verdicts = [
+        {"calibration": made.keys[run], "parameter": made.names[k], "verdict": verdict}
+        for run, k, verdict in (() if made.explanation is None else made.explanation.verdicts)
+    ]
     signals = [
         {
             "calibration": made.keys[run], "parameter": made.names[k],
@@ -289,6 +301,8 @@ def drift(
     if as_json:
         limits = vars(charts.limits) | {"limit": _number(charts.limits.limit)}
         content = {"runs": last + 1, "limits": limits, "charts": rows, "signals": signals}
+        if table is not None:
+            content["verdicts"] = verdicts
         say(canonical_json({"schema": "reseau-drift/1", **content}))
     else:
         say(f"{name}: {last + 1} calibrations since the last service event\n")
@@ -303,7 +317,67 @@ def drift(
         for each in signals:
             said = f"{each['direction']} of {each['parameter']}, probably from {each['since']} on"
             say(f"  {each['calibration']}: {said}\n")
-    raise typer.Exit(1 if signals else 0)
+        for each in verdicts:
+            by = f" by {', '.join(table.values)}" if table and each["verdict"] == "explained" else ""
+            say(f"  {each['calibration']}: {each['parameter']} {each['verdict']}{by}\n")
+    remains = signals if table is None else [each for each in verdicts if each["verdict"] == "drift"]
+    raise typer.Exit(1 if remains else 0)
+
+
+@app.command()
+def function(
+    name: Name,
+    covariates: Annotated[
+        Path, typer.Option(help="Table with the columns calibration and, for example, temperature [°C].")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Function to write (.json).")],
+    degree: Annotated[int, typer.Option(min=1, max=2, help="Degree of the polynomial.")] = 1,
+    archive: ArchivePlace = "archive",
+    objects: ObjectsPlace = None,
+) -> None:
+    """Fit the calibrations since the last service event as a function of covariates.
+
+    It is declined, with exit status 1, where the calibrations do not support it.
+    """
+    from ..core.failure import Failure
+    from ..service import CovariateTable, FunctionOptions
+
+    suffix_of(writable(out), (".json",))
+    table = CovariateTable.read(covariates)
+    with _opened(archive, objects) as opened:
+        found = opened.function(name, table, FunctionOptions(degree=2 if degree == 2 else 1))
+    if isinstance(found, Failure):
+        raise EstimationError(found.reason, where=name, do="collect more calibrations, or use a single one")
+    found.write(out)
+    ranges = ", ".join(f"{each.name} {each.low:g} to {each.high:g} {each.unit}" for each in found.covariates)
+    say(f"{name}: {found.runs} calibrations as a function of {ranges}, p = {found.p:.2g}\n")
+
+
+@app.command()
+def at(
+    source: Annotated[Path, typer.Argument(metavar="FUNCTION", help="reseau-calibration-function/1.")],
+    covariate: Annotated[
+        list[str],
+        typer.Option("--covariate", "-c", help="NAME=VALUE, or NAME=VALUE±SIGMA."),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Calibration to write (.json).")],
+) -> None:
+    """Write the calibration at given values of the covariates, with what their uncertainties add."""
+    from ..service import CalibrationFunction
+
+    suffix_of(writable(out), (".json",))
+    values, sigmas = {}, {}
+    for key, text in map(_pair, covariate):
+        value, sign, sigma = text.replace("+-", "±").partition("±")
+        try:
+            values[key] = float(value)
+            if sign:
+                sigmas[key] = float(sigma)
+        except ValueError:
+            raise UsageError(f"{text!r} is no value", where=key, do=f"use {key}=23.5±0.3") from None
+    found = CalibrationFunction.read(source).at(sigmas, **values)
+    found.write(out)
+    say(f"{out}: {found.name} at {', '.join(f'{key} {value:g}' for key, value in values.items())}\n")
 
 
 def _number(value: float) -> float | None:

@@ -6,7 +6,7 @@ The modules :mod:`~reseau.service.runlength`, :mod:`~reseau.service.charts` and
 
 from .alarms import Alarm, Alarms, sender
 from .charts import ChartOptions, KnownSeries, Monitored, monitor
-from .covariates import CalibrationFunction, FunctionOptions, explain, fit_function
+from .covariates import CalibrationFunction, CovariateTable, FunctionOptions, explain, fit_function
 from .inforce import Applied, Configurations, Decision, Drift
 from .recalibration import Recalibrated, Recalibration, Recalibrations
 from .recurrence import Recurrence
@@ -21,6 +21,7 @@ __all__ = [
     "CalibrationFunction",
     "ChartOptions",
     "Configurations",
+    "CovariateTable",
     "Decision",
     "Drift",
     "FunctionOptions",

@@ -8,9 +8,12 @@ data support it.
 
 from __future__ import annotations
 
+import csv
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import scipy.linalg
@@ -19,20 +22,25 @@ from pydantic import Field
 
 from ..calibration import Calibration, Covariance, Quantity
 from ..core.data import Array
-from ..core.errors import UsageError
+from ..core.errors import FormatError, UsageError
 from ..core.failure import Code, Failure
-from ..io import Document, Strict
+from ..io import Document, Strict, read_text
 from .charts import ChartOptions, Monitored, monitor
 
 __all__ = [
     "CalibrationFunction",
     "Covariate",
+    "CovariateTable",
     "Explanation",
     "FunctionOptions",
     "explain",
     "fit_function",
     "series_of",
 ]
+
+
+_OF_IMAGE = ("extent", "unit", "size")
+"""What the validity of a single calibration says about the image, and not about its adjustment."""
 
 
 @dataclass(frozen=True)
@@ -105,22 +113,33 @@ class CalibrationFunction(Document):
     scatter: tuple[tuple[float, ...], ...]
     p: float
 
-    def at(self, **values: float) -> Calibration:
+    def at(self, sigmas: Mapping[str, float] | None = None, /, **values: float) -> Calibration:
         """Return the calibration at a value of each covariate.
 
-        Its covariance is that of a single calibration at these values: of the coefficients and between
-        sessions.
+        Its covariance is that of a single calibration at these values: of the coefficients, between sessions,
+        and of the covariates. The last is also kept by itself (`covariates` of the validity), for budgets.
+
+        Parameters
+        ----------
+        sigmas : mapping of str to float, optional
+            Standard uncertainties of the values; by default they are known.
+        **values : float
+            Value of each covariate.
 
         Raises
         ------
         UsageError
-            If a covariate is missing or unknown, or a value is outside its range.
+            If a covariate is missing or unknown, a value is outside its range, or a sigma is negative.
         """
+        sigmas = sigmas or {}
         names = [each.name for each in self.covariates]
         if set(values) != set(names):
             raise UsageError(
                 f"needs {', '.join(names)}, not {', '.join(values) or 'none'}", where="calibration function"
             )
+        for name, sigma in sigmas.items():
+            if name not in names or not 0 <= sigma < np.inf:
+                raise UsageError(f"{sigma:g} of {name} is no standard uncertainty", where="covariates")
         for each in self.covariates:
             value = values[each.name]
             if not each.low <= value <= each.high:
@@ -132,6 +151,9 @@ class CalibrationFunction(Document):
         row = _terms(scaled, self.degree)[0]
         estimate = row @ np.array(self.coefficients)
         cov = np.array(self.scatter) * (1.0 + row @ np.array(self.cofactors) @ row)
+        effects = self._effects(scaled[0])
+        for each, effect in zip(self.covariates, effects, strict=True):
+            cov = cov + sigmas.get(each.name, 0.0) ** 2 * np.outer(effect, effect)
         base = Calibration.from_content(dict(self.base), where="calibration function")
         parameters = dict(base.parameters)
         for k, name in enumerate(self.names):
@@ -142,9 +164,89 @@ class CalibrationFunction(Document):
                 "parameters": parameters,
                 "covariance": Covariance(names=self.names, matrix=tuple(tuple(row) for row in cov.tolist())),
                 "sigma0": None, "redundancy": self.runs - len(row), "tests": (), "times": {},
-                "validity": base.validity | {name: float(value) for name, value in values.items()},
+                "validity": {key: base.validity[key] for key in _OF_IMAGE if key in base.validity} | {
+                    "covariates": {
+                        each.name: {
+                            "value": float(values[each.name]), "sigma": float(sigmas.get(each.name, 0.0)),
+                            "unit": each.unit, "effect": effect.tolist(),
+                        }
+                        for each, effect in zip(self.covariates, effects, strict=True)
+                    }
+                },
             }
         )  # fmt: skip
+
+    def _effects(self, scaled: Array) -> Array:
+        """Derivatives of the parameters by each covariate (q, c)."""
+        q, coefficients = len(self.covariates), np.array(self.coefficients)
+        half = np.array([(each.high - each.low) / 2 for each in self.covariates])
+        powers = [coefficients[1 + k * q : 1 + (k + 1) * q] for k in range(self.degree)]
+        slopes = [(k + 1) * scaled[:, None] ** k * each for k, each in enumerate(powers)]
+        found: Array = np.sum(slopes, axis=0) / half[:, None]
+        return found
+
+
+@dataclass(frozen=True)
+class CovariateTable:
+    """Covariates of calibrations, such as their temperatures.
+
+    Parameters
+    ----------
+    keys : tuple of str (n,)
+        Starts of the keys of the decisions on them.
+    values : mapping of str to ndarray (n,)
+        Values of each covariate.
+    units : mapping of str to str
+        Their units.
+
+    Examples
+    --------
+    >>> table = CovariateTable(("4f2a", "77b0"), {"temperature": np.array([20.1, 21.4])}, {})
+    >>> table.of("77b01c")
+    {'temperature': 21.4}
+    """
+
+    keys: tuple[str, ...]
+    values: Mapping[str, Array]
+    units: Mapping[str, str]
+
+    @classmethod
+    def read(cls, path: Path | str) -> Self:
+        """Read a table with the columns ``calibration`` and, for example, ``temperature [°C]``.
+
+        Raises
+        ------
+        FormatError
+            If it is not one.
+        """
+        rows = [row for row in csv.reader(read_text(Path(path)).splitlines()) if any(row)]
+        head = [re.fullmatch(r"\s*(\w+)\s*\[([^\]]+)\]\s*", each) for each in rows[0][1:]] if rows else []
+        if not head or rows[0][0].strip() != "calibration" or not all(head):
+            do = "begin with a line such as: calibration,temperature [°C]"
+            raise FormatError("is not a table of covariates", where=path, do=do)
+        named = [(each[1], each[2]) for each in head if each is not None]
+        values = np.full((len(rows) - 1, len(named)), np.nan)
+        for k, row in enumerate(rows[1:]):
+            try:
+                values[k] = [float(each) for each in row[1:]]
+            except ValueError:
+                raise FormatError("has no number for each covariate", where=f"{path}: line {k + 2}") from None
+        keys = tuple(row[0].strip() for row in rows[1:])
+        columns = {name: column for (name, _), column in zip(named, values.T, strict=True)}
+        return cls(keys, columns, dict(named))
+
+    def of(self, key: str) -> dict[str, float]:
+        """Values of the calibration with this key.
+
+        Raises
+        ------
+        UsageError
+            If there are none, or several.
+        """
+        rows = [k for k, each in enumerate(self.keys) if each and key.startswith(each)]
+        if len(rows) != 1 or not all(np.isfinite(each[rows[0]]) for each in self.values.values()):
+            raise UsageError(f"has {len(rows) or 'no'} lines with it", where=f"covariates: calibration {key}")
+        return {name: float(each[rows[0]]) for name, each in self.values.items()}
 
 
 def series_of(calibrations: Sequence[Calibration]) -> tuple[tuple[str, ...], Array]:

@@ -21,7 +21,17 @@ from ..archive import Archive, Entry, Journal
 from ..calibration import Calibration, CameraMapping, calibration_difference, parse_calibration
 from ..core.data import Array
 from ..core.errors import UsageError
+from ..core.failure import Failure
 from .charts import ChartOptions, Monitored, monitor
+from .covariates import (
+    CalibrationFunction,
+    CovariateTable,
+    Explanation,
+    FunctionOptions,
+    explain,
+    fit_function,
+    series_of,
+)
 from .rules import AcceptanceRules, Judgement, Outcome, judge
 
 __all__ = ["Applied", "Configurations", "Decision", "Drift", "a_time", "key_of"]
@@ -115,6 +125,8 @@ class Drift:
         Their values; of the norm the power 2/3 of the rms difference from the first calibration, px.
     charts : Monitored
         The charts.
+    explanation : Explanation, optional
+        Which signals covariates explain.
 
     Examples
     --------
@@ -126,6 +138,7 @@ class Drift:
     names: tuple[str, ...]
     values: Array
     charts: Monitored
+    explanation: Explanation | None = None
 
 
 class Configurations:
@@ -395,23 +408,26 @@ class Configurations:
                 raise UsageError("names no decision", where=f"{name}: {key!r}")
         return [parse_calibration(texts[key], where=f"calibration {key}") for key in keys]
 
-    def drift(self, name: str, options: ChartOptions | None = None) -> Drift:
+    def drift(
+        self, name: str, options: ChartOptions | None = None, covariates: CovariateTable | None = None
+    ) -> Drift:
         """Chart the parameters of the calibrations since the last service event, rejected ones left out.
+
+        Parameters
+        ----------
+        name : str
+            Configuration.
+        options : ChartOptions, optional
+            Charts and their rate of false alarms.
+        covariates : CovariateTable, optional
+            Covariates of each calibration, which may explain signals.
 
         Raises
         ------
         UsageError
             If there are none, or they have no parameter in common.
         """
-        from .covariates import series_of
-
-        events = self.events(name)
-        start = events[-1][0] if events else datetime.min.replace(tzinfo=UTC)
-        decisions = [d for d in self.history(name) if d.outcome != "rejected" and d.since >= start]
-        decisions.sort(key=lambda d: (d.since, d.at))
-        if not decisions:
-            raise UsageError("has no calibrations since its last service event", where=name)
-        calibrations = self._calibrations(name, [d.key for d in decisions])
+        keys, calibrations = self._since_event(name)
         names, values = series_of(calibrations)
         one_sided: tuple[int, ...] = ()
         if calibrations[0].kind == "camera":
@@ -419,7 +435,39 @@ class Configurations:
             names = (*names, "norm of the field")
             values = np.column_stack([values, _norms(calibrations)])
         charts = monitor(values, options, one_sided=one_sided)
-        return Drift(tuple(d.key for d in decisions), names, values, charts)
+        found = None
+        if covariates is not None:
+            z = np.array([list(covariates.of(key).values()) for key in keys])
+            found = explain(values, z, options, one_sided=one_sided)
+        return Drift(tuple(keys), names, values, charts, found)
+
+    def function(
+        self, name: str, covariates: CovariateTable, options: FunctionOptions | None = None
+    ) -> CalibrationFunction | Failure:
+        """Fit the calibrations since the last service event as a function of covariates.
+
+        See :func:`~reseau.service.fit_function`.
+
+        Raises
+        ------
+        UsageError
+            If there are none, or one has no covariates.
+        """
+        keys, calibrations = self._since_event(name)
+        rows = [covariates.of(key) for key in keys]
+        columns = {each: np.array([row[each] for row in rows]) for each in covariates.values}
+        return fit_function(calibrations, columns, covariates.units, options)
+
+    def _since_event(self, name: str) -> tuple[list[str], list[Calibration]]:
+        """Keys and calibrations since the last service event in time order, rejected ones left out."""
+        events = self.events(name)
+        start = events[-1][0] if events else datetime.min.replace(tzinfo=UTC)
+        decisions = [d for d in self.history(name) if d.outcome != "rejected" and d.since >= start]
+        decisions.sort(key=lambda d: (d.since, d.at))
+        if not decisions:
+            raise UsageError("has no calibrations since its last service event", where=name)
+        keys = [d.key for d in decisions]
+        return keys, self._calibrations(name, keys)
 
     def _journal(self, name: str) -> Journal:
         return self._archive.journal(_PREFIX + name)

@@ -117,25 +117,15 @@ def uncertainty_of(
         raise UsageError("has no estimated parameters", where=where)
     values = np.array([calibration.parameters[name].value for name in names])
     covariance = np.array(calibration.covariance.matrix, dtype=np.float64).reshape(len(names), len(names))
-    degrees = float(calibration.redundancy) if calibration.sigma0 is not None else np.inf
-    found: list[tuple[str, Contribution]] = []
+    found: _Found = []
     missing: dict[str, str] = {}
-
-    part = calibration.validity.get("covariance_of_targets")
-    targets = np.zeros_like(covariance) if part is None else np.array(part, dtype=np.float64)
-    if targets.shape != covariance.shape:
-        raise UsageError("has a damaged `covariance_of_targets`", where=where)
-    grey = Contribution("grey values", covariance - targets, degrees, group=_ADJUSTMENT)
-    found.append(("grey values", grey))
-    if part is None:
-        missing["target coordinates"] = "they were held, or estimated without observations of them"
+    if "covariates" in calibration.validity:
+        _add_function(found, missing, calibration, covariance, data)
     else:
-        found.append(
-            ("target coordinates", Contribution("target coordinates", targets, degrees, group=_ADJUSTMENT))
-        )
-    _add_temperature(found, missing, names, data)
-    _add_model(found, missing, calibration, covariance)
-    _add_reproducibility(found, missing, calibration, earlier)
+        _add_adjustment(found, missing, calibration, covariance)
+        _add_temperature(found, missing, names, data)
+        _add_model(found, missing, calibration, covariance)
+        _add_reproducibility(found, missing, calibration, earlier)
     for each in () if data is None else data.contributions:
         row = _row(each.sensitivities, names, each.name)
         cov = each.sigma**2 * np.outer(row, row)
@@ -148,6 +138,55 @@ def uncertainty_of(
 
 
 _Found = list[tuple[str, Contribution]]
+
+
+def _add_function(
+    found: _Found, missing: dict[str, str], calibration: Calibration, covariance: Array,
+    data: CertificateData | None,
+) -> None:  # fmt: skip
+    """Contributions to a calibration that a function of covariates gives: sessions, and each covariate."""
+    covariates: dict[str, dict[str, Any]] = calibration.validity["covariates"]
+    if data is not None and data.temperature is not None and data.temperature.coefficients:
+        raise UsageError(
+            "has coefficients, but the calibration is already a function of covariates", where="temperature",
+            do="state the uncertainty of the covariate with `reseau calibrations at`",
+        )  # fmt: skip
+    of_covariates: _Found = []
+    for name, each in covariates.items():
+        effect = np.array(each["effect"], dtype=np.float64)
+        if effect.shape != covariance.shape[:1]:
+            raise UsageError("has damaged `covariates`", where=f"calibration {calibration.name}")
+        cov = float(each["sigma"]) ** 2 * np.outer(effect, effect)
+        of_covariates.append((name if name in SOURCES else "other", Contribution(name, cov)))
+    rest = covariance - sum(each.covariance for _, each in of_covariates)
+    text = f"sessions about the function of {', '.join(covariates)}"
+    found.append(("reproducibility", Contribution(text, (rest + rest.T) / 2, float(calibration.redundancy))))
+    found += [each for each in of_covariates if each[1].covariance.any()]
+    for source in ("grey values", "target coordinates", "model"):
+        missing[source] = "it is part of the scatter of the sessions, as far as it differs between them"
+    if not any(source == "temperature" for source, _ in found):
+        known = "temperature" in covariates
+        missing["temperature"] = "its value is taken as known" if known else "it is not a covariate"
+
+
+def _add_adjustment(
+    found: _Found, missing: dict[str, str], calibration: Calibration, covariance: Array
+) -> None:
+    """Contributions that share the variance factor of the adjustment."""
+    where = f"calibration {calibration.name}"
+    degrees = float(calibration.redundancy) if calibration.sigma0 is not None else np.inf
+    part = calibration.validity.get("covariance_of_targets")
+    targets = np.zeros_like(covariance) if part is None else np.array(part, dtype=np.float64)
+    if targets.shape != covariance.shape:
+        raise UsageError("has a damaged `covariance_of_targets`", where=where)
+    grey = Contribution("grey values", covariance - targets, degrees, group=_ADJUSTMENT)
+    found.append(("grey values", grey))
+    if part is None:
+        missing["target coordinates"] = "they were held, or estimated without observations of them"
+    else:
+        found.append(
+            ("target coordinates", Contribution("target coordinates", targets, degrees, group=_ADJUSTMENT))
+        )
 
 
 def _add_temperature(
