@@ -448,7 +448,7 @@ def _doubts(
         held = doubtful_parameters(current, fit)
         doubts += held
         # Rays of control points are suspected with them.
-        tie = np.isnan(problem.network.sigma).any(axis=1)[problem.network.point_of]
+        tie: Mask = np.asarray(np.isnan(problem.network.sigma).any(axis=1))[problem.network.point_of]
         rows = _suspects(problem) if not of_control or tie.any() else np.zeros(0, dtype=np.intp)
         rows = rows[tie[rows]] if of_control else rows
         if len(rows) and not held:

@@ -317,7 +317,7 @@ def _ordered(network: Network, active: Mask) -> tuple[Rows, Rows]:
     if 6 * len(images) <= min(least for least, _ in _BANDS):
         return images, np.full(len(images), len(images) - 1)
     # Held points, and those of distances, are not eliminated and couple no images.
-    eliminated = ~network.held.all(axis=1)
+    eliminated: Mask = ~np.asarray(network.held.all(axis=1))
     eliminated[network.distance_of.ravel()] = False
     rows = np.flatnonzero(eliminated[network.point_of])
     at = (network.image_of[rows], network.point_of[rows])
