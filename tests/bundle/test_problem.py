@@ -483,3 +483,24 @@ def test_a_diagonal_prior_is_that_of_single_sigmas(banded: bool, monkeypatch: py
     assert single.sigma0 == pytest.approx(joint.sigma0, rel=1e-9)
     assert single.redundancy == joint.redundancy
     np.testing.assert_allclose(single.redundancy_numbers, joint.redundancy_numbers, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("control", [0, 12])
+def test_few_points_in_many_images_are_adjusted_alike_without_being_eliminated(
+    control: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = networks.world(images=40, points=30, control=control, datum="control" if control else "free")
+    network = world.noisy(3)
+    if control:
+        network = replace(network, sigma=np.where(np.isnan(network.sigma), np.nan, 1e-3))
+    kept = required(world.problem(network, **TOLERANCE))
+    monkeypatch.setattr("reseau.bundle.solver.unknowns._BANDS", ((1500, 1 / 4),))
+    eliminated = required(world.problem(network, **TOLERANCE))
+    assert (kept.unknowns.bands, eliminated.unknowns.bands) == (6 * 40, 0)
+    assert (kept.unknowns.kept >= 0).all()
+    assert (eliminated.unknowns.kept < 0).all()
+    assert kept.sigma0 == pytest.approx(eliminated.sigma0, rel=1e-9)
+    assert kept.counts == eliminated.counts
+    np.testing.assert_allclose(kept.values.xyz, eliminated.values.xyz, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(kept.cofactors.points, eliminated.cofactors.points, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(kept.redundancy_numbers, eliminated.redundancy_numbers, rtol=0, atol=1e-7)

@@ -175,7 +175,7 @@ def weak_points(linear: Linear) -> Rows:
     """Return the points with singular normal equations: all rays lie on one line."""
     v = _own_normals(linear)
     size = np.sqrt(np.diagonal(v, axis1=1, axis2=2))
-    known = (size > 0).all(axis=1) & (linear.system.pattern.eliminated == 1)
+    known = (size > 0).all(axis=1) & linear.system.unknowns.by_rays
     scaled = v / np.where(known[:, None, None], size[:, :, None] * size[:, None, :], 1.0)
     least = np.linalg.eigvalsh(scaled[known])[:, 0]
     return np.asarray(np.flatnonzero(known)[least < PARALLEL], dtype=np.intp)
@@ -270,7 +270,7 @@ def _unsteady(linear: Linear, chosen: Mask, times: float) -> Mask:
     largest = np.diagonal(v, axis1=1, axis2=2).max(axis=1)
     j, axis = np.nonzero(~movable)
     v[j, axis, axis] = largest[j]
-    rows = np.flatnonzero(chosen & movable.any(axis=1) & (linear.system.pattern.eliminated == 1))
+    rows = np.flatnonzero(chosen & movable.any(axis=1) & linear.system.unknowns.by_rays)
     size = np.zeros(len(chosen))
     size[rows] = 1.0 / np.sqrt(np.maximum(np.linalg.eigvalsh(v[rows])[:, 0], np.finfo(float).tiny))
     median = float(np.median(size[rows])) if len(rows) else 0.0

@@ -54,7 +54,8 @@ class Unknowns:
     motion : ndarray of int (m,)
         First of the six columns of velocity and rotation rates of each image, −1 for none.
     kept : ndarray of int (p,)
-        First of three columns of points that are not eliminated, −1 for the others.
+        First of three columns of points that are not eliminated, −1 for the others: those of distances, and
+        all where these are few.
     size, bands, bandwidth : int
         Number of columns, number of columns in the band, and number of subdiagonals of the band.
     """
@@ -120,7 +121,7 @@ class Unknowns:
             mount[c] = at
             at += 6
         kept = np.full(len(network.points), -1)
-        for j in np.unique(network.distance_of):
+        for j in _kept(network, active):
             kept[j] = at
             at += 3
         return cls(
@@ -254,6 +255,13 @@ class Unknowns:
         return Pattern(self.first, start, width, column, place, local, at, size, offset, eliminated)
 
     @cached_property
+    def by_rays(self) -> Mask:
+        """Points (p,) that their rays and observed coordinates determine, and no distance."""
+        chosen: Mask = ~np.asarray(self.network.held.all(axis=1))
+        chosen[self.network.distance_of.ravel()] = False
+        return chosen
+
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Name of each column for messages."""
         names = [""] * self.size
@@ -282,6 +290,24 @@ class Unknowns:
             at = self.kept[j]
             names[at : at + 3] = [f"{name} of point {self.network.points[j]}" for name in _POINT]
         return tuple(names)
+
+
+def _kept(network: Network, active: Mask) -> Rows:
+    """Return the points that are not eliminated: those of distances, or all where these are few.
+
+    To eliminate points couples all images that see them. Where there are fewer points than images, as on a
+    board, it is cheaper to have the points as unknowns below a band of single images.
+    """
+    free = np.flatnonzero(~network.held.all(axis=1) & (network.rays > 0))
+    images = int(active.sum())
+    if (
+        _BANDS[-1][0] < 6 * images
+        and 0 < len(free) <= images
+        and network.rig is None
+        and network.stage is None
+    ):
+        return np.union1d(free, network.distance_of).astype(np.intp)
+    return np.unique(network.distance_of)
 
 
 def _mounted(network: Network, active: Mask) -> Mask:
@@ -316,9 +342,9 @@ def _ordered(network: Network, active: Mask) -> tuple[Rows, Rows]:
     images = np.flatnonzero(active)
     if 6 * len(images) <= min(least for least, _ in _BANDS):
         return images, np.full(len(images), len(images) - 1)
-    # Held points, and those of distances, are not eliminated and couple no images.
+    # Points that are held or not eliminated couple no images.
     eliminated: Mask = ~np.asarray(network.held.all(axis=1))
-    eliminated[network.distance_of.ravel()] = False
+    eliminated[_kept(network, active)] = False
     rows = np.flatnonzero(eliminated[network.point_of])
     at = (network.image_of[rows], network.point_of[rows])
     shape = (len(network.images), len(network.points))
