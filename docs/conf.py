@@ -1,5 +1,6 @@
 """Sphinx: the pages of this folder and the reference of the API, built without a network by `make docs`."""
 
+import json
 import re
 import sys
 import types
@@ -94,8 +95,20 @@ def _display_math(translator: Any, node: nodes.Element) -> None:
     raise nodes.SkipNode
 
 
+def _schemas(app: Any) -> None:
+    """Write the JSON Schema of every document beside the pages."""
+    from reseau.cli.schema import documents
+
+    folder = Path(app.outdir) / "schemas"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, kind in documents().items():
+        text = json.dumps(kind.json_schema(), indent=1, ensure_ascii=False)
+        (folder / f"{name.replace('/', '-')}.json").write_text(text + "\n", "utf-8")
+
+
 def setup(app: Any) -> None:
     """Connect to Sphinx."""
     app.add_html_math_renderer("mathml", (_inline_math, None), (_display_math, None))
     app.connect("autodoc-process-docstring", _magnitudes)
     app.connect("autodoc-skip-member", _skip)
+    app.connect("builder-inited", _schemas)

@@ -37,6 +37,7 @@ from . import (
     perforations,
     refine,
     schedule,
+    schema,
     watch,
 )
 
@@ -76,6 +77,7 @@ app.command()(bundle.bundle)
 app.command("blurred")(blurred_network.blurred_network)
 app.command()(calibrate.calibrate)
 app.command()(bundle_compare.compare)
+app.command()(schema.schema)
 
 
 def _version(requested: bool) -> None:

@@ -169,6 +169,30 @@ class Document(Strict):
         """
         return cls.parse(read_text(Path(path)), where=path)
 
+    @classmethod
+    def json_schema(cls) -> dict[str, Any]:
+        """Return the JSON Schema (draft 2020-12) of the file: keys, types and limits of single values.
+
+        What depends on several values, as names that must be known, only reading the file checks.
+
+        Examples
+        --------
+        >>> class Note(Document):
+        ...     SCHEMA = "note/1"
+        ...     text: str
+        >>> Note.json_schema()["required"]
+        ['schema', 'text']
+        """
+        found = cls.model_json_schema()
+        key = {"const": cls.SCHEMA, "description": "Name and version of the format.", "type": "string"}
+        return {
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            **found,
+            "title": cls.SCHEMA,
+            "properties": {"schema": key} | found.get("properties", {}),
+            "required": ["schema", *found.get("required", ())],
+        }
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file, ``schema`` first."""
         return {"schema": self.SCHEMA} | self.model_dump(mode="json")
