@@ -144,9 +144,8 @@ def climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mas
     """
     steps, uneven = grid_steps(source), _unevenness(source)
     for _ in range(len(source)):
-        found = settled(found, source, candidates, valid)
+        found, plane = settled(found, source, candidates, valid)
         moved = [assign(source, found.field(source + step), candidates, valid, shifts=1) for step in steps]
-        plane = _homography(source, found.at)
         if plane is not None:
             moved += [
                 _projected(source, _on_plane(plane, source + step), candidates, valid) for step in steps
@@ -160,15 +159,25 @@ def climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mas
     return found
 
 
-def settled(found: Assignment, source: Array, candidates: Candidates, valid: Mask) -> Assignment:
-    """The same position of the design, with the marks that a projective mapping predicts in addition."""
+def settled(
+    found: Assignment, source: Array, candidates: Candidates, valid: Mask
+) -> tuple[Assignment, Array | None]:
+    """The same position of the design, with the marks that a projective mapping predicts in addition.
+
+    Returns
+    -------
+    found : Assignment
+        The assignment.
+    plane : ndarray (3, 3) or None
+        The projective mapping of the design to its marks; None where they do not determine one.
+    """
+    plane = _homography(source, found.at)
     for _ in range(len(source)):
-        plane = _homography(source, found.at)
         again = None if plane is None else _projected(source, _on_plane(plane, source), candidates, valid)
         if again is None or again.score <= found.score:
             break
-        found = again
-    return found
+        found, plane = again, _homography(source, again.at)
+    return found, plane
 
 
 def _is_better(other: Assignment, found: Assignment, source: Array, uneven: float, more: bool) -> bool:

@@ -174,7 +174,7 @@ def _despite_nominal(best: Placement | None, source: Array, options: PlacingOpti
     n = len(source)
     if best is None:
         return None
-    here = settled(best.assignment, source, best.candidates, best.screened.valid)
+    here, _ = settled(best.assignment, source, best.candidates, best.screened.valid)
     better = climbed(here, source, best.candidates, best.screened.valid)
     if better.score >= here.score + _BETTER * n:
         best = replace(best, assignment=better)
