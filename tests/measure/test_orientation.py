@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from scipy.special import ndtr
 
 from reseau.core.data import Array, Frame
 from reseau.core.failure import Code
@@ -103,6 +104,51 @@ def test_nominal_positions_wrong_by_one_pitch_are_noticed():
     assert np.abs(found.xy - truth.xy).max() < 0.05
     assert [note.code for note in found.notes] == [Code.DEVIATES]
     assert "wrong by about 52 px" in found.notes[0].text
+
+
+def screen_behind_wires(ends: float = 32.0) -> tuple[Frame, Array]:
+    """A bright screen behind 9 × 7 wires at 44 px, which ends `ends` pixels beyond them; and its crossings.
+
+    It shares nothing with the project's formation of images. Wires across the edge look like crossings there.
+    """
+    x, y, pitch, at = np.arange(440.0), np.arange(360.0), 44.0, np.array([46.0, 48.0])
+
+    def wires(p: Array, first: float, count: int) -> Array:
+        away = p - np.clip(np.rint((p - first) / pitch), 0, count - 1) * pitch - first
+        return np.asarray(1 - 0.94 * (ndtr((away + 1.5) / 0.9) - ndtr((away - 1.5) / 0.9)))
+
+    def screen(p: Array, first: float, count: int) -> Array:
+        last = first + (count - 1) * pitch
+        return np.asarray(ndtr((p - first + ends) / 5) * ndtr((last + ends - p) / 5))
+
+    light = screen(x, at[0], 9) * screen(y, at[1], 7)[:, None]
+    grey = 8 + 190 * light * wires(x, at[0], 9) * wires(y, at[1], 7)[:, None]
+    noisy = grey + np.random.default_rng(0).normal(0, 1.5, grey.shape)
+    crossings = at + pitch * np.stack(np.meshgrid(np.arange(9), np.arange(7)), axis=-1).reshape(-1, 2)
+    return shown(np.clip(np.rint(noisy), 0, 255)), crossings
+
+
+def test_wires_that_end_at_the_edge_of_a_screen_are_no_crossings_with_it():
+    frame, crossings = screen_behind_wires()
+    design = regular_reseau(9, 7, 10.0, Mark(shape="line-grid", size=0.7, line_width=0.7))
+    in_order = crossings[np.lexsort((crossings[:, 0], -crossings[:, 1] * np.sign(design.xy[-1, 1])))]
+    for step in ([44.0, 0.0], [0.0, -44.0]):
+        found = measure_reseau(frame, design.expected_at(in_order + step)).required()
+        away = np.hypot(*(found.xy[found.ok][:, None] - crossings).transpose(2, 0, 1)).min(axis=1)
+        assert found.found == 63
+        assert away.max() < 0.1
+        assert "wrong by about 44 px" in found.notes[0].text
+
+
+def test_names_of_a_part_of_a_regular_grid_are_said_to_be_open():
+    frame, crossings = screen_behind_wires()
+    design = regular_reseau(11, 7, 10.0, Mark(shape="line-grid", size=0.7, line_width=0.7))
+    upright = ReseauOptions(mirrored=False, max_rotation_deg=12.0)
+    found = measure_reseau(frame, design, upright).required()
+    away = np.hypot(*(found.xy[found.ok][:, None] - crossings).transpose(2, 0, 1)).min(axis=1)
+    assert found.found == 63
+    assert away.max() < 0.1
+    assert any("off by a row or column" in note.text for note in found.notes)
 
 
 @pytest.mark.slow

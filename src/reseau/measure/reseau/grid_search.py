@@ -136,9 +136,10 @@ def _supported(starts: list[Array], candidates: Candidates, usual: float, count:
 
 
 def climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mask) -> Assignment:
-    """Move the design by steps of its grid as long as that assigns more marks.
+    """Move the design by steps of its grid as long as that assigns more marks, each by its likeness.
 
-    A regular design that is shifted by one pitch finds a candidate for all marks except those of one row.
+    A regular design that is shifted by one pitch finds a candidate for all marks except those of one row;
+    where the wires of a grid end at the edge of a bright screen, it finds weak ones there.
     Beyond the marks found so far a polynomial does not follow perspective; a projective mapping does. The
     places of an uneven design tell which of two positions is right where a row at the border is not seen.
     """
@@ -150,12 +151,15 @@ def climbed(found: Assignment, source: Array, candidates: Candidates, valid: Mas
             moved += [
                 _projected(source, _on_plane(plane, source + step), candidates, valid) for step in steps
             ]
+        support = found.support(candidates.t)
         better = [
-            m for m in moved if m is not None and _is_better(m, found, source, uneven, m.score > found.score)
+            m
+            for m in moved
+            if m is not None and _is_better(m, found, source, uneven, m.support(candidates.t) > support)
         ]
         if not better:
             break
-        found = max(better, key=lambda m: m.score)
+        found = max(better, key=lambda m: m.support(candidates.t))
     return found
 
 

@@ -48,6 +48,9 @@ _BOTH_ARMS = 0.8
 """Least correlation with the formed image, corrected for noise, of a mark with arms; one alone has 0.7."""
 _ARMS = ("cross", "line-grid")
 """Shapes with arms, whose directions are estimated."""
+_FAINT, _MOST_FAINT = 0.25, 0.25
+"""Significance of a faint crossing as a share of that of the others; share of clear crossings of a wire below
+which the faint ones on it are doubted."""
 _CLEARINGS = 2
 """Rounds of excluding what lies beside marks; in the second, predictions are those of cleared neighbours."""
 _UNEASY = 1.2
@@ -514,10 +517,30 @@ class MarkMeasurement:
         why[outside] = Reason("outside the frame", Code.OUTSIDE)
         for mask, reason in self._objections(at, found, self.predicted[at]):
             why[at[mask & (why[at] == "")]] = reason
+        why[at[(why[at] == "") & self._beside_wires(at, found, why)]] = Reason(
+            "most other crossings with its wire are not seen, and it is faint", Code.UNLIKE
+        )
         xy, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
         xy[at], cov[at] = found.xy, found.cov
         deviation = self._judge_by_neighbours(at, found, xy, cov, why)
         return Verdict(xy, cov, why, deviation, self.field(self.source))
+
+    def _beside_wires(self, at: Rows, found: Matches, why: Array) -> Mask:
+        """Mask of faint crossings on a wire of which most others are not seen.
+
+        Where the light of a screen ends, wires that end there look like crossings with its edge.
+        """
+        suspect, good = np.zeros(len(at), dtype=bool), why[at] == ""
+        if self.design.mark.shape != "line-grid" or not good.any():
+            return suspect
+        faint = found.t < _FAINT * float(np.median(found.t[good]))
+        row = np.full(len(self.source), -1)
+        row[at] = np.arange(len(at))
+        for chain in (chain for family in grid_wires(self.source).marks for chain in family):
+            own = row[chain[row[chain] >= 0]]
+            if (good[own] & ~faint[own]).sum() < _MOST_FAINT * len(own):
+                suspect[own] |= faint[own]
+        return suspect
 
     def found_by_chance(self, at: Rows) -> tuple[int, int]:
         """How many of the places beside the marks `at`, where there are none, pass for marks; of how many."""

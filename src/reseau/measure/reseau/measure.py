@@ -352,6 +352,8 @@ def _open_names(source: Array, judged: Verdict, valid: Mask) -> tuple[Remark, ..
         return ()
     chosen = misfit(source, judged.xy, good)
     tree, pitch = KDTree(source), spacing(source)
+    # Where a row in the frame is not seen, the picture ends there, and another one may be missing, too.
+    missed = 2 * int((in_sight(judged.predicted, valid) & ~good).sum())
     for step in grid_steps(source):
         distance, row = tree.query(source[good] - step)
         if (distance > _SAME * pitch).any():
@@ -361,7 +363,7 @@ def _open_names(source: Array, judged: Verdict, valid: Mask) -> tuple[Remark, ..
         known: Mask = np.asarray(np.isfinite(renamed).all(axis=1))
         field = SmoothField.fit(source[known], renamed[known], local=False)
         missing = int((in_sight(field(source), valid) & ~known).sum())
-        if missing <= _ALIKE * len(source) and misfit(source, renamed, known) < chosen / _UNEVEN:
+        if missing <= missed + _ALIKE * len(source) and misfit(source, renamed, known) < chosen / _UNEVEN:
             text = (
                 f"the frame shows {int(good.sum())} of {len(source)} marks of a regular grid, and shifted by "
                 "a step they fit as well: names may be off by a row or column (give nominal "

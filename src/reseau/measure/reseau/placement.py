@@ -20,6 +20,8 @@ __all__ = ["Placement", "PlacingOptions", "place"]
 
 _BETTER = 0.05
 """Share of all marks that another position must find in addition to contradict the nominal positions."""
+_OF_ROW = 0.5
+"""The same by the likeness of the marks, as a share of a row."""
 _TRIAL_PX = (3.0, 4.5, 6.5, 10.0, 15.0, 22.0)
 """Sizes of a mark in the image that are tried if the size is unknown."""
 
@@ -176,7 +178,8 @@ def _despite_nominal(best: Placement | None, source: Array, options: PlacingOpti
         return None
     here, _ = settled(best.assignment, source, best.candidates, best.screened.valid)
     better = climbed(here, source, best.candidates, best.screened.valid)
-    if better.score >= here.score + _BETTER * n:
+    gain = better.support(best.candidates.t) - here.support(best.candidates.t)
+    if better.score >= here.score + _BETTER * n or gain >= _OF_ROW * np.sqrt(n):
         best = replace(best, assignment=better)
     off = np.hypot(*np.median(best.assignment.predicted - options.nominal, axis=0))
     if off < 0.5 * spacing(options.nominal):
