@@ -13,8 +13,9 @@ ARAVIS  := $(wildcard /usr/lib/*/girepository-1.0/Aravis-0.8.typelib)
 demo: aravis
 	$(BIN)/reseau demo --out $(OUT)
 
+# A file stays with one worker: what it computes once, and compiles, is not computed twice.
 test: lint
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
