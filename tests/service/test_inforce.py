@@ -51,6 +51,38 @@ def archive(opened: Callable[[], Archive]) -> Iterator[Archive]:
         yield made
 
 
+def opencv_camera(fx: float = 800.0, k1: float = 0.064) -> Calibration:
+    """The camera of `FIRST` in another model: fx = c / 0.01 mm, k1 = K1 c²."""
+    values = {"fx": fx, "fy": fx, "cx": 321.5, "cy": 238.5, "k1": k1}
+    sigma = {"fx": 0.02, "fy": 0.02, "cx": 0.02, "cy": 0.02, "k1": 1e-4}
+    matrix = tuple(tuple(sigma[a] ** 2 if a == b else 0.0 for b in sigma) for a in sigma)
+    return camera(name="converted").model_copy(
+        update={
+            "model": {"model": "opencv", "width": 640, "height": 480, "pitch_mm": [0.01, 0.01]},
+            "parameters": {
+                n: Quantity(value=v, sigma=sigma[n], unit="1" if n == "k1" else "px")
+                for n, v in values.items()
+            },
+            "covariance": Covariance(names=tuple(sigma), matrix=matrix),
+        }
+    )
+
+
+def test_calibrations_of_another_model_are_converted_and_the_error_is_told(archive: Archive) -> None:
+    known, _ = started(archive)
+    made = known.decide("left", opencv_camera(), RULES, since=day(7))
+    told = {each.rule: each for each in made.judgement.findings}
+    assert told["model"].text.startswith("brown in force, opencv now: converted with an error of at most")
+    assert told["model"].value < 0.01
+    assert made.outcome.startswith("accepted")
+    drift = known.drift("left")
+    assert drift.names[:5] == ("fx", "fy", "cx", "cy", "k1")
+    # The converted first calibration: c / pitch, and K1 c².
+    assert drift.values[0, 0] == pytest.approx(800.0, abs=0.05)
+    assert drift.values[0, 4] == pytest.approx(0.064, abs=1e-4)
+    assert 0 < drift.conversion_px < 0.01
+
+
 def started(archive: Archive) -> tuple[Configurations, str]:
     """A configuration with a first calibration in force."""
     known = Configurations(archive)

@@ -2,6 +2,7 @@
 
 from .camera import CameraMapping, ProjectionField, projection_field
 from .compare import FieldDifference, calibration_difference
+from .conversion import in_model_of
 from .document import Calibration, Covariance, Quantity
 from .fiducials import FiducialMapping, calibration_of_fiducials, film_axes, scan_coordinates, scan_pixels
 from .film import FilmFrameMapping, calibration_of_frame
@@ -37,6 +38,7 @@ __all__ = [
     "calibration_of_fiducials",
     "calibration_of_frame",
     "film_axes",
+    "in_model_of",
     "parse_calibration",
     "projection_field",
     "read_calibration",

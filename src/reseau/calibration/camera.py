@@ -8,6 +8,7 @@ a rotation, the derivatives J by the parameters become (I − G(GᵀG)⁻¹Gᵀ)
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
@@ -27,6 +28,7 @@ __all__ = [
     "CameraMapping",
     "ProjectionField",
     "by_rotation",
+    "options_of",
     "places",
     "projection_field",
     "referred",
@@ -35,6 +37,17 @@ __all__ = [
 
 _KEYS = ("model", "width", "height", "pitch_mm", "additional", "shutter")
 """Keys of the model in a file; the others are options of the camera model."""
+
+
+def options_of(model: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of the camera model of a calibration.
+
+    Examples
+    --------
+    >>> options_of({"model": "brown", "width": 640, "height": 480, "pitch_mm": [0.01, 0.01]})
+    {}
+    """
+    return {key: value for key, value in model.items() if key not in _KEYS}
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +161,7 @@ class CameraMapping(CalibratedMapping):
             mapping = registered.mapping(
                 np.array([values.get(name, 0.0) for name in registered.names]),
                 PixelGrid(model["width"], model["height"], (model["pitch_mm"][0], model["pitch_mm"][1])),
-                {key: value for key, value in model.items() if key not in _KEYS},
+                options_of(model),
                 more,
             )
         except (UsageError, KeyError, IndexError) as error:

@@ -300,12 +300,20 @@ def drift(
     ]  # fmt: skip
     if as_json:
         limits = vars(charts.limits) | {"limit": _number(charts.limits.limit)}
-        content = {"runs": last + 1, "limits": limits, "charts": rows, "signals": signals}
+        content = {
+            "runs": last + 1,
+            "conversion_px": made.conversion_px,
+            "limits": limits,
+            "charts": rows,
+            "signals": signals,
+        }
         if table is not None:
             content["verdicts"] = verdicts
         say(canonical_json({"schema": "reseau-drift/1", **content}))
     else:
         say(f"{name}: {last + 1} calibrations since the last service event\n")
+        if made.conversion_px:
+            say(f"  other models were converted, with errors of at most {made.conversion_px:.2g} px\n")
         for row in rows:
             wide = "" if row["width"] is None else f", {row['width']:.2f} times as wide as when learned"
             state = f"learning{wide}" if row["learning"] else "in control"

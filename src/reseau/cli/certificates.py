@@ -168,6 +168,8 @@ def create(
     for line in made.traceability:
         say(f"  {line}\n")
     say(f"  {made.conformity}\n")
+    if ".pdf" in kinds:
+        say("  written as PDF/A-3b; no validator has examined its conformance\n")
     for what, why in made.uncertainty.missing.items():
         say(f"  not included: {what}; {why}\n")
 

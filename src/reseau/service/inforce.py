@@ -18,7 +18,13 @@ from typing import Literal, cast
 import numpy as np
 
 from ..archive import Archive, Entry, Journal
-from ..calibration import Calibration, CameraMapping, calibration_difference, parse_calibration
+from ..calibration import (
+    Calibration,
+    CameraMapping,
+    calibration_difference,
+    in_model_of,
+    parse_calibration,
+)
 from ..core.data import Array
 from ..core.errors import UsageError
 from ..core.failure import Failure
@@ -127,6 +133,8 @@ class Drift:
         The charts.
     explanation : Explanation, optional
         Which signals covariates explain.
+    conversion_px : float
+        Largest error over the image of calibrations that were converted to the model of the last one.
 
     Examples
     --------
@@ -139,6 +147,7 @@ class Drift:
     values: Array
     charts: Monitored
     explanation: Explanation | None = None
+    conversion_px: float = 0.0
 
 
 class Configurations:
@@ -427,7 +436,7 @@ class Configurations:
         UsageError
             If there are none, or they have no parameter in common.
         """
-        keys, calibrations = self._since_event(name)
+        keys, calibrations, error = self._since_event(name)
         names, values = series_of(calibrations)
         one_sided: tuple[int, ...] = ()
         if calibrations[0].kind == "camera":
@@ -439,7 +448,7 @@ class Configurations:
         if covariates is not None:
             z = np.array([list(covariates.of(key).values()) for key in keys])
             found = explain(values, z, options, one_sided=one_sided)
-        return Drift(tuple(keys), names, values, charts, found)
+        return Drift(tuple(keys), names, values, charts, found, error)
 
     def function(
         self, name: str, covariates: CovariateTable, options: FunctionOptions | None = None
@@ -453,13 +462,16 @@ class Configurations:
         UsageError
             If there are none, or one has no covariates.
         """
-        keys, calibrations = self._since_event(name)
+        keys, calibrations, _ = self._since_event(name)
         rows = [covariates.of(key) for key in keys]
         columns = {each: np.array([row[each] for row in rows]) for each in covariates.values}
         return fit_function(calibrations, columns, covariates.units, options)
 
-    def _since_event(self, name: str) -> tuple[list[str], list[Calibration]]:
-        """Keys and calibrations since the last service event in time order, rejected ones left out."""
+    def _since_event(self, name: str) -> tuple[list[str], list[Calibration], float]:
+        """Keys and calibrations since the last service event in time order, rejected ones left out.
+
+        Cameras of other models are converted to that of the last one; with the largest error of it, px.
+        """
         events = self.events(name)
         start = events[-1][0] if events else datetime.min.replace(tzinfo=UTC)
         decisions = [d for d in self.history(name) if d.outcome != "rejected" and d.since >= start]
@@ -467,7 +479,13 @@ class Configurations:
         if not decisions:
             raise UsageError("has no calibrations since its last service event", where=name)
         keys = [d.key for d in decisions]
-        return keys, self._calibrations(name, keys)
+        *found, last = self._calibrations(name, keys)
+        errors = [0.0]
+        for k, each in enumerate(found):
+            if each.kind == last.kind == "camera" and each.model != last.model:
+                found[k], error = in_model_of(each, last)
+                errors.append(error)
+        return keys, [*found, last], max(errors)
 
     def _journal(self, name: str) -> Journal:
         return self._archive.journal(_PREFIX + name)

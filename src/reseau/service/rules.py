@@ -26,7 +26,7 @@ import numpy as np
 import scipy.special
 from pydantic import Field, model_validator
 
-from ..calibration import Calibration, CameraMapping, calibration_difference
+from ..calibration import Calibration, CameraMapping, calibration_difference, in_model_of
 from ..core.data import Array
 from ..core.errors import UsageError
 from ..io import Document, Strict
@@ -300,6 +300,8 @@ def judge(new: Calibration, in_force: Calibration | None, rules: AcceptanceRules
         text = "no calibration is in force to compare with"
         first = Finding(rule="in force", level="warning", value=0.0, limit=1.0, text=text)
         return _judged("needs review", [*findings, first], rules)
+    if new.kind == "camera" and new.model != in_force.model:
+        findings.append(_of_models(new, in_force, rules))
     found = difference(new, in_force)
     sizes = [_practical("image", found.greatest, found.unit, rules.image)]
     if rules.object is not None and found.by_distance is not None:
@@ -323,6 +325,19 @@ def judge(new: Calibration, in_force: Calibration | None, rules: AcceptanceRules
     else:
         outcome = "accepted" if all(each.level == "ok" for each in findings) else "accepted with warning"
     return _judged(outcome, findings, rules)
+
+
+def _of_models(new: Calibration, in_force: Calibration, rules: AcceptanceRules) -> Finding:
+    """How well the model of the new calibration describes the camera in force."""
+    names = [str(each.model.get("model")) for each in (in_force, new)]
+    try:
+        _, error = in_model_of(in_force, new)
+    except UsageError as refused:
+        text = f"{names[0]} in force, {names[1]} now: {refused}"
+        return Finding(rule="model", level="warning", value=0.0, limit=rules.image.warning, text=text)
+    level: Level = "ok" if error <= rules.image.warning else "warning"
+    text = f"{names[0]} in force, {names[1]} now: converted with an error of at most {error:.2g} px"
+    return Finding(rule="model", level=level, value=error, limit=rules.image.warning, text=text)
 
 
 def _judged(outcome: Outcome, findings: list[Finding], rules: AcceptanceRules) -> Judgement:
