@@ -268,6 +268,19 @@ def test_alarms_are_sent_once_and_repeated_until_they_are_acknowledged(
             alarms.acknowledge("something", "Ada")
 
 
+def test_calibrations_that_cannot_be_charted_together_are_an_alarm(tmp_path: Path) -> None:
+    start, day = datetime(2026, 3, 2, 8, tzinfo=UTC), timedelta(days=1)
+    with Archive.open(tmp_path / "archive", create=True) as archive:
+        known = Configurations(archive)
+        known.define("left", {"camera": "DMK 33"})
+        first = known.decide("left", camera(), CAMERA_RULES, since=start)
+        known.review("left", first.key, "accepted", comment="first")
+        other = camera(name="other")
+        update = {"covariance": other.covariance.model_copy(update={"names": (), "matrix": ()})}
+        known.decide("left", other.model_copy(update=update), CAMERA_RULES, since=start + day)
+        assert [each.key for each in Alarms(archive).open()] == ["charts left"]
+
+
 def test_alarms_that_cannot_be_delivered_are_sent_later(tmp_path: Path) -> None:
     start, day = datetime(2026, 3, 2, 8, tzinfo=UTC), timedelta(days=1)
     with Archive.open(tmp_path / "archive", create=True) as archive:

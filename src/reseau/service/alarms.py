@@ -161,7 +161,11 @@ class Alarms:
             since = events[-1][0] if events else None
             if not [d for d in history if d.outcome != "rejected" and (since is None or d.since >= since)]:
                 continue
-            drift = known.drift(name)
+            try:
+                drift = known.drift(name)
+            except UsageError as error:  # such as calibrations without a parameter in common
+                found[f"charts {name}"] = f"{name}: its drift is not monitored ({error})"
+                continue
             for run, k in zip(*drift.charts.alarm.nonzero(), strict=True):
                 direction = "increases" if drift.charts.alarm[run, k] > 0 else "decreases"
                 first = drift.keys[drift.charts.since(int(run), int(k))]

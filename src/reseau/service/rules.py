@@ -383,7 +383,7 @@ def _complete(new: Calibration, rules: AcceptanceRules) -> list[Finding]:
                 limit=rules.coverage, text=f"coverage {what}, at least {100 * rules.coverage:.0f} %",
             )
         )  # fmt: skip
-    codes = [str(code) for code in new.validity.get("warning_codes", ())]
+    codes = list(dict.fromkeys(str(code) for code in new.validity.get("warning_codes", ())))
     refused = [code for code in codes if code in rules.refused_warnings]
     if codes:
         text = f"warnings: {', '.join(codes)}"
