@@ -398,9 +398,10 @@ class PlaneMarks(ABC):
         """Match disks, grouped by window size."""
         images, reach = self._images(rows)
         beside = self._beside()
-        valid = self.screened.valid & ~self.hidden
+        # In a large frame every copy takes time.
+        valid = self.screened.valid & ~self.hidden if self.hidden.any() else self.screened.valid
         if beside is not None:
-            valid &= np.abs(beside) < _BESIDE
+            valid = valid & (beside < _BESIDE) & (beside > -_BESIDE)
         parts, found = [], []
         for part, half in self._windows(reach):
             options = MatchOptions(

@@ -49,7 +49,7 @@ strongest lines of both families."""
 _MOST_PEAKS, _MOST_LINES = 250, 48
 _SURROUNDED, _SAMPLED = 480, 500
 """Size of the frame, in pixels, from which not all are used to find the brightest surroundings; number of
-samples along its longest side from which they are more than a pixel apart on a line."""
+samples along its longest side from which they are more than two pixels apart on a line."""
 _STRIP_PX = 60_000
 """Number of pixels of the strips in which derivatives are formed."""
 _APART_PX = 5.0
@@ -295,7 +295,7 @@ def _dark_share(
     from .compiled import supported  # takes half a second to import; not every command needs it
 
     h, w = darkness.shape
-    apart = max(1, round(max(h, w) / _SAMPLED))
+    apart = max(2, round(max(h, w) / _SAMPLED))
     along = np.arange(-max(h, w) * 0.7, max(h, w) * 0.7, apart)
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     step = _STEP_PX * each
