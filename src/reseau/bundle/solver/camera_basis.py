@@ -75,9 +75,9 @@ def camera_bases(
     for c in np.flatnonzero((unknowns.camera >= 0) & (unknowns.count > 1)).tolist():
         if c in observed:
             continue
-        own = camera_of == c
-        rows = derivatives if own.all() else derivatives[own]
-        j = rows[:, :, 6 : 6 + int(unknowns.count[c])].reshape(-1, int(unknowns.count[c]))
+        own, count = camera_of == c, int(unknowns.count[c])
+        part = derivatives[:, :, 6 : 6 + count]
+        j = (part if own.all() else part[np.flatnonzero(own)]).reshape(-1, count)
         diagonal = np.einsum("ni,ni->i", j, j)
         if len(j) < j.shape[1] or not (diagonal > 0).all() or not np.isfinite(diagonal).all():
             continue
@@ -102,6 +102,6 @@ def with_bases(
     rows = derivatives.copy()
     for basis in bases:
         c = int(np.flatnonzero(unknowns.camera == basis.columns[0])[0])
-        own, part = camera_of == c, slice(6, 6 + len(basis.columns))
+        own, part = np.flatnonzero(camera_of == c), slice(6, 6 + len(basis.columns))
         rows[own, :, part] = rows[own, :, part] @ basis.turn
     return rows
