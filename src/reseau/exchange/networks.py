@@ -20,6 +20,7 @@ from .dbat import is_dbat, read_dbat
 from .libmv import is_libmv, read_libmv
 from .lines import read_head
 from .metashape import is_metashape, read_metashape
+from .micmac import is_micmac, read_micmac
 from .openptv import is_openptv, read_openptv
 from .photomodeler import read_photomodeler
 
@@ -142,7 +143,8 @@ def read_foreign(path: Path | str) -> Network:
     ----------
     path : Path or str
         Text export of PhotoModeler, BAL or Bundler file, XML or ``.psz`` of Metashape, project of DBAT,
-        problem of libmv, or folder with COLMAP's text or binary files, or with a calibration of OpenPTV.
+        problem of libmv, or folder with COLMAP's text or binary files, a calibration of OpenPTV, or
+        orientations of MicMac.
 
     Raises
     ------
@@ -162,6 +164,8 @@ def read_foreign(path: Path | str) -> Network:
     """
     path = Path(path)
     if path.is_dir():
+        if is_micmac(path):
+            return read_micmac(path)
         return read_openptv(path) if is_openptv(path) else read_colmap(path)
     if not path.exists():
         raise InputError("does not exist", where=path)
@@ -180,7 +184,8 @@ def read_foreign(path: Path | str) -> Network:
     raise FormatError(
         "is not a network of a known program",
         where=path,
-        do="use reseau-network/1, PhotoModeler, BAL, Bundler, COLMAP, Metashape, DBAT, libmv or OpenPTV",
+        do="use reseau-network/1 or a network of PhotoModeler, BAL, Bundler, COLMAP, Metashape, DBAT, libmv, "
+        "OpenPTV or MicMac",
     )
 
 

@@ -1,0 +1,255 @@
+"""MicMac's orientations with homologous points and ground control: a folder ``Ori-NAME`` of a project.
+
+``Orientation-IMAGE.xml`` has the projection centre and the rotation from the camera (x right, y down, z
+forward) to object space, and names the file of its interior orientation. Beside the folder, ``Homol*`` has
+the homologous points of pairs of images as text (``Tapioca … ExpTxt=1``: x, y in both images), and XML files
+the measured (``SetOfMesureAppuisFlottants``) and given (``DicoAppuisFlottant``) control points. An integer
+image coordinate is the centre of a pixel, as ours.
+
+The distortion (``eConvApero_DistM2C``) is added to the ideal image point, as by Brown's camera with the
+distortion on the object side; ``eConvApero_DistC2M`` is the reverse. The files say nothing of the pixel size:
+lengths are those of a sensor 36 mm wide. Coefficients beyond the fifth radial one, and a centre of distortion
+beside the principal point, are not read: the parameters are approximate values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+
+from ..bundle import Camera, Network
+from ..core.data import Array, Mask, Rows
+from ..core.errors import FormatError
+from ..io import read_text
+from ..optics import camera_model
+from ..optics.poses import matrix_to_vector
+from .lines import network_of, numbers, read_head
+from .markup import Node, read_markup
+
+__all__ = ["is_micmac", "read_micmac"]
+
+_PATTERN = "Orientation-*.xml"
+# Estimated parameters, and width of the sensor (mm), of which the files say nothing.
+_FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
+_SENSOR = 36.0
+# Powers of a length in the denominator of the coefficients.
+_POWER = {"P1": 1, "P2": 1} | {f"K{k}": 2 * k for k in range(1, 6)}
+_SIDES = {"eConvApero_DistM2C": "object", "eConvApero_DistC2M": "image"}
+
+
+def is_micmac(folder: Path) -> bool:
+    """Whether a folder has orientations of MicMac.
+
+    Examples
+    --------
+    >>> is_micmac(Path("missing"))
+    False
+    """
+    return any(folder.glob(_PATTERN))
+
+
+def read_micmac(path: Path | str) -> Network:
+    r"""Read a network from a folder of orientations, and what lies beside it.
+
+    Parameters
+    ----------
+    path : path
+        The folder ``Ori-NAME``.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be read.
+    FormatError
+        When a file is not as described, the model of the distortion is another one, or there are no image
+        points: homologous points in binary files are not read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> turn = "<L1>1 0 0</L1><L2>0 1 0</L2><L3>0 0 1</L3>"
+    >>> interior = "<PP>320 240</PP><F>800</F><SzIm>640 480</SzIm>"
+    >>> kind = "<KnownConv>eConvApero_DistM2C</KnownConv>"
+    >>> def orientation(x):
+    ...     outer = f"<Centre>{x} 0 -5</Centre><ParamRotation><CodageMatr>{turn}</CodageMatr></ParamRotation>"
+    ...     return (
+    ...         f"<ExportAPERO><OrientationConique><Interne>{kind}{interior}</Interne>"
+    ...         f"<Externe>{outer}</Externe></OrientationConique></ExportAPERO>"
+    ...     )
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     own, pair = Path(folder) / "Ori-All", Path(folder) / "Homol" / "Pastisa.tif"
+    ...     own.mkdir(), pair.mkdir(parents=True)
+    ...     _ = [(own / f"Orientation-{name}.tif.xml").write_text(orientation(x)) for name, x in ("a0", "b1")]
+    ...     _ = (pair / "b.tif.txt").write_text("320 240 160 240\n")
+    ...     network = read_micmac(own)
+    (None, None)
+    >>> network
+    <Network: 1 camera, 2 images, 1 point, 2 image points, datum free>
+    """
+    path = Path(path)
+    images, centres, turns, cameras, camera_of = [], [], [], list[Camera](), []
+    of_file = dict[str, int]()
+    for file in sorted(path.glob(_PATTERN)):
+        whole = read_markup(file).need("OrientationConique")
+        inside = whole.find("Interne")
+        where = "" if inside is None else file.name
+        if inside is None:
+            where = whole.need("FileInterne").text
+            inside = read_markup(_interior_file(path, where, file)).need("CalibrationInternConique")
+        camera = _camera(inside, Path(where).stem)
+        same = (k for k, known in enumerate(cameras) if _alike(known, camera))
+        if where not in of_file:
+            of_file[where] = next(same, len(cameras))
+            if of_file[where] == len(cameras):
+                cameras.append(camera)
+        camera_of.append(of_file[where])
+        images.append(file.name.removeprefix("Orientation-").removesuffix(".xml"))
+        outside = whole.need("Externe")
+        centres.append(outside.need("Centre").numbers(3))
+        rows = [outside.need(f"ParamRotation/CodageMatr/L{k}").numbers(3) for k in (1, 2, 3)]
+        turns.append(np.array(rows).T)
+    row_of = {name: k for k, name in enumerate(images)}
+    tied, tie_names = _homologous(path.parent, row_of)
+    measured, given = _control(path.parent, row_of)
+    names = (*given, *tie_names)
+    at = {name: k for k, name in enumerate(names)}
+    seen = [(image, at[name], x, y) for image, name, x, y in (*measured, *tied)]
+    if not seen:
+        raise FormatError(
+            "has no image points beside it", where=path,
+            do="write homologous points as text (`ExpTxt=1`) to Homol, or add the measured control points",
+        )  # fmt: skip
+    columns = np.array(seen, dtype=np.float64)
+    xyz, sigma = np.full((len(names), 3), np.nan), np.full((len(names), 3), np.nan)
+    for name, (place, spread) in given.items():
+        xyz[at[name]], sigma[at[name]] = place, spread
+    network = network_of(
+        tuple(cameras), tuple(images), np.array(camera_of, dtype=np.intp),
+        matrix_to_vector(np.array(turns)), np.array(centres), names, xyz,
+        (columns[:, 0].astype(np.intp), columns[:, 1].astype(np.intp), columns[:, 2:],
+         np.ones((len(columns), 2))),
+    )  # fmt: skip
+    known = np.isfinite(sigma).all(axis=1)
+    role = tuple("control" if one else "tie" for one in known)
+    return replace(network, sigma=sigma, role=role)
+
+
+def _interior_file(folder: Path, named: str, by: Path) -> Path:
+    """Return the file of an interior orientation: beside the orientation, or from the project."""
+    places = (folder / Path(named).name, folder.parent / named)
+    for file in places:
+        if file.exists():
+            return file
+    raise FormatError(f"names the interior orientation {named}, which is not there", where=by)
+
+
+def _camera(inside: Node, name: str) -> Camera:
+    """Brown's camera, with a pixel size for the width of a usual sensor."""
+    convention = inside.need("KnownConv").text
+    if convention not in _SIDES:
+        raise FormatError(f"has the convention {convention!r}", where=inside.where)
+    width, height = inside.need("SzIm").numbers(2).astype(int).tolist()
+    pp, focal = inside.need("PP").numbers(2), inside.value("F")
+    if not (focal > 0 and width > 0 and height > 0):
+        raise FormatError(f"has the focal length {focal:g}", where=inside.where)
+    pitch = _SENSOR / max(width, height)
+    lengths = {"c": focal, "x0": pp[0] - (width - 1) / 2, "y0": (height - 1) / 2 - pp[1]}
+    values = {name: pitch * value for name, value in lengths.items()}
+    for element in inside.all("CalibDistortion"):
+        values |= {name: value / pitch ** _POWER.get(name, 0) for name, value in _distortion(element).items()}
+    model = camera_model("brown_higher" if values.get("K4", 0.0) or values.get("K5", 0.0) else "brown")
+    more = ("K4",) if values.get("K4", 0.0) else ()
+    column, options = np.array([values.get(key, 0.0) for key in model.names]), {"side": _SIDES[convention]}
+    return Camera(name, width, height, (pitch, pitch), model.name, column, (*_FREE, *more), options)
+
+
+def _distortion(element: Node) -> dict[str, float]:
+    """Return the coefficients of a distortion, with y up."""
+    if element.find("ModNoDist") is not None:
+        return {}
+    standard = element.find("ModPhgrStd")
+    radial = element.find("ModRad") if standard is None else standard.find("RadialePart")
+    if radial is None:
+        kind = element.find("ModUnif/TypeModele")
+        raise FormatError(
+            f"has the distortion {'of another model' if kind is None else kind.text}", where=element.where,
+            do="use a radial model, or Fraser's (Tapas RadialBasic, RadialStd, FraserBasic, Fraser)",
+        )  # fmt: skip
+    values = {f"K{k}": one.value(".") for k, one in enumerate(radial.all("CoeffDist"), start=1) if k <= 5}
+    if standard is not None:
+        signs = {"P1": 1.0, "P2": -1.0, "b1": 1.0, "b2": -1.0}
+        for name, sign in signs.items():
+            values[name.upper()] = sign * standard.value(name, 0.0)
+    return values
+
+
+def _alike(one: Camera, other: Camera) -> bool:
+    """Whether two interior orientations are the same."""
+    size = (one.width, one.height, one.model) == (other.width, other.height, other.model)
+    return size and one.options == other.options and np.array_equal(one.values, other.values)
+
+
+def _homologous(
+    project: Path, row_of: Mapping[str, int]
+) -> tuple[list[tuple[int, str, float, float]], tuple[str, ...]]:
+    """Read the pairs of homologous points and join them to points: image, point, x, y."""
+    ends = list[tuple[int, float, float]]()
+    for file in sorted(project.glob("Homol*/Pastis*/*.txt")):
+        pair = (file.parent.name.removeprefix("Pastis"), file.name.removesuffix(".txt"))
+        if not all(name in row_of for name in pair):
+            continue
+        for k, line in enumerate(read_text(file).splitlines(), start=1):
+            words = line.split()
+            if words:
+                x = numbers(words[:4], 4, file, k)
+                ends += [(row_of[pair[0]], x[0], x[1]), (row_of[pair[1]], x[2], x[3])]
+    if not ends:
+        return [], ()
+    unique, place = np.unique(np.array(ends), axis=0, return_inverse=True)
+    pairs = place.reshape(-1, 2)
+    graph = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(len(unique), len(unique)))
+    count, track = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    # A point seen twice in an image joins different points by mistake.
+    ambiguous = _twice(track.astype(np.intp), unique[:, 0], count)
+    rows = np.flatnonzero(~ambiguous[track])
+    named = tuple(f"tie{t}" for t in np.flatnonzero(~ambiguous).tolist())
+    found = [(int(unique[r, 0]), f"tie{track[r]}", float(unique[r, 1]), float(unique[r, 2])) for r in rows]
+    return found, named
+
+
+def _twice(track: Rows, image: Array, count: int) -> Mask:
+    """Which points (count,) are twice in an image."""
+    pairs, times = np.unique(np.stack([track, image.astype(np.intp)], axis=1), axis=0, return_counts=True)
+    bad: Mask = np.zeros(count, dtype=np.bool_)
+    bad[pairs[times > 1, 0]] = True
+    return bad
+
+
+def _control(
+    project: Path, row_of: Mapping[str, int]
+) -> tuple[list[tuple[int, str, float, float]], dict[str, tuple[Array, Array]]]:
+    """Read measured and given control points: image, point, x, y; coordinates and standard deviations."""
+    measured, given = list[tuple[int, str, float, float]](), dict[str, tuple[Array, Array]]()
+    for file in sorted(project.glob("*.xml")):
+        head = read_head(file)
+        if b"<SetOfMesureAppuisFlottants" in head:
+            for image in read_markup(file).all("MesureAppuiFlottant1Im"):
+                row = row_of.get(image.need("NameIm").text)
+                for one in image.all("OneMesureAF1I"):
+                    if row is not None:
+                        x, y = one.need("PtIm").numbers(2).tolist()
+                        measured.append((row, one.need("NamePt").text, x, y))
+        elif b"<DicoAppuisFlottant" in head:
+            for one in read_markup(file).all("OneAppuisDAF"):
+                name, place = one.need("NamePt").text, one.need("Pt").numbers(3)
+                if name in given and not np.array_equal(given[name][0], place):
+                    raise FormatError(f"gives the point {name} again, with other coordinates", where=file)
+                given[name] = (place, one.need("Incertitude").numbers(3))
+    seen = {name for _, name, _, _ in measured}
+    nothing = np.full(3, np.nan)
+    return measured, {name: given.get(name, (nothing, nothing)) for name in sorted(seen)}
