@@ -154,6 +154,44 @@ def write_fisheye(problem: BundleProblem, path: Path) -> None:
             file.write(" ".join(map(repr, row)) + "\n")
 
 
+def rig_problem() -> BundleProblem:
+    """Three cameras fixed to each other, forty exposures of 42 points, from rough approximate values."""
+    network, rng = of_the_tests("bundle/rigs.py").drawn(1, cameras=3, exposures=40), np.random.default_rng(3)
+    network = replace(
+        network, x0=network.x0 + rng.normal(0, 2.0, network.x0.shape),
+        rotation=network.rotation + rng.normal(0, 0.005, network.rotation.shape),
+        distance_of=network.distance_of[:0], distance=network.distance[:0],
+    )  # fmt: skip
+    found = problem_of(network)[0]
+    xyz = network.xyz + rng.normal(0, 2.0, network.xyz.shape)
+    return replace(found, start=replace(found.start, xyz=xyz), rounds=99)
+
+
+def write_rig(problem: BundleProblem, path: Path) -> None:
+    """A rig for the Ceres program."""
+    network, start = problem.network, problem.start
+    rig, places = network.rig, start.rig
+    assert rig is not None
+    assert places is not None
+    camera = network.cameras[0]
+    pitch, sigma = camera.pitch_mm[0], float(np.sqrt(network.cov[0, 0, 0]))
+    photo = (network.xy - [(camera.width - 1) / 2, (camera.height - 1) / 2]) * [pitch, -pitch]
+    first = [int(np.flatnonzero((rig.exposure == e) & (rig.camera == 0))[0]) for e in np.unique(rig.exposure)]
+    vectors = of_the_tests("bundle/rigs.py").matrix_to_vector
+    interior = [[row[c.names.index("c")], row[c.names.index("K1")]] for c, row in zip(
+        network.cameras, start.cameras, strict=True)]
+    with path.open("w") as file:
+        counts = (len(network.cameras), len(first), len(network.points), len(network.xy))
+        file.write(f"{' '.join(map(str, counts))} {sigma * pitch!r}\n")
+        for rows in (
+            interior, np.hstack([vectors(places.rotation), places.base]).tolist(),
+            np.hstack([vectors(start.rotation[first]), start.x0[first]]).tolist(), start.xyz.tolist(),
+        ):  # fmt: skip
+            file.writelines(" ".join(repr(float(v)) for v in row) + "\n" for row in rows)
+        for i, j, (x, y) in zip(network.image_of, network.point_of, photo.tolist(), strict=True):
+            file.write(f"{rig.camera[i]} {rig.exposure[i]} {j} {x!r} {y!r}\n")
+
+
 def peers() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -164,12 +202,16 @@ def peers() -> None:
         write_shared(roma, folder / "roma.txt")
         wide = fisheye_problem()
         write_fisheye(wide, folder / "fisheye.txt")
-        best = wide.adjusted()
+        fixed = rig_problem()
+        write_rig(fixed, folder / "rig.txt")
+        best, least = wide.adjusted(), fixed.adjusted()
         assert isinstance(best, BundleFit)
+        assert isinstance(least, BundleFit)
         cases = (
             ("ladybug-49", "bal", DATA / "bal-ladybug-49.txt", ladybug, LADYBUG),
             ("roma", "shared", folder / "roma.txt", roma, ROMA),
             ("fisheye", "fisheye", folder / "fisheye.txt", wide, 0.5 * best.cost * (1 + 1e-6)),
+            ("rig", "rig", folder / "rig.txt", fixed, 0.5 * least.cost * (1 + 1e-6)),
         )
         for title, kind, file, problem, target in cases:
             ours(replace(problem, max_iterations=2), target)
@@ -178,7 +220,7 @@ def peers() -> None:
                 mine.append(ours(problem, target))
                 if program is not None:
                     theirs.append(peer(program, kind, file, target))
-                found = None if kind == "fisheye" else colmap(kind, file)
+                found = None if kind in ("fisheye", "rig") else colmap(kind, file)
                 if found is not None:
                     others.append(found)
             print(f"{title}: to ½Σr² ≤ {target:.8g}")

@@ -3,6 +3,7 @@
 //   bundle bal NETWORK COST      BAL file; each image has f, k1, k2 of its own
 //   bundle shared NETWORK COST   one camera c, x0, y0, K1, K2 (image side) for all, as benchmarks/bundle.py writes it
 //   bundle fisheye NETWORK COST  one camera fx, fy, cx, cy, k1 ... k4 of OpenCV's fisheye for all
+//   bundle rig NETWORK COST      cameras c, K1 (object side) fixed to each other; one pose for each exposure
 //
 // Prints: seconds until half the sum of squares is at most COST, seconds in all, final cost, iterations.
 #include <ceres/ceres.h>
@@ -67,6 +68,24 @@ struct FisheyeResidual {
   double x, y, sigma;
 };
 
+struct RigResidual {
+  RigResidual(double x, double y, double sigma) : x(x), y(y), sigma(sigma) {}
+  template <typename T>
+  bool operator()(const T* interior, const T* place, const T* pose, const T* point, T* residual) const {
+    T d[3], p[3], q[3];
+    for (int i = 0; i < 3; ++i) d[i] = point[i] - pose[3 + i];
+    ceres::AngleAxisRotatePoint(pose, d, p);
+    for (int i = 0; i < 3; ++i) p[i] -= place[3 + i];
+    ceres::AngleAxisRotatePoint(place, p, q);
+    const T xs = interior[0] * q[0] / q[2], ys = -interior[0] * q[1] / q[2];
+    const T scale = 1.0 + interior[1] * (xs * xs + ys * ys);
+    residual[0] = (xs * scale - x) / sigma;
+    residual[1] = (ys * scale - y) / sigma;
+    return true;
+  }
+  double x, y, sigma;
+};
+
 class Watch : public ceres::IterationCallback {
  public:
   explicit Watch(double target) : target(target), begun(std::chrono::steady_clock::now()) {}
@@ -83,12 +102,59 @@ class Watch : public ceres::IterationCallback {
   std::chrono::steady_clock::time_point begun;
 };
 
+// Adjusts and prints; `begun` is not included.
+void solve(ceres::Problem& problem, std::shared_ptr<ceres::ParameterBlockOrdering> ordering, double target,
+           double built) {
+  ceres::Solver::Options options;
+  options.linear_solver_type = ceres::DENSE_SCHUR;
+  options.linear_solver_ordering = ordering;
+  options.num_threads = 2;
+  options.max_num_iterations = 200;
+  options.function_tolerance = 1e-6;
+  Watch watch(target);
+  options.callbacks.push_back(&watch);
+  ceres::Solver::Summary summary;
+  ceres::Solve(options, &problem, &summary);
+  std::printf("%.6f %.6f %.10g %zu %.6f\n", watch.reached, watch.seconds(), summary.final_cost,
+              summary.iterations.size() - 1, built);
+}
+
+int rig(std::ifstream& file, double target) {
+  int cameras, exposures, points, observations;
+  double sigma;
+  file >> cameras >> exposures >> points >> observations >> sigma;
+  std::vector<double> interior(2 * cameras), place(6 * cameras), pose(6 * exposures), xyz(3 * points);
+  for (auto* column : {&interior, &place, &pose, &xyz})
+    for (double& value : *column) file >> value;
+  ceres::Problem problem;
+  auto ordering = std::make_shared<ceres::ParameterBlockOrdering>();
+  for (int k = 0; k < observations; ++k) {
+    int c, e, j;
+    double x, y;
+    file >> c >> e >> j >> x >> y;
+    problem.AddResidualBlock(
+        new ceres::AutoDiffCostFunction<RigResidual, 2, 2, 6, 6, 3>(new RigResidual(x, y, sigma)), nullptr,
+        &interior[2 * c], &place[6 * c], &pose[6 * e], &xyz[3 * j]);
+  }
+  if (!file) return 3;
+  problem.SetParameterBlockConstant(place.data());
+  for (int j = 0; j < points; ++j) ordering->AddElementToGroup(&xyz[3 * j], 0);
+  for (int e = 0; e < exposures; ++e) ordering->AddElementToGroup(&pose[6 * e], 1);
+  for (int c = 0; c < cameras; ++c) {
+    ordering->AddElementToGroup(&interior[2 * c], 1);
+    ordering->AddElementToGroup(&place[6 * c], 1);
+  }
+  solve(problem, ordering, target, 0.0);
+  return 0;
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
   if (argc != 4) return 2;
   const std::string kind = argv[1];
   std::ifstream file(argv[2]);
+  if (kind == "rig") return rig(file, std::atof(argv[3]));
   int images, points, observations;
   double pitch = 1;
   file >> images >> points >> observations;
@@ -134,17 +200,6 @@ int main(int argc, char** argv) {
   if (one) ordering->AddElementToGroup(interior.data(), 1);
   const double built = std::chrono::duration<double>(std::chrono::steady_clock::now() - begun).count();
 
-  ceres::Solver::Options options;
-  options.linear_solver_type = ceres::DENSE_SCHUR;
-  options.linear_solver_ordering = ordering;
-  options.num_threads = 2;
-  options.max_num_iterations = 200;
-  options.function_tolerance = 1e-6;
-  Watch watch(std::atof(argv[3]));
-  options.callbacks.push_back(&watch);
-  ceres::Solver::Summary summary;
-  ceres::Solve(options, &problem, &summary);
-  std::printf("%.6f %.6f %.10g %zu %.6f\n", watch.reached, watch.seconds(), summary.final_cost,
-              summary.iterations.size() - 1, built);
+  solve(problem, ordering, std::atof(argv[3]), built);
   return 0;
 }

@@ -43,7 +43,7 @@ def bundle(
         Path,
         typer.Argument(
             help="Network: reseau-network/1, a file of PhotoModeler, Metashape, BAL, Bundler or libmv, "
-            "or a folder of COLMAP or OpenPTV."
+            "or a folder of COLMAP, OpenPTV or MicMac."
         ),
     ],
     out: Out = None,

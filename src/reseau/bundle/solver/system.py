@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
+import scipy.sparse
 
 from ...adjust.stochastic import Weighting
 from ...core.data import Array, Mask, Rows
@@ -389,7 +390,9 @@ class Normal:
         linear = self.linear
         t, slopes = linear.transformation, linear.constraint_slopes
         own = slopes.T @ linear.other_misfits[len(linear.other_misfits) - len(slopes) :]
-        matrix = t.T @ full(self.sums.band, self.sums.border) @ t + slopes.T @ slopes
+        # A pose depends on one exposure and one camera: nearly all of T is zero.
+        sparse = scipy.sparse.csr_array(t)
+        matrix = sparse.T @ (sparse.T @ full(self.sums.band, self.sums.border)).T + slopes.T @ slopes
         gradient = t.T @ self.sums.reduced + own
         if held is not None:
             matrix[held], matrix[:, held] = 0.0, 0.0
