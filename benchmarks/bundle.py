@@ -178,8 +178,10 @@ def write_rig(problem: BundleProblem, path: Path) -> None:
     photo = (network.xy - [(camera.width - 1) / 2, (camera.height - 1) / 2]) * [pitch, -pitch]
     first = [int(np.flatnonzero((rig.exposure == e) & (rig.camera == 0))[0]) for e in np.unique(rig.exposure)]
     vectors = of_the_tests("bundle/rigs.py").matrix_to_vector
-    interior = [[row[c.names.index("c")], row[c.names.index("K1")]] for c, row in zip(
-        network.cameras, start.cameras, strict=True)]
+    interior = [
+        [row[c.names.index("c")], row[c.names.index("K1")]]
+        for c, row in zip(network.cameras, start.cameras, strict=True)
+    ]
     with path.open("w") as file:
         counts = (len(network.cameras), len(first), len(network.points), len(network.xy))
         file.write(f"{' '.join(map(str, counts))} {sigma * pitch!r}\n")
