@@ -58,8 +58,7 @@ class CameraEstimate(Display):
     @property
     def sigma(self) -> Array:
         """Standard deviations (u,)."""
-        sigma: Array = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        return sigma
+        return _deviations(self.covariance)
 
     @property
     def correlation(self) -> Array:
@@ -149,7 +148,7 @@ class RigEstimate(Display):
     @property
     def sigma(self) -> Array:
         """Standard deviations (k, 6) of rotation (rad) and base."""
-        return np.asarray(np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2)))
+        return _deviations(self.cov)
 
     @property
     def length(self) -> Array:
@@ -269,8 +268,7 @@ class MotionEstimates(Display):
     @property
     def sigma(self) -> Array:
         """Standard deviations (k, 6)."""
-        sigma: Array = np.sqrt(np.maximum(np.diagonal(self.cov, axis1=1, axis2=2), 0.0))
-        return sigma
+        return _deviations(self.cov)
 
     def _facts(self) -> list[tuple[str, str]]:
         return [
@@ -326,8 +324,7 @@ class ImageEstimates(Display):
     @property
     def sigma(self) -> Array:
         """Standard deviations (m, 6) of X0, Y0, Z0 and of the rotation vector."""
-        sigma: Array = np.sqrt(np.maximum(np.diagonal(self.cov, axis1=1, axis2=2), 0.0))
-        return sigma
+        return _deviations(self.cov)
 
     def _facts(self) -> list[tuple[str, str]]:
         return [
@@ -385,8 +382,7 @@ class PointEstimates(Display):
     @property
     def sigma(self) -> Array:
         """Standard deviations (p, 3)."""
-        sigma: Array = np.sqrt(np.maximum(np.diagonal(self.cov, axis1=1, axis2=2), 0.0))
-        return sigma
+        return _deviations(self.cov)
 
     def _facts(self) -> list[tuple[str, str]]:
         return [
@@ -399,6 +395,12 @@ class PointEstimates(Display):
         for k, name in enumerate("XYZ"):
             found |= {name: self.xyz[:, k].tolist(), f"sigma_{name}": self.sigma[:, k].tolist()}
         return found | {"rays": self.rays.tolist()}
+
+
+def _deviations(cov: Array) -> Array:
+    """Return the standard deviations (…, k) of covariances (…, k, k)."""
+    deviations: Array = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
+    return deviations
 
 
 def _median(sigma: Array, unit: str) -> str:
