@@ -321,9 +321,12 @@ def _usual_reason(measured: Mapping[str, BlurredResult]) -> str:
     return why.most_common(1)[0][0] if why else "no ray to it passes the lens"
 
 
-def _too_few(failure: Failure, measured: Mapping[str, BlurredResult]) -> Failure:
+def _too_few(failure: Failure, measured: Mapping[str, BlurredResult], left_out: int) -> Failure:
     """Say first that targets were not measured, where the rest cannot be adjusted."""
     missed = sum(int((~found.ok).sum()) for found in measured.values())
+    if not missed:
+        text = f"{left_out} image points to which no ray passes the lens are left out; {failure.reason}"
+        return replace(failure, reason=text)
     text = (
         f"{missed} of {sum(len(found.ok) for found in measured.values())} targets were not measured by rays, "
         f"most often: {_usual_reason(measured)}; what is left: {failure.reason}"
@@ -423,7 +426,7 @@ class _Run:
         start = replace(network, xy=xy, cov=cov).select(~declined)
         result = adjust_network(start, self.options.bundle)
         if isinstance(result, Failure):
-            return _too_few(result, measured) if declined.any() else result
+            return _too_few(result, measured, int(declined.sum())) if declined.any() else result
         return BlurredRound(
             result, measured, replaced & ~declined, ~replaced & ~declined, declined, float(shift.mean())
         )

@@ -28,7 +28,7 @@ __all__ = ["BlockSolution", "Cofactors", "cofactors_of", "inverse_from_rows"]
 # Smallest pivot of the normal equations with unit diagonal that is not rounding.
 _RANK = 1e-14
 # Allowed deviation of the trace of the cofactors of the adjusted observations from the number of unknowns.
-_EXACT, _INEXACT = 1e-7, 1e-6
+_EXACT, _INEXACT = 1e-7, 1e-4
 # The same with a stage: frontal images make the normal equations lose half of their digits.
 _STAGED = 1e-3
 # Largest number of entries of F; up to this, its decomposition takes about a second.
