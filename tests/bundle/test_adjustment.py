@@ -210,3 +210,18 @@ def test_swapped_names_in_an_image_are_left_out() -> None:
     xy[rows] = xy[rows[::-1]]
     result = required(adjust_network(replace(network, xy=xy), Options(outliers="reject")))
     assert set(rows.tolist()) <= set(np.flatnonzero(result.rejected).tolist())
+
+
+@pytest.mark.parametrize("sigma", [2.0, 20.0, 200.0])
+def test_highly_correlated_distortion_has_covariances_and_is_not_called_singular(sigma: float) -> None:
+    """All coefficients of a rational distortion: their normal equations lose most of their digits."""
+    free = ("fx", "fy", "k1", "k2", "k3", "k4", "k5", "k6")
+    camera = networks.camera("opencv", free, sigma=dict.fromkeys(free[2:], sigma))
+    camera = replace(camera, values=np.array([800.0, 800.0, 319.5, 239.5, -0.1, 0.02, *6 * [0.0]]))
+    world = networks.world(images=3, points=20, control=6, cameras=(camera,), sigma_px=0.003)
+    result = required(adjust_network(world.noisy(0)))
+    tie = np.array([role == "tie" for role in world.network.role])
+    off, cov = (result.points.xyz - world.xyz)[tie], result.points.cov[tie]
+    normalised = np.einsum("pi,pij,pj->p", off, np.linalg.inv(cov), off).mean() / 3
+    assert 0.7 < normalised < 1.3
+    assert 1.3e-5 < np.sqrt(np.trace(cov, axis1=1, axis2=2) / 3).mean() < 1.6e-5
