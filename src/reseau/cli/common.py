@@ -232,8 +232,9 @@ def probability(p: float) -> str:
 
 
 def say(text: str) -> None:
-    """Write to standard output."""
+    """Write to standard output, at once: what a daemon says is wanted while it runs."""
     sys.stdout.write(text)
+    sys.stdout.flush()
 
 
 @contextmanager

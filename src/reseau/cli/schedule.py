@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -118,13 +119,15 @@ def run_(
     objects: ObjectsPlace = None,
 ) -> None:
     """Carry out the runs that are due: as a daemon, or --once from cron or a timer of systemd."""
-    from ..service import Alarms, Recalibrations, Schedules, sender
-
-    deliver = None if not to else sender(to)
     over = threading.Event()
     if not once:
         for each in (signal.SIGTERM, signal.SIGINT):
             signal.signal(each, lambda *_: over.set())
+    from ..service import Alarms, Recalibrations, Schedules, sender
+
+    deliver = None if not to else sender(to)
+    if not once:
+        say(f"looking at the schedules of {archive} every {every:g} s; Ctrl-C ends this\n")
     failed = False
     while True:
         try:
@@ -138,7 +141,11 @@ def run_(
             if once:
                 raise
             typer.echo(f"reseau: {error}", err=True)
-        if once or over.wait(every):
+        # A signal that the system delivers to another thread does not end a long wait.
+        until = time.monotonic() + every
+        while not (once or over.wait(0.1)) and time.monotonic() < until:
+            pass
+        if once or over.is_set():
             break
     raise typer.Exit(1 if once and failed else 0)
 
