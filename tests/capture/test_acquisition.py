@@ -76,7 +76,8 @@ def test_a_plan_stores_frames_verdicts_documents_and_results(rig: FieldRig, sess
 def test_the_precision_after_the_next_pose_is_predicted(rig: FieldRig, session: Session) -> None:
     run = rig.acquisition(session, rig.procedure())
     carry_out(run, plans.poses(run, FEW))
-    (predicted,) = [facts for kind, facts in rig.events if kind == "outlook"]
+    # From two frames on there is a calibration, from which little can be predicted; the last is from most.
+    predicted = [facts for kind, facts in rig.events if kind == "outlook"][-1]
     (came,) = [f for kind, f in rig.events if kind == "precision" and f["step"] == predicted["step"]]
     assert abs(predicted["sigma_c"] / came["sigma_c"] - 1) < 0.1
 
