@@ -15,46 +15,25 @@ if TYPE_CHECKING:
 
 __all__ = ["documents", "schema"]
 
-_WHERE = {
-    "bundle.document": ("ResultDocument",),
-    "calibration.document": ("Calibration",),
-    "capture.bench": ("BenchFile",),
-    "io.board": ("BoardDesign",),
-    "io.design": ("ReseauDesign",),
-    "io.fiducials": ("FiducialDesign", "FiducialOrientation"),
-    "io.frame": ("FrameCorners", "FrameOrientation", "RollSummary"),
-    "io.lens": ("LensDocument",),
-    "io.measurement": ("ReseauMeasurement",),
-    "io.network": ("Network1",),
-    "io.refraction": ("RefractionFile",),
-    "io.targets": ("SpaceTargets",),
-    "io.testfield": ("TestfieldDesign",),
-    "service.certificates.data": ("CertificateData",),
-    "service.covariates": ("CalibrationFunction",),
-    "service.recalibration": ("Recalibration",),
-    "service.rules": ("AcceptanceRules", "Judgement"),
-    "service.schedule": ("Schedule",),
-    "sessions.parameters": (
-        "BlurredParameters",
-        "FramesParameters",
-        "OscilloscopeParameters",
-        "OwnParameters",
-        "ScanParameters",
-        "SensorParameters",
-        "SessionParameters",
-        "TestfieldParameters",
-    ),
-}
-"""Modules of the project, and their documents."""
+_MODULES = (
+    "bundle.document", "calibration.document", "capture.bench", "io.board", "io.design", "io.fiducials",
+    "io.frame", "io.lens", "io.measurement", "io.network", "io.refraction", "io.targets", "io.testfield",
+    "service.certificates.data", "service.covariates", "service.recalibration", "service.rules",
+    "service.schedule", "sessions.parameters",
+)  # fmt: skip
+"""Modules of the project that define documents."""
 
 
 def documents() -> dict[str, type[Document]]:
     """Every kind of document by the name of its schema, in the order of the names."""
+    from ..io.document import Document
+
     found = {}
-    for module, names in _WHERE.items():
-        for name in names:
-            kind = getattr(import_module(f"reseau.{module}"), name)
-            found[kind.SCHEMA] = kind
+    for name in _MODULES:
+        module = import_module(f"reseau.{name}")
+        for kind in vars(module).values():
+            if isinstance(kind, type) and issubclass(kind, Document) and kind.__module__ == module.__name__:
+                found[kind.SCHEMA] = kind
     return dict(sorted(found.items()))
 
 

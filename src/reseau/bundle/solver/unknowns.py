@@ -85,7 +85,8 @@ class Unknowns:
         sets = [network.cameras[c].additional for c, _ in extra_names]
         free_extra: Mask = np.array([a is not None and a.free for a in sets], dtype=np.bool_)
         widths = [0 if a is None else len(a.names) for a in sets]
-        order, reach = _ordered(network, active)
+        few = _kept(network, active)
+        order, reach = _ordered(network, active, few)
         m = len(network.images)
         pose, camera, motion = np.full(m, -1), np.full(len(users), -1), np.full(m, -1)
         moving: Mask = np.asarray(network.motion_free.any(axis=1))
@@ -121,7 +122,7 @@ class Unknowns:
             mount[c] = at
             at += 6
         kept = np.full(len(network.points), -1)
-        for j in _kept(network, active):
+        for j in few:
             kept[j] = at
             at += 3
         return cls(
@@ -337,14 +338,14 @@ def _extra_sets(network: Network, active: Mask) -> tuple[Rows, tuple[tuple[int, 
     return rows, tuple(sets)
 
 
-def _ordered(network: Network, active: Mask) -> tuple[Rows, Rows]:
+def _ordered(network: Network, active: Mask, kept: Rows) -> tuple[Rows, Rows]:
     """Order the active images for a small bandwidth; return also the last neighbour of each in this order."""
     images = np.flatnonzero(active)
     if 6 * len(images) <= min(least for least, _ in _BANDS):
         return images, np.full(len(images), len(images) - 1)
     # Points that are held or not eliminated couple no images.
     eliminated: Mask = ~np.asarray(network.held.all(axis=1))
-    eliminated[_kept(network, active)] = False
+    eliminated[kept] = False
     rows = np.flatnonzero(eliminated[network.point_of])
     at = (network.image_of[rows], network.point_of[rows])
     shape = (len(network.images), len(network.points))

@@ -140,19 +140,19 @@ def ridge_points(grey: NDArray[np.float32], noise: float, sigma: float = 1.0) ->
     bell /= bell.sum()
     slope, bend = offset / sigma**2 * bell, (offset**2 / sigma**4 - 1 / sigma**2) * bell
     least = _SIGNIFICANT * noise * float(np.sqrt((bend**2).sum() * (bell**2).sum()))
+    kernels = [
+        (x.astype(np.float32), y.astype(np.float32))
+        for x, y in ((bend, bell), (bell, bend), (slope, slope), (slope, bell), (bell, slope))
+    ]
     found = []
     # Strips of rows whose derivatives fit into a cache: those of a large frame would take long to allocate.
     high = max(4 * reach, _STRIP_PX // grey.shape[1])
     for first in range(0, len(grey), high):
-        begin, end = max(first - reach, 0), min(first + high + reach, len(grey))
-        inner = slice(first - begin, first - begin + high)
-
-        def filtered(x: Array, y: Array, strip: NDArray[Any], inner: slice) -> NDArray[Any]:
-            smooth = cv2.sepFilter2D(strip, cv2.CV_32F, x.astype(np.float32), y.astype(np.float32))
-            return np.asarray(smooth)[inner]
-
-        kernels = (bend, bell), (bell, bend), (slope, slope), (slope, bell), (bell, slope)
-        xx, yy, xy, along, down = (filtered(x, y, grey[begin:end], inner) for x, y in kernels)
+        begin = max(first - reach, 0)
+        strip, inner = grey[begin : first + high + reach], slice(first - begin, first - begin + high)
+        xx, yy, xy, along, down = (
+            np.asarray(cv2.sepFilter2D(strip, cv2.CV_32F, x, y))[inner] for x, y in kernels
+        )
         points, normal = compiled_ridges(xx, yy, xy, along, down, least)
         points[:, 1] += first
         found.append((points, normal))
