@@ -176,7 +176,7 @@ class Archive:
         ArchiveError
             If there is none.
         """
-        with schema.connected(self._engine) as connection:
+        with schema.connected(self._engine, reading=True) as connection:
             row = connection.execute(
                 sa.select(schema.sessions).where(schema.sessions.c.name == name)
             ).one_or_none()
@@ -184,8 +184,20 @@ class Archive:
             raise ArchiveError("is not a session of this archive", where=name, do="see `reseau archive list`")
         return Session(self._engine, self.objects, row._asdict(), self.clock)
 
-    def sessions(self) -> list[SessionSummary]:
-        """Return a summary of each session, in the order in which they were begun."""
+    def sessions(
+        self, *, last: int | None = None, before: str | None = None, like: str = ""
+    ) -> list[SessionSummary]:
+        """Return a summary of each session, in the order in which they were begun.
+
+        Parameters
+        ----------
+        last : int, optional
+            Only this many, the latest ones.
+        before : str, optional
+            Only those that were begun before the session of this name.
+        like : str
+            Only those whose names or plans contain this text.
+        """
         s = schema.sessions.c
 
         def count(table: sa.Table, *where: sa.ColumnElement[bool]) -> sa.ScalarSelect[int]:
@@ -199,9 +211,18 @@ class Archive:
             .scalar_subquery()
         )
         taken = count(schema.frames, schema.frames.c.kind != INPUT)
-        query = sa.select(s.name, s.plan, s.begun, taken, count(schema.results), ended).order_by(s.id)
-        with schema.connected(self._engine) as connection:
-            rows = connection.execute(query).all()
+        query = sa.select(s.name, s.plan, s.begun, taken, count(schema.results), ended)
+        if before is not None:
+            query = query.where(s.id < sa.select(s.id).where(s.name == before).scalar_subquery())
+        if like:
+            query = query.where(
+                s.name.contains(like, autoescape=True) | s.plan.contains(like, autoescape=True)
+            )
+        query = query.order_by(s.id) if last is None else query.order_by(s.id.desc()).limit(last)
+        with schema.connected(self._engine, reading=True) as connection:
+            rows = list(connection.execute(query).all())
+        if last is not None:
+            rows.reverse()
         return [
             SessionSummary(name, plan, utc(begun), frames, results, status or "not ended")
             for name, plan, begun, frames, results, status in rows
@@ -215,6 +236,22 @@ class Archive:
         """Return the names of the journals that start with `prefix`, without it, oldest first."""
         return journals(self._engine, prefix)
 
+    def heads(self) -> dict[str, int]:
+        """Return the number of the last row of each table: something was stored if one has changed."""
+        with schema.connected(self._engine, reading=True) as connection:
+            tables = [t for t in schema.metadata.sorted_tables if t is not schema.entries]
+            if schema.extended(connection):
+                tables.append(schema.entries)
+            return {t.name: connection.scalar(sa.select(sa.func.max(t.c.id))) or 0 for t in tables}
+
+    def extend(self) -> bool:
+        """Add the tables that archives of earlier versions lack; return whether any was missing."""
+        with schema.connected(self._engine, reading=True) as connection:
+            there = schema.extended(connection)
+        if not there:
+            schema.extend(self._engine)
+        return not there
+
     def faults(self) -> list[str]:
         """Return the faults that the database finds in the index."""
         return schema.faults(self._engine)
@@ -222,7 +259,7 @@ class Archive:
     def files(self) -> list[tuple[str, str, int, str]]:
         """Return SHA-256, suffix, size and name of every file in the index."""
         found = []
-        with schema.connected(self._engine) as connection:
+        with schema.connected(self._engine, reading=True) as connection:
             for table, label in (
                 (schema.frames, schema.frames.c.step + "/" + schema.frames.c.kind),
                 (schema.results, schema.results.c.name),

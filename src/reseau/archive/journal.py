@@ -128,18 +128,28 @@ class Journal:
         """Return the entries in the order in which they were appended, of one kind or all."""
         e = schema.entries.c
         query = sa.select(e.id, e.key, e.kind, e.document, e.at).where(e.journal == self.name).order_by(e.id)
-        with schema.connected(self._engine) as connection:
+        with schema.connected(self._engine, reading=True) as connection:
             if not schema.extended(connection):
                 return []
             rows = connection.execute(query if kind is None else query.where(e.kind == kind)).all()
         return [Entry(*row[:4], at=utc(row[4])) for row in rows]
+
+    def last(self) -> Entry | None:
+        """Return the last entry, or None."""
+        e = schema.entries.c
+        query = sa.select(e.id, e.key, e.kind, e.document, e.at).where(e.journal == self.name)
+        with schema.connected(self._engine, reading=True) as connection:
+            if not schema.extended(connection):
+                return None
+            row = connection.execute(query.order_by(e.id.desc()).limit(1)).one_or_none()
+        return None if row is None else Entry(*row[:4], at=utc(row[4]))
 
 
 def journals(engine: Engine, prefix: str) -> list[str]:
     """Names of the journals that start with `prefix`, without it, in the order of their first entries."""
     e = schema.entries.c
     query = sa.select(e.journal).where(e.journal.startswith(prefix, autoescape=True)).group_by(e.journal)
-    with schema.connected(engine) as connection:
+    with schema.connected(engine, reading=True) as connection:
         if not schema.extended(connection):
             return []
         found = connection.scalars(query.order_by(sa.func.min(e.id)))

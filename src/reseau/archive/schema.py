@@ -253,15 +253,27 @@ def _sqlite(path: Path, read_only: bool) -> Engine:
 
     @sa.event.listens_for(engine, "begin")
     def _begin(connection: sa.Connection) -> None:
-        # A writer waits for the lock at the start; in the middle of a transaction it cannot wait.
-        connection.exec_driver_sql("BEGIN" if read_only else "BEGIN IMMEDIATE")
+        # A writer waits for the lock at the start; in the middle of a transaction it cannot wait. Readers
+        # take no lock: a service that reads does not hold up an acquisition.
+        reading = read_only or connection.get_execution_options().get(_READING, False)
+        connection.exec_driver_sql("BEGIN" if reading else "BEGIN IMMEDIATE")
 
     return engine
 
 
+_READING = "reseau_reading"
+
+
 @contextmanager
-def connected(engine: Engine) -> Iterator[sa.Connection]:
+def connected(engine: Engine, *, reading: bool = False) -> Iterator[sa.Connection]:
     """Run a transaction; errors of the database become errors of the archive.
+
+    Parameters
+    ----------
+    engine : Engine
+        The index.
+    reading : bool
+        Whether it only reads.
 
     Raises
     ------
@@ -269,7 +281,7 @@ def connected(engine: Engine) -> Iterator[sa.Connection]:
         If the database cannot be reached, or is damaged, full or read-only.
     """
     try:
-        with engine.begin() as connection:
+        with engine.execution_options(**{_READING: reading}).begin() as connection:
             yield connection
     except (DBAPIError, PoolTimeout, JSONDecodeError) as error:
         what = f"error of the index ({_brief(error)})"

@@ -145,7 +145,7 @@ class Session:
 
     def recover(self) -> list[ArchivedFrame]:
         """Enter frames into the index whose process was killed after writing the file."""
-        with schema.connected(self._engine) as connection:
+        with schema.connected(self._engine, reading=True) as connection:
             known = set(connection.scalars(sa.select(schema.frames.c.sha256)))
         found = []
         for sha256, suffix in self.objects.names():
@@ -173,7 +173,7 @@ class Session:
             .where(f.session_id == self._id, *where)
             .order_by(f.id)
         )
-        with schema.connected(self._engine) as connection:
+        with schema.connected(self._engine, reading=True) as connection:
             rows = connection.execute(query).all()
         return [
             ArchivedFrame(*row[:9], verdict=None if row[9] is None else Verdict(*row[9:])) for row in rows
@@ -275,7 +275,7 @@ class Session:
         """Return the results in the order in which they were stored."""
         r, i = schema.results.c, schema.inputs.c
         columns = (r.id, r.name, r.sha256, r.suffix, r.size, r.parameters, r.software)
-        with schema.connected(self._engine) as connection:
+        with schema.connected(self._engine, reading=True) as connection:
             query = sa.select(*columns).where(r.session_id == self._id).order_by(r.id)
             rows = connection.execute(query).all()
             roles = connection.execute(
@@ -324,7 +324,7 @@ class Session:
         """Yield kind and document of the events, in order."""
         e = schema.events.c
         query = sa.select(e.kind, e.document).where(e.session_id == self._id).order_by(e.id)
-        with schema.connected(self._engine) as connection:
+        with schema.connected(self._engine, reading=True) as connection:
             rows = connection.execute(query if kind is None else query.where(e.kind == kind)).all()
         yield from ((row[0], row[1]) for row in rows)
 
@@ -339,5 +339,5 @@ class Session:
         """Last status: done, stopped or failed; or `not ended`."""
         e = schema.ends.c
         query = sa.select(e.status).where(e.session_id == self._id).order_by(e.id.desc()).limit(1)
-        with schema.connected(self._engine) as connection:
+        with schema.connected(self._engine, reading=True) as connection:
             return connection.scalar(query) or "not ended"

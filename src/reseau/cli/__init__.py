@@ -38,6 +38,7 @@ from . import (
     refine,
     schedule,
     schema,
+    serve,
     watch,
 )
 
@@ -62,6 +63,9 @@ capture.app.command()(capture_sensor.sensor)
 capture.app.command()(capture_own.own)
 app.add_typer(capture.app, name="capture")
 app.command()(watch.watch)
+app.command()(serve.serve)
+app.add_typer(serve.app, name="service")
+app.add_typer(serve.audit_app, name="audit")
 app.add_typer(archive.app, name="archive")
 app.add_typer(calibrations.app, name="calibrations")
 app.command()(schedule.recalibrate)

@@ -1,0 +1,155 @@
+"""Answers of the API: the form of all answers, of errors, and of pages of a list."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, RedirectResponse, Response
+from pydantic import BaseModel, ConfigDict
+from starlette.exceptions import HTTPException
+
+from ...core.errors import (
+    ArchiveError,
+    EstimationError,
+    InputError,
+    InstrumentError,
+    ReseauError,
+    UsageError,
+)
+from ..accounts import RefusedLogin
+from .access import Forbidden, NotFound, Unknown
+from .guard import log
+
+__all__ = ["Answer", "Done", "ErrorAnswer", "add_error_handlers", "refusals"]
+
+
+class Answer(BaseModel):
+    """Base of answers."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Done(Answer):
+    """Something was done."""
+
+    done: str
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"done": "revoked"}})
+
+
+class ErrorDetail(Answer):
+    """What is wrong, where, and what to do."""
+
+    code: str
+    text: str
+    what: str
+    where: str | None
+    do: str | None
+
+
+class ErrorAnswer(Answer):
+    """An error; the text is one line for people, the code is for programs."""
+
+    error: ErrorDetail
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "example": {
+                "error": {
+                    "code": "not_found", "text": "monday: is not a session of this archive",
+                    "what": "is not a session of this archive", "where": "monday", "do": None,
+                }
+            }
+        },
+    )  # fmt: skip
+
+
+_STATUS: tuple[tuple[type[ReseauError], int, str], ...] = (
+    (Unknown, 401, "unknown"),
+    (Forbidden, 403, "forbidden"),
+    (NotFound, 404, "not_found"),
+    (RefusedLogin, 401, "refused_login"),
+    (UsageError, 422, "usage"),
+    (InputError, 422, "input"),
+    (EstimationError, 409, "estimation"),
+    (InstrumentError, 409, "instrument"),
+    (ArchiveError, 503, "archive"),
+)
+_ABOUT = {
+    400: "The request is not HTTP as expected",
+    401: "Without a token or login, or with one that has ended",
+    403: "Not allowed: name, origin, missing X-CSRF-Token, or scope",
+    404: "There is no such thing",
+    409: "The state does not allow it: an instrument, or an estimate that failed",
+    413: "Too large",
+    422: "A parameter or the content cannot be used",
+    429: "Too many requests",
+    503: "The archive cannot be used now",
+}
+
+
+def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return the documentation of the errors of an operation."""
+    return {each: {"model": ErrorAnswer, "description": _ABOUT[each]} for each in statuses}
+
+
+def add_error_handlers(app: FastAPI, page: Callable[[Request, int, str], Response]) -> None:
+    """Make errors answers, and those of pages pages.
+
+    Parameters
+    ----------
+    app : FastAPI
+        The application.
+    page : callable
+        Renders a page that says what is wrong.
+    """
+
+    def shown(request: Request, status: int, text: str) -> Response:
+        if status == 401:
+            target = request.url.path if request.method == "GET" else "/"
+            return RedirectResponse(f"/login?next={target}", 303)
+        return page(request, status, text)
+
+    @app.exception_handler(ReseauError)
+    def known(request: Request, error: ReseauError) -> Response:
+        status, code = next(((s, c) for kind, s, c in _STATUS if isinstance(error, kind)), (500, "error"))
+        headers = {}
+        if isinstance(error, RefusedLogin) and error.wait_s:
+            status, code, headers["Retry-After"] = 429, "wait", f"{error.wait_s:.0f}"
+        if status == 401:
+            headers["WWW-Authenticate"] = "Bearer"
+        where = None if error.where is None else str(error.where)
+        if not request.url.path.startswith("/api/") and status in (401, 403, 404):
+            return shown(request, status, str(error))
+        return _error(status, code, str(error), error.what, where, error.do, headers)
+
+    @app.exception_handler(RequestValidationError)
+    def invalid(request: Request, error: RequestValidationError) -> Response:
+        first = error.errors()[0]
+        where = ".".join(str(each) for each in first["loc"] if each not in ("body", "query", "path"))
+        return _error(422, "usage", f"{where}: {first['msg']}", first["msg"], where or None, None, {})
+
+    @app.exception_handler(HTTPException)
+    def http(request: Request, error: HTTPException) -> Response:
+        text = str(error.detail)
+        if not request.url.path.startswith("/api/") and error.status_code == 404:
+            return shown(request, 404, text)
+        code = {404: "not_found", 405: "method"}.get(error.status_code, "request")
+        return _error(error.status_code, code, text, text, None, None, dict(error.headers or {}))
+
+    @app.exception_handler(Exception)
+    def unexpected(request: Request, error: Exception) -> Response:
+        log("error", path=request.url.path, kind=type(error).__name__, request=request.state.request)
+        text = f"the service failed; its log has more under {request.state.request}"
+        return _error(500, "error", text, text, None, None, {})
+
+
+def _error(
+    status: int, code: str, text: str, what: str, where: str | None, do: str | None, headers: dict[str, str]
+) -> JSONResponse:
+    detail = ErrorDetail(code=code, text=text, what=what, where=where, do=do)
+    return JSONResponse(ErrorAnswer(error=detail).model_dump(), status, headers)

@@ -1,0 +1,136 @@
+"""The application: routes under one guard, and the server that carries it."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import uvicorn
+from fastapi import FastAPI
+
+from ...core.errors import UsageError
+from ...core.version import __version__
+from . import accounts, operations, pages
+from .answers import add_error_handlers
+from .guard import Guard, log
+from .options import ServeOptions
+from .service import Service
+
+__all__ = ["create_app", "serve"]
+
+API = "/api/1"
+_ABOUT = """Acquisition and calibration of measuring cameras and imaging instruments.
+
+Requests need `Authorization: Bearer TOKEN`, or the cookie of a login, with `X-CSRF-Token` to change anything.
+Scopes: `read`; `operate` (move, acquire, upload); `administer` (decide on calibrations, accounts)."""
+_SECURITY = {"token": {"type": "http", "scheme": "bearer"}}
+
+
+def create_app(service: Service) -> Any:
+    """Return the ASGI application of a service.
+
+    Parameters
+    ----------
+    service : Service
+        The service, which is entered already.
+    """
+    app = FastAPI(
+        title="reseau", version=__version__, description=_ABOUT, openapi_url=f"{API}/openapi.json",
+        docs_url=None, redoc_url=None, redirect_slashes=False,
+    )  # fmt: skip
+    app.state.service = service
+    add_error_handlers(app, pages.rendered_error)
+    for each in (operations.open_router, operations.router, accounts.router):
+        app.include_router(each, prefix=API)
+    app.include_router(pages.router)
+    plain = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        document = plain()
+        document.setdefault("components", {})["securitySchemes"] = _SECURITY
+        document["security"] = [{"token": []}]
+        return document
+
+    app.openapi = openapi  # type: ignore[method-assign]
+    return Guard(app, service.options, service.meters)
+
+
+def serve(options: ServeOptions, said: Callable[[str], None], ready: Callable[[Service], None]) -> None:
+    """Serve until a signal ends it.
+
+    Parameters
+    ----------
+    options : ServeOptions
+        Its options.
+    said : callable
+        Takes lines for the console.
+    ready : callable
+        Called with the service when it answers.
+
+    Raises
+    ------
+    UsageError
+        If the address cannot be used.
+    ReseauError
+        As :class:`Service`.
+    """
+    import dataclasses
+
+    sock = _bound(options)
+    options = dataclasses.replace(options, port=sock.getsockname()[1])
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    logger = logging.getLogger("reseau.service")
+    logger.handlers, logger.propagate = [handler], False
+    logger.setLevel(logging.INFO)
+    with sock, Service(options) as service:
+        config = uvicorn.Config(
+            create_app(service), log_config=None, access_log=False, server_header=False, date_header=True,
+            proxy_headers=bool(options.proxy), ssl_certfile=options.certificate, ssl_keyfile=options.key,
+            timeout_keep_alive=15, timeout_graceful_shutdown=3, limit_concurrency=1000, lifespan="off",
+        )  # fmt: skip
+        server = _Server(config, service, ready)
+        log("started", port=options.port, archive=service.archive.place)
+        for origin in sorted(options.origins)[:1]:
+            said(f"{origin}/  (Ctrl-C ends)")
+        # uvicorn raises the signal that ended it again; it has done its work then.
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: None)
+        server.run(sockets=[sock])
+        log("ended")
+
+
+class _Server(uvicorn.Server):
+    """Says when it is ready, and ends the streams of events before it ends."""
+
+    def __init__(self, config: uvicorn.Config, service: Service, ready: Callable[[Service], None]) -> None:
+        super().__init__(config)
+        self._service, self._ready = service, ready
+
+    async def startup(self, sockets: list[Any] | None = None) -> None:
+        await super().startup(sockets)
+        self._ready(self._service)
+
+    async def shutdown(self, sockets: list[Any] | None = None) -> None:
+        self._service.events.close()
+        await super().shutdown(sockets)
+
+
+def _bound(options: ServeOptions) -> Any:
+    import socket
+
+    family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
+    sock = socket.socket(family, socket.SOCK_STREAM)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        sock.bind((options.host, options.port))
+        sock.listen(512)
+    except OSError as error:
+        sock.close()
+        raise UsageError(
+            f"cannot be used ({error.strerror})", where=f"{options.host}:{options.port}"
+        ) from None
+    return sock

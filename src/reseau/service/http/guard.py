@@ -1,0 +1,201 @@
+"""What every request passes first: names and origins that are allowed, sizes, headers, counters and the log.
+
+A request for another name than ours comes from a page whose site lets its name resolve to this machine (DNS
+rebinding); a request with another origin comes from a page of another site. Both are refused before anything
+else is looked at, also where a browser would send a cookie.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import secrets
+import time
+from collections.abc import Awaitable, Callable, MutableMapping
+from datetime import UTC, datetime
+from typing import Any
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from starlette.exceptions import HTTPException
+
+from .options import ServeOptions
+
+__all__ = ["Guard", "Meters", "log"]
+
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+
+_LOG = logging.getLogger("reseau.service")
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+    "manifest-src 'self'; frame-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+_HEADERS = {
+    b"content-security-policy": _POLICY.encode(),
+    b"x-content-type-options": b"nosniff",
+    b"x-frame-options": b"DENY",
+    b"referrer-policy": b"no-referrer",
+    b"cross-origin-opener-policy": b"same-origin",
+    b"cross-origin-resource-policy": b"same-origin",
+    b"permissions-policy": b"camera=(), microphone=(), geolocation=(), payment=(), usb=()",
+    b"cache-control": b"no-store",
+}
+_STRICT = b"max-age=31536000"
+SMALL_BODY, LARGE_BODY = 1 << 20, 1 << 30
+"""Largest body of a request, and of an upload (bytes)."""
+UPLOADS = "/api/1/uploads"
+
+
+class Meters:
+    """Counters of the service, for Prometheus.
+
+    Examples
+    --------
+    >>> Meters().registry.get_sample_value("reseau_event_clients")
+    0.0
+    """
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        named = ("method", "route", "status")
+        self.requests = Counter("reseau_requests", "Requests.", named, registry=self.registry)
+        bounds = (0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.5, 1.0, 2.5, 10.0)
+        self.seconds = Histogram(
+            "reseau_request_seconds", "Time to answer.", ("route",), buckets=bounds, registry=self.registry
+        )
+        self.refused = Counter(
+            "reseau_refused", "Requests refused before they were looked at.", ("why",), registry=self.registry
+        )
+        self.clients = Gauge("reseau_event_clients", "Open streams of events.", registry=self.registry)
+        self.events = Counter("reseau_events", "Events.", ("kind",), registry=self.registry)
+        self.logins = Counter("reseau_logins", "Logins.", ("outcome",), registry=self.registry)
+        self.workers = Gauge(
+            "reseau_worker_up", "Whether the worker of a bench answers.", ("bench",), registry=self.registry
+        )
+        self.restarts = Counter(
+            "reseau_worker_restarts", "Restarts of workers.", ("bench",), registry=self.registry
+        )
+        self.alarms = Gauge("reseau_alarms_open", "Open alarms.", registry=self.registry)
+
+
+def log(event: str, **facts: Any) -> None:
+    """Write a line of JSON to the log; facts must not contain secrets.
+
+    Examples
+    --------
+    >>> log("started", port=8480)
+    """
+    at = datetime.now(UTC).isoformat(timespec="milliseconds")
+    _LOG.info(json.dumps({"at": at, "event": event, **facts}, default=str))
+
+
+class Guard:
+    """An ASGI application around another one.
+
+    Parameters
+    ----------
+    app : callable
+        The application.
+    options : ServeOptions
+        Names and origins.
+    meters : Meters
+        Counters.
+
+    Examples
+    --------
+    >>> Guard(None, ServeOptions("archive"), Meters()).refusal({"host": "evil.example:8480"}, "GET")
+    'the name in the request is not one of this service'
+    """
+
+    def __init__(self, app: Any, options: ServeOptions, meters: Meters) -> None:
+        self.app, self._options, self._meters = app, options, meters
+
+    def refusal(self, headers: MutableMapping[str, str], method: str) -> str:
+        """Return why a request is refused; empty if it is not."""
+        if headers.get("host", "").lower() not in self._options.hosts:
+            return "the name in the request is not one of this service"
+        origin = headers.get("origin")
+        if origin is not None and origin.lower() not in self._options.origins:
+            return "the request comes from a page of another site"
+        site, mode = headers.get("sec-fetch-site", "none"), headers.get("sec-fetch-mode", "navigate")
+        # A link from another site may lead here; nothing else of it may.
+        if site in ("cross-site", "same-site") and not (mode == "navigate" and method == "GET"):
+            return "the request comes from a page of another site"
+        return ""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+        if scope["type"] == "lifespan":
+            await self.app(scope, receive, send)
+            return
+        if scope["type"] != "http":  # there are no WebSockets
+            await receive()
+            await send({"type": "websocket.close", "code": 1008})
+            return
+        headers = {k.decode("latin-1"): v.decode("latin-1") for k, v in scope["headers"]}
+        hosts = [v for k, v in scope["headers"] if k == b"host"]
+        request, begun = secrets.token_hex(4), time.perf_counter()
+        scope.setdefault("state", {})["request"] = request
+        status = 0
+
+        async def answer(message: MutableMapping[str, Any]) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                there = {k.lower() for k, _ in message["headers"]}
+                message["headers"] = [
+                    *message["headers"],
+                    *((k, v) for k, v in _HEADERS.items() if k not in there),
+                    (b"x-request-id", request.encode()),
+                ]
+                if self._options.encrypted:
+                    message["headers"].append((b"strict-transport-security", _STRICT))
+            await send(message)
+
+        refusal = self.refusal(headers, scope["method"]) or ("" if len(hosts) == 1 else "several names")
+        limit = LARGE_BODY if scope["path"] == UPLOADS else SMALL_BODY
+        length = headers.get("content-length", "0")
+        if refusal:
+            self._meters.refused.labels(refusal.partition(" ")[0]).inc()
+            await _plain(answer, 403, refusal)
+        elif not length.isdigit() or int(length) > limit:
+            await _plain(answer, 413, "the request is too large")
+        else:
+            await self.app(scope, _limited(receive, limit), answer)
+        spent = time.perf_counter() - begun
+        route = getattr(scope.get("route"), "path", "other")
+        self._meters.requests.labels(scope["method"][:8], route, str(status)).inc()
+        if not route.endswith("/events"):
+            self._meters.seconds.labels(route).observe(spent)
+        state, client = scope["state"], scope.get("client") or ("", 0)
+        log(
+            "request", request=request, method=scope["method"], path=scope["path"], status=status,
+            ms=round(1e3 * spent, 1), who=state.get("who", ""), address=client[0],
+            session=scope.get("path_params", {}).get("session", ""),
+            **({"refused": refusal} if refusal else {}),
+        )  # fmt: skip
+
+
+def _limited(receive: Receive, limit: int) -> Receive:
+    """Receive at most so many bytes, also where the length was not announced."""
+    total = 0
+
+    async def received() -> MutableMapping[str, Any]:
+        nonlocal total
+        message = await receive()
+        total += len(message.get("body", b""))
+        if total > limit:
+            raise HTTPException(413, "the request is too large")
+        return message
+
+    return received
+
+
+async def _plain(send: Send, status: int, text: str) -> None:
+    body = json.dumps(
+        {"error": {"code": "refused", "text": text, "what": text, "where": None, "do": None}}
+    ).encode()
+    headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})

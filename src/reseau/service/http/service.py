@@ -1,0 +1,130 @@
+"""What the routes share: archive, accounts, audit log, events, and the watch over what others store."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cached_property
+from typing import Any
+
+from ...archive import Archive
+from ...core.errors import ReseauError, UsageError
+from ..accounts import Accounts, Principal
+from ..audit import Audit
+from ..state import StateFolder
+from .events import Events
+from .guard import Meters, log
+from .options import ServeOptions
+
+__all__ = ["Service"]
+
+_LOOK_S, _ENTRY_S = 0.3, 600.0
+
+
+class Service:
+    """One service over one archive.
+
+    Parameters
+    ----------
+    options : ServeOptions
+        Its options.
+
+    Raises
+    ------
+    ArchiveError
+        If archive or accounts cannot be used.
+    UsageError
+        If it is open to others and there are no users.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder, Service(ServeOptions(f"{folder}/archive")) as service:
+    ...     service.archive.sessions()
+    []
+    """
+
+    def __init__(self, options: ServeOptions) -> None:
+        self.options = options
+        self.state = StateFolder.beside(options.archive, options.state)
+        self.accounts = Accounts(options.accounts or self.state.path("accounts.sqlite"))
+        if options.open_to_others and not self.accounts.users():
+            self.accounts.close()
+            do = f"reseau service user add NAME --scope administer --state {self.state.folder}"
+            raise UsageError("is open to others, but has no users", where="service", do=do)
+        self.archive = Archive.open(options.archive, options.objects, create=True)
+        self.audit = Audit(self.archive, self.state)
+        self.events, self.meters = Events(), Meters()
+        self.meters.clients.set_function(lambda: self.events.clients)
+        self.started = time.time()
+        self._entries: dict[str, float] = {}
+        self._over = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, name="archive", daemon=True)
+        self.failing = ""
+
+    def __enter__(self) -> Service:
+        self._watcher.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self.events.close()
+        self._watcher.join(2.0)
+        self.accounts.close()
+        self.archive.close()
+
+    @cached_property
+    def cookie(self) -> str:
+        """Name of the cookie; services on other ports of a machine have others."""
+        return f"reseau-{self.options.port}"
+
+    def entry_code(self) -> str:
+        """Return a code that lets a browser of this machine in, once, within ten minutes."""
+        code = secrets.token_urlsafe(24)
+        self._entries[code] = time.monotonic() + _ENTRY_S
+        return code
+
+    def enter(self, code: str) -> str | None:
+        """Return the cookie for an entry code; None if it was used or is too old."""
+        until = self._entries.pop(code, 0.0)
+        return self.accounts.begin_login("local", "administer") if time.monotonic() < until else None
+
+    @contextmanager
+    def audited(
+        self, who: Principal, action: str, about: str, facts: Mapping[str, Any] | None = None
+    ) -> Iterator[None]:
+        """Record an action before it is done, and its failure after it.
+
+        Raises
+        ------
+        ArchiveError
+            If it cannot be recorded; it must not be done then.
+        """
+        entry = self.audit.record(who.name, who.via, action, about, facts)
+        try:
+            yield
+        except ReseauError as error:
+            why = {"of": entry.number, "why": str(error)}
+            self.audit.record(who.name, who.via, f"{action} failed", about, why)
+            raise
+
+    def _watch(self) -> None:
+        """Publish what anybody stores in the archive, also other processes."""
+        before: dict[str, int] | None = None
+        while not self._over.wait(_LOOK_S):
+            try:
+                now = self.archive.heads()
+            except ReseauError as error:
+                if not self.failing:
+                    log("archive", failed=str(error))
+                self.failing = str(error)
+                continue
+            self.failing = ""
+            for table, last in now.items():
+                if before is not None and before.get(table) != last:
+                    self.events.publish("archive", table, {"last": last})
+                    self.meters.events.labels("archive").inc()
+            before = now

@@ -1,0 +1,333 @@
+"""The service trusts neither names, origins, cookies nor passwords: what is refused, and what is not."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.websockets import WebSocketDisconnect
+
+from reseau.core.errors import ArchiveError, UsageError
+from reseau.service.accounts import Accounts, RefusedLogin, one_time_code
+from reseau.service.http.options import ServeOptions
+from reseau.service.http.service import Service
+from reseau.service.state import StateFolder
+
+from .served import ORIGIN, PASSWORD, Served, served
+
+NOW = datetime(2026, 3, 2, 8, 0, tzinfo=UTC)
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = NOW
+
+    def __call__(self) -> datetime:
+        return self.now
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with served(tmp_path_factory.mktemp("served")) as found:
+        found.service.accounts.add_user("Ada", PASSWORD, "administer")
+        found.service.accounts.add_user("Bob", PASSWORD, "read")
+        yield found
+
+
+@pytest.fixture
+def accounts(tmp_path: Path) -> Iterator[tuple[Accounts, Clock]]:
+    clock = Clock()
+    with Accounts(tmp_path / "accounts.sqlite", clock) as found:
+        found.add_user("Ada", PASSWORD, "operate")
+        yield found, clock
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example:8480", "127.0.0.1.evil.example:8480", "127.0.0.1", "127.0.0.1:80"]
+)
+def test_a_request_for_another_name_is_refused(one: Served, host: str) -> None:
+    for path in ("/", "/api/1/health/live", "/api/1/events", "/static/app.js"):
+        answer = one.client().get(path, headers={"Host": host})
+        assert answer.status_code == 403
+        assert "name" in answer.json()["error"]["text"]
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Origin": "https://evil.example"},
+        {"Origin": "null"},
+        {"Origin": "http://127.0.0.1:9999"},
+        {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors"},
+        {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Mode": "cors"},
+    ],
+)
+def test_a_request_of_a_foreign_page_is_refused(one: Served, headers: dict[str, str]) -> None:
+    assert one.client().get("/api/1/me", headers=headers).status_code == 403
+    assert one.client().get("/api/1/events", headers=headers).status_code == 403
+
+
+def test_a_link_on_a_foreign_page_may_lead_to_a_page_but_do_nothing(one: Served) -> None:
+    link = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"}
+    browser = one.browser("Ada")
+    assert browser.get("/", headers=link).status_code == 200
+    assert browser.post("/api/1/logout", headers=link).status_code == 403
+
+
+def test_websockets_are_not_offered(one: Served) -> None:
+    with pytest.raises(WebSocketDisconnect) as closed, one.client().websocket_connect("/api/1/events"):
+        pass
+    assert closed.value.code == 1008
+
+
+def test_every_answer_has_a_strict_policy(one: Served) -> None:
+    for path in ("/", "/login", "/api/1/me", "/nowhere", "/static/app.js"):
+        headers = one.client("").get(path).headers
+        policy = headers["content-security-policy"]
+        assert "unsafe" not in policy
+        assert policy.startswith("default-src 'none'")
+        assert headers["x-content-type-options"] == "nosniff"
+        assert headers["x-frame-options"] == "DENY"
+        assert "server" not in headers
+
+
+def test_pages_have_no_inline_script_or_style_and_nothing_from_outside(one: Served) -> None:
+    browser = one.browser("Ada")
+    for path in ("/", "/account", "/audit", "/login", "/nowhere"):
+        text = browser.get(path).text
+        assert not re.search(r"<script(?![^>]*\bsrc=)|\bstyle=|<style|\bon[a-z]+=|javascript:", text), path
+        assert not re.findall(r'(?:src|href)="(?!/|#)', text), path
+
+
+def test_without_a_token_the_api_refuses_and_pages_lead_to_the_login(one: Served) -> None:
+    answer = one.client("").get("/api/1/me")
+    assert (answer.status_code, answer.headers["www-authenticate"]) == (401, "Bearer")
+    page = one.client("").get("/account")
+    assert (page.status_code, page.headers["location"]) == (303, "/login?next=/account")
+
+
+@pytest.mark.parametrize("value", ["Bearer ", "Bearer x", "Basic QWRhOng=", "Bearer é".encode("latin-1")])
+def test_a_wrong_token_is_refused(one: Served, value: Any) -> None:
+    assert one.client("").get("/api/1/me", headers={"Authorization": value}).status_code == 401
+
+
+def test_a_token_does_what_its_scope_allows(one: Served) -> None:
+    for scope, status in (("read", 403), ("operate", 403), ("administer", 200)):
+        client = one.client(scope)
+        assert client.get("/api/1/me").json()["scope"] == scope
+        assert client.get("/api/1/users").status_code == status
+
+
+def test_a_login_needs_the_origin_and_changes_need_the_csrf_token(one: Served) -> None:
+    given = {"name": "Ada", "password": PASSWORD}
+    assert one.client("").post("/api/1/login", json=given).status_code == 403
+    browser = one.browser("Ada")
+    cookie = next(iter(browser.cookies.jar))
+    assert cookie.has_nonstandard_attr("HttpOnly")
+    assert cookie.get_nonstandard_attr("SameSite") == "strict"
+    assert browser.post("/api/1/logout").status_code == 403
+    assert browser.post("/api/1/logout", headers={"X-CSRF-Token": "0" * 64}).status_code == 403
+    csrf = browser.get("/api/1/me").json()["csrf"]
+    other = one.browser("Bob")
+    assert other.post("/api/1/logout", headers={"X-CSRF-Token": csrf}).status_code == 403
+    assert browser.post("/api/1/logout", headers={"X-CSRF-Token": csrf}).status_code == 200
+    assert browser.get("/api/1/me").status_code == 401
+
+
+def test_a_user_without_the_scope_may_not_administer(one: Served) -> None:
+    browser = one.browser("Bob")
+    csrf = browser.get("/api/1/me").json()["csrf"]
+    new = {"name": "Eve", "password": PASSWORD, "scope": "administer"}
+    answer = browser.post("/api/1/users", json=new, headers={"X-CSRF-Token": csrf})
+    assert (answer.status_code, answer.json()["error"]["code"]) == (403, "forbidden")
+
+
+def test_the_login_leads_only_to_pages_of_ours(one: Served) -> None:
+    for given in ("//evil.example", "https://evil.example", "/\\evil.example"):
+        assert "evil" not in one.client("").get("/login", params={"next": given}).text
+
+
+def test_an_entry_code_lets_one_browser_in_once(one: Served) -> None:
+    path = one.client().post("/api/1/entries").json()["path"]
+    first = one.client("").get(path)
+    assert (first.status_code, first.headers["location"]) == (303, "/")
+    assert one.client("").get(path).headers["location"].startswith("/login")
+    assert one.client("administer").post("/api/1/entries").status_code == 403
+
+
+def test_a_large_request_is_refused(one: Served) -> None:
+    def pieces() -> Iterator[bytes]:
+        for _ in range(20):
+            yield b"x" * 100_000
+
+    assert one.client().post("/api/1/tokens", content=b"x" * 2_000_000).status_code == 413
+    assert one.client().post("/api/1/tokens", content=pieces()).status_code == 413
+
+
+def test_no_secret_is_in_log_archive_or_audit(one: Served, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO", "reseau.service"):
+        made = one.client().post("/api/1/tokens", json={"name": "secretly", "scope": "read"}).json()["secret"]
+        one.client("").get("/api/1/me", headers={"Authorization": f"Bearer {made}"})
+        one.client("").get("/enter", params={"code": "a-code"})
+    files = [path for path in Path(one.service.archive.place).rglob("*") if path.is_file()]
+    texts = [caplog.text.encode(), *(path.read_bytes() for path in files)]
+    for secret in (made, PASSWORD, "a-code", one.service.state.local_token()):
+        assert not any(secret.encode() in text for text in texts)
+    accounts = one.service.state.path("accounts.sqlite").read_bytes()
+    assert made.encode() not in accounts
+    assert PASSWORD.encode() not in accounts
+
+
+def test_five_wrong_passwords_lock_out_for_a_time_that_doubles(accounts: tuple[Accounts, Clock]) -> None:
+    found, clock = accounts
+    for _ in range(5):
+        with pytest.raises(RefusedLogin, match="wrong"):
+            found.log_in("Ada", "no")
+    waits = []
+    for _ in range(3):
+        with pytest.raises(RefusedLogin, match="wait") as refused:
+            found.log_in("Ada", PASSWORD)
+        waits.append(refused.value.wait_s)
+        clock.now += timedelta(seconds=refused.value.wait_s)
+        with pytest.raises(RefusedLogin, match="wrong"):
+            found.log_in("Ada", "no")
+    assert waits == pytest.approx([30, 60, 120])
+    clock.now += timedelta(seconds=240)
+    assert found.of_cookie(found.log_in("Ada", PASSWORD)) is not None
+
+
+def test_an_address_that_tries_many_names_is_locked_out(accounts: tuple[Accounts, Clock]) -> None:
+    found, _ = accounts
+    for number in range(30):
+        with pytest.raises(RefusedLogin, match="wrong"):
+            found.log_in(f"user {number}", "no", address="192.0.2.1")
+    with pytest.raises(RefusedLogin, match="wait"):
+        found.log_in("Ada", PASSWORD, address="192.0.2.1")
+    assert found.log_in("Ada", PASSWORD, address="192.0.2.2")
+
+
+def test_passwords_are_hashed_with_argon2id_and_19_mib_at_least(tmp_path: Path) -> None:
+    import sqlite3
+
+    import argon2
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(argon2, "PasswordHasher", argon2._password_hasher.PasswordHasher)
+        with Accounts(tmp_path / "accounts.sqlite") as found:
+            found.add_user("Ada", PASSWORD, "read")
+    with sqlite3.connect(tmp_path / "accounts.sqlite") as raw:
+        kept = raw.execute("SELECT password FROM users").fetchone()[0]
+    raw.close()
+    assert kept.startswith("$argon2id$")
+    assert argon2.extract_parameters(kept).memory_cost >= 19 * 1024
+
+
+def test_a_one_time_password_is_accepted_once(accounts: tuple[Accounts, Clock]) -> None:
+    found, clock = accounts
+    secret = re.search(r"secret=([A-Z2-7]+)", found.require_code("Ada"))
+    assert secret is not None
+    code = one_time_code(secret[1], int(clock.now.timestamp()) // 30)
+    with pytest.raises(RefusedLogin):
+        found.log_in("Ada", PASSWORD)
+    assert found.log_in("Ada", PASSWORD, code)
+    with pytest.raises(RefusedLogin):
+        found.log_in("Ada", PASSWORD, code)
+    clock.now += timedelta(seconds=30)
+    assert found.log_in("Ada", PASSWORD, one_time_code(secret[1], int(clock.now.timestamp()) // 30))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "digits"),
+    [
+        (59, "287082"),
+        (1111111109, "081804"),
+        (1111111111, "050471"),
+        (1234567890, "005924"),
+        (2000000000, "279037"),
+    ],
+)
+def test_one_time_passwords_are_those_of_rfc_6238(seconds: int, digits: str) -> None:
+    assert one_time_code("GEZDGNBVGY3TQOJQGEZDGNBVGY3TQOJQ", seconds // 30) == digits
+
+
+def test_a_login_ends_when_idle_when_old_and_when_the_clock_is_set_back(
+    accounts: tuple[Accounts, Clock],
+) -> None:
+    found, clock = accounts
+    for later in (timedelta(hours=2, minutes=1), timedelta(hours=-1)):
+        cookie = found.log_in("Ada", PASSWORD)
+        clock.now += later
+        assert found.of_cookie(cookie) is None
+        clock.now -= later
+        assert found.of_cookie(cookie) is None
+    cookie = found.log_in("Ada", PASSWORD)
+    for _ in range(11):
+        clock.now += timedelta(hours=1)
+        assert found.of_cookie(cookie) is not None
+    clock.now += timedelta(hours=1)
+    assert found.of_cookie(cookie) is None
+
+
+def test_a_token_expires_and_is_revoked(accounts: tuple[Accounts, Clock]) -> None:
+    found, clock = accounts
+    secret = found.create_token("plotter", "read", timedelta(days=1), "Ada")
+    assert found.of_token(secret) is not None
+    clock.now += timedelta(days=1)
+    assert found.of_token(secret) is None
+    clock.now = NOW
+    found.revoke_token("plotter")
+    assert found.of_token(secret) is None
+    with pytest.raises(UsageError, match="is a token already"):
+        found.create_token("plotter", "read", timedelta(days=1), "Ada")
+
+
+def test_other_addresses_need_tls_and_users(tmp_path: Path) -> None:
+    archive = str(tmp_path / "archive")
+    with pytest.raises(UsageError, match="without TLS"):
+        ServeOptions(archive, host="0.0.0.0")
+    options = ServeOptions(archive, host="0.0.0.0", proxy="https://bench.example.org")
+    with pytest.raises(UsageError, match="reseau service user add"):
+        Service(options)
+    with Accounts(StateFolder.beside(archive).path("accounts.sqlite")) as accounts:
+        accounts.add_user("Ada", PASSWORD, "administer")
+    with Service(options) as service:
+        found = Served(service)
+        browser = found.client("")
+        assert browser.get("/login").status_code == 403  # only the public name
+        public = {"Host": "bench.example.org"}
+        assert "max-age" in browser.get("/login", headers=public).headers["strict-transport-security"]
+        local = {"Authorization": f"Bearer {service.state.local_token()}", **public}
+        assert browser.get("/api/1/me", headers=local).status_code == 401
+
+
+def test_accounts_of_an_earlier_version_need_an_upgrade(tmp_path: Path) -> None:
+    import sqlite3
+
+    place = tmp_path / "accounts.sqlite"
+    with sqlite3.connect(place) as raw:
+        raw.execute("CREATE TABLE users (name TEXT PRIMARY KEY, password TEXT NOT NULL, scope TEXT NOT NULL,"
+                    " secret TEXT, created DATETIME NOT NULL)")  # fmt: skip
+    raw.close()
+    with pytest.raises(ArchiveError, match="reseau service upgrade"):
+        Accounts(place)
+    with Accounts(place, upgrade=True) as found:
+        assert found.upgraded_from == 1
+        found.add_user("Ada", PASSWORD, "read")
+        found.require_code("Ada")
+    with Accounts(place) as found:
+        assert found.upgraded_from is None
+
+
+def test_a_state_folder_that_others_can_read_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "state"
+    folder.mkdir(mode=0o755)
+    with pytest.raises(UsageError, match="chmod 700"):
+        StateFolder(folder)
+
+
+def test_the_origin_of_the_page_is_accepted(one: Served) -> None:
+    assert one.client().get("/api/1/me", headers={"Origin": ORIGIN}).status_code == 200
