@@ -16,7 +16,14 @@ from ..core.provenance import Provenance
 from ..io import Document, Strict
 from ..optics.poses import matrix_to_vector
 from ..optics.refraction import Refraction
-from .diagnostics import MotionEstimates, PriorInfluence, Result, RigEstimate, sigma_between_images
+from .diagnostics import (
+    MotionEstimates,
+    PriorInfluence,
+    Result,
+    RigEstimate,
+    StageEstimate,
+    sigma_between_images,
+)
 from .network import Rig
 from .network.network import finite
 
@@ -108,6 +115,27 @@ class RigResult(Strict):
     length: tuple[float, ...]
     length_sigma: tuple[float, ...]
     covariance: tuple[Matrix, ...]
+
+
+class TurntableResult(Strict):
+    """Axis and angles of a turntable.
+
+    The object turns anticlockwise about the unit vector `direction`, seen from where it points; `position` is
+    the point of the axis next to the centroid of the object points. `covariance` (6, 6) is that of both, and
+    their sigmas are the largest ones, across the axis. In columns: estimated angles, their sigmas (zero for
+    held ones), and estimated minus given angles.
+    """
+
+    carries: str
+    direction: tuple[float, ...]
+    direction_sigma_deg: float
+    position: tuple[float, ...]
+    position_sigma: float
+    covariance: Matrix
+    image: tuple[str, ...]
+    angle_deg: Column
+    sigma_deg: Column
+    residual_deg: Column
 
 
 class MotionResult(Strict):
@@ -264,6 +292,7 @@ class ResultDocument(Document):
     bases: DistancesResult | None = None
     refraction: RefractionResult | None = None
     rig: RigResult | None = None
+    turntable: TurntableResult | None = None
     motion: MotionResult | None = None
     variance_components: ComponentsResult | None = None
     eliminated: tuple[EliminatedParameter, ...] | None = None
@@ -296,6 +325,8 @@ class ResultDocument(Document):
             more["refraction"] = _refraction(result, result.network.refraction)
         if result.rig is not None:
             more["rig"] = _rig(result.rig)
+        if result.stage is not None and result.stage.kind == "rotary":
+            more["turntable"] = _turntable(result.stage)
         if result.motion is not None:
             more["motion"] = _motion(result.motion)
         if provenance is not None:
@@ -427,6 +458,21 @@ def _rig(found: RigEstimate) -> RigResult:
         length=tuple(found.length.tolist()),
         length_sigma=tuple(found.length_sigma.tolist()),
         covariance=tuple(_matrix(cov) for cov in found.cov),
+    )
+
+
+def _turntable(found: StageEstimate) -> TurntableResult:
+    return TurntableResult(
+        carries=found.carries,
+        direction=tuple(found.direction.tolist()),
+        direction_sigma_deg=math.degrees(found.direction_sigma),
+        position=tuple(found.position.tolist()),
+        position_sigma=found.position_sigma,
+        covariance=_matrix(found.cov),
+        image=found.images,
+        angle_deg=_column(np.degrees(found.reading)),
+        sigma_deg=_column(np.degrees(found.reading_sigma)),
+        residual_deg=_column(np.degrees(found.residual)),
     )
 
 

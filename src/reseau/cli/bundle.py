@@ -25,6 +25,7 @@ from .bundle_options import (
     say_priors,
     say_refraction,
     say_rig,
+    say_turntable,
 )
 from .common import AsJson, Out, progress, required, say
 
@@ -219,6 +220,8 @@ def _say(path: Path, result: Result) -> None:
         say_refraction(result.refraction)
     if result.rig is not None:
         say_rig(result.rig)
+    if result.stage is not None:
+        say_turntable(result.stage)
     if result.motion is not None:
         say_motion(result.motion)
     say_model(result)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         RefractionEstimate,
         Result,
         RigEstimate,
+        StageEstimate,
     )
     from ..calibration import FieldDifference
     from ..core.data import Array
@@ -42,6 +43,7 @@ __all__ = [
     "say_priors",
     "say_refraction",
     "say_rig",
+    "say_turntable",
 ]
 
 # Parameters of a camera that are printed at most.
@@ -202,6 +204,34 @@ def say_rig(found: RigEstimate) -> None:
             f"{measured(float(found.length[k]), float(found.length_sigma[k]), found.unit)}; turned by "
             f"{measured(float(found.angles[k]), turn, 'deg')}\n"
         )
+
+
+def say_turntable(found: StageEstimate) -> None:
+    """Print the axis of a turntable, and how its angles differ from those given."""
+    import numpy as np
+
+    from ..core.numbers import measured
+
+    if found.kind != "rotary":
+        return
+    sigma = np.sqrt(np.diag(found.cov))
+    one, other = (
+        ", ".join(measured(float(v), float(s)) for v, s in zip(values, spread, strict=True))
+        for values, spread in ((found.direction, sigma[:3]), (found.position, sigma[3:]))
+    )
+    turned, shifted = (
+        f"± {value:.2g} {unit}" if value > 0 else "held"
+        for value, unit in ((np.rad2deg(found.direction_sigma), "deg"), (found.position_sigma, found.unit))
+    )
+    say(f"turntable: axis {one} ({turned}) through {other} {found.unit} ({shifted})\n")
+    free = found.reading_sigma > 0
+    if free.any():
+        typical = np.rad2deg(np.median(found.reading_sigma[free]))
+        text = f"  {int(free.sum())} angles estimated, ± {typical:.2g} deg"
+        off = found.residual[free & np.isfinite(found.residual)]
+        if len(off):
+            text += f"; they differ from the given ones by {np.rad2deg(np.sqrt(np.mean(off**2))):.2g} deg rms"
+        say(text + "\n")
 
 
 def say_motion(found: MotionEstimates) -> None:

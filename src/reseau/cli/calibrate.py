@@ -29,6 +29,7 @@ from .bundle_options import (
     say_priors,
     say_refraction,
     say_rig,
+    say_turntable,
 )
 from .common import (
     AsJson,
@@ -149,6 +150,13 @@ def calibrate(
     sigma: Sigma = None,
     control: Control = None,
     refraction: Refraction = None,
+    turntable: Annotated[
+        Path | None,
+        typer.Option(
+            help="Angles of a turntable that carried the target, or the camera: CSV "
+            "image,angle_deg[,sigma_deg][,pose]; its axis is estimated."
+        ),
+    ] = None,
     target_points: Annotated[
         Target,
         typer.Option(
@@ -198,7 +206,7 @@ def calibrate(
         return corrected(read_frame(image, channel.value), sensor)
 
     options = _options(
-        sigma, control, refraction, leave_out or [], reject, kind, level, workers, target_points
+        sigma, control, refraction, leave_out or [], reject, kind, level, workers, target_points, turntable
     )
     lens = _camera(model, pitch, side, model_option or [], free, rolling)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
@@ -210,7 +218,7 @@ def calibrate(
         options = replace(options, focal_35_mm=said)
         found = calibrate_camera(frames, target, measure, _size(size), lens, options, taken or None)
         done = required(found, design)
-    named = (None if automatic else design, control, refraction, sensor)
+    named = (None if automatic else design, control, refraction, turntable, sensor)
     inputs = {path.name: path for path in named if path} | photographs
     provenance = _provenance(
         inputs,
@@ -301,10 +309,11 @@ def _options(
     level: float | None,
     workers: int,
     target: Target,
+    turntable: Path | None,
 ) -> CalibrationOptions:
     """Options of the procedure, from the options of the command."""
     from ..bundle import Options
-    from ..exchange import read_control
+    from ..exchange import read_control, read_turntable
     from ..io.refraction import RefractionFile
     from ..procedures.calibration import CalibrationOptions
 
@@ -318,6 +327,7 @@ def _options(
         Options(outliers="reject" if reject else "keep"), sigma,
         None if control is None else read_control(control), tuple(pairs), components, level, workers,
         refraction=None if refraction is None else RefractionFile.read(refraction), target=target.value,
+        turntable=None if turntable is None else read_turntable(turntable),
     )  # fmt: skip
 
 
@@ -443,6 +453,8 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
             )
     if result.rig is not None:
         say_rig(result.rig)
+    if result.stage is not None:
+        say_turntable(result.stage)
     if result.motion is not None:
         say_motion(result.motion)
     if result.refraction is not None:

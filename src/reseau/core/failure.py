@@ -61,6 +61,7 @@ class Code(StrEnum):
     NO_DATUM = "no-datum"  # nothing defines the coordinate system
     NO_REDUNDANCY = "no-redundancy"  # too few observations for the unknowns, or for a test
     ONE_STATION = "one-station"  # the camera was only turned: points have no depth
+    READINGS = "readings"  # readings of a stage in another unit or sense than the images show
     OTHER_DESIGN = "other-design"  # a target of another design is in the image
     OUTSIDE = "outside"  # beyond the edge of the frame
     OVERLAPPING = "overlapping"  # the image touches that of another mark

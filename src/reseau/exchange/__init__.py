@@ -17,6 +17,7 @@ from .metashape import read_metashape
 from .networks import calibration_files, read_foreign, read_network, write_network
 from .openptv import read_openptv
 from .photomodeler import read_photomodeler
+from .turntable import read_turntable
 from .zemax import read_zemax
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "read_network",
     "read_openptv",
     "read_photomodeler",
+    "read_turntable",
     "read_zemax",
     "write_bal",
     "write_colmap",

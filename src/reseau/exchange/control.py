@@ -11,7 +11,7 @@ from ..bundle import ControlPoints
 from ..core.errors import FormatError
 from ..io import read_text
 
-__all__ = ["read_control"]
+__all__ = ["number_of", "read_control", "table_rows"]
 
 _COLUMNS = ["id", "x", "y", "z", "sx", "sy", "sz"]
 
@@ -47,7 +47,7 @@ def read_control(path: Path | str) -> ControlPoints:
            [0.1, 0.1, nan]]))
     """
     path = Path(path)
-    lines = _rows(read_text(path))
+    lines = table_rows(read_text(path))
     header = [word.lower() for word in lines[0][1]] if lines else []
     if lines and header not in (_COLUMNS[:4], _COLUMNS) and len(header) in (4, 7) and _is_number(header[1]):
         header = _COLUMNS[: len(header)]
@@ -66,7 +66,7 @@ def read_control(path: Path | str) -> ControlPoints:
         if name in names:
             raise FormatError(f"point {name} appears twice", where=where)
         names.append(name)
-        rows.append([_number(word, where) for word in line[1:]])
+        rows.append([number_of(word, where) for word in line[1:]])
     if not names:
         raise FormatError("contains no points", where=path)
     values = np.array(rows, dtype=np.float64)
@@ -78,8 +78,8 @@ def read_control(path: Path | str) -> ControlPoints:
     return ControlPoints(tuple(names), values[:, :3], sigma)
 
 
-def _rows(text: str) -> list[tuple[int, list[str]]]:
-    """Line numbers and fields; separated by commas, semicolons or blanks, without comments."""
+def table_rows(text: str) -> list[tuple[int, list[str]]]:
+    """Return line numbers and fields; separated by commas, semicolons or blanks, without comments."""
     rows = []
     for number, line in enumerate(text.splitlines(), start=1):
         line = line.split("#")[0].split("%")[0]
@@ -99,7 +99,8 @@ def _is_number(word: str) -> bool:
         return False
 
 
-def _number(word: str, where: str) -> float:
+def number_of(word: str, where: str) -> float:
+    """Return the number of a field of a table; NaN where it is empty."""
     if not word.strip():
         return float("nan")
     try:

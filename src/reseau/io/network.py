@@ -24,6 +24,7 @@ __all__ = [
     "ObservationColumns",
     "PointColumns",
     "ShutterEntry",
+    "TurntableEntry",
 ]
 
 T = TypeVar("T")
@@ -230,10 +231,18 @@ AnyCamera = Annotated[
 class _Columns(Strict):
     """Columns of one length."""
 
+    @classmethod
+    def _column_names(cls) -> tuple[str, ...]:
+        """Names of the columns; empty where all fields are columns."""
+        return ()
+
     @model_validator(mode="after")
     def _one_length(self) -> Self:
         length = None
+        names = self._column_names()
         for name, info in type(self).model_fields.items():
+            if names and name not in names:
+                continue
             column = getattr(self, name)
             if column is None:
                 continue
@@ -299,6 +308,58 @@ class BaseColumns(DistanceColumns):
     """Known distances between the projection centres of cameras that are fixed to each other."""
 
 
+class TurntableEntry(_Columns):
+    """A turntable that carries the object, or the camera, with the angles of images.
+
+    Images with the same `pose` differ by their angles only; without the column all do. The angle of an image
+    is known where `sigma_deg` is 0, observed where it is above, and approximate (or null) where it is null.
+    The `direction` of the axis and the `position` of a point on it, in the system of the object, are
+    approximate values, observed with their sigmas, or known with 0.
+    """
+
+    carries: Literal["object", "camera"] = "object"
+    image: tuple[str, ...] = Field(min_length=1)
+    angle_deg: tuple[float | None, ...]
+    sigma_deg: tuple[float | None, ...]
+    pose: tuple[str, ...] | None = None
+    direction: Triple | None = None
+    direction_sigma_deg: float | None = Field(default=None, ge=0)
+    position: Triple | None = None
+    position_sigma: float | None = Field(default=None, ge=0)
+
+    @classmethod
+    def _column_names(cls) -> tuple[str, ...]:
+        return "image", "angle_deg", "sigma_deg", "pose"
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        twice = _twice(self.image)
+        if twice is not None:
+            raise ValueError(f"image {twice!r} has two angles of the turntable")
+        for name, angle, sigma in zip(self.image, self.angle_deg, self.sigma_deg, strict=True):
+            if sigma is not None and sigma < 0:
+                raise ValueError(f"the sigma of the angle of image {name!r} is negative")
+            if sigma is not None and angle is None:
+                raise ValueError(f"image {name!r} has a sigma, but no angle of the turntable")
+        for what, value, spread in (
+            ("direction", self.direction, self.direction_sigma_deg),
+            ("position", self.position, self.position_sigma),
+        ):
+            if value is None and spread is not None:
+                raise ValueError(f"the {what} of the axis of the turntable has a sigma, but no value")
+        if self.direction is not None and not any(self.direction):
+            raise ValueError("the direction of the axis of the turntable is zero")
+        if self.position_sigma is not None and self.direction is None:
+            raise ValueError(
+                "the position of the axis of the turntable has a sigma, but no direction is given"
+            )
+        return self
+
+    def pose_of(self, row: int) -> str:
+        """Pose of an image by its row."""
+        return "" if self.pose is None else self.pose[row]
+
+
 class Network1(Document):
     """``reseau-network/1``: the input of a bundle adjustment.
 
@@ -317,6 +378,7 @@ class Network1(Document):
     datum: Literal["control", "minimal", "free"]
     datum_points: tuple[str, ...] | None = None
     refraction: RefractionEntry | None = None
+    turntable: TurntableEntry | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -340,6 +402,8 @@ class Network1(Document):
             if not any(self.images.exposure or ()):
                 raise ValueError("`bases` require the exposures of the images")
         _named("datum_points", self.datum_points or (), points, "points")
+        if self.turntable is not None:
+            _named("turntable.image", self.turntable.image, images, "images")
         self._check_motion()
         self._check_points()
         self._check_observations()

@@ -40,12 +40,14 @@ from ..bundle import (
     model_search_entries,
     search_model,
 )
+from ..bundle.network import stage_of_turntable
 from ..calibration import Calibration
 from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
 from ..core.numbers import measured as with_sigma
+from ..io.network import TurntableEntry
 from ..io.photographs import Exif
 from ..io.refraction import RefractionEntry
 from ..optics import CameraModel, PixelGrid, camera_model
@@ -203,6 +205,9 @@ class CalibrationOptions:
     focal_35_mm : float, optional
         Approximate focal length as the camera says, for the format of 36 × 24 mm: taken for the start where
         that of the homographies is far from it.
+    turntable : TurntableEntry, optional
+        Turntable that carried the target, or the cameras; the axis is estimated. Photographs that are not in
+        it were taken without.
     target : {"free", "flat", "auto"}
         Whether all points of the target are unknowns, or are held as designed; ``auto`` holds them where
         :func:`reseau.bundle.choose_board` finds the target flat and as designed.
@@ -223,11 +228,14 @@ class CalibrationOptions:
     heights: Heights | None = None
     refraction: RefractionEntry | None = None
     focal_35_mm: float | None = None
+    turntable: TurntableEntry | None = None
     target: Literal["free", "flat", "auto"] = "free"
 
     def __post_init__(self) -> None:
         if self.target not in ("free", "flat", "auto"):
             raise UsageError(f"is {self.target!r}, not `free`, `flat` or `auto`", where="target")
+        if self.turntable is not None and self.heights is not None:
+            raise UsageError("cannot be combined with heights", where="turntable")
         if self.target != "free" and (self.control or self.heights or self.refraction):
             raise UsageError(
                 f"cannot be {self.target!r} with control points, heights, or windows and media",
@@ -482,6 +490,10 @@ def calibrate_camera(
     network = replace(network_of(measured, design, entries[0]), refraction=refraction)
     if taken:
         network = _fixed_to_each_other(network, entries, of, [taken[name].exposure for name in measured])
+    if options.turntable is not None:
+        network = _turned(
+            network, options.turntable, [taken[name].exposure for name in measured] if taken else None
+        )
     if options.heights is not None:
         network = options.heights.lifted(network)
     if options.control is not None:
@@ -537,6 +549,19 @@ def _fixed_to_each_other(
     camera_of = np.array(of, dtype=np.intp)
     rig = Rig(camera_of, np.array([number[name] for name in exposures], dtype=np.intp))
     return replace(network, cameras=tuple(cameras), camera_of=camera_of, rig=rig)
+
+
+def _turned(network: Network, turntable: TurntableEntry, exposures: Sequence[str] | None) -> Network:
+    """Return the network with a turntable."""
+    stage = stage_of_turntable(turntable, network.images, exposures)
+    if stage is None:
+        raise UsageError(
+            f"has none of the photographs, but {turntable.image[0]}", where="turntable",
+            do=f"name them as {network.images[0]}",
+        )  # fmt: skip
+    if stage.tied:
+        raise UsageError("a known axis requires control points", where="turntable")
+    return replace(network, stage=stage)
 
 
 def _measured(

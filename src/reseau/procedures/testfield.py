@@ -235,6 +235,7 @@ def _joined(
     """The network with an image from another pose; None if the image shows fewer than four points."""
     pose = _predicted(network, result, mount, place, heights)
     axis = np.array([0.0, 0.0, mount.lifts]) if network.stage is None else network.stage.axis
+    assert axis is not None  # a linear stage has one
     stage = None if heights is None else heights.stage((*network.images, PREDICTED), axis)
     return with_image(network, camera_mapping(result, 0), pose, _directions(network, pose), stage)
 

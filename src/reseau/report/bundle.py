@@ -13,7 +13,7 @@ from ..bundle.network.shutter import MOTION
 from ..calibration import CameraMapping, FieldDifference, projection_field
 from ..core.data import Frame, Rows
 from ..core.figures import nice
-from ..core.numbers import plain, power
+from ..core.numbers import aligned, measured, plain, power
 from ..core.provenance import Provenance
 from ..optics.cameras import unit_of
 from ..procedures.assessment import Assessment, sorted_remarks
@@ -85,6 +85,7 @@ def bundle_report(
         cameras=cameras,
         refraction=_refraction(result),
         rig=_rig(result),
+        turntable=_turntable(result),
         motion=_motion(result),
         more_cameras=max(0, len(_shown(result)) - _CAMERAS),
         images=images_table(result)[:_IMAGES],
@@ -290,6 +291,41 @@ def _rig(result: Result) -> list[dict[str, Any]]:
             for name, value, sigma, unit in values
         ]
     return rows
+
+
+def _turntable(result: Result) -> dict[str, Any] | None:
+    """Rows of the tables of a turntable: its axis, and its angles."""
+    found = result.stage
+    if found is None or found.kind != "rotary":
+        return None
+    sigma = np.sqrt(np.diag(found.cov))
+    axis = [
+        (f"{name} of its {what}", values[k], spread[k], unit)
+        for what, values, spread, unit in (
+            ("direction", found.direction, sigma[:3], ""), ("position", found.position, sigma[3:], found.unit)
+        )
+        for k, name in enumerate("XYZ")
+    ]  # fmt: skip
+    angles = zip(found.images, *(np.rad2deg(c) for c in (found.reading, found.reading_sigma, found.residual)),
+                 strict=True)  # fmt: skip
+    return {
+        "carries": found.carries,
+        "axis": [
+            {"name": name, "estimate": power(float(value), float(s)), "unit": unit_text(unit)}
+            for name, value, s, unit in axis
+        ],
+        "angles": [
+            {
+                "image": image,
+                "angle": f"{angle:.4f}" if spread == 0 else measured(float(angle), float(spread)),
+                "residual": "" if spread == 0 else aligned([off], 4)[0],
+            }
+            for image, angle, spread, off in list(angles)[:_IMAGES]
+        ],
+        "more": max(0, len(found.images) - _IMAGES),
+        "sigma_deg": plain(float(np.rad2deg(found.direction_sigma)), 2),
+        "sigma": plain(found.position_sigma, 2),
+    }
 
 
 def _lens(result: Result, c: int) -> CameraMapping | None:

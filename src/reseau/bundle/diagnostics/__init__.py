@@ -10,6 +10,7 @@ from .estimates import (
     PriorInfluence,
     RefractionEstimate,
     RigEstimate,
+    StageEstimate,
 )
 from .fields import camera_mapping, projection_field_at
 from .image_scatter import sigma_between_images
@@ -30,6 +31,7 @@ __all__ = [
     "RefractionEstimate",
     "Result",
     "RigEstimate",
+    "StageEstimate",
     "by_place",
     "by_point",
     "camera_mapping",

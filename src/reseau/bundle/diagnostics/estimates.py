@@ -9,7 +9,7 @@ import numpy as np
 from ...adjust.significance import CoefficientTest
 from ...core.data import Array, Rows
 from ...core.display import Display
-from ...core.numbers import measured
+from ...core.numbers import measured, plain
 from ..network.shutter import MOTION
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "PriorInfluence",
     "RefractionEstimate",
     "RigEstimate",
+    "StageEstimate",
 ]
 
 
@@ -109,6 +110,70 @@ class RefractionEstimate(CameraEstimate):
     given: Array
     tests: tuple[CoefficientTest, ...]
     partners: tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StageEstimate(Display):
+    """Axis and readings of a stage.
+
+    Parameters
+    ----------
+    kind : {"linear", "rotary"}
+        How it moves.
+    carries : {"object", "camera"}
+        What it moves.
+    direction, position : ndarray (3,)
+        Unit vector of the axis, about which the object turns (or along which it is shifted), and of a rotary
+        axis its point next to the centroid of the object points.
+    cov : ndarray (6, 6)
+        Their covariance, of rank 4: the direction has none along itself, nor the position along the axis.
+    images : tuple of str (k,)
+        Images on the stage.
+    reading : ndarray (k,)
+        Readings: rad, or the unit of object space.
+    reading_sigma : ndarray (k,)
+        Their standard deviations; zero for readings that are held.
+    residual : ndarray (k,)
+        Estimated minus given reading; NaN for one that was not given.
+    unit : str
+        Unit of object space.
+
+    Examples
+    --------
+    >>> cov = np.diag([1e-8, 1e-8, 0.0, 4e-4, 4e-4, 0.0])
+    >>> none = np.zeros(0)
+    >>> axis = StageEstimate("rotary", "object", np.array([0.0, 0.0, 1.0]), np.array([12.0, -7.0, 0.0]), cov,
+    ...     (), none, none, none, "mm")
+    >>> axis
+    <StageEstimate: rotary, axis ± 0.0057 deg, position ± 0.02 mm>
+    """
+
+    kind: str
+    carries: str
+    direction: Array
+    position: Array
+    cov: Array
+    images: tuple[str, ...]
+    reading: Array
+    reading_sigma: Array
+    residual: Array
+    unit: str
+
+    @property
+    def direction_sigma(self) -> float:
+        """Largest standard deviation of the direction (rad)."""
+        return float(np.sqrt(max(np.linalg.eigvalsh(self.cov[:3, :3])[-1], 0.0)))
+
+    @property
+    def position_sigma(self) -> float:
+        """Largest standard deviation of the position, across the axis."""
+        return float(np.sqrt(max(np.linalg.eigvalsh(self.cov[3:, 3:])[-1], 0.0)))
+
+    def _facts(self) -> list[tuple[str, str]]:
+        facts = [(self.kind, ""), ("axis", f"± {plain(np.rad2deg(self.direction_sigma), 2)} deg")]
+        if self.kind == "rotary":
+            facts.append(("position", f"± {plain(self.position_sigma, 2)} {self.unit}"))
+        return facts
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -19,9 +19,9 @@ from ...core.failure import Remark
 from ...optics.cameras import distortion_names, unit_of
 from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
 from ..network import Network
+from ..network.stage import perpendicular
 from ..solver import BundleFit
 from ..solver.rank import missing_windows
-from ..solver.rig_constraints import RigConstraints
 from .estimates import (
     CameraEstimate,
     ImageEstimates,
@@ -30,6 +30,7 @@ from .estimates import (
     PriorInfluence,
     RefractionEstimate,
     RigEstimate,
+    StageEstimate,
 )
 
 if TYPE_CHECKING:
@@ -263,16 +264,51 @@ class Result(Display):
     @cached_property
     def rig(self) -> RigEstimate | None:
         """Relative orientations of the cameras of a rig; None without one."""
-        linear, rig, places = self.fit.linear, self.network.rig, self.fit.values.rig
-        constraints = linear.system.constraints
-        if rig is None or places is None or not isinstance(constraints, RigConstraints):
+        linear, places = self.fit.linear, self.fit.values.rig
+        constraints = None if linear.system.constraints is None else linear.system.constraints.rig
+        if constraints is None or places is None:
             return None
         at, names = constraints.cameras, [camera.id for camera in self.network.cameras]
-        cofactors = constraints.cofactors(linear.transformation, self.fit.cofactors.reduced)
+        t = constraints.matrix(places, linear.values.rotation, linear.values.x0)
+        cofactors = constraints.cofactors(t, self.fit.cofactors.reduced)
         each = np.arange(len(at))
         cameras, references = (tuple(names[k] for k in rows) for rows in (at, constraints.references[at]))
         cov = cofactors[each, :, each] * self.fit.variance
         return RigEstimate(cameras, references, places.rotation[at], places.base[at], cov, self.network.unit)
+
+    @cached_property
+    def stage(self) -> StageEstimate | None:
+        """Axis and readings of a stage; None without one."""
+        network, values, linear = self.network, self.fit.values, self.fit.linear
+        stage, moved, cofactors = network.stage, values.stage, self.fit.cofactors.stage
+        own = None if linear.system.constraints is None else linear.system.constraints.stage
+        if stage is None or moved is None or own is None or cofactors is None or linear.values.stage is None:
+            return None
+        across, start = perpendicular(moved.axis), own.own.start
+        middle = values.xyz[self.fit.usable.points].mean(axis=0)
+        # Of direction and position by the unknowns: a turned axis moves its point beside the centroid.
+        slopes = np.zeros((6, len(cofactors)))
+        if own.direction >= 0:
+            columns = slice(own.direction - start, own.direction - start + 2)
+            slopes[:3, columns] = across
+            slopes[3:, columns] = across * float(moved.axis @ (middle - moved.point))
+        if own.position >= 0:
+            columns = slice(own.position - start, own.position - start + 2)
+            slopes[3:, columns] = across
+        if not stage.rotary:
+            slopes[3:] = 0.0
+        column_of = dict(zip(own.frames.key.tolist(), own.reading.tolist(), strict=True))
+        images = np.flatnonzero((stage.pose >= 0) & self.fit.usable.images)
+        column = np.array([column_of.get(int(own.frames.key_of[i]), -1) for i in images], dtype=np.intp)
+        # The last entry is that of readings that are held.
+        variance = np.append(np.diag(cofactors), 0.0)[np.where(column >= 0, column - start, -1)]
+        given = np.where(np.isnan(stage.sigmas[images]), np.nan, stage.reading[images])
+        return StageEstimate(
+            stage.kind, stage.carries, moved.axis, moved.foot(middle) if stage.rotary else np.full(3, np.nan),
+            slopes @ cofactors @ slopes.T * self.fit.variance, tuple(network.images[i] for i in images),
+            moved.reading[images], np.sqrt(np.maximum(variance, 0.0) * self.fit.variance),
+            moved.reading[images] - given, network.unit,
+        )  # fmt: skip
 
     def priors(self, c: int) -> PriorInfluence | None:
         """How much observed parameters of the c-th camera determine it; None where none is observed.

@@ -17,8 +17,9 @@ from ..diagnostics import ControlCheck, ControlShape, Result, checked_control, c
 from ..diagnostics.causes import causes, given_poses_that_do_not_fit, outside_image, seen_frontally
 from ..diagnostics.checks import listed
 from ..diagnostics.control_check import suspected, without_control
+from ..diagnostics.stage_check import checked_readings, without_readings
 from ..diagnostics.suspects import contradicting, doubtful_parameters, grouped, without_false_bars
-from ..network import Network
+from ..network import Network, Stage
 from ..network.network import finite
 from ..network.rig import RigValues
 from ..solver import BundleFit, BundleProblem, approximate
@@ -115,17 +116,28 @@ def _begun(
     unknowns = Unknowns.of(network, finite(found.x0))
     start = Values.of_cameras(unknowns, found.rotation, found.x0, found.xyz)
     start = replace(start, motion=found.motion)
-    if network.stage is not None:
-        moved, rotation, x0 = network.stage.approximate(start.rotation, start.x0)
+    stage = network.stage
+    if stage is not None and network.rig is None:
+        if stage.rotary and not finite(network.x0[stage.pose >= 0]).all():
+            start = _apart(network, options, start)
+        stage, doubts = _with_right_readings(network, stage, options, start)
+        network = replace(network, stage=stage)
+        moved, rotation, x0 = stage.approximate(start.rotation, start.x0)
         start = replace(start, rotation=rotation, x0=x0, stage=moved)
     if network.rig is not None:
         if not finite(network.x0[network.rig.exposure >= 0]).all():
-            start = _without_rig(network, options, start)
+            start = _apart(network, options, start)
         odd, typical = network.rig.apart(start.rotation, start.x0)
         if len(odd) or typical > _NOT_AT_ONCE:
             network, doubts = _not_at_once(network, odd, typical, apart=options.outliers == "reject")
     if network.rig is not None:
         places, rotation, x0 = network.rig.approximate(start.rotation, start.x0)
+        if network.stage is not None:
+            stage, more = _with_right_readings(network, network.stage, options, start)
+            doubts = (*doubts, *more)
+            moved, rotation, x0 = stage.approximate(rotation, x0, network.camera_of)
+            places, rotation, x0 = network.rig.approximate(rotation, x0)
+            network, start = replace(network, stage=stage), replace(start, stage=moved)
         start = replace(start, rotation=rotation, x0=x0, rig=places)
         scale = _scale_of_bases(network, places)
         start, found = Similarity(scale, np.eye(3), np.zeros(3))(start), replace(found, xyz=scale * found.xyz)
@@ -139,6 +151,20 @@ def _begun(
     return problem, found.notes, doubts
 
 
+def _with_right_readings(
+    network: Network, stage: Stage, options: Options, start: Values
+) -> tuple[Stage, tuple[Remark, ...]]:
+    """Return the stage, without wrong readings where outliers are rejected, and what to say of them."""
+    remarks, odd = checked_readings(network, start.rotation, start.x0)
+    if not len(odd) or options.outliers != "reject":
+        return stage, remarks
+    done = [
+        replace(remark, text=f"{remark.text}; estimated from the images") if remark is remarks[-1] else remark
+        for remark in remarks
+    ]
+    return without_readings(stage, odd), tuple(done)
+
+
 def _scale_of_bases(network: Network, places: RigValues) -> float:
     """Factor that gives a network its scale by the known bases, where nothing else does; otherwise 1."""
     rig = network.rig
@@ -149,18 +175,18 @@ def _scale_of_bases(network: Network, places: RigValues) -> float:
     return float(np.median(rig.base[length > 0, 0] / length[length > 0])) if (length > 0).any() else 1.0
 
 
-def _without_rig(network: Network, options: Options, start: Values) -> Values:
+def _apart(network: Network, options: Options, start: Values) -> Values:
     """Return the values of an adjustment in which every image has an orientation of its own.
 
-    Orientations by approximate cameras would make a poor rig, and not show which images do not belong
-    together. Where there is no such adjustment, the values remain. Windows of the rig are held before each
-    camera where the approximate values have them.
+    Orientations by approximate cameras would make a poor rig or axis of a stage, and not show which images do
+    not belong together. Where there is no such adjustment, the values remain. Windows of the rig are held
+    before each camera where the approximate values have them.
     """
     bent = network.refraction
     if bent is not None and network.rig is not None and bent.on_rig.any():
         places, _, _ = network.rig.approximate(start.rotation, start.x0)
         bent = bent.on_cameras(network.camera_of, *places)
-    problem = _begun(replace(network, rig=None, refraction=bent), options, settle=True)[0]
+    problem = _begun(replace(network, rig=None, stage=None, refraction=bent), options, settle=True)[0]
     fit = _plain(problem)
     return start if isinstance(fit, Failure) else replace(fit.values, refraction=start.refraction)
 
@@ -188,7 +214,12 @@ def _not_at_once(
             path_of[odd] = -1
             network = network.select(~np.isin(network.image_of, odd))
             network = replace(network, refraction=replace(bent, path_of=path_of))
-        network = replace(network, rig=rig.without(odd))
+        stage = network.stage
+        if stage is not None:
+            pose = stage.pose.copy()
+            pose[odd] = -1
+            stage = replace(stage, pose=pose)
+        network = replace(network, rig=rig.without(odd), stage=stage)
     return network, (Remark(text, Code.INCONSISTENT),)
 
 
@@ -229,6 +260,9 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         options = replace(options, max_iterations=min(options.max_iterations, _FEW))
     problem, notes, doubts = _begun(network, options, settle=not grave)
     network = problem.network
+    for remark in doubts:
+        if remark.code is Code.READINGS:
+            return Failure(remark.text, remark.code)
     found += doubts
     if options.outliers == "reject":
         problem = _within_the_images(problem)

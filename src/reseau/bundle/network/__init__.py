@@ -7,6 +7,7 @@ from .rig import Rig
 from .settings import network_document, with_control, with_datum, with_parameters, with_sigma
 from .shutter import Shutter
 from .stage import Stage
+from .turntable import stage_of_turntable
 
 __all__ = [
     "Additional",
@@ -20,6 +21,7 @@ __all__ = [
     "example_network",
     "film_camera",
     "network_document",
+    "stage_of_turntable",
     "with_control",
     "with_datum",
     "with_parameters",

@@ -20,6 +20,7 @@ from ...optics.refraction import Refraction
 from .rig import Rig
 from .shutter import Shutter
 from .stage import Stage
+from .turntable import stage_of_turntable
 
 __all__ = ["Additional", "Camera", "ControlPoints", "Network", "Usable", "finite", "usable"]
 
@@ -346,10 +347,11 @@ class Network(Display):
     datum_chosen : bool
         Whether the datum points were chosen; otherwise weak points are left out of the inner constraints.
     stage : Stage, optional
-        Stage that moved the field between images with the same exterior orientation; requires the datum
-        ``control``.
+        Stage that moved the object, or the cameras, between images of the same pose; one that is linear, or
+        has an axis that is known in the system of the object, requires the datum ``control``.
     rig : Rig, optional
-        Images that were taken at once by cameras fixed to each other; cannot be combined with a stage.
+        Images that were taken at once by cameras fixed to each other; images of an exposure have the same
+        reading of a stage.
     refraction : Refraction, optional
         Windows and media that the rays pass; without it, and for images without a path, all is in air.
     motion : ndarray (m, 6), optional
@@ -406,14 +408,12 @@ class Network(Display):
                 )
         if not len(self.role) == p or not len(self.groups) == len(self.files) == m:
             raise UsageError("columns differ in length", where="Network")
-        if self.stage is not None and (self.datum != "control" or len(self.stage.pose) != m):
-            raise UsageError("requires the datum `control` and a pose for each image", where="Network.stage")
+        if self.stage is not None:
+            self._check_stage(self.stage)
         if self.rig is not None and not np.array_equal(self.rig.camera, self.camera_of):
             raise UsageError(
                 "requires an exposure, or −1, for each image of each camera", where="Network.rig"
             )
-        if self.rig is not None and self.stage is not None:
-            raise UsageError("cannot be combined with a stage", where="Network.rig")
         if self.refraction is not None:
             self._check_refraction(self.refraction)
         if self.motion is not None and self.motion.shape != (m, 6):
@@ -427,6 +427,37 @@ class Network(Display):
                     raise UsageError(
                         f"a camera with {what} cannot be combined with a {name}", where=camera.label
                     )
+
+    def _check_stage(self, stage: Stage) -> None:
+        if len(stage.pose) != len(self.images):
+            raise UsageError("requires a pose, or −1, for each image", where="Network.stage")
+        if stage.tied and self.datum != "control":
+            raise UsageError(
+                "requires the datum `control` for an axis that is given in the system of the object",
+                where="Network.stage", do="give control points, or leave the axis free",
+            )  # fmt: skip
+        if self.rig is not None and ((self.rig.exposure < 0) & (stage.pose >= 0)).any():
+            raise UsageError("images of a rig on a stage need an exposure each", where="Network.stage")
+        first = self.same_reading
+        columns = (stage.pose, stage.reading, stage.sigmas)
+        for other in np.flatnonzero(first != np.arange(len(first))):
+            one = first[other]
+            if not all(np.array_equal(each[one], each[other], equal_nan=True) for each in columns):
+                raise UsageError(
+                    f"images {self.images[one]} and {self.images[other]} were taken at once, but differ in "
+                    "pose, reading or its sigma",
+                    where="Network.stage",
+                )
+
+    @property
+    def same_reading(self) -> Rows:
+        """First image (m,) with the reading of a stage of each image: that of its exposure."""
+        first = np.arange(len(self.images), dtype=np.intp)
+        if self.rig is not None:
+            on = np.flatnonzero(self.rig.exposure >= 0)
+            _, at, number = np.unique(self.rig.exposure[on], return_index=True, return_inverse=True)
+            first[on] = on[at[number.ravel()]]
+        return first
 
     @property
     def shutters(self) -> Mask:
@@ -485,7 +516,8 @@ class Network(Display):
             raise UsageError("requires a path, or −1, for each image", where="Network.refraction")
         if refraction.on_rig.any():
             self._check_rig_windows(refraction)
-        if self.stage is not None and any(window.on == "object" for window in refraction.windows):
+        moved = self.stage is not None and self.stage.carries == "object"
+        if moved and any(window.on == "object" for window in refraction.windows):
             raise UsageError(
                 "a window on the object cannot be combined with a stage that moves the object",
                 where="Network.refraction",
@@ -553,6 +585,8 @@ class Network(Display):
             rig=_rig(document, camera_row),
             refraction=None if document.refraction is None
             else document.refraction.refraction(images.id, images.camera),
+            stage=None if document.turntable is None
+            else stage_of_turntable(document.turntable, images.id, images.exposure),
             motion=None if images.motion is None
             else np.array([6 * [0.0] if row is None else row for row in images.motion], dtype=np.float64),
         )  # fmt: skip

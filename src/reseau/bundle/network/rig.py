@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
+from .stage import nearest_rotation
 
 __all__ = ["Rig", "RigValues"]
 
@@ -169,7 +170,7 @@ class Rig:
                 of_camera = self.camera[those]
                 turn = np.swapaxes(values.rotation[of_camera], 1, 2) @ rotation[those]
                 at = x0[those] - (values.base[of_camera][:, None, :] @ turn)[:, 0]
-                off = turn @ _mean_rotation(np.median(turn, axis=0)).T
+                off = turn @ nearest_rotation(np.median(turn, axis=0)).T
                 cosine = (np.trace(off, axis1=1, axis2=2) - 1) / 2
                 angle[those] = np.arccos(np.clip(cosine, -1.0, 1.0))
                 away[those] = np.linalg.norm(at - np.median(at, axis=0), axis=1)
@@ -196,12 +197,12 @@ class Rig:
         first, second = rows[0][a], rows[1][b]
         turn = rotation[second] @ np.swapaxes(rotation[first], 1, 2)
         base = np.einsum("nij,nj->ni", rotation[first], x0[second] - x0[first])
-        return _mean_rotation(np.median(turn, axis=0)), np.asarray(np.median(base, axis=0))
+        return nearest_rotation(np.median(turn, axis=0)), np.asarray(np.median(base, axis=0))
 
     @staticmethod
     def of_exposure(values: RigValues, rotation: Array, x0: Array, camera: Rows) -> tuple[Array, Array]:
         """Orientation (3, 3) and (3,) of an exposure from images (k, 3, 3) and (k, 3) of it: their mean."""
-        turn = _mean_rotation((np.swapaxes(values.rotation[camera], 1, 2) @ rotation).mean(axis=0))
+        turn = nearest_rotation((np.swapaxes(values.rotation[camera], 1, 2) @ rotation).mean(axis=0))
         return turn, np.asarray((x0 - values.base[camera] @ turn).mean(axis=0))
 
     @staticmethod
@@ -209,9 +210,3 @@ class Rig:
         """Rotations (k, 3, 3) and centres (k, 3) of images of exposures (…, 3, 3) and (…, 3)."""
         base = (values.base[camera][:, None, :] @ turn)[:, 0]
         return np.asarray(values.rotation[camera] @ turn), np.asarray(at + base)
-
-
-def _mean_rotation(matrix: Array) -> Array:
-    """Rotation next to a mean of rotations."""
-    u, _, vt = np.linalg.svd(matrix)
-    return np.asarray(u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt)

@@ -21,6 +21,7 @@ from ...io.network import (
     ShutterEntry,
 )
 from .network import Camera, ControlPoints, Datum, Network, finite
+from .turntable import turntable_of_stage
 
 __all__ = ["network_document", "with_control", "with_datum", "with_parameters", "with_sigma"]
 
@@ -198,7 +199,7 @@ def network_document(network: Network) -> Network1:
     ------
     UsageError
         When the network has something that its file format describes by other files: a calibrated camera,
-        windows, a stage.
+        windows, a linear stage.
 
     Examples
     --------
@@ -208,8 +209,8 @@ def network_document(network: Network) -> Network1:
     >>> bool((again.xy == network.xy).all()), again.cameras[0].free == network.cameras[0].free
     (True, True)
     """
-    if network.refraction is not None or network.stage is not None:
-        raise UsageError("a network with windows or a stage cannot be written", where="network")
+    if network.refraction is not None:
+        raise UsageError("a network with windows cannot be written", where="network")
     ids = [camera.id for camera in network.cameras]
     sx, sy = np.sqrt(network.cov[:, 0, 0]), np.sqrt(network.cov[:, 1, 1])
     rho = network.cov[:, 0, 1] / (sx * sy)
@@ -253,6 +254,7 @@ def network_document(network: Network) -> Network1:
             sigma=tuple(bars[:, 1].tolist()),
         ) if len(bars) else None,
         bases=_bases(network, ids),
+        turntable=None if network.stage is None else turntable_of_stage(network.stage, network.images),
         datum=network.datum,
         datum_points=tuple(points[network.datum_points]) if network.datum_chosen else None,
     )  # fmt: skip

@@ -10,6 +10,8 @@ import scipy.linalg
 
 from ...core.data import Array, Mask, Rows
 from ..network import Camera
+from ..network.stage import perpendicular
+from .stage_constraints import cross_matrix
 from .system import System
 from .unknowns import Unknowns
 from .values import Values
@@ -43,7 +45,7 @@ class Similarity(NamedTuple):
             rotation=values.rotation @ self.turn.T,
             x0=self.scale * values.x0 @ self.turn.T + self.shift,
             xyz=self.scale * values.xyz @ self.turn.T + self.shift,
-            stage=None if values.stage is None else values.stage.turned(self.turn),
+            stage=None if values.stage is None else values.stage.transformed(*self),
             rig=None if values.rig is None else values.rig.scaled(self.scale),
             cameras=values.cameras.copy(),
             motion=values.motion * np.repeat([self.scale, 1.0], 3),
@@ -66,11 +68,14 @@ class Freedom:
         Changes of the eliminated points.
     names : tuple of str
         Names of the free parameters.
+    basis : ndarray (7, d)
+        The same changes as combinations of shift, rotation and scale.
     """
 
     reduced: Array
     points: Array
     names: tuple[str, ...]
+    basis: Array
 
     @property
     def defect(self) -> int:
@@ -159,7 +164,8 @@ def freedom_of(system: System, values: Values, taking_part: Mask, *, windows: bo
     at = system.others.slices[1]
     j, axis = system.others.coordinate[system.sigma_root[at] > 0].T
     counted[j, axis] = True
-    rows = [whole[(network.held | counted) & taking_part[:, None]]]
+    rows = [*_known_axis(system, values)]
+    rows += [whole[(network.held | counted) & taking_part[:, None]]]
     for a, b in system.others.ends[system.sigma_root[system.others.slices[0]] > 0]:
         along = values.xyz[b] - values.xyz[a]
         rows.append(along[None] @ (whole[b] - whole[a]))
@@ -168,7 +174,8 @@ def freedom_of(system: System, values: Values, taking_part: Mask, *, windows: bo
         known[system.others.refraction[system.sigma_root[system.others.windows] > 0]] = True
         rows.append(moving[known])
     bases = system.sigma_root[system.others.base_lengths]
-    if network.stage is not None or (bases > 0).any() or _scaled_by_cameras(unknowns, values):
+    linear = network.stage is not None and not network.stage.rotary
+    if linear or (bases > 0).any() or _scaled_by_cameras(unknowns, values):
         rows.append(np.eye(7)[6:])
     size = float(np.sqrt((values.xyz[taking_part] ** 2).sum(axis=1).mean())) or 1.0
     scale = np.array([1.0, 1.0, 1.0, 1 / size, 1 / size, 1 / size, 1 / size])
@@ -182,7 +189,26 @@ def freedom_of(system: System, values: Values, taking_part: Mask, *, windows: bo
     )
     basis = scale[:, None] * free
     points *= system.movable[:, :, None]
-    return Freedom(reduced @ basis, points @ basis, names)
+    return Freedom(reduced @ basis, points @ basis, names, basis)
+
+
+def _known_axis(system: System, values: Values) -> list[Array]:
+    """Changes (k, 7) of the components of the axis of a stage that are held or observed."""
+    stage, at = system.unknowns.network.stage, values.stage
+    if stage is None or at is None:
+        return []
+    across, rows = perpendicular(at.axis).T, list[Array]()
+    roots = system.sigma_root[system.others.tilts]
+    tilts = system.others.tilt.shape[1]
+    if stage.axis_sigma == 0 or (roots[:tilts] > 0).any():
+        turned = np.zeros((3, 7))
+        turned[:, 3:6] = -cross_matrix(at.axis)
+        rows.append(across @ turned)
+    if stage.rotary and (stage.point_sigma == 0 or (roots[tilts:] > 0).any()):
+        point = at.foot(system.others.nominal)
+        moved = np.concatenate([np.eye(3), -cross_matrix(point), point[:, None]], axis=1)
+        rows.append(across @ moved)
+    return rows
 
 
 def _magnification(camera: Camera) -> tuple[str, ...]:

@@ -39,12 +39,15 @@ class OtherObservations:
         Image and component of the observed velocities and rotation rates.
     reading : ndarray of int (r,)
         Images of the stage readings.
-    across : ndarray (3, t)
-        Two directions perpendicular to the nominal axis of a stage; the components of the axis along them are
-        observed as zero. Empty without a stage.
+    tilt, shift : ndarray (3, t) and (3, h)
+        Two directions perpendicular to the nominal axis of a stage; the components along them of its
+        direction, and of its distance from its nominal position, are observed as zero. Empty where they are
+        not observed.
+    nominal : ndarray (3,)
+        Nominal position of a rotary axis, in reduced coordinates.
     bases : ndarray of int (b, 2)
         Cameras of the known bases of a rig.
-    value, sigma : ndarray (d + q + i + k + w + v + r + t + b,)
+    value, sigma : ndarray (d + q + i + k + w + v + r + t + h + b,)
         Observed values and their standard deviations, in this order.
     """
 
@@ -56,14 +59,19 @@ class OtherObservations:
     refraction: Rows
     motion: Rows
     reading: Rows
-    across: Array
+    tilt: Array
+    shift: Array
+    nominal: Array
     bases: Rows
     value: Array
     sigma: Array
 
     @classmethod
-    def of(cls, network: Network, active: Mask, xyz: Array) -> OtherObservations:
-        """Collect the observations of a network; `xyz` (p, 3) are reduced, `active` the adjusted points."""
+    def of(cls, network: Network, active: Mask, xyz: Array, origin: Array | None = None) -> OtherObservations:
+        """Collect the observations of a network.
+
+        `xyz` (p, 3) are reduced, that is counted from `origin` (3,), and `active` the adjusted points.
+        """
         interior = [
             (c, camera.names.index(name), camera.sigma[name])
             for c, camera in enumerate(network.cameras)
@@ -77,10 +85,8 @@ class OtherObservations:
         windows = np.zeros(0, np.intp) if bent is None else np.flatnonzero(bent.free & (bent.sigma > 0))
         j, axis = coordinate.T
         moved = np.argwhere(network.motion_sigma > 0).astype(np.intp)
-        stage = network.stage
-        read = np.zeros(0) if stage is None else stage.reading
-        across_axis = np.zeros((3, 0)) if stage is None else perpendicular(stage.axis)
-        tilts = across_axis.shape[1]
+        read, tilt, shift, nominal = _of_stage(network)
+        stage, more = network.stage, tilt.shape[1] + shift.shape[1]
         known = np.zeros((0, 2)) if network.rig is None else network.rig.base
         return cls(
             network.distance_of,
@@ -90,8 +96,10 @@ class OtherObservations:
             combination,
             windows.astype(np.intp),
             moved,
-            np.arange(len(read), dtype=np.intp),
-            across_axis,
+            read,
+            tilt,
+            shift,
+            nominal - (np.zeros(3) if origin is None else origin),
             np.zeros((0, 2), dtype=np.intp) if network.rig is None else network.rig.base_of,
             np.concatenate(
                 [
@@ -101,8 +109,8 @@ class OtherObservations:
                     observed,
                     [] if bent is None else bent.values[windows],
                     network.motions[moved[:, 0], moved[:, 1]],
-                    read,
-                    np.zeros(tilts),
+                    [] if stage is None else stage.reading[read],
+                    np.zeros(more),
                     known[:, 0],
                 ]
             ),
@@ -114,8 +122,9 @@ class OtherObservations:
                     np.ones(len(joint)),
                     [] if bent is None else bent.sigma[windows],
                     network.motion_sigma[moved[:, 0], moved[:, 1]],
-                    np.full(len(read), 0.0 if stage is None else stage.sigma),
-                    np.full(tilts, 0.0 if stage is None else stage.axis_sigma),
+                    [] if stage is None else stage.sigmas[read],
+                    np.full(tilt.shape[1], 0.0 if stage is None else stage.axis_sigma),
+                    np.full(shift.shape[1], 0.0 if stage is None else stage.point_sigma),
                     known[:, 1],
                 ]
             ),
@@ -153,9 +162,9 @@ class OtherObservations:
 
     @property
     def tilts(self) -> slice:
-        """Positions of the two components of the stage axis in `value`."""
+        """Positions of the observed components of the axis of a stage in `value`."""
         start = self.readings.stop
-        return slice(start, start + self.across.shape[1])
+        return slice(start, start + self.tilt.shape[1] + self.shift.shape[1])
 
     @property
     def base_lengths(self) -> slice:
@@ -175,10 +184,25 @@ class OtherObservations:
                 values.refraction[self.refraction],
                 values.motion[self.motion[:, 0], self.motion[:, 1]],
                 [] if values.stage is None else values.stage.reading[self.reading],
-                [] if values.stage is None else values.stage.axis @ self.across,
+                [] if values.stage is None else values.stage.axis @ self.tilt,
+                [] if values.stage is None else (values.stage.foot(self.nominal) - self.nominal) @ self.shift,
                 [] if values.rig is None else values.rig.lengths(self.bases),
             ]
         )
+
+
+def _of_stage(network: Network) -> tuple[Rows, Array, Array, Array]:
+    """Images of observed readings, directions of observed components of the axis, nominal position."""
+    nothing, stage = np.zeros((3, 0)), network.stage
+    if stage is None:
+        return np.zeros(0, dtype=np.intp), nothing, nothing, np.zeros(3)
+    with np.errstate(invalid="ignore"):
+        observed = (stage.pose >= 0) & (stage.sigmas > 0)
+    read = np.flatnonzero(observed & (network.same_reading == np.arange(len(observed))))
+    across = nothing if stage.axis is None else perpendicular(stage.axis / np.linalg.norm(stage.axis))
+    tilt = across if 0 < stage.axis_sigma < np.inf else nothing
+    shift = across if 0 < stage.point_sigma < np.inf else nothing
+    return read.astype(np.intp), tilt, shift, np.zeros(3) if stage.point is None else stage.point
 
 
 def _combinations(cameras: Sequence[Camera]) -> tuple[Rows, Array, Array]:

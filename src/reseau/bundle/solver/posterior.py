@@ -16,11 +16,10 @@ from ...adjust.stochastic import Blocks, Weighting
 from ...core.data import Array, Mask, Rows
 from .arrow import Arrow, Singular
 from .compiled import in_parallel
+from .constraints import Constraints
 from .datum import Freedom, held_for
 from .normal import SEGMENTS, posterior
 from .rank import PARALLEL
-from .rig_constraints import RigConstraints
-from .stage_constraints import StageConstraints
 from .system import Linear, Normal
 
 __all__ = ["BlockSolution", "Cofactors", "cofactors_of", "inverse_from_rows"]
@@ -109,6 +108,8 @@ class Cofactors:
         Undamped normal equations, for joint cofactors.
     referral : Referral, optional
         Transformation of the cofactors to inner constraints.
+    stage : ndarray (k, k), optional
+        Of readings and axis of a stage.
     """
 
     reduced: Array
@@ -117,6 +118,7 @@ class Cofactors:
     others: Array
     normal: Normal
     referral: Referral | None = None
+    stage: Array | None = None
 
     def joint(self, columns: Rows, points: Rows) -> Array:
         """Compute the joint cofactor matrix of reduced unknowns and of all coordinates of points.
@@ -183,7 +185,9 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
     held[still[system.movable[ends] == 0]] = True
     if system.constraints is not None:
         inner = freedom if datum is not None and freedom.defect else None
-        z, points, seen, others = _constrained(linear, normal, system.constraints, held, taking_part, inner)
+        (z, points, seen, others), q = _constrained(
+            linear, normal, system.constraints, held, taking_part, inner
+        )
     else:
         if datum is not None:
             held[held_for(freedom, system.unknowns, diagonal)] = True
@@ -191,12 +195,16 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
         z, points, seen, others = _marginal(linear, normal, held, taking_part)
     kept = np.flatnonzero(system.unknowns.kept >= 0)
     columns = system.unknowns.kept[kept, None] + np.arange(3)
-    referral = None
+    referral, stage = None, None
+    if system.constraints is not None and system.constraints.stage is not None:
+        stage = q[system.constraints.stage.own, system.constraints.stage.own]
     if datum is not None and freedom.defect:
         referral = _referral(normal, freedom, datum & taking_part, z)
+        if stage is not None:
+            stage = _stage_in_datum(referral, stage, linear, q, normal, datum & taking_part)
         z, points = _in_datum(referral, points)
         points[kept] = z[columns[:, :, None], columns[:, None, :]]
-    return Cofactors(z, points, seen, others, normal, referral)
+    return Cofactors(z, points, seen, others, normal, referral, stage)
 
 
 def _marginal(
@@ -238,12 +246,14 @@ def _marginal(
 def _constrained(
     linear: Linear,
     normal: Normal,
-    constraints: StageConstraints | RigConstraints,
+    constraints: Constraints,
     columns: Mask,
     taking_part: Mask,
     inner: Freedom | None,
-) -> tuple[Array, Array, Array, Array]:
-    """Compute the same cofactors with a stage or a rig, of which `inner` is the freedom without a datum.
+) -> tuple[tuple[Array, Array, Array, Array], Array]:
+    """Compute the same cofactors with a stage or a rig, and those of its independent unknowns (size, size).
+
+    `inner` is the freedom without a datum.
 
     Raises
     ------
@@ -251,9 +261,11 @@ def _constrained(
         When the observations do not determine the unknowns.
     """
     held = constraints.held(columns)
-    if isinstance(constraints, RigConstraints) and inner is not None:
+    held[linear.system.fixed] = True
+    if inner is not None:
         free = normal.constrained()
-        held[constraints.held_for(inner.reduced, free.back, np.diag(free.matrix))] = True
+        slopes = linear.constraint_slopes
+        held[constraints.held_for(inner.reduced, free.back, slopes, np.diag(free.matrix))] = True
     own = normal.constrained(held)
     arrow = Arrow.factorise(np.zeros((0, 1)), own.matrix)
     q = arrow.inverse()
@@ -264,7 +276,7 @@ def _constrained(
     missing = abs(_total(found) - int((~held).sum()) - _free_coordinates(linear, taking_part))
     if normal.least < PARALLEL or arrow.weakest < _RANK or not missing < _STAGED:
         raise Singular
-    return found
+    return found, q
 
 
 def _total(found: tuple[Array, Array, Array, Array]) -> float:
@@ -324,19 +336,40 @@ def _others(linear: Linear, z: Array, points: Array) -> Array:
 
 def _referral(normal: Normal, freedom: Freedom, chosen: Mask, z: Array) -> Referral:
     """Terms of the transformation of cofactors to inner constraints over the chosen points."""
-    system = normal.linear.system
-    unknowns, d = system.unknowns, freedom.defect
-    g = np.where(chosen[:, None, None], freedom.points, 0.0)
-    g_reduced = np.zeros((unknowns.size, d))
-    kept = np.flatnonzero((unknowns.kept >= 0) & chosen)
-    columns = unknowns.kept[kept, None] + np.arange(3)
-    g_reduced[columns] = freedom.reduced[columns]
+    system, d = normal.linear.system, freedom.defect
+    g, g_reduced = _chosen(normal, freedom, chosen)
     h = z @ (g_reduced + normal.reduced_sides(g))
     h_points = normal.points(g, h) * system.movable[:, :, None]
     inner = g.reshape(-1, d).T @ g.reshape(-1, d) + g_reduced.T @ g_reduced
     weight = np.asarray(np.linalg.inv(inner), dtype=np.float64)
     m = weight @ (np.einsum("pad,pae->de", g, h_points) + g_reduced.T @ h) @ weight
     return Referral(freedom, z, weight, h, h_points, m)
+
+
+def _chosen(normal: Normal, freedom: Freedom, chosen: Mask) -> tuple[Array, Array]:
+    """EG of the points (p, 3, d) and of the reduced unknowns (u, d), for the chosen points."""
+    unknowns = normal.linear.system.unknowns
+    g = np.where(chosen[:, None, None], freedom.points, 0.0)
+    g_reduced = np.zeros((unknowns.size, freedom.defect))
+    kept = np.flatnonzero((unknowns.kept >= 0) & chosen)
+    columns = unknowns.kept[kept, None] + np.arange(3)
+    g_reduced[columns] = freedom.reduced[columns]
+    return g, g_reduced
+
+
+def _stage_in_datum(
+    referral: Referral, stage: Array, linear: Linear, q: Array, normal: Normal, chosen: Mask
+) -> Array:
+    """Cofactors of readings and axis of a stage with inner constraints, as those of :func:`_in_datum`."""
+    constraints, values = linear.system.constraints, linear.values
+    if constraints is None or constraints.stage is None or values.stage is None:
+        return stage
+    g, g_reduced = _chosen(normal, referral.freedom, chosen)
+    side = linear.transformation.T @ (g_reduced + normal.reduced_sides(g))
+    h = q[constraints.stage.own] @ side
+    own = constraints.stage.changes(values.stage) @ referral.freedom.basis
+    one = own @ referral.weight @ h.T
+    return np.asarray(stage - one - one.T + own @ referral.m @ own.T)
 
 
 def _in_datum(referral: Referral, points: Array) -> tuple[Array, Array]:

@@ -28,6 +28,7 @@ from .observations import OtherObservations
 from .posterior import BlockSolution, Cofactors, cofactors_of
 from .rank import (
     SCALE_OF_WINDOWS,
+    axis_without_effect,
     missing_windows,
     poorly_determined_points,
     steady_points,
@@ -122,7 +123,7 @@ class BundleProblem(Display):
     def others(self) -> OtherObservations:
         """Observations other than image coordinates, of all points; with reduced coordinates."""
         every = np.ones(len(self.network.points), dtype=bool)
-        return OtherObservations.of(self.network, every, self.network.xyz - self.centre)
+        return OtherObservations.of(self.network, every, self.network.xyz - self.centre, self.centre)
 
     @cached_property
     def observations(self) -> NDArray[Any]:
@@ -310,8 +311,9 @@ class _Run:
         joint = used[more.joint]
         windows = np.ones(len(more.refraction), dtype=bool)
         moved = self.usable.images[more.motion[:, 0]]
-        read = self.usable.images[more.reading]
-        axis = np.ones(more.across.shape[1], dtype=bool)
+        read, staged = self._read(more.reading)
+        tilt, shift = (part if staged else part[:, :0] for part in (more.tilt, more.shift))
+        axis = np.full(more.tilt.shape[1] + more.shift.shape[1], staged)
         bases = self._connected(more.bases)
         self.in_others = np.concatenate(
             [bars, coordinate, interior, joint, windows, moved, read, axis, bases]
@@ -333,7 +335,9 @@ class _Run:
             more.refraction,
             more.motion[moved],
             more.reading[read],
-            more.across,
+            tilt,
+            shift,
+            more.nominal,
             more.bases[bases],
             more.value[self.in_others],
             more.sigma[self.in_others],
@@ -345,6 +349,15 @@ class _Run:
         self.system = System(
             self.unknowns, others, mine, factors, self.unknowns.dropped.copy(), problem.centre
         )
+
+    def _read(self, reading: Rows) -> tuple[Mask, bool]:
+        """Which images with an observed reading of a stage count, and whether any image on the stage does."""
+        stage, images = self.problem.network.stage, self.usable.images
+        if stage is None:
+            return np.zeros(0, dtype=bool), False
+        first = self.problem.network.same_reading
+        seen = np.bincount(first[images & (stage.pose >= 0)], minlength=len(first)) > 0
+        return np.asarray(seen[reading]), bool(seen.any())
 
     def _connected(self, bases: Rows) -> Mask:
         """Whether the cameras of known bases (b, 2) are connected by adjusted images."""
@@ -375,8 +388,10 @@ class _Run:
                 "give control points or distances, or use the datum `minimal` or `free`",
                 Code.NO_DATUM,
             )
-        if network.datum == "minimal":
-            self.system.held[held_minimally(freedom, self.unknowns, start)] = True
+        loose = self._without_axis(start)
+        if loose is not None:
+            return loose
+        self._fix(freedom, start)
         counts = self._counts(freedom)
         redundancy = counts[0] - counts[1] + counts[2]
         if redundancy < 0:
@@ -495,6 +510,33 @@ class _Run:
             )
         return None
 
+    def _without_axis(self, start: Values) -> Failure | None:
+        """A failure where orientations of the images would not determine the axis of a stage."""
+        constraints, stage = self.system.constraints, self.network.stage
+        if constraints is None or constraints.stage is None or stage is None:
+            return None
+        open_ = axis_without_effect(self.system.linearise(start))
+        if not open_:
+            return None
+        what = "angles" if stage.rotary else "readings"
+        return Failure(
+            f"rank defect {len(open_)}: {' and '.join(dict.fromkeys(open_))} not determined: no pose has "
+            f"images at two different {what}; give such images, or hold what is known of the axis",
+            Code.RANK_DEFECT,
+        )
+
+    def _fix(self, freedom: Freedom, start: Values) -> None:
+        """Hold unknowns that fix the datum ``minimal``."""
+        if self.network.datum != "minimal":
+            return
+        constraints = self.system.constraints
+        if constraints is None or constraints.stage is None:
+            self.system.held[held_minimally(freedom, self.unknowns, start)] = True
+            return
+        linear = self.system.linearise(start)
+        free, slopes = linear.normal(0.0).constrained(), linear.constraint_slopes
+        self.system.fixed = constraints.held_for(freedom.reduced, free.back, slopes, np.diag(free.matrix))
+
     def approach(self) -> Values | None:
         """Approximate values in the coordinate system of the network after some iterations."""
         if not self.usable.images.any():
@@ -504,8 +546,9 @@ class _Run:
         counts = self._counts(freedom)
         if counts[0] - counts[1] + counts[2] < 0:
             return None
-        if self.network.datum == "minimal":
-            self.system.held[held_minimally(freedom, self.unknowns, start)] = True
+        if self._without_axis(start) is not None:
+            return None
+        self._fix(freedom, start)
         found = iterate(
             self.system, start, redundancy=max(1, counts[0] - counts[1]), tolerance=_ROUGHLY,
             max_iterations=self.options.max_iterations, damping=self.options.damping,
@@ -541,23 +584,24 @@ class _Run:
     def _without(self, points: Rows, values: Values) -> BundleProblem:
         """Return the problem with the estimates as approximate values, without points with parallel rays."""
         start, images = self.problem.start, self.usable.images
-        xyz = np.where(self.usable.points[:, None], values.xyz + self.problem.centre, start.xyz)
+        values = values.shifted(self.problem.centre)
+        xyz = np.where(self.usable.points[:, None], values.xyz, start.xyz)
         xyz[points] = np.nan
         rotation = np.where(images[:, None, None], values.rotation, start.rotation)
-        x0 = np.where(images[:, None], values.x0 + self.problem.centre, start.x0)
+        x0 = np.where(images[:, None], values.x0, start.x0)
         start = replace(values, rotation=rotation, x0=x0, xyz=xyz)
         return replace(self.problem, start=start, rounds=self.problem.rounds + 1)
 
     def _start(self) -> Values:
         """Approximate values with reduced coordinates; finite for unused images and points as well."""
-        start, centre = self.problem.start, self.problem.centre
+        start = self.problem.start.shifted(-self.problem.centre)
         known = finite(start.x0)
         extra = start.extra
         if extra.shape[0] != max(1, len(self.unknowns.extra)):
             extra = np.zeros((max(1, len(self.unknowns.extra)), extra.shape[1]))
         rotation = np.where(known[:, None, None], start.rotation, np.eye(3))
-        x0 = np.where(known[:, None], start.x0 - centre, 0.0)
-        return replace(start, rotation=rotation, x0=x0, xyz=np.nan_to_num(start.xyz - centre), extra=extra)
+        x0 = np.where(known[:, None], start.x0, 0.0)
+        return replace(start, rotation=rotation, x0=x0, xyz=np.nan_to_num(start.xyz), extra=extra)
 
     def _counts(self, freedom: Freedom) -> tuple[int, int, int]:
         """Observations, unknowns before datum constraints, datum constraints."""
@@ -611,11 +655,11 @@ class _Run:
         weightings = [self.weighting, second] if len(others) else [self.weighting]
         whitened = np.concatenate([self.weighting.whiten(counted[: 2 * n]), second.whiten(counted[2 * n :])])
         solution = BlockSolution.of(weightings, whitened, [hats, others[:, None, None]][: len(weightings)])
-        centre, values = self.problem.centre, linear.values
-        xyz = np.where(self.usable.points[:, None], values.xyz + centre, np.nan)
+        values = linear.values.shifted(self.problem.centre)
+        xyz = np.where(self.usable.points[:, None], values.xyz, np.nan)
         xyz = np.where(whole.held & self.usable.points[:, None], whole.xyz, xyz)
         images = self.usable.images
-        x0 = np.where(images[:, None], values.x0 + centre, np.nan)
+        x0 = np.where(images[:, None], values.x0, np.nan)
         rotation = np.where(images[:, None, None], values.rotation, np.nan)
         return BundleFit(
             problem=self.problem,

@@ -17,6 +17,7 @@ from .values import Values
 __all__ = [
     "PARALLEL",
     "SCALE_OF_WINDOWS",
+    "axis_without_effect",
     "missing_windows",
     "poorly_determined_points",
     "steady_points",
@@ -39,6 +40,8 @@ _ZERO = 1e-11
 # than 3e-5 rad.
 PARALLEL = 1e-9
 _LISTED = 8
+# Effect of an axis on all orientations, relative to the extent of the network, that is rounding.
+_IDLE_AXIS = 1e-10
 # Indices that differ by less are equal: no ray is bent by 1e-9 rad.
 _SAME = 1e-9
 # A point with this many times the median uncertainty is poorly determined.
@@ -69,9 +72,9 @@ def undetermined(linear: Linear, freedom: Freedom, costs: tuple[float, ...]) -> 
             Code.NOT_IDENTIFIED,
             costs=costs,
         )
-    # Without the constraints of the stage, determined unknowns would appear undetermined.
-    vectors = _null_vectors(linear, freedom) if linear.system.constraints is None else []
-    bent = linear.system.unknowns.network.refraction is not None
+    constrained = linear.system.constraints is not None
+    vectors = _null_vectors(linear, freedom)
+    bent = linear.system.unknowns.network.refraction is not None and not constrained
     if bent and len(vectors) == 1 and _is_scale(linear, vectors[0]):
         reason = f"rank defect 1: {SCALE_OF_WINDOWS}"
         return AdjustmentFailure(reason, Code.RANK_DEFECT, costs=costs, null_space=tuple(vectors))
@@ -86,7 +89,7 @@ def _said(bent: Refraction | None, names: list[str]) -> str:
     """Say what a combination of unknowns that is not determined means, with windows and media first."""
     own = [name for name in names if bent is not None and name in bent.names]
     if bent is None or not own:
-        return f"the observations do not determine {' with '.join(names[:_LISTED])}"
+        return f"the observations do not determine {' with '.join(list(dict.fromkeys(names))[:_LISTED])}"
     others = [name for name in names if name not in own]
     rest = f" (with {', '.join(others[:_LISTED])}{' …' if len(others) > _LISTED else ''})" if others else ""
     indices = [medium.name for medium in bent.media if medium.label in own]
@@ -295,11 +298,21 @@ def _null_vectors(linear: Linear, freedom: Freedom) -> list[dict[str, float]]:
     """Basis of the null space of the reduced normal equations, with as many zeros as possible."""
     system = linear.system
     normal = linear.normal(0.0, turned=False)
-    held = system.held.copy()
-    held[held_for(freedom, system.unknowns, normal.sums.diagonal)] = True
-    diagonal = normal.sums.diagonal
-    normal.hold(held)
-    s = full(normal.sums.band, normal.sums.border)
+    if system.constraints is not None:
+        constraints, free = system.constraints, normal.constrained()
+        held = constraints.held(system.held)
+        held[system.fixed] = True
+        if freedom.defect:
+            slopes, own = linear.constraint_slopes, np.diag(free.matrix)
+            held[constraints.held_for(freedom.reduced, free.back, slopes, own)] = True
+        s, names = normal.constrained(held).matrix, constraints.names(system.unknowns)
+        diagonal = np.diag(s).copy()
+    else:
+        held, names = system.held.copy(), system.unknowns.names
+        held[held_for(freedom, system.unknowns, normal.sums.diagonal)] = True
+        diagonal = normal.sums.diagonal
+        normal.hold(held)
+        s = full(normal.sums.band, normal.sums.border)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = s * scale[:, None] * scale
     values, vectors = np.linalg.eigh(scaled)
@@ -316,5 +329,31 @@ def _null_vectors(linear: Linear, freedom: Freedom) -> list[dict[str, float]]:
     for vector in null.T:
         strong = np.flatnonzero(np.abs(vector) > 1e-3)
         strong = strong[np.argsort(-np.abs(vector[strong]))]
-        named.append({system.unknowns.names[i]: float(vector[i] * scale[i]) for i in strong})
+        named.append({names[i]: float(vector[i] * scale[i]) for i in strong})
     return named
+
+
+def axis_without_effect(linear: Linear) -> list[str]:
+    """Return what the orientations of all images, and its observations, leave open of the axis of a stage.
+
+    An example is one reading for each pose: any axis gives any orientation then.
+    """
+    constraints = linear.system.constraints
+    if constraints is None or constraints.stage is None:
+        return []
+    own = constraints.stage
+    rows = np.concatenate([linear.transformation, linear.constraint_slopes])[:, len(own.others) :]
+    size = np.linalg.norm(rows, axis=0)
+    far = float(
+        np.linalg.norm(linear.values.x0[own.frames.image] - linear.values.x0.mean(axis=0), axis=1).max()
+    )
+    # Of a turn by 360 degrees there remain roundings.
+    rows = np.where(size > _IDLE_AXIS * max(far, 1.0), rows / np.where(size > 0, size, 1.0), 0.0)
+    values, vectors = np.linalg.eigh(rows.T @ rows)
+    names = np.array(constraints.names(linear.system.unknowns)[len(own.others) :])
+    open_ = list[str]()
+    for vector in vectors[:, values < _ZERO * len(values)].T:
+        strong = np.abs(vector) > 1e-3
+        of_axis = [str(name) for name in names[strong] if name.endswith("of the axis")]
+        open_.append(of_axis[0] if of_axis else str(names[int(np.argmax(np.abs(vector)))]))
+    return open_

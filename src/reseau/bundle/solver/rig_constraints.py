@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg
 
 from ...core.data import Array, Mask, Rows
 from ...optics.poses import rotation_matrix
@@ -105,7 +104,13 @@ class RigConstraints:
         """Number of independent unknowns."""
         return len(self.others) + 6 * (len(self._numbers[1]) + len(self.cameras))
 
-    def _exposures(self, places: RigValues, rotation: Array, x0: Array) -> tuple[Array, Array]:
+    @property
+    def exposures(self) -> tuple[Rows, Rows]:
+        """First image (e,) of each exposure, and the first of its six independent unknowns (e,)."""
+        first = self._numbers[1]
+        return self.images[first], len(self.others) + 6 * np.arange(len(first), dtype=np.intp)
+
+    def orientations(self, places: RigValues, rotation: Array, x0: Array) -> tuple[Array, Array]:
         """Orientations (e, 3, 3) and (e, 3) of the exposures, from their first images."""
         first = self.images[self._numbers[1]]
         camera = self.rig.camera[first]
@@ -117,7 +122,7 @@ class RigConstraints:
         """Compute T (u, size) at given values."""
         t = np.zeros((self.unknowns.size, self.size))
         t[self.others, np.arange(len(self.others))] = 1.0
-        turn, _ = self._exposures(places, rotation, x0)
+        turn, _ = self.orientations(places, rotation, x0)
         number, camera = self._numbers[0], self.rig.camera[self.images]
         back = np.swapaxes(turn[number], 1, 2)
         at = len(self.others) + 6 * number[:, None] + np.arange(6)
@@ -133,8 +138,8 @@ class RigConstraints:
         t[columns, len(self.others) + 6 * (len(turn) + camera[:, None]) + np.arange(6)] = 1.0
         return t
 
-    def slopes(self, places: RigValues, cameras: Rows, root: Array) -> Array:
-        """Derivatives (b, size) of the distances of pairs of cameras (b, 2), times roots (b,) of weights."""
+    def slopes(self, places: RigValues, cameras: Rows) -> Array:
+        """Derivatives (b, size) of the distances of pairs of cameras (b, 2)."""
         slopes = np.zeros((len(cameras), self.size))
         start = len(self.others) + 6 * len(self._numbers[1]) + 3
         column = {int(camera): start + 6 * k for k, camera in enumerate(self.cameras)}
@@ -144,13 +149,21 @@ class RigConstraints:
             for camera, slope in ((a, -along), (b, along)):
                 if camera in column:
                     row[column[camera] : column[camera] + 3] = slope
-        return slopes * root[:, None]
+        return slopes
 
     def stepped(
-        self, places: RigValues, rotation: Array, x0: Array, q: Array
+        self,
+        places: RigValues,
+        rotation: Array,
+        x0: Array,
+        q: Array,
+        given: tuple[Rows, Array, Array] | None = None,
     ) -> tuple[RigValues, Array, Array]:
-        """Return places, rotations and projection centres (m, …) after a correction."""
-        turn, at = self._exposures(places, rotation, x0)
+        """Return places, rotations and projection centres (m, …) after a correction.
+
+        `given` are exposures with their new orientations, of a stage.
+        """
+        turn, at = self.orientations(places, rotation, x0)
         step = q[len(self.others) :].reshape(-1, 6)
         count = len(turn)
         by_base = step[count:, 3:]
@@ -158,6 +171,8 @@ class RigConstraints:
         new.rotation[self.cameras] = rotation_matrix(step[count:, :3]) @ places.rotation[self.cameras]
         new.base[self.cameras] += by_base
         turn, at = rotation_matrix(step[:count, :3]) @ turn, at + step[:count, 3:]
+        if given is not None:
+            rows, turn[rows], at[rows] = given[0], given[1], given[2]
         rotation, x0 = rotation.copy(), x0.copy()
         number, camera = self._numbers[0], self.rig.camera[self.images]
         rotation[self.images], x0[self.images] = self.rig.images(new, turn[number], at[number], camera)
@@ -172,22 +187,17 @@ class RigConstraints:
         held[at[own]] = True
         return held
 
-    def held_for(self, freedom: Array, t: Array, diagonal: Array) -> Rows:
-        """Choose well-conditioned independent unknowns that fix the datum when they are held.
-
-        Parameters
-        ----------
-        freedom : ndarray (u, d)
-            Changes of the reduced unknowns that no observation determines.
-        t : ndarray (u, size)
-            See :meth:`matrix`.
-        diagonal : ndarray (size,)
-            Diagonal of the normal equations, to compare unknowns with different units.
-        """
-        changes = np.linalg.lstsq(t, freedom, rcond=None)[0] * np.sqrt(diagonal)[:, None]
-        basis, _ = np.linalg.qr(changes / np.linalg.norm(changes, axis=0))
-        _, _, order = scipy.linalg.qr(basis.T, mode="economic", pivoting=True)
-        return np.sort(order[: freedom.shape[1]]).astype(np.intp)
+    def names(
+        self, images: tuple[str, ...], cameras: tuple[str, ...], others: tuple[str, ...]
+    ) -> tuple[str, ...]:
+        """Names (size,) of the independent unknowns, from those of images, cameras and other unknowns."""
+        names = [others[k] for k in self.others]
+        own = ("dx", "dy", "dz", "X0", "Y0", "Z0")
+        for image in self.exposures[0]:
+            names += [f"{name} of the exposure of image {images[image]}" for name in own]
+        for camera in self.cameras:
+            names += [f"{name} of {cameras[camera]} on the rig" for name in own]
+        return tuple(names)
 
     def cofactors(self, t: Array, reduced: Array) -> Array:
         """Cofactors (k, 6, k, 6) of the places of the cameras, from those of the reduced unknowns (u, u).

@@ -15,11 +15,10 @@ from ..network import Network
 from .arrow import Arrow, full
 from .camera_basis import CameraBasis, camera_bases, with_bases
 from .compiled import chunks_of, in_parallel
+from .constraints import Constrained, Constraints
 from .imaging import Bent, Imaging, Seen, mapped
 from .normal import Sums, assemble, reduce_sides, substitute
 from .observations import OtherObservations
-from .rig_constraints import RigConstraints
-from .stage_constraints import Constrained, StageConstraints
 from .unknowns import Unknowns
 from .values import Correction, Values
 
@@ -48,6 +47,11 @@ class System:
         Held reduced unknowns.
     origin : ndarray (3,)
         Point of object space from which the coordinates of points are counted.
+
+    Attributes
+    ----------
+    fixed : ndarray of int
+        Independent unknowns of a stage or a rig that are held as the datum.
     """
 
     def __init__(
@@ -66,11 +70,8 @@ class System:
         self.sigma_root = np.sqrt(factors) / others.sigma
         self.movable = np.where(network.held, 0.0, 1.0)
         self.pattern = unknowns.pattern
-        self.constraints: StageConstraints | RigConstraints | None = None
-        if network.stage is not None:
-            self.constraints = StageConstraints(unknowns, network.stage)
-        elif network.rig is not None:
-            self.constraints = RigConstraints(unknowns, network.rig)
+        self.constraints = Constraints.of(unknowns)
+        self.fixed: Rows = np.zeros(0, dtype=np.intp)
         self.chunks = chunks_of(unknowns.first)
         self.imaging = Imaging(network, unknowns.extra_names, origin, unknowns.mounts)
 
@@ -215,26 +216,32 @@ class Linear:
     @cached_property
     def transformation(self) -> Array:
         """T (u, size): reduced unknowns from the independent ones, with a stage or a rig."""
-        constraints, values = self.system.constraints, self.values
-        if isinstance(constraints, StageConstraints) and values.stage is not None:
-            return constraints.matrix(values.stage)
-        if isinstance(constraints, RigConstraints) and values.rig is not None:
-            return constraints.matrix(values.rig, values.rotation, values.x0)
-        return np.eye(self.system.unknowns.size)
+        constraints = self.system.constraints
+        if constraints is None:
+            return np.eye(self.system.unknowns.size)
+        return constraints.matrix(self.values.placed)
 
     @cached_property
     def constraint_slopes(self) -> Array:
         """Weighted derivatives (a, size) of the last of the other observations, those of a stage or a rig.
 
-        These are readings and axis of a stage, or the known bases of a rig.
+        These are readings and axis of a stage, then the known bases of a rig.
         """
         constraints, others, values = self.system.constraints, self.system.others, self.values
+        slopes = [np.zeros((0, self.transformation.shape[1]))]
+        if constraints is not None and constraints.stage is not None and values.stage is not None:
+            seen = (others.reading, others.tilt, others.shift, others.nominal)
+            slopes.append(constraints.stage.slopes(values.stage, *seen))
+        if constraints is not None and constraints.rig is not None and values.rig is not None:
+            own = constraints.rig.slopes(values.rig, others.bases)
+            if constraints.stage is not None and values.stage is not None:
+                # No base depends on exposures: of the independent unknowns, only the others do.
+                through = np.zeros((len(own), constraints.size))
+                through[:, : len(constraints.stage.others)] = own[:, constraints.stage.others]
+                own = through
+            slopes.append(own)
         root = self.system.sigma_root[others.readings.start :]
-        if isinstance(constraints, StageConstraints) and values.stage is not None:
-            return constraints.slopes(values.stage, others.across, root)
-        if isinstance(constraints, RigConstraints) and values.rig is not None:
-            return constraints.slopes(values.rig, others.bases, root)
-        return np.zeros((0, self.transformation.shape[1]))
+        return np.concatenate(slopes) * root[:, None]
 
     @cached_property
     def prior(self) -> Array:
@@ -415,7 +422,9 @@ class Normal:
             y = self.in_parameters(y)
         else:
             columns = self.linear.system.held
-            own = self.constrained(constraints.held(columns) if columns.any() else None)
+            held = constraints.held(columns)
+            held[self.linear.system.fixed] = True
+            own = self.constrained(held if held.any() else None)
             q = Arrow.factorise(np.zeros((0, 1)), own.matrix).solve(-own.gradient)
             y, by_stage = own.back @ q, float(own.own @ q)
             gradient = self.sums.gradient @ y

@@ -10,9 +10,8 @@ from ...core.data import Array, Rows
 from ...optics.poses import rotation_matrix
 from ..network.rig import RigValues
 from ..network.stage import StageValues
+from .constraints import Constraints, Placed
 from .imaging import Orientation
-from .rig_constraints import RigConstraints
-from .stage_constraints import StageConstraints
 from .unknowns import Unknowns
 
 __all__ = ["Correction", "Values"]
@@ -113,6 +112,18 @@ class Values:
         """Poses and points for the compiled loops."""
         return Orientation(self.rotation, self.x0, self.xyz, self.motion)
 
+    @property
+    def placed(self) -> Placed:
+        """Orientations of the images, and values of a rig and of a stage."""
+        return Placed(self.rotation, self.x0, self.rig, self.stage)
+
+    def shifted(self, by: Array) -> Values:
+        """Return the values with coordinates that are larger by a vector (3,)."""
+        stage = self.stage
+        if stage is not None:
+            stage = stage._replace(point=stage.point + by)
+        return replace(self, x0=self.x0 + by, xyz=self.xyz + by, stage=stage)
+
     def beyond(self, radius: float) -> Rows:
         """Return the points farther than `radius` from the origin."""
         return np.flatnonzero(~(np.linalg.norm(self.xyz, axis=1) <= radius)).astype(np.intp)
@@ -127,7 +138,7 @@ class Values:
         self,
         unknowns: Unknowns,
         step: Correction,
-        constraints: StageConstraints | RigConstraints | None = None,
+        constraints: Constraints | None = None,
     ) -> Values:
         """Return the values after a correction; rotations are about the camera axes."""
         y = step.reduced
@@ -149,14 +160,10 @@ class Values:
         kept = np.flatnonzero(unknowns.kept >= 0)
         xyz[kept] += y[unknowns.kept[kept, None] + np.arange(3)]
         x0, stage, rig = self.x0 + pose[:, 3:], self.stage, self.rig
-        if isinstance(constraints, StageConstraints) and stage is not None and step.independent is not None:
-            stage, x0 = constraints.stepped(stage, self.x0, y, step.independent)
-        if isinstance(constraints, RigConstraints) and rig is not None and step.independent is not None:
-            rig, turned, moved = constraints.stepped(rig, self.rotation, self.x0, step.independent)
-            rotation[constraints.images], x0[constraints.images] = (
-                turned[constraints.images],
-                moved[constraints.images],
-            )
+        if constraints is not None and step.independent is not None:
+            at, own = constraints.stepped(self.placed, step.independent), constraints.images
+            rotation[own], x0[own] = at.rotation[own], at.x0[own]
+            rig, stage = at.rig, at.stage
         refraction = self.refraction.copy()
         refraction[unknowns.refracting] += y[unknowns.refraction_columns]
         motion = self.motion.copy()
