@@ -337,7 +337,13 @@ class Session:
     @property
     def status(self) -> str:
         """Last status: done, stopped or failed; or `not ended`."""
+        return self.last_end[0]
+
+    @property
+    def last_end(self) -> tuple[str, str]:
+        """Last status, and why."""
         e = schema.ends.c
-        query = sa.select(e.status).where(e.session_id == self._id).order_by(e.id.desc()).limit(1)
+        query = sa.select(e.status, e.why).where(e.session_id == self._id).order_by(e.id.desc()).limit(1)
         with schema.connected(self._engine, reading=True) as connection:
-            return connection.scalar(query) or "not ended"
+            row = connection.execute(query).one_or_none()
+        return ("not ended", "") if row is None else (row[0], row[1])

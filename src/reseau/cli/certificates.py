@@ -86,16 +86,7 @@ def _find(source: str, archive: str | None, objects: str | None, at: str | None,
             # Any rejection counts, whatever another configuration says.
             decided.sort(key=lambda pair: pair[1].outcome.startswith("accepted"))
             name, decision = decided[0] if decided else ("", None)
-        earlier = []
-        if name:
-            events = [time for time, _ in known.events(name)]
-            start = max(events, default=datetime.min.replace(tzinfo=UTC))
-            earlier = [
-                known.calibration(name, each.key)
-                for each in known.history(name)
-                if each.outcome.startswith("accepted") and each.since >= start
-                and decision is not None and each.key != decision.key and decision.since >= start
-            ]  # fmt: skip
+        earlier = known.earlier(name, decision) if name and decision is not None else []
         return _Found(calibration, decision, name, earlier)
 
 

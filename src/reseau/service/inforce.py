@@ -417,6 +417,19 @@ class Configurations:
                 raise UsageError("names no decision", where=f"{name}: {key!r}")
         return [parse_calibration(texts[key], where=f"calibration {key}") for key in keys]
 
+    def earlier(self, name: str, decision: Decision) -> list[Calibration]:
+        """Return the other accepted calibrations since the last service event: they show the reproducibility.
+
+        None are returned for a decision from before that event.
+        """
+        start = max((time for time, _ in self.events(name)), default=datetime.min.replace(tzinfo=UTC))
+        keys = [
+            each.key
+            for each in self.history(name)
+            if each.outcome in _ACCEPTED and each.since >= start and each.key != decision.key
+        ]
+        return self._calibrations(name, keys) if decision.since >= start else []
+
     def drift(
         self, name: str, options: ChartOptions | None = None, covariates: CovariateTable | None = None
     ) -> Drift:

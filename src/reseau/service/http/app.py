@@ -13,7 +13,7 @@ from fastapi import FastAPI
 
 from ...core.errors import UsageError
 from ...core.version import __version__
-from . import accounts, operations, pages
+from . import accounts, calibrations, history, operations, pages, sessions
 from .answers import add_error_handlers
 from .guard import Guard, log
 from .options import ServeOptions
@@ -43,7 +43,14 @@ def create_app(service: Service) -> Any:
     )  # fmt: skip
     app.state.service = service
     add_error_handlers(app, pages.rendered_error)
-    for each in (operations.open_router, operations.router, accounts.router):
+    for each in (
+        operations.open_router,
+        operations.router,
+        accounts.router,
+        sessions.router,
+        calibrations.router,
+        history.router,
+    ):
         app.include_router(each, prefix=API)
     app.include_router(pages.router)
     plain = app.openapi

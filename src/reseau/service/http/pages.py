@@ -10,8 +10,10 @@ import jinja2
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 
-from . import accounts, operations
+from ...core.errors import ReseauError
+from . import accounts, calibrations, history, operations, sessions
 from .access import Administering, Here, NotFound, Reading, Unknown, csrf_of, principal_of, service_of
+from .service import Service
 
 __all__ = ["rendered_error", "router"]
 
@@ -22,15 +24,40 @@ _STATIC = {
     "app.js": "text/javascript",
     "icon.svg": "image/svg+xml",
 }
-NAV = (("/account", "Account"),)
+NAV = (
+    ("/sessions", "Sessions"),
+    ("/calibrations", "Calibrations"),
+    ("/history", "History"),
+    ("/account", "Account"),
+)
+_SHOWN = 400
+"""Frames on the page of a session."""
+_RULES = """{
+ "schema": "reseau-acceptance/1",
+ "version": 1,
+ "image": {"warning": 0.1, "action": 0.3}
+}"""
 
 
 @cache
 def _templates() -> jinja2.Environment:
-    return jinja2.Environment(
+    found = jinja2.Environment(
         loader=jinja2.PackageLoader("reseau.service", "pages/app"), autoescape=True, trim_blocks=True,
         lstrip_blocks=True, undefined=jinja2.StrictUndefined,
     )  # fmt: skip
+    found.filters["plain"] = _plain
+    return found
+
+
+def _plain(value: Any) -> str:
+    """A value of JSON as people read it."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_plain(each)}" for key, each in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(each) for each in value)
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "—"}[value]
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _rendered(request: Request, template: str, status: int = 200, **content: Any) -> HTMLResponse:
@@ -40,13 +67,17 @@ def _rendered(request: Request, template: str, status: int = 200, **content: Any
     cookie = request.cookies.get(service.cookie, "")
     here = "/" + request.url.path.strip("/").partition("/")[0]
     page = _templates().get_template(template)
-    text = page.render(content, who=who, csrf=csrf_of(cookie) if cookie else "", nav=NAV, here=here)
+    text = page.render(
+        content, who=who, csrf=csrf_of(cookie) if cookie else "", nav=NAV, here=here,
+        may_operate=who is not None and who.may("operate"),
+        may_administer=who is not None and who.may("administer"),
+    )  # fmt: skip
     return HTMLResponse(text, status)
 
 
 def rendered_error(request: Request, status: int, text: str) -> Response:
     """Return a page that says what is wrong."""
-    return _rendered(request, "error.html.j2", status, text=text)
+    return _rendered(request, "error.html.j2", status, text=text, code=status)
 
 
 def _inside(path: str) -> str:
@@ -87,7 +118,142 @@ def login(request: Request, service: Here, next: Annotated[str, Query(max_length
 @router.get("/")
 def home(request: Request, who: Reading, service: Here) -> Response:
     """The overview."""
-    return _rendered(request, "home.html.j2", alarms=[], benches=[], sessions=[], configurations=[])
+    return _rendered(
+        request, "home.html.j2", alarms=[a for a in history.all_alarms(service) if not a.acknowledged],
+        benches=[], sessions=sessions.rows(service, 10), configurations=calibrations.listed(service),
+    )  # fmt: skip
+
+
+@router.get("/sessions")
+def all_sessions(
+    request: Request,
+    who: Reading,
+    service: Here,
+    like: Annotated[str, Query(max_length=200)] = "",
+    before: Annotated[str | None, Query(max_length=200)] = None,
+) -> Response:
+    """All sessions, latest first."""
+    found = sessions.sessions(who, service, 50, before, like)
+    return _rendered(request, "sessions.html.j2", sessions=found.sessions, before=found.before, like=like)
+
+
+@router.get("/sessions/{session}")
+def session_page(request: Request, session: str, who: Reading, service: Here) -> Response:
+    """A session."""
+    found = sessions.session_detail(service, sessions.the_session(service, session))
+    frames = sessions.frames(session, who, service, 0, 2000)
+    return _rendered(
+        request, "session.html.j2", s=found, frames=frames[-_SHOWN:][::-1], more=max(0, len(frames) - _SHOWN),
+        report=_report(found), bench=None, reached={},
+    )  # fmt: skip
+
+
+def _report(session: sessions.SessionDetail) -> int | None:
+    """Number of the latest report of a session."""
+    found = [each.id for each in session.results if each.name == "report.html"]
+    return found[-1] if found else None
+
+
+@router.get("/sessions/{session}/frames/{number}")
+def frame_page(request: Request, session: str, number: int, who: Reading, service: Here) -> Response:
+    """A frame with the marks found in it."""
+    kept = sessions.the_session(service, session)
+    row = next((each for each in sessions.frames(session, who, service, number - 1, 1)), None)
+    if row is None or row.id != number:
+        raise NotFound("has no such frame", where=f"{session}: {number}")
+    overlay = row.suffix == ".tif" and not {"design.json", "reseau.json"}.isdisjoint(kept.inputs())
+    return _rendered(request, "frame.html.j2", f=row, session=session, overlay=overlay)
+
+
+@router.get("/calibrations")
+def configurations_page(request: Request, who: Reading, service: Here) -> Response:
+    """All configurations."""
+    return _rendered(request, "configurations.html.j2", configurations=calibrations.listed(service))
+
+
+@router.get("/calibrations/{name}")
+def configuration_page(request: Request, name: str, who: Reading, service: Here) -> Response:
+    """A configuration with its history and control charts."""
+    found = calibrations.configuration_detail(service, name)
+    drift = None
+    if len(found.history) > 1:
+        try:
+            drift = history.drift(name, who, service)
+        except ReseauError:  # such as calibrations of different cameras: the alarms say so
+            drift = None
+    done = [each.name for each in sessions.rows(service, 200) if each.results]
+    return _rendered(
+        request, "configuration.html.j2", c=found, charted=drift is not None, drift=drift, sessions=done,
+        rules=_last_rules(service, name),
+    )  # fmt: skip
+
+
+def _last_rules(service: Service, name: str) -> str:
+    """The rules by which a configuration was judged last, or an example."""
+    from ...core.provenance import canonical_json
+
+    found = calibrations.rules_of(service, name)
+    return _RULES if found is None else canonical_json(found).strip()
+
+
+@router.get("/calibrations/{name}/compare")
+def compare_page(
+    request: Request,
+    name: str,
+    who: Reading,
+    service: Here,
+    first: Annotated[str, Query(max_length=64)],
+    second: Annotated[str, Query(max_length=64)],
+) -> Response:
+    """Two calibrations of a configuration."""
+    found, field = calibrations.comparison(service, name, first, second)
+    since = {
+        d.key: d.since[:16].replace("T", " ")
+        for d in calibrations.configuration_detail(service, name).history
+    }
+    return _rendered(
+        request, "compare.html.j2", name=name, c=found, first=f"since {since[found.first]} UTC",
+        second=f"since {since[found.second]} UTC", drawn=field is not None,
+    )  # fmt: skip
+
+
+@router.get("/calibrations/{name}/{key}")
+def calibration_page(request: Request, name: str, key: str, who: Reading, service: Here) -> Response:
+    """A calibration and the decision on it."""
+    found = calibrations.calibration_detail(service, name, key)
+    current = calibrations.configuration_detail(service, name).in_force
+    report = None
+    if found.decision.session is not None:
+        kept = sessions.the_session(service, found.decision.session)
+        report = _report(sessions.session_detail(service, kept))
+    tests = {}
+    for each in found.tests:
+        if {"parameter", "p"} <= each.keys():
+            tests[each["parameter"]] = f"p = {each['p']:.2g}"
+    return _rendered(
+        request, "calibration.html.j2", c=found, report=report, tests=tests,
+        verdict=" ".join(found.validity.get("verdict", [])),
+        in_force=current is not None and current.key == found.decision.key,
+    )  # fmt: skip
+
+
+@router.get("/history")
+def history_page(request: Request, who: Reading, service: Here) -> Response:
+    """Alarms, reviews, schedules and drift."""
+    alarms = history.all_alarms(service)
+    found = calibrations.listed(service)
+    waiting = [
+        (each.name, decision)
+        for each in found
+        if each.to_review
+        for decision in calibrations.configuration_detail(service, each.name).history
+        if decision.outcome == "needs review"
+    ]
+    return _rendered(
+        request, "history.html.j2", alarms=[a for a in alarms if not a.acknowledged],
+        acknowledged=[a for a in alarms if a.acknowledged], schedules=history.scheduled(service),
+        configurations=found, to_review=waiting, pairs=[[name, each.key] for name, each in waiting],
+    )  # fmt: skip
 
 
 @router.get("/account")

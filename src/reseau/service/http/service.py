@@ -5,10 +5,10 @@ from __future__ import annotations
 import secrets
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 from ...archive import Archive
 from ...core.errors import ReseauError, UsageError
@@ -21,6 +21,7 @@ from .options import ServeOptions
 
 __all__ = ["Service"]
 
+T = TypeVar("T")
 _LOOK_S, _ENTRY_S = 0.3, 600.0
 
 
@@ -61,6 +62,8 @@ class Service:
         self.meters.clients.set_function(lambda: self.events.clients)
         self.started = time.time()
         self._entries: dict[str, float] = {}
+        self._computed: dict[str, tuple[object, Any]] = {}
+        self._locks: dict[str, threading.Lock] = {}
         self._over = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="archive", daemon=True)
         self.failing = ""
@@ -91,6 +94,25 @@ class Service:
         """Return the cookie for an entry code; None if it was used or is too old."""
         until = self._entries.pop(code, 0.0)
         return self.accounts.begin_login("local", "administer") if time.monotonic() < until else None
+
+    def current(self, name: str, compute: Callable[[], T]) -> T:
+        """Return what follows from journals and sessions, computed again when these or the minute change.
+
+        Parameters
+        ----------
+        name : str
+            What it is.
+        compute : callable
+            Computes it.
+        """
+        heads = self.archive.heads()
+        key = (heads.get("entries", 0), heads["ends"], heads["results"], int(time.time() // 60))
+        with self._locks.setdefault(name, threading.Lock()):
+            kept = self._computed.get(name)
+            if kept is None or kept[0] != key:
+                kept = self._computed[name] = (key, compute())
+        found: T = kept[1]
+        return found
 
     @contextmanager
     def audited(

@@ -18,6 +18,13 @@ export async function call(operation, body) {
   let answer;
   try { answer = await fetch(path, request); }
   catch { throw new Error('the service does not answer'); }
+  if (answer.ok && (answer.headers.get('Content-Disposition') ?? '').startsWith('attachment')) {
+    const link = document.createElement('a');
+    link.href = URL.createObjectURL(await answer.blob());
+    link.download = answer.headers.get('Content-Disposition').match(/filename="([^"]*)"/)?.[1] ?? 'file';
+    link.click();
+    return {done: `saved as ${link.download}`};
+  }
   const text = await answer.text();
   let content = {};
   try { content = JSON.parse(text); } catch { /* not JSON */ }

@@ -1,0 +1,616 @@
+"""Operations on configurations and their calibrations: verdicts, comparison, decisions, certificates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, date, datetime
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from pydantic import AwareDatetime, ConfigDict, Field
+
+from ...core.errors import ReseauError, UsageError
+from .access import Administering, Here, NotFound, Operating, Reading
+from .answers import Answer, Done, refusals
+from .service import Service
+from .sessions import the_session
+from .stored import FILE_ANSWERS, file_answer, picture_answer
+
+if TYPE_CHECKING:
+    from ...calibration import Calibration
+    from ..inforce import Configurations, Decision
+
+__all__ = ["ConfigurationRow", "calibration_detail", "comparison", "configuration_detail", "listed", "router"]
+
+router = APIRouter(tags=["calibrations"], responses=refusals(400, 401, 403, 404, 409, 422, 503))
+
+Name = Annotated[str, Path(max_length=200, description="Name of the configuration.")]
+Key = Annotated[str, Path(max_length=64, description="Decision, by the start of its key.")]
+SVG: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/svg+xml": {}}, "description": "The figure"}
+}  # fmt: skip
+
+
+class InForce(Answer):
+    """The calibration that applies."""
+
+    key: str
+    since: str
+    why: str
+
+
+class ConfigurationRow(Answer):
+    """A configuration of an instrument."""
+
+    name: str
+    parts: dict[str, str]
+    in_force: InForce | None
+    decisions: int
+    to_review: int
+
+
+class FindingRow(Answer):
+    """What one rule found."""
+
+    rule: str
+    level: str
+    text: str
+
+
+class DecisionRow(Answer):
+    """A decision on a calibration; `session` is where it comes from, if the archive knows that."""
+
+    key: str
+    outcome: str
+    since: str
+    at: str
+    by: str
+    comment: str
+    compared_with: str | None
+    findings: list[FindingRow]
+    reviewed_by: str
+    review: str
+    comments: list[tuple[str, str]]
+    session: str | None
+
+
+class EventRow(Answer):
+    """A service event."""
+
+    at: str
+    what: str
+
+
+class ConfigurationDetail(ConfigurationRow):
+    """A configuration with its history, latest decision first."""
+
+    history: list[DecisionRow]
+    events: list[EventRow]
+
+
+class ParameterRow(Answer):
+    """A parameter with its standard deviation; 0: it was held."""
+
+    name: str
+    value: float
+    sigma: float
+    unit: str
+    text: str
+
+
+class CorrelationRow(Answer):
+    """Two parameters and their correlation."""
+
+    first: str
+    second: str
+    correlation: float
+
+
+class CalibrationDetail(Answer):
+    """A calibration and the decision on it."""
+
+    configuration: str
+    decision: DecisionRow
+    kind: str
+    name: str
+    sigma0: float | None
+    redundancy: int
+    parameters: list[ParameterRow]
+    correlations: list[CorrelationRow]
+    tests: list[dict[str, Any]]
+    validity: dict[str, Any]
+    provenance: dict[str, Any]
+    figures: list[str]
+
+
+class Comparison(Answer):
+    """Difference of two calibrations over the image."""
+
+    first: str
+    second: str
+    greatest: float
+    rms: float
+    unit: str
+    p: float
+    parameters: list[tuple[str, float | None, float | None]]
+
+
+class NewConfiguration(Answer):
+    """A configuration by its parts."""
+
+    name: str = Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00-\x1f]+$")
+    parts: dict[str, str] = Field(min_length=1, max_length=50)
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"example": {"name": "left", "parts": {"camera": "DMK 33", "lens": "8 mm"}}},
+    )
+
+
+class NewDecision(Answer):
+    """A calibration of a session, or a document, to be judged by rules (`reseau-acceptance/1`)."""
+
+    session: str | None = Field(default=None, max_length=200)
+    calibration: dict[str, Any] | None = None
+    rules: dict[str, Any]
+    since: AwareDatetime | None = None
+    comment: str = Field(default="", max_length=2000)
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "example": {
+                "session": "monday",
+                "rules": {
+                    "schema": "reseau-acceptance/1", "version": 1, "image": {"warning": 0.1, "action": 0.3},
+                },
+            }
+        },
+    )  # fmt: skip
+
+
+class Review(Answer):
+    """The outcome of a review, and the reason."""
+
+    outcome: Literal["accepted", "rejected"]
+    comment: str = Field(min_length=1, max_length=2000)
+
+
+class Comment(Answer):
+    """A comment."""
+
+    comment: str = Field(min_length=1, max_length=2000)
+
+
+class Return(Answer):
+    """From when on an earlier calibration applies again; by default from now on."""
+
+    since: AwareDatetime | None = None
+    comment: str = Field(default="", max_length=2000)
+
+
+class ServiceEvent(Answer):
+    """What happened to the instrument."""
+
+    what: str = Field(min_length=1, max_length=500)
+    at: AwareDatetime | None = None
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"what": "lens changed"}})
+
+
+class CertificateOrder(Answer):
+    """What a certificate says besides (`reseau-certificate-data/1`), and its form."""
+
+    data: dict[str, Any]
+    form: Literal["pdf", "xml", "html"] = "pdf"
+    issued: date | None = None
+    probability: float = Field(default=0.95, gt=0.5, lt=1)
+
+
+class BulkReview(Answer):
+    """Several decisions, reviewed with one outcome and one reason."""
+
+    decisions: list[tuple[str, str]] = Field(
+        min_length=1, max_length=200, description="Configuration and key of each."
+    )
+    outcome: Literal["accepted", "rejected"]
+    comment: str = Field(min_length=1, max_length=2000)
+
+
+class Reviewed(Answer):
+    """What became of each decision; empty: it was reviewed."""
+
+    outcome: str
+    failed: dict[str, str]
+
+
+def _known(service: Service) -> Configurations:
+    from ..inforce import Configurations
+
+    return Configurations(service.archive)
+
+
+def _the(service: Service, name: str) -> Configurations:
+    """Configurations, of which one has this name.
+
+    Raises
+    ------
+    NotFound
+        If none has.
+    """
+    known = _known(service)
+    if name not in known.names():
+        raise NotFound("is not a configuration of this archive", where=name)
+    return known
+
+
+def _decision(known: Configurations, name: str, key: str) -> Decision:
+    try:
+        return known.decision(name, key)
+    except UsageError as error:
+        raise NotFound(error.what, where=error.where) from None
+
+
+def _session_of(service: Service, decision: Decision) -> str | None:
+    """Session of a calibration, as the comment of its decision says."""
+    if not decision.comment.startswith("session "):
+        return None
+    name = decision.comment.removeprefix("session ").partition("; ")[0]
+    try:
+        return the_session(service, name).name
+    except ReseauError:
+        return None
+
+
+def _row(service: Service, decision: Decision) -> DecisionRow:
+    return DecisionRow(
+        key=decision.key, outcome=decision.outcome, since=decision.since.isoformat(),
+        at=decision.at.isoformat(), by=decision.by, comment=decision.comment,
+        compared_with=decision.compared_with,
+        findings=[FindingRow(rule=f.rule, level=f.level, text=f.text) for f in decision.judgement.findings],
+        reviewed_by=decision.reviewed_by, review=decision.review, comments=list(decision.comments),
+        session=_session_of(service, decision),
+    )  # fmt: skip
+
+
+def _in_force(known: Configurations, name: str, now: datetime) -> InForce | None:
+    applied = known.applied(name, now)
+    if applied is None:
+        return None
+    return InForce(key=applied.key, since=applied.since.isoformat(), why=applied.why)
+
+
+def listed(service: Service) -> list[ConfigurationRow]:
+    """Return all configurations."""
+
+    def compute() -> list[ConfigurationRow]:
+        known, now = _known(service), service.archive.clock()
+        found = []
+        for name in known.names():
+            history = known.history(name)
+            found.append(
+                ConfigurationRow(
+                    name=name, parts=known.parts(name), in_force=_in_force(known, name, now),
+                    decisions=len(history), to_review=sum(d.outcome == "needs review" for d in history),
+                )
+            )  # fmt: skip
+        return found
+
+    return service.current("configurations", compute)
+
+
+def configuration_detail(service: Service, name: str) -> ConfigurationDetail:
+    """Return a configuration with its history."""
+    known = _the(service, name)
+    history = known.history(name)
+    return ConfigurationDetail(
+        name=name, parts=known.parts(name), in_force=_in_force(known, name, service.archive.clock()),
+        decisions=len(history), to_review=sum(d.outcome == "needs review" for d in history),
+        history=[_row(service, each) for each in reversed(history)],
+        events=[EventRow(at=at.isoformat(), what=what) for at, what in known.events(name)],
+    )  # fmt: skip
+
+
+def rules_of(service: Service, name: str) -> dict[str, Any] | None:
+    """Return the rules by which a configuration was judged last."""
+    history = _the(service, name).history(name)
+    return dict(history[-1].judgement.rules) if history else None
+
+
+def calibration_detail(service: Service, name: str, key: str) -> CalibrationDetail:
+    """Return a calibration and the decision on it."""
+    from ...core.numbers import measured
+
+    known = _the(service, name)
+    decision = _decision(known, name, key)
+    found = known.calibration(name, decision.key)
+    matrix, names = found.covariance.matrix, found.covariance.names
+    pairs = []
+    for i, first in enumerate(names):
+        for j in range(i):
+            scale = (matrix[i][i] * matrix[j][j]) ** 0.5
+            if scale > 0:
+                pairs.append((names[j], first, matrix[i][j] / scale))
+    pairs.sort(key=lambda pair: -abs(pair[2]))
+    return CalibrationDetail(
+        configuration=name, decision=_row(service, decision), kind=found.kind, name=found.name,
+        sigma0=found.sigma0, redundancy=found.redundancy,
+        parameters=[
+            ParameterRow(
+                name=each, value=q.value, sigma=q.sigma, unit=q.unit,
+                text=measured(q.value, q.sigma, "" if q.unit == "1" else q.unit),
+            )
+            for each, q in found.parameters.items()
+        ],
+        correlations=[CorrelationRow(first=a, second=b, correlation=r) for a, b, r in pairs],
+        tests=list(found.tests), validity=found.validity, provenance=found.provenance,
+        figures=["uncertainty", "distortion"] if found.kind == "camera" else [],
+    )  # fmt: skip
+
+
+def comparison(service: Service, name: str, first: str, second: str) -> tuple[Comparison, Any]:
+    """Return the difference of two calibrations of a configuration, and its field if they are cameras."""
+    import numpy as np
+
+    from ...calibration import CameraMapping, calibration_difference
+    from ..rules import difference
+
+    known = _the(service, name)
+    one, two = _decision(known, name, first), _decision(known, name, second)
+    old, new = known.calibration(name, one.key), known.calibration(name, two.key)
+    found = difference(new, old)
+    field = None
+    rms, p = found.greatest, float(getattr(found, "p", float("nan")))
+    if new.kind == old.kind == "camera":
+        field = calibration_difference(
+            CameraMapping.from_calibration(old), CameraMapping.from_calibration(new)
+        )
+        rms, p = float(np.sqrt(np.nanmean((field.difference**2).sum(axis=-1)))), field.p
+    every = dict.fromkeys([*old.parameters, *new.parameters])
+    values = [
+        (
+            each,
+            old.parameters[each].value if each in old.parameters else None,
+            new.parameters[each].value if each in new.parameters else None,
+        )
+        for each in every
+    ]
+    answer = Comparison(
+        first=one.key,
+        second=two.key,
+        greatest=found.greatest,
+        rms=rms,
+        unit=found.unit,
+        p=p,
+        parameters=values,
+    )
+    return answer, field
+
+
+@router.get("/configurations")
+def configurations(who: Reading, service: Here) -> list[ConfigurationRow]:
+    """Configurations of instruments, with the calibration in force of each."""
+    return listed(service)
+
+
+@router.post("/configurations", status_code=201)
+def define(given: NewConfiguration, who: Administering, service: Here) -> Done:
+    """Define a configuration by its parts."""
+    with service.audited(who, "define configuration", given.name, {"parts": given.parts}):
+        _known(service).define(given.name, given.parts)
+    return Done(done="defined")
+
+
+@router.get("/configurations/{name}")
+def configuration(name: Name, who: Reading, service: Here) -> ConfigurationDetail:
+    """A configuration with all decisions, latest first, and its service events."""
+    return configuration_detail(service, name)
+
+
+@router.post("/configurations/{name}/decisions", status_code=201)
+def decide(name: Name, given: NewDecision, who: Administering, service: Here) -> DecisionRow:
+    """Judge a calibration by rules, and put it in force if they accept it."""
+    from ... import sessions as kinds
+    from ...calibration import Calibration
+    from ..rules import AcceptanceRules
+
+    known = _the(service, name)
+    if (given.session is None) == (given.calibration is None):
+        raise UsageError("give one of them", where="session, calibration")
+    rules = AcceptanceRules.from_content(dict(given.rules), where="rules")
+    since, comment = given.since, given.comment
+    if given.session is not None:
+        session = the_session(service, given.session)
+        calibration, since = kinds.calibration_of(session), since or session.begun
+        comment = f"session {given.session}" + (f"; {comment}" if comment else "")
+    else:
+        assert given.calibration is not None
+        calibration = Calibration.from_content(dict(given.calibration), where="calibration")
+    facts = {"session": given.session, "rules": rules.version, "calibration": calibration.name}
+    with service.audited(who, "decide", name, facts):
+        made = known.decide(name, calibration, rules, since=since, by=who.name, comment=comment)
+    return _row(service, made)
+
+
+@router.get("/configurations/{name}/decisions/{key}")
+def decision(name: Name, key: Key, who: Reading, service: Here) -> CalibrationDetail:
+    """A calibration: parameters, tests, correlations, and the decision on it."""
+    return calibration_detail(service, name, key)
+
+
+@router.get(
+    "/configurations/{name}/decisions/{key}/calibration.json", response_class=Response, responses=FILE_ANSWERS
+)
+def document(request: Request, name: Name, key: Key, who: Reading, service: Here) -> Response:
+    """The calibration as a document, `reseau-calibration/1`."""
+    import hashlib
+
+    known = _the(service, name)
+    found = known.calibration(name, _decision(known, name, key).key)
+    content = found.to_json().encode("utf-8")
+    return file_answer(request, content, f"{name} {key}.json", hashlib.sha256(content).hexdigest())
+
+
+@router.get(
+    "/configurations/{name}/decisions/{key}/figures/{figure}.svg", response_class=Response, responses=SVG
+)
+def figure(
+    request: Request,
+    name: Name,
+    key: Key,
+    figure: Annotated[Literal["uncertainty", "distortion"], Path(description="Which figure.")],
+    who: Reading,
+    service: Here,
+) -> Response:
+    """The uncertainty of the projection over the image, or the distortion."""
+    known = _the(service, name)
+    decision = _decision(known, name, key)
+    calibration = known.calibration(name, decision.key)
+    return picture_answer(
+        request, lambda: _drawn(calibration, figure), "image/svg+xml", f"{decision.key}-{figure}"
+    )
+
+
+def _drawn(calibration: Calibration, figure: str) -> str:
+    from ...calibration import CameraMapping, projection_field
+    from ...report.bundle_figures import distortion_figure
+    from ...report.fields import uncertainty_figure
+
+    lens = CameraMapping.from_calibration(calibration)
+    if figure == "uncertainty":
+        return uncertainty_figure(projection_field(lens))
+    drawn = distortion_figure(lens)
+    if drawn is None:
+        raise NotFound("has no distortion", where=calibration.name)
+    return drawn
+
+
+@router.get("/configurations/{name}/compare")
+def compare(
+    name: Name,
+    first: Annotated[str, Query(max_length=64)],
+    second: Annotated[str, Query(max_length=64)],
+    who: Reading,
+    service: Here,
+) -> Comparison:
+    """The difference of two calibrations over the image, and its significance."""
+    return comparison(service, name, first, second)[0]
+
+
+@router.get("/configurations/{name}/compare.svg", response_class=Response, responses=SVG)
+def compare_figure(
+    request: Request,
+    name: Name,
+    first: Annotated[str, Query(max_length=64)],
+    second: Annotated[str, Query(max_length=64)],
+    who: Reading,
+    service: Here,
+) -> Response:
+    """The difference of two calibrations of a camera, as arrows over its uncertainty."""
+    from ...report.fields import difference_figure
+
+    found, field = comparison(service, name, first, second)
+    if field is None:
+        raise NotFound("are not of cameras", where=f"{first}, {second}")
+    return picture_answer(
+        request, lambda: difference_figure(field), "image/svg+xml", f"{found.first}-{found.second}"
+    )
+
+
+def _audited(
+    service: Service, who: Any, action: str, name: str, key: str, facts: dict[str, Any],
+    do: Callable[[Configurations, str], object],
+) -> DecisionRow:  # fmt: skip
+    """Do something about a decision, recorded, and return the decision."""
+    known = _the(service, name)
+    full = _decision(known, name, key).key
+    with service.audited(who, action, f"{name} {full}", facts):
+        do(known, full)
+    return _row(service, known.decision(name, full))
+
+
+@router.post("/configurations/{name}/decisions/{key}/review")
+def review(name: Name, key: Key, given: Review, who: Administering, service: Here) -> DecisionRow:
+    """Accept or reject a calibration that needs a review."""
+    return _audited(
+        service, who, "review", name, key, {"outcome": given.outcome, "comment": given.comment},
+        lambda known, full: known.review(name, full, given.outcome, by=who.name, comment=given.comment),
+    )  # fmt: skip
+
+
+@router.post("/reviews")
+def bulk_review(given: BulkReview, who: Administering, service: Here) -> Reviewed:
+    """Review several calibrations at once; what fails is named, the others are done."""
+    failed = {}
+    one = Review(outcome=given.outcome, comment=given.comment)
+    for name, key in given.decisions:
+        try:
+            review(name, key, one, who, service)
+        except ReseauError as error:
+            failed[f"{name} {key}"] = str(error)
+    return Reviewed(outcome=given.outcome, failed=failed)
+
+
+@router.post("/configurations/{name}/decisions/{key}/comments", status_code=201)
+def comment(name: Name, key: Key, given: Comment, who: Operating, service: Here) -> DecisionRow:
+    """Add a comment; the outcome stays."""
+    return _audited(
+        service, who, "comment", name, key, {"comment": given.comment},
+        lambda known, full: known.comment(name, full, given.comment, by=who.name),
+    )  # fmt: skip
+
+
+@router.post("/configurations/{name}/decisions/{key}/return")
+def roll_back(name: Name, key: Key, given: Return, who: Administering, service: Here) -> DecisionRow:
+    """Return to an earlier accepted calibration."""
+    return _audited(
+        service, who, "return", name, key, {"since": given.since, "comment": given.comment},
+        lambda known, full: known.roll_back(
+            name, full, since=given.since, by=who.name, comment=given.comment
+        ),
+    )  # fmt: skip
+
+
+@router.post("/configurations/{name}/events", status_code=201)
+def service_event(name: Name, given: ServiceEvent, who: Operating, service: Here) -> Done:
+    """Note a service event: from then on no calibration applies, and a run is due at once."""
+    known = _the(service, name)
+    with service.audited(who, "service event", name, {"what": given.what, "at": given.at}):
+        known.event(name, given.what, at=given.at, by=who.name)
+    return Done(done="noted")
+
+
+@router.post(
+    "/configurations/{name}/decisions/{key}/certificate", response_class=Response,
+    responses={200: {"content": {"application/pdf": {}, "application/xml": {}, "text/html": {}},
+                     "description": "The certificate"}},
+)  # fmt: skip
+def certificate(name: Name, key: Key, given: CertificateOrder, who: Administering, service: Here) -> Response:
+    """Create the certificate of an accepted calibration: PDF with its XML, DCC or HTML; unsigned."""
+    from ...core.optional import optional
+
+    with optional():
+        from ..certificates import CertificateData, certify, dcc_of, html_of, pdf_of
+
+    known = _the(service, name)
+    decision = _decision(known, name, key)
+    with service.audited(who, "certificate", f"{name} {decision.key}", {"form": given.form}), optional():
+        data = CertificateData.from_content(dict(given.data), where="data")
+        made = certify(
+            known.calibration(name, decision.key), data,
+            issued=given.issued or datetime.now(UTC).date(), decision=decision, configuration=name,
+            earlier=known.earlier(name, decision), probability=given.probability,
+        )  # fmt: skip
+        if given.form == "pdf":
+            content, kind = pdf_of(made, lambda pages: dcc_of(made, pages))[0], "application/pdf"
+        elif given.form == "xml":
+            content, kind = dcc_of(made, ""), "application/xml"
+        else:
+            content, kind = html_of(made).encode("utf-8"), "text/html; charset=utf-8"
+    from .stored import SANDBOX
+
+    headers = {
+        "Content-Disposition": f'attachment; filename="certificate.{given.form}"',
+        "Content-Security-Policy": SANDBOX,
+    }
+    return Response(content, 200, headers, kind)

@@ -1,0 +1,314 @@
+"""Operations on sessions: frames with overlays, results, reruns."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from pydantic import ConfigDict
+
+from ... import sessions as kinds
+from ...archive import ArchivedFrame, Session
+from ...core.errors import ArchiveError, ReseauError
+from .access import Here, NotFound, Reading
+from .answers import Answer, refusals
+from .service import Service
+from .stored import FILE_ANSWERS, file_answer, marks_of, picture_answer, preview_jpeg, result_named
+
+__all__ = ["SessionRow", "frames", "router", "rows", "session_detail", "the_session"]
+
+router = APIRouter(tags=["sessions"], responses=refusals(400, 401, 403, 404, 422, 503))
+
+SessionName = Annotated[str, Path(max_length=200, description="Name of the session.")]
+Number = Annotated[int, Path(ge=1, le=1 << 62, description="Its number in the archive.")]
+
+
+class SessionRow(Answer):
+    """A line of the list of sessions."""
+
+    name: str
+    plan: str
+    begun: str
+    frames: int
+    results: int
+    status: str
+
+
+class SessionPage(Answer):
+    """Sessions, latest first; `before` leads to the earlier ones."""
+
+    sessions: list[SessionRow]
+    before: str | None
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "example": {
+                "sessions": [
+                    {
+                        "name": "monday", "plan": "testfield", "begun": "2026-03-02T08:00:00+00:00",
+                        "frames": 36, "results": 2, "status": "done",
+                    }
+                ],
+                "before": None,
+            }
+        },
+    )  # fmt: skip
+
+
+class FrameRow(Answer):
+    """A frame: the step it belongs to, its verdict, its file."""
+
+    id: int
+    step: str
+    kind: str
+    take: int
+    ok: bool | None
+    why: str
+    facts: dict[str, Any]
+    measured: dict[str, Any]
+    sha256: str
+    suffix: str
+    size: int
+
+
+class ResultRow(Answer):
+    """A result with its inputs by SHA-256."""
+
+    id: int
+    name: str
+    size: int
+    sha256: str
+    software: str
+    inputs: dict[str, str]
+
+
+class SessionDetail(Answer):
+    """A session: what it was told to do, what it has, and what is to come."""
+
+    name: str
+    plan: str
+    begun: str
+    status: str
+    why: str
+    software: str
+    parameters: dict[str, Any]
+    inputs: dict[str, str]
+    expected: int | None
+    good: int
+    taken: int
+    to_come: list[str]
+    rejected: list[FrameRow]
+    results: list[ResultRow]
+
+
+class MarkRow(Answer):
+    """Marks that are found in a frame, in pixels."""
+
+    width: int
+    height: int
+    names: list[str]
+    xy: list[tuple[float, float]]
+    why: str
+
+
+def the_session(service: Service, name: str) -> Session:
+    """Return a session.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    """
+    try:
+        return service.archive.session(name)
+    except ArchiveError as error:
+        if "is not a session" in error.what:
+            raise NotFound(error.what, where=name) from None
+        raise
+
+
+def the_frame(session: Session, number: int) -> ArchivedFrame:
+    """Return a frame of a session.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    """
+    found = next((each for each in session.frames() if each.id == number), None)
+    if found is None:
+        raise NotFound("has no such frame", where=f"{session.name}: {number}")
+    return found
+
+
+def rows(service: Service, count: int, before: str | None = None, like: str = "") -> list[SessionRow]:
+    """Return lines of the list, latest first."""
+    return [
+        SessionRow(
+            name=s.name, plan=s.plan, begun=s.begun.isoformat(), frames=s.frames, results=s.results,
+            status=s.status,
+        )
+        for s in reversed(service.archive.sessions(last=count, before=before, like=like))
+    ]  # fmt: skip
+
+
+def _row(frame: ArchivedFrame) -> FrameRow:
+    verdict = frame.verdict
+    return FrameRow(
+        id=frame.id, step=frame.step, kind=frame.kind, take=frame.take,
+        ok=None if verdict is None else verdict.ok, why="" if verdict is None else verdict.why,
+        facts=frame.facts, measured={} if verdict is None else verdict.facts, sha256=frame.sha256,
+        suffix=frame.suffix, size=frame.size,
+    )  # fmt: skip
+
+
+def session_detail(service: Service, session: Session) -> SessionDetail:
+    """Return a session with what it has and what is to come."""
+    found = session.frames()
+    taken = [each for each in found if each.kind == "frame"]
+    good = {each.step for each in taken if each.verdict is not None and each.verdict.ok}
+    expected, steps = None, list[str]()
+    try:
+        given = kinds.parameters_of(session)
+        expected = given.expected
+        poses = getattr(given, "poses", None)
+        steps = [each.name for each in poses()] if poses is not None and expected is not None else []
+    except ReseauError:  # a plan of another version: its frames and results are shown all the same
+        pass
+    status, why = session.last_end
+    return SessionDetail(
+        name=session.name, plan=session.plan, begun=session.begun.isoformat(), status=status, why=why,
+        software=session.software, parameters=session.parameters,
+        inputs={each.step: each.sha256 for each in found if each.kind == "input"}, expected=expected,
+        good=len(good), taken=len(taken),
+        to_come=[] if status == "done" else [each for each in steps if each not in good],
+        rejected=[_row(each) for each in taken if each.verdict is not None and not each.verdict.ok],
+        results=[
+            ResultRow(
+                id=r.id, name=r.name, size=r.size, sha256=r.sha256, software=r.software, inputs=r.inputs
+            )
+            for r in session.results()
+        ],
+    )  # fmt: skip
+
+
+@router.get("/sessions")
+def sessions(
+    who: Reading,
+    service: Here,
+    count: Annotated[int, Query(ge=1, le=500)] = 50,
+    before: Annotated[str | None, Query(max_length=200, description="Only earlier ones than this.")] = None,
+    like: Annotated[str, Query(max_length=200, description="Part of the name or the plan.")] = "",
+) -> SessionPage:
+    """Sessions, latest first."""
+    found = rows(service, count, before, like)
+    return SessionPage(sessions=found, before=found[-1].name if len(found) == count else None)
+
+
+@router.get("/sessions/{session}")
+def session_(session: SessionName, who: Reading, service: Here) -> SessionDetail:
+    """A session."""
+    return session_detail(service, the_session(service, session))
+
+
+@router.get("/sessions/{session}/frames")
+def frames(
+    session: SessionName,
+    who: Reading,
+    service: Here,
+    after: Annotated[int, Query(ge=0, le=1 << 62, description="Only frames with larger numbers.")] = 0,
+    count: Annotated[int, Query(ge=1, le=2000)] = 500,
+) -> list[FrameRow]:
+    """Frames and other pictures of a session, in the order in which they were stored."""
+    found = the_session(service, session).frames()
+    return [_row(each) for each in found if each.kind != "input" and each.id > after][:count]
+
+
+@router.get("/sessions/{session}/frames/{number}/file", response_class=Response, responses=FILE_ANSWERS)
+def frame_file(
+    request: Request, session: SessionName, number: Number, who: Reading, service: Here
+) -> Response:
+    """The file of a frame, checked against its SHA-256; ranges are answered."""
+    kept = the_session(service, session)
+    frame = the_frame(kept, number)
+    content = kept.objects.get(frame.sha256, frame.suffix)
+    return file_answer(
+        request, content, f"{kept.name} {frame.name}{frame.suffix}".replace("/", " "), frame.sha256
+    )
+
+
+@router.get(
+    "/sessions/{session}/frames/{number}/preview.jpg", response_class=Response,
+    responses={200: {"content": {"image/jpeg": {}}, "description": "The picture"}},
+)  # fmt: skip
+def preview(
+    request: Request,
+    session: SessionName,
+    number: Number,
+    who: Reading,
+    service: Here,
+    width: Annotated[int, Query(ge=16, le=2400)] = 640,
+) -> Response:
+    """A frame with 8 bits, reduced to a width."""
+    kept = the_session(service, session)
+    frame = the_frame(kept, number)
+    if frame.suffix != ".tif":
+        return frame_file(request, session, number, who, service)
+    tag = f"{frame.sha256[:32]}-{width}"
+    return picture_answer(request, lambda: preview_jpeg(kept, frame, width), "image/jpeg", tag)
+
+
+@router.get("/sessions/{session}/frames/{number}/marks")
+def marks(session: SessionName, number: Number, who: Reading, service: Here) -> MarkRow:
+    """Marks that are found in a frame; they are measured again."""
+    kept = the_session(service, session)
+    frame, found, why = marks_of(kept, the_frame(kept, number))
+    xy = [(round(float(x), 3), round(float(y), 3)) for x, y in found.xy]
+    return MarkRow(width=frame.width, height=frame.height, names=list(found.ids), xy=xy, why=why)
+
+
+@router.get(
+    "/sessions/{session}/frames/{number}/overlay.svg", response_class=Response,
+    responses={200: {"content": {"image/svg+xml": {}}, "description": "The picture"}},
+)  # fmt: skip
+def overlay(request: Request, session: SessionName, number: Number, who: Reading, service: Here) -> Response:
+    """A frame with the marks that are found in it."""
+    from ...report.overlay import frame_overlay
+
+    kept = the_session(service, session)
+    archived = the_frame(kept, number)
+
+    def draw() -> str:
+        frame, found, _ = marks_of(kept, archived)
+        return frame_overlay(frame, found).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+
+    return picture_answer(request, draw, "image/svg+xml", f"{archived.sha256[:32]}-marks")
+
+
+@router.get("/sessions/{session}/results/{number}/file", response_class=Response, responses=FILE_ANSWERS)
+def result_file(
+    request: Request, session: SessionName, number: Number, who: Reading, service: Here
+) -> Response:
+    """The file of a result, checked against its SHA-256; reports have no scripts and no origin."""
+    kept = the_session(service, session)
+    result = result_named(kept, number)
+    if result is None:
+        raise NotFound("has no such result", where=f"{session}: {number}")
+    return file_answer(request, kept.content(result), result.name, result.sha256)
+
+
+@router.get("/sessions/{session}/inputs/{name}/file", response_class=Response, responses=FILE_ANSWERS)
+def input_file(
+    request: Request,
+    session: SessionName,
+    name: Annotated[str, Path(max_length=200, description="Name of the input.")],
+    who: Reading,
+    service: Here,
+) -> Response:
+    """An input file of a session, such as a design."""
+    kept = the_session(service, session)
+    found = kept.inputs().get(name)
+    if found is None:
+        raise NotFound("has no such input", where=f"{session}: {name}")
+    return file_answer(request, kept.objects.get(found.sha256, found.suffix), name, found.sha256)
