@@ -71,6 +71,37 @@ def test_predicted_covariances_of_true_coordinates_cover(trials):
     assert abs(rms - 1) < 4 / np.sqrt(4 * trials)
 
 
+def test_errors_that_rods_share_act_together_in_the_covariance():
+    camera, rods = _noise_free()
+    exact = RODS.model_copy(
+        update={"points": tuple(p.model_copy(update={"sigma": None}) for p in RODS.points)}
+    )
+    cov = np.tile(0.02**2 * np.eye(2), (len(rods), 1, 1))
+    rods = ImagePoints(rods.names, rods.xy, cov)
+    # An error in x of some rods, which leaves the system of M and N as it is.
+    some = np.setdiff1d(np.arange(3, len(rods), 4), [RODS.ids.index(RODS.axis)])
+    shared = np.zeros((len(rods), 2, 1))
+    shared[some, 0, 0] = 0.01
+
+    def fitted(move=0.0, shared=None):
+        moved = ImagePoints(rods.names, rods.xy + move, cov)
+        found = correct_instrument(moved, exact, camera, alpha=_ALL, trials=0, shared=shared).required()
+        return found.model.values, found.covariance
+
+    values, alone = fitted()
+    size = len(values)
+    together = fitted(shared[..., 0])[0] - values
+    one_by_one = [np.where(np.arange(len(rods))[:, None] == i, shared[..., 0], 0) for i in some]
+    each = np.array([fitted(move)[0] for move in one_by_one]) - values
+    expected = np.outer(together, together) - each.T @ each
+    added = (fitted(shared=shared)[1] - alone)[-size:, -size:]
+    scale = np.sqrt(np.diagonal(alone)[-size:])
+    scale = np.outer(scale, scale)
+    # As a share of the variances; the scale λ2 of the rods changes a little, too.
+    np.testing.assert_allclose(added / scale, expected / scale, atol=2e-3)
+    assert abs(expected / scale).max() > 0.05
+
+
 def test_absent_coefficients_are_dropped_and_the_datum_is_kept():
     rng = np.random.default_rng(2)
     camera = correct_camera(reseau_marks(rng), RESEAU, trials=0).required()

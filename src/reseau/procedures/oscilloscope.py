@@ -39,7 +39,7 @@ from ..refine import (
     still_standard,
 )
 from ..refine.remarks import of_the_camera, of_the_change, of_the_object
-from .oscilloscope_frames import declined_rods, middles_of_echoes, notes_of, pins_in, reseau_in
+from .oscilloscope_frames import declined_rods, middles_of_echoes, notes_of, pins_in, reseau_in, shared_errors
 
 __all__ = [
     "PhotoI",
@@ -269,6 +269,7 @@ def photo_ii(
         criterion=criterion,
         check=check,
         registration=registration,
+        shared=shared_errors(measured, registration),
     )
     if isinstance(instrument, Failure):
         return instrument if measured is None else replace(instrument, places=measured.points.xy)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..calibration import CameraCorrection
-from ..core.data import Frame, ImagePoints
+from ..core.data import Array, Frame, ImagePoints
 from ..core.failure import Code, Failure, Remark
 from ..io import ReseauDesign
 from ..measure import (
@@ -23,7 +23,7 @@ from ..refine import Registration, register
 from ..refine.echoes import middles_on_screen
 from ..refine.remarks import ANOTHER_SHAPE_PX
 
-__all__ = ["declined_rods", "middles_of_echoes", "notes_of", "pins_in", "reseau_in"]
+__all__ = ["declined_rods", "middles_of_echoes", "notes_of", "pins_in", "reseau_in", "shared_errors"]
 
 _STATIONARY_PX = 6.0
 """Search distance of the reseau from its position in PHOTO I; beyond it, the whole image is searched."""
@@ -70,6 +70,22 @@ def middles_of_echoes(
         return points
     reach, curvature, tilt = (values[ok] for values in (measured.reach, measured.curvature, measured.tilt))
     return middles_on_screen(points, reach, curvature, tilt, camera, registration)
+
+
+def shared_errors(measured: PinResult | None, registration: Registration | None) -> Array | None:
+    """Errors that the echoes share, as :func:`reseau.refine.correct_instrument` takes them, in PHOTO I."""
+    if measured is None or measured.shared is None:
+        return None
+    points, shared = measured.points, measured.shared[measured.ok]
+    if registration is None:
+        return shared
+
+    def carried(xy: Array) -> Array:
+        return registration.carry(ImagePoints(points.names, xy, points.cov)).xy
+
+    # They are small: differences are derivatives.
+    at = carried(points.xy)
+    return np.stack([carried(points.xy + one) - at for one in np.moveaxis(shared, 2, 0)], axis=2)
 
 
 def declined_rods(measured: PinResult) -> dict[str, str]:

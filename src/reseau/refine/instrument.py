@@ -127,6 +127,7 @@ def correct_instrument(
     check: Iterable[str] = (),
     trials: int = 499,
     registration: Registration | None = None,
+    shared: Array | None = None,
 ) -> FittedInstrument | Failure:
     """Correct an instrument by the rods of a test object (Wishahy, steps iv–vii).
 
@@ -150,6 +151,9 @@ def correct_instrument(
         Simulated sets of residuals for the test whether a local model is needed on top.
     registration : Registration, optional
         How the images were referred to PHOTO I; its errors, which they share, are part of the covariance.
+    shared : ndarray (n, 2, k), optional
+        Derivatives of the images by k errors of unit variance that all have in common, which their own
+        covariances contain; see :class:`reseau.measure.PinDetections`.
 
     Returns
     -------
@@ -172,6 +176,9 @@ def correct_instrument(
     model = RationalPolynomial.ultrasonic() if model is None else model
     coordinates = {p.id: (p.x, p.y, p.sigma or 0.0) for p in design.points if p.x is not None}
     known = [name for name in points.names if name in coordinates]
+    if shared is None:
+        shared = np.zeros((len(points), 2, 0))
+    shared = shared[[name in coordinates for name in points.names]]
     if len(known) < 4:
         return Failure(
             f"{len(known)} of {len(points)} points are rods with coordinates in design {design.name!r}; "
@@ -208,7 +215,7 @@ def correct_instrument(
     monomials = reduced(model.split())
     fit = elimination.full
     full = model.with_values(fit.values)
-    covariance = _joint_covariance(camera, rods.select(used), full, fit, registration)
+    covariance = _joint_covariance(camera, rods.select(used), full, fit, registration, shared[used])
     left = residual_field(full, fitted, target[used], full(fitted.xy) - target[used], sigma, trials)
     correction = FittedInstrument(
         camera,
@@ -239,13 +246,15 @@ def _joint_covariance(
     model: RationalPolynomial,
     fit: Adjustment,
     registration: Registration | None,
+    shared: Array,
 ) -> Array:
     """Covariance of the coefficients of both groups.
 
     An error δ of the coefficients of group A changes the estimates of group B by −Q Aᵀ W G δ, with A and W
     the design matrix and the weights of its adjustment, Q its cofactor matrix and G the derivatives of its
     conditions by the coefficients of group A. The registration of the photograph follows them, which is part
-    of G, and has errors of its own, which act in the same way.
+    of G, and has errors of its own, which act in the same way. So do errors that the images share; Q contains
+    them as if every image had its own.
     """
     photo, by_pixel, _ = camera.photo_system.derivatives(rods.xy)
     refined, by_photo, by_a = camera.model.derivatives(photo)
@@ -255,15 +264,21 @@ def _joint_covariance(
     weights = np.linalg.inv(cofactors)
     q_b = fit.cofactor
 
-    def response(conditions: Array) -> Array:
-        found: Array = -q_b @ np.einsum("nib,nij,nja->ba", by_b, weights, by_refined @ conditions)
+    def responses(conditions: Array) -> Array:
+        found: Array = -fit.cofactor @ (by_b.swapaxes(1, 2) @ weights @ by_refined @ conditions)
         return found
+
+    def response(conditions: Array) -> Array:
+        return np.asarray(responses(conditions).sum(axis=0))
 
     common = None if registration is None else registration.moves(rods.xy)
     moved = response(by_a if common is None else by_a + by_image @ common)
     if registration is not None and registration.similar:
         own = response(by_image @ registration.by_parameters(rods.xy))
         q_b = q_b + own @ registration.cofactor @ own.T
+    each = responses(by_image @ shared)
+    together = each.sum(axis=0)
+    q_b = q_b + together @ together.T - np.einsum("nbk,nck->bc", each, each)
     q_a = camera.cofactor
     cross = moved @ q_a
     return np.block([[q_a, cross.T], [cross, q_b + cross @ moved.T]])

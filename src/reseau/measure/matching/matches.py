@@ -50,6 +50,9 @@ class Matches:
         Adjusted minus observed, NaN where a pixel was not used.
     form_sigma : ndarray (k, m)
         Standard deviations of `form`.
+    form_cofactor : ndarray (k, 2, m)
+        Cofactors of the position and `form`; over the squared standard deviation of a prior of the form they
+        are the derivatives of the position by its mean.
     influence : ndarray (k, 2, rows, columns)
         Change of the position with the grey value of each pixel; (k, 2, 0, 0) if it was not wanted.
     leverage : ndarray (k, rows, columns)
@@ -61,7 +64,8 @@ class Matches:
     >>> xy, cov = np.array([[10.3, 9.6], [40.1, 9.8]]), np.tile(1e-4 * np.eye(2), (2, 1, 1))
     >>> seen = np.array([1.0, 0.4])
     >>> marks = Matches(xy, cov, one, 0.6 * one, 200 * one, 300 * one, none, one, one, seen, 0 * one,
-    ...                 one > 0, np.zeros((2, 17, 17)), none, np.zeros((2, 2, 17, 17)), np.zeros((2, 17, 17)))
+    ...                 one > 0, np.zeros((2, 17, 17)), none, np.zeros((2, 2, 0)), np.zeros((2, 2, 17, 17)),
+    ...                 np.zeros((2, 17, 17)))
     >>> len(marks.select(marks.seen > 0.5))
     1
     """
@@ -80,6 +84,7 @@ class Matches:
     converged: Mask
     residuals: Array
     form_sigma: Array
+    form_cofactor: Array
     influence: Array
     leverage: Array
 
@@ -137,6 +142,7 @@ def matches_of(
         converged=found.converged & np.isfinite(cov[:, :2, :2]).all(axis=(1, 2)),
         residuals=np.where(used, found.residuals, np.nan).reshape(patch.shape),
         form_sigma=np.sqrt(np.diagonal(cov, axis1=1, axis2=2)[:, patch.form_at :]),
+        form_cofactor=found.cofactor[:, :2, patch.form_at :],
         influence=influence,
         leverage=leverage,
     )

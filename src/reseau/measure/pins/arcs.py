@@ -61,6 +61,10 @@ class ArcMatches:
         The matched arcs.
     sigma : dict of str to ndarray (m,)
         Standard deviations of the unknowns of the form.
+    by_prior : dict of str to ndarray (m, 2)
+        Derivatives of the positions by the means of their priors.
+    shared : ndarray (m, 2, k)
+        Derivatives of the positions by k errors of unit variance that all arcs share, which `cov` contains.
     """
 
     xy: Array
@@ -76,6 +80,8 @@ class ArcMatches:
     inflation: Array
     arcs: Arcs
     sigma: dict[str, Array]
+    by_prior: dict[str, Array]
+    shared: Array
 
     def replaced(self, rows: Rows, other: ArcMatches) -> ArcMatches:
         """These matches with `rows` replaced by others."""
@@ -83,12 +89,9 @@ class ArcMatches:
         for name in _NUMBERS:
             columns[name] = getattr(self, name).copy()
             columns[name][rows] = getattr(other, name)
-        sigma = {name: values.copy() for name, values in self.sigma.items()}
-        for name in other.sigma:
-            sigma.setdefault(name, np.zeros(len(self.xy)))
-        for name, values in sigma.items():
-            values[rows] = other.sigma.get(name, 0.0)
-        return ArcMatches(**columns, arcs=_replaced(self.arcs, rows, other.arcs), sigma=sigma)
+        for name in ("sigma", "by_prior"):
+            columns[name] = _with_rows(getattr(self, name), rows, getattr(other, name), len(self.xy))
+        return ArcMatches(**columns, arcs=_replaced(self.arcs, rows, other.arcs), shared=self.shared)
 
     def moved(self, before: ArcMatches, rows: Rows) -> Array:
         """Shifts (k, 2) from the `rows` of other matches to these; NaN where these did not converge."""
@@ -301,6 +304,11 @@ class Windows:
                 name: np.sqrt(inflation) * values
                 for name, values in zip(form.sigma, found.form_sigma.T, strict=True)
             },
+            by_prior={
+                name: found.form_cofactor[:, :, k] / sigma**2 * (sign[:, None] if name == "fading" else 1.0)
+                for k, (name, sigma) in enumerate(form.sigma.items())
+            },
+            shared=np.zeros((len(rows), 2, 0)),
         )
 
 
@@ -356,7 +364,7 @@ def _inflation(residuals: Array) -> Array:
 
 def _merged(parts: list[tuple[Rows, ArcMatches]], count: int) -> ArcMatches:
     """Columns of matches from parts of them."""
-    names = {name for _, found in parts for name in found.sigma}
+    names = sorted({name for _, found in parts for name in found.sigma})
 
     def column(values: list[Array], tail: tuple[int, ...] = ()) -> Array:
         whole: Array = np.zeros((count, *tail))
@@ -370,8 +378,20 @@ def _merged(parts: list[tuple[Rows, ArcMatches]], count: int) -> ArcMatches:
     }
     columns["converged"] = columns["converged"] > 0
     arcs = {f.name: column([getattr(found.arcs, f.name) for _, found in parts]) for f in fields(Arcs)}
-    sigma = {name: column([found.sigma[name] for _, found in parts]) for name in sorted(names)}
-    return ArcMatches(**columns, arcs=Arcs(**arcs), sigma=sigma)
+    sigma = {name: column([found.sigma[name] for _, found in parts]) for name in names}
+    by_prior = {name: column([found.by_prior[name] for _, found in parts], (2,)) for name in names}
+    shared = np.zeros((count, 2, 0))
+    return ArcMatches(**columns, arcs=Arcs(**arcs), sigma=sigma, by_prior=by_prior, shared=shared)
+
+
+def _with_rows(values: dict[str, Array], rows: Rows, other: dict[str, Array], count: int) -> dict[str, Array]:
+    """Columns by name of `count` rows, with some replaced by others; 0 where a name is missing."""
+    known = {name: column.copy() for name, column in values.items()}
+    for name, column in other.items():
+        known.setdefault(name, np.zeros((count, *column.shape[1:])))
+    for name, column in known.items():
+        column[rows] = other.get(name, 0.0)
+    return known
 
 
 def _replaced(arcs: Arcs, rows: Rows, other: Arcs) -> Arcs:

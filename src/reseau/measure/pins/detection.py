@@ -136,6 +136,9 @@ class PinDetections:
     reach : ndarray (m,), optional
         Distance from the middle at which the light tells the place of the echo along the line, pixels: about
         half the length of a line, and 1.2 times the width along of a beam; NaN where not matched.
+    shared : ndarray (m, 2, k), optional
+        Derivatives of the positions by k errors of unit variance that all have in common, as that of the tilt
+        of all echoes; they are part of `cov`. NaN where not matched.
 
     Examples
     --------
@@ -165,6 +168,7 @@ class PinDetections:
     correlation: Array
     centroid: Array
     reach: Array | None = None
+    shared: Array | None = None
 
     def __len__(self) -> int:
         return len(self.ok)

@@ -7,6 +7,8 @@ between echoes as its standard deviation. It matters where a wire hides an end.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -90,7 +92,7 @@ def match_arcs(
         Width of the camera's blur and its standard deviation, pixels, if it is known.
     """
     work = Windows(grey, valid, echoes, at, options, noise)
-    form, found, start = _chosen(work)
+    form, found, start, unsure = _chosen(work)
     touching = np.flatnonzero((echoes.joined[at] > 0) & found.converged)
     if len(touching):
         # It is unknown how the instrument combines overlapping echoes: behind a logarithmic amplifier the
@@ -105,7 +107,7 @@ def match_arcs(
         # is estimated by leaving out slightly more of the arc.
         pulled = work.shift_with_wider_gap(half_hidden, found, form)
         found.cov[half_hidden] += pulled[:, :, None] * pulled[:, None, :]
-    shift = _correct_for_details(work, found, form, blur)
+    shift, details = _correct_for_details(work, found, form, blur)
     if "length" in form.sigma:
         ends = integrate_over_hidden_ends(work, found, form, start)
         # What displaces a line along itself is known to first order only, where an end is hidden.
@@ -120,21 +122,25 @@ def match_arcs(
         shift = _ORDER * arcs.fading * ends_of(arcs)[1] ** 2 / arcs.along
         along = shift[:, None] * np.stack([np.cos(arcs.tilt), np.sin(arcs.tilt)], axis=1)
         found.cov[:] += along[:, :, None] * along[:, None, :]
-    return found
+    of_priors = [found.by_prior[name][:, :, None] * unsure[name][:, None, :] for name in unsure]
+    return replace(found, shared=np.concatenate([*of_priors, details], axis=2))
 
 
 def _correct_for_details(
     work: Windows, found: ArcMatches, form: Form, blur: tuple[float, float] | None
-) -> Array:
+) -> tuple[Array, Array]:
     """Shifts (m, 2) due to blur and course, by which arcs are to be corrected; adds their covariances.
+
+    The second result is what is uncertain of them and shared by all arcs, (m, 2, 2).
 
     If the blur is not known, it is at most that of the echo itself, but mostly much less. The course of all
     arcs is a hyperbola if a range bends them; a display may bend it to a parabola, or beyond.
     """
     arcs, shift = found.arcs, np.zeros_like(found.xy)
+    shared = np.zeros((*shift.shape, 2))
     rows = np.flatnonzero(found.converged)
     if not len(rows):
-        return shift
+        return shift, shared
     unknown = np.sqrt(_BLUR_SHARE) * np.minimum(arcs.across, ends_of(arcs)[1])
     widths = unknown if blur is None else np.full(len(arcs), blur[0])
     less = details_of(work, rows, found, form, widths)
@@ -143,13 +149,14 @@ def _correct_for_details(
     course = (float(less.score[clear].sum()) + (_COURSE[0] - 1) / _COURSE[1] ** 2) / information
     relative = 1.0 if blur is None else 2 * blur[1] / blur[0]
     shift[rows] = course * less.course_px + (0.0 if blur is None else 1.0) * less.blur_px
-    for uncertain in (relative * less.blur_px, less.course_px / np.sqrt(information)):
+    for k, uncertain in enumerate((relative * less.blur_px, less.course_px / np.sqrt(information))):
         found.cov[rows] += uncertain[:, :, None] * uncertain[:, None, :]
-    return shift
+        shared[rows, :, k] = uncertain
+    return shift, shared
 
 
-def _chosen(work: Windows) -> tuple[Form, ArcMatches, Arcs]:
-    """The form of the frame's echoes, all of them matched with it, and the means of its priors."""
+def _chosen(work: Windows) -> tuple[Form, ArcMatches, Arcs, dict[str, Array]]:
+    """The form of the frame's echoes, all of them matched with it, and its priors as in `_in_common`."""
     form, start, xy = BEAM, work.start, work.echoes.xy[work.at]
     # The brightest ones are enough to choose the form, as a rule.
     some = work.every[: 2 * _FEW]
@@ -163,7 +170,7 @@ def _chosen(work: Windows) -> tuple[Form, ArcMatches, Arcs]:
     if form is BEAM and len(some) < len(work.at):
         found = work.matched(work.every, form, start, xy)
     if not len(sample):
-        return form, found, start
+        return form, found, start, {}
     if form is not BEAM:
         start = work.start_of_lines
         work.resized(start)
@@ -175,10 +182,10 @@ def _chosen(work: Windows) -> tuple[Form, ArcMatches, Arcs]:
     while (further := _further(work, form, found)) is not None:
         form = form.with_(**{further: FURTHER[further]})
         found = work.matched(work.every, form, found.arcs, found.xy)
-    shared, start = _in_common(form, found, start)
+    shared, start, unsure = _in_common(form, found, start)
     if shared is not form:
         form, found = shared, work.matched(work.every, shared, start, found.xy)
-    return form, found, start
+    return form, found, start, unsure
 
 
 def _line_or_beam(work: Windows, found: ArcMatches, sample: Rows) -> Form:
@@ -264,21 +271,32 @@ def _plausible(found: ArcMatches) -> bool:
     )
 
 
-def _in_common(form: Form, found: ArcMatches, start: Arcs) -> tuple[Form, Arcs]:
-    """The form with priors from the clear echoes, and where the matching with these priors starts."""
+def _in_common(form: Form, found: ArcMatches, start: Arcs) -> tuple[Form, Arcs, dict[str, Array]]:
+    """The priors that the clear echoes give.
+
+    Returns
+    -------
+    form : Form
+        With their standard deviations.
+    start : Arcs (m,)
+        Their means, where the matching begins.
+    unsure : dict of str to ndarray (m, k)
+        Derivatives of the means by k errors of unit variance: the means have them in common.
+    """
     rows, arcs = _clear(found), found.arcs
     names = [name for name in form.sigma if name in ("softness", *FURTHER)]
     if len(rows) < _SHARED:
-        return form, start
+        return form, start, {}
     columns = {f: getattr(arcs, f) for f in Arcs.__dataclass_fields__}
     # The priors of all else stay where they were.
     columns["curvature"], columns["tilt"] = start.curvature, start.tilt
     half, soft = ends_of(arcs)
-    sigma = {}
+    sigma, unsure = {}, {}
     for name in names:
         values = np.log(soft) if name == "softness" else columns[name]
         mean, cov, scatter = _population(values[rows], found.sigma[name][rows], np.ones((len(rows), 1)))
         sigma[name] = max(float(np.sqrt(scatter**2 + cov[0, 0])), _LEAST_SCATTER.get(name, 0.01))
+        unsure[name] = np.full((len(soft), 1), np.sqrt(cov[0, 0]))
         if name == "softness":
             soft = np.full(len(soft), np.exp(mean[0]))
         else:
@@ -296,17 +314,22 @@ def _in_common(form: Form, found: ArcMatches, start: Arcs) -> tuple[Form, Arcs]:
         )
         usual = place @ mean
         # Beyond the clear echoes, in the corners, the mean is less certain than among them.
-        unsure = np.einsum("ni,ij,nj->n", place[found.converged], cov, place[found.converged])
-        common = np.sqrt(scatter**2 + np.quantile(unsure, _MOSTLY))
-        sigma["tilt"] = max(float(common), _LEAST_SCATTER["tilt"])
+        of_mean = np.nan_to_num(place) @ np.linalg.cholesky(cov)
+        variance = (of_mean[found.converged] ** 2).sum(axis=1)
+        sigma["tilt"] = max(
+            float(np.sqrt(scatter**2 + np.quantile(variance, _MOSTLY))), _LEAST_SCATTER["tilt"]
+        )
         if sigma["tilt"] < form.sigma["tilt"]:
             columns["tilt"] = np.where(np.isfinite(usual), usual, start.tilt)
+            unsure["tilt"] = of_mean
         else:
             del sigma["tilt"]
     if not sigma:
-        return form, start
+        return form, start, {}
     common = Arcs(**columns)
-    return form.with_(**sigma), lines_with(half, soft, common) if "softness" in sigma else common
+    if "softness" in sigma:
+        common = lines_with(half, soft, common)
+    return form.with_(**sigma), common, unsure
 
 
 def _population(

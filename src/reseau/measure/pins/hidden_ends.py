@@ -74,24 +74,30 @@ def integrate_over_hidden_ends(work: Windows, found: ArcMatches, form: Form, sta
         scale = float(np.clip(end, *_SCALES_PX))
         most = np.arcsinh(_BEYOND_PX / scale)
         steps = scale * np.sinh(np.linspace(-most, most, _PLACES))
-        cost, _, _ = _with_end_at(work, found, row, side, steps, form, start)
+        cost = _with_end_at(work, found, row, side, steps, form, start)[0]
         if not np.isfinite(cost).any():
             found.converged[row] = False
             continue
         likely = np.flatnonzero(cost < cost.min() + _UNLIKELY)
         first, last = steps[np.clip(likely[[0, -1]] + [-1, 1], 0, len(steps) - 1)].tolist()
         finer = np.linspace(first, last, _PLACES)
-        cost, middle, cov = _with_end_at(work, found, row, side, finer, form, start)
+        cost, middle, cov, others, with_others = _with_end_at(work, found, row, side, finer, form, start)
         seen = np.isfinite(cost)
         if not seen.any():
             found.converged[row] = False
             continue
-        cost, middle, cov = cost[seen], middle[seen], cov[seen]
+        cost, middle, cov, others, with_others = (
+            values[seen] for values in (cost, middle, cov, others, with_others)
+        )
         weight = np.exp(-0.5 * (cost - cost.min()))
         weight /= weight.sum()
         off = middle - weight @ middle
         found.xy[row] = weight @ middle
         found.cov[row] = np.einsum("n,nij->ij", weight, cov) + np.einsum("n,ni,nj->ij", weight, off, off)
+        joint = np.einsum("n,nip->ip", weight, with_others) + np.einsum("n,ni,np->ip", weight, off, others)
+        for k, name in enumerate(name for name in form.sigma if name != "length"):
+            found.by_prior[name][row] = joint[:, k] / form.sigma[name] ** 2
+        found.by_prior["length"][row] = 0.0
         if likely[0] == 0 or likely[-1] == len(steps) - 1:
             found.cov[row] += _BEYOND_PX**2 * np.outer(along, along)
     return rows
@@ -120,7 +126,7 @@ def _hidden_shares(work: Windows, found: ArcMatches) -> Array:
 
 def _with_end_at(
     work: Windows, found: ArcMatches, row: int, side: float, steps: Array, form: Form, start: Arcs
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array]:
     """Lines adjusted anew with one end held, displaced by given steps along the curve.
 
     Parameters
@@ -147,6 +153,10 @@ def _with_end_at(
         The middle of the line.
     covs : ndarray (n, 2, 2)
         Its covariances for a given place of the end.
+    forms : ndarray (n, p)
+        The unknowns of the form but for the length.
+    with_forms : ndarray (n, 2, p)
+        Covariances of the middle and these.
     """
     n, at = len(steps), np.full(len(steps), row)
     one, mean = found.arcs.select(at), start.select(at)
@@ -235,7 +245,8 @@ def _with_end_at(
     middles, _, _ = placed(adjusted.estimates, np.arange(n))
     turned = np.stack([across, -0.5 * side * along], axis=2)
     covs = turned @ cofactor[:, :2, :2] @ turned.swapaxes(1, 2)
-    return np.where(usable, costs, np.inf), middles, covs
+    with_forms = turned @ cofactor[:, :2, 3:free]
+    return np.where(usable, costs, np.inf), middles, covs, adjusted.estimates[:, 3:free], with_forms
 
 
 def _seen(work: Windows, found: ArcMatches, row: int) -> tuple[Array, Array, Array, Mask]:

@@ -44,6 +44,7 @@ _COLUMNS = (
     "curvature",
     "tilt",
     "reach",
+    "shared",
 )
 
 
@@ -66,7 +67,7 @@ class PinResult(Measured):
         standard deviation; NaN for others. None for a design without slanted wires.
     segments_px : ndarray (n, 2, 2), optional
         Ends of the slanted wires in the image.
-    reach : ndarray (n,), optional
+    reach, shared : ndarray (n,) and (n, 2, k), optional
         As in :class:`reseau.measure.pins.PinDetections`; NaN where not measured.
 
     Examples
@@ -92,6 +93,7 @@ class PinResult(Measured):
     share_sigma: Array | None = None
     segments_px: Array | None = None
     reach: Array | None = None
+    shared: Array | None = None
 
     def _columns(self) -> dict[str, list[Any]]:
         columns = super()._columns()
