@@ -18,6 +18,7 @@ from .parameters import (
     FramesParameters,
     OscilloscopeParameters,
     OwnParameters,
+    PhotographsParameters,
     ScanParameters,
     SensorParameters,
     SessionParameters,
@@ -219,7 +220,9 @@ def _testfield(run: Acquisition, given: TestfieldParameters) -> Plan:
     return plans.homed(run, plan) if given.home else plan
 
 
-def _testfield_procedure(session: Session, given: TestfieldParameters) -> TestfieldProcedure:
+def _testfield_procedure(
+    session: Session, given: TestfieldParameters | PhotographsParameters
+) -> TestfieldProcedure:
     from ..measure import TestfieldOptions
     from ..procedures.target_measurement import measurer_of
     from ..procedures.testfield import TestfieldProcedure
@@ -255,6 +258,24 @@ def _testfield_results(procedure: TestfieldProcedure, session: Session) -> dict[
     title = f"Calibration, session {session.name}"
     report = bundle_report(found.result, title=title, provenance=procedure.provenance)
     return results | {"report.html": report}
+
+
+def _photographs(run: Acquisition, given: PhotographsParameters) -> Plan:
+    raise UsageError("is made of files, not on a bench", where=run.session.name)
+    yield  # a generator, as all plans
+
+
+def _photographs_results(procedure: TestfieldProcedure, session: Session) -> dict[str, str]:
+    from ..report.bundle import bundle_report
+
+    found = procedure.calibrated().required()
+    calibration = found.calibration(session.name, procedure.provenance.to_dict())
+    frames = {each.step: each for each in session.frames(kind="frame")}
+    report = bundle_report(
+        found.result, title=f"Calibration {session.name}", provenance=procedure.provenance,
+        assessments=found.assessments, photograph=lambda name: session.picture(frames[name]),
+    )  # fmt: skip
+    return {"calibration.json": calibration.to_json(), "report.html": report}
 
 
 def _blurred(run: Acquisition, given: BlurredParameters) -> Plan:
@@ -338,6 +359,13 @@ KINDS: Mapping[str, SessionKind] = {
         _oscilloscope,
         ("reseau.json", "object.json"),
         procedure=_oscilloscope_procedure,
+    ),
+    "photographs": SessionKind(
+        PhotographsParameters,
+        _photographs,
+        ("design.json",),
+        procedure=_testfield_procedure,
+        results=_photographs_results,
     ),
     "sensor": SessionKind(
         SensorParameters,

@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
-from pydantic import Field, NonNegativeInt, PositiveInt
+from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
 from ..capture import HEIGHT, Bench, Goal, SensorSeriesPlan, Step
 from ..core.errors import FormatError, UsageError
@@ -26,6 +26,7 @@ __all__ = [
     "FramesParameters",
     "OscilloscopeParameters",
     "OwnParameters",
+    "PhotographsParameters",
     "ScanParameters",
     "SensorParameters",
     "SessionParameters",
@@ -410,6 +411,62 @@ class TestfieldParameters(SessionParameters):
         unit = self.units[goal.parameter]
         if goal.unit and goal.unit != unit:
             raise UsageError(f"has the unit {unit or '1'}, not {goal.unit}", where=name)
+
+
+class PhotographsParameters(SessionParameters):
+    """Parameters of the plan `photographs`: a camera calibrated by photographs that were taken by hand.
+
+    Parameters
+    ----------
+    model : str
+        Camera model; empty: Brown's with `pitch`, else OpenCV's.
+    pitch : float, optional
+        Size of a pixel (mm).
+    free : tuple of str
+        Parameters to estimate; empty: the usual ones of the model.
+    row_jitter, fill : float
+        As for :class:`TestfieldParameters`.
+
+    Examples
+    --------
+    >>> PhotographsParameters(pitch=0.005).camera_options().model
+    'brown'
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-photographs-parameters/1"
+
+    retakes: NonNegativeInt = 0
+    model: str = ""
+    pitch: float | None = None
+    free: tuple[str, ...] = ()
+    row_jitter: float = 0.0
+    fill: float = 1.0
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        try:
+            self.camera_options()
+        except UsageError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    @property
+    def sigmas(self) -> None:
+        """There is no z-stage."""
+        return
+
+    def camera_options(self) -> CameraOptions:
+        """Return the camera model and the parameters to estimate.
+
+        Raises
+        ------
+        UsageError
+            If the model or a parameter is unknown, or the size of a pixel is missing.
+        """
+        from ..procedures.calibration import CameraOptions
+
+        pitch = None if self.pitch is None else (self.pitch, self.pitch)
+        return CameraOptions(self.model, self.free, pitch)
 
 
 class SensorParameters(SessionParameters):

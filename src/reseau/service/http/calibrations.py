@@ -107,7 +107,9 @@ class CorrelationRow(Answer):
 
 
 class CalibrationDetail(Answer):
-    """A calibration and the decision on it."""
+    """A calibration and the decision on it; `verdict` says what it is good for."""
+
+    verdict: list[str]
 
     configuration: str
     decision: DecisionRow
@@ -311,6 +313,12 @@ def configuration_detail(service: Service, name: str) -> ConfigurationDetail:
     )  # fmt: skip
 
 
+def verdict_of(calibration: Calibration) -> list[str]:
+    """Return what a calibration is good for, in words; nothing if it does not say."""
+    found = calibration.validity.get("assessment", {}).get("lines", [])
+    return [str(each) for each in found]
+
+
 def rules_of(service: Service, name: str) -> dict[str, Any] | None:
     """Return the rules by which a configuration was judged last."""
     history = _the(service, name).history(name)
@@ -333,6 +341,7 @@ def calibration_detail(service: Service, name: str, key: str) -> CalibrationDeta
                 pairs.append((names[j], first, matrix[i][j] / scale))
     pairs.sort(key=lambda pair: -abs(pair[2]))
     return CalibrationDetail(
+        verdict=verdict_of(found),
         configuration=name, decision=_row(service, decision), kind=found.kind, name=found.name,
         sigma0=found.sigma0, redundancy=found.redundancy,
         parameters=[

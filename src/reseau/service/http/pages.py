@@ -10,7 +10,9 @@ import jinja2
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 
+from ... import sessions as kinds
 from ...core.errors import ReseauError
+from ...io.photographs import PHOTOGRAPHS
 from . import accounts, calibrations, history, operations, sessions
 from .access import Administering, Here, NotFound, Reading, Unknown, csrf_of, principal_of, service_of
 from .service import Service
@@ -27,6 +29,7 @@ _STATIC = {
 NAV = (
     ("/sessions", "Sessions"),
     ("/calibrations", "Calibrations"),
+    ("/files", "Files"),
     ("/history", "History"),
     ("/account", "Account"),
 )
@@ -144,8 +147,17 @@ def session_page(request: Request, session: str, who: Reading, service: Here) ->
     frames = sessions.frames(session, who, service, 0, 2000)
     return _rendered(
         request, "session.html.j2", s=found, frames=frames[-_SHOWN:][::-1], more=max(0, len(frames) - _SHOWN),
-        report=_report(found), bench=None, reached={},
+        report=_report(found), verdict=_verdict(service, found), bench=None, reached={},
+        job=service.jobs.of(session),
     )  # fmt: skip
+
+
+def _verdict(service: Service, session: sessions.SessionDetail) -> str:
+    """What the calibration of a session is good for, in words."""
+    if not any(each.name == "calibration.json" for each in session.results):
+        return ""
+    calibration = kinds.calibration_of(sessions.the_session(service, session.name))
+    return " ".join(calibrations.verdict_of(calibration))
 
 
 def _report(session: sessions.SessionDetail) -> int | None:
@@ -232,9 +244,15 @@ def calibration_page(request: Request, name: str, key: str, who: Reading, servic
             tests[each["parameter"]] = f"p = {each['p']:.2g}"
     return _rendered(
         request, "calibration.html.j2", c=found, report=report, tests=tests,
-        verdict=" ".join(found.validity.get("verdict", [])),
+        verdict=" ".join(found.verdict),
         in_force=current is not None and current.key == found.decision.key,
     )  # fmt: skip
+
+
+@router.get("/files")
+def files_page(request: Request, who: Reading, service: Here) -> Response:
+    """Upload of photographs."""
+    return _rendered(request, "files.html.j2", accept=",".join(PHOTOGRAPHS))
 
 
 @router.get("/history")

@@ -17,6 +17,7 @@ from ..audit import Audit
 from ..state import StateFolder
 from .events import Events
 from .guard import Meters, log
+from .jobs import Jobs
 from .options import ServeOptions
 
 __all__ = ["Service"]
@@ -59,6 +60,7 @@ class Service:
         self.archive = Archive.open(options.archive, options.objects, create=True)
         self.audit = Audit(self.archive, self.state)
         self.events, self.meters = Events(), Meters()
+        self.jobs = Jobs(options.archive, options.objects, self.events)
         self.meters.clients.set_function(lambda: self.events.clients)
         self.started = time.time()
         self._entries: dict[str, float] = {}
@@ -70,10 +72,12 @@ class Service:
 
     def __enter__(self) -> Service:
         self._watcher.start()
+        self.jobs.start(self.archive)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._over.set()
+        self.jobs.close()
         self.events.close()
         self._watcher.join(2.0)
         self.accounts.close()

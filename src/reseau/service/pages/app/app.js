@@ -57,6 +57,15 @@ function fields(form) {
   return found;
 }
 
+function form_data(form) {
+  const found = new FormData(form);
+  // An empty field or file is left out.
+  for (const [name, value] of [...found.entries()]) {
+    if (value === '' || (value instanceof File && value.size === 0 && value.name === '')) found.delete(name);
+  }
+  return found;
+}
+
 async function act(element, body) {
   if (element.dataset.ask && !confirm(element.dataset.ask)) return;
   const buttons = element.matches('form') ? element.querySelectorAll('button') : [element];
@@ -92,7 +101,7 @@ document.addEventListener('submit', event => {
   if (!form.dataset.api) return;
   event.preventDefault();
   let body;
-  try { body = form.enctype === 'multipart/form-data' ? new FormData(form) : fields(form); }
+  try { body = form.enctype === 'multipart/form-data' ? form_data(form) : fields(form); }
   catch (error) { say(`not JSON: ${error.message}`); return; }
   act(form, body);
 });
@@ -102,6 +111,16 @@ document.addEventListener('click', event => {
   event.preventDefault();
   act(button, button.dataset.body ? JSON.parse(button.dataset.body) : undefined);
 });
+
+for (const drop of document.querySelectorAll('[data-drop]')) {
+  const input = drop.querySelector('input[type=file]');
+  const shown = drop.querySelector('output');
+  const show = () => { shown.textContent = `${input.files.length} chosen`; };
+  input.addEventListener('change', show);
+  for (const kind of ['dragenter', 'dragover']) drop.addEventListener(kind, e => { e.preventDefault(); drop.classList.add('over'); });
+  for (const kind of ['dragleave', 'drop']) drop.addEventListener(kind, e => { e.preventDefault(); drop.classList.remove('over'); });
+  drop.addEventListener('drop', e => { input.files = e.dataTransfer.files; show(); });
+}
 
 // Live parts: replaced by those of the page as the server renders it now.
 let waiting = null, last = 0, running = false;

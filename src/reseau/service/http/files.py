@@ -1,0 +1,146 @@
+"""Operations on files that people bring: photographs of a target, of an oscilloscope; and computations."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, File, Form, Path, UploadFile
+from pydantic import ConfigDict
+
+from ... import sessions as kinds
+from ...core.errors import InputError, UsageError
+from ...io.photographs import PHOTOGRAPHS
+from ..computing import PHOTOGRAPH
+from .access import Here, NotFound, Operating, Reading
+from .answers import Answer, refusals
+from .sessions import SessionName, the_session
+
+__all__ = ["JobAnswer", "router"]
+
+router = APIRouter(tags=["files"], responses=refusals(400, 401, 403, 404, 413, 422, 503))
+
+MOST_FILES, MOST_BYTES = 200, 200 << 20
+"""Photographs of an upload, and bytes of one."""
+_MOST_DESIGN = 4 << 20
+
+
+class Uploaded(Answer):
+    """The session that the photographs became, and the computation that has begun."""
+
+    session: str
+    job: int
+
+    model_config = ConfigDict(
+        extra="forbid", json_schema_extra={"example": {"session": "left, March", "job": 1}}
+    )
+
+
+class JobAnswer(Answer):
+    """A computation."""
+
+    number: int
+    what: Literal["finish", "rerun"]
+    session: str
+    state: Literal["waiting", "running", "done", "failed"]
+    found: Any
+    why: str
+
+
+def _label(name: str | None, number: int) -> str:
+    """Name of a photograph: what follows the last slash of its file's name, printable, and short."""
+    last = (name or "").replace("\\", "/").rpartition("/")[2]
+    plain = "".join(c if c.isprintable() else "_" for c in last)[-100:]
+    return plain or f"photograph {number}"
+
+
+def _suffix(name: str) -> str:
+    suffix = "." + name.rpartition(".")[2].lower()
+    if suffix not in PHOTOGRAPHS or suffix == ".dcm":
+        raise InputError("is not a photograph", where=name, do=f"use {', '.join(PHOTOGRAPHS[:5])}, …")
+    return suffix
+
+
+@router.post("/uploads", status_code=202)
+def upload(
+    who: Operating,
+    service: Here,
+    name: Annotated[str, Form(min_length=1, max_length=200, description="Name of the session.")],
+    photographs: Annotated[list[UploadFile], File(description="Photographs.")],
+    design: Annotated[UploadFile, File(description="Design of the target (JSON).")],
+    test_object: Annotated[
+        UploadFile | None, File(description="For an oscilloscope: design of the test object (JSON).")
+    ] = None,
+    target: Annotated[
+        Literal["camera", "oscilloscope"],
+        Form(description="What is calibrated: a camera, or an oscilloscope by PHOTO I, II and III."),
+    ] = "camera",
+    model: Annotated[str, Form(max_length=40, description="Camera model; empty: the usual one.")] = "",
+    pitch: Annotated[float | None, Form(gt=0, le=1, description="Size of a pixel (mm).")] = None,
+    free: Annotated[str, Form(max_length=400, description="Parameters to estimate, as c,x0,y0,K1.")] = "",
+) -> Uploaded:
+    """Calibrate from photographs: they are archived as they come, decoded, measured and adjusted.
+
+    Photographs of an oscilloscope are taken in the order PHOTO I, II, III.
+    """
+    if len(photographs) > MOST_FILES:
+        raise UsageError(f"are more than {MOST_FILES}", where="photographs")
+    labels = [_label(each.filename, k) for k, each in enumerate(photographs, start=1)]
+    suffixes = [_suffix(each) for each in labels]
+    for each, label in zip(photographs, labels, strict=True):
+        if (each.size or 0) > MOST_BYTES:
+            raise UsageError(f"is larger than {MOST_BYTES >> 20} MiB", where=label)
+        if not each.size:
+            raise InputError("is empty", where=label)
+    if target == "camera":
+        if len(set(labels)) < len(labels):
+            raise UsageError("have names that occur twice", where="photographs")
+        plan, inputs = "photographs", {"design.json": _text(design)}
+        given: dict[str, Any] = {"model": model, "pitch": pitch}
+        given["free"] = [each.strip() for each in free.split(",") if each.strip()]
+    else:
+        if test_object is None or len(photographs) < 2:
+            raise UsageError("needs PHOTO I and II, and the design of the test object", where=name)
+        plan, inputs = "oscilloscope", {"reseau.json": _text(design), "object.json": _text(test_object)}
+        given = {"body": len(photographs) > 2}
+        labels = [f"PHOTO {'I' * k}" for k in range(1, min(len(photographs), 3) + 1)]
+        if len(photographs) > 3:
+            raise UsageError("are more than PHOTO I, II and III", where="photographs")
+    with service.audited(who, "upload", name, {"photographs": len(photographs), "plan": plan}):
+        kinds.check(name, plan, given, inputs)
+        session = kinds.begin(service.archive, name, plan, given, inputs)
+        for each, label, suffix in zip(photographs, labels, suffixes, strict=True):
+            session.store(label, each.file.read(), kind=PHOTOGRAPH, suffix=suffix)
+    return Uploaded(session=name, job=service.jobs.add("finish", name).number)
+
+
+def _text(file: UploadFile) -> str:
+    if (file.size or 0) > _MOST_DESIGN:
+        raise UsageError(f"is larger than {_MOST_DESIGN >> 20} MiB", where="design")
+    try:
+        text = file.file.read().decode("utf-8")
+        json.loads(text)
+    except (ValueError, RecursionError):
+        raise InputError("is not JSON", where=_label(file.filename, 0)) from None
+    return text
+
+
+@router.post("/sessions/{session}/rerun", status_code=202)
+def rerun(session: SessionName, who: Operating, service: Here) -> JobAnswer:
+    """Compute the results of a session again from its frames, and compare them byte by byte."""
+    kept = the_session(service, session)
+    if not kept.results():
+        raise UsageError(f"has no results (status: {kept.status})", where=session)
+    return JobAnswer(**vars(service.jobs.add("rerun", session)))
+
+
+@router.get("/jobs/{number}")
+def job(
+    number: Annotated[int, Path(ge=1, le=1 << 31, description="Number of the computation.")], who: Reading,
+    service: Here,
+) -> JobAnswer:  # fmt: skip
+    """A computation: its state, and what it found. The session has the results."""
+    found = service.jobs.get(number)
+    if found is None:
+        raise NotFound("is no computation of this service since its start", where=number)
+    return JobAnswer(**vars(found))
