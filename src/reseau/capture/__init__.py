@@ -3,7 +3,7 @@
 from .acquisition import Acquisition, Plan, Procedure, Watch
 from .bench import Bench, BenchFile, Checked, InstrumentEntry, drivers, found_instruments, plugin
 from .checks import Limits, Readiness, edge_sigma, exposure_fault, readiness, shift_between
-from .engine import Decision, Rerun, carry_out, rerun
+from .engine import Control, Decision, Rerun, carry_out, rerun
 from .lock import BenchLock
 from .plans import Goal, SensorSeriesPlan
 from .steps import HEIGHT, Step, at_heights, paper_steps, read_steps, spread
@@ -15,6 +15,7 @@ __all__ = [
     "BenchFile",
     "BenchLock",
     "Checked",
+    "Control",
     "Decision",
     "Goal",
     "InstrumentEntry",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import queue
 import signal
 import sys
 import threading
@@ -23,7 +24,7 @@ from ..core.threads import one_thread
 from .acquisition import Acquisition, Plan, Procedure
 from .steps import Step, as_taken
 
-__all__ = ["Decision", "Rerun", "carry_out", "rerun"]
+__all__ = ["Control", "Decision", "Rerun", "carry_out", "rerun"]
 
 # An error is reported once, by the exception that is raised; the engine would print it as well.
 logging.getLogger("bluesky").addHandler(logging.NullHandler())
@@ -39,6 +40,7 @@ def carry_out(
     park: Mapping[str, float] | None = None,
     retreat: Mapping[str, float] | None = None,
     paused: Callable[[], Decision] = lambda: "stop",
+    control: Control | None = None,
 ) -> Any:
     """Carry out a plan, then store the results of the procedure.
 
@@ -54,6 +56,8 @@ def carry_out(
         Position of the table after a stop or a failure. Default: it stays where it stopped.
     paused : callable
         Called when the plan was interrupted, by Ctrl-C or by :meth:`RunEngine.request_pause`.
+    control : Control, optional
+        Pauses it from another thread; in place of `paused`.
 
     Returns
     -------
@@ -86,7 +90,9 @@ def carry_out(
     ('nothing to do', 'done')
     """
     in_main = threading.current_thread() is threading.main_thread()
-    engine, ended = _engine(run, in_main), _Ended()
+    engine = _engine(run, in_main)
+    ended = _Asked() if control is None else control.attach(engine)
+    paused = paused if control is None else control.wait
     status = "failed"
     try:
         run.ready()
@@ -228,7 +234,7 @@ def _engaged(
     engine: Any,
     plan: Plan,
     paused: Callable[[], Decision],
-    ended: _Ended,
+    ended: _Asked,
 ) -> Any:
     """The return value of the engine; None if the plan was ended early."""
     todo: Callable[[], Any] = lambda: engine(plan)  # noqa: E731
@@ -240,6 +246,7 @@ def _engaged(
             with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C at the question means stop
                 decision = "stop" if ended.noticed() else paused()
             if decision == "resume":
+                ended.go_on()
                 todo = engine.resume
                 continue
             with contextlib.suppress(RunEngineInterrupted):
@@ -247,34 +254,45 @@ def _engaged(
             return None
 
 
-class _Ended:
-    """Whether a signal has asked for the end of the run, and whether it has interrupted the engine."""
+class _Asked:
+    """Whether a pause or the end of the run was asked for, and whether that has interrupted the engine."""
 
     def __init__(self) -> None:
-        self._asked, self._interrupted = threading.Event(), threading.Event()
+        self._asked, self._over, self._interrupted = threading.Event(), threading.Event(), threading.Event()
+        self._inserted = False
 
-    def ask(self) -> None:
-        """Note the signal."""
+    def pause(self) -> None:
+        """Note that a pause is asked for."""
+        self._asked.set()
+
+    def end(self) -> None:
+        """Note that the end is asked for."""
+        self._over.set()
         self._asked.set()
 
     def noticed(self) -> bool:
-        """Note that the engine was interrupted; return whether a signal has asked for the end."""
+        """Note that the engine was interrupted; return whether the end was asked for."""
         if self._asked.is_set():
             self._interrupted.set()
-        return self._asked.is_set()
+        return self._over.is_set()
+
+    def go_on(self) -> None:
+        """Note that the run goes on: the next pause is another one."""
+        if not self._over.is_set():
+            self._asked.clear()
+            self._interrupted.clear()
+            self._inserted = False
 
     def heeded(self, plan: Plan) -> Plan:
         """The plan, which pauses before its next message where the engine has lost the request to pause.
 
         On a busy machine a pause that is requested while the engine waits for an instrument can be lost.
         """
-        lost = False
 
         def before(message: Any) -> Any:
-            nonlocal lost
-            if lost or not self._asked.is_set() or self._interrupted.is_set():
+            if self._inserted or not self._asked.is_set() or self._interrupted.is_set():
                 return None, None
-            lost = True
+            self._inserted = True
 
             def first() -> Plan:
                 yield from bps.pause()
@@ -285,15 +303,71 @@ class _Ended:
         return (yield from bpp.plan_mutator(plan, before))  # type: ignore[no-untyped-call]
 
 
+class Control:
+    """Pauses a plan, and lets it go on or ends it, from another thread.
+
+    Parameters
+    ----------
+    paused : callable
+        Called in the thread of the plan when it has paused.
+
+    Examples
+    --------
+    >>> control = Control()
+    >>> control.pause()  # nothing runs yet
+    False
+    """
+
+    def __init__(self, paused: Callable[[], None] = lambda: None) -> None:
+        self._paused, self._engine, self._asked = paused, None, _Asked()
+        self._decisions: queue.SimpleQueue[Decision] = queue.SimpleQueue()
+
+    def attach(self, engine: Any) -> _Asked:
+        """Control this engine from now on."""
+        self._engine = engine
+        return self._asked
+
+    def pause(self, *, at_once: bool = False) -> bool:
+        """Pause after the present pose, or at once: what moves is stopped then.
+
+        Returns
+        -------
+        bool
+            Whether there is a plan that runs.
+        """
+        engine: Any = self._engine
+        if engine is None:
+            return False
+        if at_once:
+            self._asked.pause()
+        try:
+            engine.request_pause(defer=not at_once)
+        except Exception:  # it has just paused or ended
+            return False
+        return True
+
+    def decide(self, decision: Decision) -> None:
+        """Say how a plan goes on; one that runs is paused at once for `stop` and `abort`."""
+        self._decisions.put(decision)
+        if decision != "resume":
+            self.pause(at_once=True)
+
+    def wait(self) -> Decision:
+        """Return the next decision; for the parameter `paused` of :func:`carry_out`."""
+        if self._decisions.empty():
+            self._paused()
+        return self._decisions.get()
+
+
 @contextlib.contextmanager
-def _ended_by_signals(engine: Any, ended: _Ended, in_main: bool) -> Iterator[None]:
+def _ended_by_signals(engine: Any, ended: _Asked, in_main: bool) -> Iterator[None]:
     """Make SIGTERM and SIGHUP end the run, like Ctrl-C twice and `stop`."""
     if not in_main:
         yield
         return
 
     def end(*_: object) -> None:
-        ended.ask()
+        ended.end()
         with contextlib.suppress(Exception):  # the run may have ended already
             engine.request_pause(False)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..archive import Archive, Session
 from ..calibration.document import Calibration
-from ..capture import Acquisition, Bench, BenchLock, Decision, Procedure, Rerun, Watch, carry_out
+from ..capture import Acquisition, Bench, BenchLock, Control, Decision, Procedure, Rerun, Watch, carry_out
 from ..capture import rerun as rerun_with
 from ..core.errors import UsageError
 from .kinds import GENERATOR, Reported, kind_of, own_plan
@@ -224,6 +224,7 @@ def capture(
     watch: Watch = lambda kind, facts: None,
     operator: Callable[[str], None] | None = None,
     paused: Callable[[], Decision] = lambda: "stop",
+    control: Control | None = None,
 ) -> Any:
     """Carry out a session, new or resumed, with the plan and the procedure of its kind.
 
@@ -235,7 +236,7 @@ def capture(
         Connected or not.
     watch, operator
         As for :class:`reseau.capture.Acquisition`.
-    paused
+    paused, control
         As for :func:`reseau.capture.carry_out`.
 
     Returns
@@ -264,7 +265,9 @@ def capture(
         oscilloscope=given.oscilloscope, scanner=given.scanner, retakes=given.retakes, limits=kind.limits,
         watch=watch, operator=operator,
     )  # fmt: skip
-    return carry_out(run, kind.acquire(run, given), park=given.park, retreat=given.retreat, paused=paused)
+    return carry_out(
+        run, kind.acquire(run, given), park=given.park, retreat=given.retreat, paused=paused, control=control
+    )
 
 
 def rerun(session: Session) -> list[Rerun]:
