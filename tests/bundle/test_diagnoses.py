@@ -553,6 +553,7 @@ SLOW = {
     "focal length in millimetres", "one focal length in millimetres", "principal point in pixels",
     "control points exchanged", "mirrored control", "y upwards", "control point with a typing error",
     "height of a control point wrong", "an image mirrored", "one name for two points",
+    "a decimal point lost", "one station",
 }  # fmt: skip
 
 

@@ -39,12 +39,17 @@ def errors(result: FrameResult, frame: FilmFrame) -> Array:
         FilmFrame(2, tilt_deg=14.0, beside=BUSY),
         FilmFrame(3, tilt_deg=-14.0, mirrored=True, format=HASSELBLAD, dpi=400),
         FilmFrame(4, negative=True, beside=BUSY),
-        FilmFrame(5, beside=Beside(lines=1)),
-        FilmFrame(6, beside=Beside(rods=1)),
-        FilmFrame(7, beside=Beside(blown=True)),
-        FilmFrame(8, bow_mm=0.1),
-        FilmFrame(9, format=RICOH._replace(radius=1.5)),
-        FilmFrame(10, bits=16),
+        *(
+            pytest.param(frame, marks=pytest.mark.slow)
+            for frame in (
+                FilmFrame(5, beside=Beside(lines=1)),
+                FilmFrame(6, beside=Beside(rods=1)),
+                FilmFrame(7, beside=Beside(blown=True)),
+                FilmFrame(8, bow_mm=0.1),
+                FilmFrame(9, format=RICOH._replace(radius=1.5)),
+                FilmFrame(10, bits=16),
+            )
+        ),
         FilmFrame(11, contrast=0.3),
     ],
     ids=lambda frame: f"seed {frame.seed}",

@@ -211,7 +211,7 @@ def test_frames_without_an_image_are_refused():
         find_pins(Frame(np.zeros((100, 100), np.uint8), 255.0, "dark.png"))
 
 
-@pytest.mark.parametrize("quality", [None, 60])
+@pytest.mark.parametrize("quality", [pytest.param(None, marks=pytest.mark.slow), 60])
 @pytest.mark.parametrize("scale", [0.4, 0.6, 1.0])
 def test_graphics_of_the_instrument_are_not_measured_as_pins(scale: float, quality: int | None):
     truth = np.array([[100.3, 160.2], [300.0, 160.0]])
@@ -290,7 +290,12 @@ def on_screen(matrix: Array) -> Array:
 
 
 @pytest.mark.parametrize(
-    "matrix", [[[5, 0], [0, -5]], [[-5, 0], [0, -5.2]], [[-5, 0], [0, 5]], [[4.95, -0.5], [-0.5, -4.95]]]
+    "matrix",
+    [
+        *(pytest.param(m, marks=pytest.mark.slow) for m in ([[5, 0], [0, -5]], [[-5, 0], [0, 5]])),
+        [[-5, 0], [0, -5.2]],
+        [[4.95, -0.5], [-0.5, -4.95]],
+    ],
 )
 def test_rods_are_identified_also_if_mirrored_or_rotated(matrix: list[list[float]]):
     truth = on_screen(np.array(matrix))

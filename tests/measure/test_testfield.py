@@ -73,9 +73,19 @@ CASES: dict[str, tuple[FieldBench, Station, int]] = {
     "targets turned at random": (FieldBench(design=coded_testfield(turn_seed=3)), Station(0), 300),
     "from afar": (FieldBench(distance_mm=8000), Station(0), 760),
 }
+QUICK = (
+    "the camera turned by 37°",
+    "barrel distortion of 10 px",
+    "blurred by 2 px",
+    "uneven light",
+    "from afar",
+)
+"""What the suite measures; the others take as long, and are run by `make slow`."""
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=() if c in QUICK else pytest.mark.slow) for c in CASES]
+)
 def test_there_are_no_unflagged_errors(case: str) -> None:
     bench, station, least = CASES[case]
     result, error = measured(bench, station)
