@@ -1,6 +1,8 @@
 """Boards of other programs in pictures drawn by ``worlds.prints``, beside OpenCV and ``aprilgrid``.
 
-Run from the checkout: ``python benchmarks/drawn_boards.py [--kind K …] [--condition C …] [--count 2]``. For
+Run from the checkout: ``python benchmarks/drawn_boards.py [--kind K …] [--condition C …] [--count 2]
+[--calibrate SEEDS]``. With ``--calibrate`` the camera is calibrated from ten views for each seed, and the
+errors of its parameters are compared with their sigmas. Without, for
 every picture: points measured of those in sight and clear, and those of the other program; rms error and the
 other's; errors over sigmas; points wrong by more than 0.15 px and 5 sigma; names wrong beyond the symmetry of
 the board; processor time of both. A board that the other program finds and ours does not counts as missed.
@@ -25,6 +27,7 @@ from reseau.core.failure import Failure
 from reseau.designs import board
 from reseau.io import BoardDesign
 from reseau.measure import measure_board
+from reseau.procedures.calibration import calibrate_camera, measurer_of
 
 WRONG_PX, WRONG_SIGMA, NORMALISED = 0.15, 5.0, (0.85, 1.2)
 APRIL, ARUCO = "DICT_APRILTAG_36h11", "DICT_4X4_100"
@@ -183,13 +186,53 @@ def held_out(kind: str, count: int) -> list[tuple[str, View]]:
     return found
 
 
+CALIBRATED, VIEWS = (0.75, 1.3), 10
+"""Limits of the normalised errors of parameters, free of correlations, and number of views."""
+PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+
+
+def calibrations(kind: str, seeds: int) -> bool:
+    """Calibrate from views that fill the frame, some beyond it; print errors over sigmas."""
+    design, printed = KINDS[kind]
+    white, good = [], True
+    true = np.array([*View._focal, *View._centre, *View._lens])
+    for seed in range(seeds):
+        drawn = [
+            View(printed, *pose(100 * seed + k, printed, nearer=1.15), seed=7777 * seed + k)
+            for k in range(VIEWS)
+        ]
+        frames = [Frame(view.picture(), 255.0, str(k)) for k, view in enumerate(drawn)]
+        done = calibrate_camera(frames, design, measurer_of(design))
+        if isinstance(done, Failure):
+            print(f"{kind:12} seed {seed}: {done.reason}  MISSED")
+            good = False
+            continue
+        camera = done.cameras["camera"]
+        at = [camera.parameters.index(name) for name in PARAMETERS]
+        error, cov = camera.values[at] - true, camera.covariance[np.ix_(at, at)]
+        white.append(np.linalg.solve(np.linalg.cholesky(cov), error))
+        z = " ".join(f"{value:5.1f}" for value in error / np.sqrt(np.diag(cov)))
+        print(f"{kind:12} seed {seed:2}: sigma0 {done.sigma0:.2f}, errors over sigmas {z}", flush=True)
+    if not white:
+        return False
+    ratio = float(np.sqrt((np.array(white) ** 2).mean()))
+    good &= CALIBRATED[0] <= ratio <= CALIBRATED[1]
+    print(f"{kind:12} free of correlations {ratio:.2f}  {'ok' if good else 'MISSED'}", flush=True)
+    return good
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--kind", nargs="+", default=list(KINDS), choices=list(KINDS))
     parser.add_argument("--condition", nargs="+", default=[*CONDITIONS, "held"])
     parser.add_argument("--count", type=int, default=2)
+    parser.add_argument("--calibrate", type=int, default=0, help="number of calibrations, and nothing else")
     options = parser.parse_args()
     cv2.setNumThreads(1)
+    if options.calibrate:
+        # Every kind is calibrated, whatever the others give.
+        done = [calibrations(kind, options.calibrate) for kind in options.kind]
+        return 0 if all(done) else 1
     print("kind         picture      measured  other rms   theirs worst sigma ratio wrong names s other")
     good = True
     for kind in options.kind:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,10 @@ from reseau.measure import BoardOptions, BoardResult, measure_board
 
 from .board_pictures import picture
 
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from worlds import prints
+from worlds.sheets import View, pose
+
 CHESS = board("chess", 9, 8, 20.0)
 CHARUCO = board("charuco", 7, 6, 25.0, size=18.0)
 CIRCLES = board("circles", 8, 6, 20.0, size=10.0)
@@ -28,6 +33,7 @@ APRIL_ONE = board("aprilgrid", 4, 3, 26.0, dictionary="DICT_APRILTAG_25h9")
 MARKERS = board("markers", 4, 3, 26.0, size=21.0)
 SINGLE = board("markers", 1, 1, 60.0, dictionary="DICT_APRILTAG_16h5", first_id=7)
 SHIFTED = board("circles", 5, 9, 12.0, size=9.0, asymmetric=True)
+CHARUCO_PRINT = prints.charuco(9, 6, 30.0, 22.0, "DICT_4X4_100")
 STEREO = Path(os.environ.get("RESEAU_DATA", "/nowhere")) / "chessboard_stereo"
 DATA = Path(os.environ.get("RESEAU_DATA", "/nowhere")) / "independent" / "boards"
 
@@ -99,6 +105,25 @@ def test_circles_have_no_eccentricity_at_60_degrees(design: BoardDesign, ways: i
     assert np.abs(error.mean(axis=0)).max() < 0.004
     said = [note for note in found.notes if note.code is Code.AMBIGUOUS]
     assert bool(said) == (ways > 1 and design is CIRCLES) or f"{ways} ways" in str(said[0])
+
+
+@pytest.mark.parametrize(
+    ("design", "printed", "seed"),
+    [
+        (board("charuco", 9, 6, 30.0, size=22.0, dictionary="DICT_4X4_100"), CHARUCO_PRINT, 1),
+        (board("circles", 9, 7, 25.0, size=12.0), prints.circles(9, 7, 25.0, 12.0), 4),
+    ],
+)
+def test_few_large_marks_through_a_lens_have_the_sigmas_of_their_errors(
+    design: BoardDesign, printed: prints.Print, seed: int
+) -> None:
+    view = View(printed, *pose(seed, printed, nearer=1.15), seed=seed)
+    found = measured(Frame(view.picture(), 255.0, "lens"), design)
+    assert 20 <= found.found < 45
+    error = renamed(found, view.truth)
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert 0.75 < np.sqrt(((error / sigma) ** 2).mean()) < 1.3
+    assert np.sqrt((error**2).mean()) < 0.004
 
 
 def test_half_a_chessboard_in_sight_is_measured() -> None:

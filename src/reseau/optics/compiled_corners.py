@@ -58,19 +58,22 @@ def formed(
     opposite: Floats,
     xy: Floats,
     sigma: Floats,
-    turn: Floats,
+    form: Floats,
     columns: Floats,
     rows: Floats,
     fill: float,
     images: Floats,
 ) -> None:
-    """Fill images (k, 1 or 6, r, c) of corners; see :func:`reseau.optics.corners.corner_images`."""
-    derived = images.shape[1] > 1
+    """Fill images (k, 1, 6 or 8, r, c) of corners; see :func:`reseau.optics.corners.corner_images`."""
+    derived, curved = images.shape[1] > 1, form.shape[1] > 2
     box, fourth = fill**2 / 12, -(fill**4) / 120 / 24
     for k in range(len(normal)):
         width = max(sigma[k], _SHARPEST)
         s = sqrt(width * width + box)
-        c1, s1, c2, s2 = np.cos(turn[k, 0]), np.sin(turn[k, 0]), np.cos(turn[k, 1]), np.sin(turn[k, 1])
+        c1, s1, c2, s2 = np.cos(form[k, 0]), np.sin(form[k, 0]), np.cos(form[k, 1]), np.sin(form[k, 1])
+        bend1, bend2 = bend[k, 0], bend[k, 1]
+        if curved:
+            bend1, bend2 = bend1 + form[k, 2], bend2 + form[k, 3]
         n1x, n1y = c1 * normal[k, 0, 0] - s1 * normal[k, 0, 1], s1 * normal[k, 0, 0] + c1 * normal[k, 0, 1]
         n2x, n2y = c2 * normal[k, 1, 0] - s2 * normal[k, 1, 1], s2 * normal[k, 1, 0] + c2 * normal[k, 1, 1]
         rho = min(max(n1x * n2x + n1y * n2y, -0.999), 0.999)
@@ -85,14 +88,14 @@ def formed(
             for j in range(images.shape[3]):
                 x = columns[k, j] - xy[k, 0]
                 along1, along2 = t1x * x + t1y * y, t2x * x + t2y * y
-                a = (n1x * x + n1y * y - 0.5 * bend[k, 0] * along1 * along1) / s
-                b = (n2x * x + n2y * y - 0.5 * bend[k, 1] * along2 * along2) / s
+                a = (n1x * x + n1y * y - 0.5 * bend1 * along1 * along1) / s
+                b = (n2x * x + n2y * y - 0.5 * bend2 * along2 * along2) / s
                 near1, near2 = abs(a) < _FAR, abs(b) < _FAR
                 if not (near1 or near2):
                     both = (a > 0 and b > 0) or (two and a < 0 and b < 0)
                     images[k, 0, i, j] = 1.0 if both else 0.0
                     if derived:
-                        for p in range(1, 6):
+                        for p in range(1, images.shape[1]):
                             images[k, p, i, j] = 0.0
                     continue
                 pa, pb = _step(a), _step(b)
@@ -120,10 +123,13 @@ def formed(
                 images[k, 0, i, j] = share
                 if not derived:
                     continue
-                slope1, slope2 = bend[k, 0] * along1, bend[k, 1] * along2
+                slope1, slope2 = bend1 * along1, bend2 * along2
                 images[k, 1, i, j] = -(by_a * (n1x - slope1 * t1x) + by_b * (n2x - slope2 * t2x)) / s
                 images[k, 2, i, j] = -(by_a * (n1y - slope1 * t1y) + by_b * (n2y - slope2 * t2y)) / s
                 images[k, 3, i, j] = -(a * by_a + b * by_b) * width / (s * s)
                 # A tangent turned by 90° is the negative normal.
-                images[k, 4, i, j] = by_a * along1 * (1 + bend[k, 0] * a * s) / s + by_rho * by_turn1
-                images[k, 5, i, j] = by_b * along2 * (1 + bend[k, 1] * b * s) / s + by_rho * by_turn2
+                images[k, 4, i, j] = by_a * along1 * (1 + bend1 * a * s) / s + by_rho * by_turn1
+                images[k, 5, i, j] = by_b * along2 * (1 + bend2 * b * s) / s + by_rho * by_turn2
+                if curved:
+                    images[k, 6, i, j] = -0.5 * by_a * along1 * along1 / s
+                    images[k, 7, i, j] = -0.5 * by_b * along2 * along2 / s

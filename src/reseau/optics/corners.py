@@ -67,7 +67,7 @@ def corner_images(
     corners: Corners,
     xy: Array,
     sigma: Array,
-    turn: Array,
+    form: Array,
     columns: Array,
     rows: Array,
     *,
@@ -84,8 +84,9 @@ def corner_images(
         Their positions in pixels.
     sigma : ndarray (k,)
         Widths of the point-spread function in pixels.
-    turn : ndarray (k, 2)
-        Rotation of each edge in radians, x into y.
+    form : ndarray (k, 2 or 4)
+        Rotation of each edge in radians, x into y; in four columns also what is added to their curvatures,
+        1/px.
     columns, rows : ndarray (k, c), (k, r)
         Pixel coordinates.
     fill : float
@@ -95,8 +96,8 @@ def corner_images(
 
     Returns
     -------
-    ndarray (k, 6 or 1, r, c), float32
-        Share of each pixel's light from the dark sectors; its derivatives by x, y, `sigma` and both turns.
+    ndarray (k, 1, 6 or 8, r, c), float32
+        Share of each pixel's light from the dark sectors; its derivatives by x, y, `sigma` and `form`.
 
     Examples
     --------
@@ -110,10 +111,11 @@ def corner_images(
     """
     from .compiled_corners import formed  # takes half a second to import; not every command needs it
 
-    images = np.empty((len(corners), 6 if derivatives else 1, rows.shape[1], columns.shape[1]), np.float32)
+    parts = 4 + form.shape[1] if derivatives else 1
+    images = np.empty((len(corners), parts, rows.shape[1], columns.shape[1]), np.float32)
     with one_thread():
         formed(
-            corners.normal, corners.bend, corners.opposite, xy, sigma, turn,
+            corners.normal, corners.bend, corners.opposite, xy, sigma, form,
             np.ascontiguousarray(columns), np.ascontiguousarray(rows), fill, images,
         )  # fmt: skip
     return np.asarray(images)

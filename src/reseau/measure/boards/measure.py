@@ -221,7 +221,7 @@ class CircleMarks(DiskMarks):
     curve_first = True
     eccentric = True
     even = True
-    formed_px = 0.0015
+    formed_px = 0.0007
 
 
 def sectors_of(design: BoardDesign) -> Sectors:

@@ -39,6 +39,7 @@ from ..response import FilteredShape, Samples, estimate_kernel
 from ..screening import Screened
 from ..testfield.targets import merged, replaced
 from ..tone import find_curve
+from .lens_mapping import mapping_through
 from .marks import ReseauOptions
 from .sheet_placement import through
 
@@ -83,8 +84,6 @@ _EXPLAINED = 0.7
 """Ratio of residuals below which a curve explains what looked like motion or sharpening."""
 _WHOLE = 0.97
 """Share of the pixels of a mark below which it is seen in part."""
-_PER_TERM = 2.0
-"""Least number of matched marks for each term of the polynomial of their mapping."""
 _BENT_PX = 0.15
 """Distance of one mark in ten from the mapping through all, from which that is adjusted again."""
 _PER_SMOOTH = 2.5
@@ -272,9 +271,9 @@ class PlaneMarks(ABC):
             sure = sure if self.eccentric else plain
             if sure.sum() >= _ENOUGH_LIKE:
                 self.start[rows[sure]] = found.xy[sure]
-                at, shape = self.at[rows[sure]], self.screened.grey.shape
-                degree = next(d for d in (5, 4, 3, 2, 1) if _PER_TERM * (d + 1) * (d + 2) <= 2 * len(at))
-                self.mapping = through(at, found.xy[sure], shape, degree)
+                h, w = self.screened.grey.shape
+                sigma = np.sqrt(np.trace(found.cov[sure], axis1=1, axis2=2) / 2)
+                self.mapping = mapping_through(self.at[rows[sure]], found.xy[sure], sigma, (h, w))
             found = self._match_all(rows)
         why, field = self._judged(rows, found)
         # Where paper is saturated, neighbours do not predict the light.
@@ -426,7 +425,7 @@ class PlaneMarks(ABC):
                     self.start[rows[part]],
                     options,
                     noise=max(self.screened.noise, self.rough),
-                    form_sigma=self.look.form_sigma,
+                    form_sigma=self._form_sigma(),
                     light=self._known_light(rows[part], background),
                     others=self._light_of(beside, rows[part], half),
                     region=self._region(rows[part], half),
@@ -434,6 +433,10 @@ class PlaneMarks(ABC):
             )
             parts.append(part)
         return merged(parts, found)
+
+    def _form_sigma(self) -> Array:
+        """Standard deviations of the parameters of the form."""
+        return self.look.form_sigma
 
     def _shape(self, images: Shape, part: Rows) -> Shape:
         """Images of some of the marks."""
