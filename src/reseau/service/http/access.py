@@ -23,6 +23,7 @@ __all__ = [
     "Reading",
     "Unknown",
     "csrf_of",
+    "operating",
     "principal_of",
     "service_of",
 ]
@@ -95,7 +96,8 @@ def _needs(scope: Scope) -> Callable[[Request], Principal]:
     return dependency
 
 
+operating = _needs("operate")
 Here = Annotated[Service, Depends(service_of)]
 Reading = Annotated[Principal, Depends(_needs("read"))]
-Operating = Annotated[Principal, Depends(_needs("operate"))]
+Operating = Annotated[Principal, Depends(operating)]
 Administering = Annotated[Principal, Depends(_needs("administer"))]

@@ -13,7 +13,7 @@ from fastapi import FastAPI
 
 from ...core.errors import UsageError
 from ...core.version import __version__
-from . import accounts, calibrations, files, history, operations, pages, sessions
+from . import accounts, benches, calibrations, files, history, operations, pages, sessions
 from .answers import add_error_handlers
 from .guard import Guard, log
 from .options import ServeOptions
@@ -51,6 +51,7 @@ def create_app(service: Service) -> Any:
         calibrations.router,
         history.router,
         files.router,
+        benches.router,
     ):
         app.include_router(each, prefix=API)
     app.include_router(pages.router)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 from importlib.resources import files
 from typing import Annotated, Any
+from urllib.parse import quote
 
 import jinja2
 from fastapi import APIRouter, Query, Request, Response
@@ -13,7 +14,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from ... import sessions as kinds
 from ...core.errors import ReseauError
 from ...io.photographs import PHOTOGRAPHS
-from . import accounts, calibrations, history, operations, sessions
+from . import accounts, benches, calibrations, history, operations, sessions
 from .access import Administering, Here, NotFound, Reading, Unknown, csrf_of, principal_of, service_of
 from .service import Service
 
@@ -27,12 +28,14 @@ _STATIC = {
     "icon.svg": "image/svg+xml",
 }
 NAV = (
+    ("/benches", "Bench"),
     ("/sessions", "Sessions"),
     ("/calibrations", "Calibrations"),
     ("/files", "Files"),
     ("/history", "History"),
     ("/account", "Account"),
 )
+_BUSY = ("running", "pausing", "paused", "asking", "ending")
 _SHOWN = 400
 """Frames on the page of a session."""
 _RULES = """{
@@ -123,8 +126,52 @@ def home(request: Request, who: Reading, service: Here) -> Response:
     """The overview."""
     return _rendered(
         request, "home.html.j2", alarms=[a for a in history.all_alarms(service) if not a.acknowledged],
-        benches=[], sessions=sessions.rows(service, 10), configurations=calibrations.listed(service),
+        benches=[_card(benches.bench_answer(service, each)) for each in service.benches.values()],
+        sessions=sessions.rows(service, 10), configurations=calibrations.listed(service),
     )  # fmt: skip
+
+
+def _card(found: benches.BenchAnswer) -> dict[str, str]:
+    """A bench in a line."""
+    text = found.error or found.moving or "idle"
+    if found.session is not None and found.state in _BUSY:
+        text = f"{found.session.name}: {found.session.good}"
+        text += "" if found.session.expected is None else f" of {found.session.expected} poses"
+    return {"name": found.name, "state": found.state, "text": text}
+
+
+@router.get("/benches")
+def benches_page(request: Request, who: Reading, service: Here) -> Response:
+    """The bench, or all of them."""
+    if len(service.benches) == 1:
+        return RedirectResponse(f"/benches/{quote(next(iter(service.benches)))}", 303)
+    cards = [_card(benches.bench_answer(service, each)) for each in service.benches.values()]
+    return _rendered(request, "benches.html.j2", benches=cards)
+
+
+@router.get("/benches/{bench}")
+def bench_page(request: Request, bench: str, who: Reading, service: Here) -> Response:
+    """A bench: live picture, axes, settings, session."""
+    link = benches.the_bench(service, bench)
+    found = benches.bench_answer(service, link)
+    settings: dict[str, Any] = {}
+    axes: dict[str, Any] = {}
+    if found.state in ("ready", "paused"):
+        try:
+            settings = benches.settings(bench, who, service)
+            axes = benches.axes(bench, who, service) if found.has_table else {}
+        except ReseauError:  # the worker ended meanwhile; the next event shows it
+            pass
+    busy = found.session is not None and found.state in _BUSY
+    return _rendered(
+        request,
+        "bench.html.j2",
+        b=found,
+        settings=settings,
+        axes=axes,
+        busy=busy,
+        plans=[each for each in kinds.KINDS if each not in ("own", "photographs")],
+    )
 
 
 @router.get("/sessions")
@@ -145,9 +192,13 @@ def session_page(request: Request, session: str, who: Reading, service: Here) ->
     """A session."""
     found = sessions.session_detail(service, sessions.the_session(service, session))
     frames = sessions.frames(session, who, service, 0, 2000)
+    every = [benches.bench_answer(service, each) for each in service.benches.values()]
+    mine = [b for b in every if b.session is not None and b.session.name == session and b.state in _BUSY]
+    running = mine[0] if mine else None
     return _rendered(
         request, "session.html.j2", s=found, frames=frames[-_SHOWN:][::-1], more=max(0, len(frames) - _SHOWN),
-        report=_report(found), verdict=_verdict(service, found), bench=None, reached={},
+        report=_report(found), verdict=_verdict(service, found), bench=running,
+        reached=running.session.reached if running is not None and running.session is not None else {},
         job=service.jobs.of(session),
     )  # fmt: skip
 

@@ -6,14 +6,17 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from functools import cached_property
+from pathlib import Path
 from typing import Any, TypeVar
 
 from ...archive import Archive
 from ...core.errors import ReseauError, UsageError
 from ..accounts import Accounts, Principal
 from ..audit import Audit
+from ..benches import BenchLink
 from ..state import StateFolder
 from .events import Events
 from .guard import Meters, log
@@ -60,8 +63,21 @@ class Service:
         self.archive = Archive.open(options.archive, options.objects, create=True)
         self.audit = Audit(self.archive, self.state)
         self.events, self.meters = Events(), Meters()
+        self._names: dict[Path, str] = {}
         self.jobs = Jobs(options.archive, options.objects, self.events)
         self.meters.clients.set_function(lambda: self.events.clients)
+        self.urgent = ThreadPoolExecutor(8, "urgent")
+        self._later = ThreadPoolExecutor(1, "later")
+        self.benches: dict[str, BenchLink] = {}
+        for path in options.benches:
+            link = BenchLink(
+                path.absolute(), str(self._place(options.archive)), options.objects, self.state,
+                self._told_by(path),
+            )  # fmt: skip
+            if link.name in self.benches:
+                raise UsageError("is the name of several benches", where=link.name, do="rename one")
+            self.benches[link.name] = link
+            self._names[path] = link.name
         self.started = time.time()
         self._entries: dict[str, float] = {}
         self._computed: dict[str, tuple[object, Any]] = {}
@@ -73,11 +89,17 @@ class Service:
     def __enter__(self) -> Service:
         self._watcher.start()
         self.jobs.start(self.archive)
+        for each in self.benches.values():
+            each.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._over.set()
+        for each in self.benches.values():
+            each.close()
         self.jobs.close()
+        self.urgent.shutdown(wait=False, cancel_futures=True)
+        self._later.shutdown()
         self.events.close()
         self._watcher.join(2.0)
         self.accounts.close()
@@ -136,6 +158,31 @@ class Service:
             why = {"of": entry.number, "why": str(error)}
             self.audit.record(who.name, who.via, f"{action} failed", about, why)
             raise
+
+    @staticmethod
+    def _place(archive: str) -> str | Path:
+        return archive if "://" in archive else Path(archive).absolute()
+
+    def _told_by(self, path: Path) -> Callable[[str, dict[str, Any]], None]:
+        def told(kind: str, facts: dict[str, Any]) -> None:
+            name = self._names.get(path, str(path))
+            self.events.publish("bench", name, {"what": kind, **facts})
+            self.meters.events.labels("bench").inc()
+            self.meters.workers.labels(name).set(0 if kind == "down" else 1)
+            if kind == "down":
+                self.meters.restarts.labels(name).inc()
+                log("worker", bench=name, state="down")
+
+        return told
+
+    def record_later(self, who: Principal, action: str, about: str) -> None:
+        """Record what must not wait for its record."""
+
+        def record() -> None:
+            with suppress(ReseauError):
+                self.audit.record(who.name, who.via, action, about)
+
+        self._later.submit(record)
 
     def _watch(self) -> None:
         """Publish what anybody stores in the archive, also other processes."""

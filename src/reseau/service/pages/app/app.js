@@ -66,6 +66,14 @@ function form_data(form) {
   return found;
 }
 
+async function with_files(form, body) {
+  for (const input of form.querySelectorAll('input[data-inputs]')) {
+    body[input.dataset.inputs] = {};
+    for (const file of input.files) body[input.dataset.inputs][file.name] = await file.text();
+  }
+  return body;
+}
+
 async function act(element, body) {
   if (element.dataset.ask && !confirm(element.dataset.ask)) return;
   const buttons = element.matches('form') ? element.querySelectorAll('button') : [element];
@@ -73,7 +81,16 @@ async function act(element, body) {
   if (once) for (const b of buttons) b.disabled = true;
   say('');
   try {
+    if (element.matches('form') && !(body instanceof FormData)) body = await with_files(element, body);
     const content = await call(element.dataset.api, body);
+    if (element.dataset.api.endsWith('/check')) {
+      const output = document.getElementById('tested');
+      output.replaceChildren(...content.map(each => {
+        const line = document.createElement('p');
+        line.textContent = `${each.name}: ${each.error ?? (Object.entries(each.found).map(([k, v]) => `${k} ${v}`).join(', ') || 'works')}`;
+        return line;
+      }));
+    }
     const output = element.querySelector('output');
     if (element.dataset.show && output) {
       output.replaceChildren('Shown this once: ');
@@ -179,3 +196,40 @@ if (document.querySelector('[data-live]') || document.querySelector('[data-bench
   document.addEventListener('visibilitychange', () => { if (!document.hidden) refresh(); });
 }
 for (const live of document.querySelectorAll('[data-live]')) live.dataset.was = live.innerHTML;
+
+// The live picture: fetched again and again while the page is visible.
+const picture = document.querySelector('[data-bench]');
+if (picture) {
+  const image = picture.querySelector('img'), over = picture.querySelector('svg');
+  const words = document.querySelector('[data-facts]');
+  let shown = 0;
+  const look = async () => {
+    try {
+      if (!document.hidden) {
+        const facts = await call(`GET ${picture.dataset.bench}/picture`);
+        if (facts.error) words.textContent = facts.error;
+        else if (facts.number && facts.number !== shown) {
+          const answer = await fetch(`${picture.dataset.bench}/picture.jpg`);
+          if (answer.ok) {
+            const url = URL.createObjectURL(await answer.blob());
+            image.onload = () => URL.revokeObjectURL(url);
+            image.src = url;
+            image.hidden = false;
+            shown = facts.number;
+            over.setAttribute('viewBox', `-0.5 -0.5 ${facts.width} ${facts.height}`);
+            over.replaceChildren(...facts.points.map(([x, y]) => {
+              const circle = document.createElementNS('http://www.w3.org/2000/svg', 'circle');
+              circle.setAttribute('cx', x);
+              circle.setAttribute('cy', y);
+              circle.setAttribute('r', facts.width / 130);
+              return circle;
+            }));
+            words.textContent = `exposure ${facts.exposure}; sharpest edges ${facts.edge_px ?? '–'} px; ${facts.points.length} points found; ${facts.at.slice(11, 19)} UTC`;
+          }
+        }
+      }
+    } catch (error) { words.textContent = error.message; }
+    setTimeout(look, 250);
+  };
+  look();
+}

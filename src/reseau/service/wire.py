@@ -1,0 +1,246 @@
+"""What service and worker say to each other: messages over TLS with certificates on both sides.
+
+A message is two lengths (4 bytes each, most significant first), a header in JSON, and bytes. Requests have
+`id` and `do`; answers have the same `id`, and `value` or `error`; events have `event`. The protocol is
+described in `docs/formats.md`, ``reseau-worker/1``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import select
+import socket
+import ssl
+import struct
+import threading
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from typing import Any, Literal, TypeVar
+
+from ..core.errors import ConnectionLost, InstrumentError, ProtocolError, ReseauError, UsageError
+from ..core.optional import optional
+from .state import StateFolder, private_file
+
+__all__ = ["Certificates", "Wire", "error_of", "to_error"]
+
+T = TypeVar("T")
+_LENGTHS = struct.Struct(">II")
+_MOST_HEADER, _MOST_BODY = 8 << 20, 256 << 20
+_PATIENCE_S = 10.0
+"""How long the other side may not read."""
+Role = Literal["service", "worker"]
+
+
+class Certificates:
+    """The certificates with which service and workers know each other; made when they are first needed.
+
+    Parameters
+    ----------
+    state : StateFolder
+        Where they are.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     certificates = Certificates(StateFolder(Path(folder) / "state"))
+    ...     certificates.context("worker").verify_mode.name
+    'CERT_REQUIRED'
+    """
+
+    def __init__(self, state: StateFolder) -> None:
+        self._folder = state.subfolder("workers")
+        if not (self._folder / "authority.pem").is_file():
+            self._make()
+
+    def _make(self) -> None:
+        with optional():
+            from cryptography import x509
+            from cryptography.hazmat.primitives import hashes
+            from cryptography.hazmat.primitives import serialization as forms
+            from cryptography.hazmat.primitives.asymmetric import ec
+        pem, pkcs8, bare = forms.Encoding.PEM, forms.PrivateFormat.PKCS8, forms.NoEncryption()
+
+        def named(name: str) -> x509.Name:
+            return x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
+
+        now, authority = datetime.now(UTC), ec.generate_private_key(ec.SECP256R1())
+
+        def certified(name: str, key: ec.EllipticCurvePrivateKey, *, is_authority: bool) -> bytes:
+            made = (
+                x509.CertificateBuilder()
+                .subject_name(named(name))
+                .issuer_name(named("reseau workers"))
+                .public_key(key.public_key())
+                .serial_number(x509.random_serial_number())
+                # The clock may be set back later.
+                .not_valid_before(now - timedelta(days=3650))
+                .not_valid_after(now + timedelta(days=36500))
+                .add_extension(x509.BasicConstraints(ca=is_authority, path_length=None), critical=True)
+                .add_extension(
+                    x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.public_key()), False
+                )
+                .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False)
+                .sign(authority, hashes.SHA256())
+            )
+            return made.public_bytes(pem)
+
+        for role in ("service", "worker"):
+            key = ec.generate_private_key(ec.SECP256R1())
+            both = key.private_bytes(pem, pkcs8, bare) + certified(role, key, is_authority=False)
+            private_file(self._folder / f"{role}.pem", both)
+        # Last: its presence says that the others are there.
+        private_file(
+            self._folder / "authority.pem", certified("reseau workers", authority, is_authority=True)
+        )
+
+    def context(self, role: Role) -> ssl.SSLContext:
+        """Return the settings of one side, which requires the certificate of the other."""
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if role == "worker" else ssl.PROTOCOL_TLS_CLIENT)
+        context.minimum_version = ssl.TLSVersion.TLSv1_3
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_REQUIRED
+        context.load_verify_locations(self._folder / "authority.pem")
+        context.load_cert_chain(self._folder / f"{role}.pem")
+        return context
+
+
+def checked_peer(sock: ssl.SSLSocket, role: Role) -> None:
+    """Check that the other side has the certificate of its role.
+
+    Raises
+    ------
+    ConnectionLost
+        If it has another one.
+    """
+    found = sock.getpeercert() or {}
+    names: Any = found.get("subject", ())
+    said = {value for part in names for key, value in part if key == "commonName"}
+    if said != {role}:
+        raise ConnectionLost(f"is not a {role}", where="certificate")
+
+
+class Wire:
+    """One side of a connection; several threads may send, one receives.
+
+    Parameters
+    ----------
+    sock : socket
+        Connected.
+
+    Examples
+    --------
+    >>> one, two = socket.socketpair()
+    >>> Wire(one).send({"id": 1, "do": "status"}, b"body")
+    >>> Wire(two).receive()
+    ({'id': 1, 'do': 'status'}, b'body')
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
+        # OpenSSL does not read and write one connection at the same time; a message is sent in one piece.
+        self._using, self._sending = threading.Lock(), threading.Lock()
+        sock.setblocking(False)
+        if sock.family in _INET:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def send(self, header: dict[str, Any], body: bytes = b"") -> None:
+        """Send a message.
+
+        Raises
+        ------
+        ConnectionLost
+            If the other side is gone, or does not read.
+        """
+        text = json.dumps(header, default=str).encode("utf-8")
+        rest = memoryview(_LENGTHS.pack(len(text), len(body)) + text + body)
+        with self._sending:
+            while rest:
+                sent = self._when_ready(lambda rest=rest: self._sock.send(rest[: 1 << 18]), _PATIENCE_S)  # type: ignore[misc]
+                rest = rest[sent:]
+
+    def receive(self) -> tuple[dict[str, Any], bytes]:
+        """Wait for a message.
+
+        Raises
+        ------
+        ConnectionLost
+            If the other side is gone.
+        ProtocolError
+            If it is no message.
+        """
+        header, body = _LENGTHS.unpack(self._exactly(_LENGTHS.size))
+        if header > _MOST_HEADER or body > _MOST_BODY:
+            raise ProtocolError("is too long", where="message")
+        try:
+            found = json.loads(self._exactly(header))
+        except ValueError:
+            raise ProtocolError("is no JSON", where="message") from None
+        if not isinstance(found, dict):
+            raise ProtocolError("is no object", where="message")
+        return found, self._exactly(body)
+
+    def _exactly(self, count: int) -> bytes:
+        parts = bytearray()
+        while len(parts) < count:
+            wanted = min(1 << 18, count - len(parts))
+            part = self._when_ready(lambda wanted=wanted: self._sock.recv(wanted), None)  # type: ignore[misc]
+            if not part:
+                raise ConnectionLost("is gone", where="worker")
+            parts += part
+        return bytes(parts)
+
+    def _when_ready(self, work: Callable[[], T], seconds: float | None) -> T:
+        """Do something with the connection as soon as it allows it."""
+        while True:
+            try:
+                with self._using:
+                    return work()
+            except (ssl.SSLWantReadError, ssl.SSLWantWriteError, BlockingIOError) as error:
+                reads = isinstance(error, ssl.SSLWantReadError) or seconds is None
+                mine: list[Any] = [self._sock]
+                try:
+                    if not any(select.select(mine if reads else [], [] if reads else mine, [], seconds)):
+                        raise ConnectionLost("does not read", where="worker") from None
+                except (OSError, ValueError):
+                    raise ConnectionLost("is gone", where="worker") from None
+            except (OSError, ValueError) as error:
+                raise ConnectionLost(f"is gone ({error})", where="worker") from None
+
+    def close(self) -> None:
+        """Close the connection; whoever waits for a message gets an error."""
+        with contextlib.suppress(OSError):
+            self._sock.shutdown(socket.SHUT_RDWR)
+        self._sock.close()
+
+
+_INET = (socket.AF_INET, socket.AF_INET6)
+
+
+def to_error(error: ReseauError) -> dict[str, Any]:
+    """Return an error as a part of a message.
+
+    Examples
+    --------
+    >>> to_error(UsageError("is too small", where="count", do="use 3"))["do"]
+    'use 3'
+    """
+    where = None if error.where is None else str(error.where)
+    if isinstance(error, InstrumentError):
+        return {"kind": "instrument", "what": str(error), "where": None, "do": None}
+    kind = "usage" if error.exit_status == 2 else "archive"
+    return {"kind": kind, "what": error.what, "where": where, "do": error.do}
+
+
+def error_of(found: dict[str, Any]) -> ReseauError:
+    """Return the error that a message has.
+
+    Examples
+    --------
+    >>> str(error_of({"kind": "usage", "what": "is too small", "where": "count", "do": "use 3"}))
+    'count: is too small; use 3'
+    """
+    what, where, do = (found.get(key) for key in ("what", "where", "do"))
+    kinds: dict[Any, type[ReseauError]] = {"usage": UsageError, "instrument": InstrumentError}
+    return kinds.get(found.get("kind"), ReseauError)(str(what), where=where, do=do)

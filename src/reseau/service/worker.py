@@ -1,0 +1,565 @@
+"""The process that holds the hardware of a bench: `python -m reseau.service.worker`.
+
+One thread carries out commands in their order, one a session, one takes live pictures. `stop` is none of
+these: the thread that reads it carries it out. The archive has what happened; the status follows from it and
+from the instruments, so that a service that is started again, or another browser, sees the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import socket
+import ssl
+import sys
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from .. import sessions
+from ..archive import Archive
+from ..capture import Bench, BenchFile, Control, edge_sigma, exposure_fault
+from ..core.errors import InstrumentError, ReseauError, StateError, UsageError
+from ..instruments import Camera, Turntable
+from ..io import read_text
+from .state import StateFolder, private_file
+from .wire import Certificates, Wire, checked_peer, to_error
+
+__all__ = ["Worker", "address_file"]
+
+_LIVE_S, _RETRY_S, _WIDTH = 5.0, 3.0, 960
+_STEADY_S = 0.1
+"""Time between live pictures, at least."""
+
+
+def address_file(state: StateFolder, name: str) -> Path:
+    """Return the file in which the worker of a bench says where it listens.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     address_file(StateFolder(Path(folder) / "state"), "cellar/2").name
+    'bench-63656c6c61722f32.json'
+    """
+    return state.subfolder("workers") / f"bench-{name.encode().hex()[:120]}.json"
+
+
+class Worker:
+    """The worker of a bench.
+
+    Parameters
+    ----------
+    text : str
+        Content of ``bench.toml``.
+    archive : Archive
+        Where sessions are stored.
+    state : StateFolder
+        Has the certificates.
+    """
+
+    def __init__(self, text: str, archive: Archive, state: StateFolder) -> None:
+        self.file = BenchFile.parse_toml(text, where="bench")
+        self.name, self._text, self._archive, self._state = self.file.name, text, archive, state
+        self._bench = Bench(self.file)
+        self._lock = threading.RLock()
+        self._wires: set[Wire] = set()
+        self._commands: queue.Queue[tuple[Wire, dict[str, Any]]] = queue.Queue()
+        self._held: contextlib.ExitStack | None = None
+        self._error = "not connected yet"
+        self._wanted = True
+        self._control: Control | None = None
+        self._session: dict[str, Any] = {}
+        self._thread: threading.Thread | None = None
+        self._question: str | None = None
+        self._answered = threading.Event()
+        self._moving = ""
+        self._live: tuple[dict[str, Any], bytes] = ({}, b"")
+        self._looked = 0.0
+        self._stops = 0
+        self.over = threading.Event()
+
+    # What is held.
+
+    def _take(self) -> None:
+        """Lock and connect the instruments, and stop whatever moves."""
+        with self._lock:
+            if self._held is not None:
+                return
+            stack = contextlib.ExitStack()
+            try:
+                stack.enter_context(self._bench.lock(f"reseau serve, bench {self.name}"))
+                stack.enter_context(self._bench)
+                # An earlier worker may have ended while something moved.
+                self._bench.stop()
+                for each in self._bench.instruments.values():
+                    each.stage()
+            except ReseauError as error:
+                stack.close()
+                self._error = str(error)
+                raise
+            self._held, self._error = stack, ""
+
+    def _release(self) -> None:
+        with self._lock:
+            if self._control is not None:
+                raise StateError("a session runs", where=self.name, do="abort it first")
+            if self._held is not None:
+                self._held.close()
+                self._held, self._error = None, "released"
+
+    def _required(self) -> Bench:
+        if self._held is None:
+            raise StateError(self._error or "is not connected", where=self.name)
+        return self._bench
+
+    # What is told.
+
+    def status(self) -> dict[str, Any]:
+        """Return the state of the bench, without asking an instrument."""
+        session = dict(self._session)
+        state = "ready" if self._held is not None else ("released" if not self._wanted else "down")
+        if self._control is not None:
+            state = session.get("state", "running")
+        elif self._moving:
+            state = "moving"
+        if self._question is not None:
+            state = "asking"
+        return {
+            "name": self.name, "state": state, "error": self._error, "session": session or None,
+            "question": self._question, "moving": self._moving, "pid": os.getpid(),
+            "instruments": {name: entry.driver for name, entry in self.file.instruments.items()},
+            "has_camera": self._bench.has(Camera), "has_table": self._bench.has(Turntable),
+            "picture": self._live[0].get("number", 0),
+        }  # fmt: skip
+
+    def _say(self, kind: str, facts: dict[str, Any] | None = None) -> None:
+        message = {"event": kind, "facts": facts or {}, "status": self.status()}
+        for wire in list(self._wires):
+            try:
+                wire.send(message)
+            except ReseauError:
+                self._wires.discard(wire)
+
+    # Commands.
+
+    def _do(self, request: dict[str, Any]) -> tuple[Any, bytes]:
+        """Carry out a command in its turn."""
+        what, given = request.get("do"), request.get("given") or {}
+        work: dict[Any, Callable[..., Any]] = {
+            "take": self._taken, "release": self._released, "axes": self._axes, "move": self._move,
+            "home": self._home, "settings": self._settings, "configure": self._configure,
+            "check": self._check, "begin": self._begin, "resume_session": self._resume_session,
+        }  # fmt: skip
+        if what not in work:
+            raise UsageError("is no command", where=str(what))
+        try:
+            return work[what](**given), b""
+        except TypeError as error:
+            raise UsageError(f"has other arguments ({error})", where=str(what)) from None
+
+    def _taken(self) -> dict[str, Any]:
+        self._wanted = True
+        self._take()
+        self._say("bench")
+        return self.status()
+
+    def _released(self) -> dict[str, Any]:
+        self._release()
+        self._wanted = False
+        self._say("bench")
+        return self.status()
+
+    def _table(self) -> Turntable:
+        found: Turntable = self._required().one(Turntable)
+        return found
+
+    def _axes(self) -> dict[str, Any]:
+        table = self._table()
+        found = {}
+        for name, axis in table.axes.items():
+            state = table.state(name)
+            found[name] = {
+                "position": state.position, "unit": axis.unit, "limits": list(axis.limits),
+                "homed": state.homed, "moving": state.moving,
+            }  # fmt: skip
+        return found
+
+    def _free(self) -> None:
+        if self._control is not None:
+            raise StateError("a session runs", where=self.name, do="pause or abort it first")
+
+    def _move(self, axis: str, position: float, relative: bool = False) -> dict[str, Any]:
+        self._free()
+        table = self._table()
+        if axis not in table.axes:
+            raise UsageError("is no axis", where=axis, do=f"use {', '.join(table.axes)}")
+        target = table.state(axis).position + position if relative else position
+        low, high = table.axes[axis].limits
+        if not low <= target <= high:
+            unit = table.axes[axis].unit
+            raise UsageError(f"{target:g} {unit} is out of range", where=axis, do=f"use {low:g} to {high:g}")
+        return self._moved(f"{axis} to {target:g} {table.axes[axis].unit}", lambda: table.move(axis, target))
+
+    def _home(self, axis: str) -> dict[str, Any]:
+        self._free()
+        table = self._table()
+        if axis not in table.axes:
+            raise UsageError("is no axis", where=axis, do=f"use {', '.join(table.axes)}")
+        return self._moved(f"{axis} to its reference", lambda: table.home(axis))
+
+    def _moved(self, words: str, work: Callable[[], Any]) -> dict[str, Any]:
+        stops, self._moving = self._stops, words
+        self._say("moving", {"what": words})
+        try:
+            for each in self._bench.instruments.values():
+                each.stage()  # allows motion again after a stop
+            if stops != self._stops:
+                raise StateError("was stopped", where=words)
+            work()
+        finally:
+            self._moving = ""
+            self._say("rest")
+        return self._axes()
+
+    def _settings(self) -> dict[str, Any]:
+        found = {}
+        for name, each in self._required().instruments.items():
+            settings, narrower = each.settings, self.file.instruments[name].limits
+            rows = {}
+            for key, value in settings.to_dict().items():
+                limits = narrower.get(key, settings.limits.get(key))
+                options = type(settings).__dataclass_fields__[key].metadata.get("options")
+                rows[key] = {
+                    "value": value, "unit": settings.units.get(key),
+                    "limits": None if limits is None else list(limits),
+                    "options": None if options is None else list(options),
+                }  # fmt: skip
+            found[name] = rows
+        return found
+
+    def _configure(self, instrument: str, changes: dict[str, Any]) -> dict[str, Any]:
+        self._free()
+        self._required()[instrument].configure(**changes)
+        found: dict[str, Any] = self._settings()[instrument]
+        return found
+
+    def _check(self, seconds: float = 20.0) -> list[dict[str, Any]]:
+        self._free()
+        return [
+            {
+                "name": c.name, "driver": c.driver, "found": c.found,
+                "error": None if c.error is None else str(c.error),
+            }
+            for c in self._required().check(seconds)
+        ]  # fmt: skip
+
+    def _begin(
+        self, name: str, plan: str, parameters: dict[str, Any], inputs: dict[str, str], by: str = ""
+    ) -> dict[str, Any]:
+        self._free()
+        if plan == "own":
+            raise UsageError("is a program of the user, which the service does not run", where="plan own")
+        given = sessions.check(name, plan, parameters, inputs, self._required())
+        session = sessions.begin(self._archive, name, plan, given, inputs, bench=self._text)
+        return self._run(session, by)
+
+    def _resume_session(self, name: str, by: str = "") -> dict[str, Any]:
+        self._free()
+        bench = self._required()
+        session = self._archive.session(name)
+        if session.status == "done":
+            raise UsageError("is done", where=name)
+        if session.bench != self._text:
+            raise UsageError("was begun on another bench", where=name)
+        sessions.parameters_of(session).check_bench(bench)
+        session.recover()
+        return self._run(session, by)
+
+    def _run(self, session: Any, by: str) -> dict[str, Any]:
+        given = sessions.parameters_of(session)
+        self._session = {
+            "name": session.name, "plan": session.plan, "by": by, "state": "running", "good": 0,
+            "expected": given.expected, "reached": {}, "predicted": {}, "step": "", "rejected": [],
+            "units": dict(given.units),
+        }  # fmt: skip
+        control = self._control = Control(lambda: self._set("paused"))
+        self._thread = threading.Thread(target=self._carry_out, args=(session, control), name="session")
+        self._thread.start()
+        self._say("begin", {"session": session.name})
+        return self.status()
+
+    def _set(self, state: str) -> None:
+        self._session["state"] = state
+        self._say("session", {"state": state})
+
+    def _carry_out(self, session: Any, control: Control) -> None:
+        """Carry out a session in a thread of its own."""
+        try:
+            with self._archive_lock(session.name):
+                sessions.capture(
+                    session, self._bench, watch=self._watched, operator=self._ask, control=control
+                )
+        except ReseauError as error:
+            self._session["why"] = str(error)
+        except Exception as error:  # a defect ends the session, not the worker
+            self._session["why"] = f"{type(error).__name__}: {error}"
+        finally:
+            self._question = None
+            self._control = None
+            self._set(session.status)
+
+    def _archive_lock(self, name: str) -> Any:
+        """The lock of the session itself; the instruments are locked already."""
+        return Bench(BenchFile(name="none", instruments={})).lock(
+            f"session {name}", f"{self._archive.place}: {name}"
+        )
+
+    def _watched(self, kind: str, facts: dict[str, Any]) -> None:
+        mine = self._session
+        if kind == "frame":
+            mine["step"] = facts["step"]
+            if facts["ok"]:
+                mine["good"] += 1
+            else:
+                mine["rejected"] = [*mine["rejected"][-19:], f"{facts['step']}: {facts['why']}"]
+        elif kind == "precision":
+            mine["reached"] = {k: v for k, v in facts.items() if k != "step"}
+        elif kind in ("outlook", "next"):
+            mine["predicted"] = facts
+        self._say(kind, {k: v for k, v in facts.items() if isinstance(v, str | int | float | bool | None)})
+
+    def _ask(self, request: str) -> None:
+        """Ask the person at the bench, and wait for the answer, or for the end."""
+        self._answered.clear()
+        self._question = request
+        self._say("asking", {"question": request})
+        while not self._answered.wait(0.2):
+            if self._control is None or self.over.is_set():
+                raise StateError("was not answered", where=request)
+        self._question = None
+        self._say("answered")
+
+    # What is carried out at once, in the thread that reads it.
+
+    def _at_once(self, request: dict[str, Any]) -> tuple[bool, Any, bytes]:
+        """Carry out what must not wait; return whether it was that."""
+        what, control = request.get("do"), self._control
+        if what == "stop":
+            self._stops += 1
+            begun = time.perf_counter()
+            while not self._commands.empty():  # what was to come is not done any more
+                with contextlib.suppress(queue.Empty):
+                    wire, waiting = self._commands.get_nowait()
+                    error = to_error(StateError("was stopped", where=str(waiting.get("do"))))
+                    wire.send({"id": waiting.get("id"), "error": error})
+            if control is not None:
+                threading.Thread(target=control.pause, kwargs={"at_once": True}, daemon=True).start()
+            self._bench.stop()
+            spent = time.perf_counter() - begun
+            self._say("stopped", {"ms": round(1e3 * spent, 1)})
+            return True, {"ms": round(1e3 * spent, 1), **self.status()}, b""
+        if what == "status":
+            return True, self.status(), b""
+        if what == "picture":
+            self._looked = time.monotonic()
+            return True, *self._live
+        if what in ("pause", "continue", "abort", "answer"):
+            if control is None:
+                raise StateError("no session runs", where=self.name)
+            if what == "pause":
+                if self._session.get("state") == "running":
+                    self._session["state"] = "pausing"
+                    control.pause()
+                    self._say("session", {"state": "pausing"})
+            elif what == "continue":
+                if self._session.get("state") != "paused":
+                    raise StateError("is not paused", where=str(self._session.get("name")))
+                self._set("running")
+                control.decide("resume")
+            elif what == "abort":
+                self._session["state"] = "ending"
+                self._answered.set()
+                control.decide("abort")
+            else:
+                self._answered.set()
+            return True, self.status(), b""
+        if what == "end":
+            if control is not None:
+                raise StateError("a session runs", where=self.name)
+            self.over.set()
+            return True, {}, b""
+        return False, None, b""
+
+    # Threads.
+
+    def read(self, wire: Wire) -> None:
+        """Serve one connection until it ends."""
+        self._wires.add(wire)
+        try:
+            while True:
+                request, _ = wire.receive()
+                try:
+                    done, value, body = self._at_once(request)
+                    if done:
+                        wire.send({"id": request.get("id"), "value": value}, body)
+                    else:
+                        self._commands.put((wire, request))
+                except ReseauError as error:
+                    wire.send({"id": request.get("id"), "error": to_error(error)})
+        except ReseauError:
+            pass
+        finally:
+            self._wires.discard(wire)
+            wire.close()
+
+    def work(self) -> None:
+        """Carry out commands in their order, and keep the bench connected."""
+        retry = 0.0
+        while not self.over.is_set():
+            if self._held is None and self._wanted and time.monotonic() >= retry:
+                retry = time.monotonic() + _RETRY_S
+                with contextlib.suppress(ReseauError):
+                    self._take()
+                self._say("bench")
+            try:
+                wire, request = self._commands.get(timeout=0.2)
+            except queue.Empty:
+                continue
+            try:
+                value, body = self._do(request)
+                message = {"id": request.get("id"), "value": value}
+            except ReseauError as error:
+                message, body = {"id": request.get("id"), "error": to_error(error)}, b""
+            except Exception as error:  # a defect of a driver is an answer, too
+                failed = InstrumentError(f"{type(error).__name__}: {error}", where=str(request.get("do")))
+                message, body = {"id": request.get("id"), "error": to_error(failed)}, b""
+            with contextlib.suppress(ReseauError):
+                wire.send(message, body)
+
+    def live(self) -> None:
+        """Take pictures while somebody looks, and no session runs; in a session show its frames."""
+        import cv2
+
+        from ..report.overlay import preview
+
+        number, shown = 0, ""
+        while not self.over.wait(_STEADY_S):
+            if time.monotonic() - self._looked > _LIVE_S or self._held is None or not self._bench.has(Camera):
+                continue
+            try:
+                if self._control is not None:
+                    step = self._session.get("step", "")
+                    kept = self._archive.session(self._session["name"]) if step and step != shown else None
+                    found = kept.frames(step) if kept is not None else []
+                    if kept is None or not found:
+                        continue
+                    frame, shown = kept.picture(found[-1]), step
+                else:
+                    frame = self._bench.one(Camera).expose().frame
+                edge = edge_sigma(frame)
+                number += 1
+                facts = {
+                    "number": number, "width": frame.width, "height": frame.height,
+                    "edge_px": None if edge == float("inf") else round(edge, 2),
+                    "exposure": exposure_fault(frame, _limits()) or "good",
+                    "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
+                    "points": self._points(frame),
+                }  # fmt: skip
+                _, coded = cv2.imencode(".jpg", preview(frame, _WIDTH), [cv2.IMWRITE_JPEG_QUALITY, 80])
+                self._live = facts, coded.tobytes()
+            except ReseauError as error:
+                self._live = {"number": number, "error": str(error)}, b""
+                self.over.wait(1.0)
+
+    def _points(self, frame: Any) -> list[list[float]]:
+        """Targets found in a frame, where a session of this bench says which target there is."""
+        measure = self._measurer()
+        if measure is None:
+            return []
+        try:
+            found = measure(frame)
+        except ReseauError:
+            return []
+        points = getattr(found, "points", None)
+        return [] if points is None else [[round(float(x), 1), round(float(y), 1)] for x, y in points.xy]
+
+    def _measurer(self) -> Any:
+        """What measures the target of the last session of this bench, or None."""
+        from ..io import parse_design
+        from ..procedures.target_measurement import measurer_of
+
+        for each in reversed(self._archive.sessions(last=20)):
+            session = self._archive.session(each.name)
+            if session.bench == self._text and "design.json" in session.inputs():
+                if getattr(self, "_design", None) != session.inputs()["design.json"].sha256:
+                    self._design = session.inputs()["design.json"].sha256
+                    self._measures = measurer_of(parse_design(session.input("design.json"), "design.json"))
+                return self._measures
+        return None
+
+    def serve(self, port: int = 0) -> None:
+        """Listen until the end; says in a file of the state folder where."""
+        context = Certificates(self._state).context("worker")
+        with socket.create_server(("127.0.0.1", port)) as server:
+            place = address_file(self._state, self.name)
+            about = {"port": server.getsockname()[1], "pid": os.getpid(), "bench": self._text}
+            private_file(place, json.dumps(about).encode())
+            for each in (self.work, self.live):
+                threading.Thread(target=each, name=each.__name__, daemon=True).start()
+            server.settimeout(0.3)
+            while not self.over.is_set():
+                try:
+                    raw, _ = server.accept()
+                except TimeoutError:
+                    continue
+                threading.Thread(target=self._welcome, args=(raw, context), daemon=True).start()
+        if self._thread is not None:
+            self._thread.join(60)
+        with contextlib.suppress(ReseauError):
+            self._bench.stop()
+        if self._held is not None:
+            self._held.close()
+        place.unlink(missing_ok=True)
+
+    def _welcome(self, raw: socket.socket, context: ssl.SSLContext) -> None:
+        try:
+            raw.settimeout(10)
+            sock = context.wrap_socket(raw, server_side=True)
+            checked_peer(sock, "service")
+        except (OSError, ReseauError):
+            raw.close()
+            return
+        self.read(Wire(sock))
+
+
+def _limits() -> Any:
+    from ..capture import Limits
+
+    return Limits()
+
+
+def _main() -> None:
+    bench, place, objects, state = sys.argv[1:5]
+    folder = StateFolder(Path(state))
+    with Archive.open(place, objects or None, create=True) as archive:
+        worker = Worker(read_text(Path(bench)), archive, folder)
+
+        def end(*_: object) -> None:
+            if worker._control is not None:
+                worker._control.decide("stop")
+            worker.over.set()
+
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, end)
+        worker.serve()
+
+
+if __name__ == "__main__":
+    _main()

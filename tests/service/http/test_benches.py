@@ -1,0 +1,299 @@
+"""A bench behind the service: its worker process, its table on the real protocol, sessions, crashes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import ssl
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from reseau.capture import Bench, BenchFile
+from reseau.core.errors import StateError
+from reseau.service.state import StateFolder
+from reseau.service.wire import Certificates
+from reseau_sims.serving.bench import SimulatedBench
+
+from ...capture.fieldrig import DESIGN, FieldRig
+from .driver import bench_of, install
+from .populated import PARAMETERS, STEPS
+from .served import Served, TestClient, served
+
+BENCH = "/api/1/benches/cellar"
+ROOT = Path(__file__).resolve().parents[3]
+
+
+class Rig:
+    """A simulated bench, and the service on it, which can be started again."""
+
+    def __init__(self, folder: Path, sim: SimulatedBench) -> None:
+        self.folder, self.sim = folder, sim
+        (folder / "bench.toml").write_text(bench_of(sim.toml))
+
+    def serve(self) -> Any:
+        return served(self.folder, benches=(self.folder / "bench.toml",))
+
+    def position(self, axis: str = "tilt") -> float:
+        return float(self.sim.laboratory.axes[axis])
+
+
+def until(what: Callable[[], Any], seconds: float = 60.0) -> Any:
+    end = time.monotonic() + seconds
+    while not (found := what()):
+        assert time.monotonic() < end
+        time.sleep(0.03)
+    return found
+
+
+def state(client: TestClient, *wanted: str, seconds: float = 60.0) -> dict[str, Any]:
+    last: dict[str, Any] = {}
+
+    def there() -> bool:
+        nonlocal last
+        last = client.get(BENCH).json()
+        return last["state"] in wanted
+
+    try:
+        until(there, seconds)
+    except AssertionError:
+        raise AssertionError(last) from None
+    return last
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    folder = tmp_path_factory.mktemp("bench")
+    install(folder / "drivers")
+    with pytest.MonkeyPatch.context() as monkeypatch, SimulatedBench(seed=3) as sim:
+        paths = [str(folder / "drivers"), str(ROOT), os.environ.get("PYTHONPATH", "")]
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+        monkeypatch.setenv("TMPDIR", str(folder))
+        monkeypatch.setattr("tempfile.tempdir", str(folder))  # where the locks are
+        yield Rig(folder, sim)
+
+
+@pytest.fixture(scope="module")
+def one(rig: Rig) -> Iterator[Served]:
+    with rig.serve() as found:
+        client = found.client()
+        state(client, "ready")
+        for axis in ("tilt", "roll", "camera_roll"):
+            if not client.get(f"{BENCH}/axes").json()[axis]["homed"]:
+                assert client.post(f"{BENCH}/home", json={"axis": axis}).status_code == 200
+        yield found
+
+
+def test_an_axis_is_moved_within_its_limits_and_recorded(one: Served, rig: Rig) -> None:
+    client = one.client("operate")
+    moved = client.post(f"{BENCH}/move", json={"axis": "tilt", "position": 3.0})
+    assert moved.status_code == 200, moved.text
+    assert moved.json()["tilt"]["position"] == pytest.approx(3.0, abs=0.01)
+    assert rig.position() == pytest.approx(3.0, abs=0.01)
+    jogged = client.post(f"{BENCH}/move", json={"axis": "tilt", "position": -1.0, "relative": True})
+    assert jogged.json()["tilt"]["position"] == pytest.approx(2.0, abs=0.01)
+    far = client.post(f"{BENCH}/move", json={"axis": "tilt", "position": 400.0})
+    assert (far.status_code, far.json()["error"]["code"]) == (422, "usage")
+    assert client.post(f"{BENCH}/move", json={"axis": "none", "position": 1.0}).status_code == 422
+    actions = [each["action"] for each in one.client().get("/api/1/audit").json()]
+    assert actions[:4] == ["move failed", "move", "move failed", "move"]
+    assert one.client("read").post(f"{BENCH}/move", json={"axis": "tilt", "position": 1.0}).status_code == 403
+
+
+def test_a_stop_acts_within_100_ms_and_is_not_queued(one: Served, rig: Rig) -> None:
+    import threading
+
+    client, answers = one.client("operate"), []
+    client.post(f"{BENCH}/move", json={"axis": "tilt", "position": 0.0})
+
+    def move(position: float) -> None:
+        answers.append(
+            one.client("operate").post(f"{BENCH}/move", json={"axis": "tilt", "position": position})
+        )
+
+    # The second one waits for the first, and must not be carried out after the stop.
+    threads = [threading.Thread(target=move, args=(position,)) for position in (60.0, 70.0)]
+    threads[0].start()
+    until(lambda: rig.position() > 1.0)
+    threads[1].start()
+    time.sleep(0.3)
+    stopped = client.post(f"{BENCH}/stop")
+    assert stopped.status_code == 200, stopped.text
+    assert stopped.json()["ms"] < 100
+    for each in threads:
+        each.join(30)
+    assert sorted(each.status_code for each in answers) == [409, 409]
+    at = rig.position()
+    time.sleep(0.3)
+    assert rig.position() == pytest.approx(at, abs=0.02)
+    assert at < 55
+    assert client.post(f"{BENCH}/move", json={"axis": "tilt", "position": 0.0}).status_code == 200
+
+
+def test_settings_have_units_and_limits_of_the_bench(one: Served) -> None:
+    client = one.client("operate")
+    rows = client.get(f"{BENCH}/settings").json()["camera"]
+    assert rows["exposure_us"] == {"value": 1000.0, "unit": "µs", "limits": [10.0, 5000.0], "options": None}
+    changes = {"instrument": "camera", "changes": {"exposure_us": 900.0}}
+    assert client.patch(f"{BENCH}/settings", json=changes).json()["exposure_us"]["value"] == 900.0
+    changes["changes"] = {"exposure_us": 9000.0}
+    assert client.patch(f"{BENCH}/settings", json=changes).status_code == 422
+    tested = client.post(f"{BENCH}/check").json()
+    assert {each["name"]: each["error"] for each in tested} == {"table": None, "camera": None}
+    assert client.patch(
+        f"{BENCH}/settings", json={"instrument": "camera", "changes": {"exposure_us": 1000.0}}
+    ).is_success
+
+
+def test_the_live_picture_says_how_it_is_exposed_and_focused(one: Served) -> None:
+    client = one.client("read")
+    facts = until(lambda: (f := client.get(f"{BENCH}/picture").json())["number"] and f)
+    assert facts["exposure"] == "good"
+    assert 0 < facts["edge_px"] < 10
+    assert client.get(f"{BENCH}/picture.jpg").content[:2] == b"\xff\xd8"
+
+
+def begin(client: TestClient, name: str) -> Any:
+    given = {
+        "name": name,
+        "plan": "testfield",
+        "parameters": dict(PARAMETERS),
+        "inputs": {"design.json": DESIGN.to_json()},
+    }
+    return client.post(f"{BENCH}/sessions", json=given)
+
+
+def test_a_session_is_begun_paused_continued_and_calibrated(one: Served) -> None:
+    client = one.client("operate")
+    assert begin(client, "paused").status_code == 201
+    again = begin(client, "another")
+    assert (again.status_code, again.json()["error"]["code"]) == (409, "instrument")
+    until(lambda: client.get(BENCH).json()["session"]["good"] >= 1)
+    assert client.post(f"{BENCH}/pause").status_code == 200
+    paused = state(client, "paused")
+    assert 1 <= paused["session"]["good"] < len(STEPS)
+    frames = len(client.get("/api/1/sessions/paused/frames").json())
+    time.sleep(0.3)
+    assert len(client.get("/api/1/sessions/paused/frames").json()) == frames
+    assert client.post(f"{BENCH}/resume").status_code == 200
+    done = state(client, "ready")
+    assert (done["session"]["state"], done["session"]["good"]) == ("done", len(STEPS)), done
+    assert done["session"]["reached"]["sigma_c"] > 0
+    found = client.get("/api/1/sessions/paused").json()
+    assert (found["status"], len(found["results"])) == ("done", 2)
+
+
+@pytest.mark.slow
+def test_a_session_that_was_aborted_is_resumed_without_repeating_poses(one: Served) -> None:
+    client = one.client("operate")
+    assert begin(client, "aborted").status_code == 201
+    until(lambda: client.get(BENCH).json()["session"]["good"] >= 1)
+    assert client.post(f"{BENCH}/abort").status_code == 200
+    found = state(client, "ready")
+    assert found["session"]["state"] == "stopped"
+    assert "aborted" in found["interrupted"]
+    kept = {each["sha256"] for each in client.get("/api/1/sessions/aborted/frames").json()}
+    assert client.post(f"{BENCH}/sessions/resume", json={"name": "aborted"}).status_code == 200
+    state(client, "ready")
+    assert client.get("/api/1/sessions/aborted").json()["status"] == "done"
+    rows = client.get("/api/1/sessions/aborted/frames").json()
+    assert kept <= {each["sha256"] for each in rows}
+    assert len({(each["step"], each["take"]) for each in rows}) == len(rows)
+
+
+def test_a_plan_of_the_user_is_not_run_and_a_wrong_one_refused(one: Served) -> None:
+    client = one.client("operate")
+    own = {"name": "own", "plan": "own", "parameters": {}, "inputs": {"generator.py": "import os"}}
+    assert client.post(f"{BENCH}/sessions", json=own).status_code == 422
+    wrong = {"name": "wrong", "plan": "frames", "parameters": {"count": -1}}
+    assert client.post(f"{BENCH}/sessions", json=wrong).status_code == 422
+    assert client.get("/api/1/sessions/wrong").status_code == 404
+
+
+def test_a_released_bench_is_free_for_others_and_taken_again(one: Served, rig: Rig) -> None:
+    client = one.client("operate")
+    toml = BenchFile.read(rig.folder / "bench.toml")
+    others = Bench(toml, lambda name, entry: FieldRig().table)
+    with pytest.raises(StateError, match="reseau serve, bench cellar"), others.lock("another program"):
+        pass
+    assert client.post(f"{BENCH}/release").json()["state"] == "released"
+    assert client.post(f"{BENCH}/move", json={"axis": "tilt", "position": 1.0}).status_code == 409
+    with others.lock("another program"):
+        assert client.post(f"{BENCH}/take").status_code == 409
+    assert client.post(f"{BENCH}/take").json()["state"] == "ready"
+
+
+def test_a_killed_worker_is_shown_restarted_and_leaves_nothing_moving(one: Served, rig: Rig) -> None:
+    import threading
+
+    client = one.client("operate")
+    client.post(f"{BENCH}/move", json={"axis": "roll", "position": 0.0})
+    answers: list[Any] = []
+    mover = threading.Thread(
+        target=lambda: answers.append(client.post(f"{BENCH}/move", json={"axis": "roll", "position": 350.0}))
+    )
+    mover.start()
+    until(lambda: rig.position("roll") > 1.0)
+    os.kill(one.service.benches["cellar"].status["pid"], signal.SIGKILL)
+    mover.join(10)
+    assert answers[0].status_code == 409
+    assert one.client().get("/api/1/sessions").status_code == 200
+    found = state(one.client(), "ready")
+    assert found["restarts"] == 1
+    at = rig.position("roll")
+    assert at < 345
+    time.sleep(0.3)
+    assert rig.position("roll") == pytest.approx(at, abs=0.02)
+
+
+@pytest.mark.slow
+def test_a_service_that_ends_leaves_the_session_running_and_finds_it_again(rig: Rig, one: Served) -> None:
+    client = one.client("operate")
+    client.post(f"{BENCH}/move", json={"axis": "tilt", "position": 0.0})
+    assert begin(client, "alone").status_code == 201
+    pid = one.service.benches["cellar"].status["pid"]
+    until(lambda: client.get(BENCH).json()["session"]["good"] >= 1)
+    link = one.service.benches["cellar"]
+    # The connection breaks as when the service is killed.
+    link._over.set()
+    link._wire.close()  # type: ignore[union-attr]
+    link._thread.join(5)
+    with rig.serve() as second:
+        other = second.client()
+        found = state(other, "running", "ready")
+        assert second.service.benches["cellar"].restarts == -1
+        assert second.service.benches["cellar"].status["pid"] == pid
+        assert found["session"]["name"] == "alone"
+        state(other, "ready")
+        assert other.get("/api/1/sessions/alone").json()["status"] == "done"
+
+
+def test_the_worker_answers_only_with_certificates(tmp_path: Path) -> None:
+    own, other = (Certificates(StateFolder(tmp_path / name)) for name in ("own", "other"))
+    for context, role in ((other.context("service"), "foreign"), (own.context("service"), "own")):
+        here, there = socket.socketpair()
+        import threading
+
+        outcome: list[str] = []
+
+        def serve(sock: socket.socket = there, outcome: list[str] = outcome) -> None:
+            try:
+                with own.context("worker").wrap_socket(sock, server_side=True) as made:
+                    outcome.append(str(made.recv(5)))
+            except (ssl.SSLError, OSError) as error:
+                outcome.append(type(error).__name__)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            with context.wrap_socket(here) as made:
+                made.send(b"hello")
+        except (ssl.SSLError, OSError):
+            here.close()
+        thread.join(10)
+        there.close()
+        assert ("hello" in outcome[0]) == (role == "own")
