@@ -108,8 +108,6 @@ def test_a_printed_sheet_calibrates_a_camera_whose_result_opencv_uses(
 def test_the_target_is_found_among_the_designs_beside_the_photographs(
     reseau: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Those that `reseau design` draws are tried, too, which takes long.
-    monkeypatch.setattr("reseau.procedures.which_target.known_designs", dict)
     monkeypatch.chdir(tmp_path)
     lens = replace(LENS, width=320, height=240, fx=300.0, fy=300.0, cx=160.2, cy=119.1)
     for kind, size in (("charuco", (5, 7)), ("chess", (6, 9))):

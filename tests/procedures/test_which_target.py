@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
+from reseau.core.data import Frame
 from reseau.core.failure import Failure
-from reseau.designs import board, coded_sheet
+from reseau.designs import board, coded_sheet, coded_testfield
 from reseau.io import BoardDesign
 from reseau.procedures.exposures import of_another_lens
-from reseau.procedures.which_target import which_target
+from reseau.procedures.target_measurement import Measurer, measurer_of
+from reseau.procedures.which_target import Design, which_target
 
 from ..measure.board_pictures import picture
 
@@ -28,6 +31,24 @@ def test_a_charuco_board_is_found_among_other_targets() -> None:
     assert found[0] == "mine"
     assert isinstance(found[1], BoardDesign)
     assert not which_target([frame], {"sheet": candidates["sheet"]})
+
+
+def test_lines_are_not_looked_for_where_markers_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = []
+
+    def measuring(design: Design) -> Measurer:
+        tried.append(design.name)
+        return measurer_of(design)
+
+    monkeypatch.setattr("reseau.procedures.which_target.measurer_of", measuring)
+    charuco = board("charuco", 7, 6, 24.0, name="mine")
+    frame, _ = picture(charuco)
+    large = Frame(np.kron(frame.pixels, np.ones((8, 8), np.uint8)), 255.0)
+    designs = {"field": coded_testfield(4, 4, 30.0), "chess": board("chess", 7, 6, 24.0), "mine": charuco}
+    found = which_target([large, large], designs)
+    assert not isinstance(found, Failure)
+    assert found[0] == "mine"
+    assert tried == ["mine", "mine"]
 
 
 def test_photographs_with_another_zoom_are_named(tmp_path: Path) -> None:

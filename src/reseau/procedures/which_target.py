@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+
+import cv2
+import numpy as np
 
 from ..core.data import Frame
 from ..core.errors import ReseauError
@@ -17,6 +22,10 @@ __all__ = ["designs_beside", "which_target"]
 
 Design = ReseauDesign | TestfieldDesign | BoardDesign
 _ENOUGH, _LEAST = 0.8, 8
+_LONG_PX = 1600
+"""Length of the longer side of a frame from whose double it is reduced."""
+_CODED, _PLAIN, _LINED = range(3)
+"""Kinds of targets in the order in which they are looked for."""
 
 
 def designs_beside(folders: Iterable[Path]) -> dict[str, Design]:
@@ -56,23 +65,66 @@ def which_target(frames: Iterable[Frame], designs: Mapping[str, Design]) -> tupl
     >>> which_target([], {}).code
     <Code.NOT_FOUND: 'not-found'>
     """
-    points = dict.fromkeys(designs, 0)
-    for frame in frames:
-        seen = dict[str, int]()
-        for name, design in designs.items():
-            pattern = _pattern(design)
-            if pattern not in seen:
-                measured = measurer_of(design)(frame)
-                count = 0 if isinstance(measured, Failure) else len(measured.points)
-                seen[pattern] = count if count >= _LEAST else 0
-            points[name] += seen[pattern]
+    frames = list(frames)
+    small = [_reduced(frame) for frame in frames]
+    points = _counted(small, designs)
+    if not any(points.values()) and any(a is not b for a, b in zip(frames, small, strict=True)):
+        points = _counted(frames, designs)
     most = max(points.values(), default=0)
     if most == 0:
         return Failure("shows none of the known targets; give the design", Code.NOT_FOUND)
-    plain = {name for name, design in designs.items() if _plain(design)}
-    order = [name for name in designs if name not in plain] + [name for name in designs if name in plain]
+    order = sorted(designs, key=lambda name: _effort(designs[name]) == _PLAIN)
     name = next(name for name in order if points[name] >= _ENOUGH * most)
     return name, designs[name]
+
+
+def _reduced(frame: Frame) -> Frame:
+    """The frame, with its pixels averaged where it is large: which target it shows needs no more of them."""
+    h, w = frame.pixels.shape
+    factor = max(h, w) // _LONG_PX
+    if factor < 2:
+        return frame
+    pixels = np.ascontiguousarray(frame.pixels[: h // factor * factor, : w // factor * factor])
+    size = w // factor, h // factor
+    return replace(frame, pixels=np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)))
+
+
+def _counted(frames: Sequence[Frame], designs: Mapping[str, Design]) -> dict[str, int]:
+    """Points of each design measured in all frames; none of plain patterns that most frames do not show.
+
+    A part of a larger grid may pass for a smaller one, the whole does not. What takes long is not looked for
+    where something else was found. Designs that a frame showed are looked for in the next one before others.
+    """
+    patterns = {name: _pattern(design) for name, design in designs.items()}
+    total, times, shown = dict.fromkeys(patterns.values(), 0), Counter[str](), len(frames)
+    for frame in frames:
+        seen: dict[str, int] = {}
+        known = any(total.values())
+        for found_before in (True, False) if known else (False,):
+            if found_before is False and any(seen.values()):
+                break
+            for effort in (_CODED, _PLAIN, _LINED):
+                enough = False
+                for name, design in designs.items():
+                    pattern = patterns[name]
+                    if pattern in seen or _effort(design) != effort:
+                        continue
+                    if found_before and not total[pattern]:
+                        continue
+                    measured = measurer_of(design)(frame)
+                    count = 0 if isinstance(measured, Failure) else len(measured.points)
+                    seen[pattern] = count if count >= _LEAST else 0
+                    whole = _ENOUGH * len(design.ids) if effort == _PLAIN else _LEAST
+                    enough |= count >= whole
+                if enough:
+                    break
+        for pattern, count in seen.items():
+            total[pattern] += count
+            times[pattern] += count > 0
+    return {
+        name: 0 if _effort(designs[name]) == _PLAIN and 2 * times[pattern] <= shown else total[pattern]
+        for name, pattern in patterns.items()
+    }
 
 
 def _pattern(design: Design) -> str:
@@ -89,8 +141,10 @@ def _pattern(design: Design) -> str:
     return repr(("reseau", design.ids, (design.xy / scale).round(4).tolist(), rings, design.mark.shape))
 
 
-def _plain(design: Design) -> bool:
-    """Whether nothing in the target identifies it."""
+def _effort(design: Design) -> int:
+    """What finding the target takes: markers or rings are read, lattices grown, lines of a testfield laid."""
+    if isinstance(design, TestfieldDesign):
+        return _LINED
     if isinstance(design, BoardDesign):
-        return design.kind in ("chess", "circles")
-    return isinstance(design, ReseauDesign) and design.rings is None
+        return _PLAIN if design.kind in ("chess", "circles") else _CODED
+    return _PLAIN if design.rings is None else _CODED

@@ -100,7 +100,7 @@ def _through_lens(at: Array, xy: Array, sigma: Array, shape: tuple[int, int], st
         return None
     matrix = np.linalg.inv(to_unit) @ np.append(x[:8], 1.0).reshape(3, 3) @ back
     mapping = of_degree(started(matrix, 1, shape), 5)
-    return with_coefficients(mapping, half * _expanded(*x[8:10], x[10:]).T)
+    return with_coefficients(mapping, half * _expanded(x[8], x[9], x[10:]).T)
 
 
 def _expanded(k1: float, k2: float, c: Array) -> Array:
