@@ -3,8 +3,9 @@
 Run from the checkout: ``python benchmarks/bundle.py [--part peers|statistics|growth|cover]``. Networks are
 read from $RESEAU_DATA/networks. Ceres needs g++ and libceres-dev (Debian), COLMAP needs pycolmap (PyPI);
 without them only our times are printed. All use two threads and stop when the relative change of the sum of
-squares is below 1e-6 (ours: corrections below 1e-6 standard deviations). Import, compilation and reading of
-files are not included.
+squares is below 1e-6 (ours: corrections below 1e-6 standard deviations). Times are those of all processors
+together, medians of rounds in which the programs take turns: what else runs hardly changes them. Import,
+compilation and reading of files are not included.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ DATA = (
 SOURCE, COLMAP = (Path(__file__).parent / "ceres" / name for name in ("bundle.cc", "colmap.py"))
 # Target of ½Σr²: that of Ceres for ladybug, the published 185.94²/2 for roma.
 LADYBUG, ROMA = 1.334433e4, 0.5 * 185.940**2
-REPEATS = 5
+REPEATS = 7
 
 
 def compiled_peer(folder: Path) -> Path | None:
@@ -78,10 +79,10 @@ def colmap(kind: str, network: Path) -> tuple[float, float, float, int] | None:
 
 
 def ours(problem: BundleProblem, target: float) -> tuple[float, float, float, int]:
-    """Seconds to the target, total seconds of the adjustment without statistics, ½Σr², iterations."""
+    """Processor seconds to the target, and of the adjustment without statistics, ½Σr², iterations."""
     seen: list[tuple[float, float]] = []
-    begun = time.perf_counter()
-    watched = replace(problem, watch=lambda _, cost: seen.append((time.perf_counter() - begun, 0.5 * cost)))
+    begun = time.process_time()
+    watched = replace(problem, watch=lambda _, cost: seen.append((time.process_time() - begun, 0.5 * cost)))
     watched.adjusted()
     reached = next((t for t, cost in seen if cost <= target), -1.0)
     return reached, seen[-1][0] if seen else 0.0, seen[-1][1], len(seen)

@@ -5,13 +5,14 @@
 //   bundle fisheye NETWORK COST  one camera fx, fy, cx, cy, k1 ... k4 of OpenCV's fisheye for all
 //   bundle rig NETWORK COST      cameras c, K1 (object side) fixed to each other; one pose for each exposure
 //
-// Prints: seconds until half the sum of squares is at most COST, seconds in all, final cost, iterations.
+// Prints: processor seconds until half the sum of squares is at most COST, processor seconds in all, final cost, iterations.
 #include <ceres/ceres.h>
 #include <ceres/rotation.h>
 
 #include <chrono>
 #include <cstdio>
 #include <cstdlib>
+#include <ctime>
 #include <fstream>
 #include <string>
 #include <vector>
@@ -88,18 +89,18 @@ struct RigResidual {
 
 class Watch : public ceres::IterationCallback {
  public:
-  explicit Watch(double target) : target(target), begun(std::chrono::steady_clock::now()) {}
+  explicit Watch(double target) : target(target), begun(std::clock()) {}
   ceres::CallbackReturnType operator()(const ceres::IterationSummary& summary) override {
     if (reached < 0 && summary.cost <= target) reached = seconds();
     return ceres::SOLVER_CONTINUE;
   }
   double seconds() const {
-    return std::chrono::duration<double>(std::chrono::steady_clock::now() - begun).count();
+    return static_cast<double>(std::clock() - begun) / CLOCKS_PER_SEC;
   }
   double target, reached = -1;
 
  private:
-  std::chrono::steady_clock::time_point begun;
+  std::clock_t begun;
 };
 
 // Adjusts and prints; `begun` is not included.

@@ -3,9 +3,9 @@
     colmap.py bal NETWORK        BAL file; each image has f, k1, k2 of its own
     colmap.py shared NETWORK     one camera for all, as benchmarks/bundle.py writes it
 
-Prints seconds in all, final half of the sum of squares, iterations. The sums are COLMAP's own: an observation
-whose point lies behind its camera counts nothing there, and it has no distortion on the image side, so that
-of `shared` networks it adjusts f, cx, cy, k1, k2 of its model RADIAL, on the object side.
+Prints processor seconds in all, final half of the sum of squares, iterations. The sums are COLMAP's own: an
+observation whose point lies behind its camera counts nothing there, and it has no distortion on the image
+side, so that of `shared` networks it adjusts f, cx, cy, k1, k2 of its model RADIAL, on the object side.
 """
 
 from __future__ import annotations
@@ -99,9 +99,9 @@ def main() -> int:
     for image in network.images:
         config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    begun = time.perf_counter()
+    begun = time.process_time()
     summary = pycolmap.create_default_bundle_adjuster(options, config, network).solve()
-    spent = time.perf_counter() - begun
+    spent = time.process_time() - begun
     ceres = getattr(summary, "ceres_summary", summary)
     print(f"{spent:.6f} {ceres.final_cost:.10g} {ceres.num_successful_steps + ceres.num_unsuccessful_steps}")
     return 0

@@ -72,17 +72,20 @@ def camera_bases(
         Weighted derivatives of the image coordinates; those by the camera begin in the seventh column.
     """
     found = []
+    order, first = _by_camera(camera_of, len(unknowns.camera))
+    most = int(unknowns.count.max(initial=0))
+    sorted_ = np.ascontiguousarray(derivatives[order, :, 6 : 6 + most])
     for c in np.flatnonzero((unknowns.camera >= 0) & (unknowns.count > 1)).tolist():
         if c in observed:
             continue
-        own, count = camera_of == c, int(unknowns.count[c])
-        part = derivatives[:, :, 6 : 6 + count]
-        j = (part if own.all() else part[np.flatnonzero(own)]).reshape(-1, count)
-        diagonal = np.einsum("ni,ni->i", j, j)
+        count = int(unknowns.count[c])
+        j = sorted_[first[c] : first[c + 1], :, :count].reshape(-1, count)
+        products = j.T @ j
+        diagonal = np.diag(products).copy()
         if len(j) < j.shape[1] or not (diagonal > 0).all() or not np.isfinite(diagonal).all():
             continue
         length = np.sqrt(diagonal)
-        if np.linalg.eigvalsh(j.T @ j / np.outer(length, length))[0] > _GOOD:
+        if np.linalg.eigvalsh(products / np.outer(length, length))[0] > _GOOD:
             continue
         triangle = np.linalg.qr(j / length, mode="r")
         if np.linalg.svd(triangle, compute_uv=False)[-1] < _RANK:
@@ -91,6 +94,14 @@ def camera_bases(
         columns = (unknowns.camera[c] + np.arange(len(length))).astype(np.intp)
         found.append(CameraBasis(columns, turn, diagonal))
     return tuple(found)
+
+
+def _by_camera(camera_of: Rows, cameras: int) -> tuple[Rows | slice, Rows]:
+    """Order (n,) of observations by cameras, and the first of each camera (c + 1,)."""
+    first = np.concatenate([[0], np.cumsum(np.bincount(camera_of, minlength=cameras))])
+    if cameras == 1:
+        return slice(None), first
+    return np.argsort(camera_of, kind="stable"), first
 
 
 def with_bases(

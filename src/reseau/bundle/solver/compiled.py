@@ -18,7 +18,7 @@ import numpy as np
 
 from ...core.data import Rows
 
-__all__ = ["chunks_of", "compiled", "in_parallel"]
+__all__ = ["called", "chunks_of", "compiled", "in_parallel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -31,6 +31,15 @@ _PART_SIZE = 2000
 def compiled(function: F) -> F:
     """Compile a function at its first call, cached on disk, without the global interpreter lock."""
     return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+
+
+def called(function: F) -> F:
+    """Compile a function that compiled ones call, and that allocates no array: without reference counts.
+
+    Counting the references to the arrays that it is given takes longer than short loops over their elements.
+    """
+    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
+    return cast(F, numba.njit(**options)(function))
 
 
 def chunks_of(starts: Rows) -> list[tuple[int, int]]:

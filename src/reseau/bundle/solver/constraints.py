@@ -123,6 +123,13 @@ class Constraints:
             rig, rotation, x0 = self.rig.stepped(rig, at.rotation, at.x0, q, given)
         return Placed(rotation, x0, rig, stage)
 
+    @property
+    def sparse(self) -> RigConstraints | None:
+        """The rig, where each ray depends on one exposure and one camera, so that T is not needed."""
+        if self.stage is not None or self.rig is None or (self.rig.unknowns.mount >= 0).any():
+            return None
+        return self.rig
+
     @cached_property
     def images(self) -> Rows:
         """Adjusted images that depend on the constraints."""

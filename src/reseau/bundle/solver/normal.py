@@ -16,9 +16,19 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.data import Array, Rows
-from .compiled import compiled
+from .compiled import called, compiled
 
-__all__ = ["SEGMENTS", "Pattern", "Sums", "assemble", "locals_of", "posterior", "reduce_sides", "substitute"]
+__all__ = [
+    "SEGMENTS",
+    "Pattern",
+    "Sums",
+    "assemble",
+    "locals_of",
+    "posterior",
+    "reduce_sides",
+    "substitute",
+    "through",
+]
 
 SEGMENTS = 6
 
@@ -86,11 +96,44 @@ def locals_of(first: Rows, start: Rows, width: Rows, place: Rows, out: Rows, cou
                 for q in range(base, total):
                     if width[k, a] > 0 and out[q, 0] == start[k, a]:
                         place[k, a] = out[q, 2]
+        # Segments that follow each other without a gap are one: long loops are faster.
+        joined = base
+        for q in range(base + 1, total):
+            if out[joined, 0] + out[joined, 1] == out[q, 0]:
+                out[joined, 1] += out[q, 1]
+            else:
+                joined += 1
+                for i in range(3):
+                    out[joined, i] = out[q, i]
+        total = joined + 1 if total > base else base
         count[j] = total - base
     return total
 
 
 @compiled
+def through(rows: Array, image: Rows, blocks: Array, place: int, out: Array) -> None:
+    """Write derivatives (n, 2, w + 6) by other unknowns of images, from those by poses (n, 2, w).
+
+    `blocks` (m, 6, 12) are derivatives of the pose of each image by six unknowns, which replace the first
+    columns, and by six more, which are inserted at the column `place`.
+    """
+    w = rows.shape[2]
+    for k in range(len(rows)):
+        i = image[k]
+        for r in range(2):
+            for c in range(6, place):
+                out[k, r, c] = rows[k, r, c]
+            for c in range(place, w):
+                out[k, r, c + 6] = rows[k, r, c]
+            for c in range(6):
+                one, other = 0.0, 0.0
+                for q in range(6):
+                    one += rows[k, r, q] * blocks[i, q, c]
+                    other += rows[k, r, q] * blocks[i, q, c + 6]
+                out[k, r, c], out[k, r, place + c] = one, other
+
+
+@called
 def _inverse(j: int, v: Array, out: Array) -> float:
     """Invert a symmetric positive definite 3×3 matrix; return the smallest pivot with unit diagonal."""
     s0, s1, s2 = 1.0 / np.sqrt(v[0, 0]), 1.0 / np.sqrt(v[1, 1]), 1.0 / np.sqrt(v[2, 2])
@@ -110,7 +153,7 @@ def _inverse(j: int, v: Array, out: Array) -> float:
     return float(min(d1, d2))
 
 
-@compiled
+@called
 def _blocks(k: int, rows: Array, misfits: Array, pattern: Pattern, sums: Sums) -> None:
     """Add AᵀA and Aᵀr of one ray to the matrix and the right-hand side."""
     start, width, column, border = pattern.start, pattern.width, pattern.column, sums.border
@@ -129,38 +172,60 @@ def _blocks(k: int, rows: Array, misfits: Array, pattern: Pattern, sums: Sums) -
                 if width[k, b] == 0 or sb > sa:
                     continue
                 if at >= bands:
-                    for j in range(width[k, b]):
+                    for j in range(min(width[k, b], at - sb + 1)):
                         border[at - bands, sb + j] += x0 * rows[k, 0, cb + j] + x1 * rows[k, 1, cb + j]
                 else:
                     for j in range(min(width[k, b], at - sb + 1)):
                         sums.band[sb + j, at - sb - j] += x0 * rows[k, 0, cb + j] + x1 * rows[k, 1, cb + j]
 
 
-@compiled
+@called
 def _eliminate(j: int, w: Array, t: Array, pattern: Pattern, sums: Sums) -> None:
     """Add −T Wᵀ of one point to the matrix."""
     bands, border, first = len(sums.band), sums.border, pattern.local[j]
     for a in range(first, pattern.local[j + 1]):
-        sa, oa = pattern.at[a], pattern.offset[a]
-        for i in range(pattern.size[a]):
+        sa, oa, size = pattern.at[a], pattern.offset[a], pattern.size[a]
+        if sa >= bands:
+            # Three rows at a time: W is read once for them. What they write above the diagonal is not read.
+            full = size - size % 3
+            for i in range(0, full, 3):
+                o, at = oa + i, sa + i - bands
+                a0, a1, a2 = t[o, 0], t[o, 1], t[o, 2]
+                b0, b1, b2 = t[o + 1, 0], t[o + 1, 1], t[o + 1, 2]
+                c0, c1, c2 = t[o + 2, 0], t[o + 2, 1], t[o + 2, 2]
+                if not (a0 or a1 or a2 or b0 or b1 or b2 or c0 or c1 or c2):
+                    continue
+                for b in range(first, a + 1):
+                    sb, ob = pattern.at[b], pattern.offset[b]
+                    n = min(pattern.size[b], sa + i + 3 - sb)
+                    w0, w1, w2 = w[0, ob : ob + n], w[1, ob : ob + n], w[2, ob : ob + n]
+                    one, two = border[at, sb : sb + n], border[at + 1, sb : sb + n]
+                    three = border[at + 2, sb : sb + n]
+                    for q in range(n):
+                        x, y, z = w0[q], w1[q], w2[q]
+                        one[q] -= a0 * x + a1 * y + a2 * z
+                        two[q] -= b0 * x + b1 * y + b2 * z
+                        three[q] -= c0 * x + c1 * y + c2 * z
+        else:
+            full = 0
+        for i in range(full, size):
             t0, t1, t2, at = t[oa + i, 0], t[oa + i, 1], t[oa + i, 2], sa + i
             if t0 == 0.0 and t1 == 0.0 and t2 == 0.0:
                 continue
             for b in range(first, a + 1):
                 sb, ob = pattern.at[b], pattern.offset[b]
+                n = min(pattern.size[b], at - sb + 1)
+                w0, w1, w2 = w[0, ob : ob + n], w[1, ob : ob + n], w[2, ob : ob + n]
                 if at >= bands:
-                    for q in range(pattern.size[b]):
-                        border[at - bands, sb + q] -= (
-                            t0 * w[0, ob + q] + t1 * w[1, ob + q] + t2 * w[2, ob + q]
-                        )
+                    row = border[at - bands, sb : sb + n]
+                    for q in range(n):
+                        row[q] -= t0 * w0[q] + t1 * w1[q] + t2 * w2[q]
                 else:
-                    for q in range(min(pattern.size[b], at - sb + 1)):
-                        sums.band[sb + q, at - sb - q] -= (
-                            t0 * w[0, ob + q] + t1 * w[1, ob + q] + t2 * w[2, ob + q]
-                        )
+                    for q in range(n):
+                        sums.band[sb + q, at - sb - q] -= t0 * w0[q] + t1 * w1[q] + t2 * w2[q]
 
 
-@compiled
+@called
 def _cross(j: int, rows: Array, pattern: Pattern, w: Array) -> None:
     """Compute W of one point (3, m), for the unknowns that it depends on."""
     end = rows.shape[2]
@@ -176,7 +241,7 @@ def _cross(j: int, rows: Array, pattern: Pattern, w: Array) -> None:
                     w[q, place + i] += x0 * rows[k, 0, end - 3 + q] + x1 * rows[k, 1, end - 3 + q]
 
 
-@compiled
+@called
 def _touched(j: int, pattern: Pattern) -> int:
     last = pattern.local[j + 1] - 1
     return pattern.offset[last] + pattern.size[last] if last >= pattern.local[j] else 0
@@ -294,6 +359,7 @@ def posterior(
     for j in range(begin, end):
         most = max(most, _touched(j, pattern))
     w, t, y, index = np.empty((3, most)), np.zeros((most, 3)), np.zeros((most, 3)), np.empty(most, np.int64)
+    cross = np.zeros((2, 3))
     for j in range(begin, end):
         m = _touched(j, pattern) if pattern.eliminated[j] else 0
         if pattern.eliminated[j]:
@@ -321,15 +387,17 @@ def posterior(
                         x += t[i, s] * y[i, c]
                     points[j, s, c] = x
         for k in range(pattern.first[j], pattern.first[j + 1]):
-            _hat(j, k, rows, pattern, z, y, points, seen)
+            _hat(j, k, rows, pattern, z, y, points, cross, seen)
 
 
-@compiled
-def _hat(j: int, k: int, rows: Array, pattern: Pattern, z: Array, y: Array, q: Array, out: Array) -> None:
-    """Compute the cofactor (2, 2) of the adjusted coordinates of one ray."""
+@called
+def _hat(
+    j: int, k: int, rows: Array, pattern: Pattern, z: Array, y: Array, q: Array, cross: Array, out: Array
+) -> None:
+    """Compute the cofactor (2, 2) of the adjusted coordinates of one ray; `cross` (2, 3) is room."""
     eliminated, last = pattern.eliminated[j], rows.shape[2] - 3
     h00, h01, h11 = 0.0, 0.0, 0.0
-    cross = np.zeros((2, 3))
+    cross[:, :] = 0.0
     for a in range(SEGMENTS):
         for i in range(pattern.width[k, a]):
             at, x0, x1 = pattern.start[k, a] + i, 0.0, 0.0

@@ -270,7 +270,8 @@ def _constrained(
     arrow = Arrow.factorise(np.zeros((0, 1)), own.matrix)
     q = arrow.inverse()
     q[held], q[:, held] = 0.0, 0.0
-    found = _with_inverse(linear, normal, own.back @ q @ own.back.T, columns, taking_part)
+    back = linear.sparse_transformation
+    found = _with_inverse(linear, normal, back @ (back @ q).T, columns, taking_part, independent=q)
     slopes = linear.constraint_slopes
     found[3][len(found[3]) - len(slopes) :] = np.einsum("ai,ij,aj->a", slopes, q, slopes, optimize=True)
     missing = abs(_total(found) - int((~held).sum()) - _free_coordinates(linear, taking_part))
@@ -292,21 +293,25 @@ def _free_coordinates(linear: Linear, taking_part: Mask) -> int:
 
 
 def _with_inverse(
-    linear: Linear, normal: Normal, z: Array, held: Mask, taking_part: Mask, *, turned: bool = False
-) -> tuple[Array, Array, Array, Array]:
+    linear: Linear, normal: Normal, z: Array, held: Mask, taking_part: Mask, *, turned: bool = False,
+    independent: Array | None = None,
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Cofactors from the inverse of the reduced normal equations.
 
-    `turned` tells that these are for the combinations of camera parameters of :class:`Normal`.
+    `turned` tells that these are for the combinations of camera parameters of :class:`Normal`. `independent`
+    is the inverse for the independent unknowns of a stage or a rig.
     """
     system = linear.system
     z[held] = 0.0
     z[:, held] = 0.0
     points, seen = np.zeros((len(linear.prior), 3, 3)), np.zeros((len(linear.misfits), 2, 2))
 
-    rows = linear.turned_rows if turned and normal.bases else linear.rows
+    rows, pattern, inverse = linear.turned_rows if turned and normal.bases else linear.rows, system.pattern, z
+    if independent is not None and linear.blocks is not None:
+        rows, pattern, inverse = linear.rows_through, system.through[0], independent
 
     def work(_: int, a: int, b: int) -> None:
-        posterior(a, b, rows, system.pattern, normal.inverse, z, points, seen)
+        posterior(a, b, rows, pattern, normal.inverse, inverse, points, seen)
 
     in_parallel(work, system.chunks)
     if turned:

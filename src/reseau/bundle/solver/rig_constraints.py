@@ -122,21 +122,47 @@ class RigConstraints:
         """Compute T (u, size) at given values."""
         t = np.zeros((self.unknowns.size, self.size))
         t[self.others, np.arange(len(self.others))] = 1.0
+        block, row = self.blocks(places, rotation, x0)[self.images], self._rows
+        at = len(self.others) + 6 * self._numbers[0][:, None] + np.arange(6)
+        t[row[:, :, None], at[:, None, :]] = block[:, :, :6]
+        moving = self._camera_column >= 0
+        at = self._camera_column[moving, None] + np.arange(6)
+        t[row[moving, :, None], at[:, None, :]] = block[moving, :, 6:]
+        columns, camera = self._mounted
+        start = len(self.others) + 6 * len(self._numbers[1])
+        t[columns, start + 6 * camera[:, None] + np.arange(6)] = 1.0
+        return t
+
+    def blocks(self, places: RigValues, rotation: Array, x0: Array) -> Array:
+        """Derivatives (m, 6, 12) of the pose of each image by its exposure and by the place of its camera."""
         turn, _ = self.orientations(places, rotation, x0)
         number, camera = self._numbers[0], self.rig.camera[self.images]
         back = np.swapaxes(turn[number], 1, 2)
-        at = len(self.others) + 6 * number[:, None] + np.arange(6)
-        row = self._rows
-        t[row[:, :3, None], at[:, None, :3]] = places.rotation[camera]
-        t[row[:, 3:, None], at[:, None, :3]] = back @ _cross(places.base[camera])
-        t[row[:, 3:], at[:, 3:]] = 1.0
-        moving = self._camera_column >= 0
-        at = self._camera_column[moving, None] + np.arange(6)
-        t[row[moving, :3], at[:, :3]] = 1.0
-        t[row[moving, 3:, None], at[:, None, 3:]] = back[moving]
-        columns, camera = self._mounted
-        t[columns, len(self.others) + 6 * (len(turn) + camera[:, None]) + np.arange(6)] = 1.0
-        return t
+        block = np.zeros((len(self.unknowns.pose), 6, 12))
+        block[:, np.arange(6), np.arange(6)] = 1.0
+        own = np.zeros((len(self.images), 6, 12))
+        own[:, :3, :3] = places.rotation[camera]
+        own[:, 3:, :3] = back @ _cross(places.base[camera])
+        own[:, np.arange(3, 6), np.arange(3, 6)] = 1.0
+        own[:, np.arange(3), np.arange(6, 9)] = 1.0
+        own[:, 3:, 9:] = back
+        block[self.images] = own
+        return block
+
+    @cached_property
+    def columns(self) -> tuple[Rows, Rows, Rows]:
+        """First independent unknown of the pose of each image (m,), and of the place of its camera (m,).
+
+        For images that are not of the rig, that of their own pose, and −1 for none. Last the independent
+        unknown (u,) that each reduced one is, −1 for those of images of the rig.
+        """
+        to = np.full(self.unknowns.size, -1, dtype=np.intp)
+        to[self.others] = np.arange(len(self.others))
+        pose = np.where(self.unknowns.pose >= 0, to[np.maximum(self.unknowns.pose, 0)], -1)
+        pose[self.images] = len(self.others) + 6 * self._numbers[0]
+        place = np.full(len(pose), -1, dtype=np.intp)
+        place[self.images] = self._camera_column
+        return pose, place, to
 
     def slopes(self, places: RigValues, cameras: Rows) -> Array:
         """Derivatives (b, size) of the distances of pairs of cameras (b, 2)."""

@@ -17,7 +17,7 @@ from .camera_basis import CameraBasis, camera_bases, with_bases
 from .compiled import chunks_of, in_parallel
 from .constraints import Constrained, Constraints
 from .imaging import Bent, Imaging, Seen, mapped
-from .normal import Sums, assemble, reduce_sides, substitute
+from .normal import Pattern, Sums, assemble, reduce_sides, substitute, through
 from .observations import OtherObservations
 from .unknowns import Unknowns
 from .values import Correction, Values
@@ -154,6 +154,16 @@ class System:
         return Linear(self, values, rows, out, others)
 
     @cached_property
+    def through(self) -> tuple[Pattern, Rows, int]:
+        """Pattern of the rays by the independent unknowns of a rig, their numbers (u,), their count."""
+        constraints = self.constraints
+        rig = None if constraints is None else constraints.sparse
+        if rig is None:
+            raise AssertionError("only for a rig whose rays depend on one exposure and one camera each")
+        pose, place, to = rig.columns
+        return self.unknowns.pattern_through(pose, place, to), to, rig.size
+
+    @cached_property
     def prior_column(self) -> tuple[Rows, Rows, Rows, Rows]:
         """Columns of other observations of single reduced unknowns.
 
@@ -222,6 +232,11 @@ class Linear:
         return constraints.matrix(self.values.placed)
 
     @cached_property
+    def sparse_transformation(self) -> scipy.sparse.csr_array:
+        """The same without its zeros."""
+        return scipy.sparse.csr_array(self.transformation)
+
+    @cached_property
     def constraint_slopes(self) -> Array:
         """Weighted derivatives (a, size) of the last of the other observations, those of a stage or a rig.
 
@@ -258,14 +273,21 @@ class Linear:
         prior[j, axis, 1] = root * self.other_misfits[at]
         return prior
 
-    def _add_others(self, sums: Sums) -> None:
-        """Add distances, and observed coordinates and parameters among the reduced unknowns."""
+    def _add_others(self, sums: Sums, to: Rows | None = None) -> None:
+        """Add distances, and observed coordinates and parameters among the reduced unknowns.
+
+        `to` (u,) are new numbers of these unknowns, where they have been renumbered.
+        """
         system = self.system
         bands, kept = len(sums.band), system.unknowns.kept
+        if to is None:
+            to = np.arange(system.unknowns.size)
         rows, columns, rows_interior, columns_interior = system.prior_column
         for row, column in zip([*rows, *rows_interior], [*columns, *columns_interior], strict=True):
+            column = to[column]
             _add(sums, int(column), system.sigma_root[row], float(self.other_misfits[row]), bands)
         for k, column, slope in self.slopes():
+            column = to[column]
             gradient = slope * self.other_misfits[k]
             sums.gradient[column] += gradient
             sums.diagonal[column] += slope**2
@@ -278,7 +300,7 @@ class Linear:
         held = np.flatnonzero(kept >= 0)
         for j in held:
             for axis in np.flatnonzero(system.movable[j] == 0):
-                _hold(sums, int(kept[j] + axis))
+                _hold(sums, int(to[kept[j] + axis]))
 
     def slopes(self) -> list[tuple[int, Rows, Array]]:
         """Return number, columns and weighted derivatives of observations of several reduced unknowns.
@@ -326,30 +348,13 @@ class Linear:
             Whether to form them for well-conditioned combinations of the parameters of cameras.
         """
         system, unknowns = self.system, self.system.unknowns
-        p, u, bands = len(self.prior), unknowns.size, unknowns.bands
-        inverse, side, diagonal = np.zeros((p, 3, 3)), np.zeros((p, 3)), np.zeros((p, 3))
-        chunks = system.chunks if u < _LARGE or bands else [(0, p)]
-        parts = [
-            Sums(
-                np.zeros((bands, unknowns.bandwidth + 1)), np.zeros((u - bands, u)), np.zeros(u), np.zeros(u),
-                np.zeros(u),
-            )
-            for _ in chunks
-        ]  # fmt: skip
-        least = np.ones(len(chunks))
+        if self.blocks is not None:
+            return self._normal_through(damping)
+        u, bands = unknowns.size, unknowns.bands
         bases, rows = (self.bases, self.turned_rows) if turned else ((), self.rows)
-
-        def work(part: int, a: int, b: int) -> None:
-            least[part] = assemble(
-                a, b, rows, self.misfits, system.pattern, self.prior, damping, parts[part], inverse,
-                side, diagonal,
-            )  # fmt: skip
-
-        in_parallel(work, chunks)
-        sums = parts[0]
-        for other in parts[1:]:
-            for mine, theirs in zip(sums, other, strict=True):
-                mine += theirs
+        sums, inverse, side, diagonal, least = self._assembled(
+            rows, system.pattern, damping, u, bands, unknowns.bandwidth
+        )
         self._add_others(sums)
         sums.reduced[:] += sums.gradient
         for column in np.flatnonzero(system.held):
@@ -364,7 +369,80 @@ class Linear:
             sums.border[corner, bands + corner] += extra[bands:]
         for basis in bases:
             sums.diagonal[basis.columns] = basis.diagonal
-        return Normal(self, sums, inverse, side, diagonal, damping, float(least.min(initial=1.0)), bases)
+        return Normal(self, sums, inverse, side, diagonal, damping, least, bases)
+
+    def _assembled(
+        self, rows: Array, pattern: Pattern, damping: float, u: int, bands: int, bandwidth: int
+    ) -> tuple[Sums, Array, Array, Array, float]:
+        """Sums over all points; V⁻¹, right-hand side and diagonal of each, and the smallest scaled pivot."""
+        p = len(self.prior)
+        inverse, side, diagonal = np.zeros((p, 3, 3)), np.zeros((p, 3)), np.zeros((p, 3))
+        chunks = self.system.chunks if u < _LARGE or bands else [(0, p)]
+        parts = [
+            Sums(
+                np.zeros((bands, bandwidth + 1)),
+                np.zeros((u - bands, u)),
+                np.zeros(u),
+                np.zeros(u),
+                np.zeros(u),
+            )
+            for _ in chunks
+        ]
+        least = np.ones(len(chunks))
+
+        def work(part: int, a: int, b: int) -> None:
+            least[part] = assemble(
+                a, b, rows, self.misfits, pattern, self.prior, damping, parts[part], inverse, side, diagonal
+            )
+
+        in_parallel(work, chunks)
+        sums = parts[0]
+        for other in parts[1:]:
+            for mine, theirs in zip(sums, other, strict=True):
+                mine += theirs
+        return sums, inverse, side, diagonal, float(least.min(initial=1.0))
+
+    @cached_property
+    def blocks(self) -> Array | None:
+        """Derivatives (m, 6, 12) of poses by exposures and cameras of a rig; None where T is needed."""
+        constraints, values = self.system.constraints, self.values
+        rig = None if constraints is None else constraints.sparse
+        if rig is None or values.rig is None:
+            return None
+        return rig.blocks(values.rig, values.rotation, values.x0)
+
+    @cached_property
+    def rows_through(self) -> Array:
+        """Derivatives of the image coordinates (n, 2, w + 6) by the independent unknowns of a rig."""
+        if self.blocks is None:
+            raise AssertionError("only for a rig whose rays depend on one exposure and one camera each")
+        unknowns, image = self.system.unknowns, self.system.seen.image
+        place = unknowns.width - 3 - unknowns.extra_width - unknowns.bent_width
+        rows = np.zeros((len(image), 2, unknowns.width + 6))
+        through(self.rows, image, self.blocks, place, rows)
+        return rows
+
+    def _normal_through(self, damping: float) -> Normal:
+        """Normal equations of the independent unknowns of a rig, formed without those of single images."""
+        system, unknowns = self.system, self.system.unknowns
+        pattern, to, size = system.through
+        image = system.seen.image
+        sums, inverse, side, points, least = self._assembled(self.rows_through, pattern, damping, size, 0, 0)
+        self._add_others(sums, to)
+        sums.reduced[:] += sums.gradient
+        # The damping is that of poses, as without a rig.
+        diagonal = np.zeros(unknowns.size)
+        known = to >= 0
+        diagonal[known] = sums.diagonal[to[known]]
+        square = (self.rows[:, :, :6] ** 2).sum(axis=1)
+        own, count = np.flatnonzero(unknowns.pose >= 0), len(unknowns.pose)
+        for i in range(6):
+            diagonal[unknowns.pose[own] + i] = np.bincount(image, square[:, i], count)[own]
+        if damping:
+            extra = damping * np.where(diagonal > 0, diagonal, 1.0)
+            sparse = self.sparse_transformation
+            sums.border[:] += (sparse.T @ scipy.sparse.diags_array(extra) @ sparse).toarray()
+        return Normal(self, sums._replace(diagonal=diagonal), inverse, side, points, damping, least)
 
 
 class Normal:
@@ -397,10 +475,12 @@ class Normal:
         linear = self.linear
         t, slopes = linear.transformation, linear.constraint_slopes
         own = slopes.T @ linear.other_misfits[len(linear.other_misfits) - len(slopes) :]
-        # A pose depends on one exposure and one camera: nearly all of T is zero.
-        sparse = scipy.sparse.csr_array(t)
-        matrix = sparse.T @ (sparse.T @ full(self.sums.band, self.sums.border)).T + slopes.T @ slopes
-        gradient = t.T @ self.sums.reduced + own
+        matrix, gradient = full(self.sums.band, self.sums.border), self.sums.reduced
+        if linear.blocks is None:
+            # A pose depends on few unknowns: nearly all of T is zero.
+            sparse = linear.sparse_transformation
+            matrix, gradient = sparse.T @ (sparse.T @ matrix).T, t.T @ gradient
+        matrix, gradient = matrix + slopes.T @ slopes, gradient + own
         if held is not None:
             matrix[held], matrix[:, held] = 0.0, 0.0
             matrix[held, held] = 1.0
@@ -427,7 +507,7 @@ class Normal:
             own = self.constrained(held if held.any() else None)
             q = Arrow.factorise(np.zeros((0, 1)), own.matrix).solve(-own.gradient)
             y, by_stage = own.back @ q, float(own.own @ q)
-            gradient = self.sums.gradient @ y
+            gradient = self.sums.gradient @ (y if self.linear.blocks is None else q)
         points = self.points(-self.side[:, :, None], y[:, None])[:, :, 0]
         gradient += float((self.side * points).sum()) + by_stage
         bent = (self.sums.diagonal * y) @ y + float((self.diagonal * points**2).sum())

@@ -224,27 +224,53 @@ class Unknowns:
     @cached_property
     def pattern(self) -> Pattern:
         """Unknowns of each ray, in the order of points."""
+        return self._pattern(self.pose, self.motion, np.arange(self.size), self.width, self.moving_width)
+
+    def pattern_through(self, pose: Rows, place: Rows, column: Rows) -> Pattern:
+        """Return the pattern for other unknowns of the images, with six more derivatives of a ray.
+
+        Parameters
+        ----------
+        pose, place : ndarray of int (m,)
+            First of six unknowns that replace the pose of each image, and of six more, −1 for none. The
+            latter take the columns of the motion of cameras.
+        column : ndarray of int (u,)
+            New number of each of the other unknowns.
+        """
+        return self._pattern(pose, place, column, self.width + 6, 6)
+
+    def _pattern(self, pose: Rows, motion: Rows, to: Rows, whole: int, moving_width: int) -> Pattern:
+        """Pattern with these unknowns of images, others renumbered, of `whole` derivatives of a ray."""
+
+        def renumbered(start: Rows) -> Rows:
+            return np.where(start >= 0, to[np.maximum(start, 0)], -1)
+
         image, point = self.network.image_of[self.order], self.network.point_of[self.order]
         camera, extra = self.network.camera_of[image], self.extra_of[image]
         n = len(image)
         start, width = np.full((n, SEGMENTS), -1, dtype=np.intp), np.zeros((n, SEGMENTS), dtype=np.intp)
         column = np.zeros((n, SEGMENTS), dtype=np.intp)
-        start[:, 0], width[:, 0] = self.pose[image], 6
-        start[:, 1], width[:, 1], column[:, 1] = self.camera[camera], self.count[camera], 6
+        start[:, 0], width[:, 0] = pose[image], 6
+        start[:, 1], width[:, 1], column[:, 1] = renumbered(self.camera[camera]), self.count[camera], 6
         if self.extra_names:
-            start[:, 2] = np.where(extra >= 0, self.extra[extra], -1)
+            start[:, 2] = renumbered(np.where(extra >= 0, self.extra[extra], -1))
             width[:, 2] = np.where(start[:, 2] >= 0, self.extra_count[extra], 0)
-            column[:, 2] = self.width - 3 - self.extra_width
+            column[:, 2] = whole - 3 - self.extra_width
         bent = self.network.refraction
         if bent is not None and self.refraction >= 0:
-            start[:, 3] = np.where(bent.path_of[image] >= 0, self.refraction, -1)
+            start[:, 3] = renumbered(np.where(bent.path_of[image] >= 0, self.refraction, -1))
             width[:, 3] = np.where(start[:, 3] >= 0, self.bent_width, 0)
-            column[:, 3] = self.width - 3 - self.extra_width - self.bent_width
-        start[:, 5] = self.motion[image]
+            column[:, 3] = whole - 3 - self.extra_width - self.bent_width
+        start[:, 5] = motion[image]
         width[:, 5] = np.where(start[:, 5] >= 0, 6, 0)
-        column[:, 5] = self.width - 3 - self.extra_width - self.bent_width - self.moving_width
-        start[:, 4] = self.kept[point]
-        width[:, 4], column[:, 4] = np.where(start[:, 4] >= 0, 3, 0), self.width - 3
+        column[:, 5] = whole - 3 - self.extra_width - self.bent_width - moving_width
+        start[:, 4] = renumbered(self.kept[point])
+        width[:, 4], column[:, 4] = np.where(start[:, 4] >= 0, 3, 0), whole - 3
+        # A camera with one image follows its pose: both are one segment.
+        alone = np.bincount(self.network.camera_of[self.active], minlength=len(self.camera)) == 1
+        joined = alone[camera] & (start[:, 1] == start[:, 0] + 6) & (width[:, 1] > 0)
+        width[:, 0] += np.where(joined, width[:, 1], 0)
+        width[joined, 1], start[joined, 1] = 0, -1
         place = np.zeros_like(start)
         table = np.zeros((n * SEGMENTS, 3), dtype=np.intp)
         number = np.zeros(len(self.first) - 1, dtype=np.intp)

@@ -15,7 +15,8 @@ receives an ideal direction (u, v) and the measured image point ``xy[k]`` (px), 
 
 ``c`` is the row of the camera in `cameras`, a :class:`CameraColumns`, and ``e`` the row of the set of
 additional parameters, or −1. A kernel indexes the arrays of `cameras` by element: a row taken out of them
-would count its references in all threads at once.
+would count its references in all threads at once. Kernels that are called by others, and allocate no array,
+are compiled without counting of references, which would take ten times as long as their arithmetic.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar, cast
 from ...core.data import Array
 
 __all__ = ["CameraColumns", "Kernel", "additional", "camera", "compiled", "kernel"]
+
+# Functions of NumPy in kernels that allocate arrays.
+_ALLOCATING = {"array", "copy", "empty", "full", "ones", "zeros"}
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -115,7 +119,10 @@ def compiled(function: Kernel[P, R], **slots: Kernel[..., Any]) -> Callable[P, R
 
 
 @cache
-def _compiled(function: Kernel[..., Any], **slots: Kernel[..., Any]) -> Callable[..., Any]:
+def _compiled(
+    function: Kernel[..., Any], *, called_by: bool = False, **slots: Kernel[..., Any]
+) -> Callable[..., Any]:
+    """See :func:`compiled`; `called_by` tells that the kernel is only called by compiled ones."""
     import numba
 
     inner = function.function
@@ -124,13 +131,17 @@ def _compiled(function: Kernel[..., Any], **slots: Kernel[..., Any]) -> Callable
     called = {name: slots.get(name, inner.__globals__[name]) for name in names}
     own = FunctionType(
         inner.__code__,
-        inner.__globals__ | {name: compiled(other, **slots) for name, other in called.items()},
+        inner.__globals__
+        | {name: _compiled(other, called_by=True, **slots) for name, other in called.items()},
         inner.__name__,
     )
     digest = _digest(function, slots)
     own.__module__, own.__doc__ = inner.__module__, inner.__doc__
     own.__qualname__ = f"{inner.__qualname__}_{digest[:16]}" if digest else inner.__qualname__
-    return cast(Callable[..., Any], numba.njit(cache=bool(digest), nogil=True, error_model="numpy")(own))
+    options: dict[str, Any] = {"cache": bool(digest), "nogil": True, "error_model": "numpy"}
+    if called_by and not _allocates(function, slots):
+        options["_nrt"] = False
+    return cast(Callable[..., Any], numba.njit(**options)(own))
 
 
 def _called(function: Kernel[..., Any]) -> list[str]:
@@ -139,9 +150,18 @@ def _called(function: Kernel[..., Any]) -> list[str]:
     return [name for name in inner.__code__.co_names if isinstance(inner.__globals__.get(name), Kernel)]
 
 
+def _allocates(function: Kernel[..., Any], slots: dict[str, Kernel[..., Any]]) -> bool:
+    """Whether a kernel, or one that it calls, allocates arrays."""
+    inner = cast(FunctionType, function.function)
+    others = [slots.get(name, inner.__globals__[name]) for name in _called(function)]
+    own = bool(_ALLOCATING & set(inner.__code__.co_names))
+    return own or any(_allocates(other, slots) for other in others)
+
+
 def _digest(function: Kernel[..., Any], slots: dict[str, Kernel[..., Any]]) -> str:
     """Digest of the kernels and of their source files; empty if one is not in a file."""
-    digest, todo, done = hashlib.sha256(), [function], list[Kernel[..., Any]]()
+    # How they are compiled is in this file.
+    digest, todo, done = hashlib.sha256(Path(__file__).read_bytes()), [function], list[Kernel[..., Any]]()
     while todo:
         current = todo.pop()
         done.append(current)
