@@ -242,8 +242,11 @@ class Unknowns:
     def _pattern(self, pose: Rows, motion: Rows, to: Rows, whole: int, moving_width: int) -> Pattern:
         """Pattern with these unknowns of images, others renumbered, of `whole` derivatives of a ray."""
 
+        # A camera without free parameters may begin behind the last column.
+        numbers = np.append(to, -1)
+
         def renumbered(start: Rows) -> Rows:
-            return np.where(start >= 0, to[np.maximum(start, 0)], -1)
+            return np.where(start >= 0, numbers[np.maximum(start, 0)], -1)
 
         image, point = self.network.image_of[self.order], self.network.point_of[self.order]
         camera, extra = self.network.camera_of[image], self.extra_of[image]
