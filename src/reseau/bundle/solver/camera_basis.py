@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 
 from ...core.data import Array, Rows
+from .compiled import compiled
 from .normal import Sums
 from .unknowns import Unknowns
 
@@ -72,21 +73,17 @@ def camera_bases(
         Weighted derivatives of the image coordinates; those by the camera begin in the seventh column.
     """
     found = []
-    order, first = _by_camera(camera_of, len(unknowns.camera))
-    most = int(unknowns.count.max(initial=0))
-    sorted_ = np.ascontiguousarray(derivatives[order, :, 6 : 6 + most])
-    for c in np.flatnonzero((unknowns.camera >= 0) & (unknowns.count > 1)).tolist():
+    every = products_of(derivatives, camera_of, unknowns.count)
+    weakest = _least_eigenvalues(every, unknowns.count)
+    for c in np.flatnonzero((unknowns.camera >= 0) & (unknowns.count > 1) & ~(weakest > _GOOD)).tolist():
         if c in observed:
             continue
-        count = int(unknowns.count[c])
-        j = sorted_[first[c] : first[c + 1], :, :count].reshape(-1, count)
-        products = j.T @ j
-        diagonal = np.diag(products).copy()
+        own, count = np.flatnonzero(camera_of == c), int(unknowns.count[c])
+        j = derivatives[own, :, 6 : 6 + count].reshape(-1, count)
+        diagonal = np.einsum("ni,ni->i", j, j)
         if len(j) < j.shape[1] or not (diagonal > 0).all() or not np.isfinite(diagonal).all():
             continue
         length = np.sqrt(diagonal)
-        if np.linalg.eigvalsh(products / np.outer(length, length))[0] > _GOOD:
-            continue
         triangle = np.linalg.qr(j / length, mode="r")
         if np.linalg.svd(triangle, compute_uv=False)[-1] < _RANK:
             continue
@@ -96,12 +93,38 @@ def camera_bases(
     return tuple(found)
 
 
-def _by_camera(camera_of: Rows, cameras: int) -> tuple[Rows | slice, Rows]:
-    """Order (n,) of observations by cameras, and the first of each camera (c + 1,)."""
-    first = np.concatenate([[0], np.cumsum(np.bincount(camera_of, minlength=cameras))])
-    if cameras == 1:
-        return slice(None), first
-    return np.argsort(camera_of, kind="stable"), first
+@compiled
+def products_of(derivatives: Array, camera_of: Rows, count: Rows) -> Array:
+    """Compute JᵀJ of the parameters of each camera (c, k, k), padded with zeros."""
+    most = 0
+    for c in range(len(count)):
+        most = max(most, count[c])
+    products = np.zeros((len(count), most, most))
+    for k in range(len(camera_of)):
+        c = camera_of[k]
+        for i in range(count[c]):
+            x0, x1 = derivatives[k, 0, 6 + i], derivatives[k, 1, 6 + i]
+            for o in range(i + 1):
+                products[c, i, o] += x0 * derivatives[k, 0, 6 + o] + x1 * derivatives[k, 1, 6 + o]
+    for c in range(len(count)):
+        for i in range(count[c]):
+            for o in range(i):
+                products[c, o, i] = products[c, i, o]
+    return products
+
+
+def _least_eigenvalues(products: Array, count: Rows) -> Array:
+    """Least eigenvalue (c,) of the products with unit diagonal; zero where one is not positive and finite."""
+    least = np.zeros(len(count))
+    for size in np.unique(count[count > 1]):
+        rows = np.flatnonzero(count == size)
+        own = products[rows, :size, :size]
+        diagonal = np.diagonal(own, axis1=1, axis2=2)
+        good = (diagonal > 0).all(axis=1) & np.isfinite(own).all(axis=(1, 2))
+        length = np.sqrt(diagonal[good])
+        scaled = own[good] / (length[:, :, None] * length[:, None, :])
+        least[rows[good]] = np.linalg.eigvalsh(scaled)[:, 0]
+    return least
 
 
 def with_bases(

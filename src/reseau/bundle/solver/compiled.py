@@ -37,8 +37,9 @@ def called(function: F) -> F:
     """Compile a function that compiled ones call, and that allocates no array: without reference counts.
 
     Counting the references to the arrays that it is given takes longer than short loops over their elements.
+    It is not cached on disk, from where it could not be inlined; what calls it is.
     """
-    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
     return cast(F, numba.njit(**options)(function))
 
 

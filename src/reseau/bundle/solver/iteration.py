@@ -18,7 +18,7 @@ from ...adjust import AdjustmentFailure
 from ...core.data import Rows
 from ...core.failure import Code, Failure
 from .arrow import Singular
-from .system import Linear, System
+from .system import Linear, Normal, System
 from .values import Correction, Values
 
 __all__ = ["Iterated", "iterate"]
@@ -118,8 +118,9 @@ def iterate(
     costs, rank = [cost], max(1, 2 * len(linear.misfits) + len(linear.other_misfits) - redundancy)
     while tried < max_iterations:
         tried += 1
+        normal = linear.normal(damping)
         try:
-            step = linear.normal(damping).correction()
+            step = normal.correction()
         except Singular:
             damping, growth = max(damping, _LEAST_DAMPING) * 10.0 * growth, growth * 2.0
             if damping > _MOST_DAMPING:
@@ -137,7 +138,7 @@ def iterate(
             away = linear.values.beyond(_NEARLY * radius)
             return Iterated(linear, tuple(costs), tried, float(offset), away)
         if curved:
-            step = _accelerated(linear, step, damping)
+            step = _accelerated(normal, step)
         trial = linear.values.moved(system.unknowns, step, system.constraints)
         away = trial.beyond(radius)
         if len(away):
@@ -166,8 +167,9 @@ def iterate(
     return Iterated(linear, tuple(costs), tried, float("nan"), away, converged=False)
 
 
-def _accelerated(linear: Linear, step: Correction, damping: float) -> Correction:
+def _accelerated(normal: Normal, step: Correction) -> Correction:
     """Add the acceleration a = −½ (JᵀPJ + λD)⁻¹ JᵀP v″ to a step; v″ is the second derivative along it."""
+    linear = normal.linear
     system, values = linear.system, linear.values
     ahead, back = (
         system.misfits(values.moved(system.unknowns, step.times(sign * _PART), system.constraints))
@@ -179,8 +181,11 @@ def _accelerated(linear: Linear, step: Correction, damping: float) -> Correction
     ]
     if not all(np.isfinite(part).all() for part in second):
         return step
+    if system.constraints is None:
+        bend = normal.correction_for(second[0], second[1])
+        return step.plus(bend) if bend.length <= _TRUSTED * step.length else step
     try:
-        bend = Linear(system, values, linear.rows, second[0], second[1]).normal(damping).correction()
+        bend = Linear(system, values, linear.rows, second[0], second[1]).normal(normal.damping).correction()
     except Singular:
         return step
     return step.plus(bend) if bend.length <= _TRUSTED * step.length else step

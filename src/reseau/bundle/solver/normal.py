@@ -23,6 +23,7 @@ __all__ = [
     "Pattern",
     "Sums",
     "assemble",
+    "gradients",
     "locals_of",
     "posterior",
     "reduce_sides",
@@ -344,6 +345,24 @@ def reduce_sides(
                     at, column = pattern.start[k, a], pattern.column[k, a]
                     for i in range(pattern.width[k, a]):
                         out[at + i, c] -= rows[k, 0, column + i] * x0 + rows[k, 1, column + i] * x1
+
+
+@compiled
+def gradients(
+    begin: int, end: int, rows: Array, misfits: Array, pattern: Pattern, side: Array, out: Array
+) -> None:
+    """Add Aᵀr of the points begin…end to `out` (u,), and Bᵀr to `side` (p, 3)."""
+    last = rows.shape[2] - 3
+    for j in range(begin, end):
+        for k in range(pattern.first[j], pattern.first[j + 1]):
+            r0, r1 = misfits[k, 0], misfits[k, 1]
+            for a in range(SEGMENTS):
+                at, column = pattern.start[k, a], pattern.column[k, a]
+                for i in range(pattern.width[k, a]):
+                    out[at + i] += rows[k, 0, column + i] * r0 + rows[k, 1, column + i] * r1
+            if pattern.eliminated[j]:
+                for q in range(3):
+                    side[j, q] += rows[k, 0, last + q] * r0 + rows[k, 1, last + q] * r1
 
 
 @compiled

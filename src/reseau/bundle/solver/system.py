@@ -17,7 +17,7 @@ from .camera_basis import CameraBasis, camera_bases, with_bases
 from .compiled import chunks_of, in_parallel
 from .constraints import Constrained, Constraints
 from .imaging import Bent, Imaging, Seen, mapped
-from .normal import Pattern, Sums, assemble, reduce_sides, substitute, through
+from .normal import Pattern, Sums, assemble, gradients, reduce_sides, substitute, through
 from .observations import OtherObservations
 from .unknowns import Unknowns
 from .values import Correction, Values
@@ -454,6 +454,7 @@ class Normal:
     ) -> None:  # fmt: skip
         self.linear, self.sums, self.inverse, self.side = linear, sums, inverse, side
         self.diagonal, self.damping, self.least, self.bases = diagonal, damping, least, bases
+        self.arrow: Arrow | None = None
 
     def hold(self, held: Mask) -> None:
         """Hold reduced unknowns (u,)."""
@@ -497,7 +498,8 @@ class Normal:
         """
         constraints, q, by_stage = self.linear.system.constraints, None, 0.0
         if constraints is None:
-            y = self.factorise().solve(-self.sums.reduced)
+            self.arrow = self.factorise()
+            y = self.arrow.solve(-self.sums.reduced)
             gradient = self.sums.gradient @ y
             y = self.in_parameters(y)
         else:
@@ -512,6 +514,40 @@ class Normal:
         gradient += float((self.side * points).sum()) + by_stage
         bent = (self.sums.diagonal * y) @ y + float((self.diagonal * points**2).sum())
         return Correction(y, points, float(-gradient + self.damping * bent), float(np.sqrt(bent)), q)
+
+    def correction_for(self, misfits: Array, other_misfits: Array) -> Correction:
+        """Solve for the correction with other misfits, with the factors of :meth:`correction`.
+
+        Without a stage or a rig only. The predicted decrease is not computed.
+
+        Parameters
+        ----------
+        misfits : ndarray (n, 2)
+            Weighted misfits of the image coordinates.
+        other_misfits : ndarray
+            Weighted misfits of the other observations.
+        """
+        linear, system = self.linear, self.linear.system
+        rows, pattern = linear.turned_rows if self.bases else linear.rows, system.pattern
+        other = Linear(system, linear.values, linear.rows, misfits, other_misfits)
+        side, gradient = other.prior[:, :, 1].copy(), np.zeros(system.unknowns.size)
+        gradients(0, len(side), rows, misfits, pattern, side, gradient)
+        one, at, more, interior = system.prior_column
+        for row, column in zip([*one, *more], [*at, *interior], strict=True):
+            gradient[column] += system.sigma_root[row] * other_misfits[row]
+        for k, columns, slope in linear.slopes():
+            gradient[columns] += slope * other_misfits[k]
+        reduced = np.zeros((len(gradient), 1))
+        reduce_sides(0, len(side), rows, pattern, self.inverse, side[:, :, None], reduced)
+        held = system.held.copy()
+        kept = np.flatnonzero(system.unknowns.kept >= 0)
+        held[(system.unknowns.kept[kept, None] + np.arange(3))[system.movable[kept] == 0]] = True
+        arrow = self.factorise() if self.arrow is None else self.arrow
+        y = arrow.solve(np.where(held, 0.0, -(gradient + reduced[:, 0])))
+        y = self.in_parameters(y)
+        points = self.points(-side[:, :, None], y[:, None])[:, :, 0]
+        bent = (self.sums.diagonal * y) @ y + float((self.diagonal * points**2).sum())
+        return Correction(y, points, 0.0, float(np.sqrt(bent)))
 
     def in_parameters(self, z: Array) -> Array:
         """Return reduced unknowns (u, …) for the parameters of cameras, from those for their combinations."""

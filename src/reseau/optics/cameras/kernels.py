@@ -138,7 +138,8 @@ def _compiled(
     digest = _digest(function, slots)
     own.__module__, own.__doc__ = inner.__module__, inner.__doc__
     own.__qualname__ = f"{inner.__qualname__}_{digest[:16]}" if digest else inner.__qualname__
-    options: dict[str, Any] = {"cache": bool(digest), "nogil": True, "error_model": "numpy"}
+    # Machine code from the cache is not inlined: only what is called from Python is cached.
+    options: dict[str, Any] = {"cache": bool(digest) and not called_by, "nogil": True, "error_model": "numpy"}
     if called_by and not _allocates(function, slots):
         options["_nrt"] = False
     return cast(Callable[..., Any], numba.njit(**options)(own))
