@@ -36,6 +36,7 @@ from . import (
     orient,
     perforations,
     refine,
+    remote,
     schedule,
     schema,
     serve,
@@ -66,6 +67,7 @@ app.command()(watch.watch)
 app.command()(serve.serve)
 app.add_typer(serve.app, name="service")
 app.add_typer(serve.audit_app, name="audit")
+app.add_typer(remote.app, name="remote")
 app.add_typer(archive.app, name="archive")
 app.add_typer(calibrations.app, name="calibrations")
 app.command()(schedule.recalibrate)

@@ -18,17 +18,9 @@ from ..archive import Archive, ArchivedFrame, Session, Verdict
 from ..capture.steps import Step, as_taken
 from ..core.errors import ImageError, ReseauError
 from ..core.threads import one_thread
-from .decoding import decode
+from .decoding import PHOTOGRAPH, decode
 
-__all__ = ["PHOTOGRAPH", "finish", "is_upload", "rerun"]
-
-PHOTOGRAPH = "photograph"
-"""Kind of the files that were uploaded, as they came."""
-
-
-def is_upload(session: Session) -> bool:
-    """Return whether a session is made of uploaded photographs."""
-    return bool(session.frames(kind=PHOTOGRAPH))
+__all__ = ["finish", "rerun"]
 
 
 def finish(session: Session) -> str:

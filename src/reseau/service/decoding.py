@@ -16,10 +16,14 @@ from typing import IO
 
 import numpy as np
 
+from ..archive import Session
 from ..core.data import Frame
 from ..core.errors import ImageError
 
-__all__ = ["DecodingLimits", "decode"]
+__all__ = ["PHOTOGRAPH", "DecodingLimits", "decode", "is_upload"]
+
+PHOTOGRAPH = "photograph"
+"""Kind of the files that were uploaded, as they came."""
 
 _TYPES = {"uint8": np.uint8, "uint16": np.uint16, "float32": np.float32}
 _HEAD = 4096
@@ -47,6 +51,11 @@ class DecodingLimits:
     memory: int = 6 << 30
     seconds: int = 60
     pixels: int = 120_000_000
+
+
+def is_upload(session: Session) -> bool:
+    """Return whether a session is made of uploaded photographs."""
+    return bool(session.frames(kind=PHOTOGRAPH))
 
 
 def decode(path: Path, name: str, limits: DecodingLimits | None = None) -> Frame:

@@ -138,6 +138,7 @@ def chromium() -> Iterator[Browser]:
             yield browser
         finally:
             browser.command("DELETE", "")
+            browser._http.close()
     finally:
         running.terminate()
         running.wait(20)

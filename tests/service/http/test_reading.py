@@ -114,6 +114,13 @@ def test_frames_are_downloaded_whole_and_in_ranges(client: TestClient) -> None:
     assert client.get(path, headers={"If-None-Match": whole.headers["etag"]}).status_code == 304
 
 
+def test_documents_of_bluesky_are_read(client: TestClient) -> None:
+    found = client.get("/api/1/sessions/monday/documents").json()
+    kinds = [each["name"] for each in found]
+    assert (kinds[0], kinds[-1], kinds.count("event")) == ("start", "stop", 4)
+    assert client.get("/api/1/sessions/monday/documents", params={"after": 3}).json() == found[3:]
+
+
 def test_a_preview_is_a_picture_of_the_frame(client: TestClient) -> None:
     row = client.get("/api/1/sessions/monday/frames").json()[0]
     coded = client.get(

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import ConfigDict, Field
 
 from ..accounts import Principal
-from ..benches import BenchLink
 from .access import Here, NotFound, Operating, Reading, operating
 from .answers import Answer, refusals
 from .service import Service
+
+if TYPE_CHECKING:
+    from ..benches import BenchLink
 
 __all__ = ["BenchAnswer", "bench_answer", "router"]
 

@@ -8,10 +8,9 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, File, Form, Path, UploadFile
 from pydantic import ConfigDict
 
-from ... import sessions as kinds
 from ...core.errors import InputError, UsageError
 from ...io.photographs import PHOTOGRAPHS
-from ..computing import PHOTOGRAPH
+from ..decoding import PHOTOGRAPH
 from .access import Here, NotFound, Operating, Reading
 from .answers import Answer, refusals
 from .sessions import SessionName, the_session
@@ -83,6 +82,8 @@ def upload(
 
     Photographs of an oscilloscope are taken in the order PHOTO I, II, III.
     """
+    from ... import sessions as kinds
+
     if len(photographs) > MOST_FILES:
         raise UsageError(f"are more than {MOST_FILES}", where="photographs")
     labels = [_label(each.filename, k) for k, each in enumerate(photographs, start=1)]

@@ -79,7 +79,7 @@ class Jobs:
 
     def start(self, archive: Archive) -> None:
         """Start, with the uploads that an earlier service left unfinished."""
-        from ..computing import is_upload
+        from ..decoding import is_upload
 
         self._thread.start()
         for each in archive.sessions(last=200):

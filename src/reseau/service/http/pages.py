@@ -11,7 +11,6 @@ import jinja2
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 
-from ... import sessions as kinds
 from ...core.errors import ReseauError
 from ...io.photographs import PHOTOGRAPHS
 from . import accounts, benches, calibrations, history, operations, sessions
@@ -152,6 +151,8 @@ def benches_page(request: Request, who: Reading, service: Here) -> Response:
 @router.get("/benches/{bench}")
 def bench_page(request: Request, bench: str, who: Reading, service: Here) -> Response:
     """A bench: live picture, axes, settings, session."""
+    from ... import sessions as kinds
+
     link = benches.the_bench(service, bench)
     found = benches.bench_answer(service, link)
     settings: dict[str, Any] = {}
@@ -207,6 +208,8 @@ def _verdict(service: Service, session: sessions.SessionDetail) -> str:
     """What the calibration of a session is good for, in words."""
     if not any(each.name == "calibration.json" for each in session.results):
         return ""
+    from ... import sessions as kinds
+
     calibration = kinds.calibration_of(sessions.the_session(service, session.name))
     return " ".join(calibrations.verdict_of(calibration))
 

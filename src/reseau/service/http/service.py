@@ -10,18 +10,20 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ...archive import Archive
 from ...core.errors import ReseauError, UsageError
 from ..accounts import Accounts, Principal
 from ..audit import Audit
-from ..benches import BenchLink
 from ..state import StateFolder
 from .events import Events
 from .guard import Meters, log
 from .jobs import Jobs
 from .options import ServeOptions
+
+if TYPE_CHECKING:
+    from ..benches import BenchLink
 
 __all__ = ["Service"]
 
@@ -55,6 +57,7 @@ class Service:
     def __init__(self, options: ServeOptions) -> None:
         self.options = options
         self.state = StateFolder.beside(options.archive, options.state)
+        self.state.local_token()  # for programs of the same user
         self.accounts = Accounts(options.accounts or self.state.path("accounts.sqlite"))
         if options.open_to_others and not self.accounts.users():
             self.accounts.close()
@@ -70,6 +73,8 @@ class Service:
         self._later = ThreadPoolExecutor(1, "later")
         self.benches: dict[str, BenchLink] = {}
         for path in options.benches:
+            from ..benches import BenchLink
+
             link = BenchLink(
                 path.absolute(), str(self._place(options.archive)), options.objects, self.state,
                 self._told_by(path),

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import ConfigDict
 
-from ... import sessions as kinds
 from ...archive import ArchivedFrame, Session
 from ...core.errors import ArchiveError, ReseauError
 from .access import Here, NotFound, Reading
@@ -102,6 +101,16 @@ class SessionDetail(Answer):
     results: list[ResultRow]
 
 
+class BlueskyDocument(Answer):
+    """A document of bluesky: its kind, and content."""
+
+    name: str
+    document: dict[str, Any]
+
+
+_BLUESKY = ("start", "descriptor", "event", "stop")
+
+
 class MarkRow(Answer):
     """Marks that are found in a frame, in pixels."""
 
@@ -165,6 +174,8 @@ def _row(frame: ArchivedFrame) -> FrameRow:
 
 def session_detail(service: Service, session: Session) -> SessionDetail:
     """Return a session with what it has and what is to come."""
+    from ... import sessions as kinds
+
     found = session.frames()
     taken = [each for each in found if each.kind == "frame"]
     good = {each.step for each in taken if each.verdict is not None and each.verdict.ok}
@@ -296,6 +307,19 @@ def result_file(
     if result is None:
         raise NotFound("has no such result", where=f"{session}: {number}")
     return file_answer(request, kept.content(result), result.name, result.sha256)
+
+
+@router.get("/sessions/{session}/documents")
+def documents(
+    session: SessionName,
+    who: Reading,
+    service: Here,
+    after: Annotated[int, Query(ge=0, le=1 << 31, description="Leave out so many.")] = 0,
+) -> list[BlueskyDocument]:
+    """Bluesky's documents of a session, in their order: start, descriptor, event, stop."""
+    found = the_session(service, session).notes()
+    known = [(kind, document) for kind, document in found if kind in _BLUESKY]
+    return [BlueskyDocument(name=kind, document=document) for kind, document in known[after:]]
 
 
 @router.get("/sessions/{session}/inputs/{name}/file", response_class=Response, responses=FILE_ANSWERS)

@@ -178,6 +178,7 @@ if (document.querySelector('[data-live]') || document.querySelector('[data-bench
   let lost = false;
   stream.addEventListener('open', () => {
     connection.hidden = true;
+    connection.textContent = '';
     if (lost) refresh();
     lost = false;
   });
