@@ -412,3 +412,26 @@ def test_commands_take_shutters(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert run([*command, *more]) == 0
     frozen = capsys.readouterr().out
     assert float(frozen.split("sigma0 ")[1].split(",")[0]) > 3
+
+
+def test_a_narrow_lens_does_not_tell_shifts_from_rotations_and_says_so() -> None:
+    """Within half a degree of the axis; vx, vy, wz are found where the camera is known."""
+    far, size = 200.0, 0.5
+    camera = camera_of("opencv", ROLLING)
+    values = camera.values.copy()
+    values[:2], values[4:] = far * values[:2] * 0.35, 0.0
+    scene = scene_of(replace(camera, values=values), points=20, size=size)
+    x0 = scene.x0 * far
+    motion = scene.motion * [1.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+    scene = scene._replace(x0=x0, motion=motion)
+    network = replace(world_of(scene, sigma_px=0.1).network, xyz=scene.xyz, sigma=np.zeros((20, 3)),
+                      x0=x0, rotation=matrix_to_vector(scene.rotation))  # fmt: skip
+    noise = 0.1 * np.random.default_rng(0).normal(size=network.xy.shape)
+    network = replace(network, xy=network.xy + noise)
+    failure = adjust_network(network)
+    assert isinstance(failure, Failure)
+    assert failure.code is Code.NOT_IDENTIFIED
+    assert "(wx, wy) have the effect of shifts (vy, vx)" in failure.reason
+    fewer = Shutter("rolling", READ_S / HEIGHT, ("vx", "vy", "wz"))
+    chosen = replace(network.cameras[0], shutter=fewer, free=())
+    assert adjust_network(network.with_cameras({"cam": chosen})).required().sigma0 < 1.3

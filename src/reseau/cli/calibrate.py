@@ -142,6 +142,13 @@ def calibrate(
             "(negative: from the last line on). The motion during each image is estimated.",
         ),
     ] = None,
+    motion: Annotated[
+        str,
+        typer.Option(
+            help="Components of the motion to estimate with a rolling shutter, by default vx,vy,vz,wx,wy,wz; "
+            "with a narrow lens vx,vy,wz."
+        ),
+    ] = "",
     size: Annotated[
         str, typer.Option(help="Width×height in pixels, e.g. 640x480; required without photographs.")
     ] = "",
@@ -208,7 +215,7 @@ def calibrate(
     options = _options(
         sigma, control, refraction, leave_out or [], reject, kind, level, workers, target_points, turntable
     )
-    lens = _camera(model, pitch, side, model_option or [], free, rolling)
+    lens = _camera(model, pitch, side, model_option or [], free, rolling, motion)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
     measure = drawing_overlays(
         measure, {name: drawn[path] for name, path in photographs.items() if path in drawn}
@@ -224,7 +231,7 @@ def calibrate(
         inputs,
         model=lens.model, pitch=pitch, options=dict(lens.options), free=free, sigma=sigma,
         reject=reject, row_jitter=row_jitter, fill=fill, channel=channel.value, eliminate=eliminate,
-        leave_out=list(leave_out or []), components=kind, rolling_shutter=rolling,
+        leave_out=list(leave_out or []), components=kind, rolling_shutter=rolling, motion=motion or None,
     )  # fmt: skip
     differences = _differences(done, others)
     calibrations = [
@@ -373,8 +380,9 @@ def _pictures(photographs: Mapping[str, Path], channel: Channel) -> Callable[[st
 
 
 def _camera(
-    model: str, pitch: float | None, side: str | None, more: list[str], free: str, rolling: float | None
-) -> CameraOptions:
+    model: str, pitch: float | None, side: str | None, more: list[str], free: str, rolling: float | None,
+    motion: str,
+) -> CameraOptions:  # fmt: skip
     """Camera model and parameters from the options of the command."""
     from ..bundle import Shutter
     from ..procedures.calibration import CameraOptions
@@ -386,7 +394,12 @@ def _camera(
             raise UsageError(f"is {text!r}", where="--model-option", do="write name=value, each name once")
         options[name] = value
     names = tuple(name.strip() for name in free.split(",") if name.strip())
-    shutter = None if rolling is None else Shutter("rolling", rolling)
+    chosen = tuple(name.strip() for name in motion.split(",") if name.strip())
+    if chosen and rolling is None:
+        raise UsageError("requires --rolling-shutter", where="--motion")
+    shutter = None
+    if rolling is not None:
+        shutter = Shutter("rolling", rolling, chosen) if chosen else Shutter("rolling", rolling)
     return CameraOptions(model, names, None if pitch is None else (pitch, pitch), options, shutter)
 
 

@@ -34,6 +34,8 @@ _TINY = 0.02
 _PARALLAX, _PAIRS, _COMMON = 0.03, 40, 6
 # Points are on a line, or in a plane, to this part of their extent.
 _FLAT = 1e-3
+# Half angle of view below which shifts and rotations during the read-out have the same effect.
+_NARROW_DEG = 15.0
 # Angle (rad) between the optical axes and the normal of a plane that is seen frontally.
 _FRONTAL = 0.03
 
@@ -349,6 +351,35 @@ def seen_frontally(network: Network, rotation: Array, xyz: Array, used: Mask) ->
                     "cannot be separated from the distance; tilt the camera by 20 to 40 degrees, or hold "
                     f"{', '.join(scale)}",
                     Code.FRONTAL,
+                )
+            )
+    return found
+
+
+def motion_of_narrow_lens(network: Network) -> list[Remark]:
+    """Return a remark where a lens is too narrow to tell estimated velocities and rotation rates apart.
+
+    Within a small angle of the axis a rotation about y moves an image as a shift along x does, line by line.
+    """
+    free, found = network.motion_free & ~network.parallel[:, None], list[Remark]()
+    moving = free[:, [0, 1]] & free[:, [4, 3]]
+    if not moving.any():
+        return found
+    uv = directions(network)
+    for c, camera in enumerate(network.cameras):
+        own = (network.camera_of == c) & moving.any(axis=1)
+        seen = uv[own[network.image_of]]
+        seen = seen[np.isfinite(seen).all(axis=1)]
+        if not own.any() or not len(seen):
+            continue
+        half = float(np.rad2deg(np.arctan(np.linalg.norm(seen, axis=1).max())))
+        if half < _NARROW_DEG:
+            found.append(
+                Remark(
+                    f"{camera.label}: with rays within {half:.2g} deg of the axis, rotations about x and y "
+                    "during the read-out (wx, wy) have the effect of shifts (vy, vx), and vz hardly any; "
+                    "estimate only vx, vy, wz (`free` of the shutter, or --motion vx,vy,wz)",
+                    Code.NOT_IDENTIFIED,
                 )
             )
     return found

@@ -14,7 +14,13 @@ from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ..diagnostics import ControlCheck, ControlShape, Result, checked_control, checks, control_shape
-from ..diagnostics.causes import causes, given_poses_that_do_not_fit, outside_image, seen_frontally
+from ..diagnostics.causes import (
+    causes,
+    given_poses_that_do_not_fit,
+    motion_of_narrow_lens,
+    outside_image,
+    seen_frontally,
+)
 from ..diagnostics.checks import listed
 from ..diagnostics.control_check import suspected, without_control
 from ..diagnostics.stage_check import checked_readings, without_readings
@@ -641,6 +647,8 @@ def _explained(failure: Failure, problem: BundleProblem, found: list[Remark]) ->
     network = problem.network
     if failure.code is Code.NO_DATUM and not found:
         return failure
+    if failure.code in _RETRIED and not found:
+        found = motion_of_narrow_lens(network)
     if not found:
         start = problem.start
         found = seen_frontally(network, start.rotation, start.xyz, finite(start.x0))
