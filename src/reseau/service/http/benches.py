@@ -155,7 +155,7 @@ class PictureFacts(Answer):
     edge_px: float | None = None
     exposure: str = ""
     at: str = ""
-    points: list[tuple[float, float]] = Field(default_factory=list)
+    points: list[list[float]] = Field(default_factory=list)
     error: str = ""
 
 

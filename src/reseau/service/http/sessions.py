@@ -8,7 +8,8 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import ConfigDict
 
 from ...archive import ArchivedFrame, Session
-from ...core.errors import ArchiveError, ReseauError
+from ...core.errors import ArchiveError, ReseauError, UsageError
+from ..decoding import PHOTOGRAPH
 from .access import Here, NotFound, Reading
 from .answers import Answer, refusals
 from .service import Service
@@ -117,7 +118,7 @@ class MarkRow(Answer):
     width: int
     height: int
     names: list[str]
-    xy: list[tuple[float, float]]
+    xy: list[list[float]]
     why: str
 
 
@@ -145,10 +146,23 @@ def the_frame(session: Session, number: int) -> ArchivedFrame:
     NotFound
         If there is none.
     """
-    found = next((each for each in session.frames() if each.id == number), None)
+    found = next((each for each in session.frames() if each.id == number and each.kind != "input"), None)
     if found is None:
         raise NotFound("has no such frame", where=f"{session.name}: {number}")
     return found
+
+
+def _measurable(frame: ArchivedFrame) -> ArchivedFrame:
+    """Return the frame, if it is one, and no file of another kind.
+
+    Raises
+    ------
+    UsageError
+        If it is none.
+    """
+    if frame.suffix != ".tif" or frame.kind == PHOTOGRAPH:
+        raise UsageError("is a file, not a frame", where=frame.name)
+    return frame
 
 
 def rows(service: Service, count: int, before: str | None = None, like: str = "") -> list[SessionRow]:
@@ -251,7 +265,7 @@ def frame_file(
 
 @router.get(
     "/sessions/{session}/frames/{number}/preview.jpg", response_class=Response,
-    responses={200: {"content": {"image/jpeg": {}}, "description": "The picture"}},
+    responses={200: {"content": {"image/*": {}}, "description": "The picture"}},
 )  # fmt: skip
 def preview(
     request: Request,
@@ -264,8 +278,9 @@ def preview(
     """A frame with 8 bits, reduced to a width."""
     kept = the_session(service, session)
     frame = the_frame(kept, number)
-    if frame.suffix != ".tif":
+    if frame.suffix in (".png", ".jpg", ".jpeg"):
         return frame_file(request, session, number, who, service)
+    _measurable(frame)
     tag = f"{frame.sha256[:32]}-{width}"
     return picture_answer(request, lambda: preview_jpeg(kept, frame, width), "image/jpeg", tag)
 
@@ -274,8 +289,8 @@ def preview(
 def marks(session: SessionName, number: Number, who: Reading, service: Here) -> MarkRow:
     """Marks that are found in a frame; they are measured again."""
     kept = the_session(service, session)
-    frame, found, why = marks_of(kept, the_frame(kept, number))
-    xy = [(round(float(x), 3), round(float(y), 3)) for x, y in found.xy]
+    frame, found, why = marks_of(kept, _measurable(the_frame(kept, number)))
+    xy = [[round(float(x), 3), round(float(y), 3)] for x, y in found.xy]
     return MarkRow(width=frame.width, height=frame.height, names=list(found.ids), xy=xy, why=why)
 
 
@@ -288,7 +303,7 @@ def overlay(request: Request, session: SessionName, number: Number, who: Reading
     from ...report.overlay import frame_overlay
 
     kept = the_session(service, session)
-    archived = the_frame(kept, number)
+    archived = _measurable(the_frame(kept, number))
 
     def draw() -> str:
         frame, found, _ = marks_of(kept, archived)

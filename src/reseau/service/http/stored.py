@@ -30,8 +30,8 @@ SANDBOX = (
 _RANGE = re.compile(r"bytes=(\d*)-(\d*)")
 _IMMUTABLE = "private, max-age=31536000, immutable"
 FILE_ANSWERS: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"application/octet-stream": {}}, "description": "The file"},
-    206: {"content": {"application/octet-stream": {}}, "description": "A part of the file"},
+    200: {"content": {"*/*": {}}, "description": "The file"},
+    206: {"content": {"*/*": {}}, "description": "A part of the file"},
     304: {"description": "The file is known to the client"},
     416: {"description": "The file has no such part"},
 }
