@@ -138,6 +138,15 @@ def test_half_a_chessboard_in_sight_is_measured() -> None:
     assert not [note for note in found.notes if note.code is Code.AMBIGUOUS]
 
 
+def test_a_corner_on_the_border_of_the_frame_is_declined() -> None:
+    frame, truth = picture(CHESS, 20.0, 10.0)
+    cut = int(np.round(truth[30, 0])) - 1
+    found = measured(Frame(frame.pixels[:, cut:], 255.0, "cut"), CHESS)
+    assert not found.ok[30]
+    error = np.hypot(*(found.xy - truth + np.array([cut, 0]))[found.ok].T)
+    assert error.max() < 0.05
+
+
 def test_a_part_without_the_ends_of_the_pattern_is_said_to_be_ambiguous() -> None:
     frame, truth = picture(CHESS, 20.0, 10.0)
     part = Frame(frame.pixels[130:290, 150:330], 255.0, "part")

@@ -44,6 +44,8 @@ _EDGE = 1.5
 """Half the width of an edge in widths of the point-spread function."""
 _ALIKE_WIDTH = 0.05
 """Relative change of the sharpness from which markers are formed anew."""
+_BORDER = 2.0
+"""Least distance of a corner from the outermost pixels, in widths of the point-spread function."""
 _FLAT = 0.6
 """Least sine of the angle between the edges of a corner."""
 _NODES_PX = 1.1
@@ -245,7 +247,11 @@ class CornerMarks(PlaneMarks):
         tangent = slope / np.linalg.norm(slope, axis=1, keepdims=True)
         flat = np.abs(np.linalg.det(tangent)) < _FLAT
         seen = Reason("seen at too flat an angle", Code.UNCERTAIN)
-        return [*super()._objections(rows, found), (flat, seen)]
+        # Of a corner on the border two sectors are not seen, and nothing shows an error of its edges.
+        h, w = self.screened.grey.shape
+        gap = np.minimum(found.xy, np.array([w - 1, h - 1]) - found.xy).min(axis=1)
+        border = gap < _BORDER * self.look.blur_px, Reason("on the border of the frame", Code.OUTSIDE)
+        return [border, *super()._objections(rows, found), (flat, seen)]
 
     def _edge_seen(self, rows: Rows, found: Matches) -> Array:
         """See :class:`PlaneMarks`."""
