@@ -155,11 +155,11 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
     browser.until("ready")
     browser.until("sharpest edges", seconds=60)
     for axis in ("tilt", "roll", "camera_roll"):
-        browser.click(f'button[aria-label="Find the reference of {axis}"]')
+        browser.click(f'button[aria-label="Home {axis}"]')
         until(lambda: "done" in browser.text("#message") or browser.text("#message"))
         time.sleep(0.5)
     browser.until("tilt")
-    browser.click('button[aria-label="Move tilt by 10 deg"]')
+    browser.click('button[aria-label="+10 deg, tilt"]')
     until(lambda: "10.0" in browser.text("#axes-title + div"))
     browser.click("button.stop")
     shot(browser, "service-bench")
