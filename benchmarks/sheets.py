@@ -105,9 +105,11 @@ def large() -> None:
     del grey, plane, share
     design = ReseauDesign.parse(json.dumps(sheet.design()), where="sheet")
     before = _resident_mb()
-    start = time.process_time()
-    found = measure_reseau(frame, design)
-    seconds = time.process_time() - start
+    seconds = []
+    for _ in range(3):  # the first loads the compiler and its kernels
+        start = time.process_time()
+        found = measure_reseau(frame, design)
+        seconds.append(time.process_time() - start)
     if isinstance(found, Failure):
         print(f"declined: {found.reason}")
         return
@@ -115,7 +117,8 @@ def large() -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
         f"{w} x {h} pixels: {found.found} of {len(sheet.xy)} disks, rms {np.sqrt((error**2).mean()):.4f} px, "
-        f"processor time {seconds:.2f} s, memory {before:.0f} MB before, at most {peak:.0f} MB"
+        f"processor time {seconds[0]:.2f} s in a new process, then {min(seconds[1:]):.2f} s, "
+        f"memory {before:.0f} MB before, at most {peak:.0f} MB"
     )
 
 
