@@ -331,7 +331,7 @@ class Year:
             (OFF[1], "alarms were sent once, and once more where nobody had acknowledged them by Thursday",
              set(times.values()) <= {1, 2} and 2 in times.values(), True),
             (BAD, "an alarm says that the bad run was rejected",
-             BAD not in done or f"{NAME}: calibration {done[BAD].key} was rejected" in times, True),
+             BAD not in done or any(f"({done[BAD].key}) was rejected" in text for text in times), True),
         ]  # fmt: skip
         said = ", ".join(f"{n} {name}" for name, n in Counter(outcomes).most_common())
         found = ", ".join(f"{name} in its run {n}" for name, n in late.items() if n)

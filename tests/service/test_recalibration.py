@@ -242,7 +242,7 @@ def test_alarms_are_sent_once_and_repeated_until_they_are_acknowledged(
         known.define("left", {"camera": "DMK 33"})
         first = known.decide("left", camera(), CAMERA_RULES, since=start)
         assert [each.text for each in alarms.send(deliver, day, start)] == [
-            f"left: the calibration since {first.since:%Y-%m-%d %H:%M}Z ({first.key}) needs a review"
+            f"left: the calibration of {first.since:%Y-%m-%d %H:%M}Z ({first.key}) needs a review"
         ]
         assert alarms.send(deliver, day, start + day / 2) == []
         assert len(alarms.send(deliver, day, start + day)) == 1
@@ -257,7 +257,7 @@ def test_alarms_are_sent_once_and_repeated_until_they_are_acknowledged(
         Schedules(archive).add(schedule, start)
         (one, other) = alarms.send(deliver, day, start + 3 * day)
         assert {one.text, other.text} == {
-            f"left: the calibration since {bad.since:%Y-%m-%d %H:%M}Z ({bad.key}) was rejected",
+            f"left: the calibration of {bad.since:%Y-%m-%d %H:%M}Z ({bad.key}) was rejected",
             "weekly: the run of 2026-03-04 08:00Z was not carried out",
         }
         alarms.acknowledge(f"calibration left {bad.key}", "Ada")

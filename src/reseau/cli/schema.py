@@ -18,8 +18,8 @@ __all__ = ["documents", "schema"]
 _MODULES = (
     "bundle.document", "calibration.document", "capture.bench", "io.board", "io.design", "io.fiducials",
     "io.frame", "io.lens", "io.measurement", "io.network", "io.refraction", "io.targets", "io.testfield",
-    "service.certificates.data", "service.covariates", "service.recalibration", "service.rules",
-    "service.schedule", "sessions.parameters",
+    "service.audit", "service.certificates.data", "service.covariates", "service.recalibration",
+    "service.rules", "service.schedule", "sessions.parameters",
 )  # fmt: skip
 """Modules of the project that define documents."""
 

@@ -157,7 +157,7 @@ class Alarms:
                 if each.outcome == "needs review" or (each.outcome == "rejected" and not each.reviewed_by):
                     said = "was rejected" if each.outcome == "rejected" else "needs a review"
                     found[f"calibration {name} {each.key}"] = (
-                        f"{name}: the calibration since {each.since:%Y-%m-%d %H:%M}Z ({each.key}) {said}"
+                        f"{name}: the calibration of {each.since:%Y-%m-%d %H:%M}Z ({each.key}) {said}"
                     )
             events = known.events(name)
             since = events[-1][0] if events else None

@@ -43,6 +43,7 @@ class Certificates:
     Examples
     --------
     >>> import tempfile
+    >>> from pathlib import Path
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     certificates = Certificates(StateFolder(Path(folder) / "state"))
     ...     certificates.context("worker").verify_mode.name
@@ -132,8 +133,9 @@ class Wire:
     Examples
     --------
     >>> one, two = socket.socketpair()
-    >>> Wire(one).send({"id": 1, "do": "status"}, b"body")
-    >>> Wire(two).receive()
+    >>> with one, two:
+    ...     Wire(one).send({"id": 1, "do": "status"}, b"body")
+    ...     Wire(two).receive()
     ({'id': 1, 'do': 'status'}, b'body')
     """
 
