@@ -73,9 +73,13 @@ def serve(
     )  # fmt: skip
 
     def ready(service: Service) -> None:
-        if not options.open_to_others:
+        if options.open_to_others:
+            return
+        if sys.stderr.isatty():
             origin = f"http://127.0.0.1:{service.options.port}"
-            typer.echo(f"open {origin}{'/enter?code=' + service.entry_code()}", err=True)
+            typer.echo(f"open {origin}/enter?code={service.entry_code()}", err=True)
+        else:  # what is written may be a log, which must not let anybody in
+            typer.echo("`reseau service link` prints an address that lets a browser in", err=True)
 
     run(options, lambda line: typer.echo(line, err=True), ready)
 
