@@ -74,13 +74,13 @@ def process(folder: Path, *arguments: str) -> Iterator[tuple[str, str, subproces
         end = time.monotonic() + 60
         while True:
             text = (folder / "serve.log").read_text()[begun:]
-            found = [line for line in text.splitlines() if line.startswith("open ")]
-            if found:
+            found = [line for line in text.splitlines() if line.endswith("(Ctrl-C ends)")]
+            if found and "reseau service link" in text:
                 break
             assert running.poll() is None, text
             assert time.monotonic() < end, text
             time.sleep(0.02)
-        address = found[0].removeprefix("open ").partition("/enter")[0]
+        address = found[0].partition("/  (")[0]
         token = folder / "archive-service" / "local-token"
         yield address, token.read_text().strip(), running
     finally:

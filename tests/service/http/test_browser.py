@@ -60,12 +60,17 @@ class Place:
         def opened() -> str:
             assert self.running is not None
             assert self.running.poll() is None
-            lines = (self.folder / "serve.log").read_text()[before:].splitlines()
-            return next((line[5:] for line in lines if line.startswith("open ")), "")
+            text = (self.folder / "serve.log").read_text()[before:]
+            ready = "reseau service link" in text
+            return next((line for line in text.splitlines() if line.endswith("(Ctrl-C ends)") and ready), "")
 
-        entry: str = until(opened)
-        self.port = int(entry.partition("/enter")[0].rpartition(":")[2])
-        return entry
+        address: str = until(opened)
+        self.port = int(address.partition("/  (")[0].rpartition(":")[2])
+        link = [*command[:3], "service", "link", "--port", str(self.port)]
+        done = subprocess.run(
+            link, cwd=self.folder, env=self.environment, capture_output=True, text=True, check=True
+        )
+        return done.stdout.strip()
 
     def kill(self) -> None:
         assert self.running is not None
