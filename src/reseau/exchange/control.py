@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from ..bundle import ControlPoints
 from ..core.errors import FormatError
 from ..io import read_text
 
-__all__ = ["number_of", "read_control", "table_rows"]
+__all__ = ["full_rows", "number_of", "read_control", "table_rows"]
 
 _COLUMNS = ["id", "x", "y", "z", "sx", "sy", "sz"]
 
@@ -58,10 +59,7 @@ def read_control(path: Path | str) -> ControlPoints:
             "is not a table of control points", where=path, do="start with the header id,x,y,z[,sx,sy,sz]"
         )
     names, rows = list[str](), list[list[float]]()
-    for number, line in lines:
-        where = f"{path}, line {number}"
-        if len(line) != len(header):
-            raise FormatError(f"has {len(line)} fields, not {len(header)}", where=where)
+    for where, line in full_rows(lines, header, path):
         name = line[0].strip()
         if name in names:
             raise FormatError(f"point {name} appears twice", where=where)
@@ -76,6 +74,23 @@ def read_control(path: Path | str) -> ControlPoints:
         name = names[int(np.flatnonzero((sigma < 0).any(axis=1))[0])]
         raise FormatError(f"the sigma of point {name} is negative", where=path)
     return ControlPoints(tuple(names), values[:, :3], sigma)
+
+
+def full_rows(
+    lines: list[tuple[int, list[str]]], header: list[str], path: Path
+) -> Iterator[tuple[str, list[str]]]:
+    """Rows of a table with their places; each must have as many fields as the header.
+
+    Raises
+    ------
+    FormatError
+        When one has not.
+    """
+    for number, line in lines:
+        where = f"{path}, line {number}"
+        if len(line) != len(header):
+            raise FormatError(f"has {len(line)} fields, not {len(header)}", where=where)
+        yield where, line
 
 
 def table_rows(text: str) -> list[tuple[int, list[str]]]:

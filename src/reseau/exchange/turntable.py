@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from ..core.errors import FormatError
 from ..io import read_text
 from ..io.network import TurntableEntry
-from .control import number_of, table_rows
+from .control import full_rows, number_of, table_rows
 
 __all__ = ["read_turntable"]
 
@@ -54,10 +54,7 @@ def read_turntable(path: Path | str) -> TurntableEntry:
             do="start with the header image,angle_deg[,sigma_deg][,pose]",
         )  # fmt: skip
     columns: dict[str, list[str | float | None]] = {name: [] for name in header}
-    for line_number, line in lines[1:]:
-        where = f"{path}, line {line_number}"
-        if len(line) != len(header):
-            raise FormatError(f"has {len(line)} fields, not {len(header)}", where=where)
+    for where, line in full_rows(lines[1:], header, path):
         for name, word in zip(header, line, strict=True):
             if name in ("image", "pose"):
                 columns[name].append(word.strip())
