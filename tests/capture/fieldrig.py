@@ -16,7 +16,7 @@ import pytest
 from reseau.archive import Session
 from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry
 from reseau.core.data import Frame
-from reseau.core.errors import StateError
+from reseau.core.errors import ConnectionLost, StateError
 from reseau.designs import coded_testfield
 from reseau.instruments import AxisState, BScan, Deadline, Device, Identity, Settings, Status, quantity
 from reseau.io import TestfieldDesign
@@ -66,9 +66,14 @@ class Taken:
 
 
 class _Simple(Device[Any]):
-    """An instrument that is always connected."""
+    """An instrument that is always connected, unless it is silent."""
 
-    def _open(self, deadline: Deadline) -> None: ...
+    silent = False
+
+    def _open(self, deadline: Deadline) -> None:
+        if self.silent:
+            raise ConnectionLost("does not answer", do="is it switched on?")
+
     def _disconnect(self) -> None: ...
     def _push(self, settings: Any, deadline: Deadline) -> None: ...
     def _halt(self, deadline: Deadline) -> None: ...
@@ -111,7 +116,7 @@ class FieldTable(_Simple):
         super().__init__(name, Settings())
         self.stands = dict.fromkeys(axes, 0.0)
         self.moves: list[tuple[str, float]] = []
-        self.stops = 0
+        self.stops, self.lost = 0, set[str]()
         self.before: Callable[[str, float], None] = lambda axis, position: None
 
     @property
@@ -119,6 +124,7 @@ class FieldTable(_Simple):
         return {key: Axis(self, key) for key in self.stands}
 
     def home(self, axis: str, seconds: float | None = None) -> AxisState:
+        self.lost.discard(axis)
         return self.move(axis, 0.0)
 
     def move(self, axis: str, position: float, seconds: float | None = None) -> AxisState:
@@ -130,7 +136,7 @@ class FieldTable(_Simple):
         return self.state(axis)
 
     def state(self, axis: str, seconds: float | None = None) -> AxisState:
-        return AxisState(self.stands[axis], False, True)
+        return AxisState(self.stands[axis], False, axis not in self.lost)
 
     def _halt(self, deadline: Deadline) -> None:
         self.stops += 1
@@ -152,6 +158,9 @@ class FieldCamera(_Simple):
         frame = self.field.record(Station(*(self.table.stands[axis] for axis in self.table.stands)))
         pixels = self.spoil(self.exposures, frame.pixels)
         return Taken(Frame(pixels, 255.0), self.exposures, datetime.now(UTC), self.settings.exposure_us)
+
+    def _push(self, settings: Any, deadline: Deadline) -> None:
+        self._settings = settings
 
     def frames(self, count: int, seconds: float | None = None) -> Iterator[Taken]:
         return (self.expose(seconds) for _ in range(count))

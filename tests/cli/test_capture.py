@@ -326,7 +326,9 @@ def test_sections_come_from_the_named_scanner_also_after_resume(
         BENCH + "".join(f'[instruments.{n}]\ndriver = "{n}"\naddress = "sim-{n}"\n' for n in names)
     )
     assert capture("scan") == 2
-    assert "bench: has several of UltrasonicScanner: near, far; name one" in capsys.readouterr().err
+    assert (
+        "bench: has several of UltrasonicScanner: near, far; give `--scanner NAME`" in capsys.readouterr().err
+    )
     assert capture("scan", "--scanner", "far", "--count", "2", "--name", "a") == 0
     out = capsys.readouterr().out
     assert out == "session a\n1/2 section 000: scan\n2/2 section 001: scan\na: done, 2 scans in archive\n"

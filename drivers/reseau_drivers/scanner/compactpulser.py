@@ -121,6 +121,12 @@ class CompactPulser(Device[CompactPulserSettings]):
         self._answer_s = answer_s
         self._readable, self._scanning = "G", False
 
+    @property
+    def uses(self) -> tuple[str, ...]:
+        """Names of digitiser and carrier, if there are any."""
+        others = (self._digitiser, self._carrier)
+        return tuple(each if isinstance(each, str) else each.name for each in others if each is not None)
+
     def combine(self, instruments: Mapping[str, Instrument]) -> None:
         """Look up the digitiser and the carrier by name among the instruments of the bench.
 

@@ -1,15 +1,17 @@
 """Acquisitions on a bench: instruments, plans, and the engine that carries plans out into an archive."""
 
+from . import by_hand
 from .acquisition import Acquisition, Plan, Procedure, Watch
-from .bench import Bench, BenchFile, Checked, InstrumentEntry, drivers, found_instruments, plugin
-from .checks import Limits, Readiness, edge_sigma, exposure_fault, readiness, shift_between
+from .bench import ROLES, Bench, BenchFile, Checked, InstrumentEntry, drivers, found_instruments, plugin
+from .checks import Limits, Readiness, edge_sigma, exposure_fault, exposure_of, readiness, shift_between
 from .engine import Control, Decision, Rerun, carry_out, rerun
-from .lock import BenchLock
+from .lock import BenchLock, Holder
 from .plans import Goal, SensorSeriesPlan
 from .steps import HEIGHT, Step, at_heights, paper_steps, read_steps, spread
 
 __all__ = [
     "HEIGHT",
+    "ROLES",
     "Acquisition",
     "Bench",
     "BenchFile",
@@ -18,6 +20,7 @@ __all__ = [
     "Control",
     "Decision",
     "Goal",
+    "Holder",
     "InstrumentEntry",
     "Limits",
     "Plan",
@@ -28,10 +31,12 @@ __all__ = [
     "Step",
     "Watch",
     "at_heights",
+    "by_hand",
     "carry_out",
     "drivers",
     "edge_sigma",
     "exposure_fault",
+    "exposure_of",
     "found_instruments",
     "paper_steps",
     "plugin",

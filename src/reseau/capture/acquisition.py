@@ -32,7 +32,8 @@ from ..core.errors import (
     UsageError,
 )
 from ..instruments import Camera, Exposure, Oscilloscope, Turntable, UltrasonicScanner
-from .bench import Bench
+from . import by_hand
+from .bench import ROLES, Bench
 from .checks import Limits, Readiness, exposure_fault, readiness
 from .steps import Step, as_taken
 
@@ -171,22 +172,21 @@ class Acquisition:
         operator: Callable[[str], None] | None = None,
     ) -> None:
         self.bench, self.session, self.procedure = bench, session, procedure
-        self._chosen: dict[type, str | None] = {
-            Camera: camera,
-            Turntable: table,
-            Oscilloscope: oscilloscope,
-            UltrasonicScanner: scanner,
-        }
+        names = {"camera": camera, "table": table, "oscilloscope": oscilloscope, "scanner": scanner}
+        self._chosen: dict[type, str | None] = {ROLES[role]: name for role, name in names.items()}
         self.retakes, self.limits, self.watch, self._operator = retakes, limits or Limits(), watch, operator
         self._busy = threading.Lock()
         self._verdicts: dict[int, Verdict] = {}
         self._last: ArchivedFrame | None = None
         self._at_rest = False
+        self._silent: frozenset[str] = frozenset()
         self._original_us: float | None = None
 
     def one(self, kind: type) -> Any:
         """Return the instrument of a kind: the named one, or the only one. See :meth:`Bench.one`."""
-        return self.bench.one(kind, self._chosen.get(kind))
+        found = self.bench.one(kind, self._chosen.get(kind))
+        self._silent -= {found.name}  # a plan that uses it tries again
+        return found
 
     def has(self, kind: type) -> bool:
         """Return whether the bench has an instrument of a kind."""
@@ -371,18 +371,25 @@ class Acquisition:
 
         Raises
         ------
-        BenchError
-            If an instrument cannot be connected.
+        InstrumentError
+            If one cannot be connected that the bench requires.
         """
         self._at_rest = False
-        for instrument in self.bench.instruments.values():
-            self._persist(instrument.stage)
+        for name, instrument in self.bench.instruments.items():
+            if name in self.bench.required:
+                self._persist(instrument.stage)
+                continue
+            try:
+                instrument.stage()
+            except InstrumentError as error:
+                self._silent |= {name}
+                self.watch("without", {"instrument": name, "why": str(error)})
 
     def rest(self) -> None:
         """Stop all motion and transmission. Never raises, never moves an axis."""
         self._at_rest = True
         try:
-            self.bench.stop()
+            self.bench.part(set(self.bench.instruments) - self._silent).stop()
         except InstrumentError as error:
             self.watch("rest", {"failed": str(error)})
 
@@ -443,16 +450,8 @@ class Acquisition:
         InstrumentError
             If an axis does not arrive.
         """
-        axes = self.one(Turntable).axes
-
-        def move() -> None:
-            statuses = [axes[axis].set(value) for axis, value in position.items()]
-            failures = [status.exception(None) for status in statuses]
-            for failure in failures:
-                if failure is not None:
-                    raise failure
-
-        self._persist(move)
+        table: Turntable = self.one(Turntable)
+        self._persist(lambda: by_hand.move(table, position))
 
     def home_axes(self) -> None:
         """Find the reference of each axis that has none, one axis after the other."""
@@ -518,10 +517,12 @@ class Acquisition:
                 self.watch("rest", {"failed": str(error)})
 
     def _position(self) -> dict[str, float]:
-        """Positions of the axes of the table."""
+        """Positions of the axes of the table; without a table that answers, none."""
         if not self.has(Turntable):
             return {}
-        table: Turntable = self.one(Turntable)
+        table: Turntable = self.bench.one(Turntable, self._chosen[Turntable])
+        if table.name in self._silent:
+            return {}
         return self._persist(lambda: {axis: round(table.state(axis).position, 6) for axis in table.axes})
 
     def _judged(self, frame: ArchivedFrame, step: Step) -> Verdict:

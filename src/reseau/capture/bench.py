@@ -15,10 +15,12 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -27,12 +29,21 @@ from typing import Any, ClassVar, Protocol, Self, TypeVar, runtime_checkable
 from pydantic import Field
 
 from ..core.errors import BenchError, FormatError, ReseauError, SettingError, UsageError
-from ..instruments import Identity, Instrument
+from ..instruments import Camera, Identity, Instrument, Oscilloscope, Turntable, UltrasonicScanner
 from ..io import Document, Strict, read_text
 from ..io.refraction import RefractionEntry
 from .lock import BenchLock
 
-__all__ = ["Bench", "BenchFile", "Checked", "InstrumentEntry", "drivers", "found_instruments", "plugin"]
+__all__ = [
+    "ROLES",
+    "Bench",
+    "BenchFile",
+    "Checked",
+    "InstrumentEntry",
+    "drivers",
+    "found_instruments",
+    "plugin",
+]
 
 T = TypeVar("T")
 
@@ -41,9 +52,21 @@ T = TypeVar("T")
 class _Combined(Protocol):
     """An instrument that uses others of its bench."""
 
+    @property
+    def uses(self) -> tuple[str, ...]:
+        """Names of the other instruments."""
+
     def combine(self, instruments: Mapping[str, Instrument]) -> None:
         """Find the other instruments by the names in its options."""
 
+
+ROLES: Mapping[str, type] = {
+    "camera": Camera,
+    "table": Turntable,
+    "oscilloscope": Oscilloscope,
+    "scanner": UltrasonicScanner,
+}
+"""What instruments are for a session, by the name of the option that chooses one."""
 
 INSTRUMENTS, DISCOVERY, SIMULATORS = "reseau.instruments", "reseau.discovery", "reseau.simulators"
 """Groups of entry points: drivers; functions that list addresses; simulated benches."""
@@ -219,6 +242,8 @@ class Checked:
 class Bench:
     """Instruments by name, connected and stopped together.
 
+    All of them must answer; of a :meth:`part` only those that it requires.
+
     Parameters
     ----------
     file : BenchFile
@@ -258,6 +283,7 @@ class Bench:
         if failures:
             raise BenchError(failures)
         self.instruments: Mapping[str, Instrument] = made
+        self.required = frozenset(made)
 
     @classmethod
     def read(cls, path: Path | str) -> Self:
@@ -269,6 +295,41 @@ class Bench:
             known = ", ".join(self.instruments)
             raise UsageError("is not on this bench", where=name, do=f"its instruments: {known or 'none'}")
         return self.instruments[name]
+
+    def part(self, names: Iterable[str], required: Iterable[str] | None = None) -> Self:
+        """Return the bench with some of its instruments, and those that they use.
+
+        Parameters
+        ----------
+        names : iterable of str
+            Instruments that the part consists of.
+        required : iterable of str, optional
+            Those that must answer when the part is connected. Default: all.
+
+        Raises
+        ------
+        UsageError
+            If there is no such instrument.
+
+        Examples
+        --------
+        >>> entry = InstrumentEntry(driver="ping360", address="tcp://127.0.0.1:9092")
+        >>> bench = Bench(BenchFile(name="tank", instruments={"left": entry, "right": entry}))
+        >>> list(bench.part(["right"]).instruments)
+        ['right']
+        """
+        wanted, left = dict[str, Instrument](), list(names)
+        while left:
+            name = left.pop()
+            if name not in wanted:
+                wanted[name] = found = self[name]
+                left += found.uses if isinstance(found, _Combined) else ()
+        part = copy.copy(self)
+        part.instruments = {name: each for name, each in self.instruments.items() if name in wanted}
+        entries = {name: each for name, each in self.file.instruments.items() if name in wanted}
+        part.file = self.file.model_copy(update={"instruments": entries})
+        part.required = frozenset(wanted if required is None else required)
+        return part
 
     def one(self, kind: type, name: str | None = None) -> Any:
         """Return the instrument of a kind: the named one, or the only one.
@@ -287,7 +348,8 @@ class Bench:
         if len(found) != 1:
             if not found:
                 raise UsageError(f"has no {kind.__name__}", where="bench")
-            raise UsageError(f"has several of {kind.__name__}: {names}", where="bench", do="name one")
+            option = next((f"`--{role} NAME`" for role, each in ROLES.items() if each is kind), "a name")
+            raise UsageError(f"has several of {kind.__name__}: {names}", where="bench", do=f"give {option}")
         return next(iter(found.values()))
 
     def has(self, kind: type) -> bool:
@@ -295,30 +357,49 @@ class Bench:
         return any(isinstance(each, kind) for each in self.instruments.values())
 
     def connect(self, seconds: float | None = None) -> dict[str, Identity]:
-        """Connect all instruments at the same time.
+        """Connect all instruments at the same time; return the identities of those that answer.
 
         Raises
         ------
         BenchError
-            If an instrument cannot be connected; names all such instruments, and closes the others.
+            If a required instrument cannot be connected; names all such instruments, and closes the others.
         """
         outcomes = self._all(lambda instrument: instrument.connect(seconds))
-        failures = [each for each in outcomes.values() if isinstance(each, ReseauError)]
+        failures = [
+            each for name, each in outcomes.items() if name in self.required and isinstance(each, ReseauError)
+        ]
         if failures:
             self.close()
             raise BenchError(failures)
         return {name: each for name, each in outcomes.items() if isinstance(each, Identity)}
 
-    def check(self, seconds: float | None = None) -> list[Checked]:
-        """Run the self-test of all instruments at the same time; failures are among the results."""
-        outcomes = self._all(lambda instrument: instrument.check(seconds))
-        checked = []
+    def check(self, seconds: float | None = None, owner: str = "") -> list[Checked]:
+        """Run the self-test of all instruments at the same time; failures are among the results.
+
+        Parameters
+        ----------
+        seconds : float, optional
+            Time limit for each instrument (s).
+        owner : str
+            With it, each instrument is locked for its test; one that another process uses is not tested, and
+            the result says who uses it.
+        """
+
+        def checked(instrument: Instrument) -> dict[str, str]:
+            entry = self.file.instruments[instrument.name]
+            own = owner and entry.address != IN_PROCESS
+            with BenchLock([entry.address], owner) if own else nullcontext():
+                return instrument.check(seconds)
+
+        outcomes = self._all(checked)
+        found = []
         for name, entry in self.file.instruments.items():
             outcome = outcomes[name]
-            error = outcome if isinstance(outcome, ReseauError) else None
-            found = {} if isinstance(outcome, ReseauError) else outcome
-            checked.append(Checked(name, entry.driver, entry.address, found, error))
-        return checked
+            if isinstance(outcome, ReseauError):
+                found.append(Checked(name, entry.driver, entry.address, {}, outcome))
+            else:
+                found.append(Checked(name, entry.driver, entry.address, outcome))
+        return found
 
     def stop(self) -> None:
         """Stop all instruments.

@@ -13,7 +13,7 @@ import scipy.ndimage
 from ..core.data import Array, Frame
 from ..core.errors import UsageError
 
-__all__ = ["Limits", "Readiness", "edge_sigma", "exposure_fault", "readiness", "shift_between"]
+__all__ = ["Limits", "Readiness", "edge_sigma", "exposure_fault", "exposure_of", "readiness", "shift_between"]
 
 
 _SMOOTH = 1.5
@@ -101,7 +101,7 @@ def exposure_fault(frame: Frame, limits: Limits | None = None) -> str:
     '100 % of the pixels are saturated: expose less'
     """
     limits = limits or Limits()
-    saturated, bright = _exposure(frame)
+    saturated, bright = exposure_of(frame)
     if saturated > limits.saturated:
         return f"{_percent(saturated)} of the pixels are saturated: expose less"
     if bright < limits.darkest:
@@ -113,7 +113,14 @@ def _percent(share: float) -> str:
     return f"{float(f'{100 * share:.2g}'):g} %"
 
 
-def _exposure(frame: Frame) -> tuple[float, float]:
+def exposure_of(frame: Frame) -> tuple[float, float]:
+    """Return the share of saturated pixels, and the grey value that a thousandth exceeds, of full scale.
+
+    Examples
+    --------
+    >>> exposure_of(Frame(np.full((40, 50), 51, np.uint8), 255.0))
+    (0.0, 0.2)
+    """
     pixels = frame.pixels
     bright = np.partition(pixels.ravel(), -1 - pixels.size // 1000)[-1 - pixels.size // 1000]
     return float(np.mean(pixels >= frame.full_scale)), float(bright) / frame.full_scale
@@ -231,7 +238,7 @@ def readiness(frames: Sequence[Frame], limits: Limits | None = None) -> Readines
     if len(frames) < 2:
         raise UsageError("at least two frames are needed", where="checks")
     limits = limits or Limits()
-    saturated, bright = _exposure(frames[0])
+    saturated, bright = exposure_of(frames[0])
     edge = edge_sigma(frames[0])
     steps = [shift_between(one, two) for one, two in itertools.pairwise(frames)]
     moved = np.array([step for step, _ in steps])

@@ -10,13 +10,42 @@ import os
 import tempfile
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Self
 
 from ..core.errors import StateError
 
-__all__ = ["BenchLock"]
+__all__ = ["BenchLock", "Holder"]
+
+
+@dataclass(frozen=True)
+class Holder:
+    """Process that uses an instrument.
+
+    Parameters
+    ----------
+    owner : str
+        What it uses it for.
+    pid : int
+        Number of the process; 0 if it has not said so.
+    user, since : str
+        Its user, and the time at which it began (UTC).
+
+    Examples
+    --------
+    >>> print(Holder("session monday", 4711, "anna", "2026-11-02T08:00:00+00:00"))
+    session monday (process 4711 of anna since 2026-11-02T08:00:00+00:00)
+    """
+
+    owner: str
+    pid: int
+    user: str
+    since: str
+
+    def __str__(self) -> str:
+        return f"{self.owner} (process {self.pid} of {self.user} since {self.since})"
 
 
 class BenchLock:
@@ -72,6 +101,27 @@ class BenchLock:
             raise
         return self
 
+    @classmethod
+    def holder(cls, address: str, folder: Path | None = None) -> Holder | None:
+        """Return who uses the instrument at an address; None if nobody does.
+
+        Raises
+        ------
+        StateError
+            If the lock files cannot be read.
+
+        Examples
+        --------
+        >>> with tempfile.TemporaryDirectory() as folder, BenchLock(["sim-a"], "a test", Path(folder)):
+        ...     BenchLock.holder("sim-a", Path(folder)).owner, BenchLock.holder("sim-b", Path(folder))
+        ('a test', None)
+        """
+        try:
+            with cls([address], "a question", folder):
+                return None
+        except _InUse as error:
+            return error.holder
+
     def _take(self, address: str) -> None:
         # A device is the same under all its names.
         real = os.path.realpath(address) if address.startswith("/") else address
@@ -79,17 +129,12 @@ class BenchLock:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            with handle, suppress(ValueError):
-                owner = json.load(handle)
-                who = f"{owner['owner']} (process {owner['pid']} of {owner['user']} since {owner['since']})"
-                what, do = f"is in use by {who}", "wait, or stop that process"
-                raise StateError(what, where=address, do=do) from None
-            raise StateError("is in use by another process", where=address, do="wait") from None
+            with handle:
+                raise _InUse(address, _read(handle)) from None
         self._held.append(handle)
         handle.truncate(0)
         since = datetime.now(UTC).isoformat(timespec="seconds")
-        owner = {"owner": self._owner, "pid": os.getpid(), "user": _user(), "since": since}
-        json.dump(owner, handle)
+        json.dump(asdict(Holder(self._owner, os.getpid(), _user(), since)), handle)
         handle.flush()
 
     def __exit__(self, *_: object) -> None:
@@ -98,6 +143,25 @@ class BenchLock:
             with suppress(OSError):
                 handle.truncate(0)
             handle.close()
+
+
+class _InUse(StateError):
+    """An instrument is used by another process."""
+
+    def __init__(self, address: str, holder: Holder) -> None:
+        self.holder = holder
+        if holder.pid:
+            super().__init__(f"is in use by {holder}", where=address, do="wait, or stop that process")
+        else:
+            super().__init__("is in use by another process", where=address, do="wait")
+
+
+def _read(handle: IO[str]) -> Holder:
+    """The holder that a lock file names; one without a number if the file has just been emptied."""
+    try:
+        return Holder(**json.load(handle))
+    except (ValueError, TypeError):
+        return Holder("another process", 0, "", "")
 
 
 def _shared_file(path: Path) -> IO[str]:

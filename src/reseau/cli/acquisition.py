@@ -81,6 +81,9 @@ class Where:
         bool,
         typer.Option("--resume", help="Resume a session that is not complete, with its original options."),
     ] = False
+    home: Annotated[
+        bool, typer.Option("--home", help="First home axes without a reference. The axes move.")
+    ] = False
     plan: Annotated[
         Path | None,
         typer.Option("--plan", is_eager=True, callback=_from_toml, help="TOML file with values of options."),
@@ -171,23 +174,27 @@ def conduct(
 
     with open_archive(where.archive, where.objects, create=not where.resume) as archive:
         start = _resumed if where.resume else _new
-        name, bench, begin = start(archive, where, plan, parameters, inputs or {})
+        name, given, bench, begin = start(archive, where, plan, parameters, inputs or {})
+        if where.home:
+            given = given.model_copy(update={"home": True})
+        bench = given.part_of(bench)
         with sessions.lock(bench, archive, name), bench:
+            if not given.home:
+                given.check_homed(bench)
             session = begin()
-            given = sessions.parameters_of(session)
             with Display(where.as_json, given.expected, plan == "scan", given.units) as display:
                 facts = {"session": session.name, "archive": where.archive, "poses": given.expected}
                 display.watch("begin", facts)
                 why = sessions.capture(
                     session, bench, watch=display.watch, operator=display.aside(operator),
-                    paused=display.aside(_paused),
+                    paused=display.aside(_paused), home=where.home,
                 )  # fmt: skip
         _conclude(where, session, why)
         afterwards(session)
 
 
-_Started = tuple[str, "Bench", Callable[[], "Session"]]
-"""Name and bench of a session, and a function that begins or recovers it once the bench is locked."""
+_Started = tuple[str, "SessionParameters", "Bench", Callable[[], "Session"]]
+"""Name, parameters and bench of a session, and a function that begins or recovers it once all is checked."""
 
 
 def _new(
@@ -213,8 +220,8 @@ def _new(
     bench = Bench(BenchFile.parse_toml(text, where=path))
     name = where.name or f"{plan}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
     given = parameters(bench)
-    sessions.check(name, plan, given, texts, bench)
-    return name, bench, lambda: sessions.begin(archive, name, plan, given, texts, bench=text)
+    checked = sessions.check(name, plan, given, texts, bench)
+    return name, checked, bench, lambda: sessions.begin(archive, name, plan, given, texts, bench=text)
 
 
 def _resumed(archive: Archive, where: Where, plan: str, *_: object) -> _Started:
@@ -230,7 +237,7 @@ def _resumed(archive: Archive, where: Where, plan: str, *_: object) -> _Started:
         session.recover()
         return session
 
-    return session.name, bench, recovered
+    return session.name, sessions.parameters_of(session), bench, recovered
 
 
 def _conclude(where: Where, session: Session, why: str | None) -> None:

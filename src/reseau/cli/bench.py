@@ -8,13 +8,21 @@ from typing import Annotated, Any
 
 import typer
 
+from . import bench_by_hand as by_hand
+from .bench_by_hand import BenchPath
 from .common import AsJson, Out, say, writable
 
 __all__ = ["app"]
 
-app = typer.Typer(no_args_is_help=True, help="Find, check and simulate instruments.")
+app = typer.Typer(no_args_is_help=True, help="Find, check, simulate, and use instruments by hand.")
 
-BenchPath = Annotated[Path, typer.Option("--bench", "-b", help="Bench file.")]
+app.command()(by_hand.status)
+app.command()(by_hand.home)
+app.command()(by_hand.move)
+app.command()(by_hand.stop)
+app.command("set")(by_hand.set_)
+app.command()(by_hand.expose)
+app.command()(by_hand.watch)
 
 
 @app.command("list")
@@ -50,7 +58,7 @@ def check(
 
     found = Bench.read(bench)
     try:
-        checked = found.check(seconds)
+        checked = found.check(seconds, "reseau bench check")
     finally:
         found.close()
     failed = sum(each.error is not None for each in checked)

@@ -42,6 +42,9 @@ Poses = Annotated[
     typer.Option(help="CSV of poses, one column for each axis. Default: the 36 poses of the paper."),
 ]
 TableName = Annotated[str | None, typer.Option("--table", help="Turntable to use, if there are several.")]
+RecordedTable = Annotated[
+    str | None, typer.Option("--table", help="Turntable whose positions are recorded with each frame.")
+]
 ScannerName = Annotated[str | None, typer.Option("--scanner", help="Scanner to use, if there are several.")]
 ScopeName = Annotated[
     str | None, typer.Option("--oscilloscope", help="Oscilloscope to use, if there are several.")
@@ -77,9 +80,6 @@ def coded_field(
     average: Average = 1,
     checks: Checks = 3,
     retakes: Retakes = 2,
-    home: Annotated[
-        bool, typer.Option("--home", help="First home axes without a reference. The axes move.")
-    ] = False,
     park: Annotated[
         str, typer.Option(help="Final position of the table, as tilt=0,roll=0. Default: the last pose.")
     ] = "",
@@ -107,7 +107,7 @@ def coded_field(
             steps=tuple((step.name, dict(step.position)) for step in steps), until=until, first=first,
             pitch=pitch, free=tuple(each.strip() for each in free.split(",") if each.strip()),
             sigmas=(height_sigma, axis_sigma / 1e3, field_sigma) if lifted else None,
-            row_jitter=row_jitter, fill=fill, average=average, checks=checks, retakes=retakes, home=home,
+            row_jitter=row_jitter, fill=fill, average=average, checks=checks, retakes=retakes,
             park=final, retreat=away, camera=camera, table=table,
         )  # fmt: skip
 
@@ -137,9 +137,6 @@ def blurred(
     average: Average = 1,
     checks: Checks = 3,
     retakes: Retakes = 2,
-    home: Annotated[
-        bool, typer.Option("--home", help="First home axes without a reference. The axes move.")
-    ] = False,
     camera: CameraName = None,
     table: TableName = None,
 ) -> None:
@@ -153,7 +150,7 @@ def blurred(
             raise UsageError("is missing", where="--poses", do="give a CSV with the images of the network")
         return BlurredParameters(
             steps=tuple((step.name, dict(step.position)) for step in read_steps(poses)), psf=psf,
-            search=search, rounds=rounds, average=average, checks=checks, retakes=retakes, home=home,
+            search=search, rounds=rounds, average=average, checks=checks, retakes=retakes,
             camera=camera, table=table,
         )  # fmt: skip
 
@@ -204,10 +201,11 @@ def frames(
     checks: Checks = 0,
     retakes: Retakes = 0,
     camera: CameraName = None,
+    table: RecordedTable = None,
 ) -> None:
     """Take frames with a camera."""
     how: dict[str, Any] = {"count": count, "average": average, "checks": checks, "retakes": retakes}
-    how |= {"park": {}, "camera": camera}
+    how |= {"park": {}, "camera": camera} | ({} if table is None else {"table": table})
     conduct(where, "frames", lambda bench: how)
 
 

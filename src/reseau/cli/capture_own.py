@@ -25,6 +25,9 @@ def own(
     ] = None,
     retakes: Annotated[int, typer.Option(min=0, help="Number of additional attempts after a bad frame.")] = 0,
     camera: CameraName = None,
+    table: Annotated[
+        str | None, typer.Option("--table", help="Turntable to use, if there are several.")
+    ] = None,
 ) -> None:
     """Carry out your own plan: a Python generator, stored with the session."""
     values = dict(_value(text) for text in given or ())
@@ -34,6 +37,7 @@ def own(
 
         own_plan(read_text(generator), generator, values)
     how = {"set": values, "retakes": retakes, "park": {}, "camera": camera}
+    how |= {} if table is None else {"table": table}
     conduct(where, "own", lambda bench: how, {"generator.py": generator})
 
 

@@ -130,6 +130,8 @@ class Display:
             return f"next pose {facts['step']}{tail}" if facts["step"] else "no pose is left"
         if kind == "check":
             return "checks: " + ("; ".join(facts["faults"]) or "passed")
+        if kind == "without":
+            return f"without {facts['instrument']}: {facts['why']}"
         if kind == "again":
             return f"retry: {facts['why']}"
         if kind == "rest" and "failed" in facts:

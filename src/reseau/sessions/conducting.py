@@ -7,7 +7,18 @@ from typing import Any
 
 from ..archive import Archive, Session
 from ..calibration.document import Calibration
-from ..capture import Acquisition, Bench, BenchLock, Control, Decision, Procedure, Rerun, Watch, carry_out
+from ..capture import (
+    Acquisition,
+    Bench,
+    BenchLock,
+    Control,
+    Decision,
+    Procedure,
+    Rerun,
+    Watch,
+    carry_out,
+    plans,
+)
 from ..capture import rerun as rerun_with
 from ..core.errors import UsageError
 from .kinds import GENERATOR, Reported, kind_of, own_plan
@@ -225,8 +236,11 @@ def capture(
     operator: Callable[[str], None] | None = None,
     paused: Callable[[], Decision] = lambda: "stop",
     control: Control | None = None,
+    home: bool = False,
 ) -> Any:
     """Carry out a session, new or resumed, with the plan and the procedure of its kind.
+
+    Only the instruments that the plan uses are connected, stopped and recorded.
 
     Parameters
     ----------
@@ -238,6 +252,8 @@ def capture(
         As for :class:`reseau.capture.Acquisition`.
     paused, control
         As for :func:`reseau.capture.carry_out`.
+    home : bool
+        Whether axes without a reference are homed first, also if the parameters do not say so.
 
     Returns
     -------
@@ -260,14 +276,18 @@ def capture(
     'ready'
     """
     kind, given = kind_of(session.plan), parameters_of(session)
+    if home:
+        given = given.model_copy(update={"home": True})
     run = Acquisition(
-        bench, session, procedure_of(session), camera=given.camera, table=given.table,
+        given.part_of(bench), session, procedure_of(session), camera=given.camera, table=given.table,
         oscilloscope=given.oscilloscope, scanner=given.scanner, retakes=given.retakes, limits=kind.limits,
         watch=watch, operator=operator,
     )  # fmt: skip
+    plan = kind.acquire(run, given)
     return carry_out(
-        run, kind.acquire(run, given), park=given.park, retreat=given.retreat, paused=paused, control=control
-    )
+        run, plans.homed(run, plan) if given.home else plan, park=given.park, retreat=given.retreat,
+        paused=paused, control=control,
+    )  # fmt: skip
 
 
 def rerun(session: Session) -> list[Rerun]:

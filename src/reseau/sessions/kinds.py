@@ -213,11 +213,9 @@ def _oscilloscope_procedure(session: Session, given: OscilloscopeParameters) -> 
 def _testfield(run: Acquisition, given: TestfieldParameters) -> Plan:
     poses = given.poses()
     if given.goal is None:
-        plan = plans.poses(run, poses, given.average, given.checks)
-    else:
-        first = spread(poses, given.first)
-        plan = plans.until(run, given.goal, first, poses, given.average, given.checks)
-    return plans.homed(run, plan) if given.home else plan
+        return plans.poses(run, poses, given.average, given.checks)
+    first = spread(poses, given.first)
+    return plans.until(run, given.goal, first, poses, given.average, given.checks)
 
 
 def _testfield_procedure(
@@ -279,8 +277,7 @@ def _photographs_results(procedure: TestfieldProcedure, session: Session) -> dic
 
 
 def _blurred(run: Acquisition, given: BlurredParameters) -> Plan:
-    plan = plans.poses(run, given.poses(), given.average, given.checks)
-    return plans.homed(run, plan) if given.home else plan
+    return plans.poses(run, given.poses(), given.average, given.checks)
 
 
 def _read_blurred(text: str, name: str) -> object:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
-from ..capture import HEIGHT, Bench, Goal, SensorSeriesPlan, Step
-from ..core.errors import FormatError, UsageError
-from ..instruments import Camera, Oscilloscope, Turntable, UltrasonicScanner
+from ..capture import HEIGHT, ROLES, Bench, Goal, SensorSeriesPlan, Step
+from ..core.errors import FormatError, StateError, UsageError
+from ..instruments import Camera, Turntable
 from ..io import Document
 
 if TYPE_CHECKING:
@@ -33,13 +33,6 @@ __all__ = [
     "TestfieldParameters",
 ]
 
-_INSTRUMENTS: dict[str, type] = {
-    "camera": Camera,
-    "table": Turntable,
-    "oscilloscope": Oscilloscope,
-    "scanner": UltrasonicScanner,
-}
-
 
 class SessionParameters(Document):
     """Parameters that all plans share.
@@ -52,8 +45,11 @@ class SessionParameters(Document):
         Position of the table after a complete plan; empty: it stays at the last pose.
     retreat : dict of str to float, optional
         Position of the table after a stop or a failure.
+    home : bool
+        Whether axes without a reference are homed first.
     camera, table, oscilloscope, scanner : str, optional
-        Names of instruments on the bench. Default: the only one of its kind.
+        Names of instruments on the bench. Default: the only one of its kind, if the plan uses one. A table
+        that is named is recorded with every frame, also if the plan does not move it.
     seed : int, optional
         Seed of a simulated bench.
 
@@ -72,6 +68,7 @@ class SessionParameters(Document):
     retakes: NonNegativeInt = 2
     park: dict[str, float] = Field(default_factory=dict)
     retreat: dict[str, float] | None = None
+    home: bool = False
     camera: str | None = None
     table: str | None = None
     oscilloscope: str | None = None
@@ -107,19 +104,64 @@ class SessionParameters(Document):
         """Units of the standard deviations that the procedure reports, by parameter."""
         return {}
 
+    @property
+    def positions(self) -> tuple[Step, ...]:
+        """Positions to which the plan moves the table."""
+        given = (Step("park", self.park), Step("retreat", self.retreat or {}))
+        return tuple(step for step in given if step.position)
+
+    def part_of(self, bench: Bench) -> Bench:
+        """Return the part of a bench that the plan uses; its other instruments need not even answer.
+
+        Raises
+        ------
+        UsageError
+            If an instrument is missing, or there are several of its kind and none is named.
+        """
+        return bench.part(self._used(bench))
+
+    def _used(self, bench: Bench) -> list[str]:
+        """Names of the instruments that the plan uses."""
+        moves = self.home or bool(self.positions)
+        roles = [
+            role
+            for role, kind in ROLES.items()
+            if role in self.NEEDS
+            or getattr(self, role) is not None
+            or (role in self.USES and bench.has(kind))
+            or (role == "table" and moves)
+        ]
+        return [str(bench.one(ROLES[role], getattr(self, role)).name) for role in roles]
+
     def check_bench(self, bench: Bench) -> None:
-        """Check that a bench can carry out the plan, before anything moves.
+        """Check that a bench can carry out the plan, before it is connected.
 
         Raises
         ------
         UsageError
             If an instrument is missing, or a pose is out of its range.
         """
-        for key in self.NEEDS:
-            bench.one(_INSTRUMENTS[key], getattr(self, key))
-        for key in self.USES:
-            if getattr(self, key) is not None or bench.has(_INSTRUMENTS[key]):
-                bench.one(_INSTRUMENTS[key], getattr(self, key))
+        self._used(bench)
+        if self.positions:
+            check_poses(bench.one(Turntable, self.table), self.positions)
+
+    def check_homed(self, bench: Bench) -> None:
+        """Check on a connected bench that all axes that the plan moves have their reference.
+
+        Raises
+        ------
+        StateError
+            If one has none.
+        """
+        if not self.positions:
+            return
+        table: Turntable = bench.one(Turntable, self.table)
+        moved = dict.fromkeys(axis for step in self.positions for axis in step.position)
+        lost = [axis for axis in moved if not table.state(axis).homed]
+        if lost:
+            have = "have no reference" if len(lost) > 1 else "has no reference"
+            do = "give --home, or run `reseau bench home`"
+            raise StateError(f"{', '.join(lost)} {have}", where=table.name, do=do)
 
 
 class FramesParameters(SessionParameters):
@@ -200,6 +242,10 @@ class OwnParameters(SessionParameters):
     retakes: NonNegativeInt = 0
     set: dict[str, Any] = Field(default_factory=dict)
 
+    def part_of(self, bench: Bench) -> Bench:
+        """Return the bench with all its instruments, of which only the named ones must answer."""
+        return bench.part(bench.instruments, required=self._used(bench))
+
 
 class OscilloscopeParameters(SessionParameters):
     """Parameters of the plan `oscilloscope`: PHOTO I, II and III.
@@ -246,8 +292,6 @@ class BlurredParameters(SessionParameters):
         Ordinary coordinates; see :class:`reseau.procedures.blurred_network.NetworkOptions`.
     average, checks : int
         As for :class:`FramesParameters`.
-    home : bool
-        Whether axes without a reference are homed first.
 
     Examples
     --------
@@ -265,7 +309,6 @@ class BlurredParameters(SessionParameters):
     initial: Literal["given", "centroid", "edge"] = "centroid"
     average: PositiveInt = 1
     checks: NonNegativeInt = 0
-    home: bool = False
 
     @property
     def expected(self) -> int:
@@ -276,13 +319,10 @@ class BlurredParameters(SessionParameters):
         """Return the poses as steps."""
         return tuple(Step(name, position) for name, position in self.steps)
 
-    def check_bench(self, bench: Bench) -> None:
-        """Check instruments, and the range of all poses."""
-        super().check_bench(bench)
-        check_poses(
-            bench.one(Turntable, self.table),
-            (*self.poses(), Step("park", self.park), Step("retreat", self.retreat or {})),
-        )
+    @property
+    def positions(self) -> tuple[Step, ...]:
+        """Positions to which the plan moves the table."""
+        return (*self.poses(), *super().positions)
 
 
 def check_poses(table: Turntable, steps: Sequence[Step]) -> None:
@@ -331,8 +371,6 @@ class TestfieldParameters(SessionParameters):
         coordinates of the design (mm); None: each image has its own orientation.
     average, checks : int
         As for :class:`FramesParameters`.
-    home : bool
-        Whether axes without a reference are homed first.
 
     Examples
     --------
@@ -356,7 +394,6 @@ class TestfieldParameters(SessionParameters):
     sigmas: tuple[float, float, float] | None = None
     average: PositiveInt = 1
     checks: NonNegativeInt = 0
-    home: bool = False
 
     @property
     def expected(self) -> int | None:
@@ -392,13 +429,14 @@ class TestfieldParameters(SessionParameters):
         """Return whether the target is recorded at several heights."""
         return len({step.position.get(HEIGHT, 0.0) for step in steps}) > 1
 
+    @property
+    def positions(self) -> tuple[Step, ...]:
+        """Positions to which the plan moves the table."""
+        return (*self.poses(), *super().positions)
+
     def check_bench(self, bench: Bench) -> None:
         """Check instruments, the range of all poses, and that the goal is about an estimated parameter."""
         super().check_bench(bench)
-        check_poses(
-            bench.one(Turntable, self.table),
-            (*self.poses(), Step("park", self.park), Step("retreat", self.retreat or {})),
-        )
         self._check_goal()
 
     def _check_goal(self) -> None:
