@@ -14,9 +14,10 @@ from ..core.data import Frame
 from ..core.errors import ArchiveError, InputError
 from ..core.version import __version__
 from ..io import write_whole
+from ..io.scans import Scan
 from . import schema
 from .objects import Objects
-from .picture import frame_of, tiff_of
+from .picture import frame_of, scan_in, tiff_of
 from .records import ArchivedFrame, ArchivedResult, Verdict, utc, utc_now
 
 __all__ = ["INPUT", "Session"]
@@ -71,7 +72,7 @@ class Session:
     def store(
         self,
         step: str,
-        picture: Frame | bytes,
+        picture: Frame | Scan | bytes,
         *,
         kind: str = "frame",
         take: int = 0,
@@ -85,8 +86,8 @@ class Session:
         ----------
         step : str
             Pose or photograph it belongs to.
-        picture : Frame or bytes
-            A frame, or a file as sent by an instrument.
+        picture : Frame, Scan or bytes
+            A frame, a scan with its colours, or a file as sent by an instrument.
         kind : str
             Kind of picture.
         take : int
@@ -200,6 +201,16 @@ class Session:
             If it is lost, damaged, or not a frame.
         """
         return frame_of(self.objects.get(archived.sha256, archived.suffix), archived.name)[0]
+
+    def scan(self, archived: ArchivedFrame) -> Scan:
+        """Read a frame with its colours, checked against its SHA-256.
+
+        Raises
+        ------
+        ArchiveError
+            If it is lost, damaged, or not a frame.
+        """
+        return scan_in(self.objects.get(archived.sha256, archived.suffix), archived.name)
 
     def inputs(self) -> dict[str, ArchivedFrame]:
         """Return the input files of the session, by name."""

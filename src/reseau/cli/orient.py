@@ -133,7 +133,7 @@ def orient(
     summary = RollSummary.of(_outcomes(work, done)) if len(work) > 1 else None
     if out is not None and summary is not None:
         summary.write(out / "summary.json")
-        write_whole(out / "summary.html", roll_page(summary, out / "provenance"))
+        write_whole(out / "summary.html", roll_page(summary, lambda name: _tile(out, name)))
     _report(work, done, found, summary, as_json)
     oriented = any(d.status != "declined" for item in done.values() for d in item.documents)
     return 0 if oriented and not any(item.failed for item in done.values()) else 1
@@ -330,9 +330,15 @@ def _again(work: list[_Job], done: dict[str, _Done], roll: Roll, jobs: int | Non
             done[job.name] = _run(replace(job, roll=roll), item)
 
 
-def _sheet(out: Path, done: dict[str, _Done], work: list[_Job]) -> None:
+def _tile(out: Path, stem: str) -> NDArray[np.uint8] | None:
+    """The picture of a frame, if it was written."""
     import cv2
 
+    tile: Any = cv2.imread(str(out / "provenance" / f"{stem}.png"))
+    return None if tile is None else tile[:, :, ::-1]
+
+
+def _sheet(out: Path, done: dict[str, _Done], work: list[_Job]) -> None:
     from ..report.frames import contact_sheet
 
     tiles: list[NDArray[np.uint8]] = []
@@ -340,9 +346,9 @@ def _sheet(out: Path, done: dict[str, _Done], work: list[_Job]) -> None:
         count = len(done[job.name].documents)
         for i in range(count):
             stem = job.name if count == 1 else f"{job.name}-{i + 1}"
-            tile: Any = cv2.imread(str(out / "provenance" / f"{stem}.png"))
+            tile = _tile(out, stem)
             if tile is not None:
-                tiles.append(tile[:, :, ::-1])
+                tiles.append(tile)
     contact_sheet(out / "overview.png", tiles)
 
 
@@ -357,17 +363,7 @@ def _outcomes(work: list[_Job], done: dict[str, _Done]) -> list[FrameOutcome]:
             rows.append(FrameOutcome(image=job.image.name, name=job.name, status="failed", why=item.failed))
         for i, d in enumerate(item.documents):
             name = job.name if len(item.documents) == 1 else f"{job.name}-{i + 1}"
-            largest = max((max(c.sx, c.sy) for c in (d.corners or {}).values()), default=None)
-            rows.append(
-                FrameOutcome(
-                    image=d.image,
-                    name=name,
-                    status=d.status,
-                    why=d.why,
-                    by_roll=bool(d.roll_frames),
-                    sigma_px=largest,
-                )
-            )
+            rows.append(FrameOutcome.of(d, name))
     return rows
 
 

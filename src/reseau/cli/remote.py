@@ -175,18 +175,34 @@ app.command("abort")(_steer("abort", "End the session of a bench at once; it can
 @app.command()
 def upload(
     name: Annotated[str, typer.Argument(help="Name of the session.")],
-    photographs: Annotated[list[Path], typer.Argument(help="Photographs of the target.")],
-    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the target.")],
+    photographs: Annotated[list[Path], typer.Argument(help="Photographs of the target, or scans of film.")],
+    target: Annotated[str, typer.Option(help="camera, oscilloscope (PHOTO I, II, III) or film.")] = "camera",
+    design: Annotated[Path | None, typer.Option("--design", "-d", help="Design of the target.")] = None,
+    test_object: Annotated[Path | None, typer.Option("--object", help="Design of the test object.")] = None,
+    corners: Annotated[Path | None, typer.Option(help="Calibrated corners, for film.")] = None,
     model: Annotated[str, typer.Option(help="Camera model.")] = "",
     pitch: Annotated[float | None, typer.Option(min=1e-6, help="Pixel size, mm.")] = None,
     free: Annotated[str, typer.Option(help="Parameters to estimate, e.g. c,x0,y0,K1.")] = "",
+    frame: Annotated[str, typer.Option(help="Format of film in mm, as 36x24.")] = "",
+    dpi: Annotated[float | None, typer.Option(min=10, help="Resolution of scans of film.")] = None,
     server: Server = LOCAL,
     authority: Authority = None,
 ) -> None:
-    """Calibrate from photographs on the service, which archives them; exit status 1 if it fails."""
-    given: dict[str, Any] = {"model": model, "free": free} | ({} if pitch is None else {"pitch": str(pitch)})
+    """Calibrate from files on the service, which archives them; exit status 1 if it fails."""
+    given: dict[str, Any] = {
+        "target": target,
+        "model": model,
+        "free": free,
+        "film_format": frame,
+        "pitch": pitch,
+        "dpi": dpi,
+    }
+    inputs = {"test_object": test_object, "corners": corners}
     with _client(server, authority) as client:
-        found = client.upload(name, photographs, design, **given)
+        found = client.upload(
+            name, photographs, design, inputs={k: v for k, v in inputs.items() if v is not None},
+            **{k: v for k, v in given.items() if v not in (None, "")},
+        )  # fmt: skip
     say(f"{name}: {found['status']} {found['why']}".rstrip() + "\n")
     for each in found["rejected"]:
         say(f"rejected {each['step']}: {each['why']}\n")

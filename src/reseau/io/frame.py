@@ -229,6 +229,15 @@ class FrameOutcome(Strict):
     by_roll: bool = False
     sigma_px: float | None = None
 
+    @classmethod
+    def of(cls, found: FrameOrientation, name: str) -> Self:
+        """Create the outcome of a frame with an orientation, or of a declined one."""
+        largest = max((max(c.sx, c.sy) for c in (found.corners or {}).values()), default=None)
+        return cls(
+            image=found.image, name=name, status=found.status, why=found.why, by_roll=bool(found.roll_frames),
+            sigma_px=largest,
+        )  # fmt: skip
+
 
 class RollSummary(Document):
     """``reseau-roll/1``: what became of the frames of a roll.

@@ -33,7 +33,7 @@ from .photographs import decoded_heic, decoded_raw, is_heic, is_raw
 from .profiles import curve_of_file, curve_of_profile
 from .scans import CHANNELS, Scan, Window, full_scale_of, scan_of
 
-__all__ = ["MAX_PIXELS", "Channel", "open_scan", "read_image", "write_image"]
+__all__ = ["MAX_PIXELS", "Channel", "luma", "open_scan", "read_image", "write_image"]
 
 MAX_PIXELS = 500_000_000
 """The largest image that is read whole; its header is checked before a pixel is decoded."""
@@ -98,11 +98,18 @@ def read_image(path: Path | str, channel: Channel = "luma") -> Frame:
     elif channel != "luma":
         grey = np.array(pixels[:, :, scan.channels.index(channel)])
     else:
-        grey = _luma(pixels, scan.channels)
+        grey = luma(pixels, scan.channels)
     return Frame(grey, scan.full_scale, scan.name, digest, scan.notes, scan.curve)
 
 
-def _luma(pixels: NDArray[Any], channels: tuple[str, ...]) -> NDArray[Any]:
+def luma(pixels: NDArray[Any], channels: tuple[str, ...]) -> NDArray[Any]:
+    """Return the grey values (h, w) of colours (h, w, 3), with the weights of Rec. 601 and of their type.
+
+    Examples
+    --------
+    >>> luma(np.full((1, 2, 3), 200, dtype=np.uint8), CHANNELS[3])
+    array([[200, 200]], dtype=uint8)
+    """
     grey = np.zeros(pixels.shape[:2], dtype=np.float32)
     for name, weight in _LUMA.items():
         grey += np.float32(weight) * pixels[:, :, channels.index(name)]

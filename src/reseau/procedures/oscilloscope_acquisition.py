@@ -70,6 +70,11 @@ class OscilloscopeProcedure:
         self.second: PhotoII | None = None
         self.third: PhotoIII | None = None
 
+    @property
+    def provenance(self) -> Provenance:
+        """Inputs and parameters."""
+        return Provenance(self._inputs, self._options)
+
     def on_frame(self, frame: Frame, step: _Named) -> Verdict:
         """Correct a photograph; the name of its step says which one it is."""
         found = self._corrected(frame, step.name)
@@ -117,9 +122,8 @@ class OscilloscopeProcedure:
         if self.second is None:
             what = "PHOTO I" if self.first is None else "PHOTO II"
             raise EstimationError("could not be corrected", where=what, do="see the verdicts on its frames")
-        provenance = Provenance(self._inputs, self._options)
         calibration = self.second.instrument.calibration(
-            self.reseau, self.test_object, name=self.name, provenance=provenance.to_dict(), times={}
+            self.reseau, self.test_object, name=self.name, provenance=self.provenance.to_dict(), times={}
         )
         made = {"calibration.json": calibration.to_json()}
         if self.third is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mmap
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -190,24 +190,23 @@ def contact_sheet(path: Path, tiles: Sequence[NDArray[np.uint8]]) -> None:
     write_image(path, sheet)
 
 
-def roll_page(summary: RollSummary, pictures: Path) -> str:
+def roll_page(summary: RollSummary, picture_of: Callable[[str], NDArray[np.uint8] | None]) -> str:
     """Return an HTML page of a roll: numbers, and each frame with its picture and why it was declined.
 
     Parameters
     ----------
     summary : RollSummary
         What became of the frames.
-    pictures : Path
-        Folder with a PNG of each frame; a missing one is left out.
+    picture_of : callable
+        Returns the picture of the frame of a name, see :func:`frame_tile`; None: it is left out.
     """
     rows = []
     for frame in summary.frames:
-        path, shown = pictures / f"{frame.name}.png", ""
-        picture = cv2.imread(str(path)) if path.is_file() else None
+        picture, shown = picture_of(frame.name), ""
         if picture is not None:
             # The whole frame beside its corners; half the size is enough on a page of a roll, which names it.
             small = cv2.resize(picture[_LABEL:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-            coded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+            coded = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
             shown = b64encode(coded).decode()
         # A reason begins with the file, of which the row has the name.
         rows.append({"frame": frame, "why": frame.why.split(f"{frame.image}: ")[-1], "picture": shown})

@@ -162,7 +162,14 @@ class Client:
         return float(self.post(f"/benches/{quote(bench, safe='')}/stop")["ms"])
 
     def upload(
-        self, name: str, photographs: Sequence[Path], design: Path, *, wait: bool = True, **given: Any
+        self,
+        name: str,
+        photographs: Sequence[Path],
+        design: Path | None = None,
+        *,
+        inputs: Mapping[str, Path] | None = None,
+        wait: bool = True,
+        **given: Any,
     ) -> dict[str, Any]:
         """Calibrate from photographs.
 
@@ -172,12 +179,14 @@ class Client:
             Name of the session.
         photographs : sequence of Path
             Files.
-        design : Path
-            Design of the target.
+        design : Path, optional
+            Design of the target; film needs none.
+        inputs : mapping of str to Path, optional
+            Other files: `test_object`, `corners`.
         wait : bool
             Whether to wait for the calibration.
         **given
-            `model`, `pitch`, `free`, `target`.
+            `target`, `model`, `pitch`, `free`, `film_format`, `dpi`.
 
         Returns
         -------
@@ -191,7 +200,8 @@ class Client:
         """
         try:
             files = [("photographs", (path.name, path.read_bytes())) for path in photographs]
-            files.append(("design", (design.name, design.read_bytes())))
+            for role, path in {**({} if design is None else {"design": design}), **(inputs or {})}.items():
+                files.append((role, (path.name, path.read_bytes())))
         except OSError as error:
             raise InputError(f"cannot be read ({error.strerror})", where=error.filename) from None
         made = self._sent("POST", "/uploads", files=files, data={"name": name, **given}).json()

@@ -18,7 +18,7 @@ from ..archive import Archive, ArchivedFrame, Session, Verdict
 from ..capture.steps import Step, as_taken
 from ..core.errors import ImageError, ReseauError
 from ..core.threads import one_thread
-from .decoding import PHOTOGRAPH, decode
+from .decoding import PHOTOGRAPH, Decoder
 
 __all__ = ["finish", "rerun"]
 
@@ -44,9 +44,9 @@ def finish(session: Session) -> str:
     try:
         procedure = sessions.procedure_of(session)
         assert procedure is not None
-        with one_thread():
+        with one_thread(), Decoder() as decoder:
             for original in session.frames(kind=PHOTOGRAPH):
-                frame = session.find(original.step) or _decoded(session, original)
+                frame = session.find(original.step) or _decoded(session, original, decoder)
                 if frame is None:
                     continue
                 try:
@@ -60,6 +60,11 @@ def finish(session: Session) -> str:
             inputs |= {f.name: f.sha256 for f in session.frames(kind=PHOTOGRAPH)}
             for name, content in procedure.finish().items():
                 session.keep(name, content, session.parameters, inputs)
+            # What was found of a frame may depend on the others.
+            verdicts = getattr(getattr(procedure, "procedure", procedure), "verdicts", dict)
+            for step, verdict in verdicts().items():
+                if (judged := session.find(step)) is not None:
+                    session.judge(judged, verdict)
     except ReseauError as error:
         session.end("failed", str(error))
         return "failed"
@@ -67,13 +72,14 @@ def finish(session: Session) -> str:
     return "done"
 
 
-def _decoded(session: Session, original: ArchivedFrame) -> ArchivedFrame | None:
+def _decoded(session: Session, original: ArchivedFrame, decoder: Decoder) -> ArchivedFrame | None:
     """The frame of a photograph, stored; None, with a verdict on the photograph, if it cannot be decoded."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"photograph{original.suffix}"
         path.write_bytes(session.objects.get(original.sha256, original.suffix))
         try:
-            frame = decode(path, original.step)
+            colours = session.plan == "film"
+            frame = (decoder.scan if colours else decoder.frame)(path, original.step)
         except ImageError as error:
             session.judge(original, Verdict(False, error.what))
             return None

@@ -22,9 +22,10 @@ from .conducting import (
     rerun,
     resume,
 )
-from .kinds import KINDS, Reported, SessionKind, kind_of, own_plan
+from .kinds import CORNERS, KINDS, OF_FILES, Reported, SessionKind, kind_of, own_plan
 from .parameters import (
     BlurredParameters,
+    FilmParameters,
     FramesParameters,
     OscilloscopeParameters,
     OwnParameters,
@@ -36,8 +37,11 @@ from .parameters import (
 )
 
 __all__ = [
+    "CORNERS",
     "KINDS",
+    "OF_FILES",
     "BlurredParameters",
+    "FilmParameters",
     "FramesParameters",
     "OscilloscopeParameters",
     "OwnParameters",

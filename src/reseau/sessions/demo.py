@@ -224,8 +224,11 @@ def capture_oscilloscope(archive: Archive, seed: int, watch: Watch) -> Oscillosc
         inputs = {"reseau.json": world.design.to_json(), "object.json": world.test_object.to_json()}
         given = {"seed": seed, "check": list(world.check_marks())}
         session = begin(archive, "oscilloscope", "oscilloscope", given, inputs, bench=simulated.toml)
-        live: Any = procedure_of(session)
-        _carry_out(simulated, session, live, plans.oscilloscope, ("scanner", "oscilloscope", "camera"), watch)
+        reported: Any = procedure_of(session)
+        live = reported.procedure
+        _carry_out(
+            simulated, session, reported, plans.oscilloscope, ("scanner", "oscilloscope", "camera"), watch
+        )
         way = _way(simulated)
     frames = tuple(session.picture(f) for f in session.frames(kind="frame") if f.verdict and f.verdict.ok)
     if live.first is None or live.second is None or live.third is None:

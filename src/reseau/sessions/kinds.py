@@ -15,6 +15,7 @@ from ..core.failure import Failure
 from ..io import ReseauDesign, parse_design
 from .parameters import (
     BlurredParameters,
+    FilmParameters,
     FramesParameters,
     OscilloscopeParameters,
     OwnParameters,
@@ -27,13 +28,17 @@ from .parameters import (
 
 if TYPE_CHECKING:
     from ..io.refraction import RefractionEntry
+    from ..io.scans import Scan
     from ..procedures.blurred_session import BlurredProcedure
+    from ..procedures.film_roll import FilmRollProcedure
     from ..procedures.oscilloscope_acquisition import OscilloscopeProcedure
     from ..procedures.sensor import SensorProcedure
     from ..procedures.testfield import TestfieldProcedure
 
-__all__ = ["KINDS", "Reported", "SessionKind", "kind_of", "own_plan"]
+__all__ = ["CORNERS", "KINDS", "OF_FILES", "Reported", "SessionKind", "kind_of", "own_plan"]
 
+CORNERS = "corners.json"
+"""Optional input of a session of the plan `film`: calibrated corners of the camera."""
 GENERATOR = "generator.py"
 """Input of a session of the plan `own`: the Python file with the generator."""
 
@@ -210,6 +215,24 @@ def _oscilloscope_procedure(session: Session, given: OscilloscopeParameters) -> 
     )  # fmt: skip
 
 
+def _oscilloscope_results(procedure: OscilloscopeProcedure, session: Session) -> dict[str, str]:
+    from ..report.page import oscilloscope_report
+
+    results = procedure.finish()
+    assert procedure.first is not None  # otherwise there are no results
+    good = {
+        each.step: each for each in session.frames(kind="frame") if each.verdict is None or each.verdict.ok
+    }
+    photos = [good.get(f"PHOTO {number}") for number in ("I", "II", "III")]
+    report = oscilloscope_report(
+        procedure.first, procedure.reseau, procedure.second, procedure.test_object,
+        [] if procedure.third is None else [procedure.third],
+        frames=[None if each is None else session.picture(each) for each in photos],
+        title=f"Oscilloscope, session {session.name}", provenance=procedure.provenance,
+    )  # fmt: skip
+    return results | {"report.html": report}
+
+
 def _testfield(run: Acquisition, given: TestfieldParameters) -> Plan:
     poses = given.poses()
     if given.goal is None:
@@ -258,7 +281,7 @@ def _testfield_results(procedure: TestfieldProcedure, session: Session) -> dict[
     return results | {"report.html": report}
 
 
-def _photographs(run: Acquisition, given: PhotographsParameters) -> Plan:
+def _of_files(run: Acquisition, given: SessionParameters) -> Plan:
     raise UsageError("is made of files, not on a bench", where=run.session.name)
     yield  # a generator, as all plans
 
@@ -274,6 +297,36 @@ def _photographs_results(procedure: TestfieldProcedure, session: Session) -> dic
         assessments=found.assessments, photograph=lambda name: session.picture(frames[name]),
     )  # fmt: skip
     return {"calibration.json": calibration.to_json(), "report.html": report}
+
+
+def _film_procedure(session: Session, given: FilmParameters) -> FilmRollProcedure:
+    from ..io import FrameCorners
+    from ..procedures.film_roll import FilmRollProcedure
+
+    def opened(name: str) -> Scan:
+        found = session.find(name)
+        assert found is not None  # a frame that the procedure was given
+        return session.scan(found)
+
+    calibrated = None
+    if CORNERS in session.inputs():
+        calibrated = FrameCorners.parse(session.input(CORNERS), where=CORNERS)
+    return FilmRollProcedure(
+        opened, given.options(), calibrated=calibrated, kind=given.transform,
+        parameters=session.parameters, inputs=_hashes(session),
+    )  # fmt: skip
+
+
+def _film_results(procedure: FilmRollProcedure, session: Session) -> dict[str, str]:
+    from ..report.frames import frame_tile, roll_page
+
+    results, frames = procedure.finish(), {each.stem: each for each in procedure.frames}
+
+    def picture(stem: str) -> Any:
+        found = frames[stem]
+        return frame_tile(procedure.opened(found.scan), found.document)
+
+    return results | {"report.html": roll_page(procedure.summary(), picture)}
 
 
 def _blurred(run: Acquisition, given: BlurredParameters) -> Plan:
@@ -356,14 +409,16 @@ KINDS: Mapping[str, SessionKind] = {
         _oscilloscope,
         ("reseau.json", "object.json"),
         procedure=_oscilloscope_procedure,
+        results=_oscilloscope_results,
     ),
     "photographs": SessionKind(
         PhotographsParameters,
-        _photographs,
+        _of_files,
         ("design.json",),
         procedure=_testfield_procedure,
         results=_photographs_results,
     ),
+    "film": SessionKind(FilmParameters, _of_files, procedure=_film_procedure, results=_film_results),
     "sensor": SessionKind(
         SensorParameters,
         _sensor,
@@ -380,3 +435,6 @@ KINDS: Mapping[str, SessionKind] = {
     "own": SessionKind(OwnParameters, _own, (GENERATOR,)),
 }
 """Kinds of sessions by the name of the plan."""
+
+OF_FILES = ("photographs", "film")
+"""Plans of sessions that are made of files, not on a bench."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
@@ -20,9 +20,11 @@ from ..io import Document
 
 if TYPE_CHECKING:
     from ..procedures.calibration import CameraOptions
+    from ..procedures.film_frame import FrameOptions
 
 __all__ = [
     "BlurredParameters",
+    "FilmParameters",
     "FramesParameters",
     "OscilloscopeParameters",
     "OwnParameters",
@@ -505,6 +507,40 @@ class PhotographsParameters(SessionParameters):
 
         pitch = None if self.pitch is None else (self.pitch, self.pitch)
         return CameraOptions(self.model, self.free, pitch)
+
+
+class FilmParameters(SessionParameters):
+    """Parameters of the plan `film`: the inner orientation of the scans of a roll of film.
+
+    Parameters
+    ----------
+    format : (float, float), optional
+        Width and height of a frame (mm). Default: the usual formats are tried.
+    dpi : float, optional
+        Resolution of the scans (pixels per inch), if that in the files is missing or wrong.
+    transform : str
+        Transformation to calibrated corners, which are the input ``corners.json`` if there is one.
+
+    Examples
+    --------
+    >>> FilmParameters(format=(36, 24)).options().formats
+    ((36.0, 24.0),)
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-film-parameters/1"
+
+    retakes: NonNegativeInt = 0
+    format: tuple[Annotated[float, Field(gt=1, lt=400)], Annotated[float, Field(gt=1, lt=400)]] | None = None
+    dpi: float | None = Field(default=None, ge=10, le=100_000)
+    transform: Literal["similarity", "affine", "projective", "bilinear"] = "affine"
+
+    def options(self) -> FrameOptions:
+        """Return the prior knowledge of the frames."""
+        from ..procedures.film_frame import FrameOptions
+
+        if self.format is None:
+            return FrameOptions(dpi=self.dpi)
+        return FrameOptions(formats=(self.format,), dpi=self.dpi)
 
 
 class SensorParameters(SessionParameters):

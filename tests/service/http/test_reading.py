@@ -5,9 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import shutil
 import time
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -24,14 +22,6 @@ from reseau.service import Configurations
 from .served import Served, TestClient, served
 
 LEFT = "/api/1/configurations/left"
-
-
-@pytest.fixture(scope="module")
-def one(archived: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    folder = tmp_path_factory.mktemp("reading")
-    shutil.copytree(archived, folder, dirs_exist_ok=True)
-    with served(folder) as found:
-        yield found
 
 
 @pytest.fixture(scope="module")

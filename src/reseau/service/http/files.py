@@ -65,24 +65,43 @@ def upload(
     who: Operating,
     service: Here,
     name: Annotated[str, Form(min_length=1, max_length=200, description="Name of the session.")],
-    photographs: Annotated[list[UploadFile], File(description="Photographs.")],
-    design: Annotated[UploadFile, File(description="Design of the target (JSON).")],
+    photographs: Annotated[list[UploadFile], File(description="Photographs, or scans of film.")],
+    design: Annotated[
+        UploadFile | None,
+        File(description="Design of the target, or of the reseau of an oscilloscope (JSON)."),
+    ] = None,
     test_object: Annotated[
         UploadFile | None, File(description="For an oscilloscope: design of the test object (JSON).")
     ] = None,
+    corners: Annotated[
+        UploadFile | None, File(description="For film: calibrated corners of the camera (`frame-corners/1`).")
+    ] = None,
     target: Annotated[
-        Literal["camera", "oscilloscope"],
-        Form(description="What is calibrated: a camera, or an oscilloscope by PHOTO I, II and III."),
+        Literal["camera", "oscilloscope", "film"],
+        Form(
+            description="What is calibrated: a camera, an oscilloscope by PHOTO I, II and III, "
+            "or the frames of a roll of film."
+        ),
     ] = "camera",
     model: Annotated[str, Form(max_length=40, description="Camera model; empty: the usual one.")] = "",
     pitch: Annotated[float | None, Form(gt=0, le=1, description="Size of a pixel (mm).")] = None,
     free: Annotated[str, Form(max_length=400, description="Parameters to estimate, as c,x0,y0,K1.")] = "",
+    film_format: Annotated[
+        str,
+        Form(
+            pattern=r"^([0-9]{1,3}(\.[0-9]{1,3})?x[0-9]{1,3}(\.[0-9]{1,3})?)?$",
+            description="Format of film, mm.",
+        ),
+    ] = "",
+    dpi: Annotated[float | None, Form(ge=10, le=100_000, description="Resolution of scans of film.")] = None,
 ) -> Uploaded:
     """Calibrate from photographs: they are archived as they come, decoded, measured and adjusted.
 
-    Photographs of an oscilloscope are taken in the order PHOTO I, II, III.
+    Photographs of an oscilloscope are taken in the order PHOTO I, II, III. The frames of film are oriented by
+    their edges, with what the frames of the roll have in common.
     """
     from ... import sessions as kinds
+    from ...io import FrameCorners
 
     if len(photographs) > MOST_FILES:
         raise UsageError(f"are more than {MOST_FILES}", where="photographs")
@@ -93,20 +112,34 @@ def upload(
             raise UsageError(f"is larger than {MOST_BYTES >> 20} MiB", where=label)
         if not each.size:
             raise InputError("is empty", where=label)
+    if target != "oscilloscope" and len(set(labels)) < len(labels):
+        raise UsageError("have names that occur twice", where="photographs")
+    if target != "film" and design is None:
+        raise UsageError("is missing", where="design", do="give the design of the target")
+    plan, inputs = "photographs", dict[str, str]()
+    given: dict[str, Any] = {"model": model, "pitch": pitch}
     if target == "camera":
-        if len(set(labels)) < len(labels):
-            raise UsageError("have names that occur twice", where="photographs")
-        plan, inputs = "photographs", {"design.json": _text(design)}
-        given: dict[str, Any] = {"model": model, "pitch": pitch}
+        assert design is not None
+        inputs["design.json"] = _text(design)
         given["free"] = [each.strip() for each in free.split(",") if each.strip()]
+    elif target == "film":
+        plan, given = "film", {}
+        if film_format:
+            given["format"] = [float(each) for each in film_format.split("x")]
+        if dpi is not None:
+            given["dpi"] = dpi
+        if corners is not None:
+            inputs[kinds.CORNERS] = _text(corners)
+            FrameCorners.parse(inputs[kinds.CORNERS], where=_label(corners.filename, 0))
     else:
         if test_object is None or len(photographs) < 2:
             raise UsageError("needs PHOTO I and II, and the design of the test object", where=name)
-        plan, inputs = "oscilloscope", {"reseau.json": _text(design), "object.json": _text(test_object)}
-        given = {"body": len(photographs) > 2}
-        labels = [f"PHOTO {'I' * k}" for k in range(1, min(len(photographs), 3) + 1)]
         if len(photographs) > 3:
             raise UsageError("are more than PHOTO I, II and III", where="photographs")
+        assert design is not None
+        plan, inputs = "oscilloscope", {"reseau.json": _text(design), "object.json": _text(test_object)}
+        given = {"body": len(photographs) > 2}
+        labels = [f"PHOTO {'I' * k}" for k in range(1, len(photographs) + 1)]
     with service.audited(who, "upload", name, {"photographs": len(photographs), "plan": plan}):
         kinds.check(name, plan, given, inputs)
         session = kinds.begin(service.archive, name, plan, given, inputs)

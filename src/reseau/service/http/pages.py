@@ -11,6 +11,7 @@ import jinja2
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 
+from ...archive import Session
 from ...core.errors import ReseauError
 from ...io.photographs import PHOTOGRAPHS
 from . import accounts, benches, calibrations, history, operations, sessions
@@ -171,7 +172,7 @@ def bench_page(request: Request, bench: str, who: Reading, service: Here) -> Res
         settings=settings,
         axes=axes,
         busy=busy,
-        plans=[each for each in kinds.KINDS if each not in ("own", "photographs")],
+        plans=[each for each in kinds.KINDS if each not in ("own", *kinds.OF_FILES)],
     )
 
 
@@ -191,26 +192,43 @@ def all_sessions(
 @router.get("/sessions/{session}")
 def session_page(request: Request, session: str, who: Reading, service: Here) -> Response:
     """A session."""
-    found = sessions.session_detail(service, sessions.the_session(service, session))
+    kept = sessions.the_session(service, session)
+    found = sessions.session_detail(service, kept)
     frames = sessions.frames(session, who, service, 0, 2000)
     every = [benches.bench_answer(service, each) for each in service.benches.values()]
     mine = [b for b in every if b.session is not None and b.session.name == session and b.state in _BUSY]
     running = mine[0] if mine else None
     return _rendered(
         request, "session.html.j2", s=found, frames=frames[-_SHOWN:][::-1], more=max(0, len(frames) - _SHOWN),
-        report=_report(found), verdict=_verdict(service, found), bench=running,
+        report=_report(found), verdict=_verdict(kept, found), bench=running,
         reached=running.session.reached if running is not None and running.session is not None else {},
         job=service.jobs.of(session),
     )  # fmt: skip
 
 
-def _verdict(service: Service, session: sessions.SessionDetail) -> str:
-    """What the calibration of a session is good for, in words."""
-    if not any(each.name == "calibration.json" for each in session.results):
-        return ""
+def _verdict(session: Session, found: sessions.SessionDetail) -> str:
+    """What the results of a session are good for, in words."""
     from ... import sessions as kinds
+    from ...io import RollSummary
 
-    calibration = kinds.calibration_of(sessions.the_session(service, session.name))
+    latest = {each.name: each for each in session.results()}
+    if found.plan == "film" and "summary.json" in latest:
+        summary = RollSummary.parse(session.content(latest["summary.json"]).decode(), where="summary.json")
+        counts = ", ".join(f"{count} {what}" for what, count in summary.counts() if count)
+        return f"{len(summary.frames)} frames: {counts}."
+    if "calibration.json" not in latest:
+        return ""
+    calibration = kinds.calibration_of(session)
+    if found.plan == "oscilloscope":
+        points = {
+            each.step: each.verdict.facts.get("points")
+            for each in session.frames(kind="frame")
+            if each.verdict is not None and each.verdict.ok
+        }
+        words = {"PHOTO I": "marks of the reseau", "PHOTO II": "rods", "PHOTO III": "points of the body"}
+        parts = [f"{points[photo]} {what}" for photo, what in words.items() if points.get(photo)]
+        sigma0 = "" if calibration.sigma0 is None else f"; σ₀ {calibration.sigma0:.2f}"
+        return f"Camera and oscilloscope are corrected: {', '.join(parts)}{sigma0}."
     return " ".join(calibrations.verdict_of(calibration))
 
 

@@ -129,6 +129,17 @@ document.addEventListener('click', event => {
   act(button, button.dataset.body ? JSON.parse(button.dataset.body) : undefined);
 });
 
+// Fields that belong to what is chosen; those of other choices are neither shown nor sent.
+for (const choice of document.querySelectorAll('[data-choose]')) {
+  const choose = () => {
+    for (const set of choice.form.querySelectorAll('fieldset[data-for]')) {
+      set.disabled = !set.dataset.for.split(' ').includes(choice.value);
+    }
+  };
+  choice.addEventListener('change', choose);
+  choose();
+}
+
 for (const drop of document.querySelectorAll('[data-drop]')) {
   const input = drop.querySelector('input[type=file]');
   const shown = drop.querySelector('output');
