@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from worlds import lenses
 
-from reseau.bundle import Network, adjust_network
+from reseau.bundle import Network, Options, adjust_network
 from reseau.io.network import Network1
 
 FIVE = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"]
@@ -33,11 +33,11 @@ def calibrated(lens: lenses.Lens, flat: np.ndarray, seen: list[Any], eight: bool
     return dict(zip(EIGHT if eight else FIVE, map(float, values), strict=True))
 
 
-def run(name: str, document: dict[str, Any]) -> None:
+def run(name: str, document: dict[str, Any], options: Options | None = None) -> None:
     """Adjust and print a line."""
     network = Network.from_document(Network1.from_content(json.loads(json.dumps(document)), where=name))
     begin = time.process_time()
-    found = adjust_network(network)
+    found = adjust_network(network, options)
     seconds = time.process_time() - begin
     if not found:
         print(f"  {name:6} {seconds:6.2f} s  no result: {found.reason[:90]}")
@@ -45,7 +45,8 @@ def run(name: str, document: dict[str, Any]) -> None:
     used, camera = int(found.fit.usable.images.sum()), found.cameras["A"]
     print(
         f"  {name:6} {seconds:6.2f} s  {used}/{len(network.images)} images  sigma0 {found.sigma0:.4f}  "
-        f"fx {camera.values[0]:.3f} ± {camera.sigma[0]:.3f} px  {found.fit.iterations} iterations"
+        f"fx {camera.values[0]:.3f} ± {camera.sigma[0]:.3f} px  {found.fit.iterations} iterations, "
+        f"{int(found.rejected.sum())} points rejected"
     )
 
 
@@ -60,6 +61,8 @@ def compare(half_diagonal: float, eight: bool, count: int, seed: int, **more: An
     bend = f", bent by {more['bend']} squares" if more.get("bend") else ""
     print(f"{half_diagonal}° in the corners, {count} views, {5 + 3 * eight} coefficients, seed {seed}{bend}")
     run("cold", lenses.document(lens, flat, seen, cold, free))
+    if more.get("bend"):
+        run("reject", lenses.document(lens, flat, seen, cold, free), Options(outliers="reject"))
     run("warm", lenses.document(lens, flat, seen, calibrated(lens, flat, seen, eight), free))
 
 

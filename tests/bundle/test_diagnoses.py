@@ -111,6 +111,16 @@ def uneven_board() -> Network:
     return replace(network, xyz=network.xyz + rng.normal(0, 4e-4, network.xyz.shape))
 
 
+def bent_board() -> Network:
+    """A board given as plane, in truth bent by 12 mm in its 2 m, with tilted images from all sides."""
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 6), np.linspace(-0.8, 0.8, 6)))
+    angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    centres = np.stack([2 * np.cos(angle), 2 * np.sin(angle), 3 + 0.3 * np.cos(3 * angle)], axis=1)
+    true = np.column_stack([x, y, 0.012 * (1 - x**2)])
+    network = seen_from(centres, 0 * centres, true, 36, networks.camera(free=("c", "x0", "y0", "K1")))
+    return replace(network, xyz=np.column_stack([x, y, 0 * x]))
+
+
 def camera_of(network: Network, **values: float) -> Network:
     camera = network.cameras[0]
     at = {camera.names.index(name): value for name, value in values.items()}
@@ -365,6 +375,7 @@ BROKEN = [
         Code.DOUBTFUL_CONTROL,
         ("p1 and p3 look exchanged",),
     ),
+    Broken("a bent board", bent_board, Code.DOUBTFUL_CONTROL, ("in a plane", "bent by 0.01")),
     Broken(
         "mirrored control",
         lambda: (lambda n: replace(n, xyz=n.xyz * [1, -1, 1]))(block()),

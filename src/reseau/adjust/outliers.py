@@ -26,7 +26,8 @@ from .stochastic import Weighting, blocks_of
 __all__ = ["Rejection", "Robust", "SnoopingStep", "data_snooping", "robust", "weight_function"]
 
 WeightName = Literal["huber", "tukey", "danish"]
-_TUNING = {"huber": 1.345, "tukey": 4.685, "danish": 2.0}
+TUNING = {"huber": 1.345, "tukey": 4.685, "danish": 2.0}
+"""Constants of the weight functions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +95,9 @@ def weight_function(name: WeightName, tuning: float | None = None) -> Callable[[
     >>> weight_function("huber", 2.0)(np.array([-1.0, 4.0]))
     array([1. , 0.5])
     """
-    if name not in _TUNING:
+    if name not in TUNING:
         raise UsageError(f"is no weight function: {name!r}", where="weight_function")
-    k = _TUNING[name] if tuning is None else tuning
+    k = TUNING[name] if tuning is None else tuning
     if not k > 0:
         raise UsageError("must be above zero", where="tuning")
 

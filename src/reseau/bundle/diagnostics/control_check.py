@@ -337,7 +337,9 @@ def suspected(problem: BundleProblem, fit: BundleFit) -> bool:
         found = _Tested.of(problem, fit, observed, np.zeros(len(observed), dtype=bool))
         if (found.statistic > _critical(len(points))).any():
             return True
-    large = _ray_statistic(network, fit)[rows] > scipy.special.chdtri(2, _ALPHA / max(1, int(rows.sum())))
+    # Input sigmas that are too large hide what does not fit.
+    statistic = _ray_statistic(network, fit)[rows] / min(1.0, max(fit.sigma0, 1e-300)) ** 2
+    large = statistic > scipy.special.chdtri(2, _ALPHA / max(1, int(rows.sum())))
     return bool(large.any())
 
 

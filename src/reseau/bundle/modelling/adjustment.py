@@ -8,8 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ...adjust import data_snooping, robust
-from ...adjust.outliers import Rejection, SnoopingStep
+from ...adjust import SnoopingStep
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
@@ -33,12 +32,11 @@ from ..solver.datum import Similarity
 from ..solver.problem import LAST_ROUND
 from ..solver.unknowns import Unknowns
 from ..solver.values import Values
-from .startup import improved, lost_images, settled
+from .rejection import MANY, bent_plane, many_rejected, suspects, without_gross_errors
+from .startup import RETRIED, adjusted_in_steps, lost_images, settled
 
 __all__ = ["Options", "adjust_network", "problem_of"]
 
-# Weight of a robust adjustment below which an observation is a gross error, and tolerance of its iteration.
-_GROSS_ERROR, _ROBUST_TOLERANCE = 0.2, 0.05
 # Relative sigma of a principal distance that is hardly determined.
 _WEAK = 3e-3
 # Relative sigma of points with depth.
@@ -49,14 +47,8 @@ _FEW = 30
 _NOT_AT_ONCE = 0.05
 # Part of the points of an image above which it is left out as a whole.
 _MOSTLY = 0.5
-# Failures after which cameras are freed in steps.
-_RETRIED = (Code.NOT_CONVERGED, Code.SINGULAR, Code.RANK_DEFECT, Code.NOT_FINITE, Code.NOT_IDENTIFIED)
 # Sigma0 above which control points and single observations are checked.
 _DOUBT = 3.0
-# Maximum number of observations for the search for gross errors, because of its computing time.
-_MANY = 50_000
-# Image points with misfits above this multiple of the median are left out at first; number of rounds.
-_TRIM_LIMIT, _TRIM_ROUNDS = 5.0, 5
 
 
 @dataclass(frozen=True)
@@ -193,7 +185,7 @@ def _apart(network: Network, options: Options, start: Values) -> Values:
         places, _, _ = network.rig.approximate(start.rotation, start.x0)
         bent = bent.on_cameras(network.camera_of, *places)
     problem = _begun(replace(network, rig=None, stage=None, refraction=bent), options, settle=True)[0]
-    fit = _plain(problem)
+    fit = adjusted_in_steps(problem)
     return start if isinstance(fit, Failure) else replace(fit.values, refraction=start.refraction)
 
 
@@ -286,7 +278,7 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         network = problem.network
         notes = (*notes, *left)
     else:
-        plain = problem.adjusted() if grave else _plain(problem)
+        plain = problem.adjusted() if grave else adjusted_in_steps(problem)
         if isinstance(plain, Failure):
             return _explained(plain, problem, found)
         fit, given = plain, problem.weights
@@ -300,6 +292,7 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         found += _doubts(problem, fit, of_control, given)
         found += [] if of_control else _rejected_control(network, rejected)
         found += _frontal(network, bare)
+    found += many_rejected(network, rejected)
     return Result(network, fit, rejected, steps, (*found, *notes, *checks(bare)))
 
 
@@ -365,30 +358,18 @@ def _frontal(network: Network, result: Result) -> list[Remark]:
     return []
 
 
-def _plain(problem: BundleProblem) -> BundleFit | Failure:
-    """Adjust; where this fails, or images do not fit, with cameras that are freed in steps."""
-    fit = problem.adjusted()
-    if isinstance(fit, Failure):
-        if fit.code not in _RETRIED:
-            return fit
-        again = settled(problem).adjusted()
-        if isinstance(again, Failure):
-            return fit
-        fit = again
-    return improved(problem, fit)
-
-
 def _rejecting(
     problem: BundleProblem, options: Options
 ) -> tuple[tuple[BundleFit, tuple[SnoopingStep, ...], list[Remark]], list[Remark]] | Failure:
     """Adjust without gross errors and without wrong control points, and say which these are."""
-    first = _without_gross_errors(problem, options)
+    level = options.alpha, options.max_fraction
+    first = without_gross_errors(problem, *level)
     shape = None
     if isinstance(first, Failure):
         shape = _partly_wrong(problem)
         if shape is None:
             return first
-        again = _without_gross_errors(without_control(problem, shape.points[~shape.agree]), options)
+        again = without_gross_errors(without_control(problem, shape.points[~shape.agree]), *level)
         if isinstance(again, Failure):
             return first
         check, said = _control(problem, again[0], shape)
@@ -397,7 +378,7 @@ def _rejecting(
             rays = (
                 Failure("", Code.GROSS_ERRORS)
                 if check is None
-                else _without_gross_errors(problem.continued(again[0]), options)
+                else without_gross_errors(problem.continued(again[0]), *level)
             )
             if not isinstance(rays, Failure):
                 return rays, []
@@ -406,7 +387,7 @@ def _rejecting(
     else:
         check, said = _control(problem, first[0])
     if check and not check.undecided:
-        again = _without_gross_errors(without_control(problem, check.points[check.wrong]), options)
+        again = without_gross_errors(without_control(problem, check.points[check.wrong]), *level)
         if not isinstance(again, Failure):
             return again, check.remarks(problem.network, left_out=True)
     return first, said
@@ -414,7 +395,7 @@ def _rejecting(
 
 def _partly_wrong(problem: BundleProblem) -> ControlShape | None:
     """The control points compared with a free network, where some of them do not agree."""
-    if problem.network.datum != "control" or len(problem.observations) > _MANY:
+    if problem.network.datum != "control" or len(problem.observations) > MANY:
         return None
     n = 2 * len(problem.network.xy)
     shape = control_shape(problem.network, None if problem.weights is None else problem.weights[:n:2] > 0)
@@ -436,28 +417,20 @@ def _control(
     weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
     if fit.problem.weights is not None:
         weights[:n] = np.where(np.repeat(tie, 2), fit.problem.weights[:n], weights[:n])
-    elif tie.any() and fit.sigma0 > _DOUBT and len(problem.observations) <= _MANY:
-        gross = np.isin(np.arange(len(tie)), _suspects(problem))
+    elif tie.any() and fit.sigma0 > _DOUBT and len(problem.observations) <= MANY:
+        gross = np.isin(np.arange(len(tie)), suspects(problem))
         weights[:n] = np.where(np.repeat(tie & gross, 2), 0.0, weights[:n])
-    if shape is None and len(problem.observations) <= _MANY:
+    if shape is None and len(problem.observations) <= MANY:
         shape = control_shape(network, np.asarray(weights[:n:2] > 0), fit.values)
         rejected = np.asarray(fit.rejected[:n].reshape(-1, 2).any(axis=1))
         deflection = 0.0 if shape is None else shape.bent()
         if deflection:
-            return None, [Remark(_bent(deflection, network.unit), Code.DOUBTFUL_CONTROL)]
+            return None, [Remark(bent_plane(deflection, network.unit), Code.DOUBTFUL_CONTROL)]
         poor = fit.sigma0 > _DOUBT or bool(_rejected_control(network, rejected))
         if poor and shape is not None and shape.as_a_whole:
             return None, [Remark(shape.doubt(), Code.DOUBTFUL_CONTROL)]
     check = checked_control(problem.with_weights(weights), fit, shape)
     return check, [] if check is None else check.remarks(network)
-
-
-def _bent(deflection: float, unit: str) -> str:
-    """What to say of a plane figure that is bent in the images."""
-    return (
-        f"the control points are given in a plane, but the images show them bent by {deflection:.2g} {unit}: "
-        "estimate their coordinates (`--datum free`), or give them standard deviations of this size"
-    )
 
 
 def _given_weights(problem: BundleProblem, fit: BundleFit) -> Array | None:
@@ -484,12 +457,12 @@ def _doubts(
     doubts = [*contradicting(current, every)[1], *of_control]
     if not fit.sigma0 > _DOUBT:
         return doubts
-    if len(problem.observations) <= _MANY:
+    if len(problem.observations) <= MANY:
         held = doubtful_parameters(current, fit)
         doubts += held
         # Rays of control points are suspected with them.
         tie: Mask = np.asarray(np.isnan(problem.network.sigma).any(axis=1))[problem.network.point_of]
-        rows = _suspects(problem) if not of_control or tie.any() else np.zeros(0, dtype=np.intp)
+        rows = suspects(problem) if not of_control or tie.any() else np.zeros(0, dtype=np.intp)
         rows = rows[tie[rows]] if of_control else rows
         if len(rows) and not held:
             doubts += [*grouped(problem.network, rows), _gross(problem.network, rows)]
@@ -514,120 +487,6 @@ def _worst_images(network: Network, size: Array) -> list[Remark]:
     return [Remark(f"the largest median misfits are in image {names}", Code.NOT_CONVERGED)] if names else []
 
 
-def _suspects(problem: BundleProblem) -> Rows:
-    """Image points with very small weights in a robust adjustment, the smallest first."""
-    nothing: Rows = np.zeros(0, dtype=np.intp)
-    off = robust(_trimmed(problem), "huber", max_iterations=30, tolerance=0.3)
-    if isinstance(off, Failure):
-        return nothing
-    n = len(problem.network.xy)
-    weight = off.factors[: 2 * n].reshape(n, 2).min(axis=1)
-    rows = np.argsort(weight, kind="stable")
-    return np.asarray(rows[weight[rows] < _GROSS_ERROR], dtype=np.intp)
-
-
-def _without_gross_errors(
-    problem: BundleProblem, options: Options
-) -> tuple[BundleFit, tuple[SnoopingStep, ...], list[Remark]] | Failure:
-    """Adjust robustly, then by data snooping, which may restore rejected observations.
-
-    Images most of whose points are rejected are left out as a whole: the few that remain may fit by chance.
-    Where the approximate values do not suffice, the adjustment of all observations gives better ones.
-    """
-    first = _careful(_trimmed(problem), options)
-    if isinstance(first, Failure) or first[2]:
-        plain = _plain(problem)
-        if not isinstance(plain, Failure):
-            second = _careful(_trimmed(problem.continued(plain)), options)
-            if not isinstance(second, Failure) and (
-                isinstance(first, Failure) or _used(second[0]) > _used(first[0])
-            ):
-                first = second
-    if isinstance(first, Failure):
-        return first
-    fit, steps, left = first
-    if not left:
-        return fit, steps, []
-    names = listed(problem.network.images[i] for i in left)
-    text = f"most points of image{'s' * (len(left) > 1)} {names} contradict the others: left out as a whole"
-    return fit, steps, [Remark(text, Code.GROSS_ERRORS)]
-
-
-def _used(fit: BundleFit) -> int:
-    """Number of image points in an adjustment."""
-    return int(fit.usable.observations.sum())
-
-
-def _careful(
-    problem: BundleProblem, options: Options
-) -> tuple[BundleFit, tuple[SnoopingStep, ...], list[int]] | Failure:
-    """Adjust with data snooping, and again without the images most of whose points are rejected."""
-    found = _snooped(problem, options)
-    if isinstance(found, Failure):
-        return found
-    left: list[int] = []
-    while bad := _bad_images(problem, found):
-        left += bad
-        network = problem.network
-        weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
-        weights[: 2 * len(network.xy)][np.repeat(np.isin(network.image_of, bad), 2)] = 0.0
-        problem = problem.continued(found.adjustment).with_weights(weights)
-        again = _snooped(problem, options)
-        if isinstance(again, Failure):
-            return again
-        found = again
-    return found.adjustment, found.steps, left
-
-
-def _snooped(problem: BundleProblem, options: Options) -> Rejection[BundleFit] | Failure:
-    """Adjust robustly, then by data snooping."""
-    first_fit = robust(problem, "huber", max_iterations=50, tolerance=_ROBUST_TOLERANCE)
-    if not isinstance(first_fit, Failure):
-        weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights
-        start = problem.continued(first_fit.adjustment)
-        first = start.with_weights(np.where(first_fit.factors < _GROSS_ERROR, 0.0, weights)).adjusted()
-        problem = start if isinstance(first, Failure) else start.continued(first)
-    return data_snooping(problem, options.alpha, "tau", options.max_fraction, groups=problem.groups)
-
-
-def _bad_images(problem: BundleProblem, found: Rejection[BundleFit]) -> list[int]:
-    """Images most of whose points are rejected, which are not left out yet."""
-    network, n = problem.network, len(problem.network.xy)
-    out = found.rejected[: 2 * n].reshape(n, 2).any(axis=1)
-    used = out | found.adjustment.usable.observations
-    count = np.bincount(network.image_of[used], minlength=len(network.images))
-    gone = np.bincount(network.image_of[out], minlength=len(network.images))
-    return [int(i) for i in np.flatnonzero((count > 0) & (gone > _MOSTLY * count))]
-
-
-def _trimmed(problem: BundleProblem) -> BundleProblem:
-    """Return the problem with approximate values from the image points that agree with most others.
-
-    Least squares may not converge with many gross errors (a fifth of the observations). The approximate
-    values come from the largest consistent sets: image points far from them are left out until the estimates
-    improve.
-    """
-    n = len(problem.network.xy)
-    out = np.ones(n, dtype=bool)
-    for _ in range(_TRIM_ROUNDS):
-        v = problem.misfits_at_start()
-        size = np.sqrt((v**2).sum(axis=1))
-        if not np.isfinite(size).any():
-            break
-        limit = _TRIM_LIMIT * float(np.nanmedian(size))
-        far = ~(size <= limit)
-        if (far == out).all():
-            break
-        out = far
-        weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
-        weights[: 2 * n][np.repeat(out, 2)] = 0.0
-        fit = problem.with_weights(weights).adjusted()
-        if isinstance(fit, Failure):
-            break
-        problem = problem.continued(fit)
-    return problem
-
-
 def _control_of_failed(problem: BundleProblem) -> list[Remark]:
     """What is wrong with the control points of an adjustment that failed."""
     shape = control_shape(problem.network)
@@ -647,15 +506,15 @@ def _explained(failure: Failure, problem: BundleProblem, found: list[Remark]) ->
     network = problem.network
     if failure.code is Code.NO_DATUM and not found:
         return failure
-    if failure.code in _RETRIED and not found:
+    if failure.code in RETRIED and not found:
         found = motion_of_narrow_lens(network)
     if not found:
         start = problem.start
         found = seen_frontally(network, start.rotation, start.xyz, finite(start.x0))
     if not found and network.datum == "control":
         found = _control_of_failed(problem)
-    if not found and failure.code is not Code.TOO_FEW_POINTS and len(problem.observations) <= _MANY:
-        rows = _suspects(problem)
+    if not found and failure.code is not Code.TOO_FEW_POINTS and len(problem.observations) <= MANY:
+        rows = suspects(problem)
         if len(rows):
             found = [*grouped(network, rows), _gross(network, rows)]
         elif failure.code in (Code.NOT_CONVERGED, Code.NOT_FINITE):

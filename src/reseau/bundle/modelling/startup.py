@@ -14,13 +14,16 @@ from dataclasses import replace
 import numpy as np
 
 from ...core.data import Array, Mask, Rows
-from ...core.failure import Failure
+from ...core.failure import Code, Failure
 from ...optics.poses import matrix_to_vector
 from ..network import Camera, Network
 from ..network.network import finite
 from ..solver import BundleFit, BundleProblem, approximate
 
-__all__ = ["improved", "lost_images", "retried", "settled"]
+__all__ = ["RETRIED", "adjusted_in_steps", "improved", "lost_images", "retried", "settled"]
+
+RETRIED = (Code.NOT_CONVERGED, Code.SINGULAR, Code.RANK_DEFECT, Code.NOT_FINITE, Code.NOT_IDENTIFIED)
+"""Failures after which cameras are freed in steps."""
 
 # Points from which a lost image can be expected to find its pose, attempts in each step, and iterations of
 # each.
@@ -63,6 +66,25 @@ def settled(problem: BundleProblem) -> BundleProblem:
                 break
             problem = again
     return problem
+
+
+def adjusted_in_steps(problem: BundleProblem) -> BundleFit | Failure:
+    """Adjust; where this fails, or images do not fit, with cameras that are freed in steps.
+
+    Parameters
+    ----------
+    problem : BundleProblem
+        Problem with approximate values.
+    """
+    fit = problem.adjusted()
+    if isinstance(fit, Failure):
+        if fit.code not in RETRIED:
+            return fit
+        again = settled(problem).adjusted()
+        if isinstance(again, Failure):
+            return fit
+        fit = again
+    return improved(problem, fit)
 
 
 def _steps(network: Network) -> Iterator[list[tuple[str, ...]]]:

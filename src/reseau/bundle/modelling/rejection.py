@@ -1,0 +1,236 @@
+"""Gross errors in image coordinates: robust estimation, data snooping, images left out as a whole.
+
+Rejection hides a wrong model: good points look bad then, and where most of them are dropped, the rest fits. A
+board that is bent is therefore recognised before single points are tested.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...adjust import critical_tau, data_snooping, robust
+from ...adjust.outliers import TUNING, Rejection, SnoopingStep
+from ...core.data import Array, Mask, Rows
+from ...core.failure import Code, Failure, Remark
+from ..diagnostics import control_shape
+from ..diagnostics.checks import listed
+from ..network import Network
+from ..solver import BundleFit, BundleProblem
+from .startup import adjusted_in_steps
+
+__all__ = ["MANY", "bent_plane", "many_rejected", "suspects", "without_gross_errors"]
+
+MANY = 50_000
+"""Maximum number of observations for the search for gross errors, because of its computing time."""
+
+# Weight of a robust adjustment below which an observation is a gross error, and tolerance of its iteration.
+_GROSS_ERROR, _ROBUST_TOLERANCE = 0.2, 0.05
+# Relative offset at which adjustments end whose test values are compared with critical values.
+_ROUGHLY = 1e-2
+# Part of the points of an image above which it is left out as a whole.
+_MOSTLY = 0.5
+# Image points with misfits above this multiple of the median are left out at first; number of rounds.
+_TRIM_LIMIT, _TRIM_ROUNDS = 5.0, 5
+# Times the number of test values that are expected above the critical value, from which on the shape of the
+# control is compared with the images before single points are rejected.
+_MORE = 2.0
+# Part of the image points that are rejected above which the model is suspected.
+_MANY_REJECTED = 0.05
+
+
+def without_gross_errors(
+    problem: BundleProblem, alpha: float, max_fraction: float
+) -> tuple[BundleFit, tuple[SnoopingStep, ...], list[Remark]] | Failure:
+    """Adjust robustly, then by data snooping, which may restore rejected observations.
+
+    Images most of whose points are rejected are left out as a whole: the few that remain may fit by chance.
+    Where the approximate values do not suffice, the adjustment of all observations gives better ones.
+    """
+    first = _careful(_trimmed(problem), alpha, max_fraction)
+    if isinstance(first, Failure) or first[2]:
+        plain = adjusted_in_steps(problem)
+        if not isinstance(plain, Failure):
+            second = _careful(_trimmed(problem.continued(plain)), alpha, max_fraction)
+            if not isinstance(second, Failure) and (
+                isinstance(first, Failure) or _used(second[0]) > _used(first[0])
+            ):
+                first = second
+    if isinstance(first, Failure):
+        return first
+    fit, steps, left = first
+    if not left:
+        return fit, steps, []
+    names = listed(problem.network.images[i] for i in left)
+    text = f"most points of image{'s' * (len(left) > 1)} {names} contradict the others: left out as a whole"
+    return fit, steps, [Remark(text, Code.GROSS_ERRORS)]
+
+
+def _used(fit: BundleFit) -> int:
+    """Number of image points in an adjustment."""
+    return int(fit.usable.observations.sum())
+
+
+def _careful(
+    problem: BundleProblem, alpha: float, max_fraction: float
+) -> tuple[BundleFit, tuple[SnoopingStep, ...], list[int]] | Failure:
+    """Adjust with data snooping, and again without the images most of whose points are rejected."""
+    found = _snooped(problem, alpha, max_fraction)
+    if isinstance(found, Failure):
+        return found
+    left: list[int] = []
+    while bad := _bad_images(problem, found):
+        left += bad
+        network = problem.network
+        weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+        weights[: 2 * len(network.xy)][np.repeat(np.isin(network.image_of, bad), 2)] = 0.0
+        problem = problem.continued(found.adjustment).with_weights(weights)
+        again = _snooped(problem, alpha, max_fraction)
+        if isinstance(again, Failure):
+            return again
+        found = again
+    return found.adjustment, found.steps, left
+
+
+def _snooped(problem: BundleProblem, alpha: float, max_fraction: float) -> Rejection[BundleFit] | Failure:
+    """Adjust robustly, then by data snooping; only the last adjustment needs to converge to many digits.
+
+    On a bent board only what robust estimation shows to be gross errors is left out: points that fit badly
+    would be those where the board is bent most.
+    """
+    rough = replace(problem, tolerance=max(problem.tolerance, _ROUGHLY))
+    first_fit = robust(rough, "huber", max_iterations=50, tolerance=_ROBUST_TOLERANCE)
+    if not isinstance(first_fit, Failure):
+        weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights
+        start = rough.continued(first_fit.adjustment)
+        first = start.with_weights(np.where(first_fit.factors < _GROSS_ERROR, 0.0, weights)).adjusted()
+        rough = start if isinstance(first, Failure) else start.continued(first)
+        if not isinstance(first, Failure) and _is_bent(problem, first, alpha):
+            return _only_gross(problem, first, first_fit.factors)
+    found = data_snooping(rough, alpha, "tau", max_fraction, groups=problem.groups)
+    if isinstance(found, Failure):
+        return found
+    last = problem.continued(found.adjustment).with_weights(found.adjustment.problem.weights).adjusted()
+    return last if isinstance(last, Failure) else replace(found, adjustment=last)
+
+
+def _is_bent(problem: BundleProblem, fit: BundleFit, alpha: float) -> bool:
+    """Whether more points fit badly than chance explains, on a board that is bent in the images."""
+    network, n = problem.network, 2 * len(problem.network.xy)
+    plane = network.datum == "control" and network.held.all(axis=1).sum() > 0
+    tau = np.abs(fit.w[:n]) / max(fit.sigma0, 1e-300)
+    used = np.repeat(fit.usable.observations, 2)
+    if not plane or n > MANY or fit.redundancy < 2:
+        return False
+    if not (tau[used] > critical_tau(alpha, fit.redundancy)).sum() > _MORE * alpha * used.sum():
+        return False
+    shape = control_shape(network, fit.usable.observations, fit.values)
+    return shape is not None and shape.bent() > 0
+
+
+def _only_gross(problem: BundleProblem, fit: BundleFit, factors: Array) -> Rejection[BundleFit] | Failure:
+    """Adjust without the observations that robust estimation, with these factors, has left out."""
+    last = problem.continued(fit).with_weights(fit.problem.weights).adjusted()
+    if isinstance(last, Failure):
+        return last
+    given = np.zeros(len(last.rejected), dtype=bool) if problem.weights is None else problem.weights == 0
+    out = last.rejected & ~given
+    tuning = TUNING["huber"]
+    steps = [
+        SnoopingStep(
+            (int(k),), tuning / max(float(factors[k]), 1e-300), tuning / _GROSS_ERROR, restored=False
+        )
+        for k in np.flatnonzero(out & (factors < _GROSS_ERROR))
+    ]
+    return Rejection(last, out, tuple(steps), 1)
+
+
+def _bad_images(problem: BundleProblem, found: Rejection[BundleFit]) -> list[int]:
+    """Images most of whose points are rejected, which are not left out yet."""
+    network, n = problem.network, len(problem.network.xy)
+    out = found.rejected[: 2 * n].reshape(n, 2).any(axis=1)
+    used = out | found.adjustment.usable.observations
+    count = np.bincount(network.image_of[used], minlength=len(network.images))
+    gone = np.bincount(network.image_of[out], minlength=len(network.images))
+    return [int(i) for i in np.flatnonzero((count > 0) & (gone > _MOSTLY * count))]
+
+
+def _trimmed(problem: BundleProblem) -> BundleProblem:
+    """Return the problem with approximate values from the image points that agree with most others.
+
+    Least squares may not converge with many gross errors (a fifth of the observations). The approximate
+    values come from the largest consistent sets: image points far from them are left out until the estimates
+    improve.
+    """
+    n = len(problem.network.xy)
+    out = np.ones(n, dtype=bool)
+    for _ in range(_TRIM_ROUNDS):
+        v = problem.misfits_at_start()
+        size = np.sqrt((v**2).sum(axis=1))
+        if not np.isfinite(size).any():
+            break
+        limit = _TRIM_LIMIT * float(np.nanmedian(size))
+        far = ~(size <= limit)
+        if (far == out).all():
+            break
+        out = far
+        weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+        weights[: 2 * n][np.repeat(out, 2)] = 0.0
+        fit = problem.with_weights(weights).adjusted()
+        if isinstance(fit, Failure):
+            break
+        problem = problem.continued(fit)
+    return problem
+
+
+def suspects(problem: BundleProblem) -> Rows:
+    """Image points with very small weights in a robust adjustment, the smallest first."""
+    nothing: Rows = np.zeros(0, dtype=np.intp)
+    off = robust(_trimmed(problem), "huber", max_iterations=30, tolerance=0.3)
+    if isinstance(off, Failure):
+        return nothing
+    n = len(problem.network.xy)
+    weight = off.factors[: 2 * n].reshape(n, 2).min(axis=1)
+    rows = np.argsort(weight, kind="stable")
+    return np.asarray(rows[weight[rows] < _GROSS_ERROR], dtype=np.intp)
+
+
+def many_rejected(network: Network, rejected: Mask) -> list[Remark]:
+    """Return a remark where so many image points are rejected that the model may be wrong instead.
+
+    Parameters
+    ----------
+    network : Network
+        The network.
+    rejected : ndarray of bool (n,)
+        Rejected image points.
+    """
+    share = float(rejected.sum()) / max(1, len(rejected))
+    if not share > _MANY_REJECTED:
+        return []
+    return [
+        Remark(
+            f"{int(rejected.sum())} of {len(rejected)} image points ({100 * share:.1f} %) are rejected: a "
+            "camera model without enough terms, or wrong coordinates, look like this; look at the residuals "
+            "without rejection",
+            Code.UNMODELLED,
+        )
+    ]
+
+
+def bent_plane(deflection: float, unit: str) -> str:
+    """Return what to say of control points in a plane that is bent in the images.
+
+    Parameters
+    ----------
+    deflection : float
+        See :meth:`~reseau.bundle.diagnostics.ControlShape.bent`.
+    unit : str
+        Unit of object space.
+    """
+    return (
+        f"the control points are given in a plane, but the images show them bent by {deflection:.2g} {unit}: "
+        "estimate their coordinates (`--datum free`), or give them standard deviations of this size; "
+        "until then only gross errors can be rejected"
+    )
