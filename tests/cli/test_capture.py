@@ -13,6 +13,7 @@ from reseau import designs
 from reseau.cli import run
 from reseau.core.data import Frame
 from reseau.core.errors import StateError
+from reseau_sims import FieldBench
 
 from ..capture.fieldrig import BENCH, POSES, TESTFIELD, FieldRig, Sweeper, enter, write_inputs
 
@@ -367,3 +368,20 @@ def test_the_operator_is_asked_and_a_photograph_without_a_reseau_ends_the_sessio
     assert capture("oscilloscope", *given, "--name", "b") == 2
     assert "standard input is closed; run the command in a terminal" in capsys.readouterr().err
     assert rig.camera.exposures == 1
+
+
+def test_a_goal_is_not_reached_by_images_of_a_target_that_bends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    enter(tmp_path, monkeypatch, FieldRig(FieldBench(seed=1)))  # by its own weight, as in the paper
+    write_inputs(
+        "tilt,roll,camera_roll\n0,0,0\n45,180,180\n30,0,180\n30,180,0\n30,90,90\n30,270,90\n30,90,270\n"
+    )
+    given = ("--until", "sigma_c < 0.2 mm", "--first", "6", "--name", "monday")
+    assert capture("testfield", *TESTFIELD, *given) == 1
+    said = capsys.readouterr()
+    assert "sigma_c < 0.2 mm not reached" in said.err
+    assert "the images contradict each other by" in said.err
+    assert "the images scatter" in said.out
+    assert "warning: camera: the scatter between images is larger than the sigmas" in said.out
+    assert "photograph next" in said.out

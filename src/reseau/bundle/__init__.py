@@ -18,6 +18,7 @@ from .diagnostics import (
     by_point,
     camera_mapping,
     common_pattern,
+    image_scatter,
     projection_field_at,
     sigma_between_images,
 )
@@ -107,6 +108,7 @@ __all__ = [
     "example_network",
     "film_camera",
     "held_as_designed",
+    "image_scatter",
     "model_search_entries",
     "problem_of",
     "projection_field_at",

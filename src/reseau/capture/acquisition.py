@@ -196,6 +196,10 @@ class Acquisition:
         """Return the standard deviation reached for a parameter; None while there is none."""
         return None if self.procedure is None else self.procedure.progress().get(f"sigma_{parameter}")
 
+    def scatter(self) -> float:
+        """Return how much more the images scatter than their standard deviations say; 1 if not known."""
+        return 1.0 if self.procedure is None else self.procedure.progress().get("scatter", 1.0)
+
     def verdict(self, frame: ArchivedFrame) -> Verdict:
         """Return the verdict on a frame that was taken or checked in this process."""
         return self._verdicts[frame.id]

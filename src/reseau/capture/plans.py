@@ -36,6 +36,8 @@ __all__ = [
 
 _LEAST_GAIN = 0.01
 """Least relative decrease of a standard deviation for which another pose is taken."""
+_LEAST_POSES, _MOST_SCATTER = 6, 2.0
+"""Poses from which on images show whether they agree; factor of their scatter above which they do not."""
 _LENGTHS = {"mm": 1.0, "um": 1e-3, "µm": 1e-3, "nm": 1e-6}
 _GOAL = re.compile(r"\s*sigma_(\w+)\s*<=?\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*(\S*)\s*")
 
@@ -124,6 +126,9 @@ def until(
 ) -> Plan:
     """Take the first poses, then always the pose that lowers a standard deviation most, until the goal.
 
+    The goal is reached by at least six poses whose images do not contradict each other: those of a target
+    that bends scatter by more than their standard deviations say.
+
     Returns
     -------
     str
@@ -131,19 +136,32 @@ def until(
     """
     yield from poses(run, first, average, checks)
     left = [step for step in candidates if step.name not in {each.name for each in first}]
+    taken = len(first)
     while True:
-        reached = run.reached(goal.parameter)
-        if reached is not None and reached < goal.limit:
+        reached, scatter = run.reached(goal.parameter), run.scatter()
+        agree, enough = scatter <= _MOST_SCATTER, taken >= _LEAST_POSES
+        if enough and agree and reached is not None and reached < goal.limit:
             return ""
+        because = "" if agree else f"; {_CONTRADICTION.format(scatter)}"
         chosen = (yield from run.choose(left, goal.parameter)) if left else None
         if chosen is None:
-            return f"{goal} not reached: no pose is left"
+            return f"{goal} not reached: no pose is left{because}"
         step, predicted = chosen
-        if reached is not None and predicted is not None and predicted > (1 - _LEAST_GAIN) * reached:
+        little = predicted is not None and reached is not None and predicted > (1 - _LEAST_GAIN) * reached
+        if enough and little:
             least = f"{100 * _LEAST_GAIN:g} %"
-            return f"{goal} not reached: no pose lowers {reached:.2g} {goal.unit} by more than {least}"
+            return (
+                f"{goal} not reached: no pose lowers {reached:.2g} {goal.unit} by more than {least}{because}"
+            )
         left.remove(step)
+        taken += 1
         yield from run.at(step, average)
+
+
+_CONTRADICTION = (
+    "the images contradict each other by {:.1f} times their precision: the target bends, or it or the camera "
+    "changed between them"
+)
 
 
 def scan(run: Acquisition, count: int = 1) -> Plan:

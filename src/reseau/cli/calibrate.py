@@ -39,6 +39,7 @@ from .common import (
     overlay_files,
     progress,
     read_frame,
+    remark_lines,
     required,
     say,
 )
@@ -480,12 +481,7 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     for name, why in done.declined.items():
         say(f"left out: {name}: {why}\n")
     warnings, tests = sorted_remarks(result, done.assessments.values())
-    for warning in warnings:
-        say(f"warning: {warning}\n")
-    if tests:
-        say("tests that are not passed, by amounts that the errors above contain:\n")
-    for remark in tests:
-        say(f"  {remark}\n")
+    say("".join(f"{line}\n" for line in remark_lines(warnings, tests)))
 
 
 def _say_board(choice: BoardChoice, unit: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -229,6 +229,14 @@ def probability(p: float) -> str:
     ('p = 0.031', 'p < 0.001')
     """
     return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+
+
+def remark_lines(warnings: Iterable[object], tests: Iterable[object]) -> list[str]:
+    """Warnings about a result, and tests that are not passed, as lines."""
+    lines, rest = [f"warning: {warning}" for warning in warnings], [f"  {remark}" for remark in tests]
+    if rest:
+        lines.append("tests that are not passed, by amounts that the errors above contain:")
+    return lines + rest
 
 
 def say(text: str) -> None:

@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, Self, TypeVar
 
+from .common import remark_lines
+
 __all__ = ["Display"]
 
 P = ParamSpec("P")
@@ -119,7 +121,13 @@ class Display:
             at = f"{self._poses}/{self._total} " if self._counted(facts) else ""
             return f"{at}{facts['step']}: {facts['kind']}"
         if kind == "precision":
-            return f"    {self._reached}"
+            scatter = facts.get("scatter", 0.0)
+            doubt = (
+                f"\n    the images scatter {scatter:.1f} times as much as their precision"
+                if scatter > 2
+                else ""
+            )
+            return f"    {self._reached}{doubt}"
         if kind == "outlook":
             if "why" in facts:
                 return f"    next {facts['step']}: no prediction ({facts['why']})"
@@ -130,6 +138,8 @@ class Display:
             return f"next pose {facts['step']}{tail}" if facts["step"] else "no pose is left"
         if kind == "check":
             return "checks: " + ("; ".join(facts["faults"]) or "passed")
+        if kind == "verdict":
+            return "\n".join((*facts["lines"], *remark_lines(facts["warnings"], facts["tests"])))
         if kind == "without":
             return f"without {facts['instrument']}: {facts['why']}"
         if kind == "again":
@@ -157,7 +167,7 @@ class Display:
         """Standard deviations to two digits, with units."""
         parts = []
         for name, value in facts.items():
-            if isinstance(value, float):
+            if isinstance(value, float) and name != "scatter":
                 unit = self._units.get(name.removeprefix("sigma_"), "")
                 parts.append(f"{name} {value:.2g}{' ' if unit else ''}{unit}")
         return "  ".join(parts)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..bundle import Result, by_place, camera_mapping, common_pattern, sigma_between_images
+from ..bundle import Result, by_place, camera_mapping, common_pattern, image_scatter
 from ..calibration import CameraMapping, projection_field
 from ..core.data import Array, Mask
 from ..core.errors import UsageError
@@ -252,10 +252,8 @@ def _covered(xy: Array, lens: CameraMapping) -> Mask:
 
 def _enlarged(result: Result, camera: int) -> float:
     """Factor by which the images scatter more than their standard deviations say; at least 1."""
-    sigma = np.sqrt(np.diag(result.camera_covariance(camera)))
-    ratio = sigma_between_images(result, camera) / np.where(sigma > 0, sigma, np.inf)
-    ratio = ratio[np.isfinite(ratio)]
-    return max(1.0, float(np.sqrt(np.mean(ratio**2)))) if len(ratio) else 1.0
+    found = image_scatter(result, camera)
+    return max(1.0, found) if np.isfinite(found) else 1.0
 
 
 def _sigmas(lens: CameraMapping, factor: float) -> tuple[float, float]:

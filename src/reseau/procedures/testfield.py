@@ -14,7 +14,15 @@ from typing import Any, ClassVar, Protocol, TypeVar
 import numpy as np
 
 from ..archive import Verdict
-from ..bundle import Network, Result, adjust_network, calibration_of, camera_mapping, with_estimates
+from ..bundle import (
+    Network,
+    Result,
+    adjust_network,
+    camera_mapping,
+    image_scatter,
+    sigma_between_images,
+    with_estimates,
+)
 from ..core.data import Array, Frame, ImagePoints
 from ..core.errors import EstimationError
 from ..core.failure import Code, Failure
@@ -159,22 +167,28 @@ class TestfieldProcedure:
         return Provenance(self._inputs, self._options)
 
     def progress(self) -> dict[str, float]:
-        """Return standard deviations of the camera parameters, and sigma0; nothing before the third image."""
+        """Return standard deviations of the camera parameters, and sigma0; nothing before the third image.
+
+        They are those from the scatter between the images where it is larger. From the sixth image on,
+        ``scatter`` is how much larger it is, over all parameters: see :func:`reseau.bundle.image_scatter`.
+        """
         if len(self._measured) < _LEAST_IMAGES:
             return {}
         found = self.calibrated()
         if isinstance(found, Failure):
             return {}
-        names, _, _ = found.result.camera_columns(0)
-        sigma = np.sqrt(np.diag(found.result.camera_covariance(0)))
+        names, sigma = _sigmas(found.result)
         reached = {f"sigma_{name}": float(s) for name, s in zip(names, sigma, strict=True)}
-        return reached | {"sigma0": float(found.result.sigma0)}
+        scatter = image_scatter(found.result, 0)
+        more = {"scatter": scatter} if np.isfinite(scatter) else {}
+        return reached | {"sigma0": float(found.result.sigma0)} | more
 
     def next_pose(self, candidates: Sequence[P], wanted: str) -> tuple[P, float | None] | None:
         """Return the pose that lowers the standard deviation of a parameter most, and the predicted value.
 
         The image of each candidate is predicted and added to the network with the covariance of the other
-        images; the standard deviation follows from the design matrix alone. While there are too few images
+        images; the standard deviation follows from the design matrix alone, and is enlarged as that of the
+        images so far. While there are too few images
         for a calibration, the first candidate is returned without a prediction.
 
         Raises
@@ -204,11 +218,12 @@ class TestfieldProcedure:
         )
         if isinstance(mount, Failure):
             raise EstimationError(mount.reason, where="next pose")
-        sigma0 = float(result.sigma0)
+        now = float(_sigmas(result)[1][column])
+        enlarged = float(result.sigma0) * now / float(np.sqrt(result.camera_covariance(0)[column, column]))
         best: tuple[P, float] | None = None
         for candidate in candidates:
             joined = _joined(network, result, mount, candidate, self._heights(candidate))
-            predicted = sigma0 * _sigma(network if joined is None else joined, column)
+            predicted = enlarged * _sigma(network if joined is None else joined, column)
             if np.isfinite(predicted) and (best is None or predicted < best[1]):
                 best = candidate, predicted
         return best
@@ -224,9 +239,14 @@ class TestfieldProcedure:
         found = self.calibrated()
         if isinstance(found, Failure):
             raise EstimationError(found.reason, where=self.name)
-        about = self.provenance.to_dict()
-        calibration = calibration_of(found.result, "camera", name=self.name, provenance=about)
-        return {"calibration.json": calibration.to_json()}
+        return {"calibration.json": found.calibration(self.name, self.provenance.to_dict()).to_json()}
+
+
+def _sigmas(result: Result) -> tuple[tuple[str, ...], Array]:
+    """Names and standard deviations of the parameters of the camera: the larger of the two kinds."""
+    names, _, _ = result.camera_columns(0)
+    formal: Array = np.sqrt(np.diag(result.camera_covariance(0)))
+    return tuple(names), np.fmax(formal, sigma_between_images(result, 0))
 
 
 def _joined(

@@ -21,7 +21,7 @@ from ..capture import (
 )
 from ..capture import rerun as rerun_with
 from ..core.errors import UsageError
-from .kinds import GENERATOR, Reported, kind_of, own_plan
+from .kinds import GENERATOR, Reported, SessionKind, kind_of, own_plan
 from .parameters import OwnParameters, SessionParameters
 
 __all__ = [
@@ -221,10 +221,13 @@ def procedure_of(session: Session) -> Procedure | None:
     ...     hasattr(procedure_of(session), "on_frame")
     True
     """
-    kind = kind_of(session.plan)
+    return _procedure(session, kind_of(session.plan), parameters_of(session))
+
+
+def _procedure(session: Session, kind: SessionKind, given: SessionParameters) -> Procedure | None:
     if kind.procedure is None:
         return None
-    procedure, results = kind.procedure(session, parameters_of(session)), kind.results
+    procedure, results = kind.procedure(session, given), kind.results
     return procedure if results is None else Reported(procedure, lambda: results(procedure, session))
 
 
@@ -278,16 +281,20 @@ def capture(
     kind, given = kind_of(session.plan), parameters_of(session)
     if home:
         given = given.model_copy(update={"home": True})
+    procedure = _procedure(session, kind, given)
     run = Acquisition(
-        given.part_of(bench), session, procedure_of(session), camera=given.camera, table=given.table,
+        given.part_of(bench), session, procedure, camera=given.camera, table=given.table,
         oscilloscope=given.oscilloscope, scanner=given.scanner, retakes=given.retakes, limits=kind.limits,
         watch=watch, operator=operator,
     )  # fmt: skip
     plan = kind.acquire(run, given)
-    return carry_out(
+    found = carry_out(
         run, plans.homed(run, plan) if given.home else plan, park=given.park, retreat=given.retreat,
         paused=paused, control=control,
     )  # fmt: skip
+    if kind.verdict is not None and session.status == "done":
+        watch("verdict", kind.verdict(procedure.procedure if isinstance(procedure, Reported) else procedure))
+    return found
 
 
 def rerun(session: Session) -> list[Rerun]:

@@ -62,6 +62,9 @@ class SessionKind:
     results : callable, optional
         Makes the results, with the report, of the procedure and the session. Default: those of the
         procedure.
+    verdict : callable, optional
+        Says of a complete procedure what its result is good for: ``lines``, ``warnings``, and ``tests`` that
+        are not passed.
     limits : Limits, optional
         Limits of its frames.
 
@@ -77,6 +80,7 @@ class SessionKind:
     read: Callable[[str, str], object] = lambda text, name: _read_design(text, name)
     procedure: Callable[[Session, Any], Procedure] | None = None
     results: Callable[[Any, Session], dict[str, str]] | None = None
+    verdict: Callable[[Any], dict[str, list[str]]] | None = None
     limits: Limits | None = None
 
 
@@ -271,32 +275,34 @@ def _refraction(session: Session, given: SessionParameters) -> RefractionEntry |
     return next(iter(found.values()), None)
 
 
-def _testfield_results(procedure: TestfieldProcedure, session: Session) -> dict[str, str]:
-    from ..report.bundle import bundle_report
-
-    results = procedure.finish()
-    found = procedure.calibrated().required()
-    title = f"Calibration, session {session.name}"
-    report = bundle_report(found.result, title=title, provenance=procedure.provenance)
-    return results | {"report.html": report}
-
-
 def _of_files(run: Acquisition, given: SessionParameters) -> Plan:
     raise UsageError("is made of files, not on a bench", where=run.session.name)
     yield  # a generator, as all plans
 
 
-def _photographs_results(procedure: TestfieldProcedure, session: Session) -> dict[str, str]:
+def _calibration_results(procedure: TestfieldProcedure, session: Session) -> dict[str, str]:
     from ..report.bundle import bundle_report
 
+    results = procedure.finish()
     found = procedure.calibrated().required()
-    calibration = found.calibration(session.name, procedure.provenance.to_dict())
     frames = {each.step: each for each in session.frames(kind="frame")}
     report = bundle_report(
         found.result, title=f"Calibration {session.name}", provenance=procedure.provenance,
         assessments=found.assessments, photograph=lambda name: session.picture(frames[name]),
     )  # fmt: skip
-    return {"calibration.json": calibration.to_json(), "report.html": report}
+    return results | {"report.html": report}
+
+
+def _calibration_verdict(procedure: TestfieldProcedure) -> dict[str, list[str]]:
+    from ..procedures.assessment import sorted_remarks
+
+    found = procedure.calibrated().required()
+    warnings, tests = sorted_remarks(found.result, found.assessments.values())
+    return {
+        "lines": [line for each in found.assessments.values() for line in each.lines],
+        "warnings": [str(each) for each in warnings],
+        "tests": [str(each) for each in tests],
+    }
 
 
 def _film_procedure(session: Session, given: FilmParameters) -> FilmRollProcedure:
@@ -402,7 +408,8 @@ KINDS: Mapping[str, SessionKind] = {
         _testfield,
         ("design.json",),
         procedure=_testfield_procedure,
-        results=_testfield_results,
+        results=_calibration_results,
+        verdict=_calibration_verdict,
     ),
     "oscilloscope": SessionKind(
         OscilloscopeParameters,
@@ -416,7 +423,8 @@ KINDS: Mapping[str, SessionKind] = {
         _of_files,
         ("design.json",),
         procedure=_testfield_procedure,
-        results=_photographs_results,
+        results=_calibration_results,
+        verdict=_calibration_verdict,
     ),
     "film": SessionKind(FilmParameters, _of_files, procedure=_film_procedure, results=_film_results),
     "sensor": SessionKind(

@@ -13,7 +13,7 @@ from .estimates import (
     StageEstimate,
 )
 from .fields import camera_mapping, projection_field_at
-from .image_scatter import sigma_between_images
+from .image_scatter import image_scatter, sigma_between_images
 from .patterns import CommonPattern, by_place, by_point, common_pattern
 from .result import Eliminated, Result
 from .target_part import covariance_by_targets
@@ -40,6 +40,7 @@ __all__ = [
     "common_pattern",
     "control_shape",
     "covariance_by_targets",
+    "image_scatter",
     "projection_field_at",
     "sigma_between_images",
 ]

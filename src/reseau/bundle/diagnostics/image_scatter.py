@@ -14,7 +14,7 @@ from ...core.data import Array
 from ..solver.normal import SEGMENTS
 from .result import Result
 
-__all__ = ["sigma_between_images"]
+__all__ = ["image_scatter", "sigma_between_images"]
 
 # Images processed at once, and minimum number of images for an estimate.
 _AT_ONCE, LEAST_IMAGES = 64, 6
@@ -77,3 +77,31 @@ def sigma_between_images(result: Result, c: int) -> Array:
     m = len(images)
     sigma: Array = np.sqrt((moved**2).sum(axis=1) * m / (m - 1))
     return sigma
+
+
+def image_scatter(result: Result, c: int) -> float:
+    """Return how much more the images of a camera scatter than their standard deviations say.
+
+    Parameters
+    ----------
+    result : Result
+        Of the adjustment.
+    c : int
+        Row of the camera.
+
+    Returns
+    -------
+    float
+        Root mean square, over the parameters of the camera, of :func:`sigma_between_images` relative to the
+        formal standard deviations; NaN with fewer than six images.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> round(image_scatter(adjust_network(example_network()), 0), 1)
+    1.6
+    """
+    sigma = np.sqrt(np.diag(result.camera_covariance(c)))
+    ratio = sigma_between_images(result, c) / np.where(sigma > 0, sigma, np.inf)
+    ratio = ratio[np.isfinite(ratio)]
+    return float(np.sqrt(np.mean(ratio**2))) if len(ratio) else float("nan")
