@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from reseau.bundle import Network, adjust_network
+from reseau.bundle import Network, adjust_network, regularised
 from reseau.core.data import Array
 from reseau.core.errors import FormatError, UsageError
 from reseau.exchange.calibrations import mrcal
@@ -124,6 +124,32 @@ def test_names_with_a_grid_are_models() -> None:
         camera_model("splined_stereographic_order=4_Nx=7_Ny=6_fov_x_deg=80")
     with pytest.raises(UsageError, match="is unknown"):
         camera_model("splined_stereographic_order=3")
+
+
+def test_corners_without_image_points_are_told_as_regularised() -> None:
+    """Nothing was observed in the lower right; the other parts are determined by the image points."""
+    lens = lenses.fisheye(45)
+    flat, _ = lenses.board(8, 6, 1.0)
+    seen = [
+        (rows[own], xy[own])
+        for rows, xy in lenses.views(lens, flat, flat, 24, 0.1, 3, whole=False)
+        if (own := (xy < [700, 500]).any(axis=1)).sum() > 10
+    ]
+    f = float(lens.matrix[0, 0])
+    start = {"fx": f, "fy": f, "cx": (lens.width - 1) / 2, "cy": (lens.height - 1) / 2}
+    model = "splined_stereographic_order=3_Nx=10_Ny=8_fov_x_deg=90"
+    free = list(camera_model(model).usual)
+    document = lenses.document(lens, flat, seen, start, free, 0.1, model)
+    network = Network.from_document(Network1.from_content(json.loads(json.dumps(document)), where="test"))
+    result = adjust_network(network).required()
+    found = regularised(result, 0)
+    assert found is not None
+    assert found.regions["lower right"] > 0.5
+    assert not {"middle", "left", "upper", "upper left"} & set(found.regions)
+    assert found.where_observed < 0.2
+    assert found.largest > 20 * np.median(found.sigma[found.observed])
+    (told,) = [remark for remark in result.warnings if "regularisation" in str(remark)]
+    assert "lower right" in str(told)
 
 
 @pytest.mark.slow

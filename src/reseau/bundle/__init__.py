@@ -11,6 +11,7 @@ from .diagnostics import (
     PointEstimates,
     PriorInfluence,
     RefractionEstimate,
+    Regularised,
     Result,
     RigEstimate,
     StageEstimate,
@@ -20,6 +21,7 @@ from .diagnostics import (
     common_pattern,
     image_scatter,
     projection_field_at,
+    regularised,
     sigma_between_images,
 )
 from .document import ResultDocument, model_search_entries
@@ -83,6 +85,7 @@ __all__ = [
     "PointEstimates",
     "PriorInfluence",
     "RefractionEstimate",
+    "Regularised",
     "Result",
     "ResultDocument",
     "Rig",
@@ -112,6 +115,7 @@ __all__ = [
     "model_search_entries",
     "problem_of",
     "projection_field_at",
+    "regularised",
     "reweighted",
     "search_model",
     "sigma_between_images",

@@ -19,9 +19,11 @@ from ..optics.refraction import Refraction
 from .diagnostics import (
     MotionEstimates,
     PriorInfluence,
+    Regularised,
     Result,
     RigEstimate,
     StageEstimate,
+    regularised,
     sigma_between_images,
 )
 from .network import Rig
@@ -57,6 +59,20 @@ class Significance(Strict):
     significant: bool
 
 
+class RegularisationResult(Strict):
+    """Influence of a regularisation over the image.
+
+    `area` is the part of the image where most of the variance of the projection is that of the
+    regularisation, `regions` the part of each ninth of the image; `sigma` the largest standard deviation
+    there (px), and `where_observed` the median share of the variance where there are image points.
+    """
+
+    area: float
+    regions: dict[str, float]
+    sigma: float
+    where_observed: float
+
+
 class PriorResult(Strict):
     """Observed parameters of a camera in columns: their share in the estimates, and sigmas with and without.
 
@@ -72,6 +88,7 @@ class PriorResult(Strict):
     sigma_images: tuple[float, ...]
     determined: float
     sigma0: float | None
+    regularisation: RegularisationResult | None = None
 
 
 class CameraResult(Strict):
@@ -410,7 +427,7 @@ def _camera(result: Result, c: int) -> CameraResult:
     }
     between = _column(sigma_between_images(result, c))
     influence = result.priors(c)
-    more = {} if influence is None else {"priors": _priors(influence)}
+    more = {} if influence is None else {"priors": _priors(influence, regularised(result, c))}
     return CameraResult(
         id=camera.id,
         parameters=held | estimated,
@@ -421,12 +438,15 @@ def _camera(result: Result, c: int) -> CameraResult:
     )
 
 
-def _priors(found: PriorInfluence) -> PriorResult:
+def _priors(found: PriorInfluence, over: Regularised | None) -> PriorResult:
     columns = (found.given, found.sigma_given, found.share, found.sigma, found.sigma_images)
     given, sigma_given, share, sigma, images = (tuple(column.tolist()) for column in columns)
     return PriorResult(
         parameter=found.parameters, given=given, sigma_given=sigma_given, share=share, sigma=sigma,
         sigma_images=images, determined=found.determined, sigma0=_number(found.sigma0),
+        regularisation=None if over is None else RegularisationResult(
+            area=over.area, regions=over.regions, sigma=over.largest, where_observed=over.where_observed
+        ),
     )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from .estimates import (
 from .fields import camera_mapping, projection_field_at
 from .image_scatter import image_scatter, sigma_between_images
 from .patterns import CommonPattern, by_place, by_point, common_pattern
+from .regularisation import Regularised, regularised
 from .result import Eliminated, Result
 from .target_part import covariance_by_targets
 
@@ -29,6 +30,7 @@ __all__ = [
     "PointEstimates",
     "PriorInfluence",
     "RefractionEstimate",
+    "Regularised",
     "Result",
     "RigEstimate",
     "StageEstimate",
@@ -42,5 +44,6 @@ __all__ = [
     "covariance_by_targets",
     "image_scatter",
     "projection_field_at",
+    "regularised",
     "sigma_between_images",
 ]

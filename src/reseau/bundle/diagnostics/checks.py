@@ -15,6 +15,7 @@ from ..network import Network
 from ..solver import BundleFit
 from .image_scatter import sigma_between_images
 from .patterns import CommonPattern, by_place, common_pattern
+from .regularisation import regularised
 from .result import Result
 
 __all__ = ["LISTED", "checks", "listed", "unmodelled_pattern"]
@@ -145,6 +146,7 @@ def checks(result: Result) -> list[Remark]:
         *_behind(network, fit),
         *_parallel(network, fit),
         *_corners(network, fit),
+        *_regularised(result),
     ]
 
 
@@ -494,3 +496,24 @@ def _corners(network: Network, fit: BundleFit) -> list[Remark]:
                 Remark(f"{camera.label}: no points in the {', '.join(empty)} of its images", Code.COVERAGE)
             )
     return found[:LISTED]
+
+
+def _regularised(result: Result) -> list[Remark]:
+    """Parts of the image where a camera is as it is because of its regularisation."""
+    remarks = []
+    for c, camera in enumerate(result.network.cameras):
+        found = regularised(result, c)
+        if found is None or not found.mostly.any():
+            continue
+        order = sorted(found.regions, key=lambda name: -found.regions[name])
+        regions = listed(f"{name} ({100 * found.regions[name]:.0f} % of that ninth)" for name in order)
+        remarks.append(
+            Remark(
+                f"{camera.label}: the regularisation, not the image points, determines most of the camera in "
+                f"{100 * found.area:.0f} % of its images: {regions}; the projection there has a sigma of up "
+                f"to {found.largest:.2g} px. Where there are image points, it causes "
+                f"{100 * found.where_observed:.0f} % of the variance in the median",
+                Code.COVERAGE,
+            )
+        )
+    return remarks[:LISTED]
