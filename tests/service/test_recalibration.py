@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -228,6 +231,60 @@ def body(message: Any) -> str:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("way", ["address", "name", "redirect", "rebinding"])
+def test_alarms_reach_no_address_inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+    pytest.importorskip("apprise", reason="needs apprise (extra `service`)")
+    asked: list[str] = []
+
+    class Hook(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            asked.append(self.path)
+            self.send_response(307 if self.path == "/moved" else 200)
+            self.send_header("Location", f"http://127.0.0.2:{self.server.server_port}/inside")  # type: ignore[attr-defined]
+            self.end_headers()
+
+        def log_message(self, *_: Any) -> None:
+            """Nothing."""
+
+    if way == "rebinding":  # a name that resolves to a public address first, and inside when it is used
+        (tmp_path / "sitecustomize.py").write_text(_REBINDING)
+        monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    with ThreadingHTTPServer(("127.0.0.1", 0), Hook) as server:
+        threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+        port = server.server_port
+        hosts = {"name": f"localhost:{port}/", "rebinding": f"alarms.example:{port}/"}
+        url = f"json://{hosts.get(way, f'127.0.0.1:{port}/' + ('moved' if way == 'redirect' else ''))}"
+        inside = ["127.0.0.1/32"] if way == "redirect" else []
+        with pytest.raises(UsageError, match=r"127\.0\.0\..*--inside|::1.*--inside"):
+            sender([url], inside)("title", "text")
+        assert asked == (["/moved"] if way == "redirect" else [])
+        if way == "address":
+            assert sender([url], ["127.0.0.1"])("title", "text")
+            assert asked == ["/"]
+        server.shutdown()
+    with pytest.raises(UsageError, match="is no network"):
+        sender([url], ["example"])
+
+
+_REBINDING = """
+import socket
+
+plain, count = socket.getaddrinfo, 0
+
+
+def rebinding(host, port, *arguments, **options):
+    global count
+    if host == "alarms.example":
+        count += 1
+        host = "192.0.2.1" if count == 1 and not arguments else "127.0.0.1"
+    return plain(host, port, *arguments, **options)
+
+
+socket.getaddrinfo = rebinding
+"""
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_alarms_are_sent_once_and_repeated_until_they_are_acknowledged(
     tmp_path: Path, mailbox: tuple[str, list[Any]]
 ) -> None:
@@ -235,7 +292,7 @@ def test_alarms_are_sent_once_and_repeated_until_they_are_acknowledged(
     address, received = mailbox
     start = datetime(2026, 3, 2, 8, tzinfo=UTC)
     with Archive.open(tmp_path / "archive", create=True) as archive:
-        alarms, deliver, day = Alarms(archive), sender([address]), timedelta(days=1)
+        alarms, deliver, day = Alarms(archive), sender([address], ["127.0.0.1"]), timedelta(days=1)
         assert alarms.send(deliver, day, start) == []
         assert received == []
         known = Configurations(archive)

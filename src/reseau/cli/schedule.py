@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 __all__ = ["alarms", "app", "recalibrate"]
 
 app = typer.Typer(no_args_is_help=True, help="Schedules of recalibrations: add, show, export, run.")
+Inside = Annotated[
+    list[str] | None,
+    typer.Option(help="Network inside to which alarms may be sent, as 192.168.1.0/24; repeatable."),
+]
 alarms = typer.Typer(no_args_is_help=True, help="Alarms: list, acknowledge, send.")
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the schedule.")]
@@ -114,6 +118,7 @@ def run_(
     once: Annotated[bool, typer.Option("--once", help="Carry out what is due now, and end.")] = False,
     every: Annotated[float, typer.Option(min=1, help="Time between two looks at the schedules (s).")] = 300.0,
     to: Annotated[list[str] | None, typer.Option(help="Where to send alarms: a URL of apprise.")] = None,
+    inside: Inside = None,
     repeat: Annotated[float, typer.Option(min=0.01, help="Repeat alarms after this time (h).")] = 24.0,
     archive: ArchivePlace = "archive",
     objects: ObjectsPlace = None,
@@ -125,7 +130,7 @@ def run_(
             signal.signal(each, lambda *_: over.set())
     from ..service import Alarms, Recalibrations, Schedules, sender
 
-    deliver = None if not to else sender(to)
+    deliver = None if not to else sender(to, inside or ())
     if not once:
         say(f"looking at the schedules of {archive} every {every:g} s; Ctrl-C ends this\n")
     failed = False
@@ -270,6 +275,7 @@ def acknowledge(
 @alarms.command()
 def send(
     to: Annotated[list[str], typer.Option(help="Where to: a URL of apprise; may be repeated.")],
+    inside: Inside = None,
     repeat: Annotated[float, typer.Option(min=0.01, help="Repeat after this time (h).")] = 24.0,
     archive: ArchivePlace = "archive",
     objects: ObjectsPlace = None,
@@ -278,5 +284,5 @@ def send(
     from ..service import Alarms, sender
 
     with open_archive(archive, objects) as found:
-        sent = Alarms(found).send(sender(to), timedelta(hours=repeat))
+        sent = Alarms(found).send(sender(to, inside or ()), timedelta(hours=repeat))
     say(f"{len(sent)} sent\n")

@@ -42,8 +42,12 @@ def serve(
     archive: ArchivePlace = "archive",
     objects: ObjectsPlace = None,
     bench: Annotated[
-        list[Path] | None,
-        typer.Option("--bench", "-b", help="Bench file; repeatable. Each has a worker process."),
+        list[str] | None,
+        typer.Option(
+            "--bench",
+            "-b",
+            help="Bench file; repeatable. Each has a worker process; on another machine: FILE@ADDRESS:PORT.",
+        ),
     ] = None,
     host: Annotated[
         str, typer.Option(help="Address to listen on; others than 127.0.0.1 need TLS and users.")
@@ -57,6 +61,13 @@ def serve(
     proxy: Annotated[
         str, typer.Option(help="Public address of a proxy that ends TLS, as https://bench.example.org.")
     ] = "",
+    sign_key: Annotated[
+        Path | None,
+        typer.Option(
+            help="Key that signs certificates of calibrations (PEM); password: RESEAU_KEY_PASSWORD."
+        ),
+    ] = None,
+    sign_certificate: Annotated[Path | None, typer.Option(help="Certificate of that key (PEM).")] = None,
     state: State = None,
     accounts: AccountsPlace = None,
 ) -> None:
@@ -67,9 +78,11 @@ def serve(
         from ..service.http.app import serve as run
     from ..service.http.options import ServeOptions
 
+    benches = [_placed(each) for each in bench or ()]
     options = ServeOptions(
         archive, objects, state, accounts, host, port, tuple(name or ()), certificate, key, proxy,
-        tuple(bench or ()),
+        tuple(path for path, _ in benches), {path: at for path, at in benches if at is not None}, sign_key,
+        sign_certificate,
     )  # fmt: skip
 
     def ready(service: Service) -> None:
@@ -82,6 +95,60 @@ def serve(
             typer.echo("`reseau service link` prints an address that lets a browser in", err=True)
 
     run(options, lambda line: typer.echo(line, err=True), ready)
+
+
+def _placed(text: str) -> tuple[Path, tuple[str, int] | None]:
+    """A bench file, and where its worker listens if that is on another machine."""
+    name, _, at = text.rpartition("@")
+    if not name or Path(text).is_file():
+        return Path(text), None
+    return Path(name), _address(at)
+
+
+def _address(text: str) -> tuple[str, int]:
+    import ipaddress
+
+    host, _, port = text.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        host = ""
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise UsageError("is no address and port", where=text, do="use 192.0.2.5:8490")
+    return host, int(port)
+
+
+@app.command()
+def worker(
+    bench: Annotated[Path, typer.Argument(help="Bench file; the service has the same.")],
+    listen: Annotated[str, typer.Option(help="Address and port to listen on, such as 192.0.2.5:8490.")],
+    certificates: Annotated[Path, typer.Option(help="Folder made by `reseau service worker-certificate`.")],
+    archive: ArchivePlace,
+    objects: ObjectsPlace = None,
+) -> None:
+    """Hold the instruments of a bench for a service on another machine, which uses the same archive."""
+    from ..service.worker import run
+
+    host, port = _address(listen)
+    run(bench, archive, objects, certificates, (host, port))
+
+
+@app.command("worker-certificate")
+def worker_certificate(
+    address: Annotated[str, typer.Argument(help="Address of the other machine, such as 192.0.2.5.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write, for the other machine.")],
+    archive: ArchivePlace = "archive",
+    state: State = None,
+) -> None:
+    """Make the certificate of a worker on another machine; copy its folder there, and keep it secret."""
+    from ..core.optional import optional
+
+    with optional():
+        from ..service.wire import Certificates
+
+    Certificates(_state(archive, state)).export(address, out)
+    say(f"{out}: for `reseau service worker --certificates` on {address}\n")
 
 
 @app.command()

@@ -7,6 +7,9 @@ has a key; what was sent and what was acknowledged are entries of a journal.
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -14,12 +17,13 @@ from datetime import datetime, timedelta
 from ..archive import Archive
 from ..core.errors import InputError, UsageError
 from ..core.optional import optional
+from .delivering import networks_of
 from .inforce import Configurations, a_time
 from .schedule import Schedules
 
 __all__ = ["Alarm", "Alarms", "sender"]
 
-_JOURNAL = "alarms"
+_JOURNAL, _LONGEST_S = "alarms", 120.0
 
 
 @dataclass(frozen=True)
@@ -176,29 +180,60 @@ class Alarms:
         return found
 
 
-def sender(addresses: Sequence[str]) -> Callable[[str, str], bool]:
+def sender(addresses: Sequence[str], inside: Sequence[str] = ()) -> Callable[[str, str], bool]:
     """Return a function that sends by apprise: mail, webhooks, chat.
+
+    A message is sent by a process of its own, which connects to public addresses only: neither a name that
+    resolves to an address of this machine or its network, nor a redirect leads inside.
 
     Parameters
     ----------
     addresses : sequence of str
         URLs of apprise, such as ``mailto://user:password@example.org``.
+    inside : sequence of str
+        Networks to which messages may be sent besides, such as ``192.168.1.0/24``.
 
     Raises
     ------
     UsageError
-        If one is not a URL of apprise, or apprise is not installed.
+        If one is not a URL of apprise or a network, or apprise is not installed. The function raises it when
+        an address leads inside.
 
     Examples
     --------
-    >>> deliver = sender(["json://127.0.0.1:8080/alarms"])  # doctest: +SKIP
+    >>> deliver = sender(["json://127.0.0.1:8080/alarms"], ["127.0.0.1"])  # doctest: +SKIP
     """
     with optional():
         import apprise
 
+    try:
+        networks_of(inside)
+    except ValueError as error:
+        raise UsageError(f"is no network ({error})", where="--inside", do="use 192.168.1.0/24") from None
     service = apprise.Apprise()
     for number, each in enumerate(addresses, start=1):
         if not service.add(each):
             # The address itself may contain a password.
             raise UsageError("cannot be used", where=f"address {number}", do="see the URLs of apprise")
-    return lambda title, body: bool(service.notify(title=title, body=body))
+
+    def deliver(title: str, body: str) -> bool:
+        given = {"addresses": list(addresses), "inside": list(inside), "title": title, "body": body}
+        command = [sys.executable, "-m", "reseau.service.delivering"]
+        try:
+            done = subprocess.run(
+                command,
+                input=json.dumps(given),
+                capture_output=True,
+                text=True,
+                timeout=_LONGEST_S,
+                check=False,
+            )
+            found = json.loads(done.stdout.splitlines()[-1])
+        except (subprocess.TimeoutExpired, ValueError, IndexError):
+            return False
+        if found["refused"]:
+            where = ", ".join(found["refused"])
+            raise UsageError("is inside, where no alarm is sent", where=where, do="allow it with --inside")
+        return bool(found["delivered"])
+
+    return deliver

@@ -46,6 +46,8 @@ class BenchLink:
         Has the certificates.
     told : callable
         Called with each event of the worker: kind, and facts.
+    elsewhere : (str, int), optional
+        Address and port of a worker on another machine, which is neither started nor ended.
 
     Raises
     ------
@@ -53,7 +55,16 @@ class BenchLink:
         If the file is not a bench.
     """
 
-    def __init__(self, path: Path, archive: str, objects: str | None, state: StateFolder, told: Told) -> None:
+    def __init__(
+        self,
+        path: Path,
+        archive: str,
+        objects: str | None,
+        state: StateFolder,
+        told: Told,
+        elsewhere: tuple[str, int] | None = None,
+    ) -> None:
+        self._elsewhere, self._wrong = elsewhere, ""
         self.path, self._archive, self._objects, self._state, self._told = path, archive, objects, state, told
         self.text = read_text(path)
         self.name = BenchFile.parse_toml(self.text, where=path).name
@@ -74,8 +85,9 @@ class BenchLink:
     def close(self) -> None:
         """End the worker, unless a session runs: then it goes on alone."""
         self._over.set()
-        with contextlib.suppress(ReseauError):
-            self.request("end", seconds=2.0)
+        if self._elsewhere is None:
+            with contextlib.suppress(ReseauError):
+                self.request("end", seconds=2.0)
         if self._wire is not None:
             self._wire.close()
         self._thread.join(5)
@@ -98,8 +110,8 @@ class BenchLink:
         """The state of the bench as the worker said it last; `down` without a worker."""
         if self._wire is None:
             more = {
-                "state": "down" if self.restarts >= 0 else "starting",
-                "error": "its worker does not answer",
+                "state": "down" if self.restarts >= 0 or self._wrong else "starting",
+                "error": self._wrong or "its worker does not answer",
             }
             return _EMPTY | self._status | more | {"name": self.name, "moving": ""}
         return _EMPTY | {"name": self.name} | self._status
@@ -184,6 +196,8 @@ class BenchLink:
 
     def _found(self) -> Wire | None:
         """The connection to a worker that runs already, with the same bench."""
+        if self._elsewhere is not None:
+            return self._remote(*self._elsewhere)
         try:
             about = json.loads(address_file(self._state, self.name).read_text())
             os.kill(int(about["pid"]), 0)
@@ -203,7 +217,7 @@ class BenchLink:
 
     def _started(self) -> Wire | None:
         """Start a worker, and return the connection to it."""
-        if self._over.is_set():
+        if self._over.is_set() or self._elsewhere is not None:
             return None
         place = address_file(self._state, self.name)
         place.unlink(missing_ok=True)
@@ -229,10 +243,27 @@ class BenchLink:
                     return self._connected(int(json.loads(place.read_text())["port"]))
         return None
 
-    def _connected(self, port: int) -> Wire:
-        raw = socket.create_connection(("127.0.0.1", port), timeout=5)
+    def _remote(self, host: str, port: int) -> Wire | None:
+        """The connection to a worker on another machine; None, with the reason, if it is no right one."""
         try:
-            sock = self._certificates.context("service").wrap_socket(raw)
+            wire = self._connected(port, host)
+            wire.send({"id": 0, "do": "bench"})
+            answer, _ = wire.receive()
+        except (OSError, ReseauError) as error:
+            self._wrong = f"its worker on {host} does not answer ({error})"
+            return None
+        if answer.get("value") != self.text:
+            self._wrong = f"its worker on {host} has another bench file"
+            wire.close()
+            return None
+        self._wrong = ""
+        return wire
+
+    def _connected(self, port: int, host: str = "") -> Wire:
+        raw = socket.create_connection((host or "127.0.0.1", port), timeout=5)
+        try:
+            context = self._certificates.context("service", elsewhere=bool(host))
+            sock = context.wrap_socket(raw, server_hostname=host or None)
             checked_peer(sock, "worker")
         except (OSError, ReseauError):
             raw.close()
@@ -240,7 +271,7 @@ class BenchLink:
         return Wire(sock)
 
 
-_AT_ONCE = frozenset({"stop", "status", "picture", "pause", "continue", "abort", "answer", "end"})
+_AT_ONCE = frozenset({"stop", "status", "bench", "picture", "pause", "continue", "abort", "answer", "end"})
 _EMPTY: dict[str, Any] = {
     "state": "starting", "error": "", "session": None, "question": None, "moving": "", "instruments": {},
     "has_camera": False, "has_table": False, "picture": 0, "pid": None,

@@ -70,6 +70,8 @@ class Decision:
         Who reviewed it, and the reason; empty if nobody did.
     comments : tuple of (str, str)
         Later comments: by whom, and text.
+    name : str
+        The name that people gave it; empty if nobody did.
 
     Examples
     --------
@@ -88,6 +90,7 @@ class Decision:
     reviewed_by: str = ""
     review: str = ""
     comments: tuple[tuple[str, str], ...] = ()
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -306,6 +309,23 @@ class Configurations:
         self._journal(name).add("comment", document)
         return self.decision(name, key)
 
+    def rename(self, name: str, key: str, given: str, *, by: str = "") -> Decision:
+        """Give a decision a name, by which it is called from now on.
+
+        Raises
+        ------
+        UsageError
+            If there is no name, or another decision of the configuration has it.
+        """
+        decision, given = self.decision(name, key), given.strip()
+        if not given:
+            raise UsageError("is empty", where="name of the calibration")
+        if any(each.name == given and each.key != decision.key for each in self.history(name)):
+            raise UsageError("is another calibration", where=f"{name}: {given}", do="give another name")
+        document = {"key": decision.key, "name": given, "by": by or _user()}
+        self._journal(name).add("name", document)
+        return self.decision(name, key)
+
     def roll_back(
         self, name: str, key: str, *, since: datetime | None = None, by: str = "", comment: str = ""
     ) -> Applied:
@@ -340,14 +360,16 @@ class Configurations:
         return sorted(found)
 
     def decision(self, name: str, key: str) -> Decision:
-        """Return a decision by the start of its key.
+        """Return a decision by its name, or by the start of its key.
 
         Raises
         ------
         UsageError
             If there is none, or several.
         """
-        found = [each for each in self.history(name) if each.key.startswith(key)] if key else []
+        history = self.history(name) if key else []
+        found = [each for each in history if each.name == key]
+        found = found or [each for each in history if each.key.startswith(key)]
         if len(found) != 1:
             raise UsageError(f"names {len(found)} decisions", where=f"{name}: {key!r}", do="see its history")
         return found[0]
@@ -356,6 +378,7 @@ class Configurations:
         """Return all decisions in the order in which they were made."""
         entries = self._entries(name)
         reviews = {each.document["key"]: each.document for each in entries if each.kind == "review"}
+        names = {each.document["key"]: each.document["name"] for each in entries if each.kind == "name"}
         found = []
         for each in entries:
             if each.kind != "decision":
@@ -372,7 +395,7 @@ class Configurations:
                     each.key, judged.outcome if review is None else cast(Outcome, review["outcome"]),
                     _since(each), each.at, d["by"], d["comment"], judged, d["compared_with"],
                     "" if review is None else review["by"], "" if review is None else review["comment"],
-                    tuple(comments),
+                    tuple(comments), names.get(each.key, ""),
                 )
             )  # fmt: skip
         return found

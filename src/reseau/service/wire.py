@@ -8,6 +8,7 @@ described in `docs/formats.md`, ``reseau-worker/1``.
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import json
 import select
 import socket
@@ -16,6 +17,7 @@ import struct
 import threading
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from ..core.errors import ConnectionLost, InstrumentError, ProtocolError, ReseauError, UsageError
@@ -27,6 +29,7 @@ __all__ = ["Certificates", "Wire", "error_of", "to_error"]
 T = TypeVar("T")
 _LENGTHS = struct.Struct(">II")
 _MOST_HEADER, _MOST_BODY = 8 << 20, 256 << 20
+_NAME, _AUTHORITY, _KEY = "reseau workers", "authority.pem", "authority-key.pem"
 _PATIENCE_S = 10.0
 """How long the other side may not read."""
 Role = Literal["service", "worker"]
@@ -52,59 +55,114 @@ class Certificates:
 
     def __init__(self, state: StateFolder) -> None:
         self._folder = state.subfolder("workers")
-        if not (self._folder / "authority.pem").is_file():
+        if not (self._folder / _AUTHORITY).is_file():
             self._make()
+
+    @classmethod
+    def in_folder(cls, folder: Path) -> Certificates:
+        """Return those of a worker on another machine; see :meth:`export`.
+
+        Raises
+        ------
+        UsageError
+            If they are not there, or others may read them.
+        """
+        found = cls.__new__(cls)
+        found._folder = StateFolder(folder).folder
+        for name in (_AUTHORITY, "worker.pem"):
+            if not (folder / name).is_file():
+                do = "make it with `reseau service worker-certificate` beside the service"
+                raise UsageError("is missing", where=folder / name, do=do)
+        return found
+
+    def export(self, address: str, folder: Path) -> None:
+        """Write the certificate of a worker on another machine, and what it needs to know the service.
+
+        Parameters
+        ----------
+        address : str
+            Its address, which the service checks.
+        folder : Path
+            Written; readable by its owner alone.
+
+        Raises
+        ------
+        UsageError
+            If it is no address, or the authority was made by an earlier version.
+        """
+        try:
+            host = ipaddress.ip_address(address)
+        except ValueError:
+            raise UsageError("is no address", where=address, do="use 192.0.2.5") from None
+        if not (self._folder / _KEY).is_file():
+            do = f"end the service, and move {self._folder} away"
+            raise UsageError("has no key of its authority", where=self._folder, do=do)
+        with optional():
+            from cryptography.hazmat.primitives.serialization import load_pem_private_key
+        authority: Any = load_pem_private_key((self._folder / _KEY).read_bytes(), None)
+        target = StateFolder(folder).folder
+        private_file(target / "worker.pem", _issued("worker", authority, host))
+        private_file(target / _AUTHORITY, (self._folder / _AUTHORITY).read_bytes())
 
     def _make(self) -> None:
         with optional():
-            from cryptography import x509
-            from cryptography.hazmat.primitives import hashes
             from cryptography.hazmat.primitives import serialization as forms
             from cryptography.hazmat.primitives.asymmetric import ec
-        pem, pkcs8, bare = forms.Encoding.PEM, forms.PrivateFormat.PKCS8, forms.NoEncryption()
-
-        def named(name: str) -> x509.Name:
-            return x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
-
-        now, authority = datetime.now(UTC), ec.generate_private_key(ec.SECP256R1())
-
-        def certified(name: str, key: ec.EllipticCurvePrivateKey, *, is_authority: bool) -> bytes:
-            made = (
-                x509.CertificateBuilder()
-                .subject_name(named(name))
-                .issuer_name(named("reseau workers"))
-                .public_key(key.public_key())
-                .serial_number(x509.random_serial_number())
-                # The clock may be set back later.
-                .not_valid_before(now - timedelta(days=3650))
-                .not_valid_after(now + timedelta(days=36500))
-                .add_extension(x509.BasicConstraints(ca=is_authority, path_length=None), critical=True)
-                .add_extension(
-                    x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.public_key()), False
-                )
-                .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False)
-                .sign(authority, hashes.SHA256())
-            )
-            return made.public_bytes(pem)
-
+        authority = ec.generate_private_key(ec.SECP256R1())
+        bare = authority.private_bytes(forms.Encoding.PEM, forms.PrivateFormat.PKCS8, forms.NoEncryption())
+        private_file(self._folder / _KEY, bare)
         for role in ("service", "worker"):
-            key = ec.generate_private_key(ec.SECP256R1())
-            both = key.private_bytes(pem, pkcs8, bare) + certified(role, key, is_authority=False)
-            private_file(self._folder / f"{role}.pem", both)
+            private_file(self._folder / f"{role}.pem", _issued(role, authority))
         # Last: its presence says that the others are there.
-        private_file(
-            self._folder / "authority.pem", certified("reseau workers", authority, is_authority=True)
-        )
+        private_file(self._folder / _AUTHORITY, _issued("", authority))
 
-    def context(self, role: Role) -> ssl.SSLContext:
-        """Return the settings of one side, which requires the certificate of the other."""
+    def context(self, role: Role, *, elsewhere: bool = False) -> ssl.SSLContext:
+        """Return the settings of one side, which requires the certificate of the other.
+
+        Of a worker elsewhere the service checks the address, too.
+        """
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if role == "worker" else ssl.PROTOCOL_TLS_CLIENT)
         context.minimum_version = ssl.TLSVersion.TLSv1_3
-        context.check_hostname = False
+        context.check_hostname = elsewhere
         context.verify_mode = ssl.CERT_REQUIRED
-        context.load_verify_locations(self._folder / "authority.pem")
+        context.load_verify_locations(self._folder / _AUTHORITY)
         context.load_cert_chain(self._folder / f"{role}.pem")
         return context
+
+
+def _issued(name: str, authority: Any, address: Any = None) -> bytes:
+    """A certificate with its key (PEM); without a name, that of the authority, without its key."""
+    with optional():
+        from cryptography import x509
+        from cryptography.hazmat.primitives import hashes
+        from cryptography.hazmat.primitives import serialization as forms
+        from cryptography.hazmat.primitives.asymmetric import ec
+
+    def named(text: str) -> x509.Name:
+        return x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, text)])
+
+    key = ec.generate_private_key(ec.SECP256R1()) if name else authority
+    now = datetime.now(UTC)
+    made = (
+        x509.CertificateBuilder()
+        .subject_name(named(name or _NAME))
+        .issuer_name(named(_NAME))
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        # The clock may be set back later.
+        .not_valid_before(now - timedelta(days=3650))
+        .not_valid_after(now + timedelta(days=36500))
+        .add_extension(x509.BasicConstraints(ca=not name, path_length=None), critical=True)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.public_key()), False)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False)
+    )
+    if address is not None:
+        made = made.add_extension(x509.SubjectAlternativeName([x509.IPAddress(address)]), False)
+    content: bytes = made.sign(authority, hashes.SHA256()).public_bytes(forms.Encoding.PEM)
+    if not name:
+        return content
+    bare = key.private_bytes(forms.Encoding.PEM, forms.PrivateFormat.PKCS8, forms.NoEncryption())
+    return bytes(bare) + content
 
 
 def checked_peer(sock: ssl.SSLSocket, role: Role) -> None:

@@ -31,7 +31,7 @@ from ..io import read_text
 from .state import StateFolder, private_file
 from .wire import Certificates, Wire, checked_peer, to_error
 
-__all__ = ["Worker", "address_file"]
+__all__ = ["Worker", "address_file", "run"]
 
 _LIVE_S, _RETRY_S, _WIDTH = 5.0, 3.0, 960
 _STEADY_S = 0.1
@@ -60,13 +60,14 @@ class Worker:
         Content of ``bench.toml``.
     archive : Archive
         Where sessions are stored.
-    state : StateFolder
-        Has the certificates.
+    certificates : Certificates
+        By which the service and it know each other.
     """
 
-    def __init__(self, text: str, archive: Archive, state: StateFolder) -> None:
+    def __init__(self, text: str, archive: Archive, certificates: Certificates) -> None:
         self.file = BenchFile.parse_toml(text, where="bench")
-        self.name, self._text, self._archive, self._state = self.file.name, text, archive, state
+        self.name, self._text, self._archive = self.file.name, text, archive
+        self._certificates = certificates
         self._bench = Bench(self.file)
         self._lock = threading.RLock()
         self._wires: set[Wire] = set()
@@ -367,6 +368,8 @@ class Worker:
             return True, {"ms": round(1e3 * spent, 1), **self.status()}, b""
         if what == "status":
             return True, self.status(), b""
+        if what == "bench":
+            return True, self._text, b""
         if what == "picture":
             self._looked = time.monotonic()
             return True, *self._live
@@ -467,7 +470,8 @@ class Worker:
                 number += 1
                 facts = {
                     "number": number, "width": frame.width, "height": frame.height,
-                    "edge_px": None if edge == float("inf") else round(edge, 2),
+                    # What is narrower than a step between two pixels is noise or a line, and no edge.
+                    "edge_px": round(edge, 2) if 0 < edge < float("inf") else None,
                     "exposure": exposure_fault(frame, _limits()) or "good",
                     "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
                     "points": self._points(frame),
@@ -504,13 +508,25 @@ class Worker:
                 return self._measures
         return None
 
-    def serve(self, port: int = 0) -> None:
-        """Listen until the end; says in a file of the state folder where."""
-        context = Certificates(self._state).context("worker")
-        with socket.create_server(("127.0.0.1", port)) as server:
-            place = address_file(self._state, self.name)
+    def serve(self, address: tuple[str, int] = ("127.0.0.1", 0), place: Path | None = None) -> None:
+        """Listen until the end; says in a file where, if one is given.
+
+        Raises
+        ------
+        UsageError
+            If the address cannot be used.
+        """
+        context = self._certificates.context("worker")
+        family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        try:
+            server = socket.create_server(address, family=family)
+        except OSError as error:
+            where = f"{address[0]}:{address[1]}"
+            raise UsageError(f"cannot be used ({error.strerror})", where=where) from None
+        with server:
             about = {"port": server.getsockname()[1], "pid": os.getpid(), "bench": self._text}
-            private_file(place, json.dumps(about).encode())
+            if place is not None:
+                private_file(place, json.dumps(about).encode())
             for each in (self.work, self.live):
                 threading.Thread(target=each, name=each.__name__, daemon=True).start()
             server.settimeout(0.3)
@@ -526,7 +542,8 @@ class Worker:
             self._bench.stop()
         if self._held is not None:
             self._held.close()
-        place.unlink(missing_ok=True)
+        if place is not None:
+            place.unlink(missing_ok=True)
 
     def _welcome(self, raw: socket.socket, context: ssl.SSLContext) -> None:
         try:
@@ -545,11 +562,31 @@ def _limits() -> Any:
     return Limits()
 
 
-def _main() -> None:
-    bench, place, objects, state = sys.argv[1:5]
-    folder = StateFolder(Path(state))
+def run(
+    bench: Path, place: str, objects: str | None, folder: Path, address: tuple[str, int] | None = None
+) -> None:
+    """Hold the instruments of a bench until a signal, or the service, ends it.
+
+    Parameters
+    ----------
+    bench : Path
+        Bench file.
+    place, objects : str
+        The archive.
+    folder : Path
+        State folder of the service; with an address the folder with the certificates.
+    address : (str, int), optional
+        Where to listen for a service on another machine.
+
+    Raises
+    ------
+    ReseauError
+        If bench, archive, certificates or address cannot be used.
+    """
+    told = None if address is not None else StateFolder(folder)
+    certificates = Certificates.in_folder(folder) if told is None else Certificates(told)
     with Archive.open(place, objects or None, create=True) as archive:
-        worker = Worker(read_text(Path(bench)), archive, folder)
+        worker = Worker(read_text(bench), archive, certificates)
 
         def end(*_: object) -> None:
             if worker._control is not None:
@@ -558,7 +595,15 @@ def _main() -> None:
 
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, end)
-        worker.serve()
+        if told is None:
+            worker.serve(address or ("127.0.0.1", 0))
+        else:
+            worker.serve(place=address_file(told, worker.name))
+
+
+def _main() -> None:
+    bench, place, objects, state = sys.argv[1:5]
+    run(Path(bench), place, objects or None, Path(state))
 
 
 if __name__ == "__main__":

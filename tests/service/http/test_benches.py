@@ -6,6 +6,8 @@ import os
 import signal
 import socket
 import ssl
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from reseau.archive import Archive
 from reseau.capture import Bench, BenchFile
 from reseau.core.errors import StateError
 from reseau.service.state import StateFolder
@@ -271,6 +274,39 @@ def test_a_service_that_ends_leaves_the_session_running_and_finds_it_again(rig: 
         assert found["session"]["name"] == "alone"
         state(other, "ready")
         assert other.get("/api/1/sessions/alone").json()["status"] == "done"
+
+
+@pytest.mark.slow
+def test_a_bench_on_another_machine_is_reached_with_its_own_certificate_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    bench = tmp_path / "attic.toml"
+    bench.write_text('schema = "reseau-bench/1"\nname = "attic"\n[instruments]\n')
+    Archive.open(tmp_path / "archive", create=True).close()
+    state = StateFolder.beside(str(tmp_path / "archive"))
+    own, other = tmp_path / "own", tmp_path / "other"
+    Certificates(state).export("127.0.0.2", own)
+    Certificates(state).export("127.0.0.3", other)
+    with socket.create_server(("127.0.0.2", 0)) as free:
+        port = free.getsockname()[1]
+    for folder, expected in ((other, "certificate"), (own, "ready")):
+        command = [sys.executable, "-c", "from reseau.cli import main; main()", "service", "worker"]
+        command += [str(bench), "--listen", f"127.0.0.2:{port}", "--certificates", str(folder)]
+        running = subprocess.Popen([*command, "--archive", str(tmp_path / "archive")], cwd=tmp_path)
+        try:
+            with served(tmp_path, benches=(bench,), workers={bench: ("127.0.0.2", port)}) as found:
+                client = found.client()
+                end = time.monotonic() + 60
+                while expected not in str(client.get("/api/1/benches/attic").json()):
+                    assert time.monotonic() < end
+                    time.sleep(0.1)
+                if folder is own:
+                    assert client.post("/api/1/benches/attic/check").json() == []
+            assert running.poll() is None  # the service ended, and left it
+        finally:
+            running.terminate()
+            assert running.wait(20) == 0
 
 
 def test_the_worker_answers_only_with_certificates(tmp_path: Path) -> None:

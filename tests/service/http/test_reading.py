@@ -5,7 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import shutil
+import subprocess
 import time
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -246,20 +249,62 @@ def test_a_session_is_judged_by_rules_through_the_api(one: Served) -> None:
     assert event.status_code == 201
 
 
+def test_a_calibration_has_the_name_that_somebody_gives_it(one: Served) -> None:
+    client = one.client("administer")
+    history = client.get(LEFT).json()["history"]
+    unnamed, key = history[3]["name"], history[3]["key"]
+    assert unnamed.endswith("2026 08:00 UTC")
+    assert client.get("/api/1/configurations/vidicon").json()["history"][0]["name"] == "monday"
+    named = client.post(f"{LEFT}/decisions/{key}/name", json={"name": "after the new lens"})
+    assert named.json()["name"] == "after the new lens"
+    assert client.get(f"{LEFT}/decisions/after the new lens").json()["decision"]["key"] == key
+    taken = {"name": "after the new lens"}
+    assert client.post(f"{LEFT}/decisions/{history[4]['key']}/name", json=taken).status_code == 422
+    assert "after the new lens" in client.get("/calibrations/left").text
+    assert one.client("operate").post(f"{LEFT}/decisions/{key}/name", json=taken).status_code == 403
+
+
+_LAB = {"name": "Institute of Photogrammetry", "city": "Bonn", "country": "DE", "email": "lab@example.org"}
+_CERTIFICATE = {
+    "schema": "reseau-certificate-data/1", "laboratory": _LAB, "customer": _LAB,
+    "item": {"name": "camera", "serial": "4711"}, "responsible": ["Ada Byron"],
+}  # fmt: skip
+
+
 def test_a_certificate_is_created_for_an_accepted_calibration(one: Served) -> None:
     pytest.importorskip("lxml")
     client = one.client("administer")
     history = client.get(LEFT).json()["history"]
     base = f"{LEFT}/decisions/{history[4]['key']}/certificate"
-    lab = {"name": "Institute of Photogrammetry", "city": "Bonn", "country": "DE", "email": "lab@example.org"}
-    data = {
-        "schema": "reseau-certificate-data/1", "laboratory": lab, "customer": lab,
-        "item": {"name": "camera", "serial": "4711"}, "responsible": ["Ada Byron"],
-    }  # fmt: skip
-    made = client.post(base, json={"form": "html", "data": data})
+    made = client.post(base, json={"form": "html", "data": _CERTIFICATE})
     assert made.status_code == 200, made.text
     assert "4711" in made.text
     assert made.headers["content-disposition"].startswith("attachment")
+
+
+def test_a_certificate_is_signed_with_the_key_of_the_service(
+    one: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("xmlsec")
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl, which makes the key, is not installed")
+    from reseau.service.certificates.signature import signatures
+
+    key, pem = tmp_path / "signer.key", tmp_path / "signer.pem"
+    given = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-subj", "/CN=signer"]
+    openssl = ["openssl", "req", "-x509", *given, "-keyout", key, "-out", pem]
+    subprocess.run(openssl, check=True, capture_output=True)
+    options = replace(one.service.options, signing_key=key, signing_certificate=pem)
+    monkeypatch.setattr(one.service, "options", options)
+    client = one.client("administer")
+    decision = client.get(LEFT).json()["history"][4]["key"]
+    order = {"form": "xml", "data": _CERTIFICATE}
+    made = client.post(f"{LEFT}/decisions/{decision}/certificate", json=order)
+    assert made.status_code == 200, made.text
+    (found,) = signatures(made.content, [pem])
+    assert found[0] == "passed", found
+    assert signatures(made.content.replace(b"4711", b"4712"), [pem])[0][0] == "failed"
+    assert client.get("/api/1/audit").json()[0]["facts"] == {"form": "xml", "signed": True}
 
 
 def test_pages_show_what_the_api_says(one: Served) -> None:

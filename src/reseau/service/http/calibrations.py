@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from datetime import UTC, date, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -25,7 +26,7 @@ __all__ = ["ConfigurationRow", "calibration_detail", "comparison", "configuratio
 router = APIRouter(tags=["calibrations"], responses=refusals(400, 401, 403, 404, 409, 422, 503))
 
 Name = Annotated[str, Path(max_length=200, description="Name of the configuration.")]
-Key = Annotated[str, Path(max_length=64, description="Decision, by the start of its key.")]
+Key = Annotated[str, Path(max_length=100, description="Decision, by its name or the start of its key.")]
 SVG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/svg+xml": {}}, "description": "The figure"}
 }  # fmt: skip
@@ -35,6 +36,7 @@ class InForce(Answer):
     """The calibration that applies."""
 
     key: str
+    name: str
     since: str
     why: str
 
@@ -58,9 +60,13 @@ class FindingRow(Answer):
 
 
 class DecisionRow(Answer):
-    """A decision on a calibration; `session` is where it comes from, if the archive knows that."""
+    """A decision on a calibration; `session` is where it comes from, if the archive knows that.
+
+    Without a name that somebody gave it, `name` is that of its session, or says when it began.
+    """
 
     key: str
+    name: str
     outcome: str
     since: str
     at: str
@@ -156,6 +162,7 @@ class NewDecision(Answer):
     calibration: dict[str, Any] | None = None
     rules: dict[str, Any]
     since: AwareDatetime | None = None
+    name: str = Field(default="", max_length=100, description="Name of the calibration.")
     comment: str = Field(default="", max_length=2000)
 
     model_config = ConfigDict(
@@ -182,6 +189,14 @@ class Comment(Answer):
     """A comment."""
 
     comment: str = Field(min_length=1, max_length=2000)
+
+
+class NewName(Answer):
+    """The name of a calibration."""
+
+    name: str = Field(min_length=1, max_length=100, pattern=r"^[^/\\\x00-\x1f]+$")
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"name": "after the new lens"}})
 
 
 class Return(Answer):
@@ -265,21 +280,24 @@ def _session_of(service: Service, decision: Decision) -> str | None:
 
 
 def _row(service: Service, decision: Decision) -> DecisionRow:
+    session = _session_of(service, decision)
     return DecisionRow(
-        key=decision.key, outcome=decision.outcome, since=decision.since.isoformat(),
+        key=decision.key, name=decision.name or session or f"{decision.since:%-d %B %Y %H:%M} UTC",
+        outcome=decision.outcome, since=decision.since.isoformat(),
         at=decision.at.isoformat(), by=decision.by, comment=decision.comment,
         compared_with=decision.compared_with,
         findings=[FindingRow(rule=f.rule, level=f.level, text=f.text) for f in decision.judgement.findings],
         reviewed_by=decision.reviewed_by, review=decision.review, comments=list(decision.comments),
-        session=_session_of(service, decision),
+        session=session,
     )  # fmt: skip
 
 
-def _in_force(known: Configurations, name: str, now: datetime) -> InForce | None:
+def _in_force(service: Service, known: Configurations, name: str, now: datetime) -> InForce | None:
     applied = known.applied(name, now)
     if applied is None:
         return None
-    return InForce(key=applied.key, since=applied.since.isoformat(), why=applied.why)
+    row = _row(service, known.decision(name, applied.key))
+    return InForce(key=applied.key, name=row.name, since=applied.since.isoformat(), why=applied.why)
 
 
 def listed(service: Service) -> list[ConfigurationRow]:
@@ -292,7 +310,7 @@ def listed(service: Service) -> list[ConfigurationRow]:
             history = known.history(name)
             found.append(
                 ConfigurationRow(
-                    name=name, parts=known.parts(name), in_force=_in_force(known, name, now),
+                    name=name, parts=known.parts(name), in_force=_in_force(service, known, name, now),
                     decisions=len(history), to_review=sum(d.outcome == "needs review" for d in history),
                 )
             )  # fmt: skip
@@ -306,7 +324,7 @@ def configuration_detail(service: Service, name: str) -> ConfigurationDetail:
     known = _the(service, name)
     history = known.history(name)
     return ConfigurationDetail(
-        name=name, parts=known.parts(name), in_force=_in_force(known, name, service.archive.clock()),
+        name=name, parts=known.parts(name), in_force=_in_force(service, known, name, service.archive.clock()),
         decisions=len(history), to_review=sum(d.outcome == "needs review" for d in history),
         history=[_row(service, each) for each in reversed(history)],
         events=[EventRow(at=at.isoformat(), what=what) for at, what in known.events(name)],
@@ -438,6 +456,8 @@ def decide(name: Name, given: NewDecision, who: Administering, service: Here) ->
     facts = {"session": given.session, "rules": rules.version, "calibration": calibration.name}
     with service.audited(who, "decide", name, facts):
         made = known.decide(name, calibration, rules, since=since, by=who.name, comment=comment)
+        if given.name.strip():
+            made = known.rename(name, made.key, given.name, by=who.name)
     return _row(service, made)
 
 
@@ -569,6 +589,15 @@ def comment(name: Name, key: Key, given: Comment, who: Operating, service: Here)
     )  # fmt: skip
 
 
+@router.post("/configurations/{name}/decisions/{key}/name")
+def rename(name: Name, key: Key, given: NewName, who: Administering, service: Here) -> DecisionRow:
+    """Give a calibration a name, by which people call it."""
+    return _audited(
+        service, who, "name", name, key, {"name": given.name},
+        lambda known, full: known.rename(name, full, given.name, by=who.name),
+    )  # fmt: skip
+
+
 @router.post("/configurations/{name}/decisions/{key}/return")
 def roll_back(name: Name, key: Key, given: Return, who: Administering, service: Here) -> DecisionRow:
     """Return to an earlier accepted calibration."""
@@ -595,15 +624,28 @@ def service_event(name: Name, given: ServiceEvent, who: Operating, service: Here
                      "description": "The certificate"}},
 )  # fmt: skip
 def certificate(name: Name, key: Key, given: CertificateOrder, who: Administering, service: Here) -> Response:
-    """Create the certificate of an accepted calibration: PDF with its XML, DCC or HTML; unsigned."""
+    """Create the certificate of an accepted calibration: PDF with its XML, DCC or HTML.
+
+    The XML, also that in the PDF, is signed if the service was given a key to sign with.
+    """
     from ...core.optional import optional
 
     with optional():
-        from ..certificates import CertificateData, certify, dcc_of, html_of, pdf_of
+        from ..certificates import CertificateData, certify, dcc_of, html_of, pdf_of, sign
 
-    known = _the(service, name)
+    known, keys = _the(service, name), service.options
     decision = _decision(known, name, key)
-    with service.audited(who, "certificate", f"{name} {decision.key}", {"form": given.form}), optional():
+
+    def xml(pages: str = "") -> bytes:
+        content = dcc_of(made, pages)
+        if keys.signing_key is None or keys.signing_certificate is None:
+            return content
+        return sign(
+            content, keys.signing_key, keys.signing_certificate, os.environ.get("RESEAU_KEY_PASSWORD")
+        )
+
+    facts = {"form": given.form, "signed": given.form != "html" and keys.signing_key is not None}
+    with service.audited(who, "certificate", f"{name} {decision.key}", facts), optional():
         data = CertificateData.from_content(dict(given.data), where="data")
         made = certify(
             known.calibration(name, decision.key), data,
@@ -611,9 +653,9 @@ def certificate(name: Name, key: Key, given: CertificateOrder, who: Administerin
             earlier=known.earlier(name, decision), probability=given.probability,
         )  # fmt: skip
         if given.form == "pdf":
-            content, kind = pdf_of(made, lambda pages: dcc_of(made, pages))[0], "application/pdf"
+            content, kind = pdf_of(made, xml)[0], "application/pdf"
         elif given.form == "xml":
-            content, kind = dcc_of(made, ""), "application/xml"
+            content, kind = xml(), "application/xml"
         else:
             content, kind = html_of(made).encode("utf-8"), "text/html; charset=utf-8"
     from .stored import SANDBOX

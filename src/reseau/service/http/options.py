@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -36,6 +37,10 @@ class ServeOptions:
         Public address of a proxy that ends TLS, such as ``https://bench.example.org``.
     benches : tuple of Path
         Files of benches.
+    workers : mapping of Path to (str, int)
+        Address and port of the workers of benches on other machines, by the file of the bench.
+    signing_key, signing_certificate : Path, optional
+        Private key and certificate (PEM) with which certificates of calibrations are signed.
 
     Raises
     ------
@@ -62,10 +67,15 @@ class ServeOptions:
     key: Path | None = None
     proxy: str = ""
     benches: tuple[Path, ...] = field(default_factory=tuple)
+    workers: Mapping[Path, tuple[str, int]] = field(default_factory=dict)
+    signing_key: Path | None = None
+    signing_certificate: Path | None = None
 
     def __post_init__(self) -> None:
         if (self.certificate is None) != (self.key is None):
             raise UsageError("must be given together", where="--certificate and --key")
+        if (self.signing_key is None) != (self.signing_certificate is None):
+            raise UsageError("must be given together", where="--sign-key and --sign-certificate")
         if self.proxy:
             parts = urlsplit(self.proxy)
             if parts.scheme != "https" or not parts.hostname or parts.path not in ("", "/"):
@@ -78,7 +88,7 @@ class ServeOptions:
         if self.names and self.certificate is None:
             # A name of another machine that resolves to this one is how pages of others get in.
             raise UsageError("needs --certificate and --key", where="--name")
-        for path in (self.certificate, self.key):
+        for path in (self.certificate, self.key, self.signing_key, self.signing_certificate):
             if path is not None and not path.is_file():
                 raise UsageError("is not a file", where=path)
 

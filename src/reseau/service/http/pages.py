@@ -291,13 +291,10 @@ def compare_page(
 ) -> Response:
     """Two calibrations of a configuration."""
     found, field = calibrations.comparison(service, name, first, second)
-    since = {
-        d.key: d.since[:16].replace("T", " ")
-        for d in calibrations.configuration_detail(service, name).history
-    }
+    names = {d.key: d.name for d in calibrations.configuration_detail(service, name).history}
     return _rendered(
-        request, "compare.html.j2", name=name, c=found, first=f"since {since[found.first]} UTC",
-        second=f"since {since[found.second]} UTC", drawn=field is not None,
+        request, "compare.html.j2", name=name, c=found, first=names[found.first], second=names[found.second],
+        drawn=field is not None,
     )  # fmt: skip
 
 

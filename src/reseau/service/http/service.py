@@ -77,7 +77,7 @@ class Service:
 
             link = BenchLink(
                 path.absolute(), str(self._place(options.archive)), options.objects, self.state,
-                self._told_by(path),
+                self._told_by(path), options.workers.get(path),
             )  # fmt: skip
             if link.name in self.benches:
                 raise UsageError("is the name of several benches", where=link.name, do="rename one")

@@ -236,7 +236,7 @@ if (picture) {
               circle.setAttribute('r', facts.width / 130);
               return circle;
             }));
-            words.textContent = `exposure ${facts.exposure}; sharpest edges ${facts.edge_px ?? '–'} px; ${facts.points.length} points found; ${facts.at.slice(11, 19)} UTC`;
+            words.textContent = `exposure ${facts.exposure}; ${facts.edge_px === null ? 'no sharp edges' : `sharpest edges ${facts.edge_px} px`}; ${facts.points.length} points found; ${facts.at.slice(11, 19)} UTC`;
           }
         }
       }
