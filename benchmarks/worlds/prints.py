@@ -15,7 +15,10 @@ import numpy as np
 
 from .pixels import Array, edge
 
-__all__ = ["Print", "aprilgrid", "charuco", "chess", "circles", "markers"]
+__all__ = ["Print", "aprilgrid", "charuco", "chess", "circles", "dotted", "markers", "puzzle"]
+
+_COARSE = 16
+"""Step of samples at which disks are looked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +37,8 @@ class Print:
         Black disks: x, y, radius.
     margin : float
         Paper around the ink, mm.
+    white : ndarray (k, 3)
+        Disks without ink, on top of everything: x, y, radius.
     symmetries : int
         1 if every point has its own name; else in how many ways the board looks the same.
     """
@@ -44,6 +49,7 @@ class Print:
     disks: Array = field(default_factory=lambda: np.zeros((0, 3)))
     margin: float = 8.0
     symmetries: int = 1
+    white: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
         ends = np.concatenate(
@@ -89,14 +95,21 @@ class Print:
             (a, c), (b, d) = ((at - reach, at + reach) for at, reach in zip((x, y), half, strict=True))
             whole = self._below(c, d) - self._below(a, d) - self._below(c, b) + self._below(a, b)
             ink = np.clip(whole / np.maximum((c - a) * (d - b), 1e-12), 0, 1)
-        for u, v, radius in self.disks:
-            near = np.nonzero(np.maximum(np.abs(x - u), np.abs(y - v)) < radius + 3 * (half[0] + half[1]))
-            if near[0].size:
-                dx, dy = x[near] - u, y[near] - v
-                away = np.maximum(np.hypot(dx, dy), 1e-9)
-                # Change of the distance over a sample, from those of both coordinates.
-                change = 2 * np.hypot(dx / away * half[0][near], dy / away * half[1][near])
-                ink[near] = np.maximum(ink[near], edge(radius - away, change))
+        # Where a disk is follows from few samples.
+        few = [at[::_COARSE, ::_COARSE] for at in (x, y)]
+        apart = sum(np.abs(np.gradient(at)).max(axis=0) for at in few) if min(few[0].shape) > 1 else np.inf
+        for k, (u, v, radius) in enumerate(np.concatenate([self.disks, self.white])):
+            rows = np.nonzero(np.maximum(np.abs(few[0] - u), np.abs(few[1] - v)) < radius + apart)
+            if not rows[0].size:
+                continue
+            part = tuple(slice(max(0, (r.min() - 1) * _COARSE), (r.max() + 2) * _COARSE) for r in rows)
+            dx, dy = x[part] - u, y[part] - v
+            away = np.maximum(np.hypot(dx, dy), 1e-9)
+            # Change of the distance over a sample, from those of both coordinates.
+            change = 2 * np.hypot(dx / away * half[0][part], dy / away * half[1][part])
+            inside = edge(radius - away, change)
+            white = k >= len(self.disks)
+            ink[part] = np.minimum(ink[part], 1 - inside) if white else np.maximum(ink[part], inside)
         return paper, ink
 
     def design(self) -> dict[str, Any]:
@@ -128,6 +141,32 @@ def chess(columns: int, rows: int, side: float, dark_first: bool = True) -> Prin
     ways = 2 if (columns + rows) % 2 == 0 else 1
     xy = side * np.stack([column, -row], axis=1)
     return Print(tuple(map(str, range(len(xy)))), xy.astype(float), square, symmetries=ways)
+
+
+def dotted(columns: int, rows: int, side: float, squares: list[tuple[int, int]]) -> Print:
+    """A chessboard with dots in some squares, as OpenCV's `gen_pattern.py` draws them (radius 0.17)."""
+    plain = chess(columns, rows, side)
+    dots = np.array([(side * (c - 0.5), side * (0.5 - r), 0.17 * side) for c, r in squares])
+    bare = np.array([(c + r) % 2 == 1 for c, r in squares])
+    return Print(plain.ids, plain.xy, plain.black, dots[bare], white=dots[~bare])
+
+
+def puzzle(side: float, vertical: Any, horizontal: Any, dark_first: bool = True) -> Print:
+    """A PuzzleBoard: a chessboard with a dot on each edge, of a third of its length, white for true bits.
+
+    `vertical` (r - 1, c) are the bits below the corners of each row, `horizontal` (r, c - 1) those beside
+    them.
+    """
+    rows, columns = len(horizontal), len(vertical[0])
+    plain = chess(columns + 1, rows + 1, side, dark_first)
+    ends = np.array([[-0.5, 0.5 - rows, columns - 0.5, 0.5]]) * side
+    low, high = np.maximum(plain.black[:, :2], ends[0, :2]), np.minimum(plain.black[:, 2:], ends[0, 2:])
+    dots = [(c, -r - 0.5, bit) for r, line in enumerate(vertical) for c, bit in enumerate(line)]
+    dots += [(c + 0.5, -r, bit) for r, line in enumerate(horizontal) for c, bit in enumerate(line)]
+    at = np.array(dots)
+    disks = np.column_stack([side * at[:, :2], np.full(len(at), side / 6)])
+    true = at[:, 2] > 0
+    return Print(plain.ids, plain.xy, np.hstack([low, high]), disks[~true], white=disks[true])
 
 
 def charuco(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 from dataclasses import replace
@@ -15,6 +16,7 @@ from reseau.core.data import Array, Frame
 from reseau.core.failure import Code, Failure
 from reseau.designs import board
 from reseau.designs.boards import marker_cells
+from reseau.designs.dots import dot_signs
 from reseau.io import BoardDesign
 from reseau.io.images import read_image
 from reseau.measure import BoardOptions, BoardResult, measure_board
@@ -126,6 +128,76 @@ def test_few_large_marks_through_a_lens_have_the_sigmas_of_their_errors(
     assert np.sqrt((error**2).mean()) < 0.004
 
 
+DOTS = ((3, 3), (3, 4), (4, 4))
+DOTTED = board("chess", 10, 8, 22.0, dots=DOTS)
+PUZZLE = board("puzzle", 10, 8, 22.0, start=(100, 7))
+DOTTED_PRINT = prints.dotted(10, 8, 22.0, list(DOTS))
+
+
+@functools.cache
+def puzzle_picture() -> tuple[Frame, Array]:
+    signs = dot_signs(PUZZLE)
+    printed = prints.puzzle(22.0, signs[1::2, 2:-1:2].T > 0, signs[2:-1:2, 1::2].T > 0, dark_first=False)
+    view = View(printed, *pose(2, printed, nearer=1.2), seed=2)
+    return Frame(view.picture(), 255.0, "puzzle"), view.truth
+
+
+def test_a_puzzleboard_has_the_bits_that_its_authors_print() -> None:
+    # From the description of the pattern: vertical edges in three rows, horizontal ones in five.
+    signs = dot_signs(board("puzzle", 6, 6, 10.0))
+    assert (signs[1:10:2, 2:7:2].T > 0).astype(int).tolist() == [
+        [0, 0, 0, 0, 1],
+        [0, 1, 1, 0, 0],
+        [0, 1, 0, 0, 0],
+    ]
+    across = [[1, 1, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1], [1, 1, 1, 1], [1, 0, 0, 1]]
+    assert (signs[2:9:2, 1:10:2].T > 0).astype(int).tolist() == across
+
+
+def test_a_part_of_a_puzzleboard_has_the_names_of_that_part() -> None:
+    frame, truth = puzzle_picture()
+    found = measured(frame, PUZZLE)
+    assert 20 < found.found < len(found.ids)
+    error = (found.xy - truth)[found.ok]
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert np.sqrt((error**2).mean()) < 0.005
+    assert 0.75 < np.sqrt(((error / sigma) ** 2).mean()) < 1.3
+    middle = truth[found.ok].mean(axis=0).astype(int)
+    x, y = middle - 160
+    part = Frame(frame.pixels[y : y + 320, x : x + 320].copy(), 255.0, "part")
+    some = measured(part, PUZZLE)
+    assert 12 <= some.found < 50
+    assert np.abs((some.xy + np.array([x, y]) - truth)[some.ok]).max() < 0.05
+    assert not some.notes
+
+
+def test_another_part_of_the_puzzle_and_its_mirror_image_are_declined() -> None:
+    frame, _ = puzzle_picture()
+    other = measure_board(frame, PUZZLE.model_copy(update={"start": (200, 107)}))
+    assert not other
+    assert other.code is Code.OTHER_DESIGN
+    mirrored = measure_board(replace(frame, pixels=np.ascontiguousarray(frame.pixels[:, ::-1])), PUZZLE)
+    assert not mirrored
+    assert mirrored.code is Code.MIRRORED
+
+
+def test_dots_tell_which_part_of_a_chessboard_is_seen() -> None:
+    view = View(DOTTED_PRINT, *pose(2, DOTTED_PRINT, nearer=1.2), seed=2)
+    frame, node = Frame(view.picture(), 255.0, "dots"), DOTTED.nodes.tolist()
+    found = measured(frame, DOTTED)
+    assert not found.notes
+    error = (found.xy - view.truth)[found.ok]
+    assert np.sqrt((error**2).mean()) < 0.005
+    # Around the dots, without any end of the pattern in sight.
+    near = [view.truth[node.index([x, y])] for x in (1, 4) for y in (1, 4)]
+    low, high = np.min(near, axis=0).astype(int) - 14, np.max(near, axis=0).astype(int) + 14
+    part = Frame(frame.pixels[low[1] : high[1], low[0] : high[0]].copy(), 255.0, "part")
+    some = measured(part, DOTTED)
+    assert 6 <= some.found < 36
+    assert np.abs((some.xy + low - view.truth)[some.ok]).max() < 0.1
+    assert not some.notes
+
+
 def test_half_a_chessboard_in_sight_is_measured() -> None:
     frame, truth = picture(CHESS, 20.0, 10.0)
     cut = 150
@@ -177,6 +249,20 @@ def test_old_and_new_layout_differ_with_an_even_number_of_rows(legacy: bool) -> 
     assert np.abs(measured(frame, design).xy - truth).max() < 0.03
     other = measure_board(frame, CHARUCO.model_copy(update={"legacy": not legacy}))
     assert isinstance(other, Failure)
+
+
+@pytest.mark.parametrize(
+    ("dictionary", "legacy"),
+    [("4X4_50", False), ("6X6_250", True), ("7X7_1000", False), ("ARUCO_ORIGINAL", True),
+     ("ARUCO_MIP_36h12", False), ("APRILTAG_16h5", True), ("APRILTAG_36h10", False),
+     ("APRILTAG_36h11", True)],
+)  # fmt: skip
+def test_markers_of_every_family_name_the_corners_of_a_charuco_board(dictionary: str, legacy: bool) -> None:
+    design = board("charuco", 5, 4, 25.0, dictionary=f"DICT_{dictionary}", legacy=legacy)
+    frame, truth = picture(design, distance=300.0)
+    found = measured(frame, design)
+    assert found.ok.all()
+    assert np.abs(found.xy - truth).max() < 0.03
 
 
 def test_a_few_markers_beside_a_plane_in_perspective_are_no_other_layout() -> None:

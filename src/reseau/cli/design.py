@@ -52,6 +52,7 @@ class Kind(StrEnum):
     """Kinds of boards."""
 
     CHESS = "chess"
+    PUZZLE = "puzzle"
     CHARUCO = "charuco"
     CIRCLES = "circles"
     APRILGRID = "aprilgrid"
@@ -262,6 +263,13 @@ def board(
     asymmetric: Annotated[
         bool, typer.Option("--asymmetric", help="Shift every second row of circles by half a step.")
     ] = False,
+    dots: Annotated[
+        str | None,
+        typer.Option(help="Squares of a chessboard with a dot, column row …, as OpenCV's: '7 4 7 5 8 5'."),
+    ] = None,
+    start: Annotated[
+        tuple[int, int], typer.Option(help="Column and row of a PuzzleBoard's first corner in its code.")
+    ] = (0, 0),
     given: Annotated[
         Path | None, typer.Option("--from", help="Board file of Kalibr or OpenCV to read (YAML, XML).")
     ] = None,
@@ -271,7 +279,7 @@ def board(
     paper: PaperOf = Paper.A4,
     out: Design = None,
 ) -> None:
-    """Design a chessboard, a ChArUco board, a circle grid, an AprilGrid or a grid of markers."""
+    """Design a chessboard, PuzzleBoard, ChArUco board, circle grid, AprilGrid or grid of markers."""
     if given is not None:
         from ..exchange import read_board
 
@@ -279,15 +287,30 @@ def board(
     else:
         from ..designs import board as board_of
 
+        marked = _pairs(dots) if dots else ()
+
         def of(pitch: float, size: float | None = None) -> BoardDesign:
             return board_of(
                 kind.value, columns, rows, pitch, size=size, dictionary=dictionary, first_id=first_id,
-                border_bits=border_bits, legacy=legacy, asymmetric=asymmetric, name=name,
+                border_bits=border_bits, legacy=legacy, asymmetric=asymmetric, dots=marked,
+                start=start, name=name,
             )  # fmt: skip
 
         design = of(pitch or _filling(of, paper), size)
     what = f"{design.kind}, {design.columns} × {design.rows}, pitch {design.pitch:g} mm"
     _write(design, svg, pdf, out, paper, what)
+
+
+def _pairs(text: str) -> tuple[tuple[int, int], ...]:
+    """Pairs of whole numbers between blanks or commas."""
+    from ..core.errors import UsageError
+
+    words = text.replace(",", " ").split()
+    if len(words) % 2 or not all(word.isdecimal() for word in words):
+        raise UsageError(
+            f"is {text!r}", where="--dots", do="give column and row of each square, as '7 4 7 5'"
+        )
+    return tuple((int(a), int(b)) for a, b in zip(words[::2], words[1::2], strict=True))
 
 
 def _filling(of: Callable[[float], Drawable], paper: Paper) -> float:

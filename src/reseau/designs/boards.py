@@ -1,4 +1,4 @@
-"""Boards that other programs use: chessboards, ChArUco boards, circle grids, AprilGrids."""
+"""Boards that other programs use: chessboards, PuzzleBoards, ChArUco boards, circle grids, AprilGrids."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from pydantic import ValidationError
 from ..core.data import Array
 from ..core.errors import UsageError
 from ..io.board import BoardDesign, BoardKind
+from .dots import dotted_squares
 
 __all__ = ["board", "board_figures", "marker_cells", "marker_dictionary"]
 
-_SIZES = {"charuco": 0.75, "circles": 0.5, "aprilgrid": 1 / 1.3, "markers": 0.8}
-"""Sizes of markers, circles and tags in pitches, where none is given; tags are 0.3 of a side apart."""
+_SIZES = {"puzzle": 1 / 3, "charuco": 0.75, "circles": 0.5, "aprilgrid": 1 / 1.3, "markers": 0.8}
+"""Sizes of dots, markers, circles and tags in pitches, where none is given; tags are 0.3 of a side apart."""
 _DICTIONARIES = {
     "charuco": "DICT_5X5_100",
     "aprilgrid": "DICT_APRILTAG_36h11",
@@ -35,19 +36,21 @@ def board(
     border_bits: int = 1,
     legacy: bool = False,
     asymmetric: bool = False,
+    dots: tuple[tuple[int, int], ...] = (),
+    start: tuple[int, int] = (0, 0),
     name: str = "board",
 ) -> BoardDesign:
     """Design a board, with the usual size and dictionary where none is given.
 
     Parameters
     ----------
-    kind : {"chess", "charuco", "circles", "aprilgrid", "markers"}
+    kind : {"chess", "puzzle", "charuco", "circles", "aprilgrid", "markers"}
         The pattern.
     columns, rows : int
         Number of squares, circles or tags.
     pitch : float
         Distance between squares, rows of circles or tags, mm.
-    size, dictionary, first_id, border_bits, legacy, asymmetric, name
+    size, dictionary, first_id, border_bits, legacy, asymmetric, dots, start, name
         See :class:`reseau.io.BoardDesign`.
 
     Raises
@@ -67,7 +70,8 @@ def board(
         design = BoardDesign(
             name=name, unit="mm", kind=kind, columns=columns, rows=rows, pitch=float(pitch),
             size=None if size is None else float(size), dictionary=dictionary or _DICTIONARIES.get(kind),
-            first_id=first_id, border_bits=border_bits, legacy=legacy, asymmetric=asymmetric,
+            first_id=first_id, border_bits=border_bits, legacy=legacy, asymmetric=asymmetric, dots=dots,
+            start=start,
         )  # fmt: skip
     except ValidationError as error:
         first = error.errors()[0]
@@ -142,6 +146,8 @@ def board_figures(design: BoardDesign) -> tuple[list[Array], Array]:
     if design.kind == "circles":
         assert design.size is not None
         return [], np.column_stack([design.xy, np.full(len(design.xy), design.size / 2)])
+    if design.kind == "puzzle" or design.dots:
+        return dotted_squares(design)
     polygons: list[Array] = []
     if design.kind in ("chess", "charuco"):
         row, column = np.divmod(np.arange(design.columns * design.rows), design.columns)

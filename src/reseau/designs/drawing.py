@@ -154,10 +154,13 @@ def _board(design: BoardDesign) -> Content:
     ends += [np.vstack([at[:2] - at[2], at[:2] + at[2]]) for at in circles]
     every = np.concatenate(ends)
     low, high = every.min(axis=0) - design.pitch / 2, every.max(axis=0) + design.pitch / 2
-    what = {"chess": "squares", "charuco": "squares", "circles": "circles"}.get(design.kind, "tags")
+    squares = {"chess": "squares", "puzzle": "squares", "charuco": "squares"}
+    what = (squares | {"circles": "circles"}).get(design.kind, "tags")
     title = f"{design.name}: {design.kind}, {design.columns} × {design.rows} {what}"
     title += f", pitch {design.pitch:g} mm"
-    if design.size is not None:
+    if design.kind == "puzzle":
+        title += f", from corner {design.start}"
+    elif design.size is not None:
         title += f", size {design.size:g} mm"
     if design.dictionary is not None:
         title += f", {design.dictionary}"

@@ -1,4 +1,4 @@
-"""``reseau-board/1``: chessboards, ChArUco boards, circle grids, AprilGrids and grids of markers."""
+"""``reseau-board/1``: chessboards, PuzzleBoards, ChArUco boards, circles, AprilGrids, grids of markers."""
 
 from __future__ import annotations
 
@@ -13,36 +13,41 @@ from .document import Document
 
 __all__ = ["BoardDesign", "BoardKind"]
 
-BoardKind = Literal["chess", "charuco", "circles", "aprilgrid", "markers"]
+BoardKind = Literal["chess", "puzzle", "charuco", "circles", "aprilgrid", "markers"]
 Length = Annotated[float, Field(gt=1e-6, le=1e6)]
 Count = Annotated[int, Field(ge=1, le=1000)]
 
-_FEWEST = {"chess": 3, "charuco": 2, "circles": 2, "aprilgrid": 1, "markers": 1}
+_FEWEST = {"chess": 3, "puzzle": 4, "charuco": 2, "circles": 2, "aprilgrid": 1, "markers": 1}
 _TAGGED = ("aprilgrid", "markers")
 _MARKED = ("charuco", *_TAGGED)
+_SQUARED = ("chess", "puzzle", "charuco")
+_CODE = 501
+"""Number of corners after which the code of a PuzzleBoard repeats."""
 
 
 class BoardDesign(Document):
     """``reseau-board/1``: a board of one regular pattern, in millimetres.
 
     Names are those of the programs that the boards come from, coordinates have y up: the inner corners of a
-    chessboard or a ChArUco board are numbered row by row from the upper left, and so are circles, with the
-    origin at the first; each tag of an AprilGrid has the corners ``tag.0`` … ``tag.3``, anticlockwise from
-    the lower left, with the origin at the lower left of the first tag, which is the lower left one; each
-    marker of a grid of OpenCV (`markers`: ArUco markers or AprilTags that touch nothing) has the corners
-    clockwise from the upper left, with the origin at the upper left of the first marker, the upper left one.
+    chessboard, a PuzzleBoard or a ChArUco board are numbered row by row from the upper left, and so are
+    circles, with the origin at the first; each tag of an AprilGrid has the corners ``tag.0`` … ``tag.3``,
+    anticlockwise from the lower left, with the origin at the lower left of the first tag, which is the lower
+    left one; each marker of a grid of OpenCV (`markers`: ArUco markers or AprilTags that touch nothing) has
+    the corners clockwise from the upper left, with the origin at the upper left of the first marker, the
+    upper left one.
 
     Parameters
     ----------
-    kind : {"chess", "charuco", "circles", "aprilgrid", "markers"}
+    kind : {"chess", "puzzle", "charuco", "circles", "aprilgrid", "markers"}
         The pattern; a single marker is a grid of 1 × 1.
     columns, rows : int
-        Number of squares, of circles, or of tags.
+        Number of squares, of circles, or of tags. The outer squares of a PuzzleBoard are halves: its
+        generator counts the corners, one less.
     pitch : float
         Side of a square; distance of neighbouring circles in a row, or of the rows of an asymmetric grid;
         distance of tags from centre to centre.
     size : float, optional
-        Diameter of a circle, or side of a marker or a tag with its border.
+        Diameter of a circle or of the dots of a PuzzleBoard, or side of a marker or a tag with its border.
     dictionary : str, optional
         Dictionary of the markers, as OpenCV names it: ``DICT_5X5_100``.
     first_id : int
@@ -55,6 +60,11 @@ class BoardDesign(Document):
     asymmetric : bool
         Whether every second row of circles is shifted by half a step; `pitch` is half their distance in a
         row, as in OpenCV.
+    dots : tuple of (int, int)
+        Squares of a chessboard (column, row from 0) with a dot in the other colour, 0.34 squares wide, as
+        OpenCV's ``radon_checkerboard`` has three: they tell where a part of the board belongs.
+    start : (int, int)
+        Column and row of the first corner of a PuzzleBoard in its code of 501 × 501 corners.
 
     Examples
     --------
@@ -76,6 +86,8 @@ class BoardDesign(Document):
     border_bits: Annotated[int, Field(ge=1, le=4)] = 1
     legacy: bool = False
     asymmetric: bool = False
+    dots: tuple[tuple[int, int], ...] = ()
+    start: tuple[int, int] = (0, 0)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -94,6 +106,16 @@ class BoardDesign(Document):
             raise ValueError("`legacy` is for ChArUco boards")
         if self.asymmetric and self.kind != "circles":
             raise ValueError("`asymmetric` is for circles")
+        if self.dots and self.kind != "chess":
+            raise ValueError("`dots` are for chessboards")
+        for column, row in self.dots:
+            if not (0 < column < self.columns - 1 and 0 < row < self.rows - 1):
+                raise ValueError(f"the dot in square ({column}, {row}) is not inside the outer squares")
+        if self.start != (0, 0) and self.kind != "puzzle":
+            raise ValueError("`start` is for PuzzleBoards")
+        ends = [first + n - 1 for first, n in zip(self.start, (self.columns, self.rows), strict=True)]
+        if self.kind == "puzzle" and (min(self.start) < 0 or max(ends) > _CODE):
+            raise ValueError(f"a PuzzleBoard lies within {_CODE} × {_CODE} corners")
         return self
 
     @property
@@ -103,8 +125,9 @@ class BoardDesign(Document):
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file; keys that the kind does not need are left out."""
         content = super().to_dict()
-        fields = type(self).model_fields
-        return {k: v for k, v in content.items() if k not in fields or v != fields[k].default}
+        fresh = {key: field.default for key, field in type(self).model_fields.items()}
+        plain = {key: list(v) if isinstance(v, tuple) else v for key, v in fresh.items()}
+        return {k: v for k, v in content.items() if k not in plain or v != plain[k]}
 
     @property
     def polarity(self) -> Literal["dark", "bright"]:
@@ -119,7 +142,7 @@ class BoardDesign(Document):
         asymmetric grid have steps of half their distance in a row.
         """
         columns, rows = self.columns, self.rows
-        if self.kind in ("chess", "charuco"):
+        if self.kind in _SQUARED:
             columns, rows = columns - 1, rows - 1
         if self.kind in _TAGGED:
             tag = np.arange(columns * rows)
@@ -153,7 +176,9 @@ class BoardDesign(Document):
 
     @property
     def dark_corner(self) -> bool:
-        """Whether the upper left square of a chessboard or a ChArUco board is black."""
+        """Whether the upper left square of a chessboard, a PuzzleBoard or a ChArUco board is black."""
+        if self.kind == "puzzle":
+            return sum(self.start) % 2 == 0
         return not (self.legacy and self.rows % 2 == 0)
 
     @property

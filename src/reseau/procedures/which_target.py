@@ -146,5 +146,6 @@ def _effort(design: Design) -> int:
     if isinstance(design, TestfieldDesign):
         return _LINED
     if isinstance(design, BoardDesign):
-        return _PLAIN if design.kind in ("chess", "circles") else _CODED
+        plain = design.kind == "circles" or (design.kind == "chess" and not design.dots)
+        return _PLAIN if plain else _CODED
     return _PLAIN if design.rings is None else _CODED

@@ -12,6 +12,7 @@ from ...core.data import Array, Frame
 from ...core.failure import Code, Failure, Remark
 from ...core.threads import one_thread
 from ...designs.boards import marker_cells
+from ...designs.dots import halves_of_dots
 from ...io.board import BoardDesign
 from ..points import Measured
 from ..reseau.disks import find_disks
@@ -89,7 +90,7 @@ class BoardResult(Measured):
 def measure_board(
     frame: Frame, design: BoardDesign, options: BoardOptions | None = None
 ) -> BoardResult | Failure:
-    """Measure the points of a chessboard, a ChArUco board, a circle grid, an AprilGrid or a grid of markers.
+    """Measure the points of a board of any kind: corners of squares or tags, or circles.
 
     Parameters
     ----------
@@ -190,8 +191,12 @@ def _placed(frame: Frame, screened: Screened, design: BoardDesign) -> Placed | F
         found = lay_circles(disks, design, shape)
         return replace(found, places=disks.xy) if isinstance(found, Failure) else found
     saddles = find_saddles(screened.grey, screened.noise)
-    if design.kind == "chess":
+    if design.kind in ("chess", "puzzle"):
         found = lay_chessboard(screened.grey, saddles, design)
+        if isinstance(found, Failure) and found.code is Code.OTHER_DESIGN and design.kind == "puzzle":
+            grey = np.ascontiguousarray(screened.grey[:, ::-1])
+            if lay_chessboard(grey, saddles.mirrored(frame.width), design):
+                return Failure("the board is seen mirrored", Code.MIRRORED)
     else:
         markers = _markers(frame, screened.grey, saddles, design)
         found = lay_marked(screened.grey, saddles, design, markers)
@@ -242,9 +247,16 @@ def sectors_of(design: BoardDesign) -> Sectors:
         return Sectors(towards[names], touching, reach, along, outlines, np.full(len(outlines), -1.0))
     below = design.nodes.sum(axis=1) % 2 == (0 if design.dark_corner else 1)
     dark = np.where(below[:, None], [1.0, -1.0], [1.0, 1.0])
-    _, outlines = design.markers
     reach = design.pitch / 2
-    return Sectors(dark, np.ones(count, dtype=bool), reach, reach, outlines, np.ones(len(outlines)))
+    if design.kind == "charuco":
+        outlines = design.markers[1]
+        ink = np.ones(len(outlines))
+    else:
+        outlines, ink = halves_of_dots(design)
+        if design.size is not None:
+            # The dots of a PuzzleBoard take the middles of its edges.
+            reach -= design.size / 2
+    return Sectors(dark, np.ones(count, dtype=bool), reach, reach, outlines, ink)
 
 
 def _bright_cells(design: BoardDesign) -> tuple[Array, float]:

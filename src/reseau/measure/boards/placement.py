@@ -16,15 +16,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.stats import binom
 
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure, Remark
+from ...designs.dots import dot_signs
 from ...io.board import BoardDesign
 from ...optics import Chain
 from ..reseau.disks import Disks
 from ..reseau.plane_marks import Located
 from ..reseau.sheet_placement import MOST_DISKS, disk_seeds, grown_disks, through
 from ..testfield.lattice_mapping import images_of, slope_of
+from .bits import Bits, read_bits
 from .candidates import Saddles, along, bright_between, first_mapping, grown, sector_levels, seeds
 
 __all__ = ["Placed", "lay_chessboard", "lay_circles", "lay_marked"]
@@ -34,6 +37,12 @@ _MISSED, _PLAIN, _FOREIGN = 0.4, 3.0, 3.0
 ink, where nothing hides it; one found that the design has not."""
 _ALIKE = 2.0
 """Lead in nodes of a place over another from which it is certain."""
+_MISREAD = 0.2
+"""Largest share of the dots of a PuzzleBoard that are not as on the board."""
+_MISREAD_DOTS = 2
+"""Most squares of a chessboard with a dot too many or too few."""
+_CHANCE = 1e-4
+"""Largest probability that dots without any order agree as well with one of the places compared."""
 _SEEDS = 40
 _LARGER = 2.0
 """Ratio of the meshes of two lattices from which the second is another one, not the first in perspective."""
@@ -104,7 +113,11 @@ def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDes
         levels = sector_levels(grey, mapping, missing)
         return np.asarray(((levels > limits[0]) | (levels < limits[1])).all(axis=1))
 
-    return _numbered(design, nodes.astype(np.intp), saddles.xy[rows], mapping, shape, (dark, ~bright), plain)
+    coded = design.kind == "puzzle" or bool(design.dots)
+    bits = read_bits(grey, mapping, nodes.astype(np.intp), design.kind == "puzzle") if coded else None
+    known = nodes.astype(np.intp), saddles.xy[rows], mapping, shape, (dark, ~bright)
+    # The dots of a PuzzleBoard tell more than nodes that were not found.
+    return _numbered(design, *known, None if design.kind == "puzzle" else plain, bits)
 
 
 def _dark_sectors(design: BoardDesign) -> Mask:
@@ -124,8 +137,9 @@ def _numbered(
     shape: tuple[int, int],
     dark: tuple[Mask, Mask] | None,
     plain: Callable[[Array], Mask] | None = None,
+    bits: Bits | None = None,
 ) -> Placed | Failure:
-    """Lay the lattice found on the design; `plain` tells where nothing lies over nodes."""
+    """Lay the lattice found on the design; `plain` tells where nothing hides nodes, `bits` what dots say."""
     # Diagonals of an asymmetric grid are halved: its nodes have columns and rows that are both even or odd.
     matrix = _lattice_of(design)
     numbers = design.nodes @ matrix.T // (2 if design.asymmetric else 1)
@@ -137,6 +151,7 @@ def _numbered(
     known = {tuple(node): k for k, node in enumerate(nodes.tolist())}
     mirrored = np.linalg.det(slope_of(mapping, np.zeros((1, 2)))[0]) < 0
     found: list[tuple[float, Integers, Integers]] = []
+    signs = None if bits is None else dot_signs(design)
     for quarter in range(4):
         # Rows of a design go downwards as those of a frame do.
         turn = np.linalg.matrix_power(_QUARTER, quarter)
@@ -170,11 +185,22 @@ def _numbered(
                 if plain is not None:
                     lost += (_PLAIN - _MISSED) * float((sight & plain(gone)).sum())
             score = there.sum() - lost - _FOREIGN * (~there).sum()
+            if bits is not None and signs is not None:
+                score -= _FOREIGN * bits.compared(signs, turn, np.array(shift))[0]
             found.append((float(score), turn, np.array(shift)))
     if not found:
         return Failure("the lattice found does not agree with the board at any place", Code.OTHER_DESIGN)
     found.sort(key=lambda one: -one[0])
     score, turn, moved = found[0]
+    if bits is not None and signs is not None:
+        wrong, total = bits.compared(signs, turn, moved)
+        puzzle = design.kind == "puzzle"
+        if wrong > (_MISREAD * total if puzzle else _MISREAD_DOTS):
+            return Failure(
+                f"{wrong} of {total} dots are not as on the board where it fits best", Code.OTHER_DESIGN
+            )
+        if puzzle and len(found) * binom.cdf(wrong, total, 0.5) > _CHANCE:
+            return Failure(f"{total} dots are too few to tell which part it is", Code.NOT_IDENTIFIED)
     if score < 0.25 * min(len(nodes), len(numbers)):
         return Failure(
             f"{len(nodes)} points in a lattice were found, which the board does not have", Code.OTHER_DESIGN
