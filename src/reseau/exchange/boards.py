@@ -115,9 +115,9 @@ def _kalibr(get: _Values, name: str) -> BoardDesign:
         side = 1000 * get.number("tagSize")
         pitch = round(side * (1 + get.number("tagSpacing")), 9)
         # Kalibr's tags have a black border of two bits.
-        return board(
-            kind, get.count("tagCols"), get.count("tagRows"), pitch, size=side, border_bits=2, name=name
-        )
+        counts, family = (get.count("tagCols"), get.count("tagRows")), get.text("tagFamily", "tag36h11")
+        words = "DICT_APRILTAG_" + family.lower().removeprefix("tag").removeprefix("apriltag_")
+        return board(kind, *counts, pitch, size=side, dictionary=words, border_bits=2, name=name)
     columns, rows = get.count("targetCols"), get.count("targetRows")
     if kind == "chess":
         across, down = get.number("colSpacingMeters"), get.number("rowSpacingMeters")
