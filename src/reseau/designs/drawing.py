@@ -29,6 +29,10 @@ Drawable = ReseauDesign | TestfieldDesign | SpaceTargets | BoardDesign
 _GREY = "#555555"
 _GROUND, _LETTERS = 3.0, 6.0
 """Ground of a single target in its sizes, and room for its name, mm."""
+_SINGLE = (
+    "Cut the targets out with the white around them. Fix each flat to its place on the frame; note its name.",
+    "Keep focus and zoom. Photograph the frame from many sides: each target in several photographs.",
+)
 
 
 def content_of(design: Drawable, across: int | None = None) -> Content:
@@ -192,7 +196,7 @@ def _frame(design: SpaceTargets, columns: int | None) -> Content:
         letters[name] = at - 0.5 * cell + 1.5
     low, high = np.array([0.0, -rows * cell]), np.array([columns * cell, 0.0])
     title = f"{design.name}: {count} single targets, cells of {cell:g} mm"
-    return Content(low, high, polygons, circles, title, letters)
+    return Content(low, high, polygons, circles, title, letters, _SINGLE)
 
 
 def _gap(xy: Array) -> float:

@@ -31,7 +31,7 @@ _FLAP = 10.0
 """Part of a sheet that lies under its neighbour, mm."""
 _MOST_SHEETS = 400
 _CHECK = "100 mm: measure it. Print at 100 %, no scaling."
-_HOW = (
+HOW = (
     "Fix it to something flat and stiff. Keep focus and zoom. Take 10 to 20 sharp photographs: straight, and",
     "tilted by 30–45° to the left, right, up and down, the camera also turned by 90°; reach all corners.",
 )
@@ -57,6 +57,8 @@ class Content:
         Description in one line.
     letters : dict
         Labels and the positions of their lower left corners.
+    how : (str, str)
+        What to do with the sheet, in two lines.
     """
 
     low: Array
@@ -65,6 +67,7 @@ class Content:
     circles: list[tuple[float, float, float]]
     title: str
     letters: dict[str, Array]
+    how: tuple[str, str] = HOW
 
     @property
     def size(self) -> Array:
@@ -220,7 +223,7 @@ def _single(content: Content, width: float, height: float) -> Page:
     left, top = _EDGE + (room - size) / 2 + [0, _TITLE]
     target = (float(left), float(top), float(left + size[0]), float(top + size[1]))
     drawn = _drawn(content, target, content.low[0], content.high[1])
-    lines, texts = _foot(width, height, _CHECK, _HOW)
+    lines, texts = _foot(width, height, _CHECK, content.how)
     title = (target[0], target[1] - 1.6, "start", content.title)
     return replace(drawn, width=width, height=height, lines=lines, texts=[title, *texts, *drawn.texts])
 
@@ -241,11 +244,12 @@ def _tile(content: Content, paper: tuple[float, float], grid: tuple[int, int], a
     (width, height), (across, down), (row, column) = paper, grid, at
     cell = content.size / grid
     x, y = content.low[0] + column * cell[0], content.high[1] - row * cell[1]
-    left, top = _EDGE, _EDGE + _TITLE
+    # Marks for the upper cut are beside the target, where printers print.
+    left, top = _EDGE + _FLAP / 2, _EDGE + _TITLE
     target = (left, top, float(left + cell[0]), float(top + cell[1]))
     drawn = _drawn(content, target, x, y)
     number = row * across + column + 1
-    lines, texts = _foot(width, height, _CHECK, _HOW if number == 1 else _JOIN)
+    lines, texts = _foot(width, height, _CHECK, content.how if number == 1 else _JOIN)
     where = f"{content.title}; sheet {number} of {across * down}: row {row + 1}, column {column + 1}"
     return replace(
         drawn, width=width, height=height,
