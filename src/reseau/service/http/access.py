@@ -49,6 +49,10 @@ def service_of(request: Request) -> Service:
     return found
 
 
+async def _here(request: Request) -> Service:  # a coroutine needs no thread
+    return service_of(request)
+
+
 def csrf_of(cookie: str) -> str:
     """Return what a request with a cookie must repeat to change anything; other sites cannot know it.
 
@@ -97,7 +101,7 @@ def _needs(scope: Scope) -> Callable[[Request], Principal]:
 
 
 operating = _needs("operate")
-Here = Annotated[Service, Depends(service_of)]
+Here = Annotated[Service, Depends(_here)]
 Reading = Annotated[Principal, Depends(_needs("read"))]
 Operating = Annotated[Principal, Depends(operating)]
 Administering = Annotated[Principal, Depends(_needs("administer"))]

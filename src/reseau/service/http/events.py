@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import Any
 
 __all__ = ["Event", "Events"]
@@ -19,7 +20,7 @@ _KEPT, _WAITING, _BEAT_S = 5000, 1000, 10.0
 _MOST_CLIENTS = 500
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Event:
     """An event.
 
@@ -48,8 +49,16 @@ class Event:
 
     def text(self, start: str) -> str:
         """Return it as a server-sent event; its id names the start of the service, too."""
-        document = {"kind": self.kind, "about": self.about, "at": self.at, "facts": self.facts}
-        return f"id: {start}-{self.number}\nevent: change\ndata: {json.dumps(document, default=str)}\n\n"
+        return _text(self, start)
+
+
+@lru_cache(maxsize=256)  # it is the same for all clients
+def _text(event: Event, start: str) -> str:
+    document = {"kind": event.kind, "about": event.about, "at": event.at, "facts": event.facts}
+    return f"id: {start}-{event.number}\nevent: change\ndata: {json.dumps(document, default=str)}\n\n"
+
+
+_Queue = asyncio.Queue[Event | None]
 
 
 class Events:
@@ -69,7 +78,7 @@ class Events:
         self.start = secrets.token_hex(4)
         self._kept: deque[Event] = deque(maxlen=_KEPT)
         self._lock, self._number = threading.Lock(), 0
-        self._clients: set[tuple[asyncio.AbstractEventLoop, asyncio.Queue[Event | None]]] = set()
+        self._clients: set[tuple[asyncio.AbstractEventLoop, _Queue]] = set()
         self._closed = False
 
     @property
@@ -89,31 +98,36 @@ class Events:
             at = datetime.now(UTC).isoformat(timespec="milliseconds")
             event = Event(self._number, kind, about, dict(facts or {}), at)
             self._kept.append(event)
-            clients = list(self._clients)
-        for loop, queue in clients:
-            self._hand(loop, queue, event)
+            # Handed over in their order, which the lock keeps.
+            loops: dict[asyncio.AbstractEventLoop, list[_Queue]] = {}
+            for loop, client in self._clients:
+                loops.setdefault(loop, []).append(client)
+            for loop, clients in loops.items():
+                self._hand(loop, clients, event)
         return event
 
     @staticmethod
-    def _hand(
-        loop: asyncio.AbstractEventLoop, queue: asyncio.Queue[Event | None], event: Event | None
-    ) -> None:
+    def _hand(loop: asyncio.AbstractEventLoop, clients: list[_Queue], event: Event | None) -> None:
         def put() -> None:
-            if queue.full():  # a client that does not read: it resumes where it is
-                while not queue.empty():
-                    queue.get_nowait()
-                queue.put_nowait(None)
-            else:
-                queue.put_nowait(event)
+            for queue in clients:
+                if queue.full():  # a client that does not read: it resumes where it is
+                    while not queue.empty():
+                        queue.get_nowait()
+                    queue.put_nowait(None)
+                else:
+                    queue.put_nowait(event)
 
         if not loop.is_closed():
             loop.call_soon_threadsafe(put)
 
     def after(self, last: str) -> tuple[list[Event], bool]:
         """Return the events after the one with this id, and whether none is missing."""
-        start, _, number = last.rpartition("-")
         with self._lock:
             kept = list(self._kept)
+        return self._after(kept, last)
+
+    def _after(self, kept: list[Event], last: str) -> tuple[list[Event], bool]:
+        start, _, number = last.rpartition("-")
         if not last:
             return [], True
         if start != self.start or not number.isdigit():
@@ -125,7 +139,7 @@ class Events:
         """End all streams."""
         self._closed = True
         for loop, queue in list(self._clients):
-            self._hand(loop, queue, None)
+            self._hand(loop, [queue], None)
 
     async def stream(self, last: str, valid: Callable[[], bool]) -> AsyncIterator[str]:
         """Yield server-sent events: those after `last`, then new ones while the client is `valid`.
@@ -133,20 +147,21 @@ class Events:
         Where events are missing, because the service was restarted or the client was away for long, the first
         event is ``reset``: what the client shows must be fetched again.
         """
-        queue: asyncio.Queue[Event | None] = asyncio.Queue(_WAITING)
+        queue: _Queue = asyncio.Queue(_WAITING)
         client = asyncio.get_running_loop(), queue
-        self._clients.add(client)
+        with self._lock:  # later events are in the queue, earlier ones among those that are kept
+            self._clients.add(client)
+            sent = self._number
+            kept = list(self._kept)
         try:
-            missed, complete = self.after(last)
+            missed, complete = self._after(kept, last)
             yield "retry: 1000\n\n"
-            if not complete:
-                yield f"id: {self.start}-{self._number}\nevent: reset\ndata: {{}}\n\n"
-            elif not last:
-                yield f"id: {self.start}-{self._number}\nevent: start\ndata: {{}}\n\n"
-            sent, check = 0, time.monotonic() + _BEAT_S
+            if not complete or not last:
+                kind = "start" if complete else "reset"
+                yield f"id: {self.start}-{sent}\nevent: {kind}\ndata: {{}}\n\n"
+            check = time.monotonic() + _BEAT_S
             for event in missed:
                 yield event.text(self.start)
-                sent = event.number
             while not self._closed:
                 if time.monotonic() >= check:
                     check = time.monotonic() + _BEAT_S
@@ -161,6 +176,8 @@ class Events:
                 if next_one is None:
                     return
                 if next_one.number > sent:
+                    sent = next_one.number
                     yield next_one.text(self.start)
         finally:
-            self._clients.discard(client)
+            with self._lock:
+                self._clients.discard(client)

@@ -83,6 +83,7 @@ class Service:
                 raise UsageError("is the name of several benches", where=link.name, do="rename one")
             self.benches[link.name] = link
             self._names[path] = link.name
+        self._seen = self.archive.heads()  # what is stored from now on is an event
         self.started = time.time()
         self._entries: dict[str, float] = {}
         self._computed: dict[str, tuple[object, Any]] = {}
@@ -191,7 +192,7 @@ class Service:
 
     def _watch(self) -> None:
         """Publish what anybody stores in the archive, also other processes."""
-        before: dict[str, int] | None = None
+        before = self._seen
         while not self._over.wait(_LOOK_S):
             try:
                 now = self.archive.heads()
@@ -202,7 +203,7 @@ class Service:
                 continue
             self.failing = ""
             for table, last in now.items():
-                if before is not None and before.get(table) != last:
+                if before.get(table) != last:
                     self.events.publish("archive", table, {"last": last})
                     self.meters.events.labels("archive").inc()
             before = now

@@ -186,15 +186,12 @@ async function fetchAgain() {
 
 if (document.querySelector('[data-live]') || document.querySelector('[data-bench]')) {
   const stream = new EventSource('/api/1/events');
-  let lost = false;
   stream.addEventListener('open', () => {
     connection.hidden = true;
     connection.textContent = '';
-    if (lost) refresh();
-    lost = false;
+    refresh();  // also the first time: something may have changed since the page was rendered
   });
   stream.addEventListener('error', () => {
-    lost = true;
     connection.textContent = 'The connection to the service is lost; what is shown may be old.';
     connection.hidden = false;
     if (stream.readyState === EventSource.CLOSED) setTimeout(() => location.reload(), 3000);

@@ -1,0 +1,291 @@
+"""The service under load: clients of events and requests while a session runs; and with many sessions.
+
+    python benchmarks/service.py --part load [--minutes 10] [--clients 200] [--rate 50]
+    python benchmarks/service.py --part sessions [--sessions 10000]
+
+`load` starts `reseau serve` with a bench whose camera has a clock of its own: a frame each half second, and
+whoever asks too late misses one. A session takes them all, while 200 clients read server-sent events and
+requests arrive at a constant rate, whether earlier ones are answered or not. A frame is lost if its number is
+missing in the archive, and late if it is stored after the next one is due. The time of a request counts from
+the moment at which it was due. Clients check that no event is missing or repeated.
+
+`sessions` fills an archive with sessions, and takes the time and the processor time of pages and operations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import random
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from urllib.parse import quote
+
+import httpx
+import psutil
+import sqlalchemy as sa
+
+from reseau.archive import Archive, schema
+
+try:
+    from benchmarks import clocked
+except ImportError:
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    from benchmarks import clocked
+
+ROOT = Path(__file__).resolve().parents[1]
+BENCH = """schema = "reseau-bench/1"
+name = "cellar"
+[instruments.camera]
+driver = "clocked"
+address = "clock"
+"""
+PATHS = (
+    "/api/1/benches/cellar", "/api/1/benches", "/api/1/sessions?count=50", "/api/1/sessions/load",
+    "/api/1/sessions/load/frames?count=50", "/api/1/configurations", "/api/1/alarms", "/api/1/me",
+    "/api/1/benches/cellar/picture", "/api/1/health/ready", "/", "/benches/cellar", "/sessions",
+    "/static/app.js",
+)  # fmt: skip
+
+
+@contextmanager
+def serving(folder: Path, *arguments: str) -> Iterator[tuple[int, str, psutil.Process]]:
+    """`reseau serve` in a process: port, token, and the process."""
+    clocked.install(folder / "drivers")
+    paths = [str(folder / "drivers"), str(ROOT), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "TMPDIR": str(folder)}
+    with (folder / "serve.log").open("w") as log:
+        command = [sys.executable, "-c", "from reseau.cli import main; main()", "serve", "--port", "0"]
+        running = subprocess.Popen([*command, *arguments], cwd=folder, stderr=log, env=environment)
+    try:
+        while "reseau service link" not in (text := (folder / "serve.log").read_text()):
+            if running.poll() is not None:
+                raise SystemExit(text)
+            time.sleep(0.05)
+        line = next(each for each in text.splitlines() if each.endswith("(Ctrl-C ends)"))
+        port = int(line.partition("/  (")[0].rpartition(":")[2])
+        token = (folder / "archive-service" / "local-token").read_text().strip()
+        yield port, token, psutil.Process(running.pid)
+    finally:
+        running.terminate()
+        running.wait(30)
+
+
+class Load:
+    """Clients of a service, over connections that are kept."""
+
+    def __init__(self, port: int, token: str) -> None:
+        self.port = port
+        self.head = f"Host: 127.0.0.1:{port}\r\nAuthorization: Bearer {token}\r\n"
+        self.idle: list[tuple[asyncio.StreamReader, asyncio.StreamWriter, float]] = []
+        self.seconds: dict[str, list[float]] = {}
+        self.statuses: Counter[int] = Counter()
+        self.missing = self.repeated = self.received = 0
+        self.over = False
+
+    async def request(self, path: str, due: float) -> None:
+        """Make a request; its time counts from when it was due."""
+        # The service closes connections that were idle for 15 s.
+        while self.idle and time.monotonic() - self.idle[0][2] > 5.0:
+            self.idle.pop(0)[1].close()
+        if self.idle:
+            reader, writer, _ = self.idle.pop()
+        else:
+            reader, writer = await asyncio.open_connection("127.0.0.1", self.port)
+        writer.write(f"GET {path} HTTP/1.1\r\n{self.head}\r\n".encode())
+        head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1").lower()
+        length = int(head.partition("content-length: ")[2].partition("\r")[0])
+        await reader.readexactly(length)
+        self.seconds.setdefault(path.partition("?")[0], []).append(time.monotonic() - due)
+        self.statuses[int(head.split()[1])] += 1
+        self.idle.append((reader, writer, time.monotonic()))
+
+    async def requests(self, rate: float, seconds: float) -> None:
+        """Requests at a constant rate."""
+        draw, begun, tasks = random.Random(1), time.monotonic(), set[asyncio.Task[None]]()
+        for number in range(int(rate * seconds)):
+            due = begun + number / rate
+            await asyncio.sleep(max(0.0, due - time.monotonic()))
+            task = asyncio.create_task(self.request(draw.choice(PATHS), due))
+            tasks.add(task)
+            task.add_done_callback(tasks.discard)
+        await asyncio.gather(*tasks)
+
+    async def events(self) -> None:
+        """Read events, and check that their numbers follow one another."""
+        reader, writer = await asyncio.open_connection("127.0.0.1", self.port, limit=1 << 20)
+        writer.write(f"GET /api/1/events HTTP/1.1\r\n{self.head}\r\n".encode())
+        last = None
+        with suppress(asyncio.CancelledError, asyncio.IncompleteReadError):
+            while line := await reader.readline():
+                if line.startswith(b"id: "):
+                    number = int(line.rpartition(b"-")[2])
+                    self.received += 1
+                    if last is not None and number > last + 1:
+                        self.missing += number - last - 1
+                    elif last is not None and number <= last:
+                        self.repeated += 1
+                    last = number
+        writer.close()
+
+    async def memory(self, processes: dict[str, psutil.Process], found: dict[str, list[float]]) -> None:
+        """Note the memory of processes (MB), each ten seconds."""
+        while True:
+            for name, process in processes.items():
+                found.setdefault(name, []).append(process.memory_info().rss / 1e6)
+            await asyncio.sleep(10.0)
+
+    async def run(
+        self, clients: int, rate: float, seconds: float, processes: dict[str, psutil.Process]
+    ) -> dict[str, list[float]]:
+        """Put the service under load; return the memory of the processes."""
+        found: dict[str, list[float]] = {}
+        streams = [asyncio.create_task(self.events()) for _ in range(clients)]
+        await asyncio.sleep(2.0)
+        watch = asyncio.create_task(self.memory(processes, found))
+        await self.requests(rate, seconds)
+        for each in (watch, *streams):
+            each.cancel()
+        await asyncio.gather(watch, *streams, return_exceptions=True)
+        return found
+
+
+def load(minutes: float, clients: int, rate: float) -> int:
+    """Print what the load does to the service; return 1 if a bound is not kept."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "bench.toml").write_text(BENCH)
+        with serving(folder, "--bench", "bench.toml") as (port, token, service):
+            http = httpx.Client(
+                base_url=f"http://127.0.0.1:{port}/api/1",
+                headers={"Authorization": f"Bearer {token}"},
+                timeout=60,
+            )
+            while http.get("/benches/cellar").json()["state"] != "ready":
+                time.sleep(0.1)
+            plan = {"name": "load", "plan": "frames", "parameters": {"count": 1_000_000, "checks": 0}}
+            http.post("/benches/cellar/sessions", json=plan).raise_for_status()
+            worker = psutil.Process(
+                json.loads(next((folder / "archive-service" / "workers").glob("bench-*.json")).read_text())[
+                    "pid"
+                ]
+            )
+            before = {each: sum(each.cpu_times()[:2]) for each in (service, worker)}
+            made = Load(port, token)
+            memory = asyncio.run(
+                made.run(clients, rate, 60 * minutes, {"service": service, "worker": worker})
+            )
+            spent = [sum(each.cpu_times()[:2]) - before[each] for each in (service, worker)]
+            http.post("/benches/cellar/abort").raise_for_status()
+            while http.get("/benches/cellar").json()["state"] != "ready":
+                time.sleep(0.1)
+        lost, late, frames, delays = frames_of(folder)
+    every = sorted(each for times in made.seconds.values() for each in times)
+    p50, p99 = (1e3 * every[int(q * (len(every) - 1))] for q in (0.5, 0.99))
+    print(f"{minutes:g} min, {clients} clients of events, {rate:g} requests/s, {os.cpu_count()} cores")
+    print(f"requests      {len(every)}: median {p50:.0f} ms, p99 {p99:.0f} ms, "
+          f"longest {1e3 * every[-1]:.0f} ms; statuses {dict(made.statuses)}")  # fmt: skip
+    for path, times in sorted(made.seconds.items(), key=lambda item: -statistics.median(item[1])):
+        times.sort()
+        print(f"  {path:38} median {1e3 * statistics.median(times):6.1f} ms, "
+              f"p99 {1e3 * times[int(0.99 * (len(times) - 1))]:6.1f} ms")  # fmt: skip
+    print(f"events        {made.received} received, {made.missing} missing, {made.repeated} repeated")
+    print(f"frames        {frames}: {lost} lost, {late} late; stored after "
+          f"{1e3 * statistics.median(delays):.0f} ms (median), {1e3 * max(delays):.0f} ms (longest)")  # fmt: skip
+    print(f"processor     service {1e3 * spent[0] / len(every):.1f} ms per request with events, "
+          f"{spent[0] / (60 * minutes):.2f} of a core; worker {spent[1] / (60 * minutes):.2f}")  # fmt: skip
+    grown = {}
+    for each, values in memory.items():
+        half = len(values) // 2
+        grown[each] = statistics.median(values[-max(1, half // 2) :]) - statistics.median(
+            values[half // 2 : half] or values
+        )
+        print(f"memory        {each} {values[0]:.0f} MB at first, {values[half]:.0f} MB, "
+              f"{values[-1]:.0f} MB at last; fourth quarter minus second {grown[each]:+.1f} MB")  # fmt: skip
+    kept = p99 < 200 and not (lost or late or made.missing or made.repeated) and set(made.statuses) == {200}
+    print("kept" if kept and max(grown.values()) < 10 else "NOT KEPT")
+    return 0 if kept else 1
+
+
+def frames_of(folder: Path) -> tuple[int, int, int, list[float]]:
+    """Frames of the session: how many are lost, late, there; and the times until they were stored."""
+    with Archive.open(folder / "archive") as archive:
+        found = archive.session("load").frames(kind="frame")
+        with archive._engine.connect() as connection:
+            stored = dict(connection.execute(sa.select(schema.frames.c.id, schema.frames.c.stored)).all())  # type: ignore[arg-type]
+    numbers = [each.clock["sequence"][0] for each in found]
+    delays = []
+    for each in found:
+        taken = datetime.fromtimestamp(each.clock["sequence"][0] * clocked.PERIOD_S, UTC)
+        at = stored[each.id]
+        delays.append(((at if at.tzinfo else at.replace(tzinfo=UTC)) - taken).total_seconds())
+    lost = numbers[-1] - numbers[0] + 1 - len(set(numbers))
+    return lost, sum(each > clocked.PERIOD_S for each in delays), len(found), delays
+
+
+def sessions(count: int) -> int:
+    """Print the times of pages and operations over an archive with many sessions."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with Archive.open(folder / "archive", create=True) as archive, archive._engine.begin() as connection:
+            at = datetime(2026, 3, 2, tzinfo=UTC)
+            row = {"plan": "frames", "parameters": {"count": 3}, "bench": "", "software": "reseau"}
+            rows = [{"name": f"session {k}", "begun": at + timedelta(minutes=k), **row} for k in range(count)]
+            connection.execute(sa.insert(schema.sessions), rows)
+            ends = [{"session_id": k + 1, "status": "done", "why": "", "at": at} for k in range(count)]
+            connection.execute(sa.insert(schema.ends), ends)
+        begun = time.monotonic()
+        with serving(folder) as (port, token, service):
+            print(f"{count} sessions: ready after {time.monotonic() - begun:.1f} s")
+            http = httpx.Client(
+                base_url=f"http://127.0.0.1:{port}", headers={"Authorization": f"Bearer {token}"}, timeout=60
+            )
+            worst = 0.0
+            middle = quote(f"session {count // 2}")
+            paths = ["/", "/sessions", f"/sessions?before={middle}", "/sessions?like=7777",
+                     f"/sessions/{middle}", "/calibrations", "/history", "/files", "/account", "/api/1/sessions?count=50",
+                     f"/api/1/sessions/{middle}", "/api/1/alarms"]  # fmt: skip
+            for path in paths:
+                taken, used = [], []
+                for _ in range(11):
+                    before, began = sum(service.cpu_times()[:2]), time.monotonic()
+                    http.get(path).raise_for_status()
+                    taken.append(1e3 * (time.monotonic() - began))
+                    used.append(1e3 * (sum(service.cpu_times()[:2]) - before))
+                first, rest = taken[0], statistics.median(taken[1:])
+                worst = max(worst, rest)
+                print(
+                    f"  {path:36} first {first:6.0f} ms, then {rest:5.0f} ms; "
+                    f"processor {statistics.mean(used):5.0f} ms"
+                )
+        print("kept" if worst < 100 else "NOT KEPT")
+    return 0 if worst < 100 else 1
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--part", choices=("load", "sessions"), required=True)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--clients", type=int, default=200)
+    parser.add_argument("--rate", type=float, default=50.0)
+    parser.add_argument("--sessions", type=int, default=10_000)
+    given = parser.parse_args()
+    if given.part == "load":
+        raise SystemExit(load(given.minutes, given.clients, given.rate))
+    raise SystemExit(sessions(given.sessions))
+
+
+if __name__ == "__main__":
+    main()
