@@ -49,6 +49,11 @@ _TIGHT = 1e-5
 _HALF = 0.5
 # Times the median of the smallest errors found, above which errors of a point are said not to be found.
 _HARDLY = 4.0
+# Factor on the standard deviations of image points from which on it may hide a wrong control point, and the
+# part of it that remains at most without this point.
+_INFLATED, _DEFLATED = 1.3, 0.8
+# Points up to which all are named.
+_NAMED = 60
 # Iterations of a free network; relative offset at which all adjustments end: what they find is compared with
 # multiples of its standard deviation.
 _FREE_ITERATIONS, _ROUGHLY = 50, 1e-2
@@ -288,16 +293,21 @@ class ControlCheck:
             return ""
         usual = known & (detectable <= _HARDLY * np.median(detectable[known]))
         hardly = np.flatnonzero(~self.wrong & ~usual)
-        more = f"errors up to {detectable[usual].max():.2g} {unit}"
+        others = np.flatnonzero(usual & ~self.wrong)
+        least, most = (f"{size:.2g}" for size in (detectable[others].min(), detectable[others].max()))
+        size = most if least == most else f"{least} to {most}"
+        rest = [names[k] for k in others.tolist()]
+        every = ", ".join(rest) if len(rest) <= _NAMED else listed(rest)
+        more = f"at the others ({every}) errors up to {size} {unit}"
         if not len(hardly):
-            return f"at the others {more} cannot be found"
+            return f"{more} cannot be found"
         parts = [
             f"{names[k]} (up to {detectable[k]:.2g} {unit})" if known[k] else f"{names[k]} (of any size)"
             for k in hardly.tolist()
         ]
         return (
             f"errors of the control point{'s' * (len(parts) > 1)} {', '.join(parts)} cannot be found, with "
-            f"too few rays or along them; at the others {more} cannot be found"
+            f"too few rays or along them; {more} cannot be found"
         )
 
     def _size(self, k: int, unit: str) -> str:
@@ -344,7 +354,7 @@ def suspected(problem: BundleProblem, fit: BundleFit) -> bool:
 
 
 def checked_control(
-    problem: BundleProblem, fit: BundleFit, shape: ControlShape | None = None
+    problem: BundleProblem, fit: BundleFit, left_out: Rows | None = None
 ) -> ControlCheck | None:
     """Find control points that contradict the images and the other control points, several at once.
 
@@ -354,8 +364,8 @@ def checked_control(
         The problem, with the weights that count.
     fit : BundleFit
         An adjustment of the network, for approximate values.
-    shape : ControlShape, optional
-        The control points compared with a free network; the search starts with those that agree.
+    left_out : ndarray of int, optional
+        Points without which the search starts, such as those that do not agree with a free network.
 
     Returns
     -------
@@ -391,8 +401,8 @@ def checked_control(
     weights = np.ones(len(loose.observations)) if loose.weights is None else loose.weights.copy()
     current, critical = loose.continued(fit), _critical(len(points))
     out = np.zeros(len(points), dtype=bool)
-    if shape is not None and not shape.as_a_whole:
-        out = np.isin(points, shape.points[~shape.agree])
+    if left_out is not None:
+        out = np.isin(points, left_out)
     seen, last = set[bytes](), None
     for _ in range(_ROUNDS):
         seen.add(out.tobytes())
@@ -409,13 +419,16 @@ def checked_control(
         if gross.any():
             weights[2 * last.ray[gross]] = weights[2 * last.ray[gross] + 1] = 0.0
             continue
-        back = out & (last.statistic < critical)
-        if back.any() and (out & ~back).tobytes() not in seen:
+        bad = ~out & (last.statistic > critical)
+        if not bad.any() and last.unit > _INFLATED:
+            bad = _hidden(current.with_weights(weights), points, out, last)
+        if not bad.any():
+            # Only now: while a wrong point is left, those that are left out can seem to agree with it.
+            back = out & (last.statistic < critical)
+            if not back.any() or (out & ~back).tobytes() in seen:
+                break
             out = out & ~back
             continue
-        bad = ~out & (last.statistic > critical)
-        if not bad.any():
-            break
         worst = bad & (last.statistic >= _LIKEWISE * last.statistic[bad].max())
         by_ray = worst & (last.ray_statistic > last.statistic)
         if by_ray.any():
@@ -428,6 +441,18 @@ def checked_control(
     # A point that was left out with others, and agrees without them, is not wrong.
     wrong = out & ~(last.statistic < critical)
     return ControlCheck(points, wrong, np.sqrt(last.statistic), last.off, last.detectable)
+
+
+def _hidden(problem: BundleProblem, points: Rows, out: Mask, tested: _Tested) -> Mask:
+    """The point (k,) whose error increases the misfits of all others so much that its own test is passed."""
+    worst = np.zeros(len(points), dtype=bool)
+    worst[np.argmax(np.where(out, 0.0, tested.statistic))] = True
+    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights
+    again = problem.with_weights(_without(problem, weights, points[out | worst])).adjusted()
+    if isinstance(again, Failure):
+        return np.zeros_like(worst)
+    smaller = _unit(again.w[: 2 * len(problem.network.xy)]) < _DEFLATED * tested.unit
+    return worst & ~out & smaller
 
 
 def _without(problem: BundleProblem, weights: Array, points: Rows) -> Array:
@@ -456,7 +481,8 @@ def without_control(problem: BundleProblem, points: Rows) -> BundleProblem:
 
 @dataclass(frozen=True, eq=False)
 class _Tested:
-    """Tests (k,) of control points, the largest test of a ray of each, its row, and the rays used."""
+    """Tests (k,) of control points, the largest test of a ray of each, its row, the rays used, and the
+    factor on the standard deviations of the image points by their misfits."""
 
     statistic: Array
     off: Array
@@ -464,6 +490,7 @@ class _Tested:
     ray_statistic: Array
     ray: Rows
     rays: Rows
+    unit: float
 
     @classmethod
     def of(cls, problem: BundleProblem, fit: BundleFit, points: Rows, out: Mask) -> _Tested:
@@ -505,7 +532,8 @@ class _Tested:
         # Small errors of most points (a board that is not flat, an imperfect lens) are not those of some.
         usual = max(1.0, float(np.median(statistic)) / _MEDIAN_OF_THREE) if len(points) >= _LEAST else 1.0
         return cls(
-            statistic / usual, off, detectable * np.sqrt(usual), largest / unit**2 / usual, ray, used[points]
+            statistic / usual, off, detectable * np.sqrt(usual), largest / unit**2 / usual, ray, used[points],
+            unit,
         )  # fmt: skip
 
 

@@ -386,11 +386,28 @@ def _rejecting(
         first = again
     else:
         check, said = _control(problem, first[0])
-    if check and not check.undecided:
+    seen = set[bytes]()
+    while check and not check.undecided and check.wrong.tobytes() not in seen:
+        seen.add(check.wrong.tobytes())
         again = without_gross_errors(without_control(problem, check.points[check.wrong]), *level)
-        if not isinstance(again, Failure):
-            return again, check.remarks(problem.network, left_out=True)
+        if isinstance(again, Failure):
+            break
+        first, said = again, check.remarks(problem.network, left_out=True)
+        # Without the largest errors smaller ones show.
+        check = checked_control(
+            _with_rays_of(problem, again[0]), again[0], left_out=check.points[check.wrong]
+        )
     return first, said
+
+
+def _with_rays_of(problem: BundleProblem, fit: BundleFit) -> BundleProblem:
+    """Return the problem without the image points of tie points that an adjustment has rejected."""
+    network, n = problem.network, 2 * len(problem.network.xy)
+    tie: Mask = ~np.asarray((network.observed | network.held).any(axis=1))[network.point_of]
+    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+    if fit.problem.weights is not None:
+        weights[:n] = np.where(np.repeat(tie, 2), fit.problem.weights[:n], weights[:n])
+    return problem.with_weights(weights)
 
 
 def _partly_wrong(problem: BundleProblem) -> ControlShape | None:
@@ -413,11 +430,15 @@ def _control(
     if shape is None and not suspected(problem, fit):
         return None, []
     # Rays of control points are judged with their coordinates, not before.
+    begun = _with_rays_of(problem, fit)
+    weights = np.ones(len(problem.observations)) if begun.weights is None else begun.weights
     tie: Mask = ~np.asarray((network.observed | network.held).any(axis=1))[network.point_of]
-    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
-    if fit.problem.weights is not None:
-        weights[:n] = np.where(np.repeat(tie, 2), fit.problem.weights[:n], weights[:n])
-    elif tie.any() and fit.sigma0 > _DOUBT and len(problem.observations) <= MANY:
+    if (
+        fit.problem.weights is None
+        and tie.any()
+        and fit.sigma0 > _DOUBT
+        and len(problem.observations) <= MANY
+    ):
         gross = np.isin(np.arange(len(tie)), suspects(problem))
         weights[:n] = np.where(np.repeat(tie & gross, 2), 0.0, weights[:n])
     if shape is None and len(problem.observations) <= MANY:
@@ -429,7 +450,8 @@ def _control(
         poor = fit.sigma0 > _DOUBT or bool(_rejected_control(network, rejected))
         if poor and shape is not None and shape.as_a_whole:
             return None, [Remark(shape.doubt(), Code.DOUBTFUL_CONTROL)]
-    check = checked_control(problem.with_weights(weights), fit, shape)
+    out = None if shape is None or shape.as_a_whole else shape.points[~shape.agree]
+    check = checked_control(problem.with_weights(weights), fit, out)
     return check, [] if check is None else check.remarks(network)
 
 

@@ -19,6 +19,7 @@ from ...optics.poses import matrix_to_vector
 from ..network import Camera, Network
 from ..network.network import finite
 from ..solver import BundleFit, BundleProblem, approximate
+from ..solver.values import Values
 
 __all__ = ["RETRIED", "adjusted_in_steps", "improved", "lost_images", "retried", "settled"]
 
@@ -28,6 +29,8 @@ RETRIED = (Code.NOT_CONVERGED, Code.SINGULAR, Code.RANK_DEFECT, Code.NOT_FINITE,
 # Points from which a lost image can be expected to find its pose, attempts in each step, and iterations of
 # each.
 _ENOUGH, _ATTEMPTS, _STEPS = 6, 4, 25
+# Times by which the largest coordinate grows in an iteration that leads nowhere.
+_ASTRAY = 1e9
 # Number of distortion parameters of the first step.
 _LEADING = 1
 # An image is tried again where its median misfit is this many times that of the other images, and takes the
@@ -58,7 +61,7 @@ def settled(problem: BundleProblem) -> BundleProblem:
         for _ in range(_ATTEMPTS):
             step = replace(problem, network=replace(network, cameras=cameras), rounds=0)
             values = step.approached(_STEPS)
-            if values is None:
+            if values is None or _astray(values, problem.start):
                 break
             problem = replace(problem, start=values)
             again = retried(problem)
@@ -85,6 +88,13 @@ def adjusted_in_steps(problem: BundleProblem) -> BundleFit | Failure:
             return fit
         fit = again
     return improved(problem, fit)
+
+
+def _astray(values: Values, start: Values) -> bool:
+    """Whether an iteration has driven images or points to where no network is."""
+    pairs = (values.x0, start.x0), (values.xyz, start.xyz)
+    sizes = [[float(np.nanmax(np.abs(part[finite(part)]), initial=0.0)) for part in pair] for pair in pairs]
+    return any(after > _ASTRAY * max(before, 1.0) for after, before in sizes)
 
 
 def _steps(network: Network) -> Iterator[list[tuple[str, ...]]]:

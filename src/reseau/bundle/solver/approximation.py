@@ -213,7 +213,7 @@ class _Block:
         x[beside, :2] -= uv[beside]
         uv = np.where(beside[:, None], 0.0, uv)
         ray = np.column_stack([uv, np.ones(len(uv))])
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             across = np.linalg.norm(np.cross(x, ray), axis=1)
             off: Array = across / np.linalg.norm(x, axis=1) / np.linalg.norm(ray, axis=1)
         return np.where(x[:, 2] > 0, off, np.inf)
