@@ -201,7 +201,8 @@ def load(minutes: float, clients: int, rate: float) -> int:
               f"p99 {1e3 * times[int(0.99 * (len(times) - 1))]:6.1f} ms")  # fmt: skip
     print(f"events        {made.received} received, {made.missing} missing, {made.repeated} repeated")
     print(f"frames        {frames}: {lost} lost, {late} late; stored after "
-          f"{1e3 * statistics.median(delays):.0f} ms (median), {1e3 * max(delays):.0f} ms (longest)")  # fmt: skip
+          f"{1e3 * statistics.median(delays):.0f} ms (median), "
+          f"{1e3 * max(delays):.0f} ms (longest)")  # fmt: skip
     print(f"processor     service {1e3 * spent[0] / len(every):.1f} ms per request with events, "
           f"{spent[0] / (60 * minutes):.2f} of a core; worker {spent[1] / (60 * minutes):.2f}")  # fmt: skip
     grown = {}
@@ -253,7 +254,8 @@ def sessions(count: int) -> int:
             worst = 0.0
             middle = quote(f"session {count // 2}")
             paths = ["/", "/sessions", f"/sessions?before={middle}", "/sessions?like=7777",
-                     f"/sessions/{middle}", "/calibrations", "/history", "/files", "/account", "/api/1/sessions?count=50",
+                     f"/sessions/{middle}", "/calibrations", "/history", "/files", "/account",
+                     "/api/1/sessions?count=50",
                      f"/api/1/sessions/{middle}", "/api/1/alarms"]  # fmt: skip
             for path in paths:
                 taken, used = [], []

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import re
+import socket
+import threading
+import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -13,6 +17,8 @@ from starlette.websockets import WebSocketDisconnect
 
 from reseau.core.errors import ArchiveError, UsageError
 from reseau.service.accounts import Accounts, RefusedLogin, one_time_code
+from reseau.service.http import guard, patience
+from reseau.service.http.app import create_app
 from reseau.service.http.options import ServeOptions
 from reseau.service.http.service import Service
 from reseau.service.state import StateFolder
@@ -166,6 +172,79 @@ def test_a_large_request_is_refused(one: Served) -> None:
 
     assert one.client().post("/api/1/tokens", content=b"x" * 2_000_000).status_code == 413
     assert one.client().post("/api/1/tokens", content=pieces()).status_code == 413
+
+
+def test_the_body_of_a_request_is_not_read_for_nobody(one: Served) -> None:
+    read = 0
+
+    def pieces() -> Iterator[bytes]:
+        nonlocal read
+        for _ in range(100):
+            read += 1
+            yield b"x" * 100_000
+
+    answer = one.client("").post("/api/1/uploads", content=pieces())
+    assert (answer.status_code, answer.headers["www-authenticate"]) == (401, "Bearer")
+    assert read == 0
+    assert one.client("").post("/api/1/login", content=b"x" * 20_000).status_code == 413
+
+
+def test_requests_that_arrive_too_slowly_and_connections_without_any_are_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(patience, "_HEAD_S", 0.5)
+    monkeypatch.setattr(patience, "_MOST_WAITING", 5)
+    monkeypatch.setattr(guard, "_BODY_S", 0.5)
+    found: list[bytes] = []
+    with served(tmp_path) as one, running(one) as port:
+        token = one.service.state.local_token()
+        head = f"Host: 127.0.0.1:{port}\r\nAuthorization: Bearer {token}\r\n"
+        slow_head = b"GET /api/1/me HTTP/1.1\r\n"
+        slow_body = f"POST /api/1/tokens HTTP/1.1\r\n{head}Content-Length: 50\r\n\r\n{{".encode()
+        for sent in (b"", slow_head, slow_body):
+            begun = time.monotonic()
+            with socket.create_connection(("127.0.0.1", port)) as each:
+                each.sendall(sent)
+                found.append(each.recv(1000) if sent is slow_body else refused(each))
+            assert time.monotonic() - begun < 8
+        assert found[:2] == [b"", b""]
+        assert b"arrives too slowly" in found[2] or found[2].startswith(b"HTTP/1.1 400")
+        # Whoever opens many connections closes the own ones, and not those of others.
+        held = [socket.create_connection(("127.0.0.1", port)) for _ in range(40)]
+        with socket.create_connection(("127.0.0.1", port)) as each:
+            each.sendall(f"GET /api/1/me HTTP/1.1\r\n{head}\r\n".encode())
+            assert each.recv(100).startswith(b"HTTP/1.1 200")
+        for each in held:
+            each.close()
+
+
+def refused(connection: socket.socket) -> bytes:
+    """What arrives before the end of a connection."""
+    try:
+        return connection.recv(1000)
+    except ConnectionResetError:
+        return b""
+
+
+@contextmanager
+def running(one: Served) -> Iterator[int]:
+    """The service behind a socket, in a thread."""
+    import uvicorn
+
+    with socket.create_server(("127.0.0.1", 0)) as sock:
+        port = sock.getsockname()[1]
+        object.__setattr__(one.service.options, "port", port)
+        config = uvicorn.Config(
+            create_app(one.service), http=patience.PatientProtocol, log_config=None, lifespan="off"
+        )
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [sock]}, daemon=True)
+        thread.start()
+        while not server.started:
+            time.sleep(0.02)
+        yield port
+        server.should_exit = True
+        thread.join(10)
 
 
 def test_no_secret_is_in_log_archive_or_audit(one: Served, caplog: pytest.LogCaptureFixture) -> None:

@@ -80,7 +80,7 @@ _STATUS: tuple[tuple[type[ReseauError], int, str], ...] = (
     (ArchiveError, 503, "archive"),
 )
 _ABOUT = {
-    400: "The request is not HTTP as expected",
+    400: "The request is not HTTP as expected, or arrives too slowly",
     401: "Without a token or login, or with one that has ended",
     403: "Not allowed: name, origin, missing X-CSRF-Token, or scope",
     404: "There is no such thing",

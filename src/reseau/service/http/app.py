@@ -9,14 +9,16 @@ from collections.abc import Callable
 from typing import Any
 
 import uvicorn
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 
 from ...core.errors import UsageError
 from ...core.version import __version__
 from . import accounts, benches, calibrations, files, history, operations, pages, sessions
+from .access import principal_of
 from .answers import add_error_handlers
 from .guard import Guard, log
 from .options import ServeOptions
+from .patience import PatientProtocol
 from .service import Service
 
 __all__ = ["create_app", "serve"]
@@ -64,7 +66,11 @@ def create_app(service: Service) -> Any:
         return document
 
     app.openapi = openapi  # type: ignore[method-assign]
-    return Guard(app, service.options, service.meters)
+
+    def known(scope: Any) -> bool:
+        return principal_of(Request({**scope, "app": app})) is not None
+
+    return Guard(app, service.options, service.meters, known)
 
 
 def serve(options: ServeOptions, said: Callable[[str], None], ready: Callable[[Service], None]) -> None:
@@ -98,8 +104,9 @@ def serve(options: ServeOptions, said: Callable[[str], None], ready: Callable[[S
     with sock, Service(options) as service:
         config = uvicorn.Config(
             create_app(service), log_config=None, access_log=False, server_header=False, date_header=True,
-            proxy_headers=bool(options.proxy), ssl_certfile=options.certificate, ssl_keyfile=options.key,
-            timeout_keep_alive=15, timeout_graceful_shutdown=3, limit_concurrency=1000, lifespan="off",
+            proxy_headers=bool(options.proxy), http=PatientProtocol, ssl_certfile=options.certificate,
+            ssl_keyfile=options.key, timeout_keep_alive=15, timeout_graceful_shutdown=3,
+            limit_concurrency=1000, lifespan="off",
         )  # fmt: skip
         server = _Server(config, service, ready)
         log("started", port=options.port, archive=service.archive.place)

@@ -7,6 +7,7 @@ else is looked at, also where a browser would send a cookie.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import secrets
@@ -44,7 +45,10 @@ _HEADERS = {
 _STRICT = b"max-age=31536000"
 SMALL_BODY, LARGE_BODY = 1 << 20, 1 << 30
 """Largest body of a request, and of an upload (bytes)."""
-UPLOADS = "/api/1/uploads"
+_LOGIN_BODY = 16 << 10
+UPLOADS, LOGIN = "/api/1/uploads", "/api/1/login"
+_BODY_S, _BODY_PER_S = 20.0, 8192
+"""Time that a body may take, besides that at the least rate (bytes/s)."""
 
 
 class Meters:
@@ -101,6 +105,8 @@ class Guard:
         Names and origins.
     meters : Meters
         Counters.
+    known : callable, optional
+        Tells whether a request is that of somebody who is known: bodies of others are not read.
 
     Examples
     --------
@@ -108,8 +114,10 @@ class Guard:
     'the name in the request is not one of this service'
     """
 
-    def __init__(self, app: Any, options: ServeOptions, meters: Meters) -> None:
-        self.app, self._options, self._meters = app, options, meters
+    def __init__(
+        self, app: Any, options: ServeOptions, meters: Meters, known: Callable[[Scope], bool] | None = None
+    ) -> None:
+        self.app, self._options, self._meters, self._known = app, options, meters, known
 
     def refusal(self, headers: MutableMapping[str, str], method: str) -> str:
         """Return why a request is refused; empty if it is not."""
@@ -154,13 +162,15 @@ class Guard:
             await send(message)
 
         refusal = self.refusal(headers, scope["method"]) or ("" if len(hosts) == 1 else "several names")
-        limit = LARGE_BODY if scope["path"] == UPLOADS else SMALL_BODY
+        limit = {UPLOADS: LARGE_BODY, LOGIN: _LOGIN_BODY}.get(scope["path"], SMALL_BODY)
         length = headers.get("content-length", "0")
         if refusal:
             self._meters.refused.labels(refusal.partition(" ")[0]).inc()
             await _plain(answer, 403, refusal)
         elif not length.isdigit() or int(length) > limit:
             await _plain(answer, 413, "the request is too large")
+        elif _has_body(scope, headers) and self._known and not await asyncio.to_thread(self._known, scope):
+            await _plain(answer, 401, "needs a token or a login", "unknown")
         else:
             await self.app(scope, _limited(receive, limit), answer)
         spent = time.perf_counter() - begun
@@ -178,12 +188,19 @@ class Guard:
 
 
 def _limited(receive: Receive, limit: int) -> Receive:
-    """Receive at most so many bytes, also where the length was not announced."""
-    total = 0
+    """Receive at most so many bytes, also where the length was not announced, and not too slowly."""
+    total, begun, more = 0, time.monotonic(), True
 
     async def received() -> MutableMapping[str, Any]:
-        nonlocal total
-        message = await receive()
+        nonlocal total, more
+        if not more:  # what follows is the end of the connection
+            return await receive()
+        left = begun + _BODY_S + total / _BODY_PER_S - time.monotonic()
+        try:
+            message = await asyncio.wait_for(receive(), max(0.0, left))
+        except TimeoutError:
+            raise HTTPException(400, "the request arrives too slowly") from None
+        more = bool(message.get("more_body"))
         total += len(message.get("body", b""))
         if total > limit:
             raise HTTPException(413, "the request is too large")
@@ -192,10 +209,17 @@ def _limited(receive: Receive, limit: int) -> Receive:
     return received
 
 
-async def _plain(send: Send, status: int, text: str) -> None:
+def _has_body(scope: Scope, headers: MutableMapping[str, str]) -> bool:
+    there = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
+    return there and scope["path"] != LOGIN
+
+
+async def _plain(send: Send, status: int, text: str, code: str = "refused") -> None:
     body = json.dumps(
-        {"error": {"code": "refused", "text": text, "what": text, "where": None, "do": None}}
+        {"error": {"code": code, "text": text, "what": text, "where": None, "do": None}}
     ).encode()
     headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+    if status == 401:
+        headers.append((b"www-authenticate", b"Bearer"))
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": body})

@@ -1,0 +1,71 @@
+"""Connections that somebody holds without using them are closed: slow heads, slow readers, and too many."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any, ClassVar
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+__all__ = ["PatientProtocol"]
+
+_HEAD_S, _READ_S = 10.0, 30.0
+"""Time in which the head of a request must arrive, and how long a client may not read."""
+_MOST_WAITING = 250
+"""Connections whose request has not arrived; beyond these the oldest is closed."""
+
+
+class PatientProtocol(H11Protocol):
+    """HTTP/1.1 of uvicorn with limits on time."""
+
+    _all_waiting: ClassVar[dict[PatientProtocol, None]] = {}
+    _head: asyncio.TimerHandle | None = None
+    _reading: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: Any) -> None:
+        """Wait for the first request."""
+        super().connection_made(transport)
+        self._wait()
+
+    def data_received(self, data: bytes) -> None:
+        """Take what arrived; what is no whole head yet must become one in time."""
+        super().data_received(data)
+        if self.cycle is not None and not self.cycle.response_complete:
+            self._no_longer()
+        elif self._head is None:
+            self._wait()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the connection."""
+        self._no_longer()
+        if self._reading is not None:
+            self._reading.cancel()
+        super().connection_lost(exc)
+
+    def pause_writing(self) -> None:
+        """Wait for a client that does not read, for a while."""
+        super().pause_writing()
+        self._reading = self.loop.call_later(_READ_S, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """Go on writing."""
+        if self._reading is not None:
+            self._reading.cancel()
+            self._reading = None
+        super().resume_writing()
+
+    def _wait(self) -> None:
+        self._head = self.loop.call_later(_HEAD_S, self._late)
+        self._all_waiting[self] = None
+        if len(self._all_waiting) > _MOST_WAITING:
+            next(iter(self._all_waiting))._late()
+
+    def _no_longer(self) -> None:
+        self._all_waiting.pop(self, None)
+        if self._head is not None:
+            self._head.cancel()
+            self._head = None
+
+    def _late(self) -> None:
+        self._no_longer()
+        self.transport.abort()
