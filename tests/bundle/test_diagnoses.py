@@ -441,13 +441,13 @@ BROKEN = [
         "sigmas a thousand times too small",
         lambda: (lambda n: replace(n, cov=n.cov * 1e-6))(block()),
         Code.SIGMAS_DOUBTFUL,
-        ("larger than one",),
+        ("input sigmas are too small",),
     ),
     Broken(
         "sigmas a hundred times too large",
         lambda: (lambda n: replace(n, cov=n.cov * 1e4))(block()),
         Code.SIGMAS_DOUBTFUL,
-        ("smaller than one",),
+        ("input sigmas are too large",),
     ),
     Broken(
         "given rotations in the other sense",

@@ -143,7 +143,7 @@ def say_parameters(camera: CameraEstimate, between: Array | None = None) -> None
     """Print the parameters of a camera, with sigmas from the scatter `between` images where given."""
     import math
 
-    from ..core.numbers import measured
+    from ..core.numbers import at_power, measured, power
 
     rows = zip(camera.parameters, camera.values.tolist(), camera.sigma.tolist(), camera.units, strict=True)
     for k, (name, value, sigma, unit) in enumerate(rows):
@@ -152,7 +152,9 @@ def say_parameters(camera: CameraEstimate, between: Array | None = None) -> None
             break
         by_images = ""
         if between is not None and math.isfinite(between[k]):
-            by_images = f" (from scatter between images: {between[k]:.2g})"
+            shown = power(value, sigma)
+            ten = "e" + shown.exponent.replace("\u2212", "-") if shown.exponent else ""
+            by_images = f" (from scatter between images: {at_power(between[k], shown)}{ten})"
         say(f"  {name:<6} {measured(value, sigma, unit)}{by_images}\n")
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Power", "aligned", "grouped", "measured", "plain", "power"]
+__all__ = ["Power", "aligned", "at_power", "grouped", "measured", "plain", "power"]
 
 _MINUS = "\u2212"
 
@@ -75,6 +75,18 @@ def power(value: float, sigma: float) -> Power:
     return Power(
         shown, spread if sigma > 0 else "held", str(exponent).replace("-", _MINUS) if exponent else ""
     )
+
+
+def at_power(value: float, shown: Power) -> str:
+    """A number of two digits over the power of ten of another one.
+
+    Examples
+    --------
+    >>> at_power(0.0000075, power(0.000889, 0.000012)), at_power(0.066, power(445.2, 0.061))
+    ('0.075', '0.066')
+    """
+    exponent = int(shown.exponent.replace(_MINUS, "-")) if shown.exponent else 0
+    return plain(value / 10.0**exponent, 2)
 
 
 def measured(value: float, sigma: float | None = None, unit: str = "") -> str:

@@ -52,6 +52,9 @@ _ZONES = (
 _ACROSS = 13
 _ENOUGH = 6
 """Fewer images do not show whether the camera is stable and the model fits."""
+_STRAIGHT, _PLANE = 15.0, 0.05
+"""Tilt, degrees, from which a plane tells the principal distance well; largest thickness of a plane by its
+width."""
 _STATISTICAL = (Code.SIGMAS_DOUBTFUL, Code.CORRELATED, Code.WEAK_GEOMETRY)
 """Remarks that concern the statistics; their effect on the result is part of the accuracy."""
 
@@ -74,6 +77,8 @@ class Assessment:
         What the residuals have in common beyond noise, root mean square.
     images : int
         Number of photographs.
+    tilt_deg : float
+        Largest angle at which a plane target was seen, but for one photograph; NaN where it is not plane.
     uncovered : tuple of str
         Parts of the image with few points.
     next_photograph : NextPose, optional
@@ -96,6 +101,7 @@ class Assessment:
     fits: bool
     misfit_px: float
     images: int
+    tilt_deg: float
     uncovered: tuple[str, ...]
     next_photograph: NextPose | None
     warnings: tuple[Remark, ...]
@@ -122,6 +128,8 @@ class Assessment:
             second = f"not covered, and extrapolated there: {_listed(self.uncovered)}"
         if self.images < _ENOUGH:
             second += f"; {self.images} photographs are few, take 10 or more"
+        if self.tilt_deg < _STRAIGHT:
+            second += f"; the target is seen nearly straight, tilted by {self.tilt_deg:.0f}° at most: tilt it"
         if self.next_photograph is not None:
             then = self.next_photograph
             enough = self.use is Use.MEASUREMENT and not self.uncovered and self.images >= _ENOUGH
@@ -208,8 +216,23 @@ def assess(result: Result, camera: int = 0) -> Assessment:
     focal = float("nan") if lens.mapping.parallel else float(np.sqrt(abs(np.linalg.det(slope))))
     images = int((result.fit.usable.images & (result.network.camera_of == camera)).sum())
     return Assessment(
-        use, centre, corners, focal, fits, misfit, images, uncovered, then, important, tests
+        use, centre, corners, focal, fits, misfit, images, _tilted(result, camera), uncovered, then,
+        important, tests,
     )  # fmt: skip
+
+
+def _tilted(result: Result, camera: int) -> float:
+    """Second largest angle between the camera's axis and the normal of a plane target, degrees."""
+    used = result.fit.usable.images & (result.network.camera_of == camera)
+    values = result.fit.values
+    points = values.xyz[np.isfinite(values.xyz).all(axis=1)]
+    if len(points) < 4 or used.sum() < 2 or camera_mapping(result, camera).mapping.parallel:
+        return float("nan")
+    _, size, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    if size[2] > _PLANE * size[1]:
+        return float("nan")
+    cosines = np.abs(values.rotation[used, 2] @ axes[2])
+    return float(np.degrees(np.arccos(np.clip(np.sort(cosines)[1], 0.0, 1.0))))
 
 
 def sorted_remarks(

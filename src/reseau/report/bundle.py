@@ -13,7 +13,7 @@ from ..bundle.network.shutter import MOTION
 from ..calibration import CameraMapping, FieldDifference, projection_field
 from ..core.data import Frame, Rows
 from ..core.figures import nice
-from ..core.numbers import aligned, measured, plain, power
+from ..core.numbers import aligned, at_power, measured, plain, power
 from ..core.provenance import Provenance
 from ..optics.cameras import unit_of
 from ..procedures.assessment import Assessment, sorted_remarks
@@ -207,7 +207,7 @@ def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any
             {
                 "name": name,
                 "estimate": power(value, s),
-                "between": f"{other:.2g}" if np.isfinite(other) else "–",
+                "between": at_power(other, power(value, s)) if np.isfinite(other) else "–",
                 "unit": unit_text(unit_of(name, camera.model)),
                 "statistic": "" if test is None else f"{test.statistic:.1f}",
                 "p": "" if test is None else f"{test.p:.3f}" if test.p >= 5e-4 else "< 0.001",

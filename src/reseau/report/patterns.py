@@ -75,7 +75,10 @@ def _figure(result: Result, pattern: CommonPattern, grouped: bool) -> str:
     width = 8.6 if across > 1 else 6.0
     with drawing():
         figure = Figure(figsize=(8.6, 0.5 + width * down * shape / across), layout="constrained")
-        for axes, name in zip(figure.subplots(down, across, squeeze=False).flat, names, strict=False):
+        grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
+        for axes in grid.flat[len(names) :]:
+            axes.remove()
+        for axes, name in zip(grid.flat, names, strict=False):
             for chosen, colour in (((labels == name) & ~sure, INK), ((labels == name) & sure, ACCENT)):
                 axes.quiver(
                     *pattern.xy[chosen].T, *(enlarged * pattern.shift[chosen]).T, color=colour, angles="xy",
@@ -84,8 +87,9 @@ def _figure(result: Result, pattern: CommonPattern, grouped: bool) -> str:
             axes.set_xlim(0, camera.width)
             axes.set_ylim(camera.height, 0)
             axes.set_aspect("equal")
-            axes.set_xticks([])
-            axes.set_yticks([])
+            axes.label_outer()
             axes.set_title(str(name), color=FAINT if not grouped else INK)
+        figure.supxlabel("x / px")
+        figure.supylabel("y / px")
         figure.suptitle(f"shifts × {enlarged:g}; longest {size.max():.2g} px", fontsize=10.5)
         return to_svg(figure)

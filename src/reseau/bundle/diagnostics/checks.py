@@ -170,17 +170,23 @@ def _global(result: Result) -> list[Remark]:
         ]
     if test.passed:
         return []
-    side, why = (
-        ("larger", "input sigmas are too small, or the model does not fit")
+    why = (
+        "input sigmas are too small, or the model does not fit"
         if test.statistic > test.upper
-        else ("smaller", "input sigmas are too large")
+        else "input sigmas are too large"
     )
     return [
         Remark(
-            f"global test: sigma0 {result.sigma0:.4g} is significantly {side} than one; {why}",
+            f"global test: residuals are {_times(result.sigma0)} what input sigmas say (sigma0 "
+            f"{result.sigma0:.4g}), which chance does not explain: {why}",
             Code.SIGMAS_DOUBTFUL,
         )
     ]
+
+
+def _times(ratio: float) -> str:
+    """A ratio in words."""
+    return f"{100 * ratio:.3g} % of" if ratio < 2 else f"{ratio:.2g} times"
 
 
 def _not_converged(result: Result) -> list[Remark]:
@@ -226,21 +232,15 @@ def _correlations(result: Result) -> list[Remark]:
         size = np.sqrt(np.diag(q))
         size = np.where(size > 0, size, 1.0)
         r = q / np.outer(size, size)
-        for i, k in zip(*np.nonzero(np.abs(np.tril(r, -1)) > _CORRELATED), strict=True):
+        at = list(zip(*np.nonzero(np.abs(np.tril(r, -1)) > _CORRELATED), strict=True))
+        if at:
+            pairs = listed(f"{names[k]} and {names[i]} (correlation {r[i, k]:.3f})" for i, k in at)
             found.append(
                 Remark(
-                    f"{camera.label}: correlation of {names[k]} and {names[i]} is {r[i, k]:.3f}",
+                    f"{camera.label}: {pairs} can hardly be told apart; use them together",
                     Code.CORRELATED,
                 )
             )
-    if len(found) > LISTED:
-        found = [
-            *found[:LISTED],
-            Remark(
-                f"{len(found) - LISTED} more pairs of camera parameters correlated above {_CORRELATED}",
-                Code.CORRELATED,
-            ),
-        ]
     q = result.pose_covariance[result.fit.usable.images]
     size = np.sqrt(np.maximum(np.diagonal(q, axis1=1, axis2=2), 0.0))
     size = np.where(size > 0, size, 1.0)
@@ -250,8 +250,8 @@ def _correlations(result: Result) -> list[Remark]:
         names_of = listed(result.network.images[i] for i in images)
         found.append(
             Remark(
-                f"correlation of position and rotation above {_CORRELATED} in "
-                f"{_plural('image', images)} {names_of}",
+                f"{_plural('image', images)} {names_of}: position and rotation can hardly be told apart "
+                f"(correlation above {_CORRELATED}); use them together",
                 Code.CORRELATED,
             )
         )
