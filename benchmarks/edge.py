@@ -15,7 +15,7 @@ from shared import of_the_tests
 
 from reseau.core.data import Array
 from reseau.sensor import EdgeSpread, FreeCurve, measure_edge
-from reseau.sensor.edge import FREQUENCIES
+from reseau.sensor.free_curve import FREQUENCIES
 
 edges = of_the_tests("sensor/edges.py")
 SHOWN = FREQUENCIES[1:]

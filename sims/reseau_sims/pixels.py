@@ -84,7 +84,8 @@ class PixelSensor:
         glow = np.where(self.hot, 0.02, self.dark_current)
         electrons = rng.poisson(light * answer * exposure_us * self.gain)
         signal = np.minimum(electrons, self.full_well) / self.gain
-        grey = self._read(signal) + self.bias + glow * exposure_us
+        thermal = rng.poisson(np.maximum(glow, 0.0) * exposure_us * self.gain) / self.gain
+        grey = self._read(signal) + self.bias + thermal
         grey += rng.normal(0.0, self.read_noise, grey.shape)
         kind = np.uint8 if self.bits <= 8 else np.uint16
         return np.clip(np.rint(grey), 0, self.full_scale).astype(kind)

@@ -1,4 +1,8 @@
-"""Edges formed by brute force, with their truth; and the curve that ISO 12233 computes in its plain form."""
+"""Edges with their truth, and the curve that ISO 12233 computes in its plain form.
+
+Edges by rays are formed by brute force. Edges by waves are integrals over the transfer function of a pupil
+with a rim: their light falls like 1/d² and leaves every region.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,10 @@ from scipy.stats import norm, qmc
 
 from reseau.core.data import Array, Frame
 
-KINDS = ("gaussian", "defocus", "flare", "motion", "coma")
+RAYS = ("gaussian", "defocus", "flare", "motion", "coma")
+WAVES = ("airy", "annular", "waves")
+KINDS = (*RAYS, *WAVES)
+Curve = Callable[[Array], Array]
 _POINTS = 2**15
 _DRAWN = np.clip(qmc.Sobol(6, seed=1).random(_POINTS), 1e-9, 1 - 1e-9)
 DARK, STEP = 40.0, 160.0
@@ -63,21 +70,30 @@ def edge_of(
 ) -> Edge:
     """One at 3° to 20°, of either orientation and polarity, 30 to 50 dB of its step above the noise.
 
-    The point-spread function and the square of a pixel are clouds of rays; a pixel has as many of them as
+    By rays, the point-spread function and the square of a pixel are clouds of them; a pixel has as many as
     fall on the bright side, and the truth is the transform of the same rays.
     """
     size = 48
     angle = np.deg2rad(rng.uniform(3, 20)) * rng.choice([-1, 1])
-    cloud = rays(kind, rng) + _DRAWN[:, 3:5] - 0.5
+    form = by_waves if kind in WAVES else by_rays
+    spread, truth = form(kind, rng, float(np.cos(angle)), float(np.sin(angle)))
     y, x = np.mgrid[:size, :size] - (size - 1) / 2
     slope = np.tan(angle) + 2 * bow * y
     aside = x - rng.uniform(-1, 1) - np.tan(angle) * y - bow * (y**2 - (size**2 - 1) / 12)
-    across = np.sort(cloud @ np.array([np.cos(angle), -np.sin(angle)]))
-    share = np.searchsorted(across, aside / np.hypot(1, slope)) / _POINTS
+    share = spread(aside / np.hypot(1, slope))
     share = share if rng.random() < 0.5 else 1 - share
     level = STEP / 10 ** ((decibels or rng.uniform(30, 50)) / 20)
     variance = level**2 * ((0.2 + 0.8 * share) if shot else np.ones_like(share))
     pixels = DARK + STEP * share + rng.normal(0, np.sqrt(variance))
+    if rng.random() < 0.5:
+        pixels, variance = pixels.T, variance.T
+    return Edge(Frame(pixels, 1e4), truth, variance)
+
+
+def by_rays(kind: str, rng: np.random.Generator, c: float, s: float) -> tuple[Curve, Curve]:
+    """The bright share at distances from the edge with the normal (c, −s), and the modulation."""
+    cloud = rays(kind, rng) + _DRAWN[:, 3:5] - 0.5
+    across = np.sort(cloud @ np.array([c, -s]))
     counts, bounds = np.histogram(across, np.linspace(-40, 40, 8001))
     centres = (bounds[1:] + bounds[:-1]) / 2
 
@@ -85,9 +101,52 @@ def edge_of(
         seen = counts > 0
         return np.abs(np.exp(-2j * np.pi * np.outer(f, centres[seen])) @ counts[seen]) / _POINTS
 
-    if rng.random() < 0.5:
-        pixels, variance = pixels.T, variance.T
-    return Edge(Frame(pixels, 1e4), truth, variance)
+    return lambda d: np.searchsorted(across, d) / _POINTS, truth
+
+
+def by_waves(kind: str, rng: np.random.Generator, c: float, s: float) -> tuple[Curve, Curve]:
+    """The same for a pupil: a disk, with a central obscuration, or defocused by waves of light."""
+    most = rng.uniform(0.35, 1.6)
+    hole = rng.uniform(0.25, 0.5) if kind == "annular" else 0.0
+    waves = rng.uniform(0.3, 1.0) if kind == "waves" else 0.0
+
+    def transfer(f: Array) -> Array:
+        u = np.minimum(np.abs(f) / most, 1.0)
+        pupil = _defocused(u, waves) if waves else _annular(u, hole)
+        return pupil * np.sinc(f * c) * np.sinc(f * s)
+
+    nodes, weights = np.polynomial.legendre.leggauss(800)
+    frequency = (nodes + 1) / 2 * most
+    weighed = weights / 2 * most * transfer(frequency) / (np.pi * frequency)
+    at = np.linspace(-45, 45, 9001)
+    spread = 0.5 + np.sin(2 * np.pi * np.outer(at, frequency)) @ weighed
+    return lambda d: np.interp(d, at, spread), lambda f: np.abs(transfer(f))
+
+
+def _lens(r: Array, q: float, d: Array) -> Array:
+    """Area that disks of the radii r ≥ q share at the distance d."""
+    x = (d**2 + r**2 - q**2) / (2 * np.maximum(d, 1e-12))
+    y = d - x
+    part = [k**2 * np.arccos(np.clip(a / k, -1, 1)) - a * np.sqrt(np.maximum(k**2 - a**2, 0))
+            for k, a in ((r, x), (q, y))]  # fmt: skip
+    return np.where(d >= r + q, 0.0, np.where(d <= r - q, np.pi * q**2, part[0] + part[1]))
+
+
+def _annular(u: Array, hole: float) -> Array:
+    """Autocorrelation of a ring, by the areas that displaced disks share."""
+    d = 2 * u
+    shared = _lens(1.0, 1.0, d)
+    if hole:
+        shared = shared - 2 * _lens(1.0, hole, d) + _lens(hole, hole, d)
+    return shared / (np.pi * (1 - hole**2))
+
+
+def _defocused(u: Array, waves: float) -> Array:
+    """H. H. Hopkins, Proc. R. Soc. A 231 (1955) 91, as an integral over the pupil."""
+    nodes, weights = np.polynomial.legendre.leggauss(120)
+    x = np.outer(1 - u, nodes)
+    height = np.sqrt(np.maximum(1 - (np.abs(x) + u[:, None]) ** 2, 0.0))
+    return (1 - u) * ((2 * height * np.cos(8 * np.pi * waves * u[:, None] * x)) @ weights) / np.pi
 
 
 def plain_iso(frame: Frame, frequency: Array) -> Array:

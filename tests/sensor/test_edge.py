@@ -13,7 +13,7 @@ from scipy.stats import binom
 from reseau.core.data import Array, Frame
 from reseau.core.failure import Code, Failure
 from reseau.sensor import EdgeSpread, FreeCurve, measure_edge
-from reseau.sensor.edge import FREQUENCIES
+from reseau.sensor.free_curve import FREQUENCIES
 
 from .edges import KINDS, STEP, Edge, edge_of, plain_iso
 

@@ -13,10 +13,9 @@ from .mapping import CalibratedMapping
 from .raster import CorrectedImage, undistorted_camera, write_corrected
 from .reader import parse_calibration, read_calibration
 from .sensor import Fields, SensorCorrection
-from .tables import VIDEOS, remap_tables, undistort_video, write_tables
+from .tables import remap_tables, undistort_video, write_tables
 
 __all__ = [
-    "VIDEOS",
     "CalibratedMapping",
     "Calibration",
     "CameraCorrection",

@@ -20,10 +20,8 @@ from ..io import write_whole
 from ..optics.resampling import on_lattice
 from .raster import CorrectedImage
 
-__all__ = ["VIDEOS", "remap_tables", "undistort_video", "write_tables"]
+__all__ = ["remap_tables", "undistort_video", "write_tables"]
 
-VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
-"""Suffixes of videos."""
 _CODECS = {".avi": "MJPG", ".mkv": "mp4v", ".mp4": "mp4v", ".mov": "mp4v", ".m4v": "mp4v"}
 _NOWHERE = 65535
 """Beyond every image: ffmpeg fills such pixels."""

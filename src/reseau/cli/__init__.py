@@ -39,6 +39,7 @@ from . import (
     remote,
     schedule,
     schema,
+    sensor,
     serve,
     watch,
 )
@@ -75,6 +76,7 @@ app.add_typer(schedule.app, name="schedule")
 app.add_typer(schedule.alarms, name="alarms")
 app.add_typer(certificates.app, name="certificate")
 app.command()(certificates.uncertainty)
+app.command()(sensor.sensor)
 app.command()(orient.orient)
 app.command()(refine.refine)
 app.command()(apply.apply)

@@ -120,9 +120,10 @@ def apply(
     resampled: without distortion (camera), in the system of the reseau (oscilloscope), or in millimetres of
     the frame (film frame, fiducial marks). With the calibration of a sensor, the grey values are corrected.
     """
-    from ..calibration import VIDEOS, SensorCorrection, read_calibration
+    from ..calibration import SensorCorrection, read_calibration
     from ..core.provenance import sha256_of
     from ..io import is_points
+    from ..io.stacks import VIDEOS
 
     if scale is not None and not scale > 0:
         raise UsageError(f"{scale:g} is not positive", where="--scale")

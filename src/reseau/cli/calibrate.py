@@ -33,6 +33,7 @@ from .bundle_options import (
 )
 from .common import (
     AsJson,
+    Channel,
     Out,
     SensorFile,
     corrected,
@@ -43,7 +44,6 @@ from .common import (
     required,
     say,
 )
-from .measure import Channel
 
 if TYPE_CHECKING:
     from ..bundle import BoardChoice, Kind, ModelChoice

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .acquisition import CameraName, Where, ask_operator, conduct, in_session
-from .common import probability, say, writable
+from .common import say, writable
+from .sensor import event, lines
 
 if TYPE_CHECKING:
     from ..archive import Session
-    from ..calibration.document import Calibration
     from ..capture import Bench
     from ..sessions import SensorParameters
 
@@ -78,34 +78,8 @@ def _print_result(session: Session, out: Path | None, as_json: bool) -> None:
     if out is not None:
         write_whole(out, found.to_json())
     if as_json:
-        quantities = {name: each.model_dump() for name, each in found.parameters.items()}
-        content = {"parameters": quantities, "validity": found.validity, "tests": list(found.tests)}
-        say(json.dumps({"event": "calibration", "schema": "reseau-sensor/1", **content}) + "\n")
+        say(json.dumps(event(found)) + "\n")
     else:
-        say(_lines(found) + (f"{out}\n" if out is not None else ""))
+        say(lines(found) + (f"{out}\n" if out is not None else ""))
     if getattr(parameters_of(session), "edge_us", None) is not None and "psf" not in found.parameters:
         raise EstimationError(found.validity.get("edge", "no usable frame"), where="edge")
-
-
-def _lines(found: Calibration) -> str:
-    """The calibration as text, one line for each quantity."""
-    from ..core.numbers import measured
-
-    lines = [
-        f"{name:<16} {measured(each.value, each.sigma, each.unit)}" for name, each in found.parameters.items()
-    ]
-    validity = found.validity
-    lines.append(f"{'dark signal':<16} ± {validity['dsnu']:.2g} DN from pixel to pixel")
-    lines.append(
-        f"{'response':<16} ± {100 * validity['prnu']:.2g} % from pixel to pixel, including uneven light"
-    )
-    lines.append(f"{'defects':<16} {validity['defects']} pixels")
-    if not validity["saturated"]:
-        lines.append(f"{'full well':<16} not reached: provide more light or longer exposures")
-    lines += [f"{test['name']:<16} {_verdict(test)}" for test in found.tests if "p" in test]
-    return "\n".join(lines) + "\n"
-
-
-def _verdict(test: dict[str, Any]) -> str:
-    """Outcome of a test of the edge."""
-    return f"{'accepted' if test['passed'] else 'rejected'} ({probability(test['p'])})"

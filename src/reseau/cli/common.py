@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from enum import StrEnum
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -18,9 +19,19 @@ if TYPE_CHECKING:
     from ..calibration import SensorCorrection
     from ..core.data import Frame, ImagePoints
     from ..core.failure import Failure
-    from ..io.images import Channel
+    from ..io.images import Channel as ChannelName
 
 T = TypeVar("T")
+
+
+class Channel(StrEnum):
+    """Channel of a colour image."""
+
+    LUMA = "luma"
+    RED = "red"
+    GREEN = "green"
+    BLUE = "blue"
+
 
 AsJson = Annotated[bool, typer.Option("--json", help="Write the result as JSON to standard output.")]
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
@@ -100,7 +111,7 @@ def open_archive(place: str, objects: str | None, *, create: bool = False) -> Ar
     return Archive.open(place, objects, create=create)
 
 
-def read_frame(path: Path, channel: Channel = "luma") -> Frame:
+def read_frame(path: Path, channel: ChannelName = "luma") -> Frame:
     """Read an image; notes on how it was read are written to standard error."""
     from ..io.images import read_image
 

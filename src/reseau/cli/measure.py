@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,6 +10,7 @@ import typer
 
 from .common import (
     AsJson,
+    Channel,
     MaxRotation,
     Mirrored,
     Out,
@@ -33,15 +33,6 @@ if TYPE_CHECKING:
     from ..measure.points import Measured
 
 __all__ = ["Overlay", "Task", "app", "measurement_csv"]
-
-
-class Channel(StrEnum):
-    """Channel of a colour image."""
-
-    LUMA = "luma"
-    RED = "red"
-    GREEN = "green"
-    BLUE = "blue"
 
 
 Overlay = Annotated[

@@ -22,7 +22,7 @@ from ..core.errors import ImageError, InputError
 from ..core.optional import optional
 from .scans import CHANNELS, Scan
 
-__all__ = ["is_dicom", "open_dicom"]
+__all__ = ["count_dicom", "exposure_of_dicom", "is_dicom", "open_dicom"]
 
 _SUFFIXES = (".dcm", ".dicom", ".dic", ".ima")
 
@@ -34,6 +34,43 @@ def is_dicom(path: Path, head: bytes) -> bool:
     # Without a preamble, a file begins with group 0002 or 0008, little or big endian.
     groups = (b"\x02\x00", b"\x08\x00", b"\x00\x02", b"\x00\x08")
     return path.suffix.lower() in _SUFFIXES and head[:2] in groups
+
+
+def count_dicom(path: Path) -> int:
+    """Number of frames of a file.
+
+    Raises
+    ------
+    InputError, ImageError
+        When it cannot be read, or is damaged.
+    """
+    return max(1, int(_header(path).get("NumberOfFrames", 1) or 1))
+
+
+def exposure_of_dicom(path: Path) -> float | None:
+    """Exposure time (µs) that a file states; None without one.
+
+    Raises
+    ------
+    InputError, ImageError
+        When it cannot be read, or is damaged.
+    """
+    header = _header(path)
+    for keyword, unit in (("ExposureTimeInuS", 1.0), ("ExposureTime", 1e3)):
+        try:
+            value = float(header.get(keyword, None) or 0)
+        except (TypeError, ValueError):
+            continue
+        if value > 0:
+            return value * unit
+    return None
+
+
+def _header(path: Path) -> Any:
+    with optional():
+        import pydicom
+    with _quiet(), _readable(path):
+        return pydicom.dcmread(path, stop_before_pixels=True, force=True)
 
 
 def open_dicom(path: Path, number: int | None, most_pixels: int) -> Scan:

@@ -33,7 +33,16 @@ from .photographs import decoded_heic, decoded_raw, is_heic, is_raw
 from .profiles import curve_of_file, curve_of_profile
 from .scans import CHANNELS, Scan, Window, full_scale_of, scan_of
 
-__all__ = ["MAX_PIXELS", "Channel", "luma", "open_scan", "read_image", "write_image"]
+__all__ = [
+    "MAX_PIXELS",
+    "Channel",
+    "count_pages",
+    "grey_of",
+    "luma",
+    "open_scan",
+    "read_image",
+    "write_image",
+]
 
 MAX_PIXELS = 500_000_000
 """The largest image that is read whole; its header is checked before a pixel is decoded."""
@@ -50,7 +59,7 @@ _AGAIN = "copy or scan it again"
 Channel = Literal["luma", "red", "green", "blue"]
 
 
-def read_image(path: Path | str, channel: Channel = "luma") -> Frame:
+def read_image(path: Path | str, channel: Channel = "luma", digest: str | None = None) -> Frame:
     """Read an image file as a grey frame.
 
     Parameters
@@ -62,6 +71,8 @@ def read_image(path: Path | str, channel: Channel = "luma") -> Frame:
     channel : {"luma", "red", "green", "blue"}
         Channel of a colour image that is used. A lens images colours at slightly different scales; a single
         channel avoids the shifts that this causes. The pixels of a grey image are the same for every channel.
+    digest : str, optional
+        SHA-256 of the file, if it is known.
 
     Returns
     -------
@@ -90,16 +101,26 @@ def read_image(path: Path | str, channel: Channel = "luma") -> Frame:
     if channel != "luma" and channel not in _LUMA:
         raise UsageError("is not a channel", where=channel, do="use luma, red, green or blue")
     scan = open_scan(path)
-    digest = sha256_of(path)
+    digest = sha256_of(path) if digest is None else digest
     _check_size(path, scan.width, scan.height)
     pixels = scan.window(0, scan.height, 0, scan.width)
-    if len(scan.channels) == 1:
-        grey = np.array(pixels[:, :, 0])
-    elif channel != "luma":
-        grey = np.array(pixels[:, :, scan.channels.index(channel)])
-    else:
-        grey = luma(pixels, scan.channels)
+    grey = np.array(pixels[:, :, 0]) if len(scan.channels) == 1 else grey_of(pixels, channel, scan.channels)
     return Frame(grey, scan.full_scale, scan.name, digest, scan.notes, scan.curve)
+
+
+def grey_of(
+    pixels: NDArray[Any], channel: Channel, channels: tuple[str, ...] = ("red", "green", "blue")
+) -> NDArray[Any]:
+    """A channel (h, w) of colours (h, w, 3), or their luma.
+
+    Examples
+    --------
+    >>> grey_of(np.array([[[10, 20, 30]]], np.uint8), "luma")
+    array([[18]], dtype=uint8)
+    """
+    if channel != "luma":
+        return np.array(pixels[:, :, channels.index(channel)])
+    return luma(pixels, channels)
 
 
 def luma(pixels: NDArray[Any], channels: tuple[str, ...]) -> NDArray[Any]:
@@ -293,6 +314,23 @@ def _page(tiff: Any, given: Path, number: int) -> Any:
 
 def _pages(tiff: Any) -> list[Any]:
     return [tiff.pages.first, *(page for page in tiff.pages[1:] if not page.subfiletype & 1)]
+
+
+def count_pages(path: Path) -> int:
+    """Number of images of a TIFF; previews do not count.
+
+    Raises
+    ------
+    ImageError
+        When it is damaged.
+    """
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            return len(_pages(tiff))
+    except Exception as error:  # tifffile raises exceptions of every kind on damaged files
+        raise _damaged(path, error) from None
 
 
 def _further_pages(tiff: Any, path: Path) -> tuple[str, ...]:

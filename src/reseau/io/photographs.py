@@ -26,7 +26,7 @@ PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".dcm", ".heic"
 """Suffixes of photographs in a folder."""
 _BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _ORIENTATION, _EXIF = 0x0112, 0x8769
-_FOCAL, _FOCAL_35 = 0x920A, 0xA405
+_FOCAL, _FOCAL_35, _EXPOSURE = 0x920A, 0xA405, 0x829A
 _DIAGONAL_35 = float(np.hypot(36.0, 24.0))
 """Of the format to which the equivalent focal length refers, mm."""
 
@@ -43,6 +43,8 @@ class Exif:
         Focal length.
     focal_35_mm : float, optional
         Focal length of the same field of view in the format of 36 × 24 mm.
+    exposure_us : float, optional
+        Exposure time.
 
     Examples
     --------
@@ -53,6 +55,7 @@ class Exif:
     orientation: int = 1
     focal_mm: float | None = None
     focal_35_mm: float | None = None
+    exposure_us: float | None = None
 
     def focal_px(self, width: int, height: int) -> float | None:
         """Approximate focal length in pixels; None if it is not known."""
@@ -138,7 +141,7 @@ def read_exif(path: Path) -> Exif:
     Examples
     --------
     >>> read_exif(Path("missing.jpg"))
-    Exif(orientation=1, focal_mm=None, focal_35_mm=None)
+    Exif(orientation=1, focal_mm=None, focal_35_mm=None, exposure_us=None)
     """
     try:
         from PIL import Image
@@ -151,8 +154,10 @@ def read_exif(path: Path) -> Exif:
             found = image.getexif()
             inner = found.get_ifd(_EXIF)
             shown = image.info.get("original_orientation") or found.get(_ORIENTATION) or 1
-        numbers = [float(inner[tag]) if tag in inner else None for tag in (_FOCAL, _FOCAL_35)]
+        numbers = [float(inner[tag]) if tag in inner else None for tag in (_FOCAL, _FOCAL_35, _EXPOSURE)]
     except (OSError, ValueError, SyntaxError, ZeroDivisionError, TypeError, ImportError):
         return Exif()
-    focal, equivalent = (v if v is not None and 0.1 < v < 1e4 else None for v in numbers)
-    return Exif(int(shown) if shown in range(1, 9) else 1, focal, equivalent)
+    focal, equivalent = (v if v is not None and 0.1 < v < 1e4 else None for v in numbers[:2])
+    seconds = numbers[2] if numbers[2] is not None and 0 < numbers[2] < 1e5 else None
+    exposure = None if seconds is None else seconds * 1e6
+    return Exif(int(shown) if shown in range(1, 9) else 1, focal, equivalent, exposure)

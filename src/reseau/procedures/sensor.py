@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from ..archive import Verdict
+from ..calibration.document import Calibration
 from ..core.data import Frame
 from ..core.errors import EstimationError, UsageError
 from ..core.provenance import Provenance
 from ..sensor import Level, LevelSums, SensorResult, SensorSeries, calibrate_sensor, with_edge
 
-__all__ = ["Exposed", "SensorProcedure"]
+__all__ = ["Exposed", "Exposure", "SensorProcedure"]
 
 _SATURATED = 0.01
 """Largest share of pixels of an edge at full scale."""
@@ -27,6 +29,30 @@ class Exposed(Protocol):
     @property
     def exposure_us(self) -> float | None:
         """Exposure time (µs)."""
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One frame of a series that is not taken on a bench.
+
+    Parameters
+    ----------
+    name : str
+        ``light``, ``dark`` or ``edge``, the number of the level, and a name of the frame: "light 03 a.tif".
+    exposure_us : float
+        Exposure time (µs).
+    light : float, optional
+        Amount of light in any unit, if not the exposure time alone varies.
+
+    Examples
+    --------
+    >>> Exposure("light 03 a.tif", 5000.0).light is None
+    True
+    """
+
+    name: str
+    exposure_us: float
+    light: float | None = None
 
 
 P = TypeVar("P", bound=Exposed)
@@ -66,14 +92,14 @@ class SensorProcedure:
 
     def on_frame(self, frame: Frame, step: Exposed) -> Verdict:
         """Add a frame to the sums of its level; levels follow one another."""
-        key, exposure = step.name.rpartition(" ")[0], step.exposure_us
+        key, exposure = " ".join(step.name.split(" ")[:2]), step.exposure_us
         if key.partition(" ")[0] not in self._levels or exposure is None:
             return Verdict(False, f"{step.name} is not a step of a sensor series")
         if key.startswith("edge") and (frame.pixels >= frame.full_scale).mean() > _SATURATED:
             return Verdict(False, "the edge is saturated: expose less")
         if self._open is None or self._open[0] != key:
             self._close()
-            self._open = key, LevelSums(exposure)
+            self._open = key, LevelSums(exposure, step.light if isinstance(step, Exposure) else None)
         try:
             self._open[1].add(frame.pixels)
         except UsageError as error:
@@ -120,6 +146,16 @@ class SensorProcedure:
         """Inputs and parameters of the calibration."""
         return Provenance(self._inputs, self._options)
 
+    def calibration(self, name: str) -> Calibration:
+        """Return the calibration with a name; see :meth:`calibrated`.
+
+        Raises
+        ------
+        EstimationError
+            If it fails.
+        """
+        return self.result().calibration(name, self.provenance.to_dict(), {})
+
     def calibrated(self, name: str) -> dict[str, str]:
         """Return the calibration with the name of the camera; ``times`` are empty, the archive stores them.
 
@@ -128,8 +164,7 @@ class SensorProcedure:
         EstimationError
             If it fails.
         """
-        made = self.result().calibration(name, self.provenance.to_dict(), {})
-        return {"calibration.json": made.to_json()}
+        return {"calibration.json": self.calibration(name).to_json()}
 
     def finish(self) -> dict[str, str]:
         """Return the calibration with the name of the session; see :meth:`calibrated`."""

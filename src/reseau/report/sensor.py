@@ -174,7 +174,7 @@ def transfer_figure(result: SensorResult) -> str:
         An SVG element.
     """
     curve, fit = result.transfer.curve, result.transfer.fit
-    lit = curve.bright
+    lit, amount = curve.bright, curve.exposure_us / 1000 if curve.light is None else curve.light
     with drawing():
         figure = Figure(figsize=_SIZE, layout=ConstrainedLayoutEngine(wspace=0.06))
         left, right = figure.subplots(1, 2)
@@ -188,13 +188,12 @@ def transfer_figure(result: SensorResult) -> str:
         for used, colour in ((curve.usable, INK), (~curve.usable, FAINT)):
             left.plot(curve.signal[used], curve.variance[used], "o", color=colour, markersize=3)
             part = used & lit
-            right.plot(curve.exposure_us[part] / 1000, curve.signal[part], "o", color=colour, markersize=3)
+            right.plot(amount[part], curve.signal[part], "o", color=colour, markersize=3)
         if isinstance(result.linearity, Linearity):
             part = lit & curve.usable
-            scale = np.polyfit(curve.exposure_us[part], result.linearity.straight(curve.signal[part])[0], 1)[
-                0
-            ]
-            right.plot(linear / scale / 1000, signal, color=BLUE, lw=1.0, zorder=0)
+            straight = result.linearity.straight(curve.signal[part])[0]
+            scale = float(straight @ amount[part]) / float(amount[part] @ amount[part])
+            right.plot(linear / scale, signal, color=BLUE, lw=1.0, zorder=0)
         _axes(left, "photon transfer", "signal / DN", "variance / DN²")
-        _axes(right, "response to light", "exposure / ms", "signal / DN")
+        _axes(right, "response to light", "exposure / ms" if curve.light is None else "light", "signal / DN")
         return to_svg(figure)

@@ -8,15 +8,15 @@ from scipy import stats
 from ..calibration.sensor import Fields
 from ..core.data import Mask
 from ..core.threads import one_thread
-from .series import Image32, Level, SensorSeries
+from .series import Image32, Level, SensorSeries, saturation
 
-__all__ = ["estimate_fields"]
+__all__ = ["estimate_fields", "scatter_of"]
 
 _FALSE_ALARMS = 0.5
 """Expected number of good pixels classified as defective, over a whole sensor."""
 _TESTS = 4
 _BRIGHTEST = 0.8
-"""Largest signal, as a share of full scale, of levels used for the response."""
+"""Largest signal, as a share of saturation or of full scale, of levels used for the response."""
 _MAD = 1.4826
 
 
@@ -50,8 +50,7 @@ def estimate_fields(series: SensorSeries) -> Fields:
     (True, 20)
     """
     bias, current = _dark_lines(series.dark)
-    bright = [level for level in series.bright if level.mean.mean() < _BRIGHTEST * series.full_scale]
-    bright = bright or [series.bright[0]]
+    bright = _unsaturated(series, float(bias.mean()))
     signal = np.zeros(series.shape)
     for level in bright:
         signal += level.count * (level.mean - bias - current * level.exposure_us)
@@ -63,6 +62,54 @@ def estimate_fields(series: SensorSeries) -> Fields:
     good = ~defects
     response = np.where(good, response / response[good].mean(), 1.0)
     return Fields(bias.astype(np.float32), current.astype(np.float32), response.astype(np.float32), defects)
+
+
+def scatter_of(series: SensorSeries, fields: Fields) -> tuple[float, float]:
+    """Variances of bias and response of a good pixel that come from the noise of the frames.
+
+    Parameters
+    ----------
+    series : SensorSeries
+        The frames.
+    fields : Fields
+        What was estimated from them.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> def level(exposure_us):
+    ...     return Level.of(exposure_us, 20 + 0.2 * exposure_us + rng.normal(0, 2, (8, 32, 32)))
+    >>> bright = tuple(level(exposure_us) for exposure_us in (100.0, 200.0, 300.0))
+    >>> series = SensorSeries((level(0.0),), bright, full_scale=255.0)
+    >>> round(scatter_of(series, estimate_fields(series))[0], 1)  # 2² / 8
+    0.5
+    """
+    good = ~fields.defects
+    weights = np.array([level.count for level in series.dark], dtype=np.float64)
+    times = np.array([level.exposure_us for level in series.dark])
+    noise = np.array([level.variance[good].mean(dtype=np.float64) for level in series.dark])
+    middle = float(weights @ times / weights.sum())
+    spread = float(weights @ (times - middle) ** 2)
+    # The bias is a weighted sum of the dark means.
+    share = weights / weights.sum() - (middle * weights * (times - middle) / spread if spread > 0 else 0.0)
+    bias = float((share**2 / weights) @ noise)
+    light, total, frames = 0.0, 0.0, 0.0
+    for level in _unsaturated(series, float(fields.bias[good].mean())):
+        signal = float((level.mean - fields.dark(level.exposure_us))[good].mean(dtype=np.float64))
+        light += level.count * signal
+        total += level.count * float(level.variance[good].mean(dtype=np.float64))
+        frames += level.count
+    return bias, (total + frames**2 * bias) / light**2 if light > 0 else 0.0
+
+
+def _unsaturated(series: SensorSeries, dark: float) -> list[Level]:
+    """Bright levels below saturation, wherever it is: files with 16 bits hold grey values of 12."""
+    signal = np.array([level.mean.mean(dtype=np.float64) - dark for level in series.bright])
+    variance = np.array([level.variance.mean(dtype=np.float64) for level in series.bright])
+    plateau = saturation(signal, variance)[0]
+    most = series.full_scale - dark if plateau is None else min(plateau, series.full_scale - dark)
+    found = [level for level, s in zip(series.bright, signal, strict=True) if s < _BRIGHTEST * most]
+    return found or [series.bright[0]]
 
 
 def _dark_lines(levels: tuple[Level, ...]) -> tuple[Image32, Image32]:

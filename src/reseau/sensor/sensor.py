@@ -14,8 +14,8 @@ from ..core.data import Array, Frame
 from ..core.errors import EstimationError
 from ..core.failure import Failure
 from .edge import EdgeSpread, measure_edge
-from .fields import estimate_fields
-from .series import Level, SensorSeries
+from .fields import estimate_fields, scatter_of
+from .series import Image32, Level, SensorSeries
 from .transfer import ROUNDING, Linearity, PhotonTransfer, curve_of, fit_linearity, fit_transfer
 
 __all__ = ["SensorResult", "calibrate_sensor", "with_edge"]
@@ -42,6 +42,8 @@ class SensorResult:
         Longest unsaturated exposure time.
     edge : EdgeSpread or Failure, optional
         Sharpness; a failure if no edge could be measured.
+    scatter : (float, float)
+        Variances of bias and response of a pixel that come from the noise of the frames.
 
     Examples
     --------
@@ -64,16 +66,21 @@ class SensorResult:
     full_scale: float
     exposure_us: float
     edge: EdgeSpread | Failure | None = None
+    scatter: tuple[float, float] = (0.0, 0.0)
 
     @property
     def dsnu(self) -> float:
-        """Standard deviation of the bias over the good pixels (grey values)."""
-        return float(self.fields.bias[~self.fields.defects].std(dtype=np.float64))
+        """Standard deviation of the bias over the good pixels (grey values), without the noise of frames."""
+        return self._between_pixels(self.fields.bias, self.scatter[0])
 
     @property
     def prnu(self) -> float:
-        """Standard deviation of the response over the good pixels, including uneven light."""
-        return float(self.fields.response[~self.fields.defects].std(dtype=np.float64))
+        """The same for the response, including uneven light."""
+        return self._between_pixels(self.fields.response, self.scatter[1])
+
+    def _between_pixels(self, field: Image32, noise: float) -> float:
+        variance = float(field[~self.fields.defects].var(dtype=np.float64)) - noise
+        return float(np.sqrt(max(variance, 0.0)))
 
     @property
     def correction(self) -> SensorCorrection:
@@ -209,7 +216,8 @@ def calibrate_sensor(series: SensorSeries) -> SensorResult:
     if isinstance(transfer, Failure):
         raise EstimationError(transfer.reason, where="photon transfer")
     brightest = curve.exposure_us[curve.bright & curve.usable].max()
-    return SensorResult(fields, transfer, linearity, series.full_scale, float(brightest))
+    scatter = scatter_of(series, fields)
+    return SensorResult(fields, transfer, linearity, series.full_scale, float(brightest), scatter=scatter)
 
 
 def with_edge(

@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 
 from ..core.errors import UsageError
 
-__all__ = ["Image32", "Level", "LevelSums", "SensorSeries"]
+__all__ = ["Image32", "Level", "LevelSums", "SensorSeries", "saturation"]
 
 Image32 = NDArray[np.float32]
+_LINEAR = 0.7
+"""Largest signal of the levels used, as a share of saturation (EMVA 1288)."""
+_COLLAPSED = 0.5
+"""A level is saturated if its variance is below this share of the expected one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +32,8 @@ class Level:
         Number of frames, at least two.
     mean, variance : ndarray (height, width)
         Mean and variance of each pixel over the frames, corrected for changes of whole frames (lamp flicker).
+    light : float, optional
+        Amount of light in any unit, if not the exposure time alone varies.
 
     Examples
     --------
@@ -41,6 +47,12 @@ class Level:
     count: int
     mean: Image32
     variance: Image32
+    light: float | None = None
+
+    @property
+    def amount(self) -> float:
+        """The light, in its own unit or by the exposure time."""
+        return self.exposure_us if self.light is None else self.light
 
     @classmethod
     def of(cls, exposure_us: float, frames: Iterable[NDArray[Any]]) -> Level:
@@ -64,6 +76,8 @@ class LevelSums:
     ----------
     exposure_us : float
         Exposure time.
+    light : float, optional
+        As for :class:`Level`.
 
     Examples
     --------
@@ -75,8 +89,8 @@ class LevelSums:
     (3, 1.33)
     """
 
-    def __init__(self, exposure_us: float) -> None:
-        self.exposure_us, self.count = exposure_us, 0
+    def __init__(self, exposure_us: float, light: float | None = None) -> None:
+        self.exposure_us, self.light, self.count = exposure_us, light, 0
         self._first = 0.0
         self._mean: NDArray[np.float64] = np.zeros((0, 0))
         self._scatter: NDArray[np.float64] = np.zeros((0, 0))
@@ -116,7 +130,7 @@ class LevelSums:
         # One degree of freedom of all pixels together is used for each frame's mean.
         variance = self._scatter / (self.count - 1) * (self._mean.size / (self._mean.size - 1))
         mean = self._mean.astype(np.float32)
-        return Level(self.exposure_us, self.count, mean, variance.astype(np.float32))
+        return Level(self.exposure_us, self.count, mean, variance.astype(np.float32), self.light)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +147,7 @@ class SensorSeries:
     Raises
     ------
     UsageError
-        When either is missing, or frames differ in size.
+        When either is missing, frames differ in size, or the light is given for some only.
 
     Examples
     --------
@@ -158,10 +172,32 @@ class SensorSeries:
         shapes = {level.mean.shape for level in (*self.dark, *self.bright)}
         if len(shapes) > 1:
             raise UsageError("its frames differ in size", where="sensor series")
-        object.__setattr__(self, "bright", tuple(sorted(self.bright, key=lambda each: each.exposure_us)))
+        if len({level.light is None for level in self.bright}) > 1:
+            raise UsageError("the light is given for some of its exposures only", where="sensor series")
+        object.__setattr__(self, "bright", tuple(sorted(self.bright, key=lambda each: each.amount)))
 
     @property
     def shape(self) -> tuple[int, int]:
         """Height and width."""
         height, width = self.dark[0].mean.shape
         return int(height), int(width)
+
+
+def saturation(signal: NDArray[np.float64], variance: NDArray[np.float64]) -> tuple[float | None, float]:
+    """Signal of the plateau, None without one, and the signal up to which the variance increases.
+
+    Parameters
+    ----------
+    signal, variance : ndarray (m,)
+        Of levels with increasing light.
+
+    Examples
+    --------
+    >>> saturation(np.array([50.0, 100.0, 200.0, 235.0]), np.array([5.0, 10.0, 20.0, 0.1]))
+    (235.0, 200.0)
+    """
+    top = int(np.argmax(variance))
+    for k in range(top + 1, len(signal)):
+        if variance[k] < _COLLAPSED * variance[top]:
+            return float(signal[k:].max()), float(signal[top])
+    return None, float(signal.max()) / _LINEAR

@@ -15,15 +15,15 @@ from ..adjust import Adjustment, GaussHelmert, GaussMarkov, Options, Parameters,
 from ..calibration.sensor import Fields
 from ..core.data import Array, Mask
 from ..core.failure import Code, Failure
-from .series import SensorSeries
+from .series import SensorSeries, saturation
 
 __all__ = ["Curve", "Linearity", "PhotonTransfer", "curve_of", "fit_linearity", "fit_transfer"]
 
 ROUNDING = 1 / 12
+_COARSE = 1.5
+"""Least variance, relative to that of rounding, at which rounding is independent of the signal."""
 _LINEAR = 0.7
 """Largest signal of the levels used, as a share of saturation (EMVA 1288)."""
-_COLLAPSED = 0.5
-"""A level is saturated if its variance is below this share of the expected one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +42,10 @@ class Curve:
         Which levels are far enough below saturation.
     plateau : float or None
         Signal at saturation; None if no level is saturated.
+    light : ndarray (m,), optional
+        Amount of light in any unit, if not the exposure time alone varies.
+    dark : ndarray (m,) or float
+        Grey value of the dark current.
     """
 
     exposure_us: Array
@@ -52,6 +56,13 @@ class Curve:
     bright: Mask
     usable: Mask
     plateau: float | None
+    light: Array | None = None
+    dark: Array | float = 0.0
+
+    @property
+    def amount(self) -> Array:
+        """The light (m,), in its own unit or by the exposure times."""
+        return self.exposure_us if self.light is None else self.light
 
 
 def curve_of(series: SensorSeries, fields: Fields) -> Curve:
@@ -71,8 +82,10 @@ def curve_of(series: SensorSeries, fields: Fields) -> Curve:
     freedom = (frames - 1) * int(good.sum())
     # The minimum variance is that of rounding, as in saturation or below one grey value.
     safe = np.maximum(variance, ROUNDING)
-    order = np.argsort(times[bright])
-    plateau, most = _saturation(signal[bright][order], variance[bright][order])
+    plateau, most = saturation(signal[bright], variance[bright])
+    light = None
+    if series.bright[0].light is not None:
+        light = np.array([level.amount if lit else 0.0 for level, lit in zip(levels, bright, strict=True)])
     usable = ~bright | (signal <= _LINEAR * most)
     return Curve(
         times,
@@ -83,16 +96,9 @@ def curve_of(series: SensorSeries, fields: Fields) -> Curve:
         bright,
         usable,
         plateau,
+        light,
+        np.maximum(float(fields.dark_current[good].mean(dtype=np.float64)), 0.0) * times,
     )
-
-
-def _saturation(signal: Array, variance: Array) -> tuple[float | None, float]:
-    """Signal of the plateau, if there is one, and the signal up to which the variance increases."""
-    top = int(np.argmax(variance))
-    for k in range(top + 1, len(signal)):
-        if variance[k] < _COLLAPSED * variance[top]:
-            return float(signal[k:].max()), float(signal[top])
-    return None, float(signal.max()) / _LINEAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +108,7 @@ class Linearity:
     Parameters
     ----------
     fit : Adjustment
-        Adjustment of `slope` (grey values per microsecond), `b2` and `b3`:
+        Adjustment of `slope` (grey values per microsecond, relative to that of a line), `b2` and `b3`:
         signal·(1 + b2·u + b3·u²) = slope·exposure, with u the signal over full scale.
     full_scale : float
         Full scale used for u.
@@ -154,8 +160,8 @@ def fit_linearity(curve: Curve, full_scale: float) -> Linearity | Failure:
     >>> round(found.fit["b2"], 2), found.straight(signal)[0].round(1)
     (0.1, array([ 20.,  40.,  60.,  80., 100.]))
     """
-    use = curve.bright & curve.usable & (curve.exposure_us > 0)
-    signal, times = curve.signal[use][:, None], curve.exposure_us[use][:, None]
+    use = curve.bright & curve.usable & (curve.amount > 0)
+    signal, times = curve.signal[use][:, None], curve.amount[use][:, None]
     if len(signal) < 4:
         return Failure(
             "fewer than four bright levels below saturation: take more exposures", Code.TOO_FEW_LEVELS
@@ -220,7 +226,7 @@ class PhotonTransfer:
 
 
 def fit_transfer(curve: Curve, linearity: Linearity | None = None) -> PhotonTransfer | Failure:
-    """Fit the photon transfer curve: σ² = σ_read² + 1/12 + signal/gain.
+    """Fit the photon transfer curve: σ² = σ_read² + 1/12 + (signal + dark current)/gain.
 
     For a non-linear response the signal is linearised, and its part of the variance is divided by the square
     of the slope. The uncertainty of the signal is propagated to the variance.
@@ -249,6 +255,7 @@ def fit_transfer(curve: Curve, linearity: Linearity | None = None) -> PhotonTran
     """
     use = curve.usable
     signal, variance = curve.signal[use], curve.variance[use]
+    dark = np.broadcast_to(curve.dark, use.shape)[use]
     top, saturation = np.array([curve.plateau or 0.0]), curve.plateau
     if linearity is not None:
         signal, bend = linearity.straight(signal)
@@ -258,10 +265,18 @@ def fit_transfer(curve: Curve, linearity: Linearity | None = None) -> PhotonTran
         return Failure(
             "fewer than two bright levels below saturation: take shorter exposures", Code.TOO_FEW_LEVELS
         )
+    signal = signal + dark  # electrons of the dark current scatter as those of light do
     slope, floor = np.polyfit(signal, variance, 1, w=1 / curve.variance_sigma[use])
     if not slope > 0:
         return Failure(
             "the variance does not increase with the light: check that it is even and no gamma curve is set",
+            Code.INCONSISTENT,
+        )
+    least = float(variance.min())
+    if least < _COARSE * ROUNDING:
+        return Failure(
+            f"the noise in the dark, {np.sqrt(max(least, 0.0)):.2g} grey values, is lost in rounding: use a "
+            "higher gain or more bits",
             Code.INCONSISTENT,
         )
     sigma = np.hypot(curve.variance_sigma[use], slope * curve.signal_sigma[use] * curve.bright[use])

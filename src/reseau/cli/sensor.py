@@ -1,0 +1,143 @@
+"""`reseau sensor`: calibrate a sensor from files of dark and lit exposures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..core.errors import EstimationError, UsageError
+from .common import AsJson, Channel, Out, probability, progress, say, writable
+
+if TYPE_CHECKING:
+    from ..calibration.document import Calibration
+    from ..procedures.sensor_files import FileExposure
+
+__all__ = ["event", "lines", "sensor"]
+
+
+def sensor(
+    series: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Folder with the folders `dark`, `light` and optionally `edge`, or a list: a descriptor of "
+            "EMVA 1288, or CSV with the columns file, kind (dark, light, edge), exposure_us, [light]."
+        ),
+    ] = None,
+    light: Annotated[
+        list[Path] | None, typer.Option(help="Folder or file of evenly lit exposures; repeatable.")
+    ] = None,
+    dark: Annotated[
+        list[Path] | None, typer.Option(help="Folder or file of dark exposures; repeatable.")
+    ] = None,
+    edge: Annotated[
+        list[Path] | None, typer.Option(help="Folder or file of a slanted edge, for the MTF; repeatable.")
+    ] = None,
+    region: Annotated[
+        tuple[int, int, int, int] | None, typer.Option(help="Region of the edge: left top width height (px).")
+    ] = None,
+    out: Out = None,
+    report: Annotated[Path | None, typer.Option(help="HTML report to write.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the calibration. Default: that of the folder or list.")
+    ] = None,
+    channel: Annotated[Channel, typer.Option(help="Channel of colour images.")] = Channel.LUMA,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate a sensor from files: dark signal, response, linearity, noise, gain, full well, defects, MTF.
+
+    Exposure times come from the list, from names of folders or files (`light/5ms/01.tif`), or from what
+    cameras write into files. Multi-page TIFF, DICOM loops and videos count as many frames.
+    """
+    from ..io import write_whole
+    from ..procedures.sensor import SensorProcedure
+    from ..procedures.sensor_files import add_files
+    from ..report.sensor import sensor_report
+
+    for path in (out, report):
+        if path is not None:
+            writable(path)
+    given = _exposures(series, {"light": light, "dark": dark, "edge": edge})
+    called = name or (series.stem if series is not None else "sensor")
+    root = None if series is None else series if series.is_dir() else series.parent
+    options: dict[str, Any] = {"region": region, "channel": channel.value}
+    procedure = SensorProcedure(name=called, region=region, options=options)
+    with progress("reading", len(given)) as step:
+        notes = add_files(procedure, given, channel=channel.value, root=root, step=step)
+    for note in notes:
+        typer.echo(f"note: {note}", err=True)
+    found = procedure.calibration(called)
+    if out is not None:
+        write_whole(out, found.to_json())
+    if report is not None:
+        page = sensor_report(procedure.result(), title=f"Sensor of {called}", provenance=procedure.provenance)
+        write_whole(report, page)
+    if as_json:
+        say(json.dumps(event(found)) + "\n")
+    else:
+        say(lines(found) + "".join(f"{path}\n" for path in (out, report) if path is not None))
+    if any(each.kind == "edge" for each in given) and "psf" not in found.parameters:
+        raise EstimationError(found.validity.get("edge", "no usable frame"), where="edge")
+
+
+def _exposures(series: Path | None, places: dict[str, list[Path] | None]) -> tuple[FileExposure, ...]:
+    """Files of the series and of the options.
+
+    Raises
+    ------
+    UsageError
+        If dark or lit exposures are missing.
+    """
+    from ..procedures.sensor_files import exposures_in, read_exposures
+
+    found = () if series is None else read_exposures(series)
+    for kind, folders in places.items():
+        for folder in folders or []:
+            found += exposures_in(folder, kind)
+    for kind, what in (("light", "evenly lit"), ("dark", "dark")):
+        if not any(each.kind == kind for each in found):
+            raise UsageError(
+                f"no {what} exposures", where=series or "sensor", do=f"add them with --{kind} FOLDER"
+            )
+    return found
+
+
+def event(found: Calibration) -> dict[str, Any]:
+    """The calibration without its fields, as `--json` prints it."""
+    quantities = {name: each.model_dump() for name, each in found.parameters.items()}
+    content = {"parameters": quantities, "validity": found.validity, "tests": list(found.tests)}
+    return {"event": "calibration", "schema": "reseau-sensor/1", **content}
+
+
+def lines(found: Calibration) -> str:
+    """The calibration as text, one line for each quantity."""
+    from ..core.numbers import measured
+
+    text = [
+        f"{name:<16} {measured(each.value, each.sigma, each.unit)}" for name, each in found.parameters.items()
+    ]
+    validity = found.validity
+    text.append(f"{'dark signal':<16} ± {validity['dsnu']:.2g} DN from pixel to pixel")
+    text.append(
+        f"{'response':<16} ± {100 * validity['prnu']:.2g} % from pixel to pixel, including uneven light"
+    )
+    text.append(f"{'defects':<16} {validity['defects']} pixels")
+    if validity["linearity"] != "fitted":
+        text.append(f"{'linearity':<16} not estimated: {validity['linearity']}")
+    if not validity["saturated"]:
+        text.append(f"{'full well':<16} not reached: provide more light or longer exposures")
+    text += [f"{test['name']:<16} {_verdict(test)}" for test in found.tests if "p" in test]
+    for test in found.tests:
+        if test["name"] == "photon transfer" and not test["passed"]:
+            text.append(
+                f"{'photon transfer':<16} rejected: the noise deviates by {found.sigma0:.2g} of its σ "
+                "from the model (rms); look for a tone curve, compression, averaging, or light that changes"
+            )
+    return "\n".join(text) + "\n"
+
+
+def _verdict(test: dict[str, Any]) -> str:
+    """Outcome of a test of the edge."""
+    return f"{'accepted' if test['passed'] else 'rejected'} ({probability(test['p'])})"
