@@ -22,6 +22,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from .core.lazy import lazily
 from .core.version import __version__
 
 if TYPE_CHECKING:
@@ -78,16 +79,11 @@ _PLACES = {
     "ReseauError": ".core.errors",
 }
 """Modules that define the names; all others are functions of :mod:`reseau.api`."""
+_named = lazily(__name__, dict.fromkeys(__all__, ".api") | _PLACES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name in _CALLABLE:
-        return import_module(f".{name}", __name__)
-    found = getattr(import_module(_PLACES.get(name, ".api"), __name__), name)
-    globals()[name] = found
-    return found
+    return import_module(f".{name}", __name__) if name in _CALLABLE else _named(name)
 
 
 def __dir__() -> list[str]:

@@ -54,7 +54,7 @@ def test_a_testfield_from_poses_to_a_calibration_that_can_be_rerun(
     assert run(["archive", "rerun", "monday", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["same"]
-    assert [row["name"] for row in document["results"]] == ["calibration.json", "report.html"]
+    assert [row["name"] for row in document["results"]] == ["calibration.json", "report.html", "scene.json"]
     assert run(["archive", "export", "monday", "--out", "monday.zip"]) == 0
     with zipfile.ZipFile("monday.zip") as made:
         assert sum(name.endswith(".tif") for name in made.namelist()) == 8  # three were checks

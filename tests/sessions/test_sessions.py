@@ -37,7 +37,7 @@ def test_a_program_captures_and_reruns_a_session(archive: Archive) -> None:
     assert sessions.capture(session, rig.bench) is None
     assert session.status == "done"
     done = sessions.rerun(archive.session("monday"))
-    assert [each.result.name for each in done] == ["calibration.json", "report.html"]
+    assert [each.result.name for each in done] == ["calibration.json", "report.html", "scene.json"]
     assert all(each.same for each in done)
     assert sessions.calibration_of(session).parameters["c"].unit == "mm"
 

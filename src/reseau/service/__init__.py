@@ -7,8 +7,9 @@ are first used: the service is ready before the statistics are loaded.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ..core.lazy import lazily
 
 if TYPE_CHECKING:
     from .alarms import Alarm, Alarms, sender
@@ -82,9 +83,4 @@ _PLACES = {
 """Modules that define the names."""
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _PLACES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(import_module(_PLACES[name], __name__), name)
-    globals()[name] = found
-    return found
+__getattr__ = lazily(__name__, _PLACES)

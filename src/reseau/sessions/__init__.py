@@ -22,7 +22,7 @@ from .conducting import (
     rerun,
     resume,
 )
-from .kinds import CORNERS, KINDS, OF_FILES, Reported, SessionKind, kind_of, own_plan
+from .kinds import CORNERS, KINDS, OF_FILES, SCENE, Reported, SessionKind, kind_of, own_plan
 from .parameters import (
     BlurredParameters,
     FilmParameters,
@@ -40,6 +40,7 @@ __all__ = [
     "CORNERS",
     "KINDS",
     "OF_FILES",
+    "SCENE",
     "BlurredParameters",
     "FilmParameters",
     "FramesParameters",

@@ -35,10 +35,12 @@ if TYPE_CHECKING:
     from ..procedures.sensor import SensorProcedure
     from ..procedures.testfield import TestfieldProcedure
 
-__all__ = ["CORNERS", "KINDS", "OF_FILES", "Reported", "SessionKind", "kind_of", "own_plan"]
+__all__ = ["CORNERS", "KINDS", "OF_FILES", "SCENE", "Reported", "SessionKind", "kind_of", "own_plan"]
 
 CORNERS = "corners.json"
 """Optional input of a session of the plan `film`: calibrated corners of the camera."""
+SCENE = "scene.json"
+"""Result: cameras and target in space (``reseau-scene/1``)."""
 GENERATOR = "generator.py"
 """Input of a session of the plan `own`: the Python file with the generator."""
 
@@ -282,6 +284,7 @@ def _of_files(run: Acquisition, given: SessionParameters) -> Plan:
 
 def _calibration_results(procedure: TestfieldProcedure, session: Session) -> dict[str, str]:
     from ..report.bundle import bundle_report
+    from ..report.scene import scene_of
 
     results = procedure.finish()
     found = procedure.calibrated().required()
@@ -290,7 +293,7 @@ def _calibration_results(procedure: TestfieldProcedure, session: Session) -> dic
         found.result, title=f"Calibration {session.name}", provenance=procedure.provenance,
         assessments=found.assessments, photograph=lambda name: session.picture(frames[name]),
     )  # fmt: skip
-    return results | {"report.html": report}
+    return results | {"report.html": report, SCENE: scene_of(found.result).to_json()}
 
 
 def _calibration_verdict(procedure: TestfieldProcedure) -> dict[str, list[str]]:

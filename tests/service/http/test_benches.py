@@ -187,7 +187,7 @@ def test_a_session_is_begun_paused_continued_and_calibrated(one: Served) -> None
     assert (done["session"]["state"], done["session"]["good"]) == ("done", len(STEPS)), done
     assert done["session"]["reached"]["sigma_c"] > 0
     found = client.get("/api/1/sessions/paused").json()
-    assert (found["status"], len(found["results"])) == ("done", 2)
+    assert (found["status"], len(found["results"])) == ("done", 3)
 
 
 @pytest.mark.slow

@@ -214,6 +214,17 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
     browser.click("form[data-api$='/review'] button")
     browser.until("in force", seconds=30)
     time.sleep(2.0)
+    browser.until("4 images")
+    before = browser.run("return document.querySelector('canvas').dataset.view")
+    browser.run("document.querySelector('canvas').focus()")
+    keys = [{"type": kind, "value": "\ue014"} for kind in ("keyDown", "keyUp")]  # the arrow to the right
+    browser.command("POST", "/actions", {"actions": [{"type": "key", "id": "keys", "actions": keys}]})
+    until(lambda: browser.run("return document.querySelector('canvas').dataset.view") != before)
+    browser.click("button[data-turn=top]")
+    until(lambda: browser.run("return document.querySelector('canvas').dataset.view").startswith("-90 90"))
+    browser.click("button[data-turn=down]")
+    browser.click("button[data-turn=down]")
+    browser.click("button[data-turn=down]")
     shot(browser, "service-calibration")
 
     # The drift alarm is acknowledged; an earlier calibration applies again.

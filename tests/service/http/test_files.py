@@ -84,6 +84,7 @@ def test_photographs_become_a_calibration_with_a_verdict_that_is_computed_again(
     assert finished(client, again.json()["number"])["found"] == {
         "calibration.json": True,
         "report.html": True,
+        "scene.json": True,
     }
     assert verify(one.service.archive)
 
@@ -102,7 +103,7 @@ def test_an_upload_that_was_cut_off_is_finished_after_the_next_start(
             assert time.monotonic() < end
             time.sleep(0.05)
         found = client.get("/api/1/sessions/cut off").json()
-        assert (found["status"], found["good"], len(found["results"])) == ("done", 4, 2)
+        assert (found["status"], found["good"], len(found["results"])) == ("done", 4, 3)
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ def test_a_session_says_what_was_rejected_and_why(client: TestClient) -> None:
     assert [each["step"] for each in found["rejected"]] == ["right"]
     assert "expose more" in found["rejected"][0]["why"]
     assert found["to_come"] == []
-    assert {each["name"] for each in found["results"]} == {"calibration.json", "report.html"}
+    assert {each["name"] for each in found["results"]} == {"calibration.json", "report.html", "scene.json"}
     missing = client.get("/api/1/sessions/tuesday")
     assert (missing.status_code, missing.json()["error"]["code"]) == (404, "not_found")
 
@@ -165,6 +165,19 @@ def test_a_calibration_has_parameters_with_sigmas_correlations_and_findings(clie
     for figure in found["figures"]:
         svg = client.get(f"/api/1/configurations/vidicon/decisions/{row['key']}/figures/{figure}.svg")
         assert svg.text.startswith("<svg"), figure
+
+
+def test_cameras_and_target_are_told_in_space(client: TestClient) -> None:
+    found = client.get("/api/1/sessions/monday/scene").json()
+    assert [each["name"] for each in found["cameras"]] == ["frontal", "right", "down", "left"]
+    assert len(found["points"]) == len(found["xyz"]) > 300
+    frontal = found["cameras"][0]
+    assert np.linalg.norm(frontal["position"]) == pytest.approx(5000, rel=0.01)  # mm
+    # It looks at the middle of the target.
+    toward = -np.array(frontal["position"]) / np.linalg.norm(frontal["position"])
+    assert np.dot(frontal["axes"][2], toward) > 0.999
+    assert "scene.js" in client.get("/sessions/monday").text
+    assert client.get("/api/1/sessions/dropped/scene").status_code == 404
 
 
 def test_two_calibrations_are_compared(client: TestClient) -> None:

@@ -24,6 +24,8 @@ from .service import Service
 __all__ = ["create_app", "serve"]
 
 API = "/api/1"
+_CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"
+"""Of TLS 1.2: with forward secrecy and authenticated; those of TLS 1.3 all are."""
 _ABOUT = """Acquisition and calibration of measuring cameras and imaging instruments.
 
 Requests need `Authorization: Bearer TOKEN`, or the cookie of a login, with `X-CSRF-Token` to change anything.
@@ -106,7 +108,7 @@ def serve(options: ServeOptions, said: Callable[[str], None], ready: Callable[[S
             create_app(service), log_config=None, access_log=False, server_header=False, date_header=True,
             proxy_headers=bool(options.proxy), http=PatientProtocol, ssl_certfile=options.certificate,
             ssl_keyfile=options.key, timeout_keep_alive=15, timeout_graceful_shutdown=3,
-            limit_concurrency=1000, lifespan="off",
+            limit_concurrency=1000, lifespan="off", ssl_ciphers=_CIPHERS,
         )  # fmt: skip
         server = _Server(config, service, ready)
         log("started", port=options.port, archive=service.archive.place)

@@ -25,6 +25,7 @@ router = APIRouter(include_in_schema=False)
 _STATIC = {
     "app.css": "text/css",
     "app.js": "text/javascript",
+    "scene.js": "text/javascript",
     "icon.svg": "image/svg+xml",
 }
 NAV = (
@@ -200,7 +201,8 @@ def session_page(request: Request, session: str, who: Reading, service: Here) ->
     running = mine[0] if mine else None
     return _rendered(
         request, "session.html.j2", s=found, frames=frames[-_SHOWN:][::-1], more=max(0, len(frames) - _SHOWN),
-        report=_report(found), verdict=_verdict(kept, found), bench=running,
+        report=_report(found), scene=sessions.scene_result(kept) is not None,
+        verdict=_verdict(kept, found), bench=running,
         reached=running.session.reached if running is not None and running.session is not None else {},
         job=service.jobs.of(session),
     )  # fmt: skip
@@ -303,16 +305,17 @@ def calibration_page(request: Request, name: str, key: str, who: Reading, servic
     """A calibration and the decision on it."""
     found = calibrations.calibration_detail(service, name, key)
     current = calibrations.configuration_detail(service, name).in_force
-    report = None
+    report, scene = None, False
     if found.decision.session is not None:
         kept = sessions.the_session(service, found.decision.session)
+        scene = sessions.scene_result(kept) is not None
         report = _report(sessions.session_detail(service, kept))
     tests = {}
     for each in found.tests:
         if {"parameter", "p"} <= each.keys():
             tests[each["parameter"]] = f"p = {each['p']:.2g}"
     return _rendered(
-        request, "calibration.html.j2", c=found, report=report, tests=tests,
+        request, "calibration.html.j2", c=found, report=report, scene=scene, tests=tests,
         verdict=" ".join(found.verdict),
         in_force=current is not None and current.key == found.decision.key,
     )  # fmt: skip

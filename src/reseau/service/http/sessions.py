@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import ConfigDict
 
-from ...archive import ArchivedFrame, Session
+from ...archive import ArchivedFrame, ArchivedResult, Session
 from ...core.errors import ArchiveError, ReseauError, UsageError
 from ..decoding import PHOTOGRAPH
 from .access import Here, NotFound, Reading
@@ -100,6 +101,24 @@ class SessionDetail(Answer):
     to_come: list[str]
     rejected: list[FrameRow]
     results: list[ResultRow]
+
+
+class CameraInSpace(Answer):
+    """An image: where its camera was, its axes right, down, forward, and tangents of half its view."""
+
+    name: str
+    position: tuple[float, float, float]
+    axes: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    field: tuple[float, float]
+
+
+class SceneAnswer(Answer):
+    """Cameras and points in space."""
+
+    unit: str
+    cameras: list[CameraInSpace]
+    points: list[str]
+    xyz: list[tuple[float, float, float]]
 
 
 class BlueskyDocument(Answer):
@@ -322,6 +341,25 @@ def result_file(
     if result is None:
         raise NotFound("has no such result", where=f"{session}: {number}")
     return file_answer(request, kept.content(result), result.name, result.sha256)
+
+
+@router.get("/sessions/{session}/scene")
+def scene(session: SessionName, who: Reading, service: Here) -> SceneAnswer:
+    """Cameras and target in space, as the calibration of the session found them."""
+    kept = the_session(service, session)
+    found = scene_result(kept)
+    if found is None:
+        raise NotFound("has no cameras in space", where=session)
+    content = json.loads(kept.content(found))
+    return SceneAnswer(**{key: value for key, value in content.items() if key != "schema"})
+
+
+def scene_result(session: Session) -> ArchivedResult | None:
+    """Return the result of a session with cameras and target in space, or None."""
+    from ... import sessions as kinds
+
+    found = [each for each in session.results() if each.name == kinds.SCENE]
+    return found[-1] if found else None
 
 
 @router.get("/sessions/{session}/documents")
