@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -33,10 +35,11 @@ from reseau.optics.lenses import (
     in_order,
     ray_images,
 )
+from reseau.optics.poses import matrix_to_vector
 
 from .water import Water
 
-__all__ = ["SpaceFrame"]
+__all__ = ["PROJECT_POSES", "SpaceFrame", "project"]
 
 SIZE, PITCH_MM, DISTANCE_MM = (640, 480), 0.02, 1000.0
 _ROWS = ((0.056, 2.5, "N-BK7"), (-0.04, 0.75, "SF2"), (-0.012, 1.5, ""))
@@ -161,3 +164,88 @@ class SpaceFrame:
                 share[np.ix_(y.astype(int), x.astype(int))] += formed
         # Where images overlap, targets hide each other.
         return np.minimum(share, 1.0)
+
+
+PROJECT_POSES: Mapping[str, Mapping[str, float]] = {
+    "left": {"tilt": 30.0, "roll": 0.0, "camera_roll": 0.0},
+    "right": {"tilt": 30.0, "roll": 180.0, "camera_roll": 180.0},
+    "below": {"tilt": 35.0, "roll": 90.0, "camera_roll": 0.0},
+}
+"""Positions of the table for a project of three images."""
+_CONTROL, _PROJECT_SIGMA_PX = 8, 0.3
+
+
+def project(frame: SpaceFrame, poses: Mapping[str, Pose], water: Water | None) -> str:
+    """Return a network as it is known before its photographs are taken, ``reseau-network/1``.
+
+    Poses are known to some millimetres, image coordinates to the pixel, and the coordinates of eight targets.
+
+    Parameters
+    ----------
+    frame : SpaceFrame
+        The targets.
+    poses : mapping of str to Pose
+        True pose of each image, by its name.
+    water : Water, optional
+        Port and water as designed, not as made.
+    """
+    rng = np.random.default_rng(3)
+    names, targets = tuple(poses), frame.targets.targets.id
+    places, known = frame.xyz, np.arange(len(targets)) < _CONTROL
+    turns, centres, image_of, point_of, xy = [], [], [], [], []
+    for i, pose in enumerate(poses.values()):
+        turns.append(matrix_to_vector(pose.matrix) + rng.normal(0, 2e-3, 3))
+        centres.append(pose.x0 + rng.normal(0, 3.0, 3))
+        seen = frame.seen_by(water).corresponding(pose(places))
+        inside = ((seen > 20) & (seen < np.array(SIZE) - 21)).all(axis=1)
+        xy.append(np.rint(seen[inside]))
+        image_of.append(np.full(int(inside.sum()), i))
+        point_of.append(np.flatnonzero(inside))
+    near = frame.lens.corresponding(np.array([[0.0, 0.0, 1e5], [1e3, 0.0, 1e5]]))
+    c = float(near[1, 0] - near[0, 0]) * PITCH_MM * 100.0
+    n = sum(map(len, xy))
+    document: dict[str, Any] = {
+        "schema": "reseau-network/1",
+        "unit": "mm",
+        "cameras": [{
+            "id": "camera", "width": SIZE[0], "height": SIZE[1], "pitch_mm": [PITCH_MM, PITCH_MM],
+            "model": "brown", "side": "object", "parameters": {"c": c}, "free": ["c", "K1", "K2"],
+        }],
+        "images": {
+            "id": names, "camera": len(names) * ["camera"], "X0": [each.tolist() for each in centres],
+            "rotation": [each.tolist() for each in turns],
+        },
+        "points": {
+            "id": targets,
+            "xyz": [each.tolist() if k else None for each, k in zip(places, known, strict=True)],
+            "sigma": [[0.0, 0.0, 0.0] if k else None for k in known],
+            "role": ["control" if k else "tie" for k in known],
+        },
+        "observations": {
+            "image": [names[i] for i in np.concatenate(image_of)],
+            "point": [targets[k] for k in np.concatenate(point_of)],
+            "x": np.concatenate(xy)[:, 0].tolist(), "y": np.concatenate(xy)[:, 1].tolist(),
+            "sx": n * [_PROJECT_SIGMA_PX], "sy": n * [_PROJECT_SIGMA_PX],
+        },
+        "datum": "control",
+    }  # fmt: skip
+    if water is not None:
+        x, y = np.tan(np.deg2rad(water.tilt_deg))
+        document["refraction"] = {
+            "media": {
+                "air": 1.0,
+                "glass": {"medium": "N-BK7", "wavelength_nm": 546.1},
+                "water": {
+                    "medium": {"water": {"temperature_c": water.temperature_c}}, "wavelength_nm": 546.1
+                },
+            },
+            "windows": [{
+                "id": "port", "shape": "plane", "on": "camera", "media": ["air", "glass", "water"],
+                "parameters": {
+                    "tilt_X": y, "tilt_Y": -x, "distance": water.distance_mm, "thickness": water.thickness_mm
+                },
+                "free": ["tilt_X", "tilt_Y", "distance"],
+                "sigma": {"tilt_X": 0.005, "tilt_Y": 0.005, "distance": 0.5},
+            }],
+        }  # fmt: skip
+    return json.dumps(document, indent=1)

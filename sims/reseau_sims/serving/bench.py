@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -10,13 +10,17 @@ from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
+from reseau.core.data import Array
 from reseau.core.errors import UsageError
 
 from ..frame import DISTANCE_MM as FRAME_DISTANCE_MM
+from ..frame import PROJECT_POSES, SpaceFrame, project
 from ..frame import SIZE as FRAME_SIZE
-from ..frame import SpaceFrame
 from ..laboratory import AXES, Laboratory
+from ..pixels import PixelSensor
+from ..reflectors import Reflectors
 from ..streams import stream
 from ..testfield import FieldBench
 from ..water import Water
@@ -25,20 +29,22 @@ from .bk import BkScanner
 from .compactpulser import CompactPulser
 from .faults import FaultScript
 from .gige import GigeCamera, aravis_is_installed
-from .imaging import LaboratoryScene, SimulatedCamera
+from .imaging import LaboratoryScene, LampScene, SimulatedCamera
 from .machine import FaultyConnection, Machine
 from .oscilloscope import FAMILIES, Oscilloscope
+from .person import SimulatedOperator
 from .ping360 import Ping360
 from .scpi import Vxi11Session
-from .servers import PtyServer, TcpServer
+from .servers import PtyServer, Server, TcpServer
 from .smc100 import Smc100Line
 from .v4l2 import VideoCamera
 from .zaber import ZaberChain
 
-__all__ = ["SimulatedBench", "TableKind", "serve"]
+__all__ = ["ScannerKind", "SimulatedBench", "TableKind", "serve"]
 
 TableKind = Literal["zaber", "smc100"]
-SceneName = Literal["screen", "testfield", "frame"]
+SceneName = Literal["screen", "testfield", "frame", "sensor"]
+ScannerKind = Literal["ping360", "bk", "compactpulser", "all"]
 _PATIENCE_S = 120.0
 """Time to wait for the port of another simulated camera on this machine (s)."""
 _DISTORTION_PX = 1.5
@@ -52,10 +58,15 @@ _HIGH = {"tilt": 75.0, "roll": 360.0, "camera_roll": 360.0, "z": 300.0}
 _LOW = -5.0
 """Below zero, so that zero can be approached from below."""
 _SCREEN = (800, 480)
+_SENSOR = (96, 64)
+_PIXELS: dict[str, Any] = {"gain": 0.2, "read_noise": 20.0, "full_well": 11_000.0, "bits": 16}
+_LAMP, _EDGE_US = 16.0, 1000.0
+"""Grey values per microsecond of the lamp; exposure for the edge (µs)."""
 
 _BENCH = """\
 schema = "reseau-bench/1"
 name = "simulated"
+operator = "{operator}"
 
 [instruments.table]
 driver = "{kind}"
@@ -63,33 +74,33 @@ address = "{table}"
 settings = {{speed = 50.0}}
 
 [instruments.table.options.axes]
-{axes}
-[instruments.scanner]
-driver = "ping360"
-address = "{scanner}"
-settings = {{range_mm = 150.0}}
-
-[instruments.bmode]
-driver = "bk"
-address = "{bmode}"
-
-[instruments.pulser]
-driver = "compactpulser"
-address = "{pulser}"
-options = {{digitiser = "oscilloscope", carrier = "table", axis = "z"}}
-
+{axes}{scanners}
 [instruments.oscilloscope]
 driver = "oscilloscope"
 address = "{oscilloscope}"
 """
 
+_SCANNERS = {
+    "ping360": "settings = {range_mm = 150.0}\n",
+    "bk": "",
+    "compactpulser": 'options = {digitiser = "oscilloscope", carrier = "table", axis = "z"}\n',
+}
+_NAMES = {"ping360": "scanner", "bk": "bmode", "compactpulser": "pulser"}
+"""Names of the scanners, where there are several."""
 
 _CAMERA = """
 [instruments.camera]
 driver = "aravis"
 address = "{address}"
-settings = {{trigger = "software", width = {width}, height = {height}, exposure_us = 10000.0, gain = 0.0}}
 options = {{seconds = 30.0}}
+
+[instruments.camera.settings]
+format = "{format}"
+trigger = "software"
+width = {width}
+height = {height}
+exposure_us = {exposure}
+gain = 0.0
 """
 
 
@@ -104,9 +115,13 @@ class SimulatedBench:
         Controllers of the table.
     family : str
         Oscilloscope, one of :data:`~reseau_sims.serving.FAMILIES`.
-    camera : {"screen", "testfield", "frame"}, optional
-        Object in front of a camera. The camera uses GigE Vision if Aravis is installed; otherwise it is a
+    camera : {"screen", "testfield", "frame", "sensor"}, optional
+        Object in front of a camera; `sensor`: a lamp, a cover or an edge in front of a camera without a lens,
+        whatever the operator is asked for.
+        The camera uses GigE Vision if Aravis is installed; otherwise it is a
         Video4Linux camera in this process (`video`) and not part of the ``bench.toml``.
+    scanner : {"ping360", "bk", "compactpulser", "all"}
+        The scanner, called ``scanner``; of all three the others are called ``bmode`` and ``pulser``.
     repeatable : bool
         See :class:`~reseau_sims.laboratory.Laboratory`.
     flat : bool
@@ -122,7 +137,8 @@ class SimulatedBench:
     toml : str
         ``bench.toml`` for the instruments.
     documents : dict of str to str
-        With a frame of targets: the files that a session needs, ``targets.json`` and ``lens.toml``.
+        The files that a session with this camera needs: designs, and for a frame of targets also a lens, a
+        network and poses.
     refraction : str
         The part of a ``bench.toml`` about the port and the water before the camera; empty in air.
     laboratory : Laboratory
@@ -151,6 +167,7 @@ class SimulatedBench:
         table: TableKind = "zaber",
         family: str = "keysight",
         camera: SceneName | None = None,
+        scanner: ScannerKind = "ping360",
         repeatable: bool = False,
         flat: bool = False,
         water: Water | None = None,
@@ -160,15 +177,16 @@ class SimulatedBench:
             ("table", get_args(TableKind), table),
             ("oscilloscope", tuple(FAMILIES), family),
             ("scene for a camera", get_args(SceneName), camera),
+            ("scanner", get_args(ScannerKind), scanner),
         ):
             if asked is not None and asked not in known:
                 raise UsageError(
                     f"is not a simulated {what}", where=asked, do=f"choose from {', '.join(known)}"
                 )
-        if water is not None and camera == "screen":
+        if water is not None and camera in ("screen", "sensor"):
             raise UsageError("there is water before testfield and frame only", where="water")
         field = FieldBench(seed=seed)
-        self.refraction, self.documents = "", dict[str, str]()
+        self.refraction = ""
         if water is not None:
             field = field.submerged(water.made(stream(seed, "water")))
             self.refraction = water.toml()
@@ -177,32 +195,38 @@ class SimulatedBench:
             width, height = FRAME_SIZE
             sensor = replace(field.sensor, width=width, height=height, row_jitter_px=0.0)
             field = replace(field, frame=frame, sensor=sensor, distance_mm=FRAME_DISTANCE_MM)
-            self.documents = frame.documents
         if flat:
             field = replace(field, bend_mm=0.0).distorted(_DISTORTION_PX)
         self.laboratory = laboratory = Laboratory(World.standard(seed), field, repeatable=repeatable)
+        self.documents = self._documents(camera, water)
+        pixels = PixelSensor.drawn(stream(seed, "sensor"), *_SENSOR, **_PIXELS)
+        self._lamp = LampScene(pixels, _LAMP, seed)
         self._pulser = CompactPulser()
         scope = Oscilloscope(family, lambda: laboratory.picture(*_SCREEN), self._channel)
+        kinds = tuple(_NAMES) if scanner == "all" else (scanner,)
+        self._scanners = {(_NAMES[kind] if scanner == "all" else "scanner"): kind for kind in kinds}
+        made: dict[str, Callable[[], Machine]] = {
+            "ping360": lambda: Ping360(laboratory.line),
+            "bk": lambda: BkScanner(laboratory.section, laboratory.SECTION_MM),
+            "compactpulser": lambda: self._pulser,
+        }
         self.machines: dict[str, Machine] = {
             "table": self._table(table),
-            "scanner": Ping360(laboratory.line),
-            "bmode": BkScanner(laboratory.section, laboratory.SECTION_MM),
-            "pulser": self._pulser,
+            **{name: made[kind]() for name, kind in self._scanners.items()},
             "oscilloscope": scope,
         }
         self.scripts = {name: FaultScript() for name in self.machines}
         self._servers = ExitStack()
         self.video: VideoCamera | None = None
         with ExitStack() as stack:
-            addresses = {
-                name: stack.enter_context(
-                    (TcpServer if name == "bmode" else PtyServer)(
-                        partial(FaultyConnection, machine, self.scripts[name])
-                    )
-                ).address
-                for name, machine in self.machines.items()
-                if name != "oscilloscope"
-            }
+            addresses = {}
+            for name, machine in self.machines.items():
+                if name != "oscilloscope":
+                    server: type[Server] = TcpServer if self._scanners.get(name) == "bk" else PtyServer
+                    connected = partial(FaultyConnection, machine, self.scripts[name])
+                    addresses[name] = stack.enter_context(server(connected)).address
+            person = stack.enter_context(TcpServer(partial(FaultyConnection, self._operator())))
+            addresses["operator"] = person.address
             core = stack.enter_context(
                 TcpServer(partial(Vxi11Session, scope, scope.execute, self.scripts["oscilloscope"]))
             )
@@ -210,20 +234,70 @@ class SimulatedBench:
             entry = "" if camera is None else self._camera(camera, in_process, stack)
             self._servers = stack.pop_all()
         axes = "".join(_axis_entry(table, name) for name in AXES)
-        self.toml = _BENCH.format(kind=table, axes=axes, **addresses) + entry
+        scanners = "".join(
+            f'\n[instruments.{name}]\ndriver = "{kind}"\naddress = "{addresses[name]}"\n{_SCANNERS[kind]}'
+            for name, kind in self._scanners.items()
+        )
+        self.toml = _BENCH.format(kind=table, axes=axes, scanners=scanners, **addresses) + entry
+
+    def _documents(self, camera: SceneName | None, water: Water | None) -> dict[str, str]:
+        """The files that a session with a camera needs."""
+        world, field = self.laboratory.world, self.laboratory.field
+        if camera == "screen":
+            return {"reseau.json": world.design.to_json(), "rods.json": world.test_object.to_json()}
+        if camera == "testfield":
+            return {"field.json": field.design.to_json()}
+        if camera != "frame" or field.frame is None:
+            return {}
+        poses = {name: self.laboratory.pose_at(position) for name, position in PROJECT_POSES.items()}
+        axes = tuple(next(iter(PROJECT_POSES.values())))
+        rows = (f"{name},{','.join(f'{at[a]:g}' for a in axes)}\n" for name, at in PROJECT_POSES.items())
+        return field.frame.documents | {
+            "project.json": project(field.frame, poses, water),
+            "poses.csv": f"name,{','.join(axes)}\n" + "".join(rows),
+        }
+
+    def _operator(self) -> SimulatedOperator:
+        """The person in the laboratory; what is asked for last is what the camera without a lens sees."""
+        laboratory, lamp = self.laboratory, self._lamp
+
+        def fill(reflectors: Callable[[], Reflectors]) -> None:
+            laboratory.tank = reflectors()
+
+        def light(light: Array | float) -> None:
+            lamp.light = light
+
+        def blank() -> None:
+            laboratory.tank = laboratory.tank  # nothing has been swept
+
+        return SimulatedOperator({
+            "blank the screen": blank,
+            "test object": lambda: fill(lambda: laboratory.world.rods),
+            "body": lambda: fill(laboratory.world.body),
+            "cover the lens": lambda: light(0.0),
+            "even light": lambda: light(_LAMP),
+            "edge": lambda: light(_edge()),
+        })  # fmt: skip
 
     def _camera(self, scene: SceneName, in_process: bool, stack: ExitStack) -> str:
         """Create the camera; return its part of the ``bench.toml`` if it can be reached from outside."""
-        sight: Literal["screen", "testfield"] = "screen" if scene == "screen" else "testfield"
-        first = self.laboratory.expose(sight)  # do the long computations now
-        body = SimulatedCamera(LaboratoryScene(self.laboratory, sight), first.width, first.height)
+        if scene == "sensor":
+            body = SimulatedCamera(self._lamp, *_SENSOR)
+        else:
+            sight: Literal["screen", "testfield"] = "screen" if scene == "screen" else "testfield"
+            first = self.laboratory.expose(sight)  # do the long computations now
+            body = SimulatedCamera(LaboratoryScene(self.laboratory, sight), first.width, first.height)
         self.scripts["camera"] = body.script
         if in_process or not aravis_is_installed():
             self.video = VideoCamera(body)
             return ""
         served = GigeCamera(body, wait_s=_PATIENCE_S)
         stack.callback(served.close)
-        entry = _CAMERA.format(address=served.address, width=first.width, height=first.height)
+        pixels = "Mono16" if scene == "sensor" else "Mono8"
+        entry = _CAMERA.format(
+            address=served.address, width=body.width, height=body.height, format=pixels,
+            exposure=_EDGE_US if scene == "sensor" else 10_000.0,
+        )  # fmt: skip
         return entry + self.refraction
 
     def _table(self, kind: TableKind) -> Machine:
@@ -258,6 +332,14 @@ class SimulatedBench:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _edge() -> Array:
+    """Light on the sensor from a straight edge, slanted by six degrees."""
+    width, height = _SENSOR
+    y, x = np.mgrid[:height, :width]
+    share: Array = ndtr((x - width / 2 - 0.1 * (y - height / 2)) / 0.6)
+    return np.asarray(_LAMP * (0.2 + 1.8 * share))
 
 
 def _units(chain: ZaberChain, device: int, axis: int) -> float:

@@ -6,6 +6,7 @@ from .bench import ROLES, Bench, BenchFile, Checked, InstrumentEntry, drivers, f
 from .checks import Limits, Readiness, edge_sigma, exposure_fault, exposure_of, readiness, shift_between
 from .engine import Control, Decision, Rerun, carry_out, rerun
 from .lock import BenchLock, Holder
+from .operators import RemoteOperator
 from .plans import Goal, SensorSeriesPlan
 from .steps import HEIGHT, Step, at_heights, paper_steps, read_steps, spread
 
@@ -26,6 +27,7 @@ __all__ = [
     "Plan",
     "Procedure",
     "Readiness",
+    "RemoteOperator",
     "Rerun",
     "SensorSeriesPlan",
     "Step",

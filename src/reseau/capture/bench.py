@@ -50,11 +50,7 @@ T = TypeVar("T")
 
 @runtime_checkable
 class _Combined(Protocol):
-    """An instrument that uses others of its bench."""
-
-    @property
-    def uses(self) -> tuple[str, ...]:
-        """Names of the other instruments."""
+    """An instrument that uses others of its bench: those that its attribute `uses` names, otherwise all."""
 
     def combine(self, instruments: Mapping[str, Instrument]) -> None:
         """Find the other instruments by the names in its options."""
@@ -166,6 +162,9 @@ class BenchFile(Document):
     ----------
     name : str
         Name of the bench.
+    operator : str
+        Address of a program that carries out what no instrument can, ``tcp://host:port``; see
+        :class:`~reseau.capture.RemoteOperator`. Empty: the person at the terminal does.
     instruments : dict of str to InstrumentEntry
         Instruments by name.
 
@@ -182,6 +181,7 @@ class BenchFile(Document):
 
     SCHEMA: ClassVar[str] = "reseau-bench/1"
     name: str = "bench"
+    operator: str = ""
     instruments: dict[str, InstrumentEntry]
 
     @classmethod
@@ -323,7 +323,7 @@ class Bench:
             name = left.pop()
             if name not in wanted:
                 wanted[name] = found = self[name]
-                left += found.uses if isinstance(found, _Combined) else ()
+                left += getattr(found, "uses", self.instruments) if isinstance(found, _Combined) else ()
         part = copy.copy(self)
         part.instruments = {name: each for name, each in self.instruments.items() if name in wanted}
         entries = {name: each for name, each in self.file.instruments.items() if name in wanted}

@@ -206,15 +206,14 @@ def _new(
 ) -> _Started:
     from .. import sessions
     from ..capture import Bench, BenchFile
-    from ..io import parse_design, read_text
+    from ..io import read_text
 
     texts = {}
     for role, path in inputs.items():
         if path is None:
             raise UsageError("is missing", where=f"--{Path(role).stem}", do="give the file")
         texts[role] = read_text(path)
-        if Path(role).suffix == ".json":
-            parse_design(texts[role], path)
+        sessions.kind_of(plan).read(texts[role], role, path)
     path = where.bench or Path("bench.toml")
     text = read_text(path)
     bench = Bench(BenchFile.parse_toml(text, where=path))

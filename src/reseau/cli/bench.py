@@ -87,8 +87,11 @@ def sim(
     table: Annotated[str, typer.Option(help="Controller of the turntable: zaber or smc100.")] = "zaber",
     family: Annotated[str, typer.Option(help="Oscilloscope family: keysight, rigol-1000z, …")] = "keysight",
     camera: Annotated[
-        str, typer.Option(help="Scene of the camera: screen, testfield or frame. Default: no camera.")
+        str, typer.Option(help="Scene of the camera: screen, testfield, frame or sensor. Default: no camera.")
     ] = "",
+    scanner: Annotated[
+        str, typer.Option(help="Ultrasonic scanner: ping360, bk, compactpulser, or all of them.")
+    ] = "ping360",
     repeatable: Annotated[
         bool, typer.Option("--repeatable", help="Identical frames for identical states, without drift.")
     ] = False,
@@ -124,7 +127,7 @@ def sim(
 
     if out is not None:
         writable(out)
-    options: dict[str, Any] = {"table": table, "family": family, "camera": camera or None}
+    options: dict[str, Any] = {"table": table, "family": family, "camera": camera or None, "scanner": scanner}
     options |= {"repeatable": repeatable, "flat": flat}
     if water:
         options["water"] = {

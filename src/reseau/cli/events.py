@@ -138,6 +138,8 @@ class Display:
             return f"next pose {facts['step']}{tail}" if facts["step"] else "no pose is left"
         if kind == "check":
             return "checks: " + ("; ".join(facts["faults"]) or "passed")
+        if kind == "asked":
+            return f"asked {facts['operator']}: {facts['request']}"
         if kind == "verdict":
             return "\n".join((*facts["lines"], *remark_lines(facts["warnings"], facts["tests"])))
         if kind == "without":

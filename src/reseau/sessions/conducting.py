@@ -14,6 +14,7 @@ from ..capture import (
     Control,
     Decision,
     Procedure,
+    RemoteOperator,
     Rerun,
     Watch,
     carry_out,
@@ -83,7 +84,7 @@ def check(
     for each in kind.inputs:
         if each not in given:
             raise UsageError("missing input", where=f"{name}: {each}", do="pass its content in `inputs`")
-        kind.read(given[each], each)
+        kind.read(given[each], each, each)
     if isinstance(found, OwnParameters):
         own_plan(given[GENERATOR], GENERATOR, found.set)
     if bench is not None:
@@ -252,7 +253,7 @@ def capture(
     bench : Bench
         Connected or not.
     watch, operator
-        As for :class:`reseau.capture.Acquisition`.
+        As for :class:`reseau.capture.Acquisition`; the operator that the bench file names takes precedence.
     paused, control
         As for :func:`reseau.capture.carry_out`.
     home : bool
@@ -281,6 +282,13 @@ def capture(
     kind, given = kind_of(session.plan), parameters_of(session)
     if home:
         given = given.model_copy(update={"home": True})
+    if bench.file.operator:
+        remote = RemoteOperator(bench.file.operator)
+
+        def operator(request: str) -> None:
+            watch("asked", {"request": request, "operator": remote.address})
+            remote(request)
+
     procedure = _procedure(session, kind, given)
     run = Acquisition(
         given.part_of(bench), session, procedure, camera=given.camera, table=given.table,

@@ -58,7 +58,8 @@ class SessionKind:
     inputs : tuple of str
         Names of the files that a session must be given.
     read : callable
-        Reads the text of an input with a name, to check it; by default ``.json`` files are designs.
+        Reads the text of an input with a name, to check it; the third argument names it in messages. By
+        default ``.json`` files are designs.
     procedure : callable, optional
         Makes the procedure, of a session and its parameters. Without one, frames are only stored.
     results : callable, optional
@@ -79,15 +80,15 @@ class SessionKind:
     parameters: type[SessionParameters]
     acquire: Callable[[Acquisition, Any], Plan]
     inputs: tuple[str, ...] = ()
-    read: Callable[[str, str], object] = lambda text, name: _read_design(text, name)
+    read: Callable[[str, str, object], object] = lambda text, name, where: _read_design(text, name, where)
     procedure: Callable[[Session, Any], Procedure] | None = None
     results: Callable[[Any, Session], dict[str, str]] | None = None
     verdict: Callable[[Any], dict[str, list[str]]] | None = None
     limits: Limits | None = None
 
 
-def _read_design(text: str, name: str) -> object:
-    return parse_design(text, name) if name.endswith(".json") else text
+def _read_design(text: str, name: str, where: object) -> object:
+    return parse_design(text, where) if name.endswith(".json") else text
 
 
 class Reported:
@@ -342,14 +343,14 @@ def _blurred(run: Acquisition, given: BlurredParameters) -> Plan:
     return plans.poses(run, given.poses(), given.average, given.checks)
 
 
-def _read_blurred(text: str, name: str) -> object:
+def _read_blurred(text: str, name: str, where: object) -> object:
     """An input of a session of blurred targets."""
     from ..io import LensDocument
     from ..io.network import Network1
     from ..io.targets import SpaceTargets
 
     reader: Any = {"network.json": Network1, "targets.json": SpaceTargets, "lens.toml": LensDocument}[name]
-    return reader.parse(text, where=name)
+    return reader.parse(text, where=where)
 
 
 def _blurred_procedure(session: Session, given: BlurredParameters) -> BlurredProcedure:
@@ -359,7 +360,7 @@ def _blurred_procedure(session: Session, given: BlurredParameters) -> BlurredPro
     from ..procedures.blurred_network import NetworkOptions
     from ..procedures.blurred_session import BlurredProcedure
 
-    document, targets, lens = (_read_blurred(session.input(name), name) for name in _OF_BLURRED)
+    document, targets, lens = (_read_blurred(session.input(name), name, name) for name in _OF_BLURRED)
     sensor = lens.sensor  # type: ignore[attr-defined]
     matching = BlurredOptions(
         psf_px=given.psf, search_px=given.search, fill=1.0 if sensor is None else sensor.fill
