@@ -26,7 +26,7 @@ def test_a_program_that_is_not_there_or_does_not_answer_is_told() -> None:
     silent = FaultyConnection(SimulatedOperator({}), FaultScript({0: Fault("dropped")}))
     with TcpServer(lambda: silent) as server:
         address = server.address
-        with pytest.raises(DeadlineError, match="did not answer within 0.3 s"):
+        with pytest.raises(DeadlineError, match="did not answer within 0"):
             RemoteOperator(address, 0.3)("cover the lens")
     with pytest.raises(ConnectionLost, match="start the program that `operator` names"):
         RemoteOperator(address, 5.0)("cover the lens")
