@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from reseau.bundle import Result, adjust_network, example_network
+from reseau.bundle import Options, Result, adjust_network, example_network
 from reseau.bundle.network import network_document
 from reseau.cli import run
 from reseau.core.data import Array
@@ -19,9 +20,19 @@ from .scene import residuals
 EXACT_PX = 0.01
 
 
-@pytest.fixture(scope="module")
-def result() -> Result:
-    return adjust_network(example_network()).required()
+@pytest.fixture(scope="module", params=["one camera", "two cameras and blunders"])
+def result(request: pytest.FixtureRequest) -> Result:
+    network = example_network()
+    if request.param == "one camera":
+        return adjust_network(network).required()
+    (camera,), xy = network.cameras, network.xy.copy()
+    xy[[17, 90]] += [[25.0, -8.0], [0.0, 31.0]]
+    cameras = (camera, replace(camera, id="other"))
+    network = replace(network, cameras=cameras, camera_of=np.arange(8) % 2, xy=xy)
+    found = adjust_network(network, Options(outliers="reject")).required()
+    assert found.rejected[[17, 90]].all()
+    assert found.rejected.sum() < 6
+    return found
 
 
 def projected(result: Result) -> Array:
@@ -37,13 +48,16 @@ def test_the_residuals_are_computed_minus_observed(result: Result) -> None:
 
 def test_colmap_projects_the_same_points(result: Result, tmp_path: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap (extra `peers`)")
-    (done,) = write_network(result, tmp_path / "sparse").values()
-    assert done.greatest_px < EXACT_PX
+    written = write_network(result, tmp_path / "sparse")
+    assert len(written) == len(result.network.cameras)
+    assert max(done.greatest_px for done in written.values()) < EXACT_PX
     peer = pycolmap.Reconstruction(str(tmp_path / "sparse"))
     network, own, count = result.network, projected(result), 0
     for image in peer.images.values():
         i = network.images.index(image.name)
         for mark in image.points2D:
+            if not mark.has_point3D():
+                continue
             xyz = peer.points3D[mark.point3D_id].xyz
             j = int(
                 np.flatnonzero((network.image_of == i) & (np.abs(network.xy + 0.5 - mark.xy).max(1) < 1e-9))[
@@ -52,7 +66,8 @@ def test_colmap_projects_the_same_points(result: Result, tmp_path: Path) -> None
             )
             assert np.abs(image.project_point(xyz) - 0.5 - own[j]).max() < EXACT_PX
             count += 1
-    assert count == len(network.xy)
+    assert count == (~result.rejected).sum()
+    assert len(peer.cameras) == len(network.cameras)
 
 
 def test_bal_has_the_same_residuals_by_its_own_formula(result: Result, tmp_path: Path) -> None:
@@ -64,7 +79,7 @@ def test_bal_has_the_same_residuals_by_its_own_formula(result: Result, tmp_path:
     values = np.array(words[3 + 4 * count :], dtype=float)
     view, xyz = values[: 9 * cameras].reshape(-1, 9), values[9 * cameras :].reshape(-1, 3)
     assert len(xyz) == points
-    for row, expected in zip(table, result.residuals, strict=True):
+    for row, expected in zip(table, result.residuals[~result.rejected], strict=True):
         of = view[int(row[0])]
         x = cv2.Rodrigues(of[:3])[0] @ xyz[int(row[1])] + of[3:6]
         p = -x[:2] / x[2]
@@ -79,8 +94,9 @@ def test_what_is_written_is_read_back(result: Result, tmp_path: Path, name: str)
     write_network(result, tmp_path / name)
     again = read_network(tmp_path / name)
     size = np.linalg.norm(residuals(again), axis=1)
-    assert len(again.xy) == len(result.network.xy)
-    assert abs(size.mean() - np.linalg.norm(result.residuals, axis=1).mean()) < EXACT_PX
+    kept = ~result.rejected
+    assert len(again.xy) == kept.sum()
+    assert abs(size.mean() - np.linalg.norm(result.residuals[kept], axis=1).mean()) < EXACT_PX
 
 
 def test_the_command_exports_and_refuses_other_suffixes(
