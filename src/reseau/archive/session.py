@@ -162,23 +162,26 @@ class Session:
                 found.append(self._enter(sha256, suffix, len(data), key, facts, {"recovered": True}))
         return found
 
-    def _frames(self, *where: sa.ColumnElement[bool]) -> list[ArchivedFrame]:
+    def _frames(
+        self, *where: sa.ColumnElement[bool], first: int | None = None, last: int | None = None
+    ) -> list[ArchivedFrame]:
         f, v = schema.frames.c, schema.verdicts.c
-        given = schema.verdicts.alias().c
-        last = sa.select(sa.func.max(given.id)).where(given.frame_id == f.id).scalar_subquery()
         columns = (f.id, f.step, f.kind, f.take, f.sha256, f.suffix, f.size, f.facts, f.clock)
-        query = (
-            sa.select(*columns, v.ok, v.why, v.facts)
-            .select_from(schema.frames)
-            .outerjoin(schema.verdicts, v.id == last)
-            .where(f.session_id == self._id, *where)
-            .order_by(f.id)
-        )
+        query = self._judged(sa.select(*columns, v.ok, v.why, v.facts), *where)
+        query = query.order_by(f.id).limit(first) if last is None else query.order_by(f.id.desc()).limit(last)
         with schema.connected(self._engine, reading=True) as connection:
-            rows = connection.execute(query).all()
-        return [
-            ArchivedFrame(*row[:9], verdict=None if row[9] is None else Verdict(*row[9:])) for row in rows
-        ]
+            rows: list[Any] = list(connection.execute(query).all())
+        if last is not None:
+            rows.reverse()
+        made: Any = ArchivedFrame
+        return [made(*row[:9], None if row[9] is None else Verdict(*row[9:])) for row in rows]
+
+    def _judged(self, query: Any, *where: sa.ColumnElement[bool]) -> Any:
+        """Make a query one of pictures of this session, each with its last verdict."""
+        f, v, given = schema.frames.c, schema.verdicts.c, schema.verdicts.alias().c
+        latest = sa.select(sa.func.max(given.id)).where(given.frame_id == f.id).scalar_subquery()
+        joined: Any = query.select_from(schema.frames).outerjoin(schema.verdicts, v.id == latest)
+        return joined.where(f.session_id == self._id, *where)
 
     def find(self, step: str, kind: str = "frame", take: int = 0) -> ArchivedFrame | None:
         """Return the picture of a step, kind and take, or None."""
@@ -186,11 +189,53 @@ class Session:
         found = self._frames(f.step == step, f.kind == kind, f.take == take)
         return found[0] if found else None
 
-    def frames(self, step: str | None = None, kind: str | None = None) -> list[ArchivedFrame]:
-        """Return pictures in the order in which they were stored, with their last verdicts."""
+    def frame(self, number: int) -> ArchivedFrame | None:
+        """Return the picture with a number, or None."""
+        found = self._frames(schema.frames.c.id == number)
+        return found[0] if found else None
+
+    def frames(
+        self,
+        step: str | None = None,
+        kind: str | None = None,
+        *,
+        ok: bool | None = None,
+        inputs: bool = True,
+        after: int = 0,
+        first: int | None = None,
+        last: int | None = None,
+    ) -> list[ArchivedFrame]:
+        """Return pictures in the order in which they were stored, with their last verdicts.
+
+        Parameters
+        ----------
+        step, kind : str, optional
+            Only those of a step, or of a kind.
+        ok : bool, optional
+            Only those with this verdict.
+        inputs : bool
+            Whether input files are among them.
+        after : int
+            Only those with larger numbers.
+        first, last : int, optional
+            Only so many, from the beginning or from the end.
+        """
         f = schema.frames.c
-        where = [] if step is None else [f.step == step]
-        return self._frames(*where, *([] if kind is None else [f.kind == kind]))
+        where = [f.id > after] if after else []
+        where += [] if step is None else [f.step == step]
+        where += [] if kind is None else [f.kind == kind]
+        where += [] if inputs else [f.kind != INPUT]
+        where += [] if ok is None else [schema.verdicts.c.ok == ok]
+        return self._frames(*where, first=first, last=last)
+
+    def counts(self) -> tuple[int, int]:
+        """Return the number of frames, and that of steps with a good one."""
+        f, v = schema.frames.c, schema.verdicts.c
+        good = sa.func.count(sa.distinct(sa.case((v.ok, f.step))))
+        query = self._judged(sa.select(sa.func.count(), good), f.kind == "frame")
+        with schema.connected(self._engine, reading=True) as connection:
+            taken, steps = connection.execute(query).one()
+        return taken, steps
 
     def picture(self, archived: ArchivedFrame) -> Frame:
         """Read a frame, checked against its SHA-256.

@@ -67,7 +67,7 @@ class DecodingLimits:
 
 def is_upload(session: Session) -> bool:
     """Return whether a session is made of uploaded photographs."""
-    return bool(session.frames(kind=PHOTOGRAPH))
+    return bool(session.frames(kind=PHOTOGRAPH, first=1))
 
 
 class Decoder:

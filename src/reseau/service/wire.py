@@ -20,7 +20,14 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from ..core.errors import ConnectionLost, InstrumentError, ProtocolError, ReseauError, UsageError
+from ..core.errors import (
+    ArchiveError,
+    ConnectionLost,
+    InstrumentError,
+    ProtocolError,
+    ReseauError,
+    UsageError,
+)
 from ..core.optional import optional
 from .state import StateFolder, private_file
 
@@ -302,5 +309,7 @@ def error_of(found: dict[str, Any]) -> ReseauError:
     'count: is too small; use 3'
     """
     what, where, do = (found.get(key) for key in ("what", "where", "do"))
-    kinds: dict[Any, type[ReseauError]] = {"usage": UsageError, "instrument": InstrumentError}
+    kinds: dict[Any, type[ReseauError]] = {
+        "usage": UsageError, "instrument": InstrumentError, "archive": ArchiveError,
+    }  # fmt: skip
     return kinds.get(found.get("kind"), ReseauError)(str(what), where=where, do=do)

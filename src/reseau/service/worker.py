@@ -460,7 +460,7 @@ class Worker:
                 if self._control is not None:
                     step = self._session.get("step", "")
                     kept = self._archive.session(self._session["name"]) if step and step != shown else None
-                    found = kept.frames(step) if kept is not None else []
+                    found = kept.frames(step, last=1) if kept is not None else []
                     if kept is None or not found:
                         continue
                     frame, shown = kept.picture(found[-1]), step

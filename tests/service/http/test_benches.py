@@ -212,6 +212,8 @@ def test_a_plan_of_the_user_is_not_run_and_a_wrong_one_refused(one: Served) -> N
     client = one.client("operate")
     own = {"name": "own", "plan": "own", "parameters": {}, "inputs": {"generator.py": "import os"}}
     assert client.post(f"{BENCH}/sessions", json=own).status_code == 422
+    twice = client.post(f"{BENCH}/sessions", json={"name": "paused", "plan": "frames"})
+    assert (twice.status_code, twice.json()["error"]["what"]) == (422, "is the name of another session")
     wrong = {"name": "wrong", "plan": "frames", "parameters": {"count": -1}}
     assert client.post(f"{BENCH}/sessions", json=wrong).status_code == 422
     assert client.get("/api/1/sessions/wrong").status_code == 404

@@ -12,6 +12,7 @@ from ..accounts import Principal
 from .access import Here, NotFound, Operating, Reading, operating
 from .answers import Answer, refusals
 from .service import Service
+from .sessions import new_name
 
 if TYPE_CHECKING:
     from ..benches import BenchLink
@@ -195,9 +196,7 @@ def _interrupted(service: Service, link: BenchLink) -> list[str]:
             if each.status != "done" and service.archive.session(each.name).bench == link.text
         ]
 
-    found: list[str] = service.current(
-        f"interrupted {link.name} {service.archive.heads()['sessions']}", compute
-    )
+    found: list[str] = service.current(f"interrupted {link.name}", compute)
     return found
 
 
@@ -299,6 +298,8 @@ def release(bench: BenchName, who: Operating, service: Here) -> BenchAnswer:
 @router.post("/benches/{bench}/sessions", status_code=201)
 def begin(bench: BenchName, given: NewSession, who: Operating, service: Here) -> BenchAnswer:
     """Begin a session on a bench, with a plan."""
+    the_bench(service, bench)
+    new_name(service, given.name)
     _asked(service, bench, who, "begin session", "begin", given.model_dump() | {"by": who.name}, 60.0)
     return bench_answer(service, the_bench(service, bench))
 

@@ -13,7 +13,7 @@ from ...io.photographs import PHOTOGRAPHS
 from ..decoding import PHOTOGRAPH
 from .access import Here, NotFound, Operating, Reading
 from .answers import Answer, refusals
-from .sessions import SessionName, the_session
+from .sessions import SessionName, new_name, the_session
 
 __all__ = ["JobAnswer", "router"]
 
@@ -141,6 +141,7 @@ def upload(
         given = {"body": len(photographs) > 2}
         labels = [f"PHOTO {'I' * k}" for k in range(1, len(photographs) + 1)]
     with service.audited(who, "upload", name, {"photographs": len(photographs), "plan": plan}):
+        new_name(service, name)
         kinds.check(name, plan, given, inputs)
         session = kinds.begin(service.archive, name, plan, given, inputs)
         for each, label, suffix in zip(photographs, labels, suffixes, strict=True):

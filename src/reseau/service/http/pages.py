@@ -195,12 +195,12 @@ def session_page(request: Request, session: str, who: Reading, service: Here) ->
     """A session."""
     kept = sessions.the_session(service, session)
     found = sessions.session_detail(service, kept)
-    frames = sessions.frames(session, who, service, 0, 2000)
+    frames = sessions.latest_frames(kept, _SHOWN)
     every = [benches.bench_answer(service, each) for each in service.benches.values()]
     mine = [b for b in every if b.session is not None and b.session.name == session and b.state in _BUSY]
     running = mine[0] if mine else None
     return _rendered(
-        request, "session.html.j2", s=found, frames=frames[-_SHOWN:][::-1], more=max(0, len(frames) - _SHOWN),
+        request, "session.html.j2", s=found, frames=frames[::-1], shown=_SHOWN,
         report=_report(found), scene=sessions.scene_result(kept) is not None,
         verdict=_verdict(kept, found), bench=running,
         reached=running.session.reached if running is not None and running.session is not None else {},

@@ -28,6 +28,16 @@ if TYPE_CHECKING:
 __all__ = ["Service"]
 
 T = TypeVar("T")
+
+
+def _load_the_rest() -> None:
+    """Load what the first requests need, which would otherwise wait for it."""
+    from ...report import overlay
+    from .. import alarms, inforce, schedule
+
+    del alarms, inforce, overlay, schedule
+
+
 _LOOK_S, _ENTRY_S = 0.3, 600.0
 
 
@@ -94,6 +104,7 @@ class Service:
 
     def __enter__(self) -> Service:
         self._watcher.start()
+        threading.Thread(target=_load_the_rest, name="load", daemon=True).start()
         self.jobs.start(self.archive)
         for each in self.benches.values():
             each.start()
@@ -138,7 +149,8 @@ class Service:
             Computes it.
         """
         heads = self.archive.heads()
-        key = (heads.get("entries", 0), heads["ends"], heads["results"], int(time.time() // 60))
+        stored = [heads.get(each, 0) for each in ("entries", "sessions", "ends", "results")]
+        key = (*stored, int(time.time() // 60))
         with self._locks.setdefault(name, threading.Lock()):
             kept = self._computed.get(name)
             if kept is None or kept[0] != key:

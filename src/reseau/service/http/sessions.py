@@ -85,7 +85,7 @@ class ResultRow(Answer):
 
 
 class SessionDetail(Answer):
-    """A session: what it was told to do, what it has, and what is to come."""
+    """A session: what it was told to do, what it has, what is to come, and up to 100 rejected frames."""
 
     name: str
     plan: str
@@ -128,6 +128,7 @@ class BlueskyDocument(Answer):
     document: dict[str, Any]
 
 
+_MOST_REJECTED = 100
 _BLUESKY = ("start", "descriptor", "event", "stop")
 
 
@@ -157,6 +158,21 @@ def the_session(service: Service, name: str) -> Session:
         raise
 
 
+def new_name(service: Service, name: str) -> None:
+    """Check that no session has a name.
+
+    Raises
+    ------
+    UsageError
+        If one has.
+    """
+    try:
+        service.archive.session(name)
+    except ArchiveError:  # not there, or the archive says why it cannot be used when it is
+        return
+    raise UsageError("is the name of another session", where=name, do="give another name")
+
+
 def the_frame(session: Session, number: int) -> ArchivedFrame:
     """Return a frame of a session.
 
@@ -165,8 +181,8 @@ def the_frame(session: Session, number: int) -> ArchivedFrame:
     NotFound
         If there is none.
     """
-    found = next((each for each in session.frames() if each.id == number and each.kind != "input"), None)
-    if found is None:
+    found = session.frame(number)
+    if found is None or found.kind == "input":
         raise NotFound("has no such frame", where=f"{session.name}: {number}")
     return found
 
@@ -205,13 +221,16 @@ def _row(frame: ArchivedFrame) -> FrameRow:
     )  # fmt: skip
 
 
+def latest_frames(session: Session, count: int) -> list[FrameRow]:
+    """Return the latest frames and other pictures of a session."""
+    return [_row(each) for each in session.frames(inputs=False, last=count)]
+
+
 def session_detail(service: Service, session: Session) -> SessionDetail:
     """Return a session with what it has and what is to come."""
     from ... import sessions as kinds
 
-    found = session.frames()
-    taken = [each for each in found if each.kind == "frame"]
-    good = {each.step for each in taken if each.verdict is not None and each.verdict.ok}
+    taken, good = session.counts()
     expected, steps = None, list[str]()
     try:
         given = kinds.parameters_of(session)
@@ -221,13 +240,16 @@ def session_detail(service: Service, session: Session) -> SessionDetail:
     except ReseauError:  # a plan of another version: its frames and results are shown all the same
         pass
     status, why = session.last_end
+    to_come = []
+    if status != "done" and steps:
+        have = {each.step for each in session.frames(kind="frame", ok=True)}
+        to_come = [each for each in steps if each not in have]
     return SessionDetail(
         name=session.name, plan=session.plan, begun=session.begun.isoformat(), status=status, why=why,
         software=session.software, parameters=session.parameters,
-        inputs={each.step: each.sha256 for each in found if each.kind == "input"}, expected=expected,
-        good=len(good), taken=len(taken),
-        to_come=[] if status == "done" else [each for each in steps if each not in good],
-        rejected=[_row(each) for each in taken if each.verdict is not None and not each.verdict.ok],
+        inputs={name: each.sha256 for name, each in session.inputs().items()}, expected=expected, good=good,
+        taken=taken, to_come=to_come,
+        rejected=[_row(each) for each in session.frames(kind="frame", ok=False, last=_MOST_REJECTED)],
         results=[
             ResultRow(
                 id=r.id, name=r.name, size=r.size, sha256=r.sha256, software=r.software, inputs=r.inputs
@@ -265,8 +287,8 @@ def frames(
     count: Annotated[int, Query(ge=1, le=2000)] = 500,
 ) -> list[FrameRow]:
     """Frames and other pictures of a session, in the order in which they were stored."""
-    found = the_session(service, session).frames()
-    return [_row(each) for each in found if each.kind != "input" and each.id > after][:count]
+    found = the_session(service, session).frames(inputs=False, after=after, first=count)
+    return [_row(each) for each in found]
 
 
 @router.get("/sessions/{session}/frames/{number}/file", response_class=Response, responses=FILE_ANSWERS)
