@@ -30,6 +30,7 @@ from . import (
     certificates,
     demo,
     design,
+    edge,
     export,
     fiducials,
     measure,
@@ -60,6 +61,7 @@ app.add_typer(bench.app, name="bench")
 measure.app.command()(perforations.perforations)
 measure.app.command()(fiducials.fiducials)
 measure.app.command()(blurred.blurred)
+measure.app.command()(edge.edge)
 app.add_typer(measure.app, name="measure")
 capture.app.command()(capture_sensor.sensor)
 capture.app.command()(capture_own.own)

@@ -16,6 +16,7 @@ TEMPLATES = (
     "blurred_network.html.j2",
     "bundle.html.j2",
     "certificate.html.j2",
+    "edges.html.j2",
     "oscilloscope.html.j2",
     "roll.html.j2",
     "sensor.html.j2",

@@ -26,7 +26,7 @@ _REACH_PX, _REACH_PSF = 8.0, 4.0
 """Distance from the edge up to which pixels are used for the Gaussian: the larger of pixels and widths."""
 _FREE_REACH_PX, _FREE_REACH_PSF = 32.0, 12.0
 """The same for the free curve."""
-_LEAST_SLANT, _MOST_SLANT = 0.02, 0.6
+LEAST_SLANT, MOST_SLANT = 0.02, 0.6
 """Limits of the slant in radians; below, all pixels along the edge have nearly the same distance."""
 _LEAST_CONTRAST, _BESIDE_PX = 5.0, 2.0
 """Minimum contrast of an edge over the noise of a pixel; distance from the edge of its two flat sides."""
@@ -185,12 +185,12 @@ def measure_edge(
     if along > across:
         pixels, usable = pixels.T, usable.T
         noise = None if noise is None else noise.T
-    values = approximate_edge(pixels)
+    values = approximate_edge(pixels, usable)
     if values is None:
         return Failure("a row of the region has no edge", Code.NOT_FOUND)
-    if not _contrast(pixels, values) > _LEAST_CONTRAST:
+    if not _contrast(pixels, values, usable) > _LEAST_CONTRAST:
         return Failure("there is no edge above the noise in its region", Code.LOW_CONTRAST)
-    if not _LEAST_SLANT < abs(values[1]) < _MOST_SLANT:
+    if not LEAST_SLANT < abs(values[1]) < MOST_SLANT:
         slant = np.rad2deg(np.arctan(values[1]))
         return Failure(f"the edge is slanted by {slant:.1f}°: rotate it to 3° to 20°", Code.SLANT)
     around = EdgePixels.of(pixels, usable)
@@ -200,14 +200,17 @@ def measure_edge(
         return _measured(around, values, noise is not None)
 
 
-def _contrast(pixels: Array, values: Array) -> float:
+def _contrast(pixels: Array, values: Array, usable: Mask) -> float:
     """Difference of the two sides over the noise of a pixel, both robust; 0 if a side is missing."""
     rows = np.arange(len(pixels)) - (len(pixels) - 1) / 2
     aside = np.arange(pixels.shape[1]) - values[0] - values[1] * rows[:, None]
-    left, right = pixels[aside < -_BESIDE_PX], pixels[aside > _BESIDE_PX]
+    left, right = pixels[usable & (aside < -_BESIDE_PX)], pixels[usable & (aside > _BESIDE_PX)]
     if not len(left) or not len(right):
         return 0.0
-    noise = 1.4826 * float(np.median(np.abs(np.diff(pixels, axis=0)))) / np.sqrt(2)
+    pairs = usable[1:] & usable[:-1]
+    if not pairs.any():
+        return 0.0
+    noise = 1.4826 * float(np.median(np.abs(np.diff(pixels, axis=0))[pairs])) / np.sqrt(2)
     step = abs(float(np.median(left) - np.median(right)))
     return step / noise if noise > 0 else np.inf if step > 0 else 0.0
 

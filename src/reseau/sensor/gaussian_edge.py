@@ -98,15 +98,22 @@ class EdgePixels:
         return -self.y / width - lean, -self.bent / width - 2 * self.y / self.half**2 * lean
 
 
-def approximate_edge(pixels: Array) -> Array | None:
+def approximate_edge(pixels: Array, usable: Mask) -> Array | None:
     """Edge from the centroids of the gradient in each row, with grey values beside it; None without an edge.
+
+    Parameters
+    ----------
+    pixels : ndarray (h, w)
+        The region.
+    usable : ndarray (h, w) of bool
+        Pixels to be used.
 
     Returns
     -------
     ndarray (6,) or None
         Values of the parameters of :func:`fit_gaussian`.
     """
-    gradient = np.diff(pixels, axis=1)
+    gradient = np.diff(pixels, axis=1) * (usable[:, 1:] & usable[:, :-1])
     sign = np.sign(gradient.sum())
     weight = np.clip(sign * gradient, 0, None) ** 2
     if not weight.sum(axis=1).min() > 0:
@@ -119,7 +126,7 @@ def approximate_edge(pixels: Array) -> Array | None:
         if not near.sum(axis=1).min() > 0:
             break
         slope, offset = _line(near, x, rows)
-    low, high = np.percentile(pixels, [10, 90])
+    low, high = np.percentile(pixels[usable], [10, 90])
     sides = (low, high) if sign > 0 else (high, low)
     return np.array([offset, slope, 0.0, *sides, 0.7])
 
