@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import http.client
 import json
+from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +20,11 @@ from reseau.optics import OpenCV, Pose, project
 from reseau.procedures.calibration import CameraOptions
 from reseau.procedures.watching import Seen, Watching
 from reseau.service.live import LivePage
+from reseau_sims.serving import SimulatedCamera, StillScene, VideoCamera, View
 
 from ..capture.fieldrig import FieldRig, Sweeper, enter, write_inputs
+from ..drivers.rigs import gige_camera
+from ..measure.board_pictures import picture
 
 SIZE = (640, 480)
 DESIGN = board("chess", 7, 6, 26.0)
@@ -121,3 +126,48 @@ def test_watching_the_simulated_bench_leaves_frames_for_a_calibration(
     assert sorted(file.name for file in Path("photos").iterdir()) == ["001.png", "002.png", "003.png"]
     assert run(["watch", "--design", "field.json", "-o", "photos"]) == 2
     assert "photos: is not empty" in capsys.readouterr().err
+
+
+class _Moved:
+    """The target before a camera, elsewhere as soon as a frame was taken."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        poses = ((20.0, 10.0), (30.0, 100.0), (35.0, 190.0))
+        self.scenes = [StillScene(picture(DESIGN, *pose, 420.0)[0]) for pose in poses]
+
+    def __call__(self, view: View) -> Any:
+        return self.scenes[min(len(list(self.folder.glob("*.png"))), len(self.scenes) - 1)](view)
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as made:
+        yield made
+
+
+@pytest.mark.parametrize("bus", ["v4l2", "gige"])
+def test_frames_are_taken_from_cameras_by_their_drivers(
+    bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    stack: ExitStack,
+) -> None:  # fmt: skip
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    DESIGN.write("board.json")
+    body = SimulatedCamera(_Moved(tmp_path / "photos"), 480, 400)
+    if bus == "v4l2":
+        device = VideoCamera(body)
+        monkeypatch.setattr("reseau_drivers.camera.KernelNode", lambda path: device.open())
+        camera = "/dev/video0"
+    else:
+        address, camera = gige_camera(stack, body).address, "eye"
+        settings = "width = 480\nheight = 400\nexposure_us = 10000.0\n"
+        Path("bench.toml").write_text(
+            f'schema = "reseau-bench/1"\nname = "desk"\n[instruments.eye]\ndriver = "aravis"\n'
+            f'address = "{address}"\n[instruments.eye.settings]\n{settings}'
+        )
+    how = ("--design", "board.json", "--camera", camera, "--count", "3", "--seconds", "120")
+    assert run(["watch", *how]) == 0
+    assert "3 frames in photos; next: reseau calibrate photos" in capsys.readouterr().out
+    assert len(list(Path("photos").iterdir())) == 3
+    assert body.violations == []
