@@ -58,7 +58,9 @@ def watch(
         raise UsageError("is not empty", where=out, do="give a new folder")
     instruments = _bench(bench, camera)
     chosen = None if camera is None or camera.startswith("/dev/") else camera
-    source, watching = instruments.one(Camera, chosen), Watching(target, measurer_of(target), options)
+    source = instruments.one(Camera, chosen)
+    # The axes of the bench are free to be moved from elsewhere meanwhile.
+    instruments, watching = instruments.part([source.name]), Watching(target, measurer_of(target), options)
     with (
         instruments.lock("reseau watch"),
         instruments,
