@@ -37,9 +37,28 @@ def test_zaber_motion_homes_and_moves_the_turntable() -> None:
             axis.move_relative(-1_000)
             assert axis.get_position() == 29_000
             assert axis.is_homed()
-        reply = connection.get_device(1).generic_command("get system.serial")
-        assert reply.data == "71234"
-    assert chain.violations == []
+        device = connection.get_device(1)
+        assert device.generic_command("get system.serial").data == "71234"
+        assert [
+            device.generic_command(f"get {name}").data for name in ("system.axiscount", "comm.address")
+        ] == [
+            "2",
+            "1",
+        ]
+        axis = device.get_axis(1)
+        for name in ("accel", "maxspeed", "limit.max"):
+            axis.settings.set(name, 123_456)
+            assert axis.settings.get(name) == 123_456
+        motion = pytest.importorskip("zaber_motion")
+        axis.move_absolute(1_000, motion.Units.NATIVE, True, 100_000, motion.Units.NATIVE, 50)
+        axis.park()
+        assert axis.is_parked()
+        with pytest.raises(motion.exceptions.CommandFailedException):
+            axis.move_absolute(2_000)
+        axis.unpark()
+        axis.move_absolute(2_000)
+        assert axis.get_position() == 2_000
+    assert [said for said in chain.violations if "PARKED" not in said] == []
 
 
 def test_bluerobotics_ping_scans() -> None:
@@ -74,6 +93,17 @@ def test_bluerobotics_ping_scans_over_udp() -> None:
                 message = client.wait_message([2300, 2], 4.0)
                 assert (message.angle, len(message.data)) == (angle, 1200)
                 assert set(message.data) == {angle % 256}
+            # The vendor's own methods: single settings, one pulse, and the automatic scan.
+            for change in (client.set_mode, client.set_gain_setting, client.set_angle):
+                assert change(1).message_id == 2300
+            assert client.set_number_of_samples(400).number_of_samples == 400
+            assert client.transmitAngle(7).angle == client.transmit().angle == 7
+            client.control_auto_transmit(1, 1, 32, 80, 740, 300, 10, 20, 5, 0)
+            seen = [client.wait_message([2301], 4.0) for _ in range(6)]
+            assert [message.angle for message in seen] == [10, 15, 20, 15, 10, 15]
+            assert all(set(message.data) == {message.angle} for message in seen)
+            client.control_motor_off()
+            assert client.wait_message([1], 4.0).acked_id == 2903
         finally:
             client.iodev.close()
     assert machine.violations == []

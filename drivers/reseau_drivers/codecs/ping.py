@@ -30,11 +30,14 @@ __all__ = [
     "PERIOD_NS",
     "PROTOCOL_VERSION",
     "RESET",
+    "SCAN",
     "TRANSDUCER",
     "DeviceData",
     "Frame",
     "FrameDecoder",
     "Information",
+    "ScanData",
+    "Sector",
     "Transducer",
     "encode",
 ]
@@ -52,6 +55,9 @@ MAX_PAYLOAD = 2048
 _HEAD = struct.Struct("<2sHHBB")
 _TRANSDUCER = struct.Struct("<BBHHHHHBB")
 _DATA = struct.Struct("<BBHHHHH")
+SCAN = struct.Struct("<BBHHHHHHBB")
+"""Payload of AUTO_TRANSMIT."""
+_SCAN_DATA = struct.Struct("<BBHHHHHHBBH")
 _VECTOR = struct.Struct("<H")
 _INFORMATION = struct.Struct("<BBBBBB")
 
@@ -252,6 +258,68 @@ class DeviceData:
         gain, angle, duration, period, frequency, number = rest
         asked = Transducer(gain, angle, duration, period, frequency, number, False, mode)
         return cls(asked, samples)
+
+
+@dataclass(frozen=True)
+class Sector:
+    """What AUTO_TRANSMIT scans: angles and steps in gradians, a pause after each pulse in ms.
+
+    Examples
+    --------
+    >>> settings, sector = Sector.parse(SCAN.pack(1, 0, 32, 80, 740, 200, 10, 20, 2, 0))
+    >>> settings.samples, sector.next(20, 1), sector.next(398, 1)
+    (200, (18, -1), (20, -1))
+    """
+
+    start: int
+    stop: int
+    steps: int
+    delay_ms: int
+
+    @classmethod
+    def parse(cls, payload: bytes) -> tuple[Transducer, Self]:
+        """Decode an AUTO_TRANSMIT message.
+
+        Raises
+        ------
+        ProtocolError
+            If it is too short.
+        """
+        mode, gain, duration, period, frequency, samples, *rest = _unpacked(
+            SCAN, payload, "an AUTO_TRANSMIT message"
+        )
+        start, stop, steps, delay = rest
+        settings = Transducer(gain, start, duration, period, frequency, samples, True, mode)
+        return settings, cls(start, stop, steps, delay)
+
+    def next(self, angle: int, way: int) -> tuple[int, int]:
+        """Return the angle of the next pulse and the sense of rotation; a full turn does not reverse."""
+        if (self.stop - self.start) % GRADIANS == GRADIANS - 1:
+            return (angle + self.steps) % GRADIANS, way
+        width = (self.stop - self.start) % GRADIANS
+        at = (angle - self.start) % GRADIANS + way * self.steps
+        if not 0 <= at <= width:
+            way = -way
+            at = min(max((angle - self.start) % GRADIANS + way * self.steps, 0), width)
+        return (self.start + at) % GRADIANS, way
+
+
+@dataclass(frozen=True)
+class ScanData:
+    """One line of echoes of an automatic scan."""
+
+    data: DeviceData
+    sector: Sector
+
+    def frame(self, source: int = 1) -> Frame:
+        """Return the message that reports it."""
+        asked, sector = self.data.settings, self.sector
+        head = _SCAN_DATA.pack(
+            asked.mode, asked.gain, asked.angle, asked.duration_us, asked.period, asked.frequency_khz,
+            sector.start, sector.stop, sector.steps, sector.delay_ms, asked.samples,
+        )  # fmt: skip
+        samples = self.data.samples
+        return Frame(AUTO_DEVICE_DATA, head + _VECTOR.pack(len(samples)) + samples, source, 0)
 
 
 @dataclass(frozen=True)

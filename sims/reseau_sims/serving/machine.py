@@ -34,6 +34,15 @@ class Machine(ABC):
     def receive(self, data: bytes) -> Sequence[bytes]:
         """Return the answers to these bytes."""
 
+    @property
+    def due(self) -> float | None:
+        """When it sends something unasked (of the monotonic clock); None if it does not."""
+        return None
+
+    def emit(self) -> Sequence[bytes]:
+        """Return what is due."""
+        return ()
+
     @abstractmethod
     def inject_fault(self, kind: Kind) -> None:
         """Apply one of :data:`DEVICE_KINDS`."""
@@ -95,6 +104,16 @@ class FaultyConnection:
                     self.machine.inject_fault(fault.kind)
                 sent += self.script.spoil(answer, fault)
         return sent
+
+    @property
+    def due(self) -> float | None:
+        """When the instrument sends something unasked."""
+        return self.machine.due
+
+    def emit(self) -> list[Output]:
+        """Return what is due."""
+        with self.machine.lock:
+            return [(0.0, data) for data in self.machine.emit()]
 
     def disconnected(self) -> None:
         """End the connection."""

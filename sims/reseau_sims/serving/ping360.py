@@ -6,7 +6,9 @@ Source: *Ping Protocol*, "Common Messages" and "Ping360 Messages", with the rang
 from __future__ import annotations
 
 import struct
+import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +51,32 @@ class Ping360(Machine):
         self._echo, self._frames = echo, ping.FrameDecoder()
         self.motor_on, self._stuck, self._refuse, self._wrong_size = False, False, False, False
         self.last = ping.DeviceData(ping.Transducer(0, 0, 32, 80, 740, 200), bytes(200))
+        self._scan: tuple[ping.Transducer, ping.Sector, int] | None = None
+        self._next = 0.0
+
+    @property
+    def due(self) -> float | None:
+        """Time of the next pulse of an automatic scan."""
+        return None if self._scan is None else self._next
+
+    def emit(self) -> Sequence[bytes]:
+        """Return the echoes of the pulse that is due, and rotate the head."""
+        if self._scan is None or time.monotonic() < self._next:
+            return ()
+        asked, sector, way = self._scan
+        self.last = ping.DeviceData(asked, self._heard(asked))
+        angle, way = sector.next(asked.angle, way)
+        self._scan = replace(asked, angle=angle), sector, way
+        self._next = time.monotonic() + self._seconds(asked) + sector.delay_ms * 1e-3
+        return (ping.encode(ping.ScanData(self.last, sector).frame()),)
+
+    @staticmethod
+    def _seconds(asked: ping.Transducer) -> float:
+        return asked.duration_us * 1e-6 + asked.samples * asked.period * ping.PERIOD_NS * 1e-9
+
+    def _heard(self, asked: ping.Transducer) -> bytes:
+        period = asked.period * ping.PERIOD_NS * 1e-9
+        return self._echo(asked.angle, asked.samples, period, _GAINS[asked.gain]).tobytes()
 
     def receive(self, data: bytes) -> Sequence[bytes]:
         """Return the messages in answer."""
@@ -60,12 +88,15 @@ class Ping360(Machine):
                     continue
                 self.violations.append(str(frame))
             else:
-                answers.append(ping.encode(self._obey(frame)))
+                answer = self._obey(frame)
+                if answer is not None:
+                    answers.append(ping.encode(answer))
         return answers
 
     def disconnected(self) -> None:
-        """Discard an incomplete message."""
+        """Discard an incomplete message, and end an automatic scan."""
         self._frames.reset()
+        self._scan = None
 
     def inject_fault(self, kind: Kind) -> None:
         """Stuck: the head does not rotate; wrong state: it refuses; out of range: too many samples."""
@@ -76,7 +107,14 @@ class Ping360(Machine):
             self.motor_on = self._stuck = self._refuse = self._wrong_size = False
             self.last = ping.DeviceData(ping.Transducer(0, 0, 32, 80, 740, 200), bytes(200))
 
-    def _obey(self, frame: ping.Frame) -> ping.Frame:
+    def _obey(self, frame: ping.Frame) -> ping.Frame | None:
+        if frame.id == ping.AUTO_TRANSMIT and len(frame.payload) == ping.SCAN.size:
+            return self._begin_scan(*ping.Sector.parse(frame.payload))
+        if frame.id != ping.GENERAL_REQUEST:
+            self._scan = None
+        if frame.id == ping.RESET and len(frame.payload) == 2:
+            self.inject_fault("power-cycled")
+            return ping.Frame(ping.ACK, struct.pack("<H", frame.id), 1)
         if frame.id == ping.GENERAL_REQUEST and len(frame.payload) == 2:
             return self._tell(int.from_bytes(frame.payload, "little"))
         if frame.id == ping.TRANSDUCER and len(frame.payload) == 14:
@@ -102,9 +140,11 @@ class Ping360(Machine):
                 return ping.Frame(id_, bytes([1, 0]), 1)
         return self._no(id_, "unknown request")
 
-    def _ping(self, asked: ping.Transducer) -> ping.Frame:
-        within = (
-            asked.mode == 1
+    @staticmethod
+    def _within(asked: ping.Transducer) -> bool:
+        # The vendor's client sends 0 as the mode with `transmitAngle`.
+        return (
+            asked.mode in (0, 1)
             and asked.gain in (0, 1, 2)
             and asked.angle < ping.GRADIANS
             and 1 <= asked.duration_us <= 1000
@@ -112,6 +152,17 @@ class Ping360(Machine):
             and 500 <= asked.frequency_khz <= 1000
             and 200 <= asked.samples <= 1200
         )
+
+    def _begin_scan(self, asked: ping.Transducer, sector: ping.Sector) -> ping.Frame | None:
+        """Begin a scan; its lines are sent without request."""
+        if not self._within(asked) or sector.stop >= ping.GRADIANS or not 1 <= sector.steps <= 10:
+            return self._no(ping.AUTO_TRANSMIT, "parameter out of range")
+        self.motor_on, self._next = True, time.monotonic()
+        self._scan = replace(asked, mode=1), sector, 1
+        return None
+
+    def _ping(self, asked: ping.Transducer) -> ping.Frame:
+        within = self._within(asked)
         if not within:
             return self._no(ping.TRANSDUCER, "parameter out of range")
         if self._refuse:
@@ -124,8 +175,7 @@ class Ping360(Machine):
         )
         if not asked.transmit:
             return ping.DeviceData(settings, b"").frame()
-        period = asked.period * ping.PERIOD_NS * 1e-9
-        samples = self._echo(angle, asked.samples, period, _GAINS[asked.gain]).tobytes()
+        samples = self._heard(settings)
         if self._wrong_size:
             self._wrong_size, samples = False, samples + bytes(300)
         self.last = ping.DeviceData(settings, samples)

@@ -61,6 +61,12 @@ class _Connection:
         return len(self.ready) <= _MOST_UNSENT
 
     @property
+    def emission(self) -> float | None:
+        """Time at which the instrument sends something unasked."""
+        due: float | None = getattr(self.session, "due", None)
+        return due
+
+    @property
     def next_due(self) -> float | None:
         """Time of the next output."""
         return self._due[0][0] if self._due else None
@@ -163,6 +169,8 @@ class Server(ABC):
                     for connection in list(self._connections.values()):
                         self._remove(connection)
                 for connection in list(self._connections.values()):
+                    if (due := connection.emission) is not None and due <= time.monotonic():
+                        connection.put(connection.session.emit())  # type: ignore[attr-defined]
                     self._flush(connection)
         finally:
             self._closing = True
@@ -173,7 +181,8 @@ class Server(ABC):
             self._release()
 
     def _patience(self) -> float | None:
-        due = [c.next_due for c in self._connections.values() if c.next_due is not None]
+        times = [at for c in self._connections.values() for at in (c.next_due, c.emission)]
+        due = [at for at in times if at is not None]
         return max(0.0, min(due) - time.monotonic()) if due else None
 
     def _serve(self, fd: int, events: int) -> None:

@@ -20,6 +20,19 @@ __all__ = ["ZaberChain"]
 
 _LONGEST = 80
 _SPEED = 1.6384
+_STORED = {
+    "accel": "205",
+    "motion.accelonly": "205",
+    "motion.decelonly": "205",
+    "limit.approach.maxspeed": "50000",
+    "limit.home.pos": "0",
+    "resolution": "64",
+    "peripheral.id": "0",
+    "peripheral.serial": "0",
+}
+"""Settings of an axis that do not change its simulated motion, which has a constant speed."""
+_OF_DEVICE = {"comm.alert": "0", "knob.enable": "1", "system.access": "1"}
+_FIXED = ("limit.home.pos", "resolution", "peripheral.id", "peripheral.serial")
 _RANK = ("FS", "FE", "FD", "WR", "NI")
 """Flags in order of decreasing severity."""
 
@@ -59,6 +72,9 @@ class ZaberChain(Machine):
             for axis in range(1, count + 1)
         }
         self._interrupted: set[tuple[int, int]] = set()
+        self._parked: set[tuple[int, int]] = set()
+        self._stored = {key: dict(_STORED) for key in self.motors}
+        self._of_device = {device: dict(_OF_DEVICE) for device in {device for device, _ in self.motors}}
 
     def position(self, device: int, axis: int) -> float:
         """Return the current position of an axis (steps), independent of queries."""
@@ -99,6 +115,8 @@ class ZaberChain(Machine):
                 motor.limit = 1
             elif kind == "power-cycled":
                 motor.cut_power()
+        if kind == "power-cycled":
+            self._parked.clear()
 
     def _obey(self, command: Command) -> list[bytes]:
         devices = sorted({device for device, _ in self.motors})
@@ -141,6 +159,24 @@ class ZaberChain(Machine):
         match words:
             case []:
                 return True, "0"
+            case ["tools", "parking", "park"]:
+                if any(motor.moving for motor in motors):
+                    return False, "STATUSBUSY"
+                self._parked |= set(keys)
+                return True, "0"
+            case ["tools", "parking", "unpark"]:
+                self._parked -= set(keys)
+                return True, "0"
+            case ["driver", ("enable" | "disable") as how]:
+                for motor in motors:
+                    motor.stop()
+                    motor.enabled = how == "enable"
+                return True, "0"
+            case ["system", "reset"]:
+                self.inject_fault("power-cycled")
+                return True, "0"
+            case ["home" | "move", *_] if self._parked & set(keys):
+                return False, "PARKED"
             case ["home"]:
                 for motor in motors:
                     motor.enabled = True
@@ -163,15 +199,9 @@ class ZaberChain(Machine):
             case ["tools", "echo", *rest]:
                 return True, " ".join(rest) or "0"
             case ["get", name]:
-                return self._get(name, motors)
-            case ["set", "maxspeed", value]:
-                if not value.isdigit() or int(value) == 0:
-                    return False, "BADDATA"
-                for motor in motors:
-                    if motor.moving:
-                        motor.go(motor.target)
-                    motor.speed = int(value) / _SPEED
-                return True, "0"
+                return self._get(name, motors, keys)
+            case ["set", name, value]:
+                return self._set(name, value, motors, keys)
             case _:
                 return False, "BADCOMMAND"
 
@@ -182,7 +212,11 @@ class ZaberChain(Machine):
             value = float(rest[0]) if rest else 0.0
         except ValueError:
             return False, "BADDATA"
-        if (how in ("min", "max")) == bool(rest) or len(rest) > 1:
+        # Speed and acceleration may follow a distance.
+        speeds = rest[0 if how in ("min", "max") else 1 :]
+        if (how in ("abs", "rel", "vel") and not rest) or len(speeds) > 2:
+            return False, "BADDATA"
+        if not all(text.isdigit() and int(text) for text in speeds):
             return False, "BADDATA"
         for motor in motors:
             if not motor.enabled:
@@ -202,15 +236,56 @@ class ZaberChain(Machine):
         self._interrupted -= set(keys)
         return True, "0"
 
-    def _get(self, name: str, motors: list[Motor]) -> tuple[bool, str]:
+    def _set(
+        self, name: str, value: str, motors: list[Motor], keys: list[tuple[int, int]]
+    ) -> tuple[bool, str]:
+        try:
+            number = float(value)
+        except ValueError:
+            return False, "BADDATA"
+        if name in ("maxspeed", "accel", "motion.accelonly", "motion.decelonly") and not number > 0:
+            return False, "BADDATA"
+        if name in _OF_DEVICE:
+            for device, _ in keys:
+                self._of_device[device][name] = value
+            return True, "0"
+        if name in _STORED and name not in _FIXED:
+            for key in keys:
+                changed = ("accel", "motion.accelonly", "motion.decelonly") if name == "accel" else (name,)
+                self._stored[key] |= dict.fromkeys(changed, value)
+            return True, "0"
+        for motor in motors:
+            if name == "maxspeed":
+                if motor.moving:
+                    motor.go(motor.target)
+                motor.speed = number / _SPEED
+            elif name == "limit.min":
+                motor.low = number
+            elif name == "limit.max":
+                motor.high = number
+            else:
+                return False, "BADCOMMAND"
+        return True, "0"
+
+    def _get(self, name: str, motors: list[Motor], keys: list[tuple[int, int]]) -> tuple[bool, str]:
+        device = keys[0][0]
         constant = {
             "device.id": "50081",
+            "deviceid": "50081",
             "system.serial": "71234",
             "version": "7.38",
-            "system.axiscount": "1",
+            "version.build": "15000",
+            "system.platform": "3",
+            "system.voltage": "48.0",
+            "system.temperature": "30.1",
+            "comm.address": str(device),
+            "comm.packet.size.max": str(_LONGEST),
+            "system.axiscount": str(sum(1 for d, _ in self.motors if d == device)),
+            **self._of_device[device],
         }
         per_axis: dict[str, Callable[[Motor], int]] = {
             "pos": lambda motor: round(motor.position),
+            "encoder.pos": lambda motor: round(motor.position),
             "maxspeed": lambda motor: round(motor.speed * _SPEED),
             "limit.min": lambda motor: round(motor.low),
             "limit.max": lambda motor: round(motor.high),
@@ -219,4 +294,8 @@ class ZaberChain(Machine):
             return True, constant[name]
         if name in per_axis:
             return True, " ".join(str(per_axis[name](motor)) for motor in motors)
+        if name == "parking.state":
+            return True, " ".join(str(int(key in self._parked)) for key in keys)
+        if name in _STORED:
+            return True, " ".join(self._stored[key][name] for key in keys)
         return False, "BADCOMMAND"
