@@ -140,6 +140,7 @@ def killed_at_random(place: Place, sim: SimulatedBench, bench: Bench, kills: int
         if who != "worker":
             place.kill()
             place.start()
+        time.sleep(1.0)  # until the end of the worker is noticed
         state = bench.until("ready", "running", "paused", "pausing", "ending", "moving")
         if state["state"] == "running":
             # A session goes on without the service only; it ends, or is paused.
