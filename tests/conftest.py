@@ -57,3 +57,9 @@ def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[], Archi
         return lambda: Archive.open(tmp_path / "archive", create=True)
     url = request.getfixturevalue("postgres")
     return lambda: Archive.open(url, tmp_path / "objects", create=True)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def assets(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Keep images of readings out of the project."""
+    os.environ["RESEAU_ASSETS"] = str(tmp_path_factory.mktemp("assets"))

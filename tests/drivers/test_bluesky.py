@@ -4,26 +4,42 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlparse
 
 import numpy as np
 import pytest
+import tifffile
 
-from reseau.core.errors import SettingError, StateError
+from reseau.core.errors import SettingError, StateError, UsageError
+from reseau_drivers.camera import Burst, v4l2
 from reseau_drivers.oscilloscope import oscilloscope
 from reseau_drivers.scanner import bk_oem, compact_pulser, dicom_files, ping360
 from reseau_drivers.turntable import smc100, zaber
 from reseau_sims import serving
-from reseau_sims.serving import FaultyConnection, InProcess, Machine, Smc100Line, ZaberChain
+from reseau_sims.serving import (
+    FaultyConnection,
+    InProcess,
+    Machine,
+    SimulatedCamera,
+    Smc100Line,
+    VideoCamera,
+    ZaberChain,
+)
 
 bluesky: Any = pytest.importorskip("bluesky", reason="bluesky is not installed")
 import bluesky.plan_stubs as bps  # noqa: E402
 import bluesky.plans as bp  # noqa: E402
+import bluesky.preprocessors as bpp  # noqa: E402
+import event_model  # noqa: E402
 from bluesky import protocols  # noqa: E402
 
-EVERY = ("Readable", "Triggerable", "Stageable", "Stoppable", "Configurable")
+EVERY = (
+    "Readable", "Triggerable", "Stageable", "Stoppable", "Configurable", "Pausable", "Subscribable",
+    "HasHints", "WritesStreamAssets",
+)  # fmt: skip
 Pair = tuple[Any, Machine | None]
 
 
@@ -112,7 +128,7 @@ def test_count_and_scan_with_every_detector_on_every_table(
     assert [event.get("table_tilt") for event in events[2:]] == pytest.approx([10.0, 20.0, 30.0])
     described = [document for kind, document in documents if kind == "descriptor"]
     for event, keys in zip(events[1::3], (described[0]["data_keys"], described[1]["data_keys"]), strict=True):
-        assert set(event) == set(keys)
+        assert set(event) == {name for name, kind in keys.items() if "external" not in kind}
         for name, value in event.items():
             shape = keys[name]["shape"]
             assert list(np.shape(value)) == list(shape), name
@@ -127,7 +143,8 @@ def test_count_and_scan_with_every_detector_on_every_table(
 def test_moves_grids_and_settings_of_a_table(make_table: Callable[[], Pair], engine: Any) -> None:
     table, controller = make_table()
     tilt, roll = table.axes["tilt"], table.axes["roll"]
-    for expected in ("Readable", "Movable", "Stoppable", "Configurable", "Checkable", "NamedMovable"):
+    for expected in ("Readable", "Movable", "Stoppable", "Checkable", "NamedMovable", "Locatable",
+                     "Subscribable", "HasHints"):  # fmt: skip
         assert isinstance(tilt, getattr(protocols, expected)), expected
     for expected in EVERY:
         assert isinstance(table, getattr(protocols, expected)), expected
@@ -196,3 +213,124 @@ def test_a_failure_of_an_instrument_ends_the_plan_with_its_name(engine: Any) -> 
         ) as caught:
             engine(bp.scan([], table.axes["tilt"], 10.0, 20.0, 2))
     assert isinstance(caught.value.__cause__, StateError)
+
+
+@pytest.fixture
+def eye() -> Iterator[Any]:
+    body = SimulatedCamera()
+    device = VideoCamera(body)
+    with v4l2("eye", device.open, settings={"exposure_us": 2000.0}, seconds=5.0) as camera:
+        yield camera
+    assert body.violations == []
+
+
+def images_of(documents: list[tuple[str, dict[str, Any]]]) -> list[np.ndarray]:
+    """The images to which documents refer, read from their files."""
+    found = []
+    for kind, document in documents:
+        if kind == "stream_resource":
+            folder = Path(unquote(urlparse(document["uri"]).path))
+            template = document["parameters"]["template"]
+        elif kind == "resource":
+            folder = Path(document["root"]) / document["resource_path"]
+            template = document["resource_kwargs"]["template"].lstrip("/")
+        elif kind == "stream_datum":
+            indices = range(document["indices"]["start"], document["indices"]["stop"])
+            found += [tifffile.imread(folder / template.format(k)) for k in indices]
+        elif kind == "datum":
+            found.append(tifffile.imread(folder / template.format(document["datum_kwargs"]["point_number"])))
+    return found
+
+
+def test_images_are_files_to_which_documents_refer(eye: Any, engine: Any) -> None:
+    (table, controller), documents = zaber_table(), []
+    with table:
+        table.home("tilt")
+        plan = bp.scan([eye], table.axes["tilt"], 10.0, 30.0, 3)
+        engine(bpp.monitor_during_wrapper(plan, [table.axes["tilt"]]), lambda *d: documents.append(d))
+        at = table.axes["tilt"].locate()
+        assert (at["setpoint"], round(at["readback"], 3)) == (30.0, 30.0)
+    drawn = images_of(documents)
+    assert [picture.shape for picture in drawn] == 3 * [(64, 96)]
+    assert all(any((picture == each).all() for each in eye_drawn(eye)) for picture in drawn)
+    names = {d["uid"]: d["name"] for kind, d in documents if kind == "descriptor"}
+    events = [(names[d["descriptor"]], d["data"]) for kind, d in documents if kind == "event"]
+    assert all(np.size(value) == 1 for _, data in events for value in data.values())
+    watched = [data["table_tilt"] for name, data in events if name != "primary"]
+    assert min(watched) < 10.0 < max(watched)
+    for kind, document in documents:
+        event_model.schema_validators[event_model.DocumentNames[kind]].validate(document)
+    assert controller is not None
+    assert controller.violations == []
+
+
+def eye_drawn(eye: Any) -> list[np.ndarray]:
+    """Images that the simulated camera has drawn."""
+    return list(eye._source._open_node.__self__.body.drawn)
+
+
+def test_settings_are_configured_as_bluesky_passes_them(eye: Any, engine: Any) -> None:
+    engine(bps.configure(eye, {"exposure_us": 4000.0}))
+    assert eye.settings.exposure_us == 4000.0
+    eye.configure({"exposure_us": 3000.0}, rate=50.0)
+    assert (eye.settings.exposure_us, eye.settings.rate) == (3000.0, 50.0)
+
+
+def test_bluesky_flies_a_burst_of_frames_at_the_rate_of_the_camera(eye: Any, engine: Any) -> None:
+    burst, documents = Burst(eye, 3), []
+    for expected in ("Flyable", "Preparable", "Collectable", "EventCollectable", "Stoppable"):
+        assert isinstance(burst, getattr(protocols, expected)), expected
+    engine(bps.prepare(burst, {"frames": 8, "rate": 100.0}, wait=True))
+    engine(bp.fly([burst]), lambda *d: documents.append(d))
+    assert [picture.shape for picture in images_of(documents)] == 8 * [(64, 96)]
+    (page,) = [d for kind, d in documents if kind == "event_page"]
+    sequence = np.array(page["data"]["eye_burst_sequence"])
+    assert (np.diff(sequence) == 1).all()
+    with pytest.raises(UsageError, match="0 is not a number of frames"):
+        burst.prepare(0)
+
+
+def test_a_paused_plan_stops_its_instruments_and_goes_on(engine: Any) -> None:
+    table, controller = zaber_table()
+    stops: list[str] = []
+    with table:
+        table.home("tilt")
+        halt = table._halt
+        table._halt = lambda deadline: (stops.append("stopped"), halt(deadline))[1]
+
+        def plan() -> Any:
+            yield from bps.open_run()
+            yield from bps.trigger_and_read([table])
+            yield from bps.checkpoint()
+            yield from bps.pause()
+            yield from bps.mv(table.axes["tilt"], 12.0)
+            yield from bps.close_run()
+
+        with pytest.raises(bluesky.utils.RunEngineInterrupted):
+            engine(plan())
+        assert stops == ["stopped"]
+        engine.resume()
+        assert table.state("tilt").position == pytest.approx(12.0, abs=2e-3)
+    assert controller is not None
+    assert controller.violations == []
+
+
+@pytest.mark.filterwarnings("ignore")  # of the packages that tiled uses
+def test_images_are_read_back_through_tiled(eye: Any, engine: Any, tmp_path: Path) -> None:
+    pytest.importorskip("tiled", reason="tiled is not installed")
+    from bluesky.callbacks.tiled_writer import TiledWriter
+    from tiled.catalog import in_memory
+    from tiled.client import Context, from_context
+    from tiled.server.app import build_app
+
+    catalog = in_memory(
+        readable_storage=[str(eye.images.folder.parent)],
+        writable_storage=[str(tmp_path), f"duckdb:///{tmp_path}/tables.db"],
+    )
+    with Context.from_app(build_app(catalog)) as context:
+        client = from_context(context)
+        engine.subscribe(TiledWriter(client))
+        (uid,) = engine(bp.count([eye], 3)).run_start_uids
+        stored = client[uid]["primary"]["eye_image"].read()
+    assert stored.shape == (3, 64, 96)
+    assert all(any((picture == each).all() for each in eye_drawn(eye)) for picture in stored)

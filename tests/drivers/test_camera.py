@@ -322,8 +322,10 @@ def test_the_self_test_measures_known_noise(device: VideoCamera, camera: Cam) ->
 def test_a_reading_has_the_form_of_bluesky(camera: Cam) -> None:
     camera.trigger().wait(2.0)
     reading, kinds = camera.read(), camera.describe()
-    assert set(reading) == set(kinds)
-    assert kinds["camera_image"]["shape"] == [64, 96]
+    assert {*reading, "camera_image"} == set(kinds)
+    assert kinds["camera_image"]["shape"] == [1, 64, 96]
+    assert camera.get_index() == 1
+    assert camera.hints == {"fields": ["camera_sequence", "camera_dropped"]}
 
 
 def test_a_missing_node_or_one_that_is_not_a_camera_raises() -> None:

@@ -94,7 +94,7 @@ def test_a_frame_has_the_pixel_size_of_its_region(tmp_path: Path) -> None:
         scanner.stage()
         scanner.trigger().wait(5.0)
         assert scanner.read()["files_mm_per_px"]["value"] == pytest.approx([0.2, 0.25])
-        assert scanner.describe()["files_section"]["shape"] == list(SIZE)
+        assert scanner.describe()["files_section"]["shape"] == [1, *SIZE]
 
 
 def test_the_physical_origin_is_converted_to_pixels(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
 
 from reseau_drivers.scanner import ping360
@@ -133,8 +132,11 @@ def test_bluesky_scans_over_the_turntable_with_the_sonar() -> None:
         engine(plans.count([table, sonar], 2))
     events = [document for kind, document in documents if kind == "event"]
     assert [event["data"]["table_tilt"] for event in events] == pytest.approx([10.0, 20.0, 30.0])
-    assert all(np.asarray(event["data"]["sonar_section"]).ndim == 2 for event in events)
     described = next(document for kind, document in documents if kind == "descriptor")
+    assert described["data_keys"]["sonar_section"]["external"] == "STREAM:"
+    assert [d["indices"] for kind, d in documents if kind == "stream_datum"] == [
+        {"start": k, "stop": k + 1} for k in range(3)
+    ]
     assert described["configuration"]["sonar"]["data"]["sonar_half_sector"] == 3
     assert documents[-1][1]["exit_status"] == "success"
     assert chain.violations == head.violations == []

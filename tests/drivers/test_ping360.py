@@ -32,7 +32,7 @@ def test_a_section_shows_reflectors_at_their_millimetres() -> None:
         assert isinstance(device, UltrasonicScanner)
         scan = device.scan()
     assert scan.mm_per_px is not None
-    assert scan.frame().pixels.shape == tuple(device.describe()["sonar_section"]["shape"])
+    assert (1, *scan.frame().pixels.shape) == tuple(device.describe()["sonar_section"]["shape"])
     for x, y in where:
         column, row = scan.origin_px[0] + x / scan.mm_per_px[0], scan.origin_px[1] - y / scan.mm_per_px[1]
         reach = round(14 / scan.mm_per_px[0])

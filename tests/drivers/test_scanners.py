@@ -44,7 +44,7 @@ def test_a_frame_has_its_pixel_size() -> None:
         assert (scan.pixels == machine.section()).all()
         assert scan.mm_per_px == pytest.approx((0.2, 0.25))
         assert scan.gain == 57.0
-        assert device.describe()["bk_section"]["shape"] == [60, 80]
+        assert device.describe()["bk_section"]["shape"] == [1, 60, 80]
         device.trigger().wait(5.0)
         assert device.read()["bk_mm_per_px"]["value"] == pytest.approx([0.2, 0.25])
     assert machine.violations == []

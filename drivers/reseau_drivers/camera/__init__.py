@@ -7,12 +7,14 @@ from functools import partial
 from typing import Any
 
 from .aravis import Aravis, AravisSettings, aravis_cameras
+from .burst import Burst
 from .camera import CameraDriver, CameraExposure, CameraInterface, CameraSettings, RawFrame
 from .v4l2 import KernelNode, OpenNode, V4l2, V4l2Settings, video_devices
 
 __all__ = [
     "Aravis",
     "AravisSettings",
+    "Burst",
     "CameraDriver",
     "CameraExposure",
     "CameraInterface",

@@ -112,12 +112,6 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         shape = list(np.shape(reading["value"])) if reading else [0, 0]
         return {f"{self.name}_screen": {"dtype": "array", "shape": shape}}
 
-    def stage(self) -> list[Any]:
-        """Connect and take a picture, so that its size is known before the run."""
-        staged = super().stage()
-        self._take()
-        return staged
-
     def _test(self, deadline: Deadline) -> dict[str, str]:
         found = {"dialect": self._required_dialect.name}
         if self._required_dialect.errors:

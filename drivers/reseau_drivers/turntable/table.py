@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Protocol, Self
 
 from reseau.core.errors import DeadlineError, ProtocolError, SettingError, StateError
-from reseau.instruments import AxisState, Deadline, Device, Identity, Limits, Settings, Status, quantity
+from reseau.instruments import (
+    AxisState,
+    Deadline,
+    Device,
+    Identity,
+    Limits,
+    Monitor,
+    Settings,
+    Status,
+    quantity,
+)
 
 __all__ = ["Axis", "AxisPlan", "Controller", "Table", "TableSettings"]
 
@@ -153,6 +165,8 @@ class Axis:
     def __init__(self, table: Table, key: str) -> None:
         self.parent, self._table, self._key = None, table, key
         self.name = f"{table.name}_{key}"
+        self._setpoint = float("nan")
+        self._monitor = Monitor(self.read)
 
     @property
     def unit(self) -> str:
@@ -184,7 +198,21 @@ class Axis:
             If the position is not allowed.
         """
         self.check_value(value)
+        self._setpoint = value
         return Status(lambda: self._table.move(self._key, value), self.name)
+
+    def locate(self) -> dict[str, float]:
+        """Return where the axis was last told to move, and where it is; before a move both are the same."""
+        position = self.position
+        return {"setpoint": position if math.isnan(self._setpoint) else self._setpoint, "readback": position}
+
+    def subscribe(self, function: Callable[[dict[str, Any]], None]) -> None:
+        """Call a function with each new position, ten times a second at most."""
+        self._monitor.subscribe(function)
+
+    def clear_sub(self, function: Callable[[dict[str, Any]], None]) -> None:
+        """Stop calling a function."""
+        self._monitor.clear(function)
 
     def stop(self, *, success: bool = False) -> None:
         """Stop the table."""
@@ -196,7 +224,7 @@ class Axis:
 
     def read(self) -> dict[str, Any]:
         """Return the current position as a reading."""
-        return {name: value for name, value in self._table.read_now().items() if name == self.name}
+        return {self.name: {"value": self.position, "timestamp": time.time()}}
 
     def describe(self) -> dict[str, Any]:
         """Return the contents of the reading."""
@@ -279,11 +307,6 @@ class Table(Device[TableSettings]):
             f"{self.name}_{key}": {"dtype": "number", "shape": [], "units": plan.unit}
             for key, plan in self.plans.items()
         }
-
-    def read_now(self) -> dict[str, Any]:
-        """Take a reading of the positions of all axes."""
-        self._take()
-        return self.read()
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
         found = {}

@@ -1,11 +1,14 @@
 """Interfaces of instruments: protocols, settings with units and limits, and the values that they return.
 
-This package does no input or output. Drivers are in the separate package ``reseau_drivers``; drivers of
-either package are found through the entry points of the group ``reseau.instruments``.
+This package does no input or output but that of images to files for bluesky. Drivers are in the separate
+package ``reseau_drivers``; drivers of either package are found through the entry points of the group
+``reseau.instruments``.
 """
 
+from .assets import ImageStore
 from .deadline import Deadline
 from .device import Device
+from .monitor import Monitor
 from .protocols import Camera, Exposure, Instrument, Movable, Oscilloscope, Turntable, UltrasonicScanner
 from .settings import Limits, Settings, choice, quantity, text
 from .status import Status
@@ -19,8 +22,10 @@ __all__ = [
     "Device",
     "Exposure",
     "Identity",
+    "ImageStore",
     "Instrument",
     "Limits",
+    "Monitor",
     "Movable",
     "Oscilloscope",
     "ScreenPicture",

@@ -5,12 +5,16 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any, Generic, Self, TypeVar
 
+import numpy as np
+
 from ..core.errors import ConnectionLost, DeadlineError, InstrumentError, RefusedError, StateError
+from .assets import ImageStore
 from .deadline import Deadline
+from .monitor import Monitor
 from .settings import Limits, Settings
 from .status import Status
 from .values import Identity
@@ -77,6 +81,10 @@ class Device(ABC, Generic[S]):
         self._lock, self._stopping = threading.RLock(), threading.Event()
         self._connected = False
         self._reading: dict[str, Any] = {}
+        self._read_once = False
+        self.images = ImageStore(name)
+        """Files of the images among readings, to which bluesky's documents refer."""
+        self._monitor = Monitor(self._read_now)
         self.reconnections = 0
         """Number of connections made, the first included."""
 
@@ -229,8 +237,17 @@ class Device(ABC, Generic[S]):
         with self._exchange("stop") as deadline:
             self._halt(deadline)
 
-    def configure(self, **changes: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    def configure(
+        self, settings: Mapping[str, Any] | None = None, /, **changes: Any
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Change settings.
+
+        Parameters
+        ----------
+        settings : mapping, optional
+            New values by name, as bluesky's ``configure`` passes them.
+        **changes
+            New values.
 
         Returns
         -------
@@ -242,6 +259,7 @@ class Device(ABC, Generic[S]):
         SettingError
             If a setting does not exist or a value is outside its limits; nothing is sent then.
         """
+        changes = {**(settings or {}), **changes}
         new, old = self._settings.changed(changes, self._limits), self.read_configuration()
         with self._exchange("configure") as deadline:
             self._push(new, deadline)
@@ -251,6 +269,7 @@ class Device(ABC, Generic[S]):
     def stage(self) -> list[Any]:
         """Connect for a run."""
         self._stopping.clear()
+        self.images.restart()
         self.connect()
         return [self]
 
@@ -260,23 +279,71 @@ class Device(ABC, Generic[S]):
         self._stopping.clear()
         return [self]
 
+    def pause(self) -> None:
+        """Stop the instrument: the engine has paused."""
+        self.stop()
+
+    def resume(self) -> None:
+        """Allow motion and recording again: the engine goes on."""
+        self._stopping.clear()
+        self.connect()
+
     def trigger(self) -> Status:
         """Take a reading in the background."""
         return Status(self._take, f"{self.name}.trigger")
 
     def _take(self) -> None:
         values, at = self._acquire(), time.time()
-        self._reading = {name: {"value": value, "timestamp": at} for name, value in values.items()}
+        images = {name: value for name, value in values.items() if np.ndim(value) > 1}
+        for name, pixels in images.items():
+            self.images.put(name, pixels)
+        self._reading = {
+            name: {"value": value, "timestamp": at} for name, value in values.items() if name not in images
+        }
+        self._read_once = True
+
+    def _read_now(self) -> dict[str, Any]:
+        self._take()
+        return self.read()
 
     def read(self) -> dict[str, Any]:
-        """Return the last reading; take one if there is none."""
-        if not self._reading:
+        """Return the last reading without its images; take one if there is none."""
+        if not self._read_once:
             self._take()
         return dict(self._reading)
 
     def describe(self) -> dict[str, Any]:
-        """Return the contents of a reading: source, type, shape and unit by name."""
-        return {name: {"source": self.name, **kind} for name, kind in self._reading_format().items()}
+        """Return the contents of a reading: source, type, shape and unit by name; images are external."""
+        found = {}
+        for name, kind in self._reading_format().items():
+            if kind["dtype"] == "array" and len(kind["shape"]) > 1:
+                found[name] = self.images.describe(name, tuple(kind["shape"]))
+            else:
+                found[name] = {"source": self.name, **kind}
+        return found
+
+    @property
+    def hints(self) -> dict[str, Any]:
+        """Fields that bluesky shows: the single numbers of a reading."""
+        numbers = ("number", "integer")
+        kinds = self._reading_format().items()
+        return {"fields": [n for n, kind in kinds if kind["dtype"] in numbers and not kind["shape"]]}
+
+    def collect_asset_docs(self, index: int | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield bluesky's documents about the images taken since the last call."""
+        return self.images.stream_documents(index)
+
+    def get_index(self) -> int:
+        """Return the number of images of this run."""
+        return self.images.index
+
+    def subscribe(self, function: Callable[[dict[str, Any]], None]) -> None:
+        """Call a function with each new reading, ten times a second at most."""
+        self._monitor.subscribe(function)
+
+    def clear_sub(self, function: Callable[[dict[str, Any]], None]) -> None:
+        """Stop calling a function."""
+        self._monitor.clear(function)
 
     def read_configuration(self) -> dict[str, Any]:
         """Return the settings as a reading."""

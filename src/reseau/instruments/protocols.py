@@ -49,7 +49,9 @@ class Instrument(Protocol):
     def stop(self, *, success: bool = False) -> None:
         """Stop any movement, transmission or recording, from any thread."""
 
-    def configure(self, **changes: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    def configure(
+        self, settings: Mapping[str, Any] | None = None, /, **changes: Any
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Change settings; return readings of the old and the new settings."""
 
     def stage(self) -> list[Any]:
