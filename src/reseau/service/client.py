@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import ssl
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -90,10 +91,16 @@ class Client:
             raise UsageError("would send the token without TLS", where=server, do="use https")
         secret = token if token is not None else os.environ.get("RESEAU_TOKEN", "")
         self.server = server.rstrip("/")
+        verify: Any = True
+        if authority is not None:
+            try:
+                verify = ssl.create_default_context(cafile=authority)
+            except OSError as error:
+                raise UsageError(f"is no certificate ({error.strerror})", where=authority) from None
         self._http = httpx.Client(
             base_url=f"{self.server}/api/1", timeout=330.0,
             headers={"Authorization": f"Bearer {secret}"} if secret else {},
-            verify=True if authority is None else str(authority), follow_redirects=False,
+            verify=verify, follow_redirects=False,
         )  # fmt: skip
 
     def __enter__(self) -> Self:
