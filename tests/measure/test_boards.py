@@ -19,7 +19,7 @@ from reseau.designs.boards import marker_cells
 from reseau.designs.dots import dot_signs
 from reseau.io import BoardDesign
 from reseau.io.images import read_image
-from reseau.measure import BoardOptions, BoardResult, measure_board
+from reseau.measure import BoardOptions, BoardResult, measure_board, measure_tags
 
 from .board_pictures import picture
 
@@ -89,6 +89,33 @@ def test_a_single_tag_is_a_grid_of_one() -> None:
     found = measured(frame, SINGLE)
     assert found.ids == ("7.0", "7.1", "7.2", "7.3")
     assert np.abs(found.xy - truth).max() < 0.03
+
+
+@pytest.mark.parametrize("family", ["4X4_50", "7X7_50", "ARUCO_ORIGINAL", "APRILTAG_25h9", "ARUCO_MIP_36h12"])
+def test_scattered_tags_are_points_of_their_numbers(family: str) -> None:
+    poses = {3: (15.0, 20.0), 11: (35.0, -70.0), 20: (45.0, 130.0)}
+    shown, expected = [], {}
+    for k, (number, turned) in enumerate(poses.items()):
+        design = board("markers", 1, 1, 60.0, dictionary=f"DICT_{family}", first_id=number)
+        frame, truth = picture(design, *turned, 420.0, (240, 220), seed=k)
+        shown.append(frame.pixels)
+        expected |= {
+            f"{number}.{corner}": (x + 240 * k, y) for corner, (x, y) in zip(range(4), truth, strict=True)
+        }
+    found = measure_tags(Frame(np.hstack(shown), 255.0, "scene"), f"DICT_{family}")
+    assert not isinstance(found, Failure)
+    assert found.ids == tuple(expected)
+    assert found.found >= 11  # small cells seen at 45° may disturb a corner
+    error = (found.xy - np.array(list(expected.values())))[found.ok]
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert np.abs(error).max() < 0.06
+    assert 0.5 < np.sqrt(((error / sigma) ** 2).mean()) < 1.8
+    # A number that is seen twice names no point.
+    twice = measure_tags(Frame(np.hstack([*shown, shown[0]]), 255.0, "scene"), f"DICT_{family}")
+    assert not isinstance(twice, Failure)
+    assert not twice.ok[:8].any()
+    assert twice.codes[0] is Code.AMBIGUOUS
+    assert twice.found >= 7
 
 
 def test_tags_of_an_aprilgrid_are_those_of_kalibr() -> None:

@@ -161,7 +161,7 @@ def board(
     sensor: SensorFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure a chessboard, a ChArUco board, a circle grid, an AprilGrid or a grid of markers."""
+    """Measure a chessboard, PuzzleBoard, ChArUco board, circle grid, AprilGrid or grid of markers."""
     from ..io import BoardDesign
     from ..measure import BoardOptions, measure_board
 
@@ -171,6 +171,34 @@ def board(
     task.run(
         lambda: corrected(read_frame(image, channel.value), sensor),
         lambda frame: measure_board(frame, target, options),
+    )
+
+
+@app.command()
+def tags(
+    image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
+    dictionary: Annotated[
+        str, typer.Option(help="Markers, as OpenCV's DICT_4X4_50 or DICT_APRILTAG_36h11.")
+    ] = "DICT_APRILTAG_36h11",
+    border_bits: Annotated[int, typer.Option(min=1, max=4, help="Width of their borders (bits).")] = 1,
+    out: Out = None,
+    overlay: Overlay = None,
+    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor (px).")] = 0.0,
+    fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive fraction of a pixel.")] = 1.0,
+    channel: Annotated[Channel, typer.Option(help="Channel of a colour image.")] = Channel.LUMA,
+    sensor: SensorFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the corners of single ArUco markers or AprilTags, wherever they are in the scene."""
+    from ..designs.boards import marker_dictionary
+    from ..measure import BoardOptions, measure_tags
+
+    task = Task(image, out, overlay, as_json, "points")
+    marker_dictionary(dictionary)
+    options = BoardOptions(row_jitter_px=row_jitter, fill=fill)
+    task.run(
+        lambda: corrected(read_frame(image, channel.value), sensor),
+        lambda frame: measure_tags(frame, dictionary, border_bits, options),
     )
 
 

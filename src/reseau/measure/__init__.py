@@ -1,6 +1,6 @@
 """One frame to image coordinates: marks of a reseau, a testfield or a sheet, pins, edges of film frames."""
 
-from .boards import BoardOptions, BoardResult, measure_board
+from .boards import BoardOptions, BoardResult, measure_board, measure_tags
 from .fitting import fit_mapping, mapping_problem, reduce_mapping
 from .matching import Matches, MatchOptions, match
 from .pins import (
@@ -40,6 +40,7 @@ __all__ = [
     "measure_board",
     "measure_pins",
     "measure_reseau",
+    "measure_tags",
     "measure_testfield",
     "reduce_mapping",
 ]

@@ -1,5 +1,6 @@
-"""Boards of other programs: chessboards, ChArUco boards, circle grids and AprilGrids."""
+"""Boards of other programs, and single tags."""
 
 from .measure import BoardOptions, BoardResult, measure_board
+from .single_tags import measure_tags
 
-__all__ = ["BoardOptions", "BoardResult", "measure_board"]
+__all__ = ["BoardOptions", "BoardResult", "measure_board", "measure_tags"]

@@ -18,12 +18,18 @@ _WRONG = 0.06
 """Share of the cells of a tag that may be misread; its place on the board tests it, too."""
 
 
-def find_markers(frame: Frame, design: BoardDesign) -> tuple[Array, NDArray[np.intp]]:
-    """Corners (m, 4, 2) of markers in the frame, clockwise from the upper left, and their numbers (m,)."""
+def find_markers(frame: Frame, design: BoardDesign, *, whole: bool = False) -> tuple[Array, NDArray[np.intp]]:
+    """Corners (m, 4, 2) of markers in the frame, clockwise from the upper left, and their numbers (m,).
+
+    `whole` takes markers without a wrong bit only, where no place on a board tests them.
+    """
     assert design.dictionary is not None
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = design.border_bits
     parameters.minMarkerPerimeterRate = 0.01
+    if whole:
+        parameters.errorCorrectionRate = 0.0
+        parameters.maxErroneousBitsInBorderRate = 0.0
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     detector = cv2.aruco.ArucoDetector(marker_dictionary(design.dictionary), parameters)
     pixels = frame.pixels
