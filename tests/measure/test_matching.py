@@ -250,7 +250,7 @@ def test_compiled_matches_from_known_light_are_those_of_the_general_adjustment(o
     known = {"noise": NOISE, "form_sigma": np.array([0.1]), "searching": False}
     light = np.full(len(xy), 102.0 if bright else 0.68), level
     compiled = match(*given, settings, light=light, **known)
-    monkeypatch.setattr(matcher, "_compiled", lambda *_: (None, np.arange(len(xy))))
+    monkeypatch.setattr(matcher, "_compiled", lambda *_: (None, np.arange(len(xy)), None))
     general = match(*given, settings, light=light, **known)
     assert compiled.converged.sum() > len(xy) - 5
     for name in ("converged", "seen", "rejected"):

@@ -27,6 +27,8 @@ _SHARPER = (1.0, 0.75, 0.5)
 """Shares of the width of the point-spread function that are tried beneath a kernel."""
 _FUTILE = 0.95
 """Ratio of mean square residuals above which no kernel is sought beneath a sharper function."""
+_SINGULAR = 1e-12
+"""Added to the diagonal of correlations, where parts of a basis may be alike."""
 _SMALL = 1e-3
 """Values of a kernel below this are set to zero."""
 
@@ -142,9 +144,29 @@ _POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 
 def unexplained(values: Array, basis: Array, weight: Array) -> Array:
     """What weighted values (k, n, s) contain beside a weighted basis (k, n, b)."""
-    q = np.linalg.qr(basis * weight[..., None])[0]
-    scaled = values * weight[..., None]
-    return np.asarray(scaled - q @ (np.swapaxes(q, 1, 2) @ scaled))
+    known, scaled = basis * weight[..., None], values * weight[..., None]
+    known = known / np.maximum(np.linalg.norm(known, axis=1, keepdims=True), 1e-300)
+    turned = np.swapaxes(known, 1, 2)
+    normal = turned @ known + _SINGULAR * np.eye(known.shape[2])
+    for _ in range(2):  # what rounding left the first time
+        scaled = scaled - known @ np.linalg.solve(normal, turned @ scaled)
+    return np.asarray(scaled)
+
+
+def _turned(basis: Array) -> Array:
+    """A basis (k, n, b) as rows (k, b, n) of length 1."""
+    rows = np.swapaxes(basis, 1, 2)
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=2, keepdims=True), 1e-300))
+
+
+def _reduced(parts: Array, last: int) -> Array:
+    """Products (last, last) of the last rows of parts (k, m, n) without what the others explain, summed."""
+    products = parts @ np.swapaxes(parts, 1, 2)
+    first = parts.shape[1] - last
+    known = products[:, :first, :first] + _SINGULAR * np.eye(first)
+    across = products[:, :first, first:]
+    left = products[:, first:, first:] - np.swapaxes(across, 1, 2) @ np.linalg.solve(known, across)
+    return np.asarray(left.sum(axis=0))
 
 
 def estimate_kernel(samples: Samples) -> tuple[Array, float, float]:
@@ -183,8 +205,8 @@ def estimate_kernel(samples: Samples) -> tuple[Array, float, float]:
         [(i, j) for j in range(_REACH + 1) for i in range(-_REACH, _REACH + 1) if (j, i) > (0, 0)]
     )
     k, high, wide = samples.grey.shape
-    weight = samples.used.reshape(k, -1).astype(np.float64)
-    observed = np.where(samples.used, samples.grey, 0.0).reshape(k, -1, 1)
+    used = samples.used.reshape(k, 1, -1).astype(np.float64)
+    observed = np.where(samples.used, samples.grey, 0.0).reshape(k, 1, -1)
     every, best = np.arange(k), (np.inf, 1.0, np.zeros(len(offsets)))
     plain = np.inf
     for sharper in _SHARPER:
@@ -198,24 +220,22 @@ def estimate_kernel(samples: Samples) -> tuple[Array, float, float]:
         def shifted(i: int, j: int, image: Array = share) -> Array:
             return image[:, _REACH - j : _REACH - j + high, _REACH - i : _REACH - i + wide]
 
-        moved = (
-            np.stack([(shifted(i, j) + shifted(-i, -j)) - 2 * middle for i, j in offsets.tolist()], axis=-1)
-            * samples.depth[:, None, None, None]
-        )
-        basis = samples.basis(middle, own)
-        left = unexplained(
-            np.concatenate([observed, moved.reshape(k, high * wide, -1)], axis=2), basis, weight
-        )
         if sharper == 1.0:
-            wider = samples.basis(middle, slopes[:, :, *inner])
-            plain = float((unexplained(observed, wider, weight) ** 2).sum())
-        rest, taps = left[..., 0].ravel(), left[..., 1:].reshape(-1, len(offsets))
-        square, across, cost = taps.T @ taps, taps.T @ rest, plain
+            wider = _turned(samples.basis(middle, slopes[:, :, *inner])) * used
+            plain = float(_reduced(np.concatenate([wider, observed], axis=1), 1)[0, 0])
+        basis = _turned(samples.basis(middle, own))
+        parts = np.empty((k, basis.shape[1] + 1 + len(offsets), high * wide))
+        parts[:, : basis.shape[1]], parts[:, basis.shape[1]] = basis * used, observed[:, 0]
+        for part, (i, j) in enumerate(offsets.tolist(), basis.shape[1] + 1):
+            moved = shifted(i, j) + shifted(-i, -j) - 2 * middle
+            parts[:, part] = (moved * samples.depth[:, None, None]).reshape(k, -1) * used[:, 0]
+        left = _reduced(parts, 1 + len(offsets))
+        square, across, whole, cost = left[1:, 1:], left[1:, 0], float(left[0, 0]), plain
         for _ in range(3):
             # The prior is weighed by what is left with the kernel: noise, not misfit.
-            weight_of_prior = cost / max(weight.sum(), 1) / _TAP**2
+            weight_of_prior = cost / max(used.sum(), 1) / _TAP**2
             values = np.linalg.solve(square + weight_of_prior * np.eye(len(offsets)), across)
-            cost = float(((rest - taps @ values) ** 2).sum())
+            cost = float(whole - 2 * values @ across + values @ square @ values)
         if cost < best[0]:
             best = cost, sharper, values
         if cost > _FUTILE * plain:

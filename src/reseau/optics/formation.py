@@ -34,6 +34,7 @@ __all__ = [
     "coverage_derivatives",
     "draw",
     "mark_outline",
+    "polygons",
     "rectangles",
     "side_rule",
 ]
@@ -139,6 +140,38 @@ class Outline:
         turned = np.swapaxes(matrix, -1, -2)
         xy = self.xy @ turned
         return Outline(xy if shift is None else xy + shift[..., None, :], self.dxy @ turned)
+
+
+def polygons(corners: Array, spacing: float) -> Outline:
+    """Outlines of polygons with equally many corners, in columns.
+
+    Parameters
+    ----------
+    corners : ndarray (k, c, 2)
+        Corners in the direction that turns x into y.
+    spacing : float
+        Largest mean distance of two nodes; see :meth:`Outline.polygon`.
+
+    Returns
+    -------
+    Outline (k, j, 2)
+        Every side has as many nodes as the longest one needs.
+
+    Examples
+    --------
+    >>> square = np.array([[[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]]])
+    >>> outline = polygons(square, 0.5)
+    >>> doubled = outline.xy[..., 0] * outline.dxy[..., 1] - outline.xy[..., 1] * outline.dxy[..., 0]
+    >>> float(doubled.sum().round(6))
+    8.0
+    """
+    side = np.roll(corners, -1, axis=1) - corners
+    longest = float(np.hypot(side[..., 0], side[..., 1]).max(initial=0.0))
+    along, weight = side_rule(longest, spacing)
+    xy = corners[:, :, None] + along[:, None] * side[:, :, None]
+    dxy = weight[:, None] * side[:, :, None]
+    flat = len(corners), corners.shape[1] * len(along), 2
+    return Outline(xy.reshape(flat), dxy.reshape(flat))
 
 
 def rectangles(edges: Array, spacing: float) -> Outline:

@@ -17,7 +17,7 @@ from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code
 from ...optics import Chain
 from ...optics.corners import Corners, corner_images
-from ...optics.formation import Outline, PixelResponse
+from ...optics.formation import PixelResponse, polygons
 from ..matching import GrownOutline, Matches, Shape, Window
 from ..points import Reason
 from ..reseau.marks import ReseauOptions
@@ -48,6 +48,8 @@ _BORDER = 2.0
 """Least distance of a corner from the outermost pixels, in widths of the point-spread function."""
 _FLAT = 0.6
 """Least sine of the angle between the edges of a corner."""
+_FAR_PX, _FIGURES_PX = 1e5, 8
+"""Coordinates from which a mapping is not used; step of the window sizes of figures."""
 _NODES_PX = 1.1
 """Distance of nodes on an outline, in widths of the point-spread function."""
 
@@ -128,7 +130,7 @@ class CornerMarks(PlaneMarks):
     curve_first = True
     even = True
     formed_px = 0.0007
-    least_seen = 0.4
+    least_seen = 0.15
 
     def __init__(
         self, image: Frame, screened: Screened, located: Located, options: ReseauOptions, sectors: Sectors
@@ -212,27 +214,32 @@ class CornerMarks(PlaneMarks):
         corners = images_of(self.mapping, outlines.reshape(-1, 2) @ self.frame.T + self.origin)
         reach = 0 if look.kernel is None else len(look.kernel) // 2
         margin = int(np.ceil(6 * look.psf_px)) + 2 + reach
-        for polygon, ink in zip(corners.reshape(outlines.shape), self.sectors.ink, strict=True):
-            low = np.floor(polygon.min(axis=0)).astype(np.intp) - margin
-            high = np.ceil(polygon.max(axis=0)).astype(np.intp) + margin + 1
-            if not (np.isfinite(polygon).all() and (high > 0).all() and (low < (w, h)).all()):
+        corners = corners.reshape(outlines.shape)
+        low = np.floor(np.nan_to_num(corners.min(axis=1), nan=-_FAR_PX)) - margin
+        size = np.ceil(np.ptp(np.nan_to_num(corners), axis=1)) + 2 * margin + 2
+        seen = np.isfinite(corners).all(axis=(1, 2)) & (np.abs(corners) < _FAR_PX).all(axis=(1, 2))
+        seen &= (low + size > 0).all(axis=1) & (low < (w, h)).all(axis=1)
+        classes, of = np.unique(np.ceil(size / _FIGURES_PX), axis=0, return_inverse=True)
+        for k, (wide, high) in enumerate((classes * _FIGURES_PX).astype(np.intp)):
+            part = np.flatnonzero((of.ravel() == k) & seen)
+            if not len(part):
                 continue
-            x, y = (np.arange(a, b, dtype=np.float64)[None] for a, b in zip(low, high, strict=True))
-            nodes = Outline.polygon(polygon, _NODES_PX * look.psf_px).oriented()
-            single = Outline(nodes.xy[None], nodes.dxy[None]).single()
-            taken = GrownOutline(single, np.zeros((0, 2, 2))).image(
-                np.zeros((1, 2)),
-                np.full(1, look.psf_px),
-                np.zeros((1, 0)),
-                np.zeros(1, dtype=np.intp),
+            nodes = polygons(corners[part], _NODES_PX * look.psf_px).oriented().single()
+            x, y = (low[part, i, None] + np.arange(n) for i, n in ((0, wide), (1, high)))
+            taken = GrownOutline(nodes, np.zeros((0, 2, 2))).image(
+                np.zeros((len(part), 2)),
+                np.full(len(part), look.psf_px),
+                np.zeros((len(part), 0)),
+                np.arange(len(part)),
                 Window(x, y, PixelResponse(self.options.fill)),
-            )[0]
-            taken = taken if look.kernel is None else np.asarray(cv2.filter2D(taken, -1, look.kernel))
-            left, top = np.maximum(low, 0)
-            right, bottom = np.minimum(high, (w, h))
-            share[top:bottom, left:right] += (
-                ink * taken[top - low[1] : bottom - low[1], left - low[0] : right - low[0]]
             )
+            if look.kernel is not None:
+                taken = np.stack([cv2.filter2D(image, -1, look.kernel) for image in taken])
+            taken = taken * self.sectors.ink[part, None, None].astype(np.float32)
+            for image, (left, top) in zip(taken, low[part].astype(np.intp), strict=True):
+                a, b = max(left, 0), max(top, 0)
+                place = share[b : top + high, a : left + wide]
+                place += image[b - top : b - top + len(place), a - left : a - left + place.shape[1]]
         self.figures = share, self.mapping, look.psf_px, look.kernel
         return share
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
-from ...core.data import Array, Frame
+from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Failure, Remark
 from ...core.threads import one_thread
 from ...designs.boards import marker_cells
@@ -17,15 +18,19 @@ from ...io.board import BoardDesign
 from ..points import Measured
 from ..reseau.disks import find_disks
 from ..reseau.marks import ReseauOptions
-from ..reseau.plane_marks import PlaneMarks
+from ..reseau.plane_marks import Located, PlaneMarks
 from ..reseau.sheet import DiskMarks
 from ..screening import Screened, screen
+from ..testfield.lattice_mapping import second_order
 from .candidates import Saddles, find_saddles
 from .corners import CornerMarks, Sectors
 from .markers import find_markers, find_tags
 from .placement import Placed, lay_chessboard, lay_circles, lay_marked
 
 __all__ = ["BoardOptions", "BoardResult", "measure_board"]
+
+_CIRCLE_EDGE = 3.0
+"""Distance from the next circle in which pixels are not used, in widths of the point-spread function."""
 
 
 @dataclass(frozen=True)
@@ -178,8 +183,7 @@ def _measured(frame: Frame, design: BoardDesign, options: BoardOptions) -> Board
         marks = CircleMarks(frame, screened, placed.located, common, design.size)
     else:
         marks = CornerMarks(frame, screened, placed.located, common, sectors_of(design))
-    columns = marks.columns()
-    del columns["field"]
+    columns = marks.columns(with_field=False)
     return BoardResult(**columns | {"notes": placed.notes + columns["notes"]})
 
 
@@ -227,6 +231,27 @@ class CircleMarks(DiskMarks):
     eccentric = True
     even = True
     formed_px = 0.0007
+
+    def __init__(
+        self, image: Frame, screened: Screened, located: Located, options: ReseauOptions, size: float
+    ) -> None:
+        super().__init__(image, screened, located, options, size)
+        nearest = KDTree(self.xy).query(self.xy, k=2)[0][:, 1]
+        self.free = float(nearest.min()) - size / 2
+
+    def _region(self, rows: Rows, half: tuple[int, int]) -> Mask | None:
+        """See :class:`PlaneMarks`: what lies before the next circles."""
+        slope = second_order(self.mapping, self.at[rows])[1] @ self.frame
+        value = np.linalg.svd(slope, compute_uv=False)
+        limit = self.free - _CIRCLE_EDGE * self.look.blur_px / value[:, 1]
+        if (np.hypot(*half) < limit * value[:, 1]).all():
+            return None
+        centre = np.rint(self.start[rows])
+        x = centre[:, :1] + np.arange(-half[0], half[0] + 1) - self.start[rows, :1]
+        y = centre[:, 1:] + np.arange(-half[1], half[1] + 1) - self.start[rows, 1:]
+        back = np.linalg.inv(slope)[..., None, None]
+        one, two = (back[:, k, 0] * x[:, None, :] + back[:, k, 1] * y[:, :, None] for k in (0, 1))
+        return np.asarray(one * one + two * two < np.maximum(limit, 0.0)[:, None, None] ** 2)
 
 
 def sectors_of(design: BoardDesign) -> Sectors:

@@ -273,6 +273,7 @@ def linearised(
     trial: Floats,
     iteration: Floats,
     state: Floats,
+    influence: tuple[Floats, Floats],
 ) -> None:
     """Form the normal equations of all windows at `x`, and the first trial of each.
 
@@ -302,10 +303,15 @@ def linearised(
     trial, iteration, state : ndarray (k, u), (k, 4), (k,)
         Filled: next values to evaluate; cost, damping, decrease predicted, and the same in the iteration
         before; ACTIVE, DONE or LEFT. The damping is given.
+    influence : tuple
+        Filled: influence of each pixel on the position (k, 2, n) and its leverage (k, n), float32; (0, …) if
+        they are not wanted. With derivatives A, weights W and cofactor Q they are the first rows of Q Aᵀ W,
+        and the diagonal of A Q Aᵀ W.
     """
     monomials, across, columns = window
     dark, variance, jitter = light
     residuals, kept, normals, gradients, cofactors, slope, weighted = work
+    on_position, leverage = influence
     (count, n), u, ground, forms = observed.shape, x.shape[1], len(monomials), slopes.shape[1] - 3
     plane, contrast, grey = np.empty(n), np.empty(n), np.empty(n)
     by_share, rest, jacobian = np.empty(n, f32), np.empty(n, f32), np.empty((u, n), f32)
@@ -374,6 +380,14 @@ def linearised(
             _solve(lower, cofactors[k, m])
             for i in range(u):
                 cofactors[k, m, i] *= scale[i] * scale[m]
+        if len(leverage):
+            gains = np.dot(cofactors[k].astype(f32), kept[k])
+            on_position[k] = gains[:2]
+            leverage[k] = f32(0)
+            for m in range(u):
+                row, gain = jacobian[m], gains[m]
+                for i in range(n):
+                    leverage[k, i] += gain[i] * row[i]
         limit = share_of_sigma**2 * cost / max(freedom, 1)
         _next(k, normals[k], gradients[k], limit, x, trial, iteration, state)
         # What the first correction leaves is smaller than itself by half the relative change of the mark.
@@ -483,6 +497,7 @@ def adjusted(
     most: int,
     x: Floats,
     found: tuple[Floats, Floats, Floats, Floats, Floats],
+    influence: tuple[Floats, Floats],
 ) -> None:
     """Adjust windows with one outline each, as many together as fit into a cache.
 
@@ -504,6 +519,8 @@ def adjusted(
     found : tuple
         Filled: residuals (k, n), cofactors (k, u, u), numbers of iterations (k,). Filled as in
         :func:`linearised`: iteration (k, 4), state (k,).
+    influence : tuple
+        As in :func:`linearised`.
     observed, weights, window, light, psf, prior, share_of_sigma, x
         As in :func:`linearised`.
     """
@@ -521,6 +538,7 @@ def adjusted(
     images, where = np.empty((together, 1, high, wide), f32), np.empty((together, 2), f32)
     form, sigma = np.empty((together, forms), f32), np.empty(together, f32)
     rows, flat = np.empty(together, np.intp), shares.reshape(count, n)
+    wanted, (on_position, leverage) = len(influence[1]) > 0, influence
     for begin in range(0, count, together):
         part = slice(begin, min(begin + together, count))
         some = part.stop - begin
@@ -549,6 +567,7 @@ def adjusted(
             trial[:some],
             iteration[part],
             state[part],
+            (on_position[part], leverage[part]) if wanted else (on_position, leverage),
         )
         for _ in range(most):
             active = 0

@@ -49,6 +49,7 @@ def match(
     region: Mask | None = None,
     light: tuple[Array, Array] | None = None,
     searching: bool = True,
+    least: tuple[Array, float] | None = None,
 ) -> Matches:
     """Match every patch with the formed image of its mark.
 
@@ -83,6 +84,9 @@ def match(
         known approximately. Then only patches with large residuals are searched for blunders.
     searching : bool
         Whether to search those patches; if not, they count as not converged.
+    least : tuple, optional
+        Least correlation (k,) with the formed image, and least share of a mark on pixels that may be used,
+        from which patches are searched. By default all.
 
     Returns
     -------
@@ -117,8 +121,13 @@ def match(
         free[patch.form_at :] = form_sigma
     if light is None:
         return _searched(patch, free, noise)
-    quick, amiss = _continued(patch, patch.begin(*light), free, noise)
-    quick.converged[amiss] = False
+    quick, amiss = _continued(patch, patch.begin(*light), free, noise, least)
+    came, quick.converged[amiss] = quick.converged[amiss], False
+    settled = np.zeros(len(xy), dtype=bool)
+    settled[amiss] = came
+    if least is not None:
+        likely = (quick.correlation >= least[0]) & (quick.seen >= least[1])
+        amiss = amiss[likely[amiss]]
     if not len(amiss) or not searching:
         return quick
     contrast = options.contrast
@@ -136,7 +145,11 @@ def match(
         None if others is None else others[amiss],
         None if region is None else region[amiss],
     )
-    return quick.replaced(amiss, _searched(few, free, noise))
+    found = _searched(few, free, noise)
+    # A search that leaves larger residuals than it started from has rejected the mark itself.
+    worse = settled[amiss] & (~(found.noise < quick.noise[amiss]) | ~found.converged)
+    quick.converged[amiss[worse]] = True
+    return quick.replaced(amiss[~worse], found.select(~worse))
 
 
 def _searched(patch: Patches, free: Array, noise: float) -> Matches:
@@ -179,11 +192,18 @@ def _searched(patch: Patches, free: Array, noise: float) -> Matches:
     return matches_of(patch, found, used > 0, scale[:, 0])
 
 
-def _continued(patch: Patches, start: Array, free: Array, noise: float) -> tuple[Matches, Rows]:
-    """Matches from good start values, and the rows with blunders or without convergence."""
+def _continued(
+    patch: Patches, start: Array, free: Array, noise: float, least: tuple[Array, float] | None = None
+) -> tuple[Matches, Rows]:
+    """Matches from good start values, and the rows with blunders or without convergence.
+
+    See :func:`match` for `least`.
+    """
     weights = patch.weights * patch.relative_weights / noise**2
     options = BatchOptions(share=patch.options.settled, max_iterations=_FIRST, damping=1e-5)
-    found, rows = _compiled(patch, start, free, noise, weights, options)
+    found, rows, influence = _compiled(patch, start, free, noise, weights, options)
+    if found is not None and least is not None and len(rows):
+        rows = rows[patch.correlation(found.estimates, rows) >= least[0][rows]]
     if found is None or len(rows):
         formed = patch.shares.copy()
         if patch.options.row_jitter_px > 0:
@@ -208,19 +228,23 @@ def _continued(patch: Patches, start: Array, free: Array, noise: float) -> tuple
         | ~(worst < _PLAIN * patch.options.rejection * np.maximum(rms, noise))
         | ~(rms < 2 * noise)
     )
-    return matches_of(patch, found, used, np.full(len(start), noise), patch.shares), np.flatnonzero(amiss)
+    scale = np.full(len(start), noise)
+    if influence is not None and len(rows):
+        ours = patch.influence(found.estimates[rows], found.cofactor[rows], used[rows], scale[rows], rows)
+        for whole, part in zip(influence, ours, strict=True):
+            whole[rows] = part
+    return matches_of(patch, found, used, scale, patch.shares, influence), np.flatnonzero(amiss)
 
 
 def _compiled(
     patch: Patches, start: Array, free: Array, noise: float, weights: Array, options: BatchOptions
-) -> tuple[BatchAdjustment | None, Rows]:
-    """The adjustment of :func:`_continued` by compiled code, and the rows left to the general one."""
+) -> tuple[BatchAdjustment | None, Rows, tuple[Array, Array] | None]:
+    """The adjustment of :func:`_continued` by compiled code, the rows left to the general one, influences."""
     every, shape = np.arange(len(start)), patch.form
-    share, slopes = shape.derivatives(
-        patch.xy + start[:, :2], patch.width(start, every), start[:, patch.form_at :], every, patch.window
-    )
+    assert patch.first is not None
+    share, slopes = patch.first
     if share.dtype != np.float32:
-        return None, every
+        return None, every, None
     from .compiled import DONE, adjusted  # takes half a second to import; not every command needs it
 
     (k, n), u = patch.grey.shape, start.shape[1]
@@ -231,6 +255,12 @@ def _compiled(
     x, iteration, (state, rounds) = start.copy(), np.zeros((k, 4)), np.zeros((2, k), np.int64)
     iteration[:, 1] = options.damping
     patch.shares = share.copy()
+    # Errors that rows have in common are not among those of pixels.
+    wanted = k if patch.options.influence and jitter == 0 else 0
+    influence: tuple[Any, Any] = (
+        np.zeros((wanted, 2, n), np.float32),
+        np.zeros((wanted, n), np.float32),
+    )
     given = patch.grey, weights, window, light, SHARPEST * patch.psf, prior, options.share
     outlines = outlines_of(shape, every)
     if outlines is not None:
@@ -246,11 +276,11 @@ def _compiled(
                 options.max_iterations - 1,
                 x,
                 (residuals, cofactor, rounds, iteration, state),
+                influence,
             )
     else:
-        _stepwise(
-            patch, start, (share, slopes, *given), options, x, (residuals, cofactor, rounds, iteration, state)
-        )
+        filled = residuals, cofactor, rounds, iteration, state
+        _stepwise(patch, start, (share, slopes, *given), options, x, filled, influence)
     redundancy = (patch.weights > 0).sum(axis=1) + np.count_nonzero(prior) - u
     left = state != DONE
     found = BatchAdjustment(
@@ -264,7 +294,10 @@ def _compiled(
         reasons=np.where(left, BatchReason.MAX_ITERATIONS, BatchReason.CONVERGED).astype(np.int64),
         factors=np.broadcast_to(1.0, (k, n)),
     )
-    return found, np.flatnonzero(left)
+    shaped = None
+    if wanted:
+        shaped = influence[0].reshape(k, 2, *patch.shape[1:]), influence[1].reshape(patch.shape)
+    return found, np.flatnonzero(left), shaped
 
 
 def _stepwise(
@@ -274,6 +307,7 @@ def _stepwise(
     options: BatchOptions,
     x: Array,
     found: tuple[Any, ...],
+    influence: tuple[Array, Array],
 ) -> None:
     """The iterations of :func:`reseau.measure.matching.compiled.adjusted` for shapes other than outlines."""
     from .compiled import ACTIVE, advanced, linearised  # takes half a second to import
@@ -285,10 +319,11 @@ def _stepwise(
     work = residuals, kept, np.zeros((k, u, u)), np.zeros((k, u)), cofactor, common[0], common[1]
     steps: Any = x, work, trial, iteration, state
     with one_thread():
+        begun: Any = *steps, influence
         linearised(
             *(share.reshape(k, n), slopes.reshape(k, -1, n), observed, weights),
             *(window, light, psf, prior, share_of_sigma),
-            *steps,
+            *begun,
         )
         for _ in range(options.max_iterations - 1):
             rows = np.flatnonzero(state == ACTIVE)

@@ -110,9 +110,14 @@ def with_rows(whole: Columns, rows: Rows, part: Columns) -> Columns:
 
 
 def matches_of(
-    patch: Patches, found: BatchAdjustment, used: Mask, scale: Array, share: Array | None = None
+    patch: Patches,
+    found: BatchAdjustment,
+    used: Mask,
+    scale: Array,
+    share: Array | None = None,
+    influences: tuple[Array, Array] | None = None,
 ) -> Matches:
-    """Columns of results from the adjusted batch; `share` as formed last, if it is known."""
+    """Columns of results from the adjusted batch; `share` as formed last, and influences, if known."""
     x, k = found.estimates, len(patch.xy)
     flat = (patch.share(x) if share is None else share).reshape(k, -1)
     plane, dark = patch.background(x).reshape(k, -1), patch.options.polarity == "dark"
@@ -125,8 +130,10 @@ def matches_of(
         cov = found.covariance
         t = correlation * np.sqrt(np.maximum(count - patch.form_at, 1) / (1 - correlation**2))
     influence, leverage = np.zeros((k, 2, 0, 0)), np.zeros((k, 0, 0))
-    if patch.options.influence:
-        influence, leverage = patch.influence(x, found.cofactor, used, scale)
+    if influences is not None:
+        influence, leverage = influences
+    elif patch.options.influence:
+        influence, leverage = patch.influence(x, found.cofactor, used, scale, np.arange(k))
     return Matches(
         xy=patch.xy + x[:, :2],
         cov=cov[:, :2, :2],

@@ -162,6 +162,7 @@ class Patches:
         self.relative_weights: Array = np.broadcast_to(1.0, self.grey.shape)
         self.whitener: tuple[Array, Array] | None = None
         self._formed: tuple[Array, Rows, Array, Array] | None = None
+        self.first: tuple[Array, Array] | None = None  # images and derivatives where `begin` starts
         self.shares = np.empty(self.shape)
 
     def begin(self, contrast: Array, ground: Array) -> Array:
@@ -170,8 +171,30 @@ class Patches:
         # Start with the expected width; see `width`.
         x[:, WIDTH] = np.log(self.psf * np.sqrt(1 - SHARPEST**2))
         x[:, CONTRAST], x[:, self.ground] = contrast, ground
-        self._weigh(x)
+        self.first = self.form.derivatives(
+            self.xy, self.width(x, every := np.arange(len(x))), x[:, self.form_at :], every, self.window
+        )
+        if self.options.variance is not None:
+            grey = self._grey(x, self.first[0])
+            self.relative_weights = relative_weights(grey.reshape(len(x), -1), self.options.variance)
         return x
+
+    def correlation(self, x: Array, at: Rows) -> Array:
+        """Correlation (m,) of grey values with images of the marks `at` as formed last at `x` (k, u)."""
+        off = self.grey[at] - self.background(x[at]).reshape(len(at), -1)
+        mark = (self._grey(x[at], self.shares[at]) - self.background(x[at])).reshape(len(at), -1)
+        used = self.weights[at] > 0
+        parts = [np.where(used, v, 0.0) for v in (off, mark)]
+        count = np.maximum(used.sum(axis=1, keepdims=True), 1)
+        parts = [np.where(used, v - v.sum(axis=1, keepdims=True) / count, 0.0) for v in parts]
+        both, one, two = (np.einsum("kn,kn->k", parts[i], parts[j]) for i, j in ((0, 1), (0, 0), (1, 1)))
+        with np.errstate(all="ignore"):
+            return np.asarray(np.nan_to_num(both / np.sqrt(one * two)))
+
+    def _grey(self, x: Array, share: Array) -> Array:
+        """Grey values (k, rows, columns) of marks that take a share of each pixel."""
+        plane, part = self.background(x), self.contrast(x) * share
+        return np.asarray(plane * (1 - part) if self.options.polarity == "dark" else plane + part)
 
     def _weigh(self, x: Array) -> None:
         """Weights of the pixels by the grey values that are formed."""
@@ -269,9 +292,7 @@ class Patches:
             self.xy[at] + x[:, :2], self.width(x, at), x[:, self.form_at :], at, self.window.select(at)
         )
         self.shares[at] = share
-        plane, part = self.background(x), self.contrast(x) * share
-        formed = plane * (1 - part) if self.options.polarity == "dark" else plane + part
-        grey: Array = formed.reshape(len(x), -1)
+        grey: Array = self._grey(x, share).reshape(len(x), -1)
         if self.whitener is None:
             return grey
         slope, weighted = (field[at] for field in self.whitener)
@@ -320,18 +341,19 @@ class Patches:
             formed = plane + contrast * share
         return formed - self.grey, _FORM_ERROR * amplitude * (share > 0.02)
 
-    def influence(self, x: Array, cofactor: Array, used: Mask, scale: Array) -> tuple[Array, Array]:
-        """Influence of each pixel on the position (k, 2, rows, columns), and leverage (k, rows, columns).
+    def influence(self, x: Array, cofactor: Array, used: Mask, scale: Array, at: Rows) -> tuple[Array, Array]:
+        """Influence of each pixel on the position (m, 2, rows, columns), and leverage (m, rows, columns).
 
         With derivatives A, weights W and cofactor Q they are the first rows of Q Aᵀ W, and the diagonal of
         A Q Aᵀ W.
         """
-        _, jacobian = self.form_image(x, np.arange(len(x)))
-        weights = self.weights * self.relative_weights * used / scale[:, None] ** 2
+        _, jacobian = self.form_image(x, at)
+        weights = self.weights[at] * self.relative_weights[at] * used / scale[:, None] ** 2
         gain = np.nan_to_num(jacobian @ cofactor.astype(jacobian.dtype)) * weights[..., None]
         leverage = (gain * jacobian).sum(axis=2)
         on_position = np.moveaxis(gain[..., :2], 2, 1).copy()  # a view would keep all of `gain`
-        return on_position.reshape(len(x), 2, *self.shape[1:]), leverage.reshape(self.shape)
+        size = self.shape[1:]
+        return on_position.reshape(len(x), 2, *size), leverage.reshape(len(x), *size)
 
     def whiten(self, x: Array, sigma: Array, jitter: float) -> None:
         """Include a common error of each row, jitter × slope along x, in the stochastic model.

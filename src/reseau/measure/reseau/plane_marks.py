@@ -66,6 +66,8 @@ _FOREIGN, _SHADE, _SHIFT_PX = 4.0, 0.03, 0.25
 """Tolerances of the prediction of a mark by its neighbours: noise, share of the light, and shift."""
 _NEIGHBOURS = 6
 """Number of neighbours whose light is taken."""
+_LIKELY = 0.7
+"""Correlation with the formed image from which a mark that was not found at first is looked for."""
 _ENOUGH_LIKE, _SAMPLE = 6, 20
 """Least number of reliable marks from which something is learnt, and most that show the camera's response."""
 _FEW = 3
@@ -223,6 +225,7 @@ class PlaneMarks(ABC):
         self.dazzled = np.zeros(len(self.at), dtype=bool)
         self.notes: tuple[Remark, ...] = ()
         self.learning = True
+        self.own_px = np.zeros(len(self.at))  # pixels of the windows that belong to marks, matched last
         self.rough = 0.0  # residuals of the marks that were learnt from
 
     @abstractmethod
@@ -253,8 +256,8 @@ class PlaneMarks(ABC):
         """Pixels (k, rows, columns) of the windows that belong to the marks; None for all."""
         return None
 
-    def columns(self) -> dict[str, Any]:
-        """Columns of the result."""
+    def columns(self, *, with_field: bool = True) -> dict[str, Any]:
+        """Columns of the result; the field from the design to the image only if wanted."""
         rows = np.flatnonzero(self.found)
         if len(rows) > self.learnt_from:
             rows = rows[np.linspace(0, len(rows) - 1, self.learnt_from).astype(np.intp)]
@@ -287,8 +290,8 @@ class PlaneMarks(ABC):
         if self.precise_start:
             found = self._with_doubtful_light(rows, found)
         found = replace(found, cov=found.cov + self.formed_px**2 * np.eye(2))
-        why, field = self._judged(rows, found)
-        return self._spread(rows, found, why, field)
+        why, field = self._judged(rows, found, field)
+        return self._spread(rows, found, why, field, with_field)
 
     def _bent(self, rows: Rows, found: Matches) -> bool:
         """Whether the lens bends the target more than the mapping through the marks found contains."""
@@ -311,9 +314,8 @@ class PlaneMarks(ABC):
         Where a part of a window is saturated or hidden, it is no longer symmetric about its mark, and errors
         of the background shift the position.
         """
-        used = np.isfinite(found.residuals).sum(axis=(1, 2)) / max(found.residuals[0].size, 1)
-        whole = np.array(self._region_sizes(rows, found), dtype=np.float64)
-        partly = found.converged & (used < _WHOLE * whole)
+        used = np.isfinite(found.residuals).sum(axis=(1, 2))
+        partly = found.converged & (used < _WHOLE * self.own_px[rows])
         if not partly.any():
             return found
         plain = self._match(rows[partly], background=1)
@@ -362,18 +364,6 @@ class PlaneMarks(ABC):
             share = 0.0 if abs(none) < abs(whole) else 1.0
         return replace(alike, cov=plain.cov + share * extra)
 
-    def _region_sizes(self, rows: Rows, found: Matches) -> Array:
-        """Share (k,) of the pixels of the windows, all of one size, that belong to the marks."""
-        high, wide = (n // 2 for n in found.residuals.shape[1:])
-        region = self._region(rows, (wide, high))
-        if region is None:
-            return np.ones(len(rows))
-        if (beside := self._beside()) is not None:
-            # What is printed there is known, and the same around every mark.
-            x, y = self._pixels(rows, (wide, high))
-            region &= np.abs(beside[y, x]) < _BESIDE
-        return np.asarray(region.mean(axis=(1, 2)))
-
     def _match_all(self, rows: Rows) -> Matches:
         """Match disks; on even paper where paper is saturated all around."""
         found = self._match(rows, influence=True)
@@ -384,10 +374,11 @@ class PlaneMarks(ABC):
             found = replaced(found, ~lost, self._match(rows[lost], influence=True))
             self.look = look
         # Only where pixels are lost can the edge be.
-        lost = found.converged & (np.isfinite(found.residuals).mean(axis=(1, 2)) < 1)
+        lost = found.converged & (np.isfinite(found.residuals).sum(axis=(1, 2)) < self.own_px[rows])
         if not lost.any():
             return found
-        dim = lost & (self._edge_seen(rows, found) < _LEAST_RIM)
+        dim = lost.copy()
+        dim[lost] = self._edge_seen(rows[lost], found.select(lost)) < _LEAST_RIM
         self.dazzled[rows] |= dim
         if not dim.any():
             return found
@@ -403,6 +394,13 @@ class PlaneMarks(ABC):
             valid = valid & (beside < _BESIDE) & (beside > -_BESIDE)
         parts, found = [], []
         for part, half in self._windows(reach):
+            region = self._region(rows[part], half)
+            here = None if beside is None else beside[self._pixels(rows[part], half)[::-1]]
+            self.own_px[rows[part]] = float((2 * np.array(half) + 1).prod())
+            if region is not None:
+                # What is printed there is known, and the same around every mark.
+                own = region if here is None else region & (np.abs(here) < _BESIDE)
+                self.own_px[rows[part]] = own.sum(axis=(1, 2))
             options = MatchOptions(
                 half_px=half,
                 psf_px=self.look.psf_px,
@@ -427,8 +425,9 @@ class PlaneMarks(ABC):
                     noise=max(self.screened.noise, self.rough),
                     form_sigma=self._form_sigma(),
                     light=self._known_light(rows[part], background),
-                    others=self._light_of(beside, rows[part], half),
-                    region=self._region(rows[part], half),
+                    others=self._light_of(here, rows[part]),
+                    region=region,
+                    least=(np.where(self.found[rows[part]], -1.0, _LIKELY), self.least_seen),
                 )
             )
             parts.append(part)
@@ -464,19 +463,18 @@ class PlaneMarks(ABC):
     def _known_light(self, rows: Rows, background: int) -> tuple[Array, Array] | None:
         """Contrast and background from which the match of marks continues."""
         look = self.look
-        if self.learning or not self.precise_start or look.contrast is None or look.light is None:
+        if not self.precise_start or look.contrast is None or look.light is None:
             return None
         ground = np.zeros((len(rows), (background + 1) * (background + 2) // 2))
         ground[:, 0] = np.abs(look.light[rows] / look.contrast[rows])
         return look.contrast[rows], ground
 
-    def _light_of(self, beside: Array | None, rows: Rows, half: tuple[int, int]) -> Array | None:
-        """Light (k, rows, columns) that the blurred edges of other ink take in the windows of marks."""
+    def _light_of(self, beside: Array | None, rows: Rows) -> Array | None:
+        """Light (k, rows, columns) that other ink, its share in the windows given, takes there."""
         light = self.look.light
         if light is None or beside is None:
             return None
-        x, y = self._pixels(rows, half)
-        return np.asarray(beside[y, x] * light[rows, None, None])
+        return np.asarray(beside * light[rows, None, None])
 
     def _learn(self, first: Matches, rows: Rows) -> Matches:
         """Learn mapping, sharpness, size and noise from reliable marks; their form refers to the new size."""
@@ -539,7 +537,7 @@ class PlaneMarks(ABC):
                 # The noise of grey values is alike, that of light grows with it where curves are steeper.
                 bent = float(curve.light(np.array(0.5), 1.0)) < 0.5
                 variance = (0.02 * full_scale, 1.0) if bent else None
-                self.look = replace(self.look, variance=variance, light=None)
+                self.look = self._relit(replace(self.look, variance=variance), tried[straight][1], curve)
                 again = self._settle(self._match(rows))
                 self.screened = replace(self.screened, noise=float(np.median(again.noise)))
                 tried[curve] = self.screened, self.look, again
@@ -561,6 +559,15 @@ class PlaneMarks(ABC):
         if note is not None and (chosen is not straight or not sure):
             self.notes += (note,)
         return first, chosen is not straight
+
+    def _relit(self, look: Appearance, straight: Appearance, curve: ToneCurve) -> Appearance:
+        """An appearance with the contrast and light of another one in grey values along a curve."""
+        if straight.light is None or straight.contrast is None or self.polarity != "dark":
+            return replace(look, light=None)
+        level = np.abs(straight.light / straight.contrast)
+        paper, ink = (curve.light(v, self.image.full_scale) for v in (level, level + straight.light))
+        contrast = 1 - ink / np.maximum(paper, 1e-12)
+        return replace(look, contrast=contrast, light=ink - paper)
 
     def _weigh(self, first: Matches, rows: Rows) -> None:
         """Learn noise, contrast and light from some of the marks; those of the others change as much."""
@@ -598,7 +605,8 @@ class PlaneMarks(ABC):
         centre = slice(high - half[1], high + half[1] + 1), slice(wide - half[0], wide + half[0] + 1)
         residuals = first.residuals[:, *centre]
         grey = self.screened.grey[y, x].astype(np.float64)
-        if (others := self._light_of(self._beside(), rows, half)) is not None:
+        beside = self._beside()
+        if beside is not None and (others := self._light_of(beside[y, x], rows)) is not None:
             grey -= others
         window = Window(x[:, 0].astype(float), y[:, :, 0].astype(float), PixelResponse(self.options.fill))
         every = np.arange(len(rows))
@@ -688,18 +696,20 @@ class PlaneMarks(ABC):
             (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
         ]
 
-    def _judged(self, rows: Rows, found: Matches) -> tuple[Array, SmoothField | None]:
-        """Reason why each mark is rejected, and the field through the others."""
+    def _judged(
+        self, rows: Rows, found: Matches, before: SmoothField | None = None
+    ) -> tuple[Array, SmoothField | None]:
+        """Reason why each mark is rejected, and the field through the others; `before` has its length."""
         why = np.full(len(rows), "", dtype=object)
         for mask, reason in self._objections(rows, found):
             why[mask & (why == "")] = reason
-        source, field = self._straight(rows), None
+        source, field, known = self._straight(rows), None, before
         variance = np.trace(found.cov, axis1=1, axis2=2) / 2 + _UNMODELLED_PX**2
         radius = self._radius(rows)
         while (good := np.flatnonzero(why == "")).size >= 10:
             relative = np.sqrt(variance[good] / np.median(variance[good]))
-            length = field.length if field is not None and np.isfinite(field.length) else None
-            field = SmoothField.fit(source[good], found.xy[good], sigma=relative, length=length)
+            length = known.length if known is not None and np.isfinite(known.length) else None
+            field = known = SmoothField.fit(source[good], found.xy[good], sigma=relative, length=length)
             deviation, sigma = field.leave_one_out()
             limit = np.maximum(np.maximum(self.options.neighbour_px, _BULGED * radius[good, None]), 4 * sigma)
             excess = (np.abs(deviation) / limit).max(axis=1)
@@ -712,7 +722,9 @@ class PlaneMarks(ABC):
             )
         return why, field
 
-    def _spread(self, rows: Rows, found: Matches, why: Array, field: SmoothField | None) -> dict[str, Any]:
+    def _spread(
+        self, rows: Rows, found: Matches, why: Array, field: SmoothField | None, with_field: bool
+    ) -> dict[str, Any]:
         """Columns over all marks of the design."""
         n, good = len(self.at), why == ""
         ok, reasons = (
@@ -730,20 +742,24 @@ class PlaneMarks(ABC):
             full[rows[keep]] = values[keep]
             return full
 
-        if field is not None and good.sum() >= 10:
-            design = SmoothField.fit(self.xy[rows[good]], found.xy[good])
-        else:
-            design = SmoothField.fit(self.xy, self.mapping(self.at), local=False)
-        return {
-            "image": self.image.name,
-            "sha256": self.image.sha256,
-            "ids": self.ids,
-            "field": design,
-            "xy": spread(found.xy, good),
-            "cov": spread(found.cov, good),
-            "ok": ok,
-            "why": tuple(reasons),
-            "predicted": predicted,
-            "deviation": deviation,
-            "notes": self.notes,
-        } | {name: spread(getattr(found, name)) for name in ("psf_px", "contrast", "t", "noise")}
+        design: dict[str, Any] = {}
+        if with_field and field is not None and good.sum() >= 10:
+            design["field"] = SmoothField.fit(self.xy[rows[good]], found.xy[good])
+        elif with_field:
+            design["field"] = SmoothField.fit(self.xy, self.mapping(self.at), local=False)
+        return (
+            design
+            | {
+                "image": self.image.name,
+                "sha256": self.image.sha256,
+                "ids": self.ids,
+                "xy": spread(found.xy, good),
+                "cov": spread(found.cov, good),
+                "ok": ok,
+                "why": tuple(reasons),
+                "predicted": predicted,
+                "deviation": deviation,
+                "notes": self.notes,
+            }
+            | {name: spread(getattr(found, name)) for name in ("psf_px", "contrast", "t", "noise")}
+        )
