@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,26 @@ def test_pairs_are_joined_to_points_unless_these_are_twice_in_an_image(tmp_path:
     assert network.rays.tolist() == [3, 2]
     found = sorted(zip(network.image_of.tolist(), network.xy.tolist(), strict=True))
     assert found == [(0, [10, 20]), (0, [50, 60]), (1, [11, 21]), (1, [51, 61]), (2, [12, 22])]
+
+
+def test_binary_homologous_points_are_those_of_the_text(tmp_path: Path) -> None:
+    """Little-endian: 2, count; 2, weight, x and y in both images for each. What is cut off is refused."""
+    for name in ("text", "binary"):
+        (tmp_path / name).mkdir()
+    of_text = project(tmp_path / "text", images="ab")
+    tie(tmp_path / "text", "a", "b", "320 240 160 240", "100 50.5 20 60")
+    of_binary = project(tmp_path / "binary", images="ab")
+    pair = tmp_path / "binary" / "Homol" / "Pastisa.tif"
+    pair.mkdir(parents=True)
+    rows = [(320.0, 240.0, 160.0, 240.0), (100.0, 50.5, 20.0, 60.0)]
+    content = struct.pack("<ii", 2, 2) + b"".join(struct.pack("<id4d", 2, 1.0, *row) for row in rows)
+    (pair / "b.tif.dat").write_bytes(content)
+    one, other = read_network(of_text), read_network(of_binary)
+    assert np.array_equal(one.xy, other.xy)
+    assert np.array_equal(one.point_of, other.point_of)
+    (pair / "b.tif.dat").write_bytes(content[:-5])
+    with pytest.raises(FormatError, match="not complete"):
+        read_network(of_binary)
 
 
 def test_control_points_are_read_with_their_uncertainties(tmp_path: Path) -> None:

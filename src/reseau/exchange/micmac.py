@@ -2,7 +2,8 @@
 
 ``Orientation-IMAGE.xml`` has the projection centre and the rotation from the camera (x right, y down, z
 forward) to object space, and names the file of its interior orientation. Beside the folder, ``Homol*`` has
-the homologous points of pairs of images as text (``Tapioca … ExpTxt=1``: x, y in both images), and XML files
+the homologous points of pairs of images, in binary files (``.dat``) or as text (``Tapioca … ExpTxt=1``: x, y
+in both images), and XML files
 the measured (``SetOfMesureAppuisFlottants``) and given (``DicoAppuisFlottant``) control points. An integer
 image coordinate is the centre of a pixel, as ours.
 
@@ -28,7 +29,7 @@ from ..core.errors import FormatError
 from ..io import read_text
 from ..optics import camera_model
 from ..optics.poses import matrix_to_vector
-from .lines import network_of, numbers, read_head
+from .lines import network_of, numbers, read_bytes, read_head
 from .markup import Node, read_markup
 
 __all__ = ["is_micmac", "read_micmac"]
@@ -40,6 +41,12 @@ _SENSOR = 36.0
 # Powers of a length in the denominator of the coefficients.
 _POWER = {"P1": 1, "P2": 1} | {f"K{k}": 2 * k for k in range(1, 6)}
 _SIDES = {"eConvApero_DistM2C": "object", "eConvApero_DistC2M": "image"}
+
+
+# Binary files of homologous points, little-endian.
+_HEAD = np.dtype([("images", "<i4"), ("count", "<i4")])
+_MOST_MB = 500
+_PAIR = np.dtype([("images", "<i4"), ("weight", "<f8"), ("xy", "<f8", 4)])
 
 
 def is_micmac(folder: Path) -> bool:
@@ -67,7 +74,7 @@ def read_micmac(path: Path | str) -> Network:
         When a file cannot be read.
     FormatError
         When a file is not as described, the model of the distortion is another one, or there are no image
-        points: homologous points in binary files are not read.
+        points.
 
     Examples
     --------
@@ -122,7 +129,7 @@ def read_micmac(path: Path | str) -> Network:
     if not seen:
         raise FormatError(
             "has no image points beside it", where=path,
-            do="write homologous points as text (`ExpTxt=1`) to Homol, or add the measured control points",
+            do="put homologous points to Homol, or add the measured control points",
         )  # fmt: skip
     columns = np.array(seen, dtype=np.float64)
     xyz, sigma = np.full((len(names), 3), np.nan), np.full((len(names), 3), np.nan)
@@ -199,15 +206,12 @@ def _homologous(
 ) -> tuple[list[tuple[int, str, float, float]], tuple[str, ...]]:
     """Read the pairs of homologous points and join them to points: image, point, x, y."""
     ends = list[tuple[int, float, float]]()
-    for file in sorted(project.glob("Homol*/Pastis*/*.txt")):
-        pair = (file.parent.name.removeprefix("Pastis"), file.name.removesuffix(".txt"))
-        if not all(name in row_of for name in pair):
+    for file in sorted(project.glob("Homol*/Pastis*/*")):
+        one, other = file.parent.name.removeprefix("Pastis"), file.stem
+        if file.suffix not in (".txt", ".dat") or one not in row_of or other not in row_of:
             continue
-        for k, line in enumerate(read_text(file).splitlines(), start=1):
-            words = line.split()
-            if words:
-                x = numbers(words[:4], 4, file, k)
-                ends += [(row_of[pair[0]], x[0], x[1]), (row_of[pair[1]], x[2], x[3])]
+        for x in _binary_pairs(file) if file.suffix == ".dat" else _text_pairs(file):
+            ends += [(row_of[one], x[0], x[1]), (row_of[other], x[2], x[3])]
     if not ends:
         return [], ()
     unique, place = np.unique(np.array(ends), axis=0, return_inverse=True)
@@ -220,6 +224,28 @@ def _homologous(
     named = tuple(f"tie{t}" for t in np.flatnonzero(~ambiguous).tolist())
     found = [(int(unique[r, 0]), f"tie{track[r]}", float(unique[r, 1]), float(unique[r, 2])) for r in rows]
     return found, named
+
+
+def _text_pairs(file: Path) -> list[list[float]]:
+    """Read x, y in both images of each pair."""
+    lines = enumerate(read_text(file).splitlines(), start=1)
+    return [numbers(line.split()[:4], 4, file, k) for k, line in lines if line.strip()]
+
+
+def _binary_pairs(file: Path) -> list[list[float]]:
+    """Read the same from a binary file: 2 and the number of pairs, then 2, a weight, and x, y of each."""
+    content = read_bytes(file, _MOST_MB)
+    size = len(content) - _HEAD.itemsize
+    head = np.frombuffer(content, _HEAD, 1)[0] if size >= 0 else None
+    if head is None or head["images"] != 2 or size != head["count"] * _PAIR.itemsize:
+        raise FormatError(
+            "is no binary file of homologous points of two images, or is not complete", where=file
+        )
+    pairs = np.frombuffer(content, _PAIR, offset=_HEAD.itemsize)
+    if (pairs["images"] != 2).any() or not np.isfinite(pairs["xy"]).all():
+        raise FormatError("has damaged homologous points", where=file)
+    found: list[list[float]] = pairs["xy"].tolist()
+    return found
 
 
 def _twice(track: Rows, image: Array, count: int) -> Mask:

@@ -166,7 +166,16 @@ def read_foreign(path: Path | str) -> Network:
     if path.is_dir():
         if is_micmac(path):
             return read_micmac(path)
-        return read_openptv(path) if is_openptv(path) else read_colmap(path)
+        if is_openptv(path):
+            return read_openptv(path)
+        if not any((path / f"cameras.{kind}").exists() for kind in ("txt", "bin")):
+            raise FormatError(
+                "is not a folder of a known program",
+                where=path,
+                do="give a folder of COLMAP (cameras, images, points3D), of OpenPTV (with `parameters`), or "
+                "of MicMac (Ori-NAME)",
+            )
+        return read_colmap(path)
     if not path.exists():
         raise InputError("does not exist", where=path)
     head = read_head(path)

@@ -15,7 +15,6 @@ from ..core.data import Frame, Rows
 from ..core.figures import nice
 from ..core.numbers import aligned, at_power, measured, plain, power
 from ..core.provenance import Provenance
-from ..optics.cameras import unit_of
 from ..procedures.assessment import Assessment, sorted_remarks
 from .bundle_figures import distortion_figure, network_figure, next_figure, residual_figure
 from .bundle_tables import components_table, dropped_table, images_table, left_out_table, worst_points
@@ -208,7 +207,7 @@ def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any
                 "name": name,
                 "estimate": power(value, s),
                 "between": at_power(other, power(value, s)) if np.isfinite(other) else "–",
-                "unit": unit_text(unit_of(name, camera.model)),
+                "unit": unit_text(camera.unit_of(name)),
                 "statistic": "" if test is None else f"{test.statistic:.1f}",
                 "p": "" if test is None else f"{test.p:.3f}" if test.p >= 5e-4 else "< 0.001",
                 "verdict": "" if test is None or test.significant else "not significant",

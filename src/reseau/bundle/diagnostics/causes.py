@@ -88,7 +88,7 @@ def _camera(camera: Camera) -> list[Remark]:
         pitch = float(np.mean(camera.pitch_mm))
         diagonal = 2 * half * pitch
         views = {name: half * pitch / values[name] for name in scale}
-        if not _SENSORS[0] <= diagonal <= _SENSORS[1]:
+        if not camera.in_pixels and not _SENSORS[0] <= diagonal <= _SENSORS[1]:
             unit = "micrometres" if diagonal > _SENSORS[1] else "metres"
             factor = 1e-3 if unit == "micrometres" else 1e3
             guess = f"; is it given in {unit}?" if _within(diagonal * factor, _SENSORS) else ""
@@ -99,20 +99,20 @@ def _camera(camera: Camera) -> list[Remark]:
             views = {}
     else:
         pitch, views = 0.0, {name: half / values[name] for name in scale}
-    told = set[float]()
+    told, with_size = set[float](), model.needs_pitch and not camera.in_pixels
     for name, view in views.items():
         if _within(view, (_NARROWEST, _WIDEST)) or values[name] in told:
             continue
         told.add(values[name])
-        unit = model.units[name]
+        unit = camera.unit_of(name)
         size = f"{values[name]:g} {unit}"
-        across = f"{2 * half * pitch:.3g} mm" if model.needs_pitch else f"{2 * half:.0f} px"
+        across = f"{2 * half * pitch:.3g} mm" if with_size else f"{2 * half:.0f} px"
         side = "too short" if view > _WIDEST else "too long"
-        tries = {"metres": 1e3, "micrometres": 1e-3, "pixels": pitch} if model.needs_pitch else {}
+        tries = {"metres": 1e3, "micrometres": 1e-3, "pixels": pitch} if with_size else {}
         fits = [other for other, f in tries.items() if f and _within(view / f, (_NARROWEST, _WIDEST))]
         # Of several units the one that gives the most usual angle of view.
         fits.sort(key=lambda other: abs(np.log(view / tries[other] / 0.5)))
-        guess = f"; is it given in {fits[0]}?" if fits else "" if model.needs_pitch else "; give it in pixels"
+        guess = f"; is it given in {fits[0]}?" if fits else "" if with_size else "; give it in pixels"
         what = "focal length" if unit == "px" else "principal distance"
         found.append(f"the {what} of {size} is {side} for an image of {across}{guess}")
     named = {name: name for name in model.of_role("centre")}
@@ -120,8 +120,8 @@ def _camera(camera: Camera) -> list[Remark]:
         here = camera.bare_mapping(distorted=False)(np.zeros((1, 2)))[0]
         off = float(np.hypot(*(here - camera.grid.centre))) / half
         if off > _OFF_CENTRE:
-            at = ", ".join(f"{name} {values[name]:g} {model.units[name]}" for name in named)
-            guess = "; is it given in pixels?" if model.needs_pitch else ""
+            at = ", ".join(f"{name} {values[name]:g} {camera.unit_of(name)}" for name in named)
+            guess = "; is it given in pixels?" if with_size else ""
             found.append(
                 f"the principal point ({at}) is {off * half:.0f} px from the middle of the image{guess}"
             )

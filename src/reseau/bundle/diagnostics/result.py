@@ -16,7 +16,7 @@ from ...core.data import Array, Mask, Rows
 from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Remark
-from ...optics.cameras import distortion_names, unit_of
+from ...optics.cameras import distortion_names
 from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
 from ..network import Network
 from ..network.stage import perpendicular
@@ -201,7 +201,7 @@ class Result(Display):
         """Return the estimated parameters of the c-th camera of the network."""
         names, _, values = self.camera_columns(c)
         entry = self.network.cameras[c]
-        units = tuple(unit_of(name, entry.model) for name in names)
+        units = tuple(entry.unit_of(name) for name in names)
         return CameraEstimate(entry.id, names, values, self.camera_covariance(c), units)
 
     @cached_property

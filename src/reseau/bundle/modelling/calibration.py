@@ -10,7 +10,6 @@ import numpy as np
 
 from ...calibration.document import Calibration, CameraModel, Covariance, Place, Quantity
 from ...core.errors import UsageError
-from ...optics.cameras import unit_of
 from ...optics.poses import matrix_to_vector
 from ..diagnostics import Result, covariance_by_targets, sigma_between_images
 from ..network import Camera, Network
@@ -65,10 +64,10 @@ def calibration_of(
     covariance = result.camera_covariance(c)
     sigma = np.sqrt(np.diag(covariance))
     parameters = {
-        key: Quantity(value=value, sigma=0.0, unit=unit_of(key, entry.model))
+        key: Quantity(value=value, sigma=0.0, unit=entry.unit_of(key))
         for key, value in entry.parameters.items()
     } | {
-        key: Quantity(value=float(value), sigma=float(s), unit=unit_of(key, entry.model))
+        key: Quantity(value=float(value), sigma=float(s), unit=entry.unit_of(key))
         for key, value, s in zip(names, values, sigma, strict=True)
     }
     between = zip(names, sigma_between_images(result, c).tolist(), strict=True)

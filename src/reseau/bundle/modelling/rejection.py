@@ -33,6 +33,8 @@ _ROUGHLY = 1e-2
 _MOSTLY = 0.5
 # Image points with misfits above this multiple of the median are left out at first; number of rounds.
 _TRIM_LIMIT, _TRIM_ROUNDS = 5.0, 5
+# Multiple of the median above which misfits are beyond all measure.
+_ABSURD = 1e4
 # Times the number of test values that are expected above the critical value, from which on the shape of the
 # control is compared with the images before single points are rejected.
 _MORE = 2.0
@@ -81,15 +83,15 @@ def _careful(
         return found
     left: list[int] = []
     while bad := _bad_images(problem, found):
-        left += bad
         network = problem.network
         weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
         weights[: 2 * len(network.xy)][np.repeat(np.isin(network.image_of, bad), 2)] = 0.0
         problem = problem.continued(found.adjustment).with_weights(weights)
         again = _snooped(problem, alpha, max_fraction)
         if isinstance(again, Failure):
-            return again
+            break
         found = again
+        left += bad
     return found.adjustment, found.steps, left
 
 
@@ -101,6 +103,7 @@ def _snooped(problem: BundleProblem, alpha: float, max_fraction: float) -> Rejec
     """
     rough = replace(problem, tolerance=max(problem.tolerance, _ROUGHLY))
     first_fit = robust(rough, "huber", max_iterations=50, tolerance=_ROBUST_TOLERANCE)
+    first: BundleFit | Failure = Failure("", Code.NOT_CONVERGED)
     if not isinstance(first_fit, Failure):
         weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights
         start = rough.continued(first_fit.adjustment)
@@ -110,9 +113,31 @@ def _snooped(problem: BundleProblem, alpha: float, max_fraction: float) -> Rejec
             return _only_gross(problem, first, first_fit.factors)
     found = data_snooping(rough, alpha, "tau", max_fraction, groups=problem.groups)
     if isinstance(found, Failure):
+        # With all gross errors there may be no adjustment to begin with.
+        found = _beside_gross(
+            rough, found, None if isinstance(first, Failure) else first, alpha, max_fraction
+        )
+    if isinstance(found, Failure):
         return found
     last = problem.continued(found.adjustment).with_weights(found.adjustment.problem.weights).adjusted()
-    return last if isinstance(last, Failure) else replace(found, adjustment=last)
+    # In a very flat valley the rough one is the result; that it is rough is a warning.
+    return found if isinstance(last, Failure) else replace(found, adjustment=last)
+
+
+def _beside_gross(
+    problem: BundleProblem, failed: Failure, fit: BundleFit | None, alpha: float, max_fraction: float
+) -> Rejection[BundleFit] | Failure:
+    """Data snooping without the observations that robust estimation has left out, which are rejected."""
+    if fit is None or failed.code is Code.TOO_MANY_OUTLIERS or fit.problem.weights is None:
+        return failed
+    given = np.ones(len(problem.observations)) if problem.weights is None else problem.weights
+    gross = (fit.problem.weights == 0) & (given > 0)
+    if gross.sum() > max_fraction * (given > 0).sum():
+        return failed
+    found = data_snooping(
+        problem.with_weights(fit.problem.weights), alpha, "tau", max_fraction, groups=problem.groups
+    )
+    return found if isinstance(found, Failure) else replace(found, rejected=found.rejected | gross)
 
 
 def _is_bent(problem: BundleProblem, fit: BundleFit, alpha: float) -> bool:
@@ -161,7 +186,8 @@ def _trimmed(problem: BundleProblem) -> BundleProblem:
 
     Least squares may not converge with many gross errors (a fifth of the observations). The approximate
     values come from the largest consistent sets: image points far from them are left out until the estimates
-    improve.
+    improve. Those that are still beyond all measure have weight zero in the problem returned: an adjustment
+    with them would not converge.
     """
     n = len(problem.network.xy)
     out = np.ones(n, dtype=bool)
@@ -181,17 +207,28 @@ def _trimmed(problem: BundleProblem) -> BundleProblem:
         if isinstance(fit, Failure):
             break
         problem = problem.continued(fit)
-    return problem
+    size = np.sqrt((problem.misfits_at_start() ** 2).sum(axis=1))
+    known = np.isfinite(size)
+    absurd = known & (size > _ABSURD * max(1.0, float(np.median(size[known])))) if known.any() else ~known
+    if not absurd.any():
+        return problem
+    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
+    weights[: 2 * n][np.repeat(absurd, 2)] = 0.0
+    return problem.with_weights(weights)
 
 
 def suspects(problem: BundleProblem) -> Rows:
     """Image points with very small weights in a robust adjustment, the smallest first."""
     nothing: Rows = np.zeros(0, dtype=np.intp)
-    off = robust(_trimmed(problem), "huber", max_iterations=30, tolerance=0.3)
+    trimmed = replace(_trimmed(problem), tolerance=max(problem.tolerance, _ROUGHLY))
+    off = robust(trimmed, "huber", max_iterations=30, tolerance=0.3)
     if isinstance(off, Failure):
         return nothing
     n = len(problem.network.xy)
-    weight = off.factors[: 2 * n].reshape(n, 2).min(axis=1)
+    factors = off.factors if trimmed.weights is None else np.where(trimmed.weights > 0, off.factors, 0.0)
+    if problem.weights is not None:
+        factors = np.where(problem.weights > 0, factors, 1.0)
+    weight = factors[: 2 * n].reshape(n, 2).min(axis=1)
     rows = np.argsort(weight, kind="stable")
     return np.asarray(rows[weight[rows] < _GROSS_ERROR], dtype=np.intp)
 

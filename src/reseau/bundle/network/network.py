@@ -15,7 +15,7 @@ from ...core.display import Display
 from ...core.errors import UsageError
 from ...io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Network1
 from ...optics import CameraModel, PixelGrid, PlaneMapping, additional_model, camera_model
-from ...optics.cameras import distortion_names
+from ...optics.cameras import distortion_names, unit_of
 from ...optics.refraction import Refraction
 from .rig import Rig
 from .shutter import Shutter
@@ -182,6 +182,17 @@ class Camera:
     def label(self) -> str:
         """Name for messages."""
         return self.id if self.id == "camera" else f"camera {self.id}"
+
+    @property
+    def in_pixels(self) -> bool:
+        """Whether lengths are in pixels: with a pitch of one, where files say nothing of the pixel size."""
+        model = self.registered
+        return model is not None and model.needs_pitch and self.pitch_mm == (1.0, 1.0)
+
+    def unit_of(self, name: str) -> str:
+        """Unit of a parameter; pixels stand for millimetres where lengths are in pixels."""
+        unit = unit_of(name, self.model)
+        return unit.replace("mm", "px") if self.in_pixels else unit
 
     @property
     def parameters(self) -> dict[str, float]:

@@ -11,6 +11,7 @@ import scipy.linalg
 from ...core.data import Array, Mask, Rows
 from ..network import Camera
 from ..network.stage import perpendicular
+from .arrow import Singular
 from .stage_constraints import cross_matrix
 from .system import System
 from .unknowns import Unknowns
@@ -246,6 +247,8 @@ def held_for(freedom: Freedom, unknowns: Unknowns, diagonal: Array) -> Rows:
         return np.zeros(0, dtype=np.intp)
     scaled = freedom.reduced * np.sqrt(diagonal)[:, None]
     scaled = scaled / np.linalg.norm(scaled, axis=0)
+    if not np.isfinite(scaled).all():
+        raise Singular("the datum has no effect on the unknowns")
     # Orthogonalise first: some columns may be nearly parallel.
     basis, _ = np.linalg.qr(scaled)
     _, _, order = scipy.linalg.qr(basis.T, mode="economic", pivoting=True)
