@@ -61,6 +61,9 @@ def serve(
     proxy: Annotated[
         str, typer.Option(help="Public address of a proxy that ends TLS, as https://bench.example.org.")
     ] = "",
+    tiled: Annotated[
+        str, typer.Option(help="Server of tiled to publish bluesky's documents to; its key: TILED_API_KEY.")
+    ] = "",
     sign_key: Annotated[
         Path | None,
         typer.Option(
@@ -81,8 +84,8 @@ def serve(
     benches = [_placed(each) for each in bench or ()]
     options = ServeOptions(
         archive, objects, state, accounts, host, port, tuple(name or ()), certificate, key, proxy,
-        tuple(path for path, _ in benches), {path: at for path, at in benches if at is not None}, sign_key,
-        sign_certificate,
+        tuple(path for path, _ in benches), {path: at for path, at in benches if at is not None}, tiled,
+        sign_key, sign_certificate,
     )  # fmt: skip
 
     def ready(service: Service) -> None:

@@ -175,7 +175,8 @@ class Alarms:
             for run, k in zip(*drift.charts.alarm.nonzero(), strict=True):
                 direction = "increases" if drift.charts.alarm[run, k] > 0 else "decreases"
                 first = drift.keys[drift.charts.since(int(run), int(k))]
-                text = f"{name}: {drift.names[k]} {direction}, probably since calibration {first}"
+                which = next(d.name or f"of {d.since:%Y-%m-%d %H:%M}Z" for d in history if d.key == first)
+                text = f"{name}: {drift.names[k]} {direction}, probably since the calibration {which}"
                 found[f"drift {name} {drift.names[k]} {drift.keys[run]}"] = text
         return found
 

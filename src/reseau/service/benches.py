@@ -157,6 +157,8 @@ class BenchLink:
                 pause = min(2 * pause, _LONGEST_PAUSE_S)
                 continue
             pause = 0.1
+            # What an earlier worker said last is not true of this one, which has not said anything yet.
+            self._status = {}
             self._wire = wire
             self._told("up", {})
             try:

@@ -470,8 +470,7 @@ class Worker:
                 number += 1
                 facts = {
                     "number": number, "width": frame.width, "height": frame.height,
-                    # What is narrower than a step between two pixels is noise or a line, and no edge.
-                    "edge_px": round(edge, 2) if 0 < edge < float("inf") else None,
+                    "edge_px": None if edge == float("inf") else round(edge, 2),
                     "exposure": exposure_fault(frame, _limits()) or "good",
                     "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
                     "points": self._points(frame),

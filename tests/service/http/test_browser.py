@@ -10,10 +10,13 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -66,10 +69,15 @@ class Place:
 
         address: str = until(opened)
         self.port = int(address.partition("/  (")[0].rpartition(":")[2])
-        link = [*command[:3], "service", "link", "--port", str(self.port)]
+        return self.link()
+
+    def link(self) -> str:
+        """An address that lets a browser in."""
+        program = [sys.executable, "-c", "from reseau.cli import main; main()"]
         done = subprocess.run(
-            link, cwd=self.folder, env=self.environment, capture_output=True, text=True, check=True
-        )
+            [*program, "service", "link", "--port", str(self.port)], cwd=self.folder, env=self.environment,
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
         return done.stdout.strip()
 
     def kill(self) -> None:
@@ -111,10 +119,19 @@ def browser() -> Iterator[Browser]:
 
 
 def shot(browser: Browser, name: str) -> None:
+    """Keep a picture of the page for the documentation: its upper part, that of a desk at half its size."""
     folder = os.environ.get("RESEAU_SCREENSHOTS")
     if folder:
-        Path(folder).mkdir(exist_ok=True)
-        browser.screenshot(Path(folder) / f"{name}.png")
+        path = Path(folder) / f"{name}.png"
+        path.parent.mkdir(exist_ok=True)
+        browser.screenshot(path)
+        picture = cv2.imread(str(path))
+        assert picture is not None
+        wide = picture.shape[1] > 500
+        picture = picture[: 2200 if wide else 1300]
+        if wide:
+            picture = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(path), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
 def axe(browser: Browser) -> list[str]:
@@ -264,13 +281,15 @@ def test_pages_fit_a_phone_and_have_no_serious_finding_of_axe(place: Place, brow
     browser.open(f"{base}/calibrations/left")
     key = browser.run("return document.querySelector('#configuration tbody a').getAttribute('href')")
     found: dict[str, Any] = {}
-    paths = [
-        "/", "/benches/cellar", "/sessions", "/sessions/monday", "/sessions/monday/frames/2", "/calibrations",
-        "/calibrations/left", key, "/files", "/history", "/account", "/audit", "/login",
-    ]  # fmt: skip
+    paths = {
+        "overview": "/", "bench": "/benches/cellar", "sessions": "/sessions", "session": "/sessions/monday",
+        "frame": "/sessions/monday/frames/2", "calibrations": "/calibrations", "charts": "/calibrations/left",
+        "calibration": key, "files": "/files", "history": "/history", "account": "/account",
+        "audit": "/audit", "login": "/login",
+    }  # fmt: skip
     for width in (1280, 390):
         browser.resize(width, 844)
-        for path in paths:
+        for name, path in paths.items():
             browser.open(base + path)
             time.sleep(0.3)
             over = browser.run("return document.documentElement.scrollWidth - innerWidth")
@@ -278,8 +297,90 @@ def test_pages_fit_a_phone_and_have_no_serious_finding_of_axe(place: Place, brow
             if findings := axe(browser):
                 found[f"{path} {width}"] = findings
             if width == 390:
-                shot(browser, f"phone{path.replace('/', '-')}"[:40])
+                time.sleep(1.0)
+                shot(browser, f"service-{name}-phone")
     assert found == {}, json.dumps(found, indent=1)
+
+
+class Cutting:
+    """A proxy on the address ::1 that cuts every connection again and again."""
+
+    def __init__(self, port: int, seconds: float) -> None:
+        self._port, self._seconds, self._pairs = port, seconds, set[tuple[socket.socket, socket.socket]]()
+        self._over, self.cut = threading.Event(), 0
+        self._server = socket.create_server(("::1", port), family=socket.AF_INET6)
+        for work in (self._accept, self._cut):
+            threading.Thread(target=work, daemon=True).start()
+
+    def _accept(self) -> None:
+        while not self._over.is_set():
+            with suppress(OSError):
+                here, _ = self._server.accept()
+                there = socket.create_connection(("127.0.0.1", self._port))
+                self._pairs.add((here, there))
+                for a, b in ((here, there), (there, here)):
+                    threading.Thread(target=self._pass, args=(a, b), daemon=True).start()
+
+    def _pass(self, source: socket.socket, target: socket.socket) -> None:
+        with suppress(OSError):
+            while part := source.recv(1 << 16):
+                target.sendall(part)
+        for each in (source, target):
+            with suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+
+    def _cut(self) -> None:
+        while not self._over.wait(self._seconds):
+            for pair in list(self._pairs):
+                self._pairs.discard(pair)
+                self.cut += 1
+                for each in pair:
+                    with suppress(OSError):
+                        each.shutdown(socket.SHUT_RDWR)
+                    each.close()
+
+    def close(self) -> None:
+        self._over.set()
+        self._server.close()
+
+
+def position(browser: Browser) -> str:
+    """The tilt as the page shows it."""
+    rows = browser.text("#axes-title + div").splitlines()
+    return next((row.split("\t")[1] for row in rows if row.startswith("tilt")), "")
+
+
+def test_two_browsers_show_the_same_bench_also_where_connections_are_cut(
+    place: Place, browser: Browser
+) -> None:
+    if place.running is None or place.running.poll() is not None:
+        browser.open(place.start())
+    seconds = float(os.environ.get("RESEAU_CUT_S", "4"))
+    proxy = Cutting(place.port, seconds)
+    try:
+        with chromium() as other:
+            other.open(place.link().replace("127.0.0.1", "[::1]"))
+            other.open(f"http://[::1]:{place.port}/benches/cellar")
+            browser.resize(1280, 900)
+            browser.open(f"http://127.0.0.1:{place.port}/benches/cellar")
+            for page in (browser, other):
+                page.until("tilt", "#state", 60)
+            for number in range(4):
+                jogs = browser if number % 2 else other
+                before = position(browser)
+                button = "+1 deg, tilt" if number < 2 else "-1 deg, tilt"
+                until(lambda jogs=jogs: jogs.text("#state").startswith("ready"), 60)
+                jogs.click(f'button[aria-label="{button}"]')
+                until(lambda before=before: position(browser) not in ("", before), 60)
+                until(lambda: position(other) == position(browser), 60)
+                time.sleep(seconds)
+            cut = proxy.cut
+            browser.click("button.stop")
+            until(lambda: proxy.cut > cut, 60)
+            until(lambda: position(other) == position(browser), 60)
+            assert other.text("#state").startswith("ready")
+    finally:
+        proxy.close()
 
 
 def test_a_login_that_ends_leads_to_the_login(place: Place, browser: Browser) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import ssl
 import subprocess
+import warnings
 from pathlib import Path
 
 import httpx
@@ -14,6 +15,7 @@ from reseau.archive import Archive
 from reseau.service.client import Client
 from reseau.service.http.options import ServeOptions
 from reseau.service.http.service import Service
+from reseau.service.tiled import TiledPublisher
 
 from .served import PASSWORD, Served, process
 
@@ -67,3 +69,25 @@ def test_requests_over_tls(tmp_path: Path) -> None:
             http.get(address)
         with pytest.raises(httpx.HTTPError), httpx.Client() as http:
             http.get(address.replace("https", "http")).raise_for_status()
+
+
+def test_documents_of_bluesky_are_published_to_tiled_once(archived: Path, tmp_path: Path) -> None:
+    pytest.importorskip("tiled.server", reason="needs tiled (pip install 'tiled[server,client]')")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from tiled.catalog import in_memory
+        from tiled.client import Context, from_context
+        from tiled.server.app import build_app
+
+        places = [str(tmp_path / "files"), f"duckdb:///{tmp_path}/tables.db"]
+        with Context.from_app(build_app(in_memory(writable_storage=places))) as context:
+            client = from_context(context)
+            with Archive.open(archived / "archive") as archive:
+                publisher = TiledPublisher(archive, "", client)
+                assert publisher.look() == 1
+                assert publisher.look() == 0
+                (run,) = client.values()
+                assert run.metadata["start"]["session"] == "monday"
+                assert run.metadata["stop"]["exit_status"] == "success"
+                steps = list(run["primary"].read()["step"].values)
+    assert steps == ["frontal", "right", "down", "left"]

@@ -39,6 +39,8 @@ class ServeOptions:
         Files of benches.
     workers : mapping of Path to (str, int)
         Address and port of the workers of benches on other machines, by the file of the bench.
+    tiled : str
+        Address of a server of tiled to which bluesky's documents are published; empty: none.
     signing_key, signing_certificate : Path, optional
         Private key and certificate (PEM) with which certificates of calibrations are signed.
 
@@ -68,6 +70,7 @@ class ServeOptions:
     proxy: str = ""
     benches: tuple[Path, ...] = field(default_factory=tuple)
     workers: Mapping[Path, tuple[str, int]] = field(default_factory=dict)
+    tiled: str = ""
     signing_key: Path | None = None
     signing_certificate: Path | None = None
 

@@ -24,6 +24,7 @@ from .options import ServeOptions
 
 if TYPE_CHECKING:
     from ..benches import BenchLink
+    from ..tiled import TiledPublisher
 
 __all__ = ["Service"]
 
@@ -93,6 +94,11 @@ class Service:
                 raise UsageError("is the name of several benches", where=link.name, do="rename one")
             self.benches[link.name] = link
             self._names[path] = link.name
+        self.tiled: TiledPublisher | None = None
+        if options.tiled:
+            from ..tiled import TiledPublisher
+
+            self.tiled = TiledPublisher(self.archive, options.tiled)
         self._seen = self.archive.heads()  # what is stored from now on is an event
         self.started = time.time()
         self._entries: dict[str, float] = {}
@@ -106,12 +112,16 @@ class Service:
         self._watcher.start()
         threading.Thread(target=_load_the_rest, name="load", daemon=True).start()
         self.jobs.start(self.archive)
+        if self.tiled is not None:
+            self.tiled.start()
         for each in self.benches.values():
             each.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._over.set()
+        if self.tiled is not None:
+            self.tiled.close()
         for each in self.benches.values():
             each.close()
         self.jobs.close()

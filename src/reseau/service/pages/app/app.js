@@ -206,6 +206,11 @@ if (document.querySelector('[data-live]') || document.querySelector('[data-bench
 }
 for (const live of document.querySelectorAll('[data-live]')) live.dataset.was = live.innerHTML;
 
+function edges(px) {
+  if (px === null) return 'no edges';
+  return px < 0.3 ? 'sharpest edges narrower than a pixel' : `sharpest edges ${px} px`;
+}
+
 // The live picture: fetched again and again while the page is visible.
 const picture = document.querySelector('[data-bench]');
 if (picture) {
@@ -233,7 +238,7 @@ if (picture) {
               circle.setAttribute('r', facts.width / 130);
               return circle;
             }));
-            words.textContent = `exposure ${facts.exposure}; ${facts.edge_px === null ? 'no sharp edges' : `sharpest edges ${facts.edge_px} px`}; ${facts.points.length} points found; ${facts.at.slice(11, 19)} UTC`;
+            words.textContent = `exposure ${facts.exposure}; ${edges(facts.edge_px)}; ${facts.points.length} points found; ${facts.at.slice(11, 19)} UTC`;
           }
         }
       }
