@@ -104,6 +104,23 @@ def test_a_printed_board_calibrates_a_camera_whose_result_opencv_uses(
     assert np.abs(own - expected).max() < 0.15
 
 
+def keep(picture: Pixels, path: Path, suffix: str) -> None:
+    """Write a photograph as telephones and cameras do: turned for the viewer by its file, 16 bits, HEIC."""
+    path = path.with_suffix(suffix)
+    if suffix == ".jpg":
+        from PIL import Image
+
+        turned = Image.Exif()
+        turned[0x0112] = 6
+        Image.fromarray(picture).convert("RGB").save(path, quality=97, exif=turned)
+    elif suffix == ".heic":
+        heif = pytest.importorskip("pillow_heif")
+        heif.from_bytes("L", picture.shape[::-1], picture.tobytes()).save(str(path), quality=97)
+    else:
+        scale = 257 if suffix == ".TIF" else 1
+        cv2.imwrite(str(path), picture.astype(np.uint16) * scale if scale > 1 else picture)
+
+
 @pytest.mark.slow
 def test_the_target_is_found_among_the_designs_beside_the_photographs(
     reseau: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -117,14 +134,21 @@ def test_the_target_is_found_among_the_designs_beside_the_photographs(
     sheet, rng = print_out(tmp_path / "charuco.pdf"), np.random.default_rng(2)
     photos = tmp_path / "photos"
     photos.mkdir()
-    for k, pose in enumerate(poses(4, PAPER, rng)):
-        cv2.imwrite(str(photos / f"{k}.png"), photograph(sheet, lens, lens.rays(), pose, rng, noise=1.0))
+    pictures = [photograph(sheet, lens, lens.rays(), pose, rng, noise=1.0) for pose in poses(4, PAPER, rng)]
+    for k, picture in enumerate(pictures):
+        keep(picture, photos / str(k), (".png", ".jpg", ".heic", ".TIF")[k])
+    (photos / "cut.jpg").write_bytes((photos / "1.jpg").read_bytes()[:3000])
+    (photos / "notes.txt").write_text("f/8")
     status, out, err = reseau("calibrate", photos, "--design", "auto", "--jobs", 1)
     assert status == 0
+    assert "4 images" in out
+    assert [line for line in out.splitlines() if line.startswith("left out")] == [
+        "left out: cut.jpg: is a truncated image"
+    ]
     assert "note: the target is" in err
     assert "charuco" in err
     assert abs(float(out.split("fx")[1].split()[0]) - 300.0) < 3.0
-    status, _, err = reseau("calibrate", tmp_path / "photos" / "0.png", "--design", tmp_path / "none.json")
+    status, _, err = reseau("calibrate", photos / "0.png", "--design", tmp_path / "none.json")
     assert status == 2
     assert "none.json" in err
 
