@@ -377,8 +377,8 @@ class CameraDriver(Device[S]):
         patterns cancel. Cover the lens to measure the dark noise.
         """
         deadline = Deadline(self._seconds if seconds is None else seconds)
-        found = {"identity": str(self.connect(deadline.left or 1e-3))}
-        shots = list(self.frames(_CHECKED, deadline.left or 1e-3))
+        found = {"identity": str(self.connect(deadline.left_or_minimum))}
+        shots = list(self.frames(_CHECKED, deadline.left_or_minimum))
         elapsed = (shots[-1].taken - shots[0].taken).total_seconds()
         steps = shots[-1].sequence - shots[0].sequence
         height, width = shots[0].pixels.shape
@@ -391,7 +391,7 @@ class CameraDriver(Device[S]):
         before, shortest = self.settings, self._source.dark(self.settings)
         try:
             self.configure(**_differences(before, shortest))
-            one, two = (self.expose(deadline.left or 1e-3).pixels.astype(np.float64) for _ in range(2))
+            one, two = (self.expose(deadline.left_or_minimum).pixels.astype(np.float64) for _ in range(2))
         finally:
             self.configure(**_differences(shortest, before))
         noise = (one - two).std() / np.sqrt(2)
@@ -399,7 +399,7 @@ class CameraDriver(Device[S]):
         return found
 
     def _exchanged(self, ask: Callable[[Deadline], str], command: str, deadline: Deadline) -> str:
-        with self._exchange(command, deadline.left or 1e-3) as part:
+        with self._exchange(command, deadline.left_or_minimum) as part:
             return ask(part)
 
 

@@ -179,6 +179,8 @@ class Acquisition:
         self._verdicts: dict[int, Verdict] = {}
         self._last: ArchivedFrame | None = None
         self._at_rest = False
+        self.doing = ""
+        """What is under way, in words."""
         self._silent: frozenset[str] = frozenset()
         self._original_us: float | None = None
 
@@ -438,6 +440,7 @@ class Acquisition:
     def _exposed(
         self, step: Step, average: int, source: Callable[[], Exposure] | None = None
     ) -> ArchivedFrame:
+        self.doing = f"the frame of {step.name}"
         for take in range(self.retakes + 1):
             frame = self.session.find(step.name, "frame", take) or self._taken(step, take, average, source)
             verdict = self._judged(frame, step)
@@ -455,6 +458,7 @@ class Acquisition:
             If an axis does not arrive.
         """
         table: Turntable = self.one(Turntable)
+        self.doing = f"the move to {' '.join(f'{axis} {value:g}' for axis, value in position.items())}"
         self._persist(lambda: by_hand.move(table, position))
 
     def home_axes(self) -> None:
@@ -462,6 +466,7 @@ class Acquisition:
         table: Turntable = self.one(Turntable)
         for axis in table.axes:
             if not self._persist(lambda axis=axis: table.state(axis)).homed:  # type: ignore[misc]
+                self.doing = f"the reference of {axis}"
                 self.watch("home", {"axis": axis})
                 self._persist(lambda axis=axis: table.home(axis))  # type: ignore[misc]
 
@@ -570,6 +575,7 @@ class Acquisition:
             For another kind of picture.
         """
         with self._busy:
+            self.doing = f"the {kind} of {step.name}"
             stored = self.session.find(step.name, kind)
             picture = self._pictured(step, kind) if stored is None else stored
             self.watch("picture", {"step": step.name, "kind": kind, "there": stored is not None})
@@ -614,6 +620,7 @@ class Acquisition:
     def choose_pose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
         """Return the pose that the procedure chooses; in a resumed session the pose that it had chosen."""
         with self._busy:
+            self.doing = "the choice of the next pose"
             key = f"choice among {len(candidates)}"
             names = {step.name: step for step in candidates}
             for made in (note for _, note in self.session.notes("choice") if note["key"] == key):
@@ -630,6 +637,7 @@ class Acquisition:
         """Report what a pose would bring for the first parameter, if the procedure can predict it."""
         assert self.procedure is not None
         with self._busy:
+            self.doing = f"the prediction for {step.name}"
             reached = next(iter(self.procedure.progress()), "")
             parameter = reached.removeprefix("sigma_")
             if not reached or reached == "sigma0":

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import logging
 import queue
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -97,7 +99,7 @@ def carry_out(
     try:
         run.ready()
         with one_thread():  # the same sums for any number of processors
-            with contextlib.redirect_stdout(sys.stderr), _ended_by_signals(engine, ended, in_main):
+            with contextlib.redirect_stdout(_Prints()), _ended_by_signals(engine, ended, in_main):
                 outcome = _engaged(engine, _whole(run, ended.heeded(plan), park or {}), paused, ended)
             run.settle()
             status = "stopped" if outcome is None else "done"
@@ -191,13 +193,56 @@ def _engine(run: Acquisition, in_main: bool) -> Any:
     engine: Any = RunEngine(
         {},
         call_returns_result=True,
-        context_managers=None if in_main else [],
+        context_managers=[lambda engine: _Interrupts(engine, run)] if in_main else [],
         during_task=_Awake(),  # type: ignore[no-untyped-call]
     )
     for name, command in run.commands.items():
         engine.register_command(name, command)
     engine.subscribe(_Recorder(run.session))
     return engine
+
+
+class _Prints(io.TextIOBase):
+    """Passes on what a plan prints, to standard error, but not what the engine prints about itself."""
+
+    _ENGINE = ("Pausing...", "Deferred pause", "Stopping: running", "Aborting: running", "Halting: skipping")
+
+    def __init__(self) -> None:
+        self._line = ""
+
+    def write(self, text: str) -> int:
+        *lines, self._line = (self._line + text).split("\n")
+        for line in lines:
+            if not line.startswith(self._ENGINE):
+                sys.stderr.write(line + "\n")
+        return len(text)
+
+
+class _Interrupts:
+    """Ctrl-C pauses after the present pose, pressed again at once; the fifth time it interrupts Python."""
+
+    def __init__(self, engine: Any, run: Acquisition) -> None:
+        self._engine, self._run = engine, run
+        self._pressed, self._last = 0, 0.0
+        self._before: Any = None
+
+    def __enter__(self) -> None:
+        self._before = signal.signal(signal.SIGINT, self._on_press)
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGINT, self._before)
+
+    def _on_press(self, *_: object) -> None:
+        now = time.monotonic()
+        if now - self._last < 0.1:  # a terminal may send it to the whole group of processes, twice
+            return
+        self._pressed, self._last = self._pressed + 1, now
+        if self._pressed > 4:
+            raise KeyboardInterrupt
+        soft = self._pressed == 1
+        self._run.watch("interrupt", {"at_once": not soft, "waits_for": self._run.doing})
+        with contextlib.suppress(Exception):  # it may have paused or ended already
+            self._engine.request_pause(defer=soft)
 
 
 class _Awake(DuringTask):

@@ -138,6 +138,11 @@ class Display:
             return f"next pose {facts['step']}{tail}" if facts["step"] else "no pose is left"
         if kind == "check":
             return "checks: " + ("; ".join(facts["faults"]) or "passed")
+        if kind == "interrupt":
+            waits = f"pausing after {facts['waits_for'] or 'this step'}; Ctrl-C again pauses at once"
+            return "pausing at once" if facts["at_once"] else waits
+        if kind == "home":
+            return f"homing {facts['axis']}"
         if kind == "asked":
             return f"asked {facts['operator']}: {facts['request']}"
         if kind == "verdict":

@@ -4,10 +4,22 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Self
 
 from ..core.errors import UsageError
 
 __all__ = ["Deadline"]
+
+
+class _Remaining(float):
+    """What is left of a time limit (s), which messages name as a whole."""
+
+    whole: float
+
+    def __new__(cls, seconds: float, whole: float) -> Self:
+        found = super().__new__(cls, seconds)
+        found.whole = whole
+        return found
 
 
 class Deadline:
@@ -16,7 +28,8 @@ class Deadline:
     Parameters
     ----------
     seconds : float
-        Time from now (s).
+        Time from now (s). Of what another deadline has left, messages name the whole: that is what the caller
+        has set.
 
     Raises
     ------
@@ -28,6 +41,8 @@ class Deadline:
     >>> deadline = Deadline(10.0)
     >>> deadline.expired, deadline.at_most(0.5)
     (False, 0.5)
+    >>> Deadline(deadline.left_or_minimum).seconds
+    10.0
     """
 
     def __init__(self, seconds: float) -> None:
@@ -35,7 +50,8 @@ class Deadline:
             raise UsageError(
                 f"{seconds} s is not a valid time limit: give a positive, finite time", where="deadline"
             )
-        self.seconds = seconds
+        self.seconds = getattr(seconds, "whole", seconds)
+        """The time limit that messages name (s)."""
         self._at = time.monotonic() + seconds
 
     @property
@@ -55,8 +71,8 @@ class Deadline:
     @property
     def left_or_minimum(self) -> float:
         """Remaining time (s), at least 1 ms: a valid deadline for a further call."""
-        return max(1e-3, self.left)
+        return _Remaining(max(1e-3, self.left), self.seconds)
 
     def part(self, seconds: float) -> Deadline:
         """Return a deadline for a part of the call; it is never later than this one."""
-        return Deadline(max(1e-3, self.at_most(seconds)))
+        return Deadline(self.left_or_minimum if self.left < seconds else seconds)

@@ -196,7 +196,7 @@ class Device(ABC, Generic[S]):
     def check(self, seconds: float | None = None) -> dict[str, str]:
         """Run the self-test: identity, firmware and the tests of the driver, within one time limit."""
         deadline = Deadline(self._seconds if seconds is None else seconds)
-        found = self.connect(deadline.left)
+        found = self.connect(deadline.left_or_minimum)
         identity = " ".join(part for part in (found.maker, found.model, found.serial) if part)
         result = {"identity": identity or "unknown", "firmware": found.firmware or "not reported"}
         return result | self._test(deadline)
