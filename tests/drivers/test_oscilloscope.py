@@ -9,6 +9,7 @@ import subprocess
 import threading
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,20 @@ def test_screen_and_waveform_of_every_family(family: str) -> None:
         assert not machine.running
         assert device.check()["dialect"] == device.dialect.name
     assert machine.violations == []
+
+
+def test_an_unknown_model_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("reseau_drivers.oscilloscope.scope._TRIAL_S", 0.3)
+    device, machine = scope("keysight", seconds=5.0)
+    machine._like = replace(machine._like, idn="KEYSIGHT TECHNOLOGIES,QX9000,MY1,1")
+    with device:
+        assert device.dialect is not None
+        assert device.dialect.name == "Keysight InfiniiVision X"
+        assert (device.screen().frame().pixels == machine.screen()).all()
+    device, machine = scope("rohde", seconds=5.0)
+    machine._like = replace(machine._like, idn="RIGOL TECHNOLOGIES,QX1,1,1")
+    with pytest.raises(ProtocolError, match="in none of the known dialects"):
+        device.connect()
 
 
 @pytest.mark.parametrize("transport", ["tcp", "vxi-11", "hislip"])
@@ -129,10 +144,26 @@ def test_dialects_are_chosen_by_identity() -> None:
         "RIGOL TECHNOLOGIES,MSO5074,M,1": "Rigol",
         "RIGOL TECHNOLOGIES,MSO1104Z,M,1": "Rigol 1000Z",
         "AGILENT TECHNOLOGIES,DSO-X 2024A,M,1": "Keysight InfiniiVision X",
+        "KEYSIGHT TECHNOLOGIES,DSOX3024T,M,1": "Keysight InfiniiVision X",
+        "KEYSIGHT TECHNOLOGIES,MXR608A,M,1": "Keysight Infiniium",
+        "KEYSIGHT TECHNOLOGIES,DSOS254A,M,1": "Keysight Infiniium",
+        "Siglent Technologies,SDS814X HD,S,1": "Siglent with PRINt",
+        "Siglent Technologies,SDS3104X HD,S,1": "Siglent with PRINt",
+        "Siglent Technologies,SDS2354X Plus,S,1": "Siglent with PRINt",
     }.items():
-        assert dialect_of(idn).name == name
-    with pytest.raises(ProtocolError, match="set the option dialect"):
-        dialect_of("ACME,X1,1,1")
+        found = dialect_of(idn)
+        assert found is not None
+        assert found.name == name
+    for idn in (
+        "Keysight Technologies,34465A,M,1",
+        "Siglent Technologies,SDM3065X,S,1",
+        "RIGOL TECHNOLOGIES,DM3068,M,1",
+        "TEKTRONIX,AFG31052,C,1",
+        "Rohde&Schwarz,HMC8012,1,1",
+    ):
+        with pytest.raises(ProtocolError, match="is no oscilloscope"):
+            dialect_of(idn)
+    assert dialect_of("ACME,X1,1,1") is None
     assert len({dialect.name for dialect in DIALECTS}) == len(DIALECTS)
     with pytest.raises(SettingError):
         oscilloscope("scope", "tcp://127.0.0.1:1", dialect="none")

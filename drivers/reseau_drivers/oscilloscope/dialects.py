@@ -19,7 +19,16 @@ import numpy as np
 from reseau.core.data import Array
 from reseau.core.errors import ProtocolError
 
-__all__ = ["DIALECTS", "Dialect", "Step", "WaveformDialect", "dialect_of", "fields_of", "samples_of"]
+__all__ = [
+    "DIALECTS",
+    "Dialect",
+    "Step",
+    "WaveformDialect",
+    "candidates_of",
+    "dialect_of",
+    "fields_of",
+    "samples_of",
+]
 
 Numbers = dict[str, float]
 Step = tuple[Literal["send", "query", "fetch"], str]
@@ -96,7 +105,7 @@ class Dialect:
 
     Examples
     --------
-    >>> [step for step, _ in DIALECTS[0].screen]
+    >>> [step for step, _ in DIALECTS[1].screen]
     ['send', 'fetch']
     """
 
@@ -117,6 +126,13 @@ _KEYSIGHT = WaveformDialect(
     MappingProxyType({_TEN: ":WAVeform:PREamble?"}),
     ":WAVeform:DATA?",
     "u1",
+    lambda codes, f: (codes - f["yref"]) * f["dy"] + f["y0"],
+)
+_INFINIIUM = WaveformDialect(
+    (":WAVeform:SOURce CHANnel{n}", ":WAVeform:FORMat BYTE", ":WAVeform:STReaming OFF"),
+    MappingProxyType({_TEN: ":WAVeform:PREamble?"}),
+    ":WAVeform:DATA?",
+    "i1",
     lambda codes, f: (codes - f["yref"]) * f["dy"] + f["y0"],
 )
 _RIGOL = WaveformDialect(
@@ -188,8 +204,14 @@ _ROHDE = WaveformDialect(
 
 DIALECTS: tuple[Dialect, ...] = (
     Dialect(
+        "Keysight Infiniium",
+        r"(KEYSIGHT|AGILENT|HEWLETT).*,((MXR|EXR|UXR)\d|(DSO|MSO|DSA)(S|V|Z|X?9)\d).*",
+        (("fetch", ":DISPlay:DATA? PNG,SCReen,ON,NORMal"),),
+        _INFINIIUM,
+    ),
+    Dialect(
         "Keysight InfiniiVision X",
-        r"(KEYSIGHT|AGILENT).*,(DSO|MSO|EDU|DSOX|MSOX|MXR)?.*",
+        r"(KEYSIGHT|AGILENT).*,((DSO|MSO|EDU)-?X ?[1-6]\d{3}|(DSO|MSO)[5-7]\d{3}|HD3\d|M924|P924).*",
         (("send", ":HARDcopy:INKSaver OFF"), ("fetch", ":DISPlay:DATA? PNG, COLor")),
         _KEYSIGHT,
     ),
@@ -199,10 +221,10 @@ DIALECTS: tuple[Dialect, ...] = (
         (("fetch", ":DISPlay:DATA? ON,0,PNG"),),
         _RIGOL,
     ),
-    Dialect("Rigol", r"RIGOL.*", (("fetch", ":DISPlay:DATA?"),), _RIGOL),
+    Dialect("Rigol", r"RIGOL.*,(DS|MSO|DHO|MHO|HDO)\d.*", (("fetch", ":DISPlay:DATA?"),), _RIGOL),
     Dialect(
         "Siglent with PRINt",
-        r"SIGLENT.*,SDS(2\d{3}X (Plus|HD)|1\d{3}X HD|[567]\d{3}).*",
+        r"SIGLENT.*,SDS(\d+X (Plus|HD)|[567]\d{3}).*",
         (("fetch", "PRINt? PNG"),),
         _SIGLENT_BLOCK,
         setup=("CHDR OFF",),
@@ -210,7 +232,13 @@ DIALECTS: tuple[Dialect, ...] = (
         errors="",
     ),
     Dialect(
-        "Siglent", r"SIGLENT.*", (("fetch", "SCDP"),), _SIGLENT, setup=("CHDR OFF",), halt="STOP", errors=""
+        "Siglent",
+        r"SIGLENT.*,SDS\d.*",
+        (("fetch", "SCDP"),),
+        _SIGLENT,
+        setup=("CHDR OFF",),
+        halt="STOP",
+        errors="",
     ),
     Dialect(
         "Tektronix with a file system",
@@ -228,7 +256,7 @@ DIALECTS: tuple[Dialect, ...] = (
     ),
     Dialect(
         "Tektronix",
-        r"TEKTRONIX.*",
+        r"TEKTRONIX,(MSO|DPO|MDO|TDS|TBS|TPS|DSA|CSA) ?\d.*",
         (
             ("send", "SAVe:IMAGe:FILEFormat PNG"),
             ("send", "HARDCopy:INKSaver OFF"),
@@ -254,13 +282,13 @@ DIALECTS: tuple[Dialect, ...] = (
     ),
     Dialect(
         "Rohde & Schwarz",
-        r"(ROHDE&SCHWARZ|HAMEG).*",
+        r"(ROHDE&SCHWARZ|HAMEG),(RTB|RTM|RTA|RTC|RTH|HMO)\d?.*",
         (("send", "HCOPy:FORMat PNG"), ("fetch", "HCOPy:DATA?")),
         _ROHDE,
     ),
     Dialect(
         "LeCroy",
-        r"LECROY.*",
+        r"LECROY,(?!WAVESTATION|T3|WS\d{4}).*",
         (
             ("send", "CHDR OFF"),
             ("send", "HCSU DEV,PNG,BCKG,BLACK,AREA,DSOWINDOW,DEST,REMOTE"),
@@ -272,13 +300,51 @@ DIALECTS: tuple[Dialect, ...] = (
 )
 
 
-def dialect_of(identity: str) -> Dialect:
-    """Return the dialect of an instrument by its answer to ``*IDN?``.
+_MAKERS = {
+    "Keysight": r"KEYSIGHT|AGILENT|HEWLETT",
+    "Rigol": r"RIGOL",
+    "Siglent": r"SIGLENT",
+    "Tektronix": r"TEKTRONIX",
+    "Rohde & Schwarz": r"ROHDE|HAMEG",
+    "LeCroy": r"LECROY|TELEDYNE",
+}
+_OTHER = re.compile(
+    r"(KEYSIGHT|AGILENT|HEWLETT).*,(34|U?12|U34|L44|EDU3[46]|3[35]\d|N\d|E\d)|RIGOL.*,(DM|DG|DP|DSA|DL|RSA)\d"
+    r"|SIGLENT.*,(SDM|SDG|SPD|SSA|SSG|SVA|SDL)|TEKTRONIX,(DMM|AFG|AWG|PWS|RSA|PA)"
+    r"|ROHDE&SCHWARZ,(HMC|NG|FP|FS|SM|HMP|UDS)|LECROY,(WAVESTATION|T3|WS\d{4}).*|KEITHLEY.*",
+    re.IGNORECASE,
+)
+"""Multimeters, generators, supplies and analyzers of the same makers."""
+
+
+def candidates_of(identity: str) -> tuple[Dialect, ...]:
+    """Return the dialects that an instrument of an unknown model may have: those of its maker, or all.
 
     Raises
     ------
     ProtocolError
-        If no dialect matches.
+        If it is known to be no oscilloscope.
+
+    Examples
+    --------
+    >>> [dialect.name for dialect in candidates_of("RIGOL TECHNOLOGIES,XYZ9,1,1")]
+    ['Rigol 1000Z', 'Rigol']
+    """
+    if _OTHER.match(identity.strip()):
+        raise ProtocolError(f"{identity!r} is no oscilloscope", do="check the address")
+    for maker, pattern in _MAKERS.items():
+        if re.match(pattern, identity.strip(), re.IGNORECASE):
+            return tuple(dialect for dialect in DIALECTS if dialect.name.startswith(maker))
+    return DIALECTS
+
+
+def dialect_of(identity: str) -> Dialect | None:
+    """Return the dialect of an instrument by its answer to ``*IDN?``; None if its model is not known.
+
+    Raises
+    ------
+    ProtocolError
+        If it is known to be no oscilloscope.
 
     Examples
     --------
@@ -288,7 +354,8 @@ def dialect_of(identity: str) -> Dialect:
     for dialect in DIALECTS:
         if re.match(dialect.identity, identity.strip(), re.IGNORECASE):
             return dialect
-    raise ProtocolError(f"no dialect is known for {identity!r}", do="set the option dialect")
+    candidates_of(identity)
+    return None
 
 
 def fields_of(block: bytes, dialect: WaveformDialect) -> Numbers:

@@ -15,10 +15,12 @@ from reseau.instruments.values import now
 from ..codecs.ieee488 import LARGEST, error_entry, missing_bytes, parse_block, picture
 from ..codecs.stream import excerpt
 from ..link import Link
-from .dialects import Dialect, WaveformDialect, dialect_of, fields_of, samples_of
+from .dialects import Dialect, WaveformDialect, candidates_of, dialect_of, fields_of, samples_of
 
 __all__ = ["Oscilloscope", "OscilloscopeSettings"]
 
+_TRIAL_S = 3.0
+"""Time in which an instrument of an unknown model must send a picture."""
 _LONGEST_LINE = 65536
 
 
@@ -87,7 +89,27 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         self._idn = self._query("*IDN?", deadline)
         if self._idn.count(",") < 2:
             raise ProtocolError(f"{self._idn!r} is not a valid answer to *IDN?")
-        self._dialect = self._forced_dialect or dialect_of(self._idn)
+        self._dialect = self._forced_dialect or dialect_of(self._idn) or self._asked(deadline)
+
+    def _asked(self, deadline: Deadline) -> Dialect:
+        """Find the dialect of an unknown model: the one in which it sends a picture."""
+        for dialect in candidates_of(self._idn):
+            trial = Deadline(min(_TRIAL_S, deadline.left_or_minimum))
+            try:
+                for command in dialect.setup:
+                    self._send(command, trial)
+                if self._picture_of(dialect, trial):
+                    return dialect
+            except (DeadlineError, ProtocolError):
+                # What it may still say belongs to no later question.
+                self._link.close()
+                self._link.open(deadline)
+                self._received.clear()
+                self._answer_pending = False
+                self._send("*CLS", deadline)
+        raise ProtocolError(
+            f"{self._idn!r} sends a picture in none of the known dialects", do="set the option dialect"
+        )
 
     def _disconnect(self) -> None:
         self._link.close()
@@ -129,16 +151,20 @@ class Oscilloscope(Device[OscilloscopeSettings]):
             If no complete picture arrives.
         """
         with self._exchange("screen", seconds) as deadline:
-            asked, data = now(), b""
-            for how, text in self._required_dialect.screen:
-                if how == "send":
-                    self._send(text, deadline)
-                elif how == "query":
-                    self._query(text, deadline)
-                else:
-                    data = picture(self._fetch(text, deadline))
-            _verify_png(data)
-            return ScreenPicture(data, asked)
+            asked = now()
+            return ScreenPicture(self._picture_of(self._required_dialect, deadline), asked)
+
+    def _picture_of(self, dialect: Dialect, deadline: Deadline) -> bytes:
+        data = b""
+        for how, text in dialect.screen:
+            if how == "send":
+                self._send(text, deadline)
+            elif how == "query":
+                self._query(text, deadline)
+            else:
+                data = picture(self._fetch(text, deadline))
+        _verify_png(data)
+        return data
 
     def waveform(self, channel: int = 1, seconds: float | None = None) -> Waveform:
         """Return the samples of a channel.

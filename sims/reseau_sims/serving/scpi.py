@@ -61,6 +61,12 @@ class AnswerQueue:
         """Whether an answer can be read."""
         return bool(self._waiting) and self._waiting[0][0] <= time.monotonic()
 
+    def status(self) -> int:
+        """Return the status byte: of the instrument, or with the message available alone."""
+        byte: Callable[[bool], int] | None = getattr(self._machine, "status_byte", None)
+        available = self.available()
+        return 0x10 * available if byte is None else byte(available)
+
     def clear(self) -> None:
         """Discard all answers."""
         self._waiting.clear()
@@ -201,7 +207,7 @@ class Vxi11Session:
                 queue.clear()
                 self._begun.pop(link, None)
             case vxi11.Procedure.DEVICE_READSTB:
-                return [(0.0, reply(rpc.pack(vxi11.Error.NONE, 0x10 if queue.available() else 0)))]
+                return [(0.0, reply(rpc.pack(vxi11.Error.NONE, queue.status())))]
             case (
                 vxi11.Procedure.DEVICE_TRIGGER
                 | vxi11.Procedure.DEVICE_REMOTE
@@ -371,7 +377,7 @@ class _Channel:
                 size = struct.pack(">Q", _LARGEST)
                 return [(0.0, _coded(hislip.Type.ASYNC_MAX_MSG_SIZE_RESPONSE, 0, 0, size))]
             case hislip.Type.ASYNC_STATUS_QUERY:
-                status = 0x10 if queue.available() else 0
+                status = queue.status()
                 return [(0.0, _coded(hislip.Type.ASYNC_STATUS_RESPONSE, status, 0))]
             case hislip.Type.ASYNC_DEVICE_CLEAR:
                 queue.clear()
