@@ -91,6 +91,22 @@ def test_a_single_tag_is_a_grid_of_one() -> None:
     assert np.abs(found.xy - truth).max() < 0.03
 
 
+def test_a_grid_of_markers_is_what_opencv_draws_as_a_grid_board() -> None:
+    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    drawn = cv2.aruco.GridBoard((4, 3), 21.0, 5.0, words)
+    assert drawn.getIds().ravel().tolist() == MARKERS.markers[0].tolist()
+    corners = np.array(drawn.getObjPoints())[..., :2].reshape(-1, 2)
+    own = MARKERS.xy * [1, -1]
+    assert np.abs(own - own[0] - (corners - corners[0])).max() < 1e-4
+    # 99 mm at 7 px, with 40 px of margin; cells have 3 mm.
+    print_out = drawn.generateImage((99 * 7 + 80, 73 * 7 + 80), marginSize=40, borderBits=1)
+    noise = np.random.default_rng(0).normal(0, 1, print_out.shape)
+    picture = cv2.GaussianBlur(print_out / 255.0 * 180 + 30, (0, 0), 0.8) + noise
+    found = measured(Frame(np.rint(picture).astype(np.uint8), 255.0, "grid"), MARKERS)
+    assert found.ok.all()
+    assert np.abs(found.xy - (own - own[0]) * 7 - 39.5).max() < 0.6  # OpenCV draws whole pixels
+
+
 @pytest.mark.parametrize("family", ["4X4_50", "7X7_50", "ARUCO_ORIGINAL", "APRILTAG_25h9", "ARUCO_MIP_36h12"])
 def test_scattered_tags_are_points_of_their_numbers(family: str) -> None:
     poses = {3: (15.0, 20.0), 11: (35.0, -70.0), 20: (45.0, 130.0)}
