@@ -49,6 +49,8 @@ def test_a_covered_and_accurate_calibration_is_usable_for_measurement() -> None:
     assert found.uncovered == ()
     assert found.centre_px < found.corners_px < 0.05
     assert found.lines[0].startswith("usable for measurement: 0.00")
+    assert 29.0 < found.tilt_deg < 31.0
+    assert "straight" not in found.lines[1]
     assert "more photographs are not needed" in found.lines[1] or "no further" in found.lines[1]
 
 
@@ -110,3 +112,12 @@ def test_the_calibration_contains_the_verdict() -> None:
     entry = done.calibration("c").validity["assessment"]
     assert entry["use"] == "measurement"
     assert entry["lines"] == list(done.assessments["camera"].lines)
+
+
+def test_a_target_seen_nearly_straight_is_to_be_tilted() -> None:
+    found = calibrated(measured(8, tilt=6.0)).assessments["camera"]
+    assert "nearly straight, tilted by 6° at most: tilt it; " in found.lines[1]
+    then = found.next_photograph
+    assert then is not None
+    assert "40° towards the camera" in then.words
+    assert then.worst_px < 0.5 * found.corners_px
