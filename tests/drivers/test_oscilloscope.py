@@ -248,6 +248,9 @@ def _portmapper(core: int) -> TcpServer:
         ("siglent", "siglent-sds"),
         ("rohde", "rs-hmo-rtb"),
         ("tektronix", "tektronix-2000"),
+        ("lecroy", "lecroy-wp"),
+        ("keysight", ""),
+        ("rohde", ""),
     ],
 )
 def test_lxi_saves_the_same_screen(family: str, plugin: str, tmp_path: Path) -> None:
@@ -258,7 +261,7 @@ def test_lxi_saves_the_same_screen(family: str, plugin: str, tmp_path: Path) -> 
         with portmapper:
             saved = tmp_path / "screen.png"
             done = subprocess.run(
-                ["lxi", "screenshot", "-a", "127.0.0.1", "-p", plugin, str(saved)],
+                ["lxi", "screenshot", "-a", "127.0.0.1", *(["-p", plugin] if plugin else []), str(saved)],
                 capture_output=True,
                 timeout=60,
                 check=False,

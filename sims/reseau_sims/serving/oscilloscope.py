@@ -6,6 +6,7 @@ Source: programming manuals of the makers: sequences that transfer the screen an
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -212,6 +213,7 @@ class Oscilloscope(Machine):
         self._silent, self._wrong_size = 0, False
         self._begun = b""
         self._piece, self._wide = 0, False
+        self._dumped = 0
 
     def receive(self, data: bytes) -> list[bytes]:
         """Return the answers to program messages that end with a newline, as on a raw socket."""
@@ -274,6 +276,8 @@ class Oscilloscope(Machine):
     def _obey(self, header: str, arguments: str) -> bytes | None:
         if header.startswith("*"):
             return self._common(header, arguments)
+        if self._like.waveform == "" and (dump := self._dump(header, arguments)) is not None:
+            return dump or None
         if any(Header(each).matches(header) for each in self._like.saves):
             return self._file(header, arguments)
         if Header(self._like.screen).matches(header):
@@ -360,6 +364,36 @@ class Oscilloscope(Machine):
             return block(data) if self._like.as_block else data
         del self._files[name]
         return None
+
+    def _dump(self, header: str, arguments: str) -> bytes | None:
+        """LeCroy: a screen dump to a file, its register INR, and the file; None for other headers.
+
+        Source: *MAUI Oscilloscopes Remote Control and Automation Manual*, HCSU, INR?, TRFL?, DELF.
+        """
+        name = f"{self._option('DIR')}\\{self._option('FILE')}--00000.png"
+        wanted = string(arguments.rpartition(",")[2]) if arguments.startswith("DISK") else ""
+        match header.upper():
+            case "SCDP" if self._option("DEST") == "FILE":
+                self._files[name] = self._picture(".png")
+                self._dumped = 2
+                return b""
+            case "INE":
+                return b""
+            case "INR?":
+                found, self._dumped = self._dumped, 0
+                return (b"" if self._value("CHDR") == "OFF" else b"INR ") + str(found).encode()
+            case "DELF":
+                self._files.pop(wanted, None)
+                return b""
+            case "TRFL?" if wanted in self._files:
+                data = self._files[wanted]
+                return b"TRFL #" + block(data)[1:] + f"{zlib.crc32(data):08X}\r".encode()
+        return None
+
+    def _option(self, name: str) -> str:
+        """The value after a name in HCSU, such as DEST; empty without one."""
+        parts = [part.strip().strip("'") for part in self._values.get("HCSU", "").split(",")]
+        return dict(zip(parts[::2], parts[1::2], strict=False)).get(name, "")
 
     def _require_settings(self) -> None:
         if missing := set(self._like.prepared_by) - self._seen:
