@@ -111,6 +111,24 @@ def uneven_board() -> Network:
     return replace(network, xyz=network.xyz + rng.normal(0, 4e-4, network.xyz.shape))
 
 
+def copied(network: Network, image: int, onto: int) -> Network:
+    """The image points of an image given to another one as well."""
+    rows = np.flatnonzero(network.image_of == image)
+    every = np.concatenate([np.flatnonzero(network.image_of != onto), rows])
+    image_of = np.concatenate([network.image_of[network.image_of != onto], np.full(len(rows), onto)])
+    return replace(
+        network,
+        image_of=image_of,
+        point_of=network.point_of[every],
+        xy=network.xy[every],
+        cov=network.cov[every],
+    )
+
+
+def with_control(network: Network, factor: Array) -> Network:
+    return replace(network, xyz=network.xyz * factor)
+
+
 def camera_of(network: Network, **values: float) -> Network:
     camera = network.cameras[0]
     at = {camera.names.index(name): value for name, value in values.items()}
@@ -364,6 +382,30 @@ BROKEN = [
         lambda: exchanged(block(), 1, 3),
         Code.DOUBTFUL_CONTROL,
         ("p1 and p3 look exchanged",),
+    ),
+    Broken(
+        "some control points in feet",
+        lambda: with_control(block(control=10), np.where(np.arange(40) < 4, 1 / 0.3048, 1.0)[:, None]),
+        Code.DOUBTFUL_CONTROL,
+        ("p0, p1, p2, p3", "factor of 3.28", "another unit"),
+    ),
+    Broken(
+        "heights of control counted downwards",
+        lambda: with_control(block(control=10), np.array([1.0, 1.0, -1.0])),
+        Code.DOUBTFUL_CONTROL,
+        ("mirrored",),
+    ),
+    Broken(
+        "a copy of an image",
+        lambda: copied(block(), 2, 5),
+        Code.INCONSISTENT,
+        ("i2 and i5 have exactly the same",),
+    ),
+    Broken(
+        "image coordinates from the middle",
+        lambda: mapped(block(), lambda xy: xy - [319.5, 239.5]),
+        Code.OUTSIDE,
+        ("from the middle of the image",),
     ),
     Broken(
         "mirrored control",

@@ -29,6 +29,8 @@ _OFF_CENTRE, _DISTORTED = 0.75, 0.8
 _OUTSIDE = 0.01
 # Extent of all coordinates, in the size of the image, below which they have another unit.
 _TINY = 0.02
+# Part of the coordinates that are negative where they are from the middle of the image.
+_FROM_MIDDLE = 0.2
 # Misfit of rays after the best rotation, in their spread, that is no parallax; pairs of images tested, points
 # of a pair, and smallest rotation that counts as another view (rad).
 _PARALLAX, _PAIRS, _COMMON = 0.03, 40, 6
@@ -71,7 +73,7 @@ def causes(network: Network) -> list[Remark]:
         # Directions follow from these values.
         return found
     uv = directions(network)
-    return [*_one_station(network, uv), *_lines(network, uv)]
+    return [*_copies(network), *_one_station(network, uv), *_lines(network, uv)]
 
 
 def _camera(camera: Camera) -> list[Remark]:
@@ -162,8 +164,9 @@ def outside_image(network: Network) -> Rows:
     found = [np.zeros(0, dtype=np.intp)]
     for c, camera in enumerate(network.cameras):
         rows = np.flatnonzero(network.camera_of[network.image_of] == c)
-        out, swapped = _beyond(network.xy[rows], np.array([camera.width, camera.height], dtype=np.float64))
-        found += [] if swapped else [rows[out]]
+        size = np.array([camera.width, camera.height], dtype=np.float64)
+        out, swapped = _beyond(network.xy[rows], size)
+        found += [] if swapped or _centred(network.xy[rows], size) else [rows[out]]
     return np.concatenate(found)
 
 
@@ -173,6 +176,12 @@ def _beyond(xy: Array, size: Array) -> tuple[Mask, bool]:
     out: Mask = np.asarray(far.any(axis=1))
     turned = ((xy > -0.5 - _OUTSIDE * size) & (xy < size[::-1] * (1 + _OUTSIDE) - 0.5)).all()
     return out, bool(turned and out.sum() > 2)
+
+
+def _centred(xy: Array, size: Array) -> bool:
+    """Whether coordinates are such as those from the middle of an image."""
+    inside = bool((np.abs(xy) < size / 2 * (1 + _OUTSIDE)).all())
+    return inside and bool(((xy < -_OUTSIDE * size).mean(axis=0) > _FROM_MIDDLE).all())
 
 
 def _outside(network: Network) -> list[Remark]:
@@ -192,6 +201,16 @@ def _outside(network: Network) -> list[Remark]:
                     f"{camera.label}: all image coordinates are within {extent[0]:.3g} × {extent[1]:.3g} px "
                     f"of an image of {camera.width}×{camera.height}; are they {unit}?",
                     Code.IMPLAUSIBLE,
+                )
+            )
+            continue
+        if _centred(xy, size):
+            found.append(
+                Remark(
+                    f"{camera.label}: all image coordinates are within half an image of zero, many of them "
+                    "negative; are they from the middle of the image? They count from the centre of the "
+                    "top-left pixel, y down",
+                    Code.OUTSIDE,
                 )
             )
             continue
@@ -221,6 +240,28 @@ def _outside(network: Network) -> list[Remark]:
             )
         )
     return found
+
+
+def _copies(network: Network) -> list[Remark]:
+    """Images with exactly the same image points: one is a copy of the other."""
+    seen = dict[bytes, int]()
+    pairs = []
+    for i, rows in enumerate(_by_image(network, np.ones(len(network.xy), dtype=bool))):
+        if len(rows) < 4:
+            continue
+        rows = rows[np.argsort(network.point_of[rows], kind="stable")]
+        key = network.point_of[rows].tobytes() + network.xy[rows].tobytes()
+        if key in seen:
+            pairs.append(f"{network.images[seen[key]]} and {network.images[i]}")
+        seen.setdefault(key, i)
+    if not pairs:
+        return []
+    return [
+        Remark(
+            f"the images {listed(pairs)} have exactly the same image points: leave out the copy",
+            Code.INCONSISTENT,
+        )
+    ]
 
 
 def _rotations(network: Network) -> list[Remark]:

@@ -60,6 +60,8 @@ _FREE_ITERATIONS, _ROUGHLY = 50, 1e-2
 # Thickness of a plane figure in its extent, its least number of points, part of the differences that a
 # deflection of second degree explains, and its size in the standard deviations of the points.
 _PLANE, _BENT_POINTS, _BENT_PART, _BENT_SIGMAS = 1e-3, 12, 0.7, 4.0
+# Ratio of scales from which on units are asked for.
+_UNIT = 2.0
 _OTHER_SHAPE = "do not agree with the shape determined by the images"
 
 
@@ -110,18 +112,42 @@ class ControlShape:
         exchanged = [f"{names[a]} and {names[b]}" for a, b in self._exchanged]
         if exchanged:
             return f"the coordinates of control points {', or '.join(exchanged)} look exchanged"
-        if self.agree.sum() < _LEAST:
+        if self.agree.sum() <= max(_LEAST - 1, _HALF * len(names)):
+            # In a flat figure some points agree with a mirrored one by chance.
             mirrored = _largest_agreement(found * [1.0, 1.0, -1.0], given, limit)
             if mirrored.sum() > max(_LEAST - 1, self.agree.sum()):
                 return "the control points are mirrored: their coordinate system is left-handed"
+        if self.agree.sum() < _LEAST:
             return (
                 f"the control points {', '.join(names)} do not agree with the shape determined by the images"
             )
         wrong = [names[k] for k in np.flatnonzero(~self.agree)]
+        factor = self._in_another_unit
+        if factor:
+            right = [names[k] for k in np.flatnonzero(self.agree)]
+            return (
+                f"the control points {', '.join(wrong)} and the others, {', '.join(right)}, agree among "
+                f"themselves, but not in scale (by a factor of {factor:.4g}): are some in another unit?"
+            )
         return (
             f"control point{'s' * (len(wrong) > 1)} {', '.join(wrong)} "
             f"contradict{'s' * (len(wrong) == 1)} the others"
         )
+
+    @cached_property
+    def _in_another_unit(self) -> float:
+        """Ratio of the scales of points that do not agree and the others; 0 where it is none of a unit."""
+        off, given, found = ~self.agree, self.given, self.found
+        if off.sum() < _LEAST or self.agree.sum() < _LEAST:
+            return 0.0
+        size = [float(np.linalg.norm(given[k] - given[k].mean(axis=0))) for k in (off, self.agree)]
+        true = [float(np.linalg.norm(found[k] - found[k].mean(axis=0))) for k in (off, self.agree)]
+        ratio = size[0] / true[0] / (size[1] / true[1])
+        scale = max(ratio, 1 / ratio)
+        misfit = _misfits(found[off], given[off], np.ones(int(off.sum()), dtype=bool))
+        # Errors of the others are in their scale.
+        same = bool((misfit < self.limit[off] * min(1.0, ratio)).all())
+        return float(scale) if same and scale > _UNIT else 0.0
 
     @cached_property
     def _exchanged(self) -> list[tuple[int, int]]:
@@ -164,7 +190,7 @@ class ControlShape:
     @property
     def as_a_whole(self) -> bool:
         """Whether the doubt is not about single points."""
-        return bool(self.agree.sum() < _LEAST) or bool(self._exchanged)
+        return bool(self.agree.sum() < _LEAST) or bool(self._exchanged) or self._in_another_unit > 0
 
 
 def control_shape(

@@ -444,6 +444,12 @@ def _control(
     if shape is None and len(problem.observations) <= MANY:
         shape = control_shape(network, np.asarray(weights[:n:2] > 0), fit.values)
         rejected = np.asarray(fit.rejected[:n].reshape(-1, 2).any(axis=1))
+        if many_rejected(network, rejected):
+            # Rays were perhaps rejected because of the control: the images alone must say what is wrong.
+            used = None if problem.weights is None else np.asarray(problem.weights[:n:2] > 0)
+            whole = control_shape(network, used)
+            if whole is not None and whole.as_a_whole:
+                return None, [Remark(whole.doubt(), Code.DOUBTFUL_CONTROL)]
         deflection = 0.0 if shape is None else shape.bent()
         if deflection:
             return None, [Remark(bent_plane(deflection, network.unit), Code.DOUBTFUL_CONTROL)]
