@@ -44,7 +44,13 @@ def rays() -> Pixels:
     return np.asarray(LENS.rays())
 
 
-BOARDS = {"charuco": (7, 10), "chess": (7, 10), "circles": (7, 10), "aprilgrid": (5, 7)}
+BOARDS = {
+    "charuco": (7, 10),
+    "chess": (7, 10),
+    "circles": (7, 10),
+    "asymmetric": (4, 11),
+    "aprilgrid": (5, 7),
+}
 """Columns and rows."""
 
 
@@ -53,7 +59,9 @@ def evening(
 ) -> tuple[dict[str, dict[str, float]], float]:
     """Print, photograph and calibrate; the parameters found, and sigma0."""
     columns, rows = BOARDS.get(kind, (7, 9))
-    target = ("board", "--kind", kind) if kind in BOARDS else ("sheet",)
+    turned = kind == "asymmetric"
+    option = ("circles", "--asymmetric") if turned else (kind,)
+    target = ("board", "--kind", *option) if kind in BOARDS else ("sheet",)
     files = ("--pdf", folder / "target.pdf", "--json", folder / "target.json")
     assert reseau("design", *target, "--columns", columns, "--rows", rows, *files)[0] == 0
     sheet, rng = print_out(folder / "target.pdf"), np.random.default_rng(seed)
@@ -154,7 +162,7 @@ def test_the_target_is_found_among_the_designs_beside_the_photographs(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["charuco"])
+@pytest.mark.parametrize("kind", ["charuco", "chess", "asymmetric", "aprilgrid"])
 def test_true_parameters_are_within_their_sigmas_over_twenty_evenings(
     reseau: Run, tmp_path: Path, rays: Pixels, kind: str
 ) -> None:

@@ -271,6 +271,16 @@ def test_a_part_without_the_ends_of_the_pattern_is_said_to_be_ambiguous() -> Non
     assert [note for note in found.notes if note.code is Code.AMBIGUOUS]
 
 
+def test_a_row_of_corners_near_the_border_of_the_frame_tells_how_a_chessboard_is_turned() -> None:
+    """With an odd and an even number of squares only the right turn fits, if all rows are seen."""
+    frame, truth = picture(CHESS)
+    right = int(np.ceil(truth[:, 0].max())) + 5
+    found = measured(replace(frame, pixels=frame.pixels[:, :right]), CHESS)
+    assert not [note for note in found.notes if note.code is Code.AMBIGUOUS]
+    assert np.abs(found.xy - truth)[found.ok].max() < 0.05
+    assert found.ok.mean() > 0.85
+
+
 @pytest.mark.parametrize("hidden", [(slice(120, 260), slice(180, 330)), (slice(0, 400), slice(0, 230))])
 def test_something_over_a_part_hides_only_that_part(hidden: tuple[slice, slice]) -> None:
     for design in (CHESS, CHARUCO):

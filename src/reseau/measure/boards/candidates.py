@@ -26,6 +26,7 @@ __all__ = [
     "Saddles",
     "along",
     "bright_between",
+    "crossed",
     "find_saddles",
     "first_mapping",
     "grown",
@@ -269,7 +270,8 @@ def sector_levels(grey: NDArray[np.float32], mapping: Chain, nodes: Array, share
     """Grey values (n, 4) in the sectors around nodes of a lattice: after, before, and beside both steps."""
     around = share * np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]])
     at = images_of(mapping, (nodes[:, None] + around).reshape(-1, 2)).astype(np.float32)
-    at = np.nan_to_num(np.clip(at, -1e4, 1e6))
+    # Beside the border of the frame a sector is seen up to there.
+    at = np.clip(np.nan_to_num(at), 0, np.array([grey.shape[1] - 1, grey.shape[0] - 1], np.float32))
     # Fewer than 32768 pixels along an axis of the map are allowed.
     values = cv2.remap(grey, at[:, 0].reshape(-1, 4), at[:, 1].reshape(-1, 4), cv2.INTER_LINEAR)
     return np.asarray(values, dtype=np.float64)

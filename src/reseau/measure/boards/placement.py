@@ -28,7 +28,7 @@ from ..reseau.plane_marks import Located
 from ..reseau.sheet_placement import MOST_DISKS, disk_seeds, grown_disks, through
 from ..testfield.lattice_mapping import images_of, slope_of
 from .bits import Bits, read_bits
-from .candidates import Saddles, along, bright_between, first_mapping, grown, sector_levels, seeds
+from .candidates import Saddles, along, bright_between, crossed, first_mapping, grown, sector_levels, seeds
 
 __all__ = ["Placed", "lay_chessboard", "lay_circles", "lay_marked"]
 
@@ -109,15 +109,21 @@ def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDes
     ink = float(np.median(sector_levels(grey, mapping, nodes).min(axis=1)))
     limits = paper - 0.25 * (paper - ink), ink + 0.25 * (paper - ink)
 
-    def plain(missing: Array) -> Mask:
+    even = nodes.sum(axis=1) % 2 == 0
+    odd = (bright == even).mean() > 0.5
+
+    def cost(missing: Array) -> Array:
         levels = sector_levels(grey, mapping, missing)
-        return np.asarray(((levels > limits[0]) | (levels < limits[1])).all(axis=1))
+        plain = ((levels > limits[0]) | (levels < limits[1])).all(axis=1)
+        # A corner that is in the frame but was not among the saddles does not count against a place.
+        there = crossed(levels, (missing.sum(axis=1) % 2 == 0) == odd)
+        return np.where(there, 0.0, np.where(plain, _PLAIN, _MISSED))
 
     coded = design.kind == "puzzle" or bool(design.dots)
     bits = read_bits(grey, mapping, nodes.astype(np.intp), design.kind == "puzzle") if coded else None
     known = nodes.astype(np.intp), saddles.xy[rows], mapping, shape, (dark, ~bright)
     # The dots of a PuzzleBoard tell more than nodes that were not found.
-    return _numbered(design, *known, None if design.kind == "puzzle" else plain, bits)
+    return _numbered(design, *known, None if design.kind == "puzzle" else cost, bits)
 
 
 def _dark_sectors(design: BoardDesign) -> Mask:
@@ -136,10 +142,10 @@ def _numbered(
     mapping: Chain,
     shape: tuple[int, int],
     dark: tuple[Mask, Mask] | None,
-    plain: Callable[[Array], Mask] | None = None,
+    cost: Callable[[Array], Array] | None = None,
     bits: Bits | None = None,
 ) -> Placed | Failure:
-    """Lay the lattice found on the design; `plain` tells where nothing hides nodes, `bits` what dots say."""
+    """Lay the lattice found on the design; `cost` of nodes not found, `bits` what dots tell."""
     # Diagonals of an asymmetric grid are halved: its nodes have columns and rows that are both even or odd.
     matrix = _lattice_of(design)
     numbers = design.nodes @ matrix.T // (2 if design.asymmetric else 1)
@@ -181,9 +187,8 @@ def _numbered(
                 gone = back[missing].astype(np.float64)
                 where = images_of(mapping, gone)
                 sight = ((where > 2) & (where < np.array(shape[::-1]) - 3)).all(axis=1)
-                lost = _MISSED * float(sight.sum())
-                if plain is not None:
-                    lost += (_PLAIN - _MISSED) * float((sight & plain(gone)).sum())
+                each = np.full(len(gone), _MISSED) if cost is None else cost(gone)
+                lost = float(each[sight].sum())
             score = there.sum() - lost - _FOREIGN * (~there).sum()
             if bits is not None and signs is not None:
                 score -= _FOREIGN * bits.compared(signs, turn, np.array(shift))[0]
