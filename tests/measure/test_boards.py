@@ -273,7 +273,7 @@ def test_a_part_without_the_ends_of_the_pattern_is_said_to_be_ambiguous() -> Non
 
 def test_a_row_of_corners_near_the_border_of_the_frame_tells_how_a_chessboard_is_turned() -> None:
     """With an odd and an even number of squares only the right turn fits, if all rows are seen."""
-    frame, truth = picture(CHESS)
+    frame, truth = picture(CHESS, 0.0, 0.0)
     right = int(np.ceil(truth[:, 0].max())) + 5
     found = measured(replace(frame, pixels=frame.pixels[:, :right]), CHESS)
     assert not [note for note in found.notes if note.code is Code.AMBIGUOUS]
