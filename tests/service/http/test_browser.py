@@ -164,7 +164,7 @@ def written(browser: Browser, css: str, text: str) -> None:
 def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> None:
     begun = time.monotonic()
     entry = place.start()
-    assert time.monotonic() - begun < 20  # on a loaded machine; alone under 3 s
+    assert time.monotonic() - begun < 60  # on a loaded machine; alone under 3 s
     base = entry.partition("/enter")[0]
     browser.open(f"{base}/sessions")
     browser.until("Log in")

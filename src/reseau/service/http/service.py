@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import secrets
 import threading
 import time
@@ -37,6 +38,9 @@ def _load_the_rest() -> None:
     from .. import alarms, inforce, schedule
 
     del alarms, inforce, overlay, schedule
+    # What stays for ever need not be looked at by each collection, which stops all threads meanwhile.
+    gc.collect()
+    gc.freeze()
 
 
 _LOOK_S, _ENTRY_S = 0.3, 600.0
