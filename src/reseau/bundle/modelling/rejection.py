@@ -54,7 +54,11 @@ def without_gross_errors(
     if isinstance(first, Failure) or first[2]:
         plain = adjusted_in_steps(problem)
         if not isinstance(plain, Failure):
-            second = _careful(_trimmed(problem.continued(plain)), alpha, max_fraction)
+            begun = problem.continued(plain)
+            second = _careful(_trimmed(begun), alpha, max_fraction)
+            if isinstance(second, Failure):
+                # What remains after trimming can be too weak for an adjustment.
+                second = _careful(begun, alpha, max_fraction)
             if not isinstance(second, Failure) and (
                 isinstance(first, Failure) or _used(second[0]) > _used(first[0])
             ):
