@@ -395,7 +395,7 @@ class Acquisition:
         """Stop all motion and transmission. Never raises, never moves an axis."""
         self._at_rest = True
         try:
-            self.bench.part(set(self.bench.instruments) - self._silent).stop()
+            self.bench.without(self._silent).stop()
         except InstrumentError as error:
             self.watch("rest", {"failed": str(error)})
 

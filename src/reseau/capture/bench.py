@@ -18,7 +18,7 @@ from __future__ import annotations
 import copy
 import json
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, field
@@ -284,6 +284,8 @@ class Bench:
             raise BenchError(failures)
         self.instruments: Mapping[str, Instrument] = made
         self.required = frozenset(made)
+        self.silent: Mapping[str, ReseauError] = {}
+        """Why instruments could not be connected last time, by name."""
 
     @classmethod
     def read(cls, path: Path | str) -> Self:
@@ -324,11 +326,26 @@ class Bench:
             if name not in wanted:
                 wanted[name] = found = self[name]
                 left += getattr(found, "uses", self.instruments) if isinstance(found, _Combined) else ()
+        return self._only(wanted, wanted if required is None else required)
+
+    def without(self, names: Iterable[str]) -> Self:
+        """Return the bench without some instruments: none of those that are left is required.
+
+        Examples
+        --------
+        >>> entry = InstrumentEntry(driver="ping360", address="tcp://127.0.0.1:9092")
+        >>> bench = Bench(BenchFile(name="tank", instruments={"left": entry, "right": entry}))
+        >>> list(bench.without(["right"]).instruments)
+        ['left']
+        """
+        return self._only(self.instruments.keys() - set(names), ())
+
+    def _only(self, names: Collection[str], required: Iterable[str]) -> Self:
         part = copy.copy(self)
-        part.instruments = {name: each for name, each in self.instruments.items() if name in wanted}
-        entries = {name: each for name, each in self.file.instruments.items() if name in wanted}
+        part.instruments = {name: each for name, each in self.instruments.items() if name in names}
+        entries = {name: each for name, each in self.file.instruments.items() if name in names}
         part.file = self.file.model_copy(update={"instruments": entries})
-        part.required = frozenset(wanted if required is None else required)
+        part.required = frozenset(required)
         return part
 
     def one(self, kind: type, name: str | None = None) -> Any:
@@ -365,9 +382,8 @@ class Bench:
             If a required instrument cannot be connected; names all such instruments, and closes the others.
         """
         outcomes = self._all(lambda instrument: instrument.connect(seconds))
-        failures = [
-            each for name, each in outcomes.items() if name in self.required and isinstance(each, ReseauError)
-        ]
+        self.silent = {name: each for name, each in outcomes.items() if isinstance(each, ReseauError)}
+        failures = [error for name, error in self.silent.items() if name in self.required]
         if failures:
             self.close()
             raise BenchError(failures)

@@ -194,7 +194,7 @@ def stop(bench: BenchPath = _BENCH) -> None:
         outcomes = everything.connect()
         silent = [name for name in everything.instruments if name not in outcomes]
         try:
-            everything.part(outcomes).stop()
+            everything.without(silent).stop()
         finally:
             everything.close()
     say("".join(f"{name}: stopped\n" for name in outcomes))

@@ -25,7 +25,7 @@ from typing import Any
 from .. import sessions
 from ..archive import Archive
 from ..capture import Bench, BenchFile, Control, edge_sigma, exposure_fault
-from ..core.errors import InstrumentError, ReseauError, StateError, UsageError
+from ..core.errors import BenchError, InstrumentError, ReseauError, StateError, UsageError
 from ..instruments import Camera, Turntable
 from ..io import read_text
 from .state import StateFolder, private_file
@@ -68,7 +68,9 @@ class Worker:
         self.file = BenchFile.parse_toml(text, where="bench")
         self.name, self._text, self._archive = self.file.name, text, archive
         self._certificates = certificates
-        self._bench = Bench(self.file)
+        every = Bench(self.file)
+        self._bench = every.part(every.instruments, required=())
+        self._answering = self._bench
         self._lock = threading.RLock()
         self._wires: set[Wire] = set()
         self._commands: queue.Queue[tuple[Wire, dict[str, Any]]] = queue.Queue()
@@ -89,7 +91,7 @@ class Worker:
     # What is held.
 
     def _take(self) -> None:
-        """Lock and connect the instruments, and stop whatever moves."""
+        """Lock and connect the instruments, and stop whatever moves; some may be silent, but not all."""
         with self._lock:
             if self._held is not None:
                 return
@@ -97,15 +99,19 @@ class Worker:
             try:
                 stack.enter_context(self._bench.lock(f"reseau serve, bench {self.name}"))
                 stack.enter_context(self._bench)
+                silent = self._bench.silent
+                if silent and len(silent) == len(self._bench.instruments):
+                    raise BenchError(list(silent.values()))
+                self._answering = self._bench.without(silent)
                 # An earlier worker may have ended while something moved.
-                self._bench.stop()
-                for each in self._bench.instruments.values():
+                self._answering.stop()
+                for each in self._answering.instruments.values():
                     each.stage()
             except ReseauError as error:
                 stack.close()
                 self._error = str(error)
                 raise
-            self._held, self._error = stack, ""
+            self._held, self._error = stack, "; ".join(str(error) for error in silent.values())
 
     def _release(self) -> None:
         with self._lock:
@@ -219,7 +225,7 @@ class Worker:
         stops, self._moving = self._stops, words
         self._say("moving", {"what": words})
         try:
-            for each in self._bench.instruments.values():
+            for each in self._answering.instruments.values():
                 each.stage()  # allows motion again after a stop
             if stops != self._stops:
                 raise StateError("was stopped", where=words)
@@ -268,6 +274,7 @@ class Worker:
         if plan == "own":
             raise UsageError("is a program of the user, which the service does not run", where="plan own")
         given = sessions.check(name, plan, parameters, inputs, self._required())
+        self._prepare(given)
         session = sessions.begin(self._archive, name, plan, given, inputs, bench=self._text)
         return self._run(session, by)
 
@@ -279,9 +286,21 @@ class Worker:
             raise UsageError("is done", where=name)
         if session.bench != self._text:
             raise UsageError("was begun on another bench", where=name)
-        sessions.parameters_of(session).check_bench(bench)
+        given = sessions.parameters_of(session)
+        given.check_bench(bench)
+        self._prepare(given)
         session.recover()
         return self._run(session, by)
+
+    def _prepare(self, given: sessions.SessionParameters) -> None:
+        """Check that the instruments of a session answer, and that its axes have their reference."""
+        used = given.part_of(self._required())
+        if used.instruments.keys() - self._answering.instruments.keys():
+            used.connect()
+            answering = used.instruments.keys() | self._answering.instruments.keys()
+            self._answering = self._bench.without(self._bench.instruments.keys() - answering)
+        if not given.home:
+            given.check_homed(used)
 
     def _run(self, session: Any, by: str) -> dict[str, Any]:
         given = sessions.parameters_of(session)
@@ -362,7 +381,7 @@ class Worker:
                     wire.send({"id": waiting.get("id"), "error": error})
             if control is not None:
                 threading.Thread(target=control.pause, kwargs={"at_once": True}, daemon=True).start()
-            self._bench.stop()
+            self._answering.stop()
             spent = time.perf_counter() - begun
             self._say("stopped", {"ms": round(1e3 * spent, 1)})
             return True, {"ms": round(1e3 * spent, 1), **self.status()}, b""
@@ -454,7 +473,11 @@ class Worker:
 
         number, shown = 0, ""
         while not self.over.wait(_STEADY_S):
-            if time.monotonic() - self._looked > _LIVE_S or self._held is None or not self._bench.has(Camera):
+            if (
+                time.monotonic() - self._looked > _LIVE_S
+                or self._held is None
+                or not self._answering.has(Camera)
+            ):
                 continue
             try:
                 if self._control is not None:
@@ -538,7 +561,7 @@ class Worker:
         if self._thread is not None:
             self._thread.join(60)
         with contextlib.suppress(ReseauError):
-            self._bench.stop()
+            self._answering.stop()
         if self._held is not None:
             self._held.close()
         if place is not None:

@@ -86,7 +86,9 @@ def one(rig: Rig) -> Iterator[Served]:
         client = found.client()
         state(client, "ready")
         for axis in ("tilt", "roll", "camera_roll"):
-            if not client.get(f"{BENCH}/axes").json()[axis]["homed"]:
+            axes = client.get(f"{BENCH}/axes")
+            assert axes.status_code == 200, axes.text
+            if not axes.json()[axis]["homed"]:
                 assert client.post(f"{BENCH}/home", json={"axis": axis}).status_code == 200
         yield found
 
@@ -336,3 +338,25 @@ def test_the_worker_answers_only_with_certificates(tmp_path: Path) -> None:
         thread.join(10)
         there.close()
         assert ("hello" in outcome[0]) == (role == "own")
+
+
+def test_an_instrument_that_does_not_answer_is_named_and_does_not_take_the_others_with_it(
+    rig: Rig, tmp_path: Path
+) -> None:
+    with SimulatedBench(seed=4) as sim:
+        another = Rig(tmp_path, sim)
+        path = tmp_path / "bench.toml"
+        path.write_text(
+            path.read_text().replace('"field"', '"another field"')
+            + '\n[instruments.sonar]\ndriver = "ping360"\naddress = "tcp://127.0.0.1:1"\n'
+        )
+        with another.serve() as found:
+            client = found.client("operate")
+            bench = state(client, "ready")
+            assert "sonar" in bench["error"]
+            assert client.post(f"{BENCH}/home", json={"axis": "tilt"}).status_code == 200
+            given = {"name": "deaf", "plan": "scan", "parameters": {}, "inputs": {}}
+            answer = client.post(f"{BENCH}/sessions", json=given)
+            assert answer.status_code == 409
+            assert "sonar" in answer.json()["error"]["text"]
+            assert client.get("/api/1/sessions/deaf").status_code == 404
