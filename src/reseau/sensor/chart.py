@@ -86,6 +86,14 @@ class ChartEdge:
         Where it is.
     found : EdgeSpread or Failure
         Its sharpness, or why it was declined.
+
+    Examples
+    --------
+    >>> from reseau.core.failure import Code
+    >>> region = EdgeRegion("E1", np.array([[10.0, 10.0], [14.0, 60.0]]), (0, 10, 25, 50))
+    >>> edge = ChartEdge(region, Failure("is not slanted", Code.NOT_FOUND))
+    >>> bool(edge.found), edge.found.reason
+    (False, 'is not slanted')
     """
 
     at: EdgeRegion

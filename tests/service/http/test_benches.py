@@ -354,7 +354,8 @@ def test_an_instrument_that_does_not_answer_is_named_and_does_not_take_the_other
             client = found.client("operate")
             bench = state(client, "ready")
             assert "sonar" in bench["error"]
-            assert client.post(f"{BENCH}/home", json={"axis": "tilt"}).status_code == 200
+            homed = client.post(f"{BENCH}/home", json={"axis": "tilt"})
+            assert homed.status_code == 200, homed.text
             given = {"name": "deaf", "plan": "scan", "parameters": {}, "inputs": {}}
             answer = client.post(f"{BENCH}/sessions", json=given)
             assert answer.status_code == 409
