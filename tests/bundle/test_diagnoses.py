@@ -172,6 +172,12 @@ def posed(network: Network) -> Network:
     return replace(network, x0=fit.values.x0.copy(), rotation=matrix_to_vector(fit.values.rotation))
 
 
+def stations_in(network: Network, unit: float) -> Network:
+    """The network with its projection centres given in another unit."""
+    given = posed(network)
+    return replace(given, x0=given.x0 / unit)
+
+
 def bar(network: Network, k: int, factor: float) -> Network:
     distance = network.distance.copy()
     distance[k, 0] *= factor
@@ -247,6 +253,18 @@ BROKEN = [
         lambda: camera_of(opencv(), fy=8.0),
         Code.IMPLAUSIBLE,
         ("focal length of 8 px",),
+    ),
+    Broken(
+        "projection centres in thousands",
+        lambda: stations_in(block(), 1e3),
+        Code.IMPLAUSIBLE,
+        ("projection centres X0 are 1000 times too small", "points (m)"),
+    ),
+    Broken(
+        "projection centres in thousandths",
+        lambda: stations_in(block(), 1e-3),
+        Code.IMPLAUSIBLE,
+        ("projection centres X0 are 1000 times too large",),
     ),
     Broken(
         "principal point in pixels",

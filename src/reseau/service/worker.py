@@ -36,6 +36,8 @@ __all__ = ["Worker", "address_file", "run"]
 _LIVE_S, _RETRY_S, _WIDTH = 5.0, 3.0, 960
 _STEADY_S = 0.1
 """Time between live pictures, at least."""
+_ALONE_S = 600.0
+"""Time after which the worker of a service ends that has gone, when no session runs."""
 
 
 def address_file(state: StateFolder, name: str) -> Path:
@@ -552,10 +554,15 @@ class Worker:
             for each in (self.work, self.live):
                 threading.Thread(target=each, name=each.__name__, daemon=True).start()
             server.settimeout(0.3)
+            heard = time.monotonic()
             while not self.over.is_set():
                 try:
                     raw, _ = server.accept()
                 except TimeoutError:
+                    if self._wires or self._control is not None:
+                        heard = time.monotonic()
+                    if place is not None and time.monotonic() - heard > _ALONE_S:
+                        self.over.set()  # started by a service, which would start another one
                     continue
                 threading.Thread(target=self._welcome, args=(raw, context), daemon=True).start()
         if self._thread is not None:

@@ -18,6 +18,7 @@ import pytest
 from reseau.archive import Archive
 from reseau.capture import Bench, BenchFile
 from reseau.core.errors import StateError
+from reseau.service import worker
 from reseau.service.state import StateFolder
 from reseau.service.wire import Certificates
 from reseau_sims.serving.bench import SimulatedBench
@@ -361,3 +362,15 @@ def test_an_instrument_that_does_not_answer_is_named_and_does_not_take_the_other
             assert answer.status_code == 409
             assert "sonar" in answer.json()["error"]["text"]
             assert client.get("/api/1/sessions/deaf").status_code == 404
+
+
+def test_a_worker_whose_service_has_gone_ends_by_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker, "_ALONE_S", 0.1)
+    text, told = 'schema = "reseau-bench/1"\nname = "empty"\ninstruments = {}\n', tmp_path / "told.json"
+    with Archive.open(tmp_path / "archive", create=True) as archive:
+        alone = worker.Worker(text, archive, Certificates(StateFolder(tmp_path / "state")))
+        alone.serve(place=told)
+    assert alone.over.is_set()
+    assert not told.exists()

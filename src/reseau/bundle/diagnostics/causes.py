@@ -38,6 +38,10 @@ _PARALLAX, _PAIRS, _COMMON = 0.03, 40, 6
 _FLAT = 1e-3
 # Half angle of view below which shifts and rotations during the read-out have the same effect.
 _NARROW_DEG = 15.0
+# Factors between units of projection centres and of points. The distance from the points is that from the
+# angles between their rays to the first factor if the unit is right, and far from it by the second if it is
+# not, in the median of this many images.
+_UNITS, _RIGHT_UNIT, _WRONG_UNIT, _STATIONS = (1e3, 1e-3), 1.7, 8.0, 3
 # Angle (rad) between the optical axes and the normal of a plane that is seen frontally.
 _FRONTAL = 0.03
 
@@ -73,7 +77,9 @@ def causes(network: Network) -> list[Remark]:
         # Directions follow from these values.
         return found
     uv = directions(network)
-    return [*_copies(network), *_one_station(network, uv), *_lines(network, uv)]
+    return [
+        *_copies(network), *_stations(network, uv), *_one_station(network, uv), *_lines(network, uv)
+    ]  # fmt: skip
 
 
 def _camera(camera: Camera) -> list[Remark]:
@@ -275,6 +281,44 @@ def _rotations(network: Network) -> list[Remark]:
         Remark(
             f"rotation vectors longer than a full turn of 2π rad, in image{'s' * (len(rows) > 1)} {names}; "
             "are they in degrees?",
+            Code.IMPLAUSIBLE,
+        )
+    ]
+
+
+def _stations(network: Network, uv: Array) -> list[Remark]:
+    """Projection centres that are given in another unit than the points."""
+    if network.refraction is not None or network.parallel.any():
+        return []
+    known = finite(network.xyz)
+    ratios = []
+    for i, rows in enumerate(_by_image(network, finite(uv) & known[network.point_of])):
+        if len(rows) < 4 or not np.isfinite(network.x0[i]).all():
+            continue
+        places, rays = network.xyz[network.point_of[rows]], _unit(uv[rows])
+        spread = float(np.sqrt(((rays - rays.mean(axis=0)) ** 2).sum(axis=1).mean()))
+        middle = places.mean(axis=0)
+        row = []
+        for factor in (1.0, *_UNITS):
+            away = factor * network.x0[i] - middle
+            far = max(float(np.linalg.norm(away)), 1e-300)
+            # What is spread along the line of sight does not spread the rays.
+            across = (places - middle) - np.outer((places - middle) @ away, away) / far**2
+            extent = float(np.sqrt((across**2).sum(axis=1).mean()))
+            row.append(far * spread / max(extent, 1e-300))
+        ratios.append(row)
+    if len(ratios) < _STATIONS:
+        return []
+    off = np.median(np.abs(np.log(np.maximum(ratios, 1e-300))), axis=0)
+    best = int(np.argmin(off))
+    if best == 0 or off[0] < np.log(_WRONG_UNIT) or off[best] > np.log(_RIGHT_UNIT):
+        return []
+    times = f"{1 / _UNITS[best - 1]:g}" if _UNITS[best - 1] < 1 else f"{_UNITS[best - 1]:g}"
+    side = "small" if _UNITS[best - 1] > 1 else "large"
+    return [
+        Remark(
+            f"the given projection centres X0 are {times} times too {side} for the points that the images "
+            f"show; are they in another unit than the points ({network.unit})?",
             Code.IMPLAUSIBLE,
         )
     ]
