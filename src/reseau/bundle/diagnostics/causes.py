@@ -491,8 +491,8 @@ def given_poses_that_do_not_fit(network: Network, misfit: Array) -> list[Remark]
     names = listed(network.images[i] for i in wrong)
     return [
         Remark(
-            f"the given orientation{'s' * (len(wrong) > 1)} of image{'s' * (len(wrong) > 1)} {names} do not "
-            "fit the points; leave them out, or check the order and the sense of the rotations",
+            f"the given orientation{'s' * (len(wrong) > 1)} of image{'s' * (len(wrong) > 1)} {names} "
+            f"{'do' if len(wrong) > 1 else 'does'} not fit the points; leave them out, or check the order and the sense of the rotations",
             Code.INCONSISTENT,
         )
     ]
