@@ -492,7 +492,8 @@ def given_poses_that_do_not_fit(network: Network, misfit: Array) -> list[Remark]
     return [
         Remark(
             f"the given orientation{'s' * (len(wrong) > 1)} of image{'s' * (len(wrong) > 1)} {names} "
-            f"{'do' if len(wrong) > 1 else 'does'} not fit the points; leave them out, or check the order and the sense of the rotations",
+            f"{'do' if len(wrong) > 1 else 'does'} not fit the points; leave them out, or check the order "
+            "and the sense of the rotations",
             Code.INCONSISTENT,
         )
     ]
