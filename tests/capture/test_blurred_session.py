@@ -86,7 +86,10 @@ def test_a_session_measures_blurred_targets_under_water_by_rays(tmp_path: Path) 
 def test_frames_without_the_targets_are_declined(tmp_path: Path) -> None:
     water = Water()
     laboratory = SimulatedBench(2, camera="frame", repeatable=True, in_process=True).laboratory
-    inputs = {"network.json": project(laboratory, water), **laboratory.field.frame.documents}  # type: ignore[union-attr]
+    frame = laboratory.field.frame
+    assert frame is not None
+    poses = {name: laboratory.pose_at(position) for name, position in PROJECT_POSES.items()}
+    inputs = {"network.json": project(frame, poses, water), **frame.documents}
     parameters = {"steps": [[name, dict(at)] for name, at in PROJECT_POSES.items()]}
     archive = Archive.open(tmp_path / "archive", create=True)
     session = sessions.begin(archive, "dry", "blurred", parameters, inputs)

@@ -95,7 +95,7 @@ def test_without_the_water_the_global_test_fails(reseau: Run, network: Callable[
     del document["refraction"]
     status, out, _ = reseau("bundle", network(document), "--json")
     assert status == 0
-    assert any("significantly larger" in warning for warning in json.loads(out)["warnings"])
+    assert any("which chance does not explain" in warning for warning in json.loads(out)["warnings"])
 
 
 def test_images_in_air_and_paths_of_single_images_can_be_named(

@@ -99,7 +99,7 @@ def image_scatter(result: Result, c: int) -> float:
     --------
     >>> from reseau.bundle import adjust_network, example_network
     >>> round(image_scatter(adjust_network(example_network()), 0), 1)
-    1.6
+    1.3
     """
     sigma = np.sqrt(np.diag(result.camera_covariance(c)))
     ratio = sigma_between_images(result, c) / np.where(sigma > 0, sigma, np.inf)
