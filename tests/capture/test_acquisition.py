@@ -15,6 +15,7 @@ from bluesky import RunEngine
 
 from reseau.archive import Archive, Session, Verdict
 from reseau.capture import Goal, Plan, Step, at_heights, carry_out, paper_steps, plans, rerun
+from reseau.core.data import Frame
 from reseau.core.errors import ArchiveError, EstimationError, StateError, UsageError
 
 from .fieldrig import FieldRig
@@ -440,3 +441,23 @@ def test_a_goal_for_a_parameter_that_is_not_estimated_is_refused(rig: FieldRig, 
     run = rig.acquisition(session, rig.procedure())
     with pytest.raises(EstimationError, match="is not estimated; use c, x0, y0, K1"):
         carry_out(run, plans.until(run, Goal("fx", 1.0, ""), FEW, EVERY[-1:]))
+
+
+def test_frames_from_before_a_resumption_are_not_measured_again(rig: FieldRig, session: Session) -> None:
+    run = rig.acquisition(session, rig.procedure())
+    carry_out(run, plans.poses(run, FEW))
+    (first,) = session.results()
+    made, number = rig.procedure(), 0
+    measure = made._measure
+
+    def counted(frame: Frame) -> Any:
+        nonlocal number
+        number += 1
+        return measure(frame)
+
+    made._measure = counted
+    again = rig.acquisition(session, made)
+    carry_out(again, plans.poses(again, FEW))
+    assert number == 0
+    assert session.results()[-1].id == first.id  # the same to the byte, so that it is not stored again
+    assert made.finish()["calibration.json"].encode() == session.content(first)

@@ -31,6 +31,7 @@ from ..core.errors import (
     StateError,
     UsageError,
 )
+from ..core.version import __version__
 from ..instruments import Camera, Exposure, Oscilloscope, Turntable, UltrasonicScanner
 from . import by_hand
 from .bench import ROLES, Bench
@@ -42,6 +43,8 @@ __all__ = ["Acquisition", "Plan", "Procedure", "Watch"]
 T = TypeVar("T")
 _TRIES = 4
 """Attempts on an instrument before its failure ends the session."""
+_MEASURED = "measured"
+"""Kind of the notes about what was measured in frames."""
 _STILL = 0.02
 """Largest movement of an axis during an exposure, in the unit of the axis."""
 
@@ -183,6 +186,7 @@ class Acquisition:
         """What is under way, in words."""
         self._silent: frozenset[str] = frozenset()
         self._original_us: float | None = None
+        self._memories: dict[int, Mapping[str, Any]] | None = None
 
     def one(self, kind: type) -> Any:
         """Return the instrument of a kind: the named one, or the only one. See :meth:`Bench.one`."""
@@ -538,9 +542,10 @@ class Acquisition:
         """The verdict on a frame; the procedure gets each frame once, also those from before a resumption."""
         if frame.id in self._verdicts:
             return self._verdicts[frame.id]
-        verdict = self._checked(self.session.picture(frame), frame, step)
+        verdict = self._recalled(frame, step) or self._checked(self.session.picture(frame), frame, step)
         if frame.verdict is None:
             self.session.judge(frame, verdict)
+            self._remember(frame, step, verdict)
         self._verdicts[frame.id] = verdict
         facts = {"step": step.name, "take": frame.take, "ok": verdict.ok, "why": verdict.why}
         # A frame from before a resumption took no time.
@@ -550,6 +555,32 @@ class Acquisition:
             if reached:
                 self.watch("precision", {"step": step.name} | reached)
         return verdict
+
+    def _remember(self, frame: ArchivedFrame, step: Step, verdict: Verdict) -> None:
+        """Store what was measured, so that a session that is resumed need not measure it again."""
+        recollection = getattr(self.procedure, "recollection", None)
+        if recollection is not None and verdict.ok:
+            self.session.note(
+                f"measured {frame.id}", _MEASURED,
+                {"frame": frame.id, "software": __version__, "measured": recollection(step)},
+            )  # fmt: skip
+
+    def _recalled(self, frame: ArchivedFrame, step: Step) -> Verdict | None:
+        """The verdict on a frame from before a resumption, as this version of the software found it."""
+        if frame.verdict is None:
+            return None
+        if not frame.verdict.ok:  # no procedure has it
+            return frame.verdict
+        recall = getattr(self.procedure, "recall", None)
+        if recall is None:
+            return None
+        if self._memories is None:
+            notes = (note for _, note in self.session.notes(_MEASURED))
+            self._memories = {
+                int(note["frame"]): note["measured"] for note in notes if note["software"] == __version__
+            }
+        measured = self._memories.get(frame.id)
+        return None if measured is None else recall(as_taken(step, frame.facts), measured)
 
     def _checked(self, picture: Frame, frame: ArchivedFrame, step: Step) -> Verdict:
         if frame.facts.get("moved"):

@@ -125,12 +125,31 @@ class TestfieldProcedure:
             return Verdict(False, found.reason)
         if len(found.points) < self._least:
             return Verdict(False, f"{len(found.points)} points are too few")
-        self._size = (frame.width, frame.height)
-        self._measured[step.name] = found.points
-        self._places[step.name], self._inputs[step.name] = dict(step.position), frame.sha256
+        self._keep(step, found.points, (frame.width, frame.height), frame.sha256)
+        return Verdict(True, facts={"points": len(found.points)})
+
+    def _keep(self, step: Place, points: ImagePoints, size: tuple[int, int], sha256: str) -> None:
+        self._size = size
+        self._measured[step.name] = points
+        self._places[step.name], self._inputs[step.name] = dict(step.position), sha256
         self._stands = self._at(step)  # only good frames: a rerun has no others
         self._pose[step.name] = self._stands[0]
-        return Verdict(True, facts={"points": len(found.points)})
+
+    def recollection(self, step: Place) -> dict[str, Any]:
+        """Return what was measured in the good frame of a step, for :meth:`recall`."""
+        points, size = self._measured[step.name], self._size
+        return {
+            "names": list(points.names), "xy": points.xy.tolist(), "cov": points.cov.tolist(),
+            "size": None if size is None else list(size), "sha256": self._inputs[step.name],
+        }  # fmt: skip
+
+    def recall(self, step: Place, measured: Mapping[str, Any]) -> Verdict:
+        """Take over what was measured in a frame before, in place of measuring it again."""
+        xy, cov = (np.array(measured[key], dtype=np.float64) for key in ("xy", "cov"))
+        points = ImagePoints(tuple(measured["names"]), xy.reshape(-1, 2), cov.reshape(-1, 2, 2))
+        width, height = measured["size"]
+        self._keep(step, points, (int(width), int(height)), str(measured["sha256"]))
+        return Verdict(True, facts={"points": len(points)})
 
     def _at(self, place: Place) -> tuple[int, dict[str, float] | None]:
         """The number of a pose, and the positions of all its axes except the height.

@@ -116,6 +116,16 @@ class Reported:
         verdict: Verdict = self.procedure.on_frame(frame, step)
         return verdict
 
+    @property
+    def recollection(self) -> Callable[[Step], dict[str, Any]] | None:
+        """What the procedure says of a measured frame, if it can take that over when it is resumed."""
+        return getattr(self.procedure, "recollection", None)
+
+    @property
+    def recall(self) -> Callable[[Step, Mapping[str, Any]], Verdict] | None:
+        """How the procedure takes over a frame that was measured before."""
+        return getattr(self.procedure, "recall", None)
+
     def progress(self) -> Mapping[str, float]:
         """Return the standard deviations reached so far."""
         reached: Mapping[str, float] = self.procedure.progress()
