@@ -24,7 +24,7 @@ from typing import Any
 
 from .. import sessions
 from ..archive import Archive
-from ..capture import Bench, BenchFile, Control, edge_sigma, exposure_fault
+from ..capture import Bench, BenchFile, BenchLock, Control, edge_sigma, exposure_fault
 from ..core.errors import BenchError, InstrumentError, ReseauError, StateError, UsageError
 from ..instruments import Camera, Turntable
 from ..io import read_text
@@ -561,6 +561,9 @@ class Worker:
                 except TimeoutError:
                     if self._wires or self._control is not None:
                         heard = time.monotonic()
+                    if place is not None and not place.exists():
+                        # A service that was about to start another worker has removed it.
+                        private_file(place, json.dumps(about).encode())
                     if place is not None and time.monotonic() - heard > _ALONE_S:
                         self.over.set()  # started by a service, which would start another one
                     continue
@@ -614,8 +617,14 @@ def run(
     """
     told = None if address is not None else StateFolder(folder)
     certificates = Certificates.in_folder(folder) if told is None else Certificates(told)
-    with Archive.open(place, objects or None, create=True) as archive:
-        worker = Worker(read_text(bench), archive, certificates)
+    text = read_text(bench)
+    with contextlib.ExitStack() as stack:
+        if told is not None:
+            # A service that was killed may have started one that has not said so yet: that one stays.
+            where = address_file(told, BenchFile.parse_toml(text, where=bench).name)
+            stack.enter_context(BenchLock([str(where)], f"worker of {bench}"))
+        archive = stack.enter_context(Archive.open(place, objects or None, create=True))
+        worker = Worker(text, archive, certificates)
 
         def end(*_: object) -> None:
             if worker._control is not None:
@@ -632,7 +641,10 @@ def run(
 
 def _main() -> None:
     bench, place, objects, state = sys.argv[1:5]
-    run(Path(bench), place, objects or None, Path(state))
+    try:
+        run(Path(bench), place, objects or None, Path(state))
+    except StateError as error:
+        sys.exit(f"reseau: {error}")
 
 
 if __name__ == "__main__":
