@@ -70,7 +70,10 @@ class Bench:
             found = self.state()
             return found["state"] in wanted
 
-        until(there, 120)
+        try:
+            until(there, 120)
+        except AssertionError:
+            raise AssertionError(found) from None
         return found
 
 
