@@ -411,10 +411,9 @@ class Bench:
         found = []
         for name, entry in self.file.instruments.items():
             outcome = outcomes[name]
-            if isinstance(outcome, ReseauError):
-                found.append(Checked(name, entry.driver, entry.address, {}, outcome))
-            else:
-                found.append(Checked(name, entry.driver, entry.address, outcome))
+            error = outcome if isinstance(outcome, ReseauError) else None
+            tested = {} if isinstance(outcome, ReseauError) else outcome
+            found.append(Checked(name, entry.driver, entry.address, tested, error))
         return found
 
     def stop(self) -> None:

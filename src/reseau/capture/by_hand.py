@@ -1,4 +1,4 @@
-"""Acts on single instruments of a bench by hand: where the axes are, move, home, and who else uses them."""
+"""Acts on the axes of a table by hand: where they are, where they can be moved, move, home."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from .common import AsJson, Out, say, writable
 
 if TYPE_CHECKING:
     from ..capture import Bench
-    from ..instruments import Camera, Turntable
+    from ..instruments import Turntable
 
 __all__ = ["BenchPath", "expose", "home", "move", "set_", "status", "stop", "watch"]
 
@@ -44,27 +44,14 @@ def _held(bench: Bench, purpose: str) -> Iterator[None]:
 
 
 @contextmanager
-def _table(path: Path, name: str | None, purpose: str) -> Iterator[Turntable]:
-    """The table of a bench, connected."""
+def _one(path: Path, kind: type, name: str | None, purpose: str) -> Iterator[Any]:
+    """An instrument of a bench, connected: the named one, or the only one of its kind."""
     from ..capture import Bench
-    from ..instruments import Turntable
 
     bench = Bench.read(path)
-    table: Turntable = bench.one(Turntable, name)
-    with _held(bench.part([table.name]), purpose):
-        yield table
-
-
-@contextmanager
-def _camera(path: Path, name: str | None, purpose: str) -> Iterator[Camera]:
-    """The camera of a bench, connected."""
-    from ..capture import Bench
-    from ..instruments import Camera
-
-    bench = Bench.read(path)
-    camera: Camera = bench.one(Camera, name)
-    with _held(bench.part([camera.name]), purpose):
-        yield camera
+    found = bench.one(kind, name)
+    with _held(bench.part([found.name]), purpose):
+        yield found
 
 
 def status(bench: BenchPath = _BENCH, as_json: AsJson = False) -> None:
@@ -122,8 +109,9 @@ def home(
 ) -> None:
     """Find the reference of axes, one after the other. The axes move; Ctrl-C stops them."""
     from ..capture import by_hand
+    from ..instruments import Turntable
 
-    with _table(bench, table, "reseau bench home") as found:
+    with _one(bench, Turntable, table, "reseau bench home") as found:
         homed = by_hand.home(found, axes or ())
         say(f"{', '.join(homed)}: homed\n" if homed else "all axes have their reference\n")
         _say_axes(found)
@@ -137,9 +125,10 @@ def move(
 ) -> None:
     """Move axes, all at the same time, and wait. Ctrl-C stops them where they are."""
     from ..capture import by_hand
+    from ..instruments import Turntable
 
     wanted = dict(_number(text) for text in positions)
-    with _table(bench, table, "reseau bench move") as found:
+    with _one(bench, Turntable, table, "reseau bench move") as found:
         there = by_hand.targets(found, wanted, relative=by)
         lost = [axis for axis in there if not found.state(axis).homed]
         if lost:
@@ -269,11 +258,12 @@ def expose(
 ) -> None:
     """Take a frame, and say how it is exposed and how sharp it is; it is not archived."""
     from ..core.provenance import canonical_json
+    from ..instruments import Camera
     from ..io.images import write_image
 
     if out is not None:
         writable(out)
-    with _camera(bench, camera, "reseau bench expose") as found:
+    with _one(bench, Camera, camera, "reseau bench expose") as found:
         # Others set the exposure of the bench file again, when they connect.
         if exposure_us is not None:
             found.configure(exposure_us=exposure_us)

@@ -24,7 +24,7 @@ from typing import Any
 
 from .. import sessions
 from ..archive import Archive
-from ..capture import Bench, BenchFile, BenchLock, Control, edge_sigma, exposure_fault
+from ..capture import Bench, BenchFile, BenchLock, Control, by_hand, edge_sigma, exposure_fault
 from ..core.errors import BenchError, InstrumentError, ReseauError, StateError, UsageError
 from ..instruments import Camera, Turntable
 from ..io import read_text
@@ -190,15 +190,13 @@ class Worker:
         return found
 
     def _axes(self) -> dict[str, Any]:
-        table = self._table()
-        found = {}
-        for name, axis in table.axes.items():
-            state = table.state(name)
-            found[name] = {
-                "position": state.position, "unit": axis.unit, "limits": list(axis.limits),
-                "homed": state.homed, "moving": state.moving,
-            }  # fmt: skip
-        return found
+        return {
+            name: {
+                "position": axis.position, "unit": axis.unit, "limits": list(axis.limits),
+                "homed": axis.homed, "moving": axis.moving,
+            }
+            for name, axis in by_hand.axes_of(self._table()).items()
+        }  # fmt: skip
 
     def _free(self) -> None:
         if self._control is not None:
@@ -207,13 +205,7 @@ class Worker:
     def _move(self, axis: str, position: float, relative: bool = False) -> dict[str, Any]:
         self._free()
         table = self._table()
-        if axis not in table.axes:
-            raise UsageError("is no axis", where=axis, do=f"use {', '.join(table.axes)}")
-        target = table.state(axis).position + position if relative else position
-        low, high = table.axes[axis].limits
-        if not low <= target <= high:
-            unit = table.axes[axis].unit
-            raise UsageError(f"{target:g} {unit} is out of range", where=axis, do=f"use {low:g} to {high:g}")
+        target = by_hand.targets(table, {axis: position}, relative=relative)[axis]
         return self._moved(f"{axis} to {target:g} {table.axes[axis].unit}", lambda: table.move(axis, target))
 
     def _home(self, axis: str) -> dict[str, Any]:
