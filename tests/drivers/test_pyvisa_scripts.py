@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -136,6 +137,20 @@ def test_curves_of_tektronix_in_every_coding(coding: str, datatype: str, big: bo
             codes = np.array(device.query_ascii_values("CURVE?"))
         assert offset == shift
         assert (codes.astype(float) - offset) * scale + 0.12 == pytest.approx(VOLTS, abs=1e-6)
+        assert machine.violations == []
+
+
+def test_answers_of_tektronix_have_headers_until_they_are_switched_off() -> None:
+    with opened("tektronix-tds3000", "vxi-11") as (device, machine):
+        assert device.query("HARDC:FORM?") == ":HARDCOPY:FORMAT BMP"
+        assert device.query("VERB OFF;:HARDC:LAY?;:CH2:SCA?") == ":HARDC:LAY PORTR;:CH2:SCA 1.000000E+00"
+        assert device.query("HEAD OFF;:HARDC:PORT?;:WFMP:PT_O?") == "FIL;500"
+        # A picture that is to be printed or saved is not sent; one that is compressed is.
+        device.write("HARDCopy:FORMat PNG;PORT CENtronics;:HARDCopy STARt")
+        assert device.read_stb() & 0x10 == 0
+        device.write("HARDCopy:PORT GPIb;COMPRession ON;:HARDCopy STARt")
+        data = gzip.decompress(device.read_raw())
+        assert (cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) == machine.screen()).all()
         assert machine.violations == []
 
 

@@ -11,6 +11,7 @@ import re
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import Literal
 
@@ -89,9 +90,9 @@ class Dialect:
     Parameters
     ----------
     name : str
-        Name of the family.
-    identity : str
-        Regular expression for maker and model, as ``MAKER,MODEL``.
+        Name of the family; begins with that of the maker.
+    models : str
+        Regular expression for the beginning of the model.
     screen : tuple of Step
         Steps to obtain the screen picture; one of them fetches it.
     waveform : WaveformDialect, optional
@@ -110,38 +111,54 @@ class Dialect:
     """
 
     name: str
-    identity: str
+    models: str
     screen: tuple[Step, ...]
     waveform: WaveformDialect | None = None
     setup: tuple[str, ...] = ()
     halt: str = ":STOP"
     errors: str = ":SYSTem:ERRor?"
 
+    @property
+    def maker(self) -> str:
+        """The maker."""
+        return next(maker for maker in _MAKERS if self.name.startswith(maker))
+
 
 _TEN = "- - points - dx x0 - dy y0 yref"
 """The ten numbers of a Keysight or Rigol preamble: format, type, points, count, x, y."""
 
-_KEYSIGHT = WaveformDialect(
-    (":WAVeform:SOURce CHANnel{n}", ":WAVeform:FORMat BYTE", ":WAVeform:UNSigned ON"),
-    MappingProxyType({_TEN: ":WAVeform:PREamble?"}),
-    ":WAVeform:DATA?",
-    "u1",
-    lambda codes, f: (codes - f["yref"]) * f["dy"] + f["y0"],
-)
-_INFINIIUM = WaveformDialect(
-    (":WAVeform:SOURce CHANnel{n}", ":WAVeform:FORMat BYTE", ":WAVeform:STReaming OFF"),
-    MappingProxyType({_TEN: ":WAVeform:PREamble?"}),
-    ":WAVeform:DATA?",
-    "i1",
-    lambda codes, f: (codes - f["yref"]) * f["dy"] + f["y0"],
-)
-_RIGOL = WaveformDialect(
-    (":WAVeform:SOURce CHANnel{n}", ":WAVeform:MODE NORMal", ":WAVeform:FORMat BYTE"),
-    MappingProxyType({_TEN: ":WAVeform:PREamble?"}),
-    ":WAVeform:DATA?",
-    "u1",
-    lambda codes, f: (codes - f["y0"] - f["yref"]) * f["dy"],
-)
+
+def _with_preamble(dtype: str, *setup: str, shifted: bool = False) -> WaveformDialect:
+    """Bytes scaled by a preamble of ten numbers; `shifted`: its origin counts codes, not volts."""
+
+    def volts(codes: Array, f: Numbers) -> Array:
+        return (codes - f["y0"] - f["yref"]) * f["dy"] if shifted else (codes - f["yref"]) * f["dy"] + f["y0"]
+
+    return WaveformDialect(
+        (":WAVeform:SOURce CHANnel{n}", ":WAVeform:FORMat BYTE", *setup),
+        MappingProxyType({_TEN: ":WAVeform:PREamble?"}),
+        ":WAVeform:DATA?",
+        dtype,
+        volts,
+    )
+
+
+def _curve(group: str, **more: str) -> WaveformDialect:
+    """The curve of a Tektronix, scaled by the numbers of a group; some count samples from the trigger."""
+    names = {"dx": "XINcr", "x0": "XZEro", "dy": "YMUlt", "yoff": "YOFf", "y0": "YZEro"} | more
+    return WaveformDialect(
+        ("HEADer OFF", "DATa:SOUrce CH{n}", "DATa:ENCdg RIBinary", "DATa:WIDth 1"),
+        MappingProxyType({name: f"{group}:{written}?" for name, written in names.items()}),
+        "CURVe?",
+        "i1",
+        lambda codes, f: (codes - f["yoff"]) * f["dy"] + f["y0"],
+        start=lambda f: f["x0"] - f.get("first", 0.0) * f["dx"],
+    )
+
+
+_KEYSIGHT = _with_preamble("u1", ":WAVeform:UNSigned ON")
+_INFINIIUM = _with_preamble("i1", ":WAVeform:STReaming OFF")
+_RIGOL = _with_preamble("u1", ":WAVeform:MODE NORMal", shifted=True)
 _SIGLENT = WaveformDialect(
     ("CHDR OFF", "WFSU SP,0,NP,0,FP,0"),
     MappingProxyType({"vdiv": "C{n}:VDIV?", "ofst": "C{n}:OFST?", "rate": "SARA?", "tdiv": "TDIV?"}),
@@ -178,21 +195,8 @@ _SIGLENT_BLOCK = WaveformDialect(
     wide=(":WAVeform:WIDTh WORD", "<i2"),
     piece=":WAVeform:STARt {at}",
 )
-_TEKTRONIX = WaveformDialect(
-    ("HEADer OFF", "DATa:SOUrce CH{n}", "DATa:ENCdg RIBinary", "DATa:WIDth 1"),
-    MappingProxyType(
-        {
-            "dx": "WFMOutpre:XINcr?",
-            "x0": "WFMOutpre:XZEro?",
-            "dy": "WFMOutpre:YMUlt?",
-            "yoff": "WFMOutpre:YOFf?",
-            "y0": "WFMOutpre:YZEro?",
-        }
-    ),
-    "CURVe?",
-    "i1",
-    lambda codes, f: (codes - f["yoff"]) * f["dy"] + f["y0"],
-)
+_TEKTRONIX = _curve("WFMOutpre")
+_TEKTRONIX_TDS = _curve("WFMPre", first="PT_Off")
 _ROHDE = WaveformDialect(
     ("FORMat REAL,32", "FORMat:BORDer LSBFirst"),
     MappingProxyType({"x0 x1 points -": "CHANnel{n}:DATA:HEADer?"}),
@@ -202,47 +206,45 @@ _ROHDE = WaveformDialect(
     step=lambda f: (f["x1"] - f["x0"]) / f["points"],
 )
 
+
+def _hardcopy(kind: str, port: str) -> tuple[Step, ...]:
+    """Steps of a Tektronix TDS; without LAYout and COMPRession it may send what was last printed with."""
+    return (
+        ("send", f"HARDCopy:FORMat {kind}"),
+        ("send", "HARDCopy:LAYout PORTRait"),
+        ("send", f"HARDCopy:PORT {port}"),
+        ("fetch", "HARDCopy STARt"),
+    )
+
+
+_no_queue = partial(Dialect, halt="STOP", errors="", setup=("CHDR OFF",))
+_tektronix = partial(Dialect, halt="ACQuire:STATE STOP", errors="", setup=("HEADer OFF",))
+
 DIALECTS: tuple[Dialect, ...] = (
     Dialect(
         "Keysight Infiniium",
-        r"(KEYSIGHT|AGILENT|HEWLETT).*,((MXR|EXR|UXR)\d|(DSO|MSO|DSA)(S|V|Z|X?9)\d).*",
+        r"(MXR|EXR|UXR)\d|(DSO|MSO|DSA)(S|V|Z|X?9)\d",
         (("fetch", ":DISPlay:DATA? PNG,SCReen,ON,NORMal"),),
         _INFINIIUM,
     ),
     Dialect(
         "Keysight InfiniiVision X",
-        r"(KEYSIGHT|AGILENT).*,((DSO|MSO|EDU)-?X ?[1-6]\d{3}|(DSO|MSO)[5-7]\d{3}|HD3\d|M924|P924).*",
+        r"(DSO|MSO|EDU)-?X ?[1-6]\d{3}|(DSO|MSO)[5-7]\d{3}|HD3\d|M924|P924",
         (("send", ":HARDcopy:INKSaver OFF"), ("fetch", ":DISPlay:DATA? PNG, COLor")),
         _KEYSIGHT,
     ),
-    Dialect(
-        "Rigol 1000Z",
-        r"RIGOL.*,(DS|MSO)1\d{3}Z.*",
-        (("fetch", ":DISPlay:DATA? ON,0,PNG"),),
-        _RIGOL,
-    ),
-    Dialect("Rigol", r"RIGOL.*,(DS|MSO|DHO|MHO|HDO)\d.*", (("fetch", ":DISPlay:DATA?"),), _RIGOL),
-    Dialect(
+    Dialect("Rigol 1000Z", r"(DS|MSO)1\d{3}Z", (("fetch", ":DISPlay:DATA? ON,0,PNG"),), _RIGOL),
+    Dialect("Rigol", r"(DS|MSO|DHO|MHO|HDO)\d", (("fetch", ":DISPlay:DATA?"),), _RIGOL),
+    _no_queue(
         "Siglent with PRINt",
-        r"SIGLENT.*,SDS(\d+X (Plus|HD)|[567]\d{3}).*",
+        r"SDS(\d+X (Plus|HD)|[567]\d{3})",
         (("fetch", "PRINt? PNG"),),
         _SIGLENT_BLOCK,
-        setup=("CHDR OFF",),
-        halt="STOP",
-        errors="",
     ),
-    Dialect(
-        "Siglent",
-        r"SIGLENT.*,SDS\d.*",
-        (("fetch", "SCDP"),),
-        _SIGLENT,
-        setup=("CHDR OFF",),
-        halt="STOP",
-        errors="",
-    ),
-    Dialect(
+    _no_queue("Siglent", r"SDS\d", (("fetch", "SCDP"),), _SIGLENT),
+    _tektronix(
         "Tektronix with a file system",
-        r"TEKTRONIX,(MSO|DPO|LPD)(2[24]|4[46]|5[468]|58LP|6[468])B?\b.*",
+        r"(MSO|DPO|LPD)(2[24]|4[46]|5[468]|58LP|6[468])B?\b",
         (
             ("send", 'SAVe:IMAGe "C:/Temp/reseau.png"'),
             ("query", "*OPC?"),
@@ -250,26 +252,32 @@ DIALECTS: tuple[Dialect, ...] = (
             ("send", 'FILESystem:DELEte "C:/Temp/reseau.png"'),
         ),
         _TEKTRONIX,
-        setup=("HEADer OFF",),
-        halt="ACQuire:STATE STOP",
-        errors="",
     ),
-    Dialect(
+    _tektronix(
+        "Tektronix TDS 3000",
+        r"TDS ?3\d{3}",
+        (("send", "HARDCopy:COMPRession OFF"), *_hardcopy("BMPColor", "GPIb")),
+        _TEKTRONIX_TDS,
+    ),
+    _tektronix(
+        "Tektronix TDS 1000 and 2000",
+        r"(TDS ?[12]0\d\d|TPS ?2\d{3}|TBS ?1\d{3})",
+        _hardcopy("BMP", "USB"),
+        _TEKTRONIX_TDS,
+    ),
+    _tektronix(
         "Tektronix",
-        r"TEKTRONIX,(MSO|DPO|MDO|TDS|TBS|TPS|DSA|CSA) ?\d.*",
+        r"(MSO|DPO|MDO|TDS|TBS|TPS|DSA|CSA) ?\d",
         (
             ("send", "SAVe:IMAGe:FILEFormat PNG"),
             ("send", "HARDCopy:INKSaver OFF"),
             ("fetch", "HARDCopy STARt"),
         ),
         _TEKTRONIX,
-        setup=("HEADer OFF",),
-        halt="ACQuire:STATE STOP",
-        errors="",
     ),
     Dialect(
         "Rohde & Schwarz with a file system",
-        r"ROHDE&SCHWARZ,(RTO|RTE|RTP|MXO).*",
+        r"RTO|RTE|RTP|MXO",
         (
             ("send", "HCOPy:DEVice1:LANGuage PNG"),
             ("send", "MMEMory:NAME 'C:\\reseau.png'"),
@@ -282,39 +290,34 @@ DIALECTS: tuple[Dialect, ...] = (
     ),
     Dialect(
         "Rohde & Schwarz",
-        r"(ROHDE&SCHWARZ|HAMEG),(RTB|RTM|RTA|RTC|RTH|HMO)\d?.*",
+        r"RTB|RTM|RTA|RTC|RTH|HMO",
         (("send", "HCOPy:FORMat PNG"), ("fetch", "HCOPy:DATA?")),
         _ROHDE,
     ),
-    Dialect(
+    _no_queue(
         "LeCroy",
-        r"LECROY,(?!WAVESTATION|T3|WS\d{4}).*",
-        (
-            ("send", "CHDR OFF"),
-            ("send", "HCSU DEV,PNG,BCKG,BLACK,AREA,DSOWINDOW,DEST,REMOTE"),
-            ("fetch", "SCDP"),
-        ),
-        halt="STOP",
-        errors="",
+        r"",
+        (("send", "HCSU DEV,PNG,BCKG,BLACK,AREA,DSOWINDOW,DEST,REMOTE"), ("fetch", "SCDP")),
     ),
 )
 
-
 _MAKERS = {
-    "Keysight": r"KEYSIGHT|AGILENT|HEWLETT",
-    "Rigol": r"RIGOL",
-    "Siglent": r"SIGLENT",
-    "Tektronix": r"TEKTRONIX",
-    "Rohde & Schwarz": r"ROHDE|HAMEG",
-    "LeCroy": r"LECROY|TELEDYNE",
+    "Keysight": ("KEYSIGHT|AGILENT|HEWLETT", r"34|U?12|U34|L44|EDU3[46]|3[35]\d|N\d|E\d"),
+    "Rigol": ("RIGOL", r"(DM|DG|DP|DSA|DL|RSA)\d"),
+    "Siglent": ("SIGLENT", r"SDM|SDG|SPD|SSA|SSG|SVA|SDL"),
+    "Tektronix": ("TEKTRONIX", r"DMM|AFG|AWG|PWS|RSA|PA"),
+    "Rohde & Schwarz": ("ROHDE|HAMEG", r"HMC|NG|FP|FS|SM|HMP|UDS"),
+    "LeCroy": ("LECROY|TELEDYNE", r"WAVESTATION|T3|WS\d{4}"),
+    "Keithley": ("KEITHLEY", ""),
 }
-_OTHER = re.compile(
-    r"(KEYSIGHT|AGILENT|HEWLETT).*,(34|U?12|U34|L44|EDU3[46]|3[35]\d|N\d|E\d)|RIGOL.*,(DM|DG|DP|DSA|DL|RSA)\d"
-    r"|SIGLENT.*,(SDM|SDG|SPD|SSA|SSG|SVA|SDL)|TEKTRONIX,(DMM|AFG|AWG|PWS|RSA|PA)"
-    r"|ROHDE&SCHWARZ,(HMC|NG|FP|FS|SM|HMP|UDS)|LECROY,(WAVESTATION|T3|WS\d{4}).*|KEITHLEY.*",
-    re.IGNORECASE,
-)
-"""Multimeters, generators, supplies and analyzers of the same makers."""
+"""Makers as in the names of their dialects: what ``*IDN?`` begins with, and models that are no oscilloscopes:
+multimeters, generators, supplies and analyzers.
+"""
+
+
+def _is(maker: str, models: str, identity: str) -> bool:
+    """Whether an identity is of a maker and of models."""
+    return re.match(rf"({_MAKERS[maker][0]})[^,]*, *({models})", identity.strip(), re.IGNORECASE) is not None
 
 
 def candidates_of(identity: str) -> tuple[Dialect, ...]:
@@ -330,11 +333,11 @@ def candidates_of(identity: str) -> tuple[Dialect, ...]:
     >>> [dialect.name for dialect in candidates_of("RIGOL TECHNOLOGIES,XYZ9,1,1")]
     ['Rigol 1000Z', 'Rigol']
     """
-    if _OTHER.match(identity.strip()):
-        raise ProtocolError(f"{identity!r} is no oscilloscope", do="check the address")
-    for maker, pattern in _MAKERS.items():
-        if re.match(pattern, identity.strip(), re.IGNORECASE):
-            return tuple(dialect for dialect in DIALECTS if dialect.name.startswith(maker))
+    for maker, (_, others) in _MAKERS.items():
+        if _is(maker, others, identity):
+            raise ProtocolError(f"{identity!r} is no oscilloscope", do="check the address")
+        if _is(maker, "", identity):
+            return tuple(dialect for dialect in DIALECTS if dialect.maker == maker)
     return DIALECTS
 
 
@@ -351,11 +354,8 @@ def dialect_of(identity: str) -> Dialect | None:
     >>> dialect_of("RIGOL TECHNOLOGIES,DS1104Z,DS1ZA000000001,00.04.04").name
     'Rigol 1000Z'
     """
-    for dialect in DIALECTS:
-        if re.match(dialect.identity, identity.strip(), re.IGNORECASE):
-            return dialect
-    candidates_of(identity)
-    return None
+    possible = candidates_of(identity)
+    return next((dialect for dialect in possible if _is(dialect.maker, dialect.models, identity)), None)
 
 
 def fields_of(block: bytes, dialect: WaveformDialect) -> Numbers:

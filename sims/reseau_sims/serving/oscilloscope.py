@@ -5,6 +5,7 @@ Source: programming manuals of the makers: sequences that transfer the screen an
 
 from __future__ import annotations
 
+import gzip
 import struct
 import zlib
 from collections.abc import Callable, Mapping
@@ -42,6 +43,8 @@ class Family:
         Required arguments, in upper case.
     picture : str
         ``.png`` or ``.bmp``.
+    format : str
+        Header of the setting that names another kind of file, if there is one.
     as_block : bool
         Whether the picture is sent as a block.
     newline : bool
@@ -50,7 +53,7 @@ class Family:
         Headers that must be sent before, in any order.
     waveform : str
         Transfer of waveforms: ``keysight``, ``infiniium``, ``rigol``, ``siglent``, ``siglent-block`` (and
-        ``-wide``, with 16 bits), ``tektronix``, ``rohde``.
+        ``-wide``, with 16 bits), ``tektronix``, ``tektronix-tds``, ``rohde``.
     options : tuple of tuple of str
         Alternatives of each argument of the screen's header, where it has them; all are optional.
     saves : tuple of str
@@ -66,6 +69,7 @@ class Family:
     screen: str
     screen_arguments: str = ""
     picture: str = ".png"
+    format: str = ""
     as_block: bool = True
     newline: bool = True
     prepared_by: tuple[str, ...] = ()
@@ -79,11 +83,13 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
         "keysight": Family(
             "KEYSIGHT TECHNOLOGIES,MSO-X 3024T,MY00000001,07.50",
             ":DISPlay:DATA?",
+            picture=".bmp",
             options=(("BMP", "BMP8bit", "PNG"), ("COLor", "GRAYscale")),
         ),
         "keysight-infiniium": Family(
             "KEYSIGHT TECHNOLOGIES,MXR058A,MY00000002,11.20.00601",
             ":DISPlay:DATA?",
+            picture=".bmp",
             options=(
                 ("BMP", "JPG", "GIF", "TIF", "PNG"),
                 ("SCReen", "GRATicule"),
@@ -128,11 +134,32 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
         "tektronix": Family(
             "TEKTRONIX,MSO2024B,C000001,CF:91.1CT FV:v1.52",
             "HARDCopy",
-            "START",
+            format="SAVe:IMAGe:FILEFormat",
             as_block=False,
             newline=False,
             prepared_by=("SAVe:IMAGe:FILEFormat",),
             waveform="tektronix",
+            options=(("STARt",),),
+        ),
+        "tektronix-tds2000": Family(
+            "TEKTRONIX,TDS 2024C,C000002,CF:91.1CT FV:v24.26",
+            "HARDCopy",
+            format="HARDCopy:FORMat",
+            as_block=False,
+            newline=False,
+            prepared_by=("HARDCopy:FORMat", "HARDCopy:PORT"),
+            waveform="tektronix-tds",
+            options=(("STARt",),),
+        ),
+        "tektronix-tds3000": Family(
+            "TEKTRONIX,TDS 3054B,0,CF:91.1CT FV:v3.41 TDS3FFT:v1.00 TDS3TRG:v1.00",
+            "HARDCopy",
+            format="HARDCopy:FORMat",
+            as_block=False,
+            newline=False,
+            prepared_by=("HARDCopy:FORMat", "HARDCopy:PORT"),
+            waveform="tektronix-tds",
+            options=(("STARt",),),
         ),
         "tektronix-files": Family(
             "TEKTRONIX,MSO54,C012345,CF:91.1CT FV:1.28.3.7430",
@@ -168,6 +195,12 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
 
 _PREAMBLE = (1e-6, -5e-4, 0.04, 0.12)
 """Time step and time of the first sample (s); voltage step and voltage of the middle (V)."""
+
+
+_SUFFIXES = {
+    "PNG": ".png", "JPG": ".jpg", "TIF": ".tif", "BMP": ".bmp", "BMPC": ".bmp", "BMP8": ".bmp", "GIF": ".bmp",
+}  # fmt: skip
+"""Kinds of files; GIF is not drawn."""
 
 
 def _grey() -> NDArray[np.uint8]:
@@ -244,7 +277,8 @@ class Oscilloscope(Machine):
     def execute(self, message: bytes) -> bytes | None:
         """Return the answer to a program message, if any; several answers are joined by semicolons."""
         text = message.strip(b"\r\n").decode("latin-1")
-        units, answers = list(units_of(text)), []
+        # A newline ends a message (IEEE 488.2, 7.5) also where the transport marks the end itself.
+        units, answers = [unit for line in text.split("\n") for unit in units_of(line)], []
         for header, arguments in units:
             answer = self._unit(header, arguments)
             if answer is not None:
@@ -290,21 +324,29 @@ class Oscilloscope(Machine):
                 return self._set(setting, header, arguments)
         for written, found in self._waveform().items():
             if Header(written).matches(header):
-                return found(arguments, header)
+                return self._headed(written, found(arguments, header))
         raise ValueError('-113,"Undefined header"')
 
     def _set(self, setting: Setting, header: str, arguments: str) -> bytes | None:
         number = "".join(c for c in header if c.isdigit()) if "<n>" in setting.written else ""
-        key = setting.written + number
+        key = setting.written.replace("<n>", number)
         if header.endswith("?"):
             if not arguments:
-                return self._values.get(key, setting.value).encode()
+                return self._headed(key, self._values.get(key, setting.value).encode())
             return setting.read(arguments).encode()  # the limit that MINimum or MAXimum stands for
         if not arguments:
             raise ValueError('-109,"Missing parameter"')
         self._values[key] = setting.read(arguments)
         self._seen.add(setting.written)
         return None
+
+    def _headed(self, written: str, answer: bytes | None) -> bytes | None:
+        """Tektronix: an answer begins with its header, unless HEADer is off."""
+        if answer is None or not self._like.waveform.startswith("tektronix") or self._value("HEADer") == "0":
+            return answer
+        name = written.removesuffix("?")
+        short = "".join(c for c in name if not c.islower())
+        return f":{name.upper() if self._value('VERBose') == '1' else short} ".encode() + answer
 
     def _value(self, written: str) -> str:
         """A setting that is in force."""
@@ -400,24 +442,31 @@ class Oscilloscope(Machine):
             raise ValueError(f'-221,"Settings conflict"; {", ".join(missing)} was not sent')
 
     def _picture(self, suffix: str) -> bytes:
-        found, coded = cv2.imencode(suffix, self.screen())
+        screen = self.screen()
+        if self._like.waveform == "tektronix-tds" and self._value("HARDCopy:LAYout") == "LAN":
+            screen = np.rot90(screen)
+        found, coded = cv2.imencode(suffix, screen)
         data = coded.tobytes() if found else b""
         if self._wrong_size:
             self._wrong_size, data = False, data[:-30]
         return data
 
     def _screenshot(self, arguments: str) -> bytes | None:
-        like, suffix = self._like, self._like.picture
+        like, kind = self._like, self._value(self._like.format) if self._like.format else ""
         given = [part.strip() for part in arguments.split(",")] if arguments else []
         if like.options:
             if len(given) > len(like.options):
                 raise ValueError('-108,"Parameter not allowed"')
             kinds = [choice(*known)(text) for text, known in zip(given, like.options, strict=False)]
-            suffix = {"PNG": ".png", "JPG": ".jpg", "TIF": ".tif"}.get(kinds[0] if kinds else "", ".bmp")
+            kind = kind or (kinds[0] if kinds else "")
         elif ",".join(given).upper() != like.screen_arguments.replace(" ", ""):
             raise ValueError('-108,"Parameter not allowed"')
         self._require_settings()
-        data = self._picture(suffix)
+        if like.waveform == "tektronix-tds" and self._value("HARDCopy:PORT") not in ("GPI", "USB"):
+            return None  # printed, or saved to a file
+        data = self._picture(_SUFFIXES.get(kind, like.picture))
+        if like.waveform == "tektronix-tds" and self._value("HARDCopy:COMPRession") == "1":
+            data = gzip.compress(data)
         return block(data) if like.as_block else data
 
     def _waveform(self) -> dict[str, Callable[[str, str], bytes | None]]:
@@ -443,16 +492,20 @@ class Oscilloscope(Machine):
                 }
             case "siglent-block" | "siglent-wide":
                 return self._descriptor(code)
-            case "tektronix":
+            case "tektronix" | "tektronix-tds":
                 wide = 256 if self._value("DATa:WIDth") == "2" else 1
+                # Older instruments count the samples from the trigger.
+                older = self._like.waveform == "tektronix-tds"
+                group, first = ("WFMPre", n // 2) if older else ("WFMOutpre", 0)
                 return {
-                    "WFMOutpre:XINcr?": say(f"{dx:.6E}"),
-                    "WFMOutpre:XZEro?": say(f"{x0:.6E}"),
-                    "WFMOutpre:YMUlt?": say(f"{dy / wide:.6E}"),
-                    "WFMOutpre:YOFf?": say(f"{128 * wide if self._positive else 0:.6E}"),
-                    "WFMOutpre:YZEro?": say(f"{y0:.6E}"),
-                    "WFMOutpre:NR_Pt?": say(str(n)),
-                    "WFMOutpre:BYT_Nr?": say(self._value("DATa:WIDth")),
+                    f"{group}:XINcr?": say(f"{dx:.6E}"),
+                    f"{group}:XZEro?": say(f"{x0 + dx * first:.6E}"),
+                    f"{group}:PT_Off?": say(str(first)),
+                    f"{group}:YMUlt?": say(f"{dy / wide:.6E}"),
+                    f"{group}:YOFf?": say(f"{128 * wide if self._positive else 0:.6E}"),
+                    f"{group}:YZEro?": say(f"{y0:.6E}"),
+                    f"{group}:NR_Pt?": say(str(n)),
+                    f"{group}:BYT_Nr?": say(self._value("DATa:WIDth")),
                     "CURVe?": lambda _a, _h: self._curve(code.astype(np.int64), wide),
                 }
             case "rohde":

@@ -49,6 +49,22 @@ _SIGLENT = (
     Setting(":WAVeform:INTerval", _POINTS, _ONE),
     Setting(":WAVeform:POINt", _POINTS, _ZERO),
 )
+_TEKTRONIX = (
+    Setting("HEADer", boolean, "1"),
+    Setting("VERBose", boolean, "1"),
+    Setting("HORizontal:SCAle", _SECONDS, _MILLI),
+    Setting("CH<n>:SCAle", _SCALE, _ONE),
+    Setting("CH<n>:OFFSet", _VOLTS, _ZERO),
+    Setting("SELect:CH<n>", boolean, "1"),
+    Setting("HARDCopy:INKSaver", boolean, "1"),
+    Setting("DATa:SOUrce", _source("CH<n>"), "CH1"),
+    Setting(
+        "DATa:ENCdg", choice("RIBinary", "RPBinary", "SRIbinary", "SRPbinary", "ASCIi", "FAStest"), "RIB"
+    ),
+    Setting("DATa:WIDth", choice("1", "2"), "1"),
+    Setting("DATa:STARt", _POINTS, "1"),
+    Setting("DATa:STOP", _POINTS, "1000"),
+)
 
 SETTINGS: Mapping[str, tuple[Setting, ...]] = MappingProxyType(
     {
@@ -76,24 +92,13 @@ SETTINGS: Mapping[str, tuple[Setting, ...]] = MappingProxyType(
         "siglent": (_HEADER, Setting("WFSU", _anything, "")),
         "siglent-block": _SIGLENT,
         "siglent-wide": _SIGLENT,
-        "tektronix": (
-            Setting("HEADer", boolean, "1"),
-            Setting("VERBose", boolean, "1"),
-            Setting("HORizontal:SCAle", _SECONDS, _MILLI),
-            Setting("CH<n>:SCAle", _SCALE, _ONE),
-            Setting("CH<n>:OFFSet", _VOLTS, _ZERO),
-            Setting("SELect:CH<n>", boolean, "1"),
-            Setting("SAVe:IMAGe:FILEFormat", choice("PNG", "BMP", "TIFf"), "BMP"),
-            Setting("HARDCopy:INKSaver", boolean, "1"),
-            Setting("DATa:SOUrce", _source("CH<n>"), "CH1"),
-            Setting(
-                "DATa:ENCdg",
-                choice("RIBinary", "RPBinary", "SRIbinary", "SRPbinary", "ASCIi", "FAStest"),
-                "RIB",
-            ),
-            Setting("DATa:WIDth", choice("1", "2"), "1"),
-            Setting("DATa:STARt", _POINTS, "1"),
-            Setting("DATa:STOP", _POINTS, "1000"),
+        "tektronix": (*_TEKTRONIX, Setting("SAVe:IMAGe:FILEFormat", choice("PNG", "BMP", "TIFf"), "BMP")),
+        "tektronix-tds": (
+            *_TEKTRONIX,
+            Setting("HARDCopy:FORMat", choice("BMP", "BMPColor", "PNG", "TIFf"), "BMP"),
+            Setting("HARDCopy:COMPRession", boolean, "0"),
+            Setting("HARDCopy:LAYout", choice("PORTRait", "LANdscape"), "PORTR"),
+            Setting("HARDCopy:PORT", choice("CENtronics", "ETHERnet", "FILe", "GPIb", "RS232", "USB"), "FIL"),
         ),
         "rohde": (
             Setting("TIMebase:SCALe", _SECONDS, _MILLI),
