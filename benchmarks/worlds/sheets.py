@@ -29,6 +29,7 @@ __all__ = ["CONDITIONS", "Printed", "Sheet", "View", "coded", "pose", "views"]
 
 _WIDTH, _HEIGHT = 960, 720
 _OVERSAMPLING = 4
+_ITERATIONS = 60
 _AROUND = 0.14
 """Light of what is around the paper, relative to it."""
 
@@ -273,7 +274,8 @@ class View:
 
     def _undistorted(self, at: Array) -> Array:
         found = at
-        for _ in range(8):
+        # Where a wide lens compresses the picture to the share s, an iteration leaves 1 − s of the error.
+        for _ in range(_ITERATIONS):
             found = found - (self._distorted(found) - at)
         return found
 

@@ -23,6 +23,9 @@ _DARK, _PAPER = 25.0, 200.0
 _INK_MM = 0.15
 """Width of the edges of ink: sharper ones, sampled three times in a pixel, would be displaced by 0.02 px."""
 
+_BEYOND = 6
+"""Pixels around the frame from which the point-spread function takes light."""
+
 
 def printer() -> str | None:
     """The program that rasterises, if it is there."""
@@ -56,9 +59,11 @@ class Lens:
     fine: int = 4
 
     def rays(self) -> Array:
-        """Undistorted directions (h · fine, w · fine, 2) of all samples."""
-        x = (np.arange(self.width * self.fine) + 0.5) / self.fine - 0.5
-        y = (np.arange(self.height * self.fine) + 0.5) / self.fine - 0.5
+        """Undistorted directions of all samples, also of those of `_BEYOND` pixels around the frame."""
+        x, y = (
+            (np.arange((size + 2 * _BEYOND) * self.fine) + 0.5) / self.fine - 0.5 - _BEYOND
+            for size in (self.width, self.height)
+        )
         bent = np.stack(np.meshgrid((x - self.cx) / self.fx, (y - self.cy) / self.fy), axis=-1)
         u, v = bent[..., 0].copy(), bent[..., 1].copy()
         for _ in range(25):  # x_d = x (1 + k1 r² + k2 r⁴) + decentering, solved for x by its own iteration
@@ -114,5 +119,7 @@ def photograph(
         borderValue=110.0,  # type: ignore[call-overload]
     )
     fine = cv2.GaussianBlur(fine, (0, 0), blur * lens.fine)
-    pixels = fine.reshape(lens.height, lens.fine, lens.width, lens.fine).mean(axis=(1, 3))
+    high, wide = (size + 2 * _BEYOND for size in (lens.height, lens.width))
+    pixels = fine.reshape(high, lens.fine, wide, lens.fine).mean(axis=(1, 3))
+    pixels = pixels[_BEYOND:-_BEYOND, _BEYOND:-_BEYOND]
     return np.clip(np.rint(pixels + rng.normal(0, noise, pixels.shape)), 0, 255).astype(np.uint8)

@@ -162,7 +162,7 @@ def test_the_target_is_found_among_the_designs_beside_the_photographs(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["charuco", "chess", "asymmetric", "aprilgrid"])
+@pytest.mark.parametrize("kind", ["charuco", "chess", "circles", "asymmetric", "aprilgrid", "sheet"])
 def test_true_parameters_are_within_their_sigmas_over_twenty_evenings(
     reseau: Run, tmp_path: Path, rays: Pixels, kind: str
 ) -> None:
