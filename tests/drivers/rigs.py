@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from reseau.instruments import Device
-from reseau_drivers.camera import aravis, v4l2
+from reseau_drivers.camera import CameraDriver, aravis, v4l2
+from reseau_drivers.camera import rig as camera_rig
 from reseau_drivers.link import link_to
 from reseau_drivers.oscilloscope import Oscilloscope
 from reseau_drivers.oscilloscope.visa import scpi_link
@@ -34,6 +35,7 @@ from reseau_sims.serving import (
     ZaberChain,
 )
 from reseau_sims.serving.gige import GigeCamera
+from reseau_sims.serving.gigevision import GigeVisionCamera, loopback_addresses
 from reseau_sims.serving.imaging import SimulatedCamera, StripeScene, View
 from reseau_sims.serving.usbtmc import UsbInstrument, plugged_in
 from reseau_sims.serving.v4l2 import VideoCamera
@@ -66,7 +68,7 @@ class Rig:
     script: FaultScript
     work: Callable[[int], None]
     recover: Callable[[], object]
-    server: Server | GigeCamera | None = None
+    server: Server | GigeCamera | GigeVisionCamera | None = None
     extra: dict[str, Any] = field(default_factory=dict)
 
 
@@ -265,6 +267,87 @@ def gige_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     return Rig(device, body, script, work, device.expose, camera)
 
 
+def vision_cameras(stack: ExitStack, *bodies: SimulatedCamera, **more: Any) -> list[GigeVisionCamera]:
+    """Simulated GigE Vision cameras at addresses of this process; without Aravis the test is skipped."""
+    missing = aravis_is_missing()
+    if missing:
+        pytest.skip(missing)
+    return [
+        stack.enter_context(GigeVisionCamera(body, address=address, serial=f"RS{k}", **more))
+        for k, (body, address) in enumerate(zip(bodies, loopback_addresses(len(bodies)), strict=True))
+    ]
+
+
+def own_key() -> int:
+    """Device key of this process: action commands are broadcast, also to cameras of other tests."""
+    return os.getpid()
+
+
+class CameraPair:
+    """A rig of two cameras, which is closed with them."""
+
+    def __init__(self, rig: Any, cameras: dict[str, CameraDriver[Any]]) -> None:
+        self.rig, self.cameras, self.name = rig, cameras, rig.name
+        rig.combine(cameras)
+
+    @property
+    def reconnections(self) -> int:
+        """Of the camera with the faults."""
+        return self.cameras["left"].reconnections
+
+    def connect(self, seconds: float | None = None) -> Any:
+        for each in self.cameras.values():
+            each.connect(seconds)
+        return self.rig.connect(seconds)
+
+    def close(self) -> None:
+        for each in (self.rig, *self.cameras.values()):
+            each.close()
+
+
+def _pair_rig(pair: CameraPair, bodies: list[SimulatedCamera], script: FaultScript, view: View) -> Rig:
+    def work(run: int) -> None:
+        for k in range(3):
+            patterns = [StripeScene(shift=10 * run + 3 * k + side) for side in range(2)]
+            for body, pattern in zip(bodies, patterns, strict=True):
+                body.point_at(pattern)
+            taken = pair.rig.expose_all()
+            # A frame of another exposure, or of the other camera, would show another pattern.
+            for shot, pattern in zip(taken.exposures.values(), patterns, strict=True):
+                assert shot.fresh
+                assert (shot.pixels == pattern(view)).all()
+
+    device: Any = pair
+    return Rig(device, bodies[0], script, work, pair.rig.expose_all)
+
+
+def gige_pair(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
+    bodies = [SimulatedCamera(script=script), SimulatedCamera()]
+    served = vision_cameras(stack, *bodies)
+    how = {"trigger": "action", "action_device_key": own_key(), "exposure_us": 2000.0, "gain": 3.0}
+    cameras = {
+        name: aravis(name, each.address, settings=how | {"width": 96, "height": 64}, seconds=2.0)
+        for name, each in zip(("left", "right"), served, strict=True)
+    }
+    pair = CameraPair(camera_rig("pair", "left, right", settings={"trigger": "action"}, seconds=2.0), cameras)
+    made = _pair_rig(pair, bodies, script, View(2000.0, 3.0, 0.0, 0, 0, 96, 64, 255.0))
+    made.server = served[0]
+    return made
+
+
+def v4l2_pair(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
+    bodies = [SimulatedCamera(script=script), SimulatedCamera()]
+    videos = [VideoCamera(body) for body in bodies]
+    cameras = {
+        name: v4l2(name, each.open, settings={"exposure_us": 2000.0, "gain": 3}, seconds=0.5)
+        for name, each in zip(("left", "right"), videos, strict=True)
+    }
+    pair = CameraPair(camera_rig("pair", "left, right", seconds=0.5), cameras)
+    for each in cameras.values():
+        each.connect()
+    return _pair_rig(pair, bodies, script, videos[0].view)
+
+
 Maker = Callable[[ExitStack, str, FaultScript], Rig]
 RIGS: dict[tuple[str, str], Maker] = {
     **{("zaber", transport): zaber_rig for transport in TRANSPORTS},
@@ -278,6 +361,8 @@ RIGS: dict[tuple[str, str], Maker] = {
     },
     ("v4l2", "in process"): v4l2_rig,
     ("aravis", "gige"): gige_rig,
+    ("rig", "in process"): v4l2_pair,
+    ("rig", "gige"): gige_pair,
 }
 
 

@@ -289,7 +289,7 @@ _ASKED_BY_THE_LIBRARY = """
 import sys
 from reseau.core.errors import RefusedError
 from reseau_drivers.camera import aravis, gvcp
-gvcp._is_ip = lambda address: False
+gvcp.is_ip = lambda address: False
 try:
     aravis("other", sys.argv[1], settings={"width": 640, "height": 480}).connect(20.0)
 except RefusedError as error:

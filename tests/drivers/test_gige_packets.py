@@ -218,9 +218,10 @@ def test_a_frame_after_a_hardware_trigger_is_fresh_and_an_earlier_one_is_not(
         time.sleep(0.1)
         asked, request = threading.Event(), camera._source.request
 
-        def question(deadline: Deadline) -> None:
-            request(deadline)
+        def question(deadline: Deadline, ready: Any = None) -> int:
+            since = request(deadline, ready)
             asked.set()
+            return since
 
         def pulse() -> None:
             asked.wait(5.0)

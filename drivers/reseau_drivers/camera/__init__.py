@@ -9,6 +9,7 @@ from typing import Any
 from .aravis import Aravis, AravisSettings, aravis_cameras
 from .burst import Burst
 from .camera import CameraDriver, CameraExposure, CameraInterface, CameraSettings, RawFrame
+from .rig import Rig, RigSettings
 from .v4l2 import KernelNode, OpenNode, V4l2, V4l2Settings, video_devices
 
 __all__ = [
@@ -20,10 +21,13 @@ __all__ = [
     "CameraInterface",
     "CameraSettings",
     "RawFrame",
+    "Rig",
+    "RigSettings",
     "V4l2",
     "V4l2Settings",
     "aravis",
     "aravis_cameras",
+    "rig",
     "v4l2",
     "video_devices",
 ]
@@ -82,3 +86,26 @@ def aravis(
     ('Mono12', 'software')
     """
     return CameraDriver(name, Aravis(address), AravisSettings().changed(settings or {}), **options)
+
+
+def rig(name: str, address: str, *, settings: Mapping[str, Any] | None = None, **options: Any) -> Rig:
+    """Create a rig of cameras of the bench; entry point ``rig``.
+
+    Parameters
+    ----------
+    name : str
+        Name on the bench.
+    address : str
+        Names of the cameras, separated by commas; the first is the reference of the others.
+    settings : mapping, optional
+        Values for :class:`RigSettings`.
+    **options
+        Further arguments of :class:`Rig`.
+
+    Examples
+    --------
+    >>> rig("rig", "left, right", settings={"trigger": "action"}).cameras
+    ('left', 'right')
+    """
+    names = [each.strip() for each in address.split(",") if each.strip()]
+    return Rig(name, names, RigSettings().changed(settings or {}), **options)

@@ -28,15 +28,18 @@ from reseau.core.errors import (
 )
 from reseau.instruments import Deadline, Identity, choice, quantity, text
 
+from ..codecs.gige import Action
 from ..codecs.pixels import GENICAM, decode
-from .camera import CameraSettings, OriginalValues, RawFrame
+from .camera import CameraSettings, OriginalValues, RawFrame, Ready
 from .clocks import BlockCounter, ExposureTimes, realtime_offset
-from .gvcp import HEARTBEAT_S, controlled_elsewhere, require_answer, require_control
+from .gvcp import HEARTBEAT_S, controlled_elsewhere, is_ip, require_answer, require_control, send_action
 
 __all__ = ["Aravis", "AravisSettings", "aravis_cameras"]
 
 _UNKNOWN_PERIOD_NS = 1_000_000_000
 _RELEASE_S = 0.5
+_CLOCK_IS_OLD_NS = 1_000_000_000
+"""Age of a reading of the clock from which the exposures of a rig need another one."""
 _LATCHES = (
     ("TimestampLatch", "TimestampLatchValue"),
     ("GevTimestampControlLatch", "GevTimestampValue"),
@@ -48,6 +51,8 @@ _LATCHES = (
 class AravisSettings(CameraSettings):
     """Settings of a GenICam camera; gains in dB if the camera uses that unit; packet size 0 is negotiated.
 
+    With the trigger ``action``, the camera exposes at action commands with its keys and a bit of its mask.
+
     Examples
     --------
     >>> AravisSettings(format="Mono12", features="ReverseX=true").features
@@ -55,8 +60,11 @@ class AravisSettings(CameraSettings):
     """
 
     format: str = choice("Mono8", *GENICAM)
-    trigger: str = choice("off", "off", "software", "hardware")
+    trigger: str = choice("off", "off", "software", "hardware", "action")
     trigger_line: str = choice("Line0", "Line0", "Line1", "Line2", "Line3")
+    action_device_key: int = quantity(1, "", 0, 0xFFFFFFFF)
+    action_group_key: int = quantity(1, "", 0, 0xFFFFFFFF)
+    action_group_mask: int = quantity(1, "", 1, 0xFFFFFFFF)
     stamp: str = choice("end", "end", "start")
     chunks: str = choice("off", "off", "on")
     packet_size: int = quantity(0, "B", 0, 65535)
@@ -65,6 +73,11 @@ class AravisSettings(CameraSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         wanted_features(self.features)
+
+    @property
+    def action(self) -> Action:
+        """The action command that triggers the camera."""
+        return Action(self.action_device_key, self.action_group_key, self.action_group_mask)
 
 
 def wanted_features(text: str) -> tuple[tuple[str, str], ...]:
@@ -220,6 +233,22 @@ class Aravis:
         """Height and width of the frames (px)."""
         return self._size[1], self._size[0]
 
+    @property
+    def host(self) -> str:
+        """IP address of the camera.
+
+        Raises
+        ------
+        RefusedError
+            If it is not a GigE Vision camera.
+        """
+        if is_ip(self._address):
+            return self._address
+        with self._translated_errors("address") as camera:
+            if not camera.is_gv_device():
+                raise RefusedError("has no IP address: action commands are those of GigE Vision")
+            return str(camera.get_device().get_device_address().get_address().to_string())
+
     def open(self, deadline: Deadline) -> None:
         """Open the camera and take control of it; an open one is closed before."""
         self.close()
@@ -236,7 +265,7 @@ class Aravis:
             # A previous application may have died during an acquisition; the receiver is set at the next
             # start.
             self._camera.stop_acquisition()
-            self._stamps.offset = self._latched()
+            self._read_clock()
 
     def close(self) -> None:
         """Release the camera if it is open, without waiting for one that does not answer."""
@@ -270,10 +299,7 @@ class Aravis:
                 self._set_feature(camera, name, value)
             self._set_region(camera, settings)
             self._set_light(camera, settings)
-            if settings.trigger == "off":
-                camera.clear_triggers()
-            else:
-                camera.set_trigger("Software" if settings.trigger == "software" else settings.trigger_line)
+            self._set_trigger(camera, settings)
             self._set_chunks(camera, settings.chunks == "on")
             if settings.packet_size and camera.is_gv_device():
                 camera.gv_set_packet_size(settings.packet_size)
@@ -302,17 +328,29 @@ class Aravis:
         self._numbers.restart()
         self._stamps.restart(self._period_ns)
 
-    def request(self, deadline: Deadline) -> None:
+    def request(self, deadline: Deadline, ready: Ready | None = None) -> int:
         """Send a software trigger if configured; earlier frames are discarded."""
-        if self._settings.trigger == "off":
-            return
-        while (buffer := self._stream.try_pop_buffer()) is not None:
+        if ready is not None and time.monotonic_ns() - self._stamps.read_at > _CLOCK_IS_OLD_NS:
+            with self._translated_errors("clock"):
+                self._read_clock()
+        triggered = self._settings.trigger != "off"
+        while triggered and (buffer := self._stream.try_pop_buffer()) is not None:
             self._counted(buffer)
             self._stream.push_buffer(buffer)
+        # Who is triggered by the others of a rig is so after this, however late this thread goes on.
+        waiting = time.monotonic_ns()
+        by_rig = ready is not None and ready()
+        self._stamps.triggered = None
         if self._settings.trigger == "software":
             self._stamps.triggered = time.monotonic_ns()
             with self._translated_errors("trigger") as camera:
                 camera.software_trigger()
+        elif triggered and by_rig:
+            self._stamps.triggered = waiting
+        elif self._settings.trigger == "action" and ready is None:
+            self._stamps.triggered = time.monotonic_ns()
+            send_action([self.host], self._settings.action)
+        return self._stamps.triggered or time.monotonic_ns()
 
     def take(self, deadline: Deadline) -> RawFrame | None:
         """Return the next complete frame that is newer than the last."""
@@ -341,7 +379,7 @@ class Aravis:
     def clock(self, deadline: Deadline) -> str:
         """Describe the offset of the camera's clock to UTC."""
         with self._translated_errors("clock"):
-            self._stamps.offset = self._latched()
+            self._read_clock()
         return self._stamps.describe()
 
     def _counted(self, buffer: Any) -> int | None:
@@ -375,6 +413,9 @@ class Aravis:
         exposure_us = float("nan") if exposure_ns is None else exposure_ns / 1000
         return RawFrame(pixels, layout.full_scale, layout.pattern, b"", sequence, began, exposure_us, gain)
 
+    def _read_clock(self) -> None:
+        self._stamps.offset, self._stamps.read_at = self._latched(), time.monotonic_ns()
+
     def _latched(self) -> tuple[int, int] | None:
         """Return offset of the camera's clock to the computer's and its uncertainty; None if not readable."""
         camera = _held(self._camera)
@@ -401,6 +442,25 @@ class Aravis:
         got = str(camera.get_device().get_feature(name).get_value_as_string())
         if not same_value(got, value):
             raise RefusedError(f"{name} is {got}, not {value}")
+
+    def _set_trigger(self, camera: Any, settings: AravisSettings) -> None:
+        if settings.trigger == "off":
+            camera.clear_triggers()
+        elif settings.trigger == "action":
+            for name, value in (
+                ("ActionSelector", 0),
+                ("ActionDeviceKey", settings.action_device_key),
+                ("ActionGroupKey", settings.action_group_key),
+                ("ActionGroupMask", settings.action_group_mask),
+            ):
+                if camera.is_feature_available(name):
+                    camera.set_integer(name, value)
+                elif name != "ActionSelector":
+                    raise RefusedError(f"has no feature {name}: it knows no action commands")
+            sources = camera.dup_available_enumerations_as_strings("TriggerSource")
+            camera.set_trigger(next((name for name in sources if name.startswith("Action")), "Action1"))
+        else:
+            camera.set_trigger("Software" if settings.trigger == "software" else settings.trigger_line)
 
     def _set_chunks(self, camera: Any, wanted: bool) -> None:
         """Make each frame report its exposure and gain, as far as the camera supports it."""

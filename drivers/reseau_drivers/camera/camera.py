@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,10 +19,11 @@ from reseau.instruments import Deadline, Device, Identity, Limits, Settings, qua
 
 from .clocks import TimeInterval, utc
 
-__all__ = ["CameraDriver", "CameraExposure", "CameraInterface", "CameraSettings", "RawFrame"]
+__all__ = ["CameraDriver", "CameraExposure", "CameraInterface", "CameraSettings", "RawFrame", "Ready"]
 
 _SLICE_S = 0.05
 """Time to wait for a frame before checking for a stop request (s)."""
+Ready = Callable[[], bool]
 _CHECKED = 12
 """Number of frames from which :meth:`CameraDriver.check` computes the frame rate."""
 
@@ -163,8 +163,21 @@ class CameraInterface(Protocol[S]):
     def start(self, deadline: Deadline) -> None:
         """Start the acquisition if it is not running."""
 
-    def request(self, deadline: Deadline) -> None:
-        """Send a software trigger if configured; frames exposed before are discarded."""
+    def request(self, deadline: Deadline, ready: Ready | None = None) -> int:
+        """Send a software trigger if configured; frames exposed before are discarded.
+
+        Parameters
+        ----------
+        deadline : Deadline
+            Time limit.
+        ready : callable, optional
+            Called when the camera waits for its trigger; see :meth:`CameraDriver.expose`.
+
+        Returns
+        -------
+        int
+            Time of the monotonic clock (ns); an exposure that started at it or later is fresh.
+        """
 
     def take(self, deadline: Deadline) -> RawFrame | None:
         """Return the next complete frame that is newer than the last; None if none arrives in time."""
@@ -251,6 +264,20 @@ class CameraDriver(Device[S]):
         self._source = source
         self.skipped = 0
 
+    @property
+    def host(self) -> str:
+        """IP address of a connected GigE Vision camera.
+
+        Raises
+        ------
+        RefusedError
+            If it is another camera.
+        """
+        host = getattr(self._source, "host", None)
+        if not isinstance(host, str):
+            raise RefusedError("has no IP address", where=self.name)
+        return host
+
     def _open(self, deadline: Deadline) -> None:
         self._source.open(deadline)
 
@@ -288,13 +315,16 @@ class CameraDriver(Device[S]):
             f"{self.name}_dropped": {"dtype": "integer", "shape": []},
         }
 
-    def expose(self, seconds: float | None = None) -> CameraExposure:
+    def expose(self, seconds: float | None = None, *, ready: Ready | None = None) -> CameraExposure:
         """Return a frame whose exposure started after this call.
 
         Parameters
         ----------
         seconds : float, optional
             Time limit (s).
+        ready : callable, optional
+            Called as soon as the camera waits for its trigger, before a software trigger is sent; cameras of
+            a rig wait in it for each other. Returns whether it, or what follows it, triggers the camera.
 
         Raises
         ------
@@ -309,7 +339,7 @@ class CameraDriver(Device[S]):
         """
         self._stopping.clear()
         with self._exchange("expose", seconds) as deadline:
-            return self._next(deadline, stale=False)
+            return self._next(deadline, stale=False, ready=ready)
 
     def frames(self, count: int, seconds: float | None = None) -> Iterator[CameraExposure]:
         """Yield consecutive frames as the camera delivers them; each states whether it is fresh.
@@ -332,10 +362,9 @@ class CameraDriver(Device[S]):
                 shot = self._next(deadline, stale=True)
             yield shot
 
-    def _next(self, deadline: Deadline, *, stale: bool) -> CameraExposure:
+    def _next(self, deadline: Deadline, *, stale: bool, ready: Ready | None = None) -> CameraExposure:
         self._source.start(deadline)
-        asked, passed = time.monotonic_ns(), 0
-        self._source.request(deadline)
+        asked, passed = self._source.request(deadline, ready), 0
         while True:
             if self._stopping.is_set():
                 raise StateError("was stopped")

@@ -13,6 +13,8 @@ __all__ = ["BlockCounter", "ExposureTimes", "FrameCounter", "TimeInterval", "rea
 
 _TRIES = 5
 _SHORT, _SHORT_WITH_ZERO, _LONG = 65535, 65536, 1 << 64
+_DRIFT = 10_000
+"""A quartz clock drifts by less than one part in so many."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -117,6 +119,8 @@ class ExposureTimes:
     offset : (int, int) or None
         Offset from the camera's clock to the computer's, and its uncertainty (ns); None if the camera's clock
         cannot be read.
+    read_at : int
+        When the camera's clock was read (ns); since then it may have drifted from the computer's.
     triggered : int or None
         Time of the software trigger of the expected frame; all earlier frames were discarded.
 
@@ -126,13 +130,14 @@ class ExposureTimes:
     >>> times.restart(period=10)
     >>> times.began(1000, 5000, before=3, exposure=3), times.began(1100, 5140, before=3, exposure=3)
     (TimeInterval(earliest=4987, latest=4997), TimeInterval(earliest=5087, latest=5137))
-    >>> times.offset = 4000, 2
+    >>> times.offset, times.read_at = (4000, 2), 5000
     >>> times.began(1200, 5240, before=3, exposure=3)
-    TimeInterval(earliest=5195, latest=5199)
+    TimeInterval(earliest=5194, latest=5200)
     """
 
     def __init__(self) -> None:
         self.offset: tuple[int, int] | None = None
+        self.read_at = 0
         self.triggered: int | None = None
         self._period = 0
         self._least_delay: int | None = None
@@ -155,6 +160,7 @@ class ExposureTimes:
         """
         if self.offset is not None:
             start, doubt = stamped + self.offset[0] - before, self.offset[1]
+            doubt += max(0, arrived - self.read_at) // _DRIFT + 1
             span = TimeInterval(start - doubt, start + doubt)
         else:
             # The longest possible wait of a frame is its delay beyond the shortest delay of all frames.
@@ -164,8 +170,11 @@ class ExposureTimes:
             span = TimeInterval(arrived - waited - exposure - self._period, arrived - exposure)
         if self.triggered is None:
             return span
-        # All earlier frames were discarded: this one was exposed at the trigger or after it.
-        return TimeInterval(max(span.earliest, self.triggered), max(span.latest, arrived, self.triggered))
+        # All earlier frames were discarded: this one was exposed between the trigger and its arrival.
+        earliest, latest = max(span.earliest, self.triggered), min(span.latest, arrived)
+        if self.offset is None or earliest > latest:  # the stamp does not say more, or is wrong
+            return TimeInterval(max(span.earliest, self.triggered), max(span.latest, arrived, self.triggered))
+        return TimeInterval(earliest, latest)
 
     def describe(self) -> str:
         """Describe the offset of the camera's clock to UTC."""

@@ -1,30 +1,33 @@
-"""Check directly whether a GigE Vision camera answers and is free; libraries retry for many seconds.
+"""Commands to GigE Vision cameras beside the library: whether one answers and is free, and action commands.
 
-Source: AIA, *GigE Vision* 2.0: commands DISCOVERY and READREG of the control protocol (sections 14 and 16),
-register Control Channel Privilege (section 28).
+Libraries retry for many seconds. Source: AIA, *GigE Vision* 2.0: commands DISCOVERY, READREG and ACTION of
+the control protocol (sections 14, 16 and 18), register Control Channel Privilege (section 28).
 """
 
 from __future__ import annotations
 
 import ipaddress
 import socket
-import struct
 import time
+from collections.abc import Iterable
+
+import psutil  # type: ignore[import-untyped, unused-ignore]
 
 from reseau.core.errors import ConnectionLost, RefusedError
 from reseau.instruments import Deadline
 
-__all__ = ["HEARTBEAT_S", "controlled_elsewhere", "require_answer", "require_control"]
+from ..codecs.gige import PORT, PRIVILEGE, Action, Command, Kind, Status
 
-_PORT = 3956
-_COMMAND = struct.Struct(">BBHHH")
-"""Key, flags (acknowledge), command, length of the payload, number of the request."""
-_KEY, _ACKNOWLEDGE = 0x42, 0x01
-_DISCOVERY, _READREG = 0x0002, 0x0080
-_PRIVILEGE = 0x0A00
+__all__ = [
+    "HEARTBEAT_S",
+    "controlled_elsewhere",
+    "is_ip",
+    "require_answer",
+    "require_control",
+    "send_action",
+]
+
 _EXCLUSIVE, _CONTROL = 0x1, 0x2
-_DENIED = 0x8006
-"""GEV_STATUS_ACCESS_DENIED: another application has exclusive access; others may not even read."""
 _TRY_S = 0.2
 _TRIES = 5
 _PAUSE_S = 0.05
@@ -40,8 +43,8 @@ def require_answer(address: str, deadline: Deadline) -> None:
     ConnectionLost
         If no camera answers.
     """
-    if _is_ip(address):
-        _answer(address, _DISCOVERY, b"", deadline)
+    if is_ip(address):
+        _answer(address, Kind.DISCOVERY, b"", deadline)
 
 
 def require_control(address: str, deadline: Deadline, ours_until: float = 0.0) -> None:
@@ -64,7 +67,7 @@ def require_control(address: str, deadline: Deadline, ours_until: float = 0.0) -
     ConnectionLost
         If no camera answers.
     """
-    if not _is_ip(address):
+    if not is_ip(address):
         return
     while _privilege(address, deadline) & (_EXCLUSIVE | _CONTROL):
         if time.monotonic() >= ours_until or deadline.expired:
@@ -80,24 +83,25 @@ def controlled_elsewhere(address: str) -> RefusedError:
 
 def _privilege(address: str, deadline: Deadline) -> int:
     """Return the access bits; 0 if the register cannot be read, so that the library finds out."""
-    status, value = _register(address, _PRIVILEGE, deadline)
-    return _EXCLUSIVE if status == _DENIED else value if status == 0 else 0
+    status, value = _register(address, PRIVILEGE, deadline)
+    # Where another application has exclusive access, others may not even read.
+    return _EXCLUSIVE if status == Status.ACCESS_DENIED else value if status == 0 else 0
 
 
 def _register(address: str, register: int, deadline: Deadline) -> tuple[int, int]:
     """Return status and value of a register."""
-    answer = _answer(address, _READREG, register.to_bytes(4, "big"), deadline)
+    answer = _answer(address, Kind.READ_REGISTER, register.to_bytes(4, "big"), deadline)
     return int.from_bytes(answer[:2], "big"), int.from_bytes(answer[8:12], "big")
 
 
-def _answer(address: str, command: int, data: bytes, deadline: Deadline) -> bytes:
+def _answer(address: str, command: Kind, data: bytes, deadline: Deadline) -> bytes:
     """Return the acknowledgement of a command, whatever its status."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
         for number in range(1, _TRIES + 1):
             try:
-                asking.connect((address, _PORT))
+                asking.connect((address, PORT))
                 asking.settimeout(max(0.01, deadline.at_most(_TRY_S)))
-                asking.send(_COMMAND.pack(_KEY, _ACKNOWLEDGE, command, len(data), number) + data)
+                asking.send(Command(command, data, number).encode())
                 answer = asking.recv(2048)
                 # The acknowledgement has the number of the command plus one; a late one is accepted too.
                 if len(answer) >= 8 and answer[2:4] == (command + 1).to_bytes(2, "big"):
@@ -110,7 +114,47 @@ def _answer(address: str, command: int, data: bytes, deadline: Deadline) -> byte
     raise ConnectionLost(f"{address} does not answer", do="check power and address")
 
 
-def _is_ip(address: str) -> bool:
+def send_action(cameras: Iterable[str], action: Action) -> None:
+    """Send an action command to cameras: one packet to all that are in a network of this computer.
+
+    Parameters
+    ----------
+    cameras : iterable of str
+        IP addresses of the cameras.
+    action : Action
+        The command. It has no acknowledgement: a camera shows by its frame that it received it.
+
+    Raises
+    ------
+    ConnectionLost
+        If it cannot be sent.
+    """
+    command = Command(Kind.ACTION, action.encode(), acknowledge=False).encode()
+    targets = dict.fromkeys(_broadcast_to(each) for each in cameras)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sending:
+        sending.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        for each in targets:
+            try:
+                sending.sendto(command, (each, PORT))
+            except OSError as error:
+                raise ConnectionLost(
+                    f"the action command to {each} was not sent ({error.strerror})", do="check the network"
+                ) from None
+
+
+def _broadcast_to(address: str) -> str:
+    """Broadcast address of the network of a camera; its own address if it is in none of this computer."""
+    for interface in psutil.net_if_addrs().values():
+        for each in interface:
+            if each.family == socket.AF_INET and each.netmask:
+                network = ipaddress.ip_network(f"{each.address}/{each.netmask}", strict=False)
+                if ipaddress.ip_address(address) in network and network.num_addresses > 2:
+                    return str(network.broadcast_address)
+    return address
+
+
+def is_ip(address: str) -> bool:
+    """Whether a text is an IP address."""
     try:
         ipaddress.ip_address(address)
     except ValueError:

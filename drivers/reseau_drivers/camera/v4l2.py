@@ -26,7 +26,7 @@ from reseau.instruments import Deadline, Identity, choice, quantity
 
 from ..codecs import v4l2 as uapi
 from ..codecs.pixels import VIDEO, decode, size_of
-from .camera import CameraSettings, OriginalValues, RawFrame
+from .camera import CameraSettings, OriginalValues, RawFrame, Ready
 from .clocks import FrameCounter, TimeInterval
 
 __all__ = ["KernelNode", "Mapping", "Node", "OpenNode", "V4l2", "V4l2Settings", "video_devices"]
@@ -253,8 +253,11 @@ class V4l2:
         self._numbers.restart()
         self._stamp_ns = 0
 
-    def request(self, deadline: Deadline) -> None:
-        """Do nothing: the camera runs freely."""
+    def request(self, deadline: Deadline, ready: Ready | None = None) -> int:
+        """Wait for the other cameras of a rig, if any: the camera runs freely."""
+        if ready is not None:
+            ready()
+        return time.monotonic_ns()
 
     def take(self, deadline: Deadline) -> RawFrame | None:
         """Return the next complete frame that is newer than the last."""

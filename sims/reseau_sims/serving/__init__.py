@@ -12,6 +12,7 @@ from .bk import BkScanner
 from .compactpulser import CompactPulser
 from .faults import DEVICE_KINDS, KINDS, LINE_KINDS, Fault, FaultScript, Kind
 from .gige import GigeCamera, aravis_is_installed
+from .gigevision import GigeVisionCamera, loopback_addresses
 from .imaging import LaboratoryScene, LampScene, Scene, SimulatedCamera, StillScene, StripeScene, View
 from .machine import FaultyConnection, Machine, Session
 from .motion import Motor
@@ -36,6 +37,7 @@ __all__ = [
     "FaultScript",
     "FaultyConnection",
     "GigeCamera",
+    "GigeVisionCamera",
     "HislipInstrument",
     "InProcess",
     "Kind",
@@ -63,5 +65,6 @@ __all__ = [
     "Vxi11Session",
     "ZaberChain",
     "aravis_is_installed",
+    "loopback_addresses",
     "plugged_in",
 ]

@@ -402,12 +402,13 @@ class Bench:
         """
 
         def checked(instrument: Instrument) -> dict[str, str]:
-            entry = self.file.instruments[instrument.name]
-            own = owner and entry.address != IN_PROCESS
-            with BenchLock([entry.address], owner) if own else nullcontext():
+            addresses = self._addresses(instrument.name)
+            with BenchLock(addresses, owner) if owner else nullcontext():
                 return instrument.check(seconds)
 
-        outcomes = self._all(checked)
+        # What consists of other instruments is tested when they are not in use.
+        composed = [name for name in self.instruments if not self._addresses(name)]
+        outcomes = self.without(composed)._all(checked) | self._only(composed, ())._all(checked)
         found = []
         for name, entry in self.file.instruments.items():
             outcome = outcomes[name]
@@ -447,8 +448,17 @@ class Bench:
         also : str
             Other things to lock, for instance the name of a session.
         """
-        addresses = [entry.address for entry in self.file.instruments.values()]
-        return BenchLock([*(each for each in addresses if each != IN_PROCESS), *also], owner)
+        return BenchLock([*self._addresses(*self.file.instruments), *also], owner)
+
+    def _addresses(self, *names: str) -> list[str]:
+        """Addresses that no other process can use at the same time."""
+        return [
+            entry.address
+            for name, entry in self.file.instruments.items()
+            if name in names
+            and entry.address != IN_PROCESS
+            and not getattr(self.instruments[name], "composed", False)
+        ]
 
     def __enter__(self) -> Self:
         self.connect()

@@ -9,7 +9,17 @@ from .assets import ImageStore
 from .deadline import Deadline
 from .device import Device
 from .monitor import Monitor
-from .protocols import Camera, Exposure, Instrument, Movable, Oscilloscope, Turntable, UltrasonicScanner
+from .protocols import (
+    Camera,
+    CameraRig,
+    Exposure,
+    ExposureSet,
+    Instrument,
+    Movable,
+    Oscilloscope,
+    Turntable,
+    UltrasonicScanner,
+)
 from .settings import Limits, Settings, choice, quantity, text
 from .status import Status
 from .values import AxisState, BScan, Identity, ScreenPicture, Waveform
@@ -18,9 +28,11 @@ __all__ = [
     "AxisState",
     "BScan",
     "Camera",
+    "CameraRig",
     "Deadline",
     "Device",
     "Exposure",
+    "ExposureSet",
     "Identity",
     "ImageStore",
     "Instrument",

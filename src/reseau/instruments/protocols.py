@@ -8,6 +8,7 @@ protocols include bluesky's protocols of the same names, so that bluesky's plans
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Protocol, runtime_checkable
 
@@ -16,7 +17,17 @@ from .settings import Settings
 from .status import Status
 from .values import AxisState, BScan, Identity, ScreenPicture, Waveform
 
-__all__ = ["Camera", "Exposure", "Instrument", "Movable", "Oscilloscope", "Turntable", "UltrasonicScanner"]
+__all__ = [
+    "Camera",
+    "CameraRig",
+    "Exposure",
+    "ExposureSet",
+    "Instrument",
+    "Movable",
+    "Oscilloscope",
+    "Turntable",
+    "UltrasonicScanner",
+]
 
 
 @runtime_checkable
@@ -225,3 +236,58 @@ class Camera(Instrument, Protocol):
 
     def frames(self, count: int, seconds: float | None = None) -> Iterator[Exposure]:
         """Yield consecutive frames as the camera delivers them; each states whether it is fresh."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureSet:
+    """Frames of the cameras of a rig, exposed at once.
+
+    Parameters
+    ----------
+    exposures : mapping of str to Exposure
+        Frame of each camera.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> at = datetime(2026, 1, 5)
+    >>> left = SimpleNamespace(taken=at, taken_within_s=2e-4)
+    >>> right = SimpleNamespace(taken=at.replace(microsecond=1000), taken_within_s=1e-4)
+    >>> ExposureSet({"left": left, "right": right}).skew
+    (0.001, 0.0003)
+    """
+
+    exposures: Mapping[str, Exposure]
+
+    @property
+    def skew(self) -> tuple[float, float]:
+        """Time from the first start of an exposure to the last, and its half-width (s).
+
+        The true skew is within the half-width: the sum of the two largest half-widths of the starts.
+        """
+        starts = [each.taken for each in self.exposures.values()]
+        widths = sorted(each.taken_within_s for each in self.exposures.values())
+        within = sum(widths[-2:]) if len(widths) > 1 else 0.0
+        return (max(starts) - min(starts)).total_seconds(), round(within, 9)
+
+
+@runtime_checkable
+class CameraRig(Instrument, Protocol):
+    """Cameras that expose at once.
+
+    Examples
+    --------
+    >>> hasattr(CameraRig, "expose_all")
+    True
+    """
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+
+    @property
+    def largest_skew_s(self) -> float:
+        """Largest skew of a usable set of frames (s); infinite without a limit."""
+
+    def expose_all(self, seconds: float | None = None) -> ExposureSet:
+        """Return a frame of each camera, of one exposure that started after this call."""
