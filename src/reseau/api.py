@@ -44,7 +44,7 @@ from .measure import (
 from .measure.points import Measured
 from .procedures import oscilloscope as _procedure
 from .procedures.calibration import Calibrated, CalibrationOptions, CameraOptions, calibrate_camera
-from .procedures.exposures import photographs_of
+from .procedures.exposures import photograph_reader, photographs_of
 from .procedures.film_frame import FrameOptions, FrameResult, orient_scan
 from .procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
 from .procedures.target_measurement import measurer_of
@@ -332,10 +332,7 @@ def calibrate(
         name = photo.name if isinstance(photo, Path | Frame) and not isinstance(image, np.ndarray) else ""
         named.append((name or f"image {number}", photo))
 
-    def opened(image: Path | Frame) -> Frame:
-        return _corrected(read_image(image, channel) if isinstance(image, Path) else image, sensor)
-
-    said, photographs = photographs_of(named, opened)
+    said, photographs = photographs_of(named, photograph_reader(channel, _correction(sensor)))
     options = options or CalibrationOptions()
     if options.focal_35_mm is None:
         options = replace(options, focal_35_mm=said)
@@ -702,11 +699,12 @@ def _reseau_design(given: DesignLike, argument: str) -> ReseauDesign:
 
 def _corrected(frame: Frame, sensor: CalibrationLike | None) -> Frame:
     """The frame corrected by the calibration of its sensor, where there is one."""
-    return (
-        frame
-        if sensor is None
-        else SensorCorrection.from_calibration(read_calibration(sensor)).correct(frame)
-    )
+    correction = _correction(sensor)
+    return frame if correction is None else correction.correct(frame)
+
+
+def _correction(sensor: CalibrationLike | None) -> SensorCorrection | None:
+    return None if sensor is None else SensorCorrection.from_calibration(read_calibration(sensor))
 
 
 def _options(given: object, kind: type[T]) -> T | None:

@@ -344,3 +344,58 @@ def test_windows_before_the_target_are_taken_from_a_file(
     assert (status, out) == (2, "")
     assert err.count("\n") == 1
     assert "glass" in err
+
+
+def photographs(folder: Path) -> list[Path]:
+    """Photographs of the field, small ones; the last is none."""
+    stations = [Station(45.0, kappa, kappa) for kappa in (0.0, 90.0, 180.0)] + [Station(30.0, 270.0)]
+    files = []
+    for k, station in enumerate(stations):
+        files.append(folder / f"{k}.png")
+        write_image(files[-1], BENCH.record(station).pixels)
+    return files
+
+
+def test_measurements_are_kept_in_a_store_and_not_repeated(
+    reseau: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "photos").mkdir()
+    BENCH.design.write(tmp_path / "field.json")
+    files = photographs(tmp_path / "photos")
+    command = (
+        "calibrate",
+        *files,
+        "-d",
+        tmp_path / "field.json",
+        "--pitch",
+        0.027,
+        "--free",
+        "c",
+        "--jobs",
+        1,
+    )
+    assert reseau(*command, "-o", tmp_path / "plain.json")[0] == 0
+    kept = (*command, "--store", tmp_path / "store", "-o", tmp_path / "kept.json")
+    assert reseau(*kept)[0] == 0
+    assert (tmp_path / "kept.json").read_bytes() == (tmp_path / "plain.json").read_bytes()
+    assert len(list((tmp_path / "store").glob("records/*/*.json"))) == len(files)
+
+    def fails(*_: object) -> None:
+        raise AssertionError("measured again")
+
+    (next((tmp_path / "store").glob("records/*/*.json"))).unlink()
+    with monkeypatch.context() as patched:
+        patched.setattr("reseau.procedures.target_measurement._points", fails)
+        with pytest.raises(AssertionError, match="measured again"):
+            reseau(*kept)
+    assert reseau(*kept)[0] == 0
+    with monkeypatch.context() as patched:
+        patched.setattr("reseau.procedures.target_measurement._points", fails)
+        assert reseau(*kept)[0] == 0
+    assert (tmp_path / "kept.json").read_bytes() == (tmp_path / "plain.json").read_bytes()
+
+
+def test_a_cluster_without_a_store_is_one_line(reseau: Run, measured: tuple[Path, ...]) -> None:
+    status, _, err = reseau(*common(measured), "--cluster", "tcp://127.0.0.1:9")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "--cluster: requires a store that all workers share; add --store" in err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import uuid
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -38,6 +39,12 @@ class Objects(Protocol):
 
     def names(self) -> Iterator[tuple[str, str]]:
         """Return SHA-256 and suffix of all files."""
+
+    def write_record(self, key: str, data: bytes) -> None:
+        """Write a record durably, in place of an earlier one; its name is a SHA-256."""
+
+    def record(self, key: str) -> bytes | None:
+        """Return the record of a name, or None."""
 
 
 class LocalObjects:
@@ -83,9 +90,32 @@ class LocalObjects:
         """
         sha256 = sha256_of(data)
         path = self.path(sha256, suffix)
-        if path.exists() and sha256_of(path) == sha256:
-            return sha256
-        draft = path.with_name(f".{path.name}.{os.getpid()}")
+        if not (path.exists() and sha256_of(path) == sha256):
+            self._write(path, data)
+        return sha256
+
+    def write_record(self, key: str, data: bytes) -> None:
+        """Write a record, in place of an earlier one.
+
+        Raises
+        ------
+        ArchiveError
+            As :meth:`put`.
+        """
+        self._write(self.folder / _record(key), data)
+
+    def record(self, key: str) -> bytes | None:
+        """Return the record of a name, or None."""
+        try:
+            return (self.folder / _record(key)).read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise ArchiveError(f"cannot be read ({error.strerror})", where=self.folder) from None
+
+    def _write(self, path: Path, data: bytes) -> None:
+        # Processes of several machines may share the folder: a number of a process is not enough.
+        draft = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}")
         try:
             if not path.parent.is_dir():
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -101,7 +131,6 @@ class LocalObjects:
                 draft.unlink(missing_ok=True)
             what, do = f"cannot be stored ({error.strerror})", "free disk space or name another archive"
             raise ArchiveError(what, where=self.folder, do=do) from None
-        return sha256
 
     def get(self, sha256: str, suffix: str) -> bytes:
         """Return the bytes of a hash.
@@ -195,6 +224,35 @@ class RemoteObjects:
         path = self._path(sha256, suffix)
         return _sound(bytes(self._asked(lambda: self._files.cat_file(path))), sha256, path)
 
+    def write_record(self, key: str, data: bytes) -> None:
+        """Write a record, in place of an earlier one; object stores write atomically.
+
+        Raises
+        ------
+        ArchiveError
+            If the store refuses it.
+        """
+        path = f"{self._root}/{_record(key)}"
+
+        def keep() -> None:
+            self._files.makedirs(path.rpartition("/")[0], exist_ok=True)
+            self._files.pipe_file(path, data)
+
+        self._asked(keep)
+
+    def record(self, key: str) -> bytes | None:
+        """Return the record of a name, or None."""
+        path = f"{self._root}/{_record(key)}"
+
+        def read() -> bytes | None:
+            try:
+                return bytes(self._files.cat_file(path))
+            except FileNotFoundError:
+                return None
+
+        found: bytes | None = self._asked(read)
+        return found
+
     def names(self) -> Iterator[tuple[str, str]]:
         """Return SHA-256 and suffix of all files."""
         found = self._asked(lambda: self._files.find(self._root) if self._files.exists(self._root) else [])
@@ -224,6 +282,11 @@ def objects_at(place: str | Path) -> Objects:
     'memory://frames'
     """
     return RemoteObjects(str(place)) if "://" in str(place) else LocalObjects(Path(place))
+
+
+def _record(key: str) -> str:
+    # No name of a record is as long as a hash: `names` passes over it.
+    return f"records/{key[:2]}/record-{key}.json"
 
 
 def _sound(data: bytes, sha256: str, where: object) -> bytes:

@@ -10,10 +10,14 @@ import typer
 from .common import (
     ArchivePlace,
     AsJson,
+    ClusterAddress,
+    Jobs,
     ObjectsPlace,
     SessionName,
+    Store,
     open_archive,
     progress,
+    required,
     say,
     suffix_of,
     writable,
@@ -113,26 +117,45 @@ def export(
 
 @app.command()
 def rerun(
-    session: SessionName,
+    session: Annotated[
+        str | None, typer.Argument(help="Name of the session; by default all that have results.")
+    ] = None,
     archive: ArchivePlace = "archive",
     objects: ObjectsPlace = None,
+    jobs: Jobs = None,
+    cluster: ClusterAddress = "",
+    store: Store = "",
     as_json: AsJson = False,
 ) -> None:
-    """Recompute the results of a session from its frames, and compare them byte for byte."""
+    """Recompute the results of sessions from their frames, and compare them byte for byte."""
     from .. import sessions
+    from ..core.failure import Failure
+    from ..core.processes import cores
     from ..core.provenance import canonical_json
+    from ..execution import executor_at
 
     with open_archive(archive, objects) as found:
-        done = sessions.rerun(found.session(session))
-    same = all(each.same for each in done)
+        names = [each.name for each in found.sessions() if each.results] if session is None else [session]
+    rows, same = [], True
+    count = max(1, min(jobs or cores(), len(names)))
+    with executor_at(count, cluster, store, ["reseau.sessions"]) as executor:
+        for name, done in sessions.rerun_all(archive, objects, names, executor):
+            if isinstance(done, Failure):
+                if session is not None:
+                    required(done, name)
+                same = False
+                typer.echo(f"reseau: {done}", err=True)
+                continue
+            same &= all(each.same for each in done)
+            for each in done:
+                made = each.result
+                about = {"name": made.name, "sha256": made.sha256, "software": made.software}
+                if session is None:
+                    about = {"session": name} | about
+                rows.append(about | {"same": each.same})
+                if not as_json:
+                    outcome = "identical" if each.same else f"differs; made with {made.software}"
+                    say(f"{'' if session is not None else name + ': '}{made.name}: {outcome}\n")
     if as_json:
-        rows = [
-            {"name": d.result.name, "sha256": d.result.sha256, "software": d.result.software, "same": d.same}
-            for d in done
-        ]
         say(canonical_json({"schema": "reseau-rerun/1", "same": same, "results": rows}))
-    else:
-        for each in done:
-            outcome = "identical" if each.same else f"differs; made with {each.result.software}"
-            say(f"{each.result.name}: {outcome}\n")
     raise typer.Exit(0 if same else 1)

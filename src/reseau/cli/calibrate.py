@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -34,8 +34,11 @@ from .bundle_options import (
 from .common import (
     AsJson,
     Channel,
+    ClusterAddress,
+    Jobs,
     Out,
     SensorFile,
+    Store,
     corrected,
     overlay_files,
     progress,
@@ -43,6 +46,7 @@ from .common import (
     remark_lines,
     required,
     say,
+    sensor_correction,
 )
 
 if TYPE_CHECKING:
@@ -50,9 +54,11 @@ if TYPE_CHECKING:
     from ..calibration import CameraMapping, FieldDifference, ProjectionField
     from ..core.data import Frame
     from ..core.provenance import Provenance
+    from ..execution import Executor
     from ..io import BoardDesign, ReseauDesign, TestfieldDesign
     from ..procedures.calibration import Calibrated, CalibrationOptions, CameraOptions
     from ..procedures.exposures import Taken
+    from ..procedures.target_measurement import Photograph
 
 __all__ = ["calibrate"]
 
@@ -183,19 +189,23 @@ def calibrate(
         list[Path] | None, typer.Option(help="Calibration of the same camera to compare with; repeatable.")
     ] = None,
     distance: Distances = None,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Number of processes; by default the number of cores.")
-    ] = None,
+    jobs: Jobs = None,
+    cluster: ClusterAddress = "",
+    store: Store = "",
     as_json: AsJson = False,
 ) -> None:
     """Calibrate a camera from photographs of a target."""
     photographs, taken = _photographs(images or [], camera or [])
     files = list(photographs.values())
-    workers = _processes(files, jobs)
+    executor = _executor(files, jobs, cluster, store)
+    if overlay is not None and not executor.local:
+        raise UsageError("is drawn by this machine only", where="--overlay", do="leave out --cluster")
+    from ..core.provenance import sha256_of
+    from ..execution import Outputs
     from ..io import parse_design, read_text
     from ..measure import TestfieldOptions
     from ..procedures.calibration import calibrate_camera, measurer_of
-    from ..procedures.exposures import photographs_of
+    from ..procedures.exposures import photograph_reader, photographs_of
     from ..procedures.target_measurement import drawing_overlays
 
     outputs(out, report)
@@ -208,24 +218,30 @@ def calibrate(
         raise UsageError("requires one camera", where="--against", do="compare the cameras one by one")
     level = level_of(eliminate, "--eliminate")
 
-    def opened(image: Path | Frame) -> Frame:
-        assert isinstance(image, Path)
-        step(f"measuring {image.name}")
-        return corrected(read_frame(image, channel.value), sensor)
-
     options = _options(
-        sigma, control, refraction, leave_out or [], reject, kind, level, workers, target_points, turntable
+        sigma, control, refraction, leave_out or [], reject, kind, level, target_points, turntable
     )
     lens = _camera(model, pitch, side, model_option or [], free, rolling, motion)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
     measure = drawing_overlays(
         measure, {name: drawn[path] for name, path in photographs.items() if path in drawn}
     )
-    with progress("measuring", len(files)) as step:
-        said, frames = photographs_of(list(photographs.items()), opened, one_lens=not taken)
+    read = photograph_reader(channel.value, None if sensor is None else sensor_correction(sensor))
+    about = {
+        "compute": "points of a target", "design": sha256_of(target.to_json().encode()), "fill": fill,
+        "channel": channel.value, "row_jitter": row_jitter, "sensor": sha256_of(sensor) if sensor else None,
+    }  # fmt: skip
+    # Overlays are drawn while photographs are measured.
+    kept = Outputs(store, about) if store and not drawn else None
+    with executor, progress("measuring", len(files)) as step:
+        said, frames = photographs_of(list(photographs.items()), read, one_lens=not taken, store=store)
         options = replace(options, focal_35_mm=said)
-        found = calibrate_camera(frames, target, measure, _size(size), lens, options, taken or None)
+        found = calibrate_camera(
+            _shown(frames, step), target, measure, _size(size), lens, options, taken or None, executor, kept
+        )
         done = required(found, design)
+    for note in done.notes:
+        typer.echo(f"note: {note}", err=True)
     named = (None if automatic else design, control, refraction, turntable, sensor)
     inputs = {path.name: path for path in named if path} | photographs
     provenance = _provenance(
@@ -315,7 +331,6 @@ def _options(
     reject: bool,
     components: Kind | None,
     level: float | None,
-    workers: int,
     target: Target,
     turntable: Path | None,
 ) -> CalibrationOptions:
@@ -333,21 +348,30 @@ def _options(
         pairs.append((image, point))
     return CalibrationOptions(
         Options(outliers="reject" if reject else "keep"), sigma,
-        None if control is None else read_control(control), tuple(pairs), components, level, workers,
+        None if control is None else read_control(control), tuple(pairs), components, level,
         refraction=None if refraction is None else RefractionFile.read(refraction), target=target.value,
         turntable=None if turntable is None else read_turntable(turntable),
     )  # fmt: skip
 
 
-def _processes(images: list[Path], jobs: int | None) -> int:
-    """Number of processes for the photographs; start them early so that they import in the background."""
+def _executor(images: list[Path], jobs: int | None, cluster: str, store: str) -> Executor:
+    """What measures the photographs; its processes import in the background."""
     from ..core.processes import cores, start_early
+    from ..execution import executor_at
     from ..io import is_points
 
     count = max(1, min(jobs or cores(), sum(not is_points(path) for path in images)))
-    if count > 1:
-        start_early(["reseau.procedures.target_measurement"])
-    return count
+    modules = ["reseau.procedures.target_measurement"]
+    if count > 1 and not cluster:
+        start_early(modules)
+    return executor_at(count, cluster, store, modules)
+
+
+def _shown(photographs: Iterator[Photograph], step: Callable[[str], None]) -> Iterator[Photograph]:
+    """The photographs; each is a step of the progress bar."""
+    for each in photographs:
+        step(f"measuring {each[0] if isinstance(each, tuple) else each.name}")
+        yield each
 
 
 def _write_report(

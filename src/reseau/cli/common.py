@@ -47,6 +47,27 @@ ObjectsPlace = Annotated[
 SessionName = Annotated[str, typer.Argument(help="Name of the session.")]
 
 
+Jobs = Annotated[int | None, typer.Option(min=1, help="Number of processes; by default the number of cores.")]
+ClusterAddress = Annotated[
+    str,
+    typer.Option(
+        "--cluster",
+        envvar="RESEAU_CLUSTER",
+        metavar="tcp://HOST:PORT",
+        help="Scheduler of a Dask cluster that does the work, in place of processes; requires --store.",
+    ),
+]
+Store = Annotated[
+    str,
+    typer.Option(
+        "--store",
+        envvar="RESEAU_STORE",
+        help="Folder or URL that keeps what is computed: a repeated command continues where it ended. "
+        "Workers of a cluster share it.",
+    ),
+]
+
+
 SensorFile = Annotated[
     Path | None,
     typer.Option("--sensor", help="Calibration of the sensor; correct images with it before measuring."),
@@ -87,12 +108,12 @@ def corrected(frame: Frame, sensor: Path | None) -> Frame:
     UsageError
         If the size of the frame is not that of the sensor.
     """
-    return frame if sensor is None else _sensor_correction(sensor).correct(frame)
+    return frame if sensor is None else sensor_correction(sensor).correct(frame)
 
 
 @cache
-def _sensor_correction(path: Path) -> SensorCorrection:
-    """Read the calibration once for all frames of a command."""
+def sensor_correction(path: Path) -> SensorCorrection:
+    """Return the correction of a calibration of a sensor, which is read once for all frames of a command."""
     from ..calibration import Calibration, SensorCorrection
 
     return SensorCorrection.from_calibration(Calibration.read(path))

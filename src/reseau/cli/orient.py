@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ..core.errors import InputError, ReseauError, UsageError
-from .common import AsJson, overlay_files, progress, required, say
+from .common import AsJson, ClusterAddress, Jobs, Store, overlay_files, progress, required, say
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from ..execution import Executor
     from ..io import FrameOrientation, FrameOutcome, RollSummary
     from ..procedures.film_frame import FrameOptions, FrameResult, Roll
 
@@ -52,12 +53,13 @@ class _Job:
 
 @dataclass(frozen=True)
 class _Done:
-    """Result of one image."""
+    """Result of one image; files that another machine has made, by their SHA-256 in the store."""
 
     documents: list[FrameOrientation]
     results: list[FrameResult]
     failed: str = ""
     notes: tuple[str, ...] = ()
+    files: dict[str, str] = field(default_factory=dict)
 
 
 def orient(
@@ -88,15 +90,17 @@ def orient(
             "FILE.png for a single scan."
         ),
     ] = None,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Number of processes. Default: one per core.")
-    ] = None,
+    jobs: Jobs = None,
+    cluster: ClusterAddress = "",
+    store: Store = "",
     as_json: AsJson = False,
 ) -> int:
     """Orient scanned film frames by their four edges.
 
     The JSON document of a frame is the calibration of its scan for `reseau apply`.
     """
+    from ..core.processes import cores
+    from ..execution import executor_at
     from ..io import FrameCorners, RollSummary, write_whole
     from ..report.frames import roll_page
 
@@ -122,10 +126,16 @@ def orient(
         )
         for path, name in zip(images, _names(images), strict=True)
     ]
-    done = dict(zip((job.name for job in work), _all(work, jobs), strict=True))
+    count = min(jobs or cores(), len(work))
+    with executor_at(
+        count, cluster, store, ["reseau.cli.orient", "reseau.procedures.film_frame"]
+    ) as executor:
+        if not executor.local and overlay is not None:
+            raise UsageError("is drawn by this machine only", where="--overlay", do="leave out --cluster")
+        done = dict(zip((job.name for job in work), _all(work, executor, store), strict=True))
     found = _common(done) if roll else None
     if found is not None:
-        _again(work, done, found, jobs)
+        _again(work, done, found)
     if out is not None:
         _sheet(out, done, work)
         if found is not None:
@@ -284,31 +294,76 @@ def _earlier(job: _Job) -> _Done | None:
         return None
 
 
-def _all(work: list[_Job], jobs: int | None) -> Iterator[_Done]:
+def _all(work: list[_Job], executor: Executor, store: str) -> Iterator[_Done]:
     """Orient all images in parallel; yield the results in their order."""
-    from concurrent.futures import ProcessPoolExecutor
+    from ..core.failure import Failure
 
     kept = [_earlier(job) for job in work]
     rest = [job for job, done in zip(work, kept, strict=True) if done is None]
-    count = min(jobs or os.cpu_count() or 1, max(len(rest), 1))
+    if executor.local:
+        fresh = executor.outcomes(_run, ((job.name, job) for job in rest))
+    else:
+        fresh = executor.outcomes(partial(_run_apart, store), ((job.name, _sent(job, store)) for job in rest))
     with progress("orienting frames", len(work)) as step:
-        for done in kept:
-            if done is not None:
-                step()
-        if count == 1:
-            fresh: Any = map(_run, rest)
-            yield from _merged(kept, fresh, step)
-            return
-        with ProcessPoolExecutor(count) as pool:
-            yield from _merged(kept, pool.map(_run, rest), step)
-
-
-def _merged(kept: list[_Done | None], fresh: Iterator[_Done], step: Any) -> Iterator[_Done]:
-    for done in kept:
-        if done is None:
-            done = next(fresh)
+        for job, done in zip(work, kept, strict=True):
+            if done is None:
+                _, found = next(fresh)
+                done = _Done([], [], f"{job.image}: {found.reason}") if isinstance(found, Failure) else found
+                _receive(job, done, store)
             step()
-        yield done
+            yield done
+
+
+def _sent(job: _Job, store: str) -> tuple[_Job, dict[str, str]]:
+    """A job for another machine: its files by their SHA-256 in the store."""
+    from ..archive import objects_at
+
+    objects, files = objects_at(store), {}
+    for path in (job.image, job.corners):
+        if path is not None:
+            try:
+                files[str(path)] = objects.put(path.read_bytes(), path.suffix)
+            except OSError as error:
+                raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    return job, files
+
+
+def _run_apart(store: str, sent: tuple[_Job, dict[str, str]]) -> _Done:
+    """Orient the frames of an image from the store; the files that are to be written go there."""
+    from tempfile import TemporaryDirectory
+
+    from ..archive import objects_at
+
+    (job, files), objects = sent, objects_at(store)
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        here = {}
+        for number, (path, sha256) in enumerate(files.items()):
+            here[path] = folder / str(number) / Path(path).name
+            here[path].parent.mkdir()
+            here[path].write_bytes(objects.get(sha256, Path(path).suffix))
+        out = None if job.out is None else folder / "out"
+        if out is not None:
+            _prepare(out)
+        corners = None if job.corners is None else here[str(job.corners)]
+        done = _run(replace(job, image=here[str(job.image)], corners=corners, out=out))
+        made = {} if out is None else {str(p.relative_to(out)): p for p in out.rglob("*") if p.is_file()}
+        files = {path: objects.put(made[path].read_bytes(), made[path].suffix) for path in sorted(made)}
+        # The user knows the file by its own path.
+        failed = done.failed.replace(str(here[str(job.image)]), str(job.image))
+        return replace(done, failed=failed, files=files)
+
+
+def _receive(job: _Job, done: _Done, store: str) -> None:
+    """Write the files that another machine has made; the provenance last: it marks the image as done."""
+    from ..archive import objects_at
+    from ..io import write_whole
+
+    if job.out is not None and done.files:
+        objects = objects_at(store)
+        last = f"provenance/{job.name}.json"
+        for path in sorted(done.files, key=lambda each: each == last):
+            write_whole(job.out / path, objects.get(done.files[path], Path(path).suffix))
 
 
 def _common(done: dict[str, _Done]) -> Roll | None:
@@ -320,10 +375,8 @@ def _common(done: dict[str, _Done]) -> Roll | None:
     return None if isinstance(found, Failure) else found
 
 
-def _again(work: list[_Job], done: dict[str, _Done], roll: Roll, jobs: int | None) -> None:
+def _again(work: list[_Job], done: dict[str, _Done], roll: Roll) -> None:
     """Orient frames that were not fully oriented again, with the shape of the roll."""
-    from dataclasses import replace
-
     for job in work:
         item = done[job.name]
         if item.results and any(result.status != "oriented" for result in item.results):

@@ -35,6 +35,7 @@ class Code(StrEnum):
     COLLINEAR = "collinear"  # all points lie on one line
     CORRELATED = "correlated"  # unknowns that the observations can hardly separate
     COVERAGE = "coverage"  # parts of the images have no points
+    CRASHED = "crashed"  # what computed it ended its process, twice
     DECLINED = "declined"  # an earlier step declined the image
     DEVIATES = "deviates"  # far from the position predicted by the other points
     DISPLAY_SHIFTED = "display-shifted"  # the display has shifted against the reseau

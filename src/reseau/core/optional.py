@@ -15,6 +15,7 @@ _DISTRIBUTIONS = {
     "bluesky": "bluesky",
     "cryptography": "reseau[service]",
     "dateutil": "reseau[service]",
+    "distributed": "reseau[scale]",
     "fastapi": "reseau[service]",
     "fsspec": "fsspec",
     "gi": "reseau[aravis]",

@@ -27,7 +27,7 @@ from .frame import (
     RollSummary,
 )
 from .lens import LensDocument, LensSensor
-from .measurement import MeasuredPoint, ReseauMeasurement
+from .measurement import MeasuredPoint, PhotographPoints, PointColumns, ReseauMeasurement
 from .reading import is_points, read_design, read_measurement
 from .testfield import SHAPES, FieldLines, FieldTargets, TestfieldDesign, parse_design
 
@@ -56,6 +56,8 @@ __all__ = [
     "MeasuredEdge",
     "MeasuredFiducial",
     "MeasuredPoint",
+    "PhotographPoints",
+    "PointColumns",
     "ReseauDesign",
     "ReseauMeasurement",
     "Rings",

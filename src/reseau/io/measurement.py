@@ -11,10 +11,10 @@ import numpy as np
 
 from ..core.data import Array, ImagePoints, Mask
 from ..core.errors import FormatError
-from ..core.failure import Remark
+from ..core.failure import Code, Failure, Remark
 from .document import Document, Strict, read_text
 
-__all__ = ["MeasuredPoint", "ReseauMeasurement"]
+__all__ = ["MeasuredPoint", "PhotographPoints", "PointColumns", "ReseauMeasurement"]
 
 
 class MeasuredPoint(Strict):
@@ -184,3 +184,56 @@ class ReseauMeasurement(Document):
             found=len(points),
             expected=len(points),
         )
+
+
+class PointColumns(Strict):
+    """Image points in columns: names (n), coordinates (n, 2), covariance matrices (n, 4) by rows; pixels.
+
+    Examples
+    --------
+    >>> PointColumns(names=("a",), xy=((1.0, 2.0),), cov=((1e-4, 0.0, 0.0, 1e-4),)).names
+    ('a',)
+    """
+
+    names: tuple[str, ...]
+    xy: tuple[tuple[float, ...], ...]
+    cov: tuple[tuple[float, ...], ...]
+
+
+class PhotographPoints(Document):
+    """``reseau-photograph-points/1``: what was measured in a photograph of a target, or why nothing was.
+
+    Unlike ``reseau-measurement/1`` it gives the image points back to the last bit.
+
+    Examples
+    --------
+    >>> points = ImagePoints.with_sigma(["A1"], [[100.25, 80.5]], 0.02)
+    >>> PhotographPoints.of(points, size=(640, 480)).image_points().xy.tolist()
+    [[100.25, 80.5]]
+    """
+
+    SCHEMA: ClassVar[str] = "reseau-photograph-points/1"
+    size: tuple[int, int] | None
+    points: PointColumns | None
+    why: str = ""
+    code: str = ""
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls, found: ImagePoints | Failure, size: tuple[int, int] | None = None, notes: Sequence[str] = ()
+    ) -> Self:
+        """Create the document from image points, or from the reason why there are none."""
+        if isinstance(found, Failure):
+            return cls(size=size, points=None, why=found.reason, code=str(found.code), notes=tuple(notes))
+        xy, cov = found.xy.tolist(), found.cov.reshape(-1, 4).tolist()
+        points = PointColumns(names=found.names, xy=tuple(map(tuple, xy)), cov=tuple(map(tuple, cov)))
+        return cls(size=size, points=points, notes=tuple(notes))
+
+    def image_points(self, where: str = "") -> ImagePoints | Failure:
+        """Return the image points, or the failure of a photograph of this name."""
+        if self.points is None:
+            return Failure(self.why, Code(self.code), where=where)
+        xy = np.array(self.points.xy, dtype=np.float64).reshape(-1, 2)
+        cov = np.array(self.points.cov, dtype=np.float64).reshape(-1, 2, 2)
+        return ImagePoints(self.points.names, xy, cov)

@@ -47,6 +47,7 @@ from ..core.display import Display
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
 from ..core.numbers import measured as with_sigma
+from ..execution import Executor, Outputs
 from ..io.network import TurntableEntry
 from ..io.photographs import Exif
 from ..io.refraction import RefractionEntry
@@ -55,7 +56,7 @@ from ..optics.cameras import default_camera_model
 from ..optics.refraction import RefractedRays, Refraction
 from .assessment import Assessment, assess
 from .exposures import Taken
-from .target_measurement import Measurer, Photograph, measured_in_order, measurer_of
+from .target_measurement import MeasuredPhotograph, Measurer, Photograph, measured_in_order, measurer_of
 from .z_stage import Heights
 
 if TYPE_CHECKING:
@@ -193,8 +194,6 @@ class CalibrationOptions:
         Groups with separate factors on their standard deviations; see :func:`reseau.bundle.search_model`.
     level : float, optional
         Significance level of the tests by which distortion parameters are dropped.
-    workers : int
-        Number of processes for the measurement.
     heights : Heights, optional
         Heights of the target on a z-stage.
     refraction : RefractionEntry, optional
@@ -224,7 +223,6 @@ class CalibrationOptions:
     without: tuple[tuple[str, str], ...] = ()
     components: Kind | None = None
     level: float | None = None
-    workers: int = 1
     heights: Heights | None = None
     refraction: RefractionEntry | None = None
     focal_35_mm: float | None = None
@@ -259,6 +257,8 @@ class Calibrated(Display):
         How the camera model was chosen.
     board : BoardChoice, optional
         How the model of the target was chosen.
+    notes : tuple of str
+        How photographs were read.
     """
 
     result: Result
@@ -266,6 +266,7 @@ class Calibrated(Display):
     declined: dict[str, str]
     choice: ModelChoice | None = None
     board: BoardChoice | None = None
+    notes: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
         return True
@@ -423,12 +424,14 @@ def calibrate_camera(
     model: CameraOptions | None = None,
     options: CalibrationOptions | None = None,
     taken: Mapping[str, Taken] | None = None,
+    executor: Executor | None = None,
+    outputs: Outputs | None = None,
 ) -> Calibrated | Failure:
     """Calibrate a camera, or several that are fixed to each other, from photographs of a target.
 
     Parameters
     ----------
-    frames : iterable of Frame, or of (name, ImagePoints) or (name, Failure)
+    frames : iterable of Frame or Unread, or of (name, ImagePoints) or (name, Failure)
         Photographs, of one size for each camera, measured image points, or why a photograph cannot be read.
         Those of another size than most are declined.
     design : PlaneDesign
@@ -445,6 +448,11 @@ def calibrate_camera(
     taken : mapping of str to Taken, optional
         Camera and exposure of each photograph, by its name, of cameras that are fixed to each other; see
         :func:`~reseau.procedures.exposures.exposures_of_files`. By default all are of one camera.
+    executor : Executor, optional
+        What measures the photographs; by default this process.
+    outputs : Outputs, optional
+        Where measurements are kept; see
+        :func:`~reseau.procedures.target_measurement.measured_in_order`.
 
     Returns
     -------
@@ -458,7 +466,8 @@ def calibrate_camera(
         out was not measured, or windows and media contradict each other.
     """
     options = options or CalibrationOptions()
-    measured, declined, sizes = _measured(frames, measure, size, taken, options.workers)
+    photographs = list(measured_in_order(_checked(frames, taken), measure, executor, outputs))
+    measured, declined, sizes = _measured(photographs, size, taken)
     measured = _without(measured, options.without)
     cameras = list(dict.fromkeys(each.camera for each in taken.values())) if taken else [_CAMERA]
     of = [cameras.index(taken[name].camera) if taken else 0 for name in measured]
@@ -521,7 +530,8 @@ def calibrate_camera(
         if found.code is Code.NOT_CONVERGED:
             return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
         return found
-    calibrated = Calibrated(found, measured, declined, choice, board)
+    notes = tuple(note for each in photographs for note in each.notes)
+    calibrated = Calibrated(found, measured, declined, choice, board, notes)
     loose = _without_scale(calibrated.result)
     return calibrated if loose is None else loose
 
@@ -564,39 +574,39 @@ def _turned(network: Network, turntable: TurntableEntry, exposures: Sequence[str
     return replace(network, stage=stage)
 
 
+def _checked(frames: Iterable[Photograph], taken: Mapping[str, Taken] | None) -> Iterator[Photograph]:
+    """Yield the photographs, each of a name of its own, and of a known camera."""
+    names = set[str]()
+    for frame in frames:
+        name = frame[0] if isinstance(frame, tuple) else frame.name
+        if name in names:
+            raise UsageError("two photographs have this name", where=name)
+        if taken is not None and name not in taken:
+            raise UsageError("is of no known camera and exposure", where=name)
+        names.add(name)
+        yield frame
+
+
 def _measured(
-    frames: Iterable[Photograph],
-    measure: Measurer,
+    photographs: Iterable[MeasuredPhotograph],
     size: tuple[int, int] | None,
     taken: Mapping[str, Taken] | None,
-    workers: int,
 ) -> tuple[dict[str, ImagePoints], dict[str, str], dict[str, tuple[int, int]]]:
     """Return the image points of each photograph, reasons of declined ones, and image sizes by camera."""
-    names = set[str]()
     every = {each.camera for each in taken.values()} if taken else {_CAMERA}
     seen: dict[str, tuple[int, int]] = {}
-
-    def checked() -> Iterator[Photograph]:
-        for frame in frames:
-            name = frame.name if isinstance(frame, Frame) else frame[0]
-            if name in names:
-                raise UsageError("two photographs have this name", where=name)
-            if taken is not None and name not in taken:
-                raise UsageError("is of no known camera and exposure", where=name)
-            names.add(name)
-            if isinstance(frame, Frame):
-                seen[name] = (frame.width, frame.height)
-            yield frame
-
     measured: dict[str, ImagePoints] = {}
     declined: dict[str, str] = {}
-    for name, found in measured_in_order(checked(), measure, workers):
-        if isinstance(found, Failure):
-            declined[name] = found.reason
-        elif len(found) < _LEAST_POINTS:
-            declined[name] = f"{len(found)} points are too few"
-        else:
-            measured[name] = found
+    for each in photographs:
+        if isinstance(each.found, Failure):
+            declined[each.name] = each.found.reason
+            continue
+        if len(each.found) < _LEAST_POINTS:
+            declined[each.name] = f"{len(each.found)} points are too few"
+            continue
+        measured[each.name] = each.found
+        if each.size is not None:
+            seen[each.name] = each.size
     sizes = {} if size is None else dict.fromkeys(every, size)
     for camera in every - sizes.keys():
         own = Counter(seen[name] for name in measured if name in seen and _camera_of(name, taken) == camera)

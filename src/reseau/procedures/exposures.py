@@ -6,18 +6,31 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from glob import glob
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
+from ..archive import LocalObjects, objects_at
+from ..calibration import SensorCorrection
 from ..core.data import Frame, ImagePoints
-from ..core.errors import ImageError, InputError, UsageError
+from ..core.errors import InputError, UsageError
 from ..core.failure import Code, Failure
 from ..io import is_points, read_measurement
+from ..io.images import Channel, read_image
 from ..io.photographs import PHOTOGRAPHS, read_exif
-from .target_measurement import Photograph
+from .target_measurement import Photograph, Unread
 
-__all__ = ["Taken", "exposures_of_files", "files_of", "of_another_lens", "photographs_in", "photographs_of"]
+__all__ = [
+    "Taken",
+    "exposures_of_files",
+    "files_of",
+    "of_another_lens",
+    "photograph_reader",
+    "photographs_in",
+    "photographs_of",
+]
 
 
 _NUMBER = re.compile(r"\d+(?=\D*$)")
@@ -174,37 +187,72 @@ def of_another_lens(photographs: Mapping[str, Path]) -> tuple[float | None, dict
     return next((length for length in said if length), None), others
 
 
+def photograph_reader(
+    channel: Channel = "luma", correction: SensorCorrection | None = None
+) -> Callable[[Path | Frame], Frame]:
+    """Return the function that reads a photograph, or takes a frame, and corrects it; picklable.
+
+    Parameters
+    ----------
+    channel : {"luma", "red", "green", "blue"}
+        Channel of colour images.
+    correction : SensorCorrection, optional
+        Correction for the sensor.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> photograph_reader()(Frame(np.zeros((2, 3), np.uint8), 255.0)).width
+    3
+    """
+    return partial(_opened, channel, correction)
+
+
+def _opened(channel: Channel, correction: SensorCorrection | None, image: Path | Frame) -> Frame:
+    frame = read_image(image, channel) if isinstance(image, Path) else image
+    return frame if correction is None else correction.correct(frame)
+
+
 def photographs_of(
     images: Sequence[tuple[str, Path | Frame | ImagePoints]],
     read: Callable[[Path | Frame], Frame],
     *,
     one_lens: bool = True,
+    store: str = "",
 ) -> tuple[float | None, Iterator[Photograph]]:
-    """Open photographs one after another; one that cannot be used does not end the series.
+    """Return photographs to be read where they are measured; one that cannot be used does not end the series.
 
     Parameters
     ----------
     images : sequence of (str, Path or Frame or ImagePoints)
         Names, and files of photographs or of measured image coordinates, frames, or image points.
     read : callable
-        Returns the frame of a file, or of a frame, with the corrections that are wanted.
+        Returns the frame of a file, or of a frame, with the corrections that are wanted; picklable, unless
+        this process measures.
     one_lens : bool
         Whether all are of one camera: those that were taken with another focal length are left out.
+    store : str, optional
+        Folder or URL to copy the files to, and from which they are read by their SHA-256.
 
     Returns
     -------
     focal_35_mm : float or None
         Equivalent focal length, as the camera says.
     photographs : iterator
-        Frames, image points, or why a photograph cannot be used.
+        Photographs to be read, image points, or why a photograph cannot be used.
 
     Examples
     --------
     >>> import numpy as np
     >>> frame = Frame(np.zeros((2, 3), np.uint8), 255.0)
-    >>> focal, frames = photographs_of([("a", frame)], lambda image: image)
+    >>> focal, frames = photographs_of([("a", frame)], photograph_reader())
     >>> focal, [each.name for each in frames]
     (None, ['a'])
+
+    Raises
+    ------
+    ArchiveError
+        If the store cannot be used.
     """
     files = {name: image for name, image in images if isinstance(image, Path) and not is_points(image)}
     said, zoomed = of_another_lens(files if one_lens else {})
@@ -217,10 +265,33 @@ def photographs_of(
                 yield name, Failure(zoomed[name], Code.DECLINED, where=name)
             elif isinstance(image, Path) and is_points(image):
                 yield name, read_measurement(image).image_points()
+            elif isinstance(image, Path) and objects is not None:
+                sha256, suffix = objects.put(_content(image), image.suffix), image.suffix
+                source = partial(_of_store, read, store, sha256, suffix)
+                yield Unread(name, partial(_named, source, name), {"image": sha256})
             else:
-                try:
-                    yield replace(read(image), name=name)
-                except ImageError as error:
-                    yield name, Failure(error.what, Code.DECLINED, where=name)
+                yield Unread(name, partial(_named, partial(read, image), name))
 
+    objects = objects_at(store) if store else None
     return said, opened()
+
+
+def _named(read: Callable[[], Frame], name: str) -> Frame:
+    return replace(read(), name=name)
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+
+
+def _of_store(read: Callable[[Path | Frame], Frame], place: str, sha256: str, suffix: str) -> Frame:
+    store = objects_at(place)
+    if isinstance(store, LocalObjects):
+        return read(store.path(sha256, suffix))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"{sha256}{suffix}"
+        path.write_bytes(store.get(sha256, suffix))
+        return read(path)

@@ -1,11 +1,9 @@
-"""Measure a target in many photographs, in parallel processes."""
+"""Measure a target in many photographs."""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -13,11 +11,10 @@ import cv2
 import numpy as np
 
 from ..core.data import Frame, ImagePoints
-from ..core.errors import EstimationError, ImageError
+from ..core.errors import ImageError
 from ..core.failure import Code, Failure
-from ..core.processes import process_context
-from ..core.threads import always_one_thread, one_thread
-from ..io import BoardDesign, ReseauDesign, TestfieldDesign
+from ..execution import Executor, Here, Outputs
+from ..io import BoardDesign, PhotographPoints, ReseauDesign, TestfieldDesign
 from ..measure import (
     BoardOptions,
     TestfieldOptions,
@@ -27,14 +24,68 @@ from ..measure import (
 )
 from ..measure.points import Measured
 
-__all__ = ["Measurer", "Photograph", "drawing_overlays", "measured_in_order", "measurer_of"]
+__all__ = [
+    "MeasuredPhotograph",
+    "Measurer",
+    "Photograph",
+    "Unread",
+    "drawing_overlays",
+    "measured_in_order",
+    "measurer_of",
+]
 
 Measurer = Callable[[Frame], Measured | Failure]
 """A function that measures a target in a frame."""
-Photograph = Frame | tuple[str, ImagePoints | Failure]
-"""A frame, the points measured in it by its name, or why it cannot be read."""
-# Frames queued for each process, so that none is idle.
-_AHEAD = 2
+
+
+@dataclass(frozen=True)
+class Unread:
+    """A photograph that is read by the process that measures it.
+
+    Parameters
+    ----------
+    name : str
+        Name of the photograph.
+    read : callable
+        Returns its frame; picklable.
+    inputs : mapping of str to str
+        SHA-256 of all files that the frame depends on, by their roles; required to keep what is measured.
+
+    Examples
+    --------
+    >>> Unread("photo.png", partial(print, "read")).name
+    'photo.png'
+    """
+
+    name: str
+    read: Callable[[], Frame]
+    inputs: Mapping[str, str] = field(default_factory=dict)
+
+
+Photograph = Frame | Unread | tuple[str, ImagePoints | Failure]
+"""A frame, one to be read, the points measured in it by its name, or why it cannot be read."""
+
+
+@dataclass(frozen=True)
+class MeasuredPhotograph:
+    """What was measured in a photograph.
+
+    Parameters
+    ----------
+    name : str
+        Name of the photograph.
+    found : ImagePoints or Failure
+        The image points, or why there are none.
+    size : (int, int), optional
+        Width and height in pixels, if a frame was measured.
+    notes : tuple of str
+        How the file was read.
+    """
+
+    name: str
+    found: ImagePoints | Failure
+    size: tuple[int, int] | None = None
+    notes: tuple[str, ...] = ()
 
 
 def measurer_of(
@@ -90,76 +141,77 @@ def _drawn(measure: Measurer, files: Mapping[str, Path], frame: Frame) -> Measur
 
 
 def measured_in_order(
-    frames: Iterable[Photograph], measure: Measurer, workers: int = 1
-) -> Iterator[tuple[str, ImagePoints | Failure]]:
-    """Yield names of frames with their measured points, in the order of the frames.
+    photographs: Iterable[Photograph],
+    measure: Measurer,
+    executor: Executor | None = None,
+    outputs: Outputs | None = None,
+) -> Iterator[MeasuredPhotograph]:
+    """Yield what was measured in each photograph, in their order.
 
     Parameters
     ----------
-    frames : iterable of Frame, or of (name, ImagePoints) or (name, Failure)
-        Read when needed; points that were measured before, and failures to read a frame, are passed on.
+    photographs : iterable of Frame or Unread, or of (name, ImagePoints) or (name, Failure)
+        Asked for when needed; points that were measured before, and failures to read a photograph, are passed
+        on.
     measure : callable
-        Measures a frame; must be picklable with several processes.
-    workers : int
-        Number of processes; with one, this process measures.
+        Measures a frame; picklable, unless this process measures.
+    executor : Executor, optional
+        What measures; by default this process.
+    outputs : Outputs, optional
+        Where measurements of unread photographs are kept; those that exist are not repeated.
 
     Raises
     ------
     ReseauError
-        Errors of reading and measuring; EstimationError if a process dies.
+        Errors of reading and measuring.
 
     Examples
     --------
     >>> list(measured_in_order([], measure=None))
     []
     """
-    work = partial(_points, measure)
-    if workers == 1:
-        for frame in frames:
-            yield (frame.name, work(frame)) if isinstance(frame, Frame) else frame
-        return
-    pool = ProcessPoolExecutor(workers, mp_context=process_context([__name__]), initializer=_one_thread)
-    waiting: deque[tuple[str, ImagePoints | Failure | Future[ImagePoints | Failure]]] = deque()
-    try:
-        for frame in frames:
-            waiting.append((frame.name, pool.submit(work, frame)) if isinstance(frame, Frame) else frame)
-            if len(waiting) > _AHEAD * workers:
-                yield _next(waiting)
-        while waiting:
-            yield _next(waiting)
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    work = partial(_measured, measure, outputs)
+    named = ((each[0] if isinstance(each, tuple) else each.name, each) for each in photographs)
+    for name, found in (executor or Here()).outcomes(work, named):
+        if isinstance(found, str):
+            assert outputs is not None
+            yield _of_document(name, outputs.read(found))
+        else:
+            yield MeasuredPhotograph(name, found) if isinstance(found, Failure) else found
 
 
-def _points(measure: Measurer, frame: Frame) -> ImagePoints | Failure:
-    # Sums of one and of several threads differ in the last digits; results must not depend on `workers`.
+def _measured(measure: Measurer, outputs: Outputs | None, photograph: Photograph) -> MeasuredPhotograph | str:
+    """What was measured in a photograph, or the SHA-256 of the output that says it."""
+    if isinstance(photograph, tuple):
+        return MeasuredPhotograph(*photograph)
+    if outputs is None or not isinstance(photograph, Unread):
+        return _points(measure, photograph)
+    return outputs.made(photograph.inputs, lambda: _document(_points(measure, photograph)))
+
+
+def _points(measure: Measurer, photograph: Frame | Unread) -> MeasuredPhotograph:
+    name = photograph.name
     try:
-        with one_thread():
-            found = measure(frame)
+        frame = photograph.read() if isinstance(photograph, Unread) else photograph
     except ImageError as error:
-        return Failure(error.what, Code.DECLINED, where=frame.name)
+        return MeasuredPhotograph(name, Failure(error.what, Code.DECLINED, where=name))
+    size = frame.width, frame.height
+    try:
+        found = measure(frame)
+    except ImageError as error:
+        return MeasuredPhotograph(name, Failure(error.what, Code.DECLINED, where=name), size, frame.notes)
     except (np.linalg.LinAlgError, cv2.error) as error:
         # One photograph must not end the measurement of the others.
         reason = f"could not be measured ({type(error).__name__}); please report it with the image"
-        return Failure(reason, Code.SINGULAR, where=frame.name)
-    return found if isinstance(found, Failure) else found.points
+        return MeasuredPhotograph(name, Failure(reason, Code.SINGULAR, where=name), size, frame.notes)
+    return MeasuredPhotograph(name, found if isinstance(found, Failure) else found.points, size, frame.notes)
 
 
-def _next(
-    waiting: deque[tuple[str, ImagePoints | Failure | Future[ImagePoints | Failure]]],
-) -> tuple[str, ImagePoints | Failure]:
-    name, found = waiting.popleft()
-    if isinstance(found, ImagePoints | Failure):
-        return name, found
-    try:
-        return name, found.result()
-    except BrokenProcessPool:
-        raise EstimationError(
-            "a measuring process died", where=name, do="use fewer processes if memory is short"
-        ) from None
+def _document(photograph: MeasuredPhotograph) -> bytes:
+    document = PhotographPoints.of(photograph.found, photograph.size, photograph.notes)
+    return document.to_json().encode()
 
 
-def _one_thread() -> None:
-    """Use one core in each process."""
-    cv2.setNumThreads(1)
-    always_one_thread()
+def _of_document(name: str, data: bytes) -> MeasuredPhotograph:
+    document = PhotographPoints.parse(data.decode(), where=name)
+    return MeasuredPhotograph(name, document.image_points(name), document.size, document.notes)

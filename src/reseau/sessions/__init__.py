@@ -20,6 +20,7 @@ from .conducting import (
     parameters_of,
     procedure_of,
     rerun,
+    rerun_all,
     resume,
 )
 from .kinds import CORNERS, KINDS, OF_FILES, SCENE, Reported, SessionKind, kind_of, own_plan
@@ -63,5 +64,6 @@ __all__ = [
     "parameters_of",
     "procedure_of",
     "rerun",
+    "rerun_all",
     "resume",
 ]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from ..archive import Archive, Session
@@ -21,7 +22,9 @@ from ..capture import (
     plans,
 )
 from ..capture import rerun as rerun_with
-from ..core.errors import UsageError
+from ..core.errors import ReseauError, UsageError
+from ..core.failure import Code, Failure
+from ..execution import Executor
 from .kinds import GENERATOR, Reported, SessionKind, kind_of, own_plan
 from .parameters import OwnParameters, SessionParameters
 
@@ -34,6 +37,7 @@ __all__ = [
     "parameters_of",
     "procedure_of",
     "rerun",
+    "rerun_all",
     "resume",
 ]
 
@@ -330,6 +334,46 @@ def rerun(session: Session) -> list[Rerun]:
     if not session.results():
         raise UsageError(f"has no results (status: {session.status})", where=session.name)
     return rerun_with(session, procedure)
+
+
+def rerun_all(
+    place: str, objects: str | None, names: Sequence[str], executor: Executor
+) -> Iterator[tuple[str, list[Rerun] | Failure]]:
+    """Compute the results of several sessions of an archive again, each independently of the others.
+
+    Parameters
+    ----------
+    place, objects : str
+        The archive, as for :meth:`~reseau.archive.Archive.open`; workers open it, too.
+    names : sequence of str
+        Names of the sessions.
+    executor : Executor
+        What does the work.
+
+    Returns
+    -------
+    iterator of (str, list of Rerun or Failure)
+        Names with what :func:`rerun` returned, or why a session cannot be computed again.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from reseau.execution import Here
+    >>> with tempfile.TemporaryDirectory() as folder, Archive.open(folder, create=True) as archive:
+    ...     _ = archive.begin("mine", "frames", {})
+    ...     for name, found in rerun_all(folder, None, ["mine"], Here()):
+    ...         print(found)
+    mine: plan `frames` computes nothing
+    """
+    yield from executor.outcomes(partial(_rerun, place, objects), ((name, name) for name in names))
+
+
+def _rerun(place: str, objects: str | None, name: str) -> list[Rerun] | Failure:
+    try:
+        with Archive.open(place, objects) as archive:
+            return rerun(archive.session(name))
+    except ReseauError as error:
+        return Failure(error.what, Code.DECLINED, where=str(error.where or name))
 
 
 def calibration_of(session: Session) -> Calibration:

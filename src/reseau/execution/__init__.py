@@ -1,0 +1,12 @@
+"""Independent parts of a computation, done in this process, in several, or on a cluster.
+
+An :class:`Executor` yields the outcome of each job in the order of the jobs; the outcomes are the same
+whichever does the work. :class:`Outputs` keeps them by what they were computed from, so that a computation
+that is started again takes up where it ended.
+"""
+
+from .choice import executor_at
+from .executors import Executor, Here, Processes
+from .outputs import Outputs
+
+__all__ = ["Executor", "Here", "Outputs", "Processes", "executor_at"]

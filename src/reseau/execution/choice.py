@@ -1,0 +1,44 @@
+"""The executor that a user asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ..core.processes import cores
+from .executors import Executor, Here, Processes
+
+__all__ = ["executor_at"]
+
+
+def executor_at(
+    jobs: int | None = None, cluster: str = "", store: str = "", modules: Sequence[str] = ()
+) -> Executor:
+    """Return the executor that a user asks for.
+
+    Parameters
+    ----------
+    jobs : int, optional
+        Number of processes; by default one for each core.
+    cluster : str, optional
+        Address of the scheduler of a Dask cluster, such as ``tcp://192.168.1.5:8786``; replaces `jobs`.
+    store : str, optional
+        Folder or URL that the workers of the cluster share; required with a cluster.
+    modules : sequence of str
+        Modules to import once for all processes.
+
+    Raises
+    ------
+    UsageError
+        If the cluster has no store, its packages are not installed, or it does not answer.
+
+    Examples
+    --------
+    >>> executor_at(1).local
+    True
+    """
+    if cluster:
+        from .cluster import Cluster
+
+        return Cluster(cluster, store)
+    count = jobs or cores()
+    return Here() if count == 1 else Processes(count, modules)

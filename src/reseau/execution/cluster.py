@@ -1,0 +1,190 @@
+"""Do the independent parts of a computation on a Dask cluster.
+
+Whatever is large goes through a store that client and workers share, by its SHA-256: the function with its
+parameters once; jobs and outcomes if they are larger than a message should be. The scheduler sees names and
+hashes only.
+
+A worker gives each job to a process of its own, so that a job which ends its process does not end the worker
+and all that is under way in it. What is lost with a worker is done again by another.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache, partial
+from typing import Any, NamedTuple, Self, TypeVar
+
+from ..archive import Objects, objects_at
+from ..core.errors import EstimationError, UsageError
+from ..core.failure import Failure
+from ..core.optional import optional
+from .executors import Processes, crashed
+
+__all__ = ["Cluster"]
+
+J = TypeVar("J")
+R = TypeVar("R")
+_AHEAD = 3
+"""Jobs that are queued for each thread of a worker, so that none is idle."""
+_SMALL = 2048
+"""Bytes that may be sent through the scheduler; what is larger is stored."""
+_TRIES = 2
+"""How often a job is given to a cluster whose workers die with it."""
+_SUFFIX = ".pickle"
+_PATIENCE_S = 10.0
+_ASK_S = 2.0
+
+
+class Cluster:
+    """The workers of a Dask cluster do the work.
+
+    Client, scheduler and workers trust each other: whoever reaches the scheduler, or writes to the store, can
+    execute code on the workers.
+
+    Parameters
+    ----------
+    address : str
+        Address of the scheduler.
+    store : str
+        Folder or URL that client and workers share.
+
+    Raises
+    ------
+    UsageError
+        If there is no store, Dask is not installed, or the scheduler does not answer.
+
+    Examples
+    --------
+    >>> Cluster("tcp://127.0.0.1:8786", "")
+    Traceback (most recent call last):
+    ...
+    reseau.core.errors.UsageError: --cluster: requires a store that all workers share; add --store
+    """
+
+    local = False
+
+    def __init__(self, address: str, store: str) -> None:
+        if not store:
+            raise UsageError("requires a store that all workers share", where="--cluster", do="add --store")
+        with optional():
+            import distributed
+        self._place, self._store = store, objects_at(store)
+        self._known, self._asked = 1, -_ASK_S
+        connect: Any = distributed.Client
+        try:
+            self._client = connect(address, timeout=_PATIENCE_S, set_as_default=False)
+        except (OSError, ValueError) as error:
+            what = "does not answer" if isinstance(error, OSError) else f"is no address ({error})"
+            raise UsageError(
+                what,
+                where=f"cluster {address}",
+                do="start it with `dask scheduler`, or write tcp://host:8786",
+            ) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._client.close()
+
+    def outcomes(
+        self, work: Callable[[J], R], jobs: Iterable[tuple[str, J]]
+    ) -> Iterator[tuple[str, R | Failure]]:
+        """Yield the outcome of each job; see :meth:`Executor.outcomes`.
+
+        Raises
+        ------
+        EstimationError
+            If the cluster is lost; what its workers have stored remains.
+        """
+        run = partial(_on_worker, self._place, _sent(self._store, work, always=True))
+        series, waiting = uuid.uuid4().hex[:12], deque[tuple[str, _Sent, Any]]()
+        try:
+            for name, job in jobs:
+                sent = _sent(self._store, job)
+                waiting.append((name, sent, self._submit(run, name, sent, series)))
+                if len(waiting) > _AHEAD * self._threads():
+                    yield self._next(run, waiting)
+            while waiting:
+                yield self._next(run, waiting)
+        finally:
+            self._client.cancel([future for _, _, future in waiting])
+
+    def _threads(self) -> int:
+        """Number of threads of all workers, which come and go; the scheduler is asked now and then."""
+        now = time.monotonic()
+        if now - self._asked > _ASK_S:
+            self._known, self._asked = max(1, sum(self._client.nthreads().values())), now
+        return self._known
+
+    def _submit(self, run: _Run, name: str, sent: _Sent, series: str) -> Any:
+        return self._client.submit(run, name, sent, key=f"{name}-{series}", pure=False)
+
+    def _next(self, run: _Run, waiting: deque[tuple[str, _Sent, Any]]) -> tuple[str, Any]:
+        from distributed import CancelledError, KilledWorker
+        from distributed.comm.core import CommClosedError
+
+        name, sent, future = waiting.popleft()
+        for tried in range(1, _TRIES + 1):
+            try:
+                return name, _received(self._store, future.result())
+            except KilledWorker:
+                # Its workers died, perhaps of something else: the system's memory, or another's hand.
+                if tried < _TRIES:
+                    future = self._submit(run, name, sent, uuid.uuid4().hex[:12])
+            except (CancelledError, CommClosedError, TimeoutError):
+                raise EstimationError(
+                    "the cluster is lost", where=name, do="start it again, and repeat the command"
+                ) from None
+        return name, crashed(name)
+
+
+class _Sent(NamedTuple):
+    """An object as bytes, or as the hash of bytes in the store."""
+
+    data: bytes
+    sha256: str
+
+
+_Run = Callable[[str, _Sent], _Sent]
+
+
+def _sent(store: Objects, thing: object, *, always: bool = False) -> _Sent:
+    data = pickle.dumps(thing, protocol=5)
+    if always or len(data) > _SMALL:
+        return _Sent(b"", store.put(data, _SUFFIX))
+    return _Sent(data, "")
+
+
+def _received(store: Objects, sent: _Sent) -> Any:
+    return pickle.loads(store.get(sent.sha256, _SUFFIX) if sent.sha256 else sent.data)
+
+
+_of_thread = threading.local()
+
+
+def _on_worker(place: str, work: _Sent, name: str, job: _Sent) -> _Sent:
+    """Have a job done by the process that belongs to this thread of a worker."""
+    if not hasattr(_of_thread, "processes"):
+        # Dask marks its workers as processes without children. These end by themselves with their parent.
+        multiprocessing.current_process().daemon = False
+        _of_thread.processes = Processes(1, (__name__,))
+    ((_, found),) = _of_thread.processes.outcomes(partial(_done, place, work), [(name, job)])
+    return _sent(objects_at(place), found) if isinstance(found, Failure) else found
+
+
+def _done(place: str, work: _Sent, job: _Sent) -> _Sent:
+    store = objects_at(place)
+    return _sent(store, _work(place, work)(_received(store, job)))
+
+
+@lru_cache(maxsize=4)
+def _work(place: str, sent: _Sent) -> Callable[[Any], Any]:
+    found: Callable[[Any], Any] = _received(objects_at(place), sent)
+    return found
