@@ -83,3 +83,9 @@ def test_a_dicom_photograph_names_the_package_that_reads_it(tmp_path: Path) -> N
 def test_errors_of_other_modules_are_not_about_optional_packages() -> None:
     assert missing(ModuleNotFoundError("No module named 'reseau.nothing'", name="reseau.nothing")) is None
     assert missing(ImportError("cannot import name 'x'", name="matplotlib")) is None
+
+
+def test_a_camera_is_calibrated_without_a_database(tmp_path: Path) -> None:
+    done = without(OPTIONAL, "calibrate", tmp_path / "none.csv", "--design", tmp_path / "none.json")
+    assert done.returncode == 2
+    assert "none.json: cannot be read" in done.stderr

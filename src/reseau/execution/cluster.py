@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache, partial
 from typing import Any, NamedTuple, Self, TypeVar
 
-from ..archive import Objects, objects_at
+from ..archive.objects import Objects, objects_at
 from ..core.errors import EstimationError, UsageError
 from ..core.failure import Failure
 from ..core.optional import optional

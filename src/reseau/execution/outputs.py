@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from ..archive import Objects, objects_at
+from ..archive.objects import Objects, objects_at
 from ..core.errors import ArchiveError
 from ..core.provenance import canonical_json, sha256_of
 from ..core.version import __version__

@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from ..archive import LocalObjects, objects_at
+from ..archive.objects import LocalObjects, objects_at
 from ..calibration import SensorCorrection
 from ..core.data import Frame, ImagePoints
 from ..core.errors import InputError, UsageError

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 from ..adjust import Adjustment
 from ..calibration import CameraCorrection
@@ -189,7 +189,7 @@ def register(points: ImagePoints, design: ReseauDesign, camera: CameraCorrection
     by_camera = _by_camera(camera, marks, expected, length, fit.cofactor)
     cofactor = fit.cofactor + by_camera @ camera.cofactor @ by_camera.T
     statistic = float(off @ np.linalg.solve(cofactor, off)) / 4 / max(1.0, fit.sigma0**2)
-    p = float(scipy.stats.f.sf(statistic, 4, fit.redundancy))
+    p = float(scipy.special.fdtrc(4, fit.redundancy, statistic))
     system: Similarity | SmoothField = _about(fit.values, centre, length)
     left = system(marks.xy) - expected
     if fit.sigma0 > _UNLIKE and len(marks) >= _FIELD_FROM:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
 from numpy.typing import ArrayLike
 
 from ..adjust import Adjustment
@@ -105,6 +104,8 @@ def rivals(
         errors.append(found[0])
         squares.append(found[1])
     difference = squares[0] - squares[1]
+    import scipy.stats  # half a second of every command otherwise
+
     p = float(scipy.stats.wilcoxon(difference).pvalue) if difference.any() else 1.0
     better = "first" if np.median(difference) < 0 else "second"
     rms = np.array([np.sqrt(np.mean(e**2, axis=0)) for e in errors])

@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 from ..calibration import InstrumentCorrection
 from ..core.data import Array, ImagePoints
@@ -164,12 +164,12 @@ def still_standard(
         sigma=np.sqrt(np.diagonal(cov)).reshape(-1, 2),
         statistic=statistic,
         degrees=len(d),
-        critical=float(scipy.stats.chi2.isf(alpha, len(d))),
-        p=float(scipy.stats.chi2.sf(statistic, len(d))),
+        critical=float(scipy.special.chdtri(len(d), alpha)),
+        p=float(scipy.special.chdtrc(len(d), statistic)),
         shift=shift,
         shift_sigma=np.sqrt(np.diagonal(cofactor)),
-        p_shift=float(scipy.stats.chi2.sf(of_shift, 2)),
-        p_rest=float(scipy.stats.chi2.sf(statistic - of_shift, len(d) - 2)),
+        p_shift=float(scipy.special.chdtrc(2, of_shift)),
+        p_rest=float(scipy.special.chdtrc(len(d) - 2, statistic - of_shift)),
         same_object=same_object,
         alpha=alpha,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.stats
+import scipy.special
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
@@ -60,7 +60,7 @@ def draw_body(
 ) -> float:
     """Draw the content of :func:`body_map` into axes; return the factor of enlargement."""
     variance, axis = np.linalg.eigh(true.cov)
-    semi = np.sqrt(variance * scipy.stats.chi2.ppf(PROBABILITY, 2))
+    semi = np.sqrt(variance * scipy.special.chdtri(2, 1 - PROBABILITY))
     both = np.concatenate([true.xy, rods])
     low, high = both.min(axis=0), both.max(axis=0)
     extent = float((high - low).max())

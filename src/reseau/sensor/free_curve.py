@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.optimize import brentq
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
 
 from ..adjust import Adjustment, GaussMarkov, Parameters, adjust
 from ..core.data import Array
@@ -283,7 +283,7 @@ class FreeCurve:
         outer = self.spline.beyond(0.75 * min(-k[0], k[-1]))
         with one_thread():
             statistic = float(a[outer] @ np.linalg.solve(cov[np.ix_(outer, outer)], a[outer])) / len(outer)
-        p = float(fisher.sf(statistic, len(outer), self.fit.redundancy))
+        p = float(fdtrc(len(outer), self.fit.redundancy, statistic))
         return float(np.abs(found).sum() / abs(self._step[0])), p
 
 

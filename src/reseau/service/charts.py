@@ -22,7 +22,6 @@ from typing import Literal
 import numpy as np
 import scipy.optimize
 import scipy.special
-import scipy.stats
 
 from ..core.data import Array, Mask, Rows
 from ..core.errors import UsageError
@@ -446,7 +445,7 @@ class _Predictor:
         self._xx = [np.zeros((*lead, c)) for _ in range(3)]
         self._z, self._x = np.zeros((*lead, c, p)), np.full((*lead, c), np.nan)
         degrees = np.maximum(np.arange(n + 1), 1)
-        self._wider = -scipy.stats.t.ppf(scipy.special.ndtr(-single), degrees) / single
+        self._wider = -scipy.special.stdtrit(degrees, scipy.special.ndtr(-single)) / single
 
     def predict(self, now: Array, row: Array) -> tuple[Array, Array, Array, Array, Array]:
         """Scores, predicted values, their standard deviations, the widths of the charts, and φ."""

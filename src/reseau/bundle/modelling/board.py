@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 from ...core.data import Array
 from ...core.display import Display
@@ -240,7 +240,7 @@ def _compared(network: Network, held: Network, found: list[BoardModel], count: i
             more = richer.parameters - each.parameters
             rest = richer.cost / richer.sigma0**2
             ratio = max(each.cost - richer.cost, 0.0) / more / richer.sigma0**2
-            p = float(scipy.stats.f.sf(ratio, more, rest))
+            p = float(scipy.special.fdtrc(more, rest, ratio))
         models.append(replace(each, length=float(length[k]), p=p))
     chosen = next(each for each in models if each.length <= _EQUAL)
     return BoardChoice(chosen, tuple(models), held if chosen.name == "flat" else network)

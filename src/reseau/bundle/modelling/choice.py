@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 from ...calibration.camera import CameraMapping, projection_field
 from ...calibration.compare import calibration_difference
@@ -638,7 +638,7 @@ def _test(own: Candidate, fit: BundleFit, chosen: Candidate, best: BundleFit) ->
     if more <= 0 or large.redundancy <= 0:
         return np.nan
     ratio = max(small.cost - large.cost, 0.0) / more / (large.cost / large.redundancy)
-    return float(scipy.stats.f.sf(ratio, more, large.redundancy))
+    return float(scipy.special.fdtrc(more, large.redundancy, ratio))
 
 
 def _difference(best: BundleFit, other: BundleFit) -> dict[str, float]:
@@ -656,7 +656,7 @@ def _difference(best: BundleFit, other: BundleFit) -> dict[str, float]:
     known = [place for place in corners if np.isfinite(size[place])]
     worst = max(known, key=lambda place: float(size[place]), default=None)
     seen = np.isfinite(size) & np.isfinite(sigma)
-    limit = np.sqrt(scipy.stats.chi2.ppf(0.99, 2))
+    limit = np.sqrt(scipy.special.chdtri(2, 0.01))
     return {
         "rms_px": float(np.sqrt(np.nanmean(size**2))),
         "corner_px": np.nan if worst is None else float(size[worst]),
@@ -749,5 +749,5 @@ def _worse(squares: Array | None) -> set[int]:
     best = int(each.sum(axis=1).argmin())
     off = each - each[best]
     spread = off.std(axis=1, ddof=1) * np.sqrt(off.shape[1])
-    limit = scipy.stats.t.ppf(1 - _LEVEL, off.shape[1] - 1)
+    limit = scipy.special.stdtrit(off.shape[1] - 1, 1 - _LEVEL)
     return {int(row) for row in np.flatnonzero(off.sum(axis=1) > limit * spread)} - {best}

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
-from scipy.stats import binom
+from scipy.special import bdtr
 
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure, Remark
@@ -204,7 +204,7 @@ def _numbered(
             return Failure(
                 f"{wrong} of {total} dots are not as on the board where it fits best", Code.OTHER_DESIGN
             )
-        if puzzle and len(found) * binom.cdf(wrong, total, 0.5) > _CHANCE:
+        if puzzle and len(found) * bdtr(wrong, total, 0.5) > _CHANCE:
             return Failure(f"{total} dots are too few to tell which part it is", Code.NOT_IDENTIFIED)
     if score < 0.25 * min(len(nodes), len(numbers)):
         return Failure(
