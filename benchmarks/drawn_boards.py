@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from worlds import prints
 from worlds.pixels import Array
-from worlds.sheets import CONDITIONS, View, pose, views
+from worlds.sheets import CONDITIONS, View, Wide, pose, views
 
 from reseau.core.data import Frame
 from reseau.core.failure import Failure
@@ -159,14 +159,6 @@ def line(kind: str, label: str, view: View) -> bool:
         flush=True,
     )
     return good
-
-
-class Wide(View):
-    """A view through a wide lens."""
-
-    _focal = np.array([520.0, 518.0])
-    _centre = np.array([471.2, 366.4])
-    _lens = (-0.24, 0.045, -0.0006, 0.0008)
 
 
 def held_out(kind: str, count: int) -> list[tuple[str, View]]:

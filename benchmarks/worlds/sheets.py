@@ -25,7 +25,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from worlds.pixels import Array, edge, form, interpolated
 
-__all__ = ["CONDITIONS", "Printed", "Sheet", "View", "coded", "pose", "views"]
+__all__ = ["CONDITIONS", "Printed", "Sheet", "View", "Wide", "coded", "pose", "views"]
 
 _WIDTH, _HEIGHT = 960, 720
 _OVERSAMPLING = 4
@@ -278,6 +278,14 @@ class View:
         for _ in range(_ITERATIONS):
             found = found - (self._distorted(found) - at)
         return found
+
+
+class Wide(View):
+    """A view through a wide lens."""
+
+    _focal = np.array([520.0, 518.0])
+    _centre = np.array([471.2, 366.4])
+    _lens = (-0.24, 0.045, -0.0006, 0.0008)
 
 
 def pose(seed: int, sheet: Printed, most_tilt_deg: float = 50.0, nearer: float = 1.0) -> tuple[Array, Array]:

@@ -25,7 +25,7 @@ from .board_pictures import picture
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from worlds import prints
-from worlds.sheets import View, pose
+from worlds.sheets import View, Wide, pose
 
 CHESS = board("chess", 9, 8, 20.0)
 CHARUCO = board("charuco", 7, 6, 25.0, size=18.0)
@@ -34,6 +34,8 @@ APRIL = board("aprilgrid", 4, 3, 26.0, border_bits=2)
 APRIL_ONE = board("aprilgrid", 4, 3, 26.0, dictionary="DICT_APRILTAG_25h9")
 MARKERS = board("markers", 4, 3, 26.0, size=21.0)
 SINGLE = board("markers", 1, 1, 60.0, dictionary="DICT_APRILTAG_16h5", first_id=7)
+CLOSE = board("circles", 4, 11, 20.0, size=16.0, asymmetric=True)
+CLOSE_PRINT = prints.circles(4, 11, 20.0, 16.0, True)
 SHIFTED = board("circles", 5, 9, 12.0, size=9.0, asymmetric=True)
 CHARUCO_PRINT = prints.charuco(9, 6, 30.0, 22.0, "DICT_4X4_100")
 STEREO = Path(os.environ.get("RESEAU_DATA", "/nowhere")) / "chessboard_stereo"
@@ -168,6 +170,30 @@ def test_few_large_marks_through_a_lens_have_the_sigmas_of_their_errors(
     error = renamed(found, view.truth)
     sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
     assert 0.75 < np.sqrt(((error / sigma) ** 2).mean()) < 1.3
+    assert np.sqrt((error**2).mean()) < 0.004
+
+
+@pytest.mark.parametrize(
+    ("design", "printed", "wide", "seed", "nearer"),
+    [
+        (CLOSE, CLOSE_PRINT, True, 51, 1.7),
+        (CLOSE, CLOSE_PRINT, True, 52, 1.7),
+        (CLOSE, CLOSE_PRINT, False, 111, 2.6),
+        (board("circles", 9, 7, 25.0, size=12.0), prints.circles(9, 7, 25.0, 12.0), False, 110, 2.6),
+    ],
+)
+def test_large_circles_through_a_wide_lens_or_in_part_have_the_sigmas_of_their_errors(
+    design: BoardDesign, printed: prints.Print, wide: bool, seed: int, nearer: float
+) -> None:
+    """Images of the circles are up to 2 px aside of those of their centres."""
+    turn, place = pose(seed, printed, nearer=nearer)
+    shift = np.append(np.random.default_rng(seed - 110).uniform(-60, 60, 2), 0.0) if not wide else 0.0
+    view = (Wide if wide else View)(printed, turn, place * [1, 1, 0.55 if wide else 1] + shift, seed=seed)
+    found = measured(Frame(view.picture(), 255.0, "lens"), design)
+    error = renamed(found, view.truth)
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert 0.4 < np.sqrt(((error / sigma) ** 2).mean()) < 1.3
+    assert np.abs(error / sigma).max() < 4.5
     assert np.sqrt((error**2).mean()) < 0.004
 
 

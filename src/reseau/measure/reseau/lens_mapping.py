@@ -1,36 +1,68 @@
-"""The mapping of a plane target through a lens, from few points: a projectivity and radial distortion.
+r"""The mapping of a plane target through a lens, from few points: a projectivity and distortion.
 
-With the ideal image u by the projectivity, in units of half the longer side of the frame about its middle,
+With the ideal image u by the projectivity, in units of half the longer side of the frame about its middle, a
+centre c, and the ratio a of the scales along both axes less 1,
 
-.. math:: u_d = u + (u - c)\\,(k_1 r^2 + k_2 r^4) , \\qquad r = |u - c| ,
+.. math:: u_d = u + S^{-1} q(S (u - c)) , \qquad S = \mathrm{diag}(1, 1 + a) , \qquad
+   q(d) = d\,(k_1 r^2 + k_2 r^4 + k_3 r^6) +
+   \begin{pmatrix} 2 p_1 d_x d_y + p_2 (r^2 + 2 d_x^2) \\ p_1 (r^2 + 2 d_y^2) + 2 p_2 d_x d_y \end{pmatrix}
 
-twelve parameters contain the second derivatives that a free polynomial has only from its third degree on,
-with twenty. A centre c that is not the principal point contains decentring distortion to first order (Brown
-1971, Photogrammetric Engineering 37, eq. 10). Written out it is a polynomial of the fifth degree.
+with r = |d| (Brown 1971, Photogrammetric Engineering 37, eq. 10): sixteen parameters, of which usual sizes
+are known, contain the second derivatives that a free polynomial has only from its third degree on, with
+twenty. Written out it is a polynomial of the seventh degree.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from ...core.data import Array
 from ...optics import Chain
+from ..testfield.lattice_fit import monomials_of
 from ..testfield.lattice_mapping import of_degree, started, with_coefficients
 from .sheet_placement import through
 
-__all__ = ["mapping_through"]
+__all__ = ["FoundMapping", "mapping_through"]
 
-_LENS_SIGMA = np.array([0.3, 0.3, 0.1, 0.1])
-"""Usual sizes of k1, k2 and the centre; half the width of a frame has r = 1."""
+_LENS_SIGMA = np.array([0.3, 0.3, 0.1, 0.1, 0.1, 0.005, 0.003, 0.003])
+"""Usual sizes of k1, k2, k3, c, a, p1 and p2; half the width of a frame has r = 1."""
+_DEGREE = 7
 _ROUGH_PX = 0.005
 """Deviation that does not count in the comparison of mappings: positions were formed with another one."""
 _PER_TERM = 2.0
 """Least number of points for each term of a polynomial."""
 _STEPS, _SETTLED = 12, 1e-3
 """Most iterations, and change of the sum of squares at which they end."""
+_SHOWN = 4
+"""Redundancy from which misfits tell more about the errors of a mapping than sigmas do."""
 
 
-def mapping_through(at: Array, xy: Array, sigma: Array, shape: tuple[int, int]) -> Chain:
+@dataclass(frozen=True, eq=False)
+class FoundMapping:
+    """A mapping with its uncertainty.
+
+    Parameters
+    ----------
+    mapping : Chain
+        The mapping.
+    displaced : tuple of Chain
+        Mappings that are off by one standard deviation in independent directions: the covariance of anything
+        that follows from the mapping is the sum of the squares of what changes with them.
+
+    Examples
+    --------
+    >>> from reseau.measure.testfield.lattice_mapping import started
+    >>> FoundMapping(started(np.eye(3), 1, (480, 640)), ()).displaced
+    ()
+    """
+
+    mapping: Chain
+    displaced: tuple[Chain, ...]
+
+
+def mapping_through(at: Array, xy: Array, sigma: Array, shape: tuple[int, int]) -> FoundMapping:
     """Mapping through precise points: through a lens, or a polynomial where that describes them better.
 
     The one with the least sum of weighted squares and twice the number of parameters is taken (Akaike 1974).
@@ -47,16 +79,58 @@ def mapping_through(at: Array, xy: Array, sigma: Array, shape: tuple[int, int]) 
     degree = next(d for d in (5, 4, 3, 2, 1) if _PER_TERM * (d + 1) * (d + 2) <= 2 * len(at) or d == 1)
     free = through(at, xy, shape, degree)
     lens = _through_lens(at, xy, sigma, shape, free)
-    if lens is None:
-        return free
-    weight = 1 / np.hypot(sigma, _ROUGH_PX)[:, None]
-    misfit = [float((((m(at) - xy) * weight) ** 2).sum()) for m in (lens, free)]
-    better = misfit[0] + 2 * (8 + len(_LENS_SIGMA)) <= misfit[1] + 2 * len(free.second.values)
-    return lens if better else free
+    weight = 1 / np.hypot(sigma, _ROUGH_PX)
+    if lens is not None:
+        misfit = [float((((m(at) - xy) * weight[:, None]) ** 2).sum()) for m in (lens.mapping, free)]
+        if misfit[0] + 2 * (8 + len(_LENS_SIGMA)) <= misfit[1] + 2 * len(free.second.values):
+            return lens
+    return FoundMapping(free, _displaced(free, at, xy, weight))
 
 
-def _through_lens(at: Array, xy: Array, sigma: Array, shape: tuple[int, int], start: Chain) -> Chain | None:
-    """Least-squares mapping with radial distortion; None if there is none."""
+def _displaced(free: Chain, at: Array, xy: Array, weight: Array) -> tuple[Chain, ...]:
+    """See :class:`FoundMapping`; the coefficients of a polynomial are those of a linear problem."""
+    monomials, _ = monomials_of(free, at)
+    _, value, right = np.linalg.svd(monomials * weight[:, None], full_matrices=False)
+    known = value > 1e-10 * value[0]
+    redundancy = len(at) - int(known.sum())
+    square = (((free(at) - xy) * weight[:, None]) ** 2).mean() * len(at) / max(redundancy, 1)
+    scale = np.sqrt(square) if 2 * redundancy >= _SHOWN else 1.0
+    none = np.zeros(monomials.shape[1])
+    return tuple(
+        with_coefficients(free, scale * np.stack([step, none] if k == 0 else [none, step]))
+        for step in right[known] / value[known, None]
+        for k in range(2)
+    )
+
+
+def _distortion(u: Array, x: Array) -> tuple[Array, Array, Array]:
+    """Distortion (n, 2) at points, its derivatives by these (n, 2, 2) and by its parameters (n, 2, 8)."""
+    (k1, k2, k3), c, stretch, (p1, p2) = x[:3], x[3:5], np.array([1.0, 1.0 + x[5]]), x[6:]
+    off = u - c
+    d = off * stretch
+    dx, dy = d.T
+    r2 = dx * dx + dy * dy
+    radial, rate = r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))
+    by_p = np.stack([2 * dx * dy, r2 + 2 * dx * dx, r2 + 2 * dy * dy, 2 * dx * dy], axis=1).reshape(-1, 2, 2)
+    q = d * radial[:, None] + by_p @ [p1, p2]
+    slope = radial[:, None, None] * np.eye(2) + rate[:, None, None] * d[:, :, None] * d[:, None]
+    cross = 2 * (p1 * dx + p2 * dy)
+    slope += np.stack([2 * p1 * dy + 6 * p2 * dx, cross, cross, 6 * p1 * dy + 2 * p2 * dx], axis=1).reshape(
+        -1, 2, 2
+    )
+    by_u = slope * stretch / stretch[:, None]
+    by_a = slope[:, :, 1] * off[:, 1, None]
+    by_a[:, 1] -= q[:, 1] / stretch[1]
+    by_k = d[:, :, None] * (r2[:, None] ** [1, 2, 3])[:, None]
+    parts = by_k / stretch[:, None], -by_u, (by_a / stretch)[..., None], by_p / stretch[:, None]
+    by_x = np.concatenate(parts, axis=2)
+    return q / stretch, by_u, by_x
+
+
+def _through_lens(
+    at: Array, xy: Array, sigma: Array, shape: tuple[int, int], start: Chain
+) -> FoundMapping | None:
+    """Least-squares mapping with distortion; None if there is none."""
     h, w = shape
     middle, half = np.array([w - 1, h - 1]) / 2, max(h, w) / 2
     centre, size = at.mean(axis=0), max(float(np.ptp(at, axis=0).max()) / 2, 1e-9)
@@ -65,26 +139,21 @@ def _through_lens(at: Array, xy: Array, sigma: Array, shape: tuple[int, int], st
     first = to_unit @ np.append(start.first.values, 1.0).reshape(3, 3) @ np.linalg.inv(back)
     source = np.column_stack([(at - centre) / size, np.ones(len(at))])
     seen, weight = (xy - middle) / half, np.repeat(half / np.hypot(sigma, _ROUGH_PX), 2)
-    x = np.append((first / first[2, 2]).ravel()[:8], np.zeros(4))
+    x = np.append((first / first[2, 2]).ravel()[:8], np.zeros(len(_LENS_SIGMA)))
     prior = np.append(np.zeros(8), 1 / _LENS_SIGMA)
     last = np.inf
     for _ in range(_STEPS):
-        matrix, (k1, k2), c = np.append(x[:8], 1.0).reshape(3, 3), x[8:10], x[10:]
-        p = source @ matrix.T
+        p = source @ np.append(x[:8], 1.0).reshape(3, 3).T
         u = p[:, :2] / p[:, 2:]
-        d = u - c
-        r2 = (d**2).sum(axis=1)[:, None]
-        bent = r2 * (k1 + k2 * r2)
-        # Derivative of the distortion by its argument.
-        slope = bent[..., None] * np.eye(2) + (2 * (k1 + 2 * k2 * r2))[..., None] * d[:, :, None] * d[:, None]
-        by_u = slope + np.eye(2)
+        bent, by_u, by_x = _distortion(u, x[8:])
         by_h = np.zeros((len(at), 2, 8))
         by_h[:, 0, :3] = by_h[:, 1, 3:6] = source / p[:, 2:]
         by_h[:, :, 6:] = -u[:, :, None] * (source[:, None, :2] / p[:, 2:, None])
-        jacobian = np.concatenate([by_u @ by_h, (d * r2)[..., None], (d * r2**2)[..., None], -slope], axis=2)
-        jacobian = jacobian.reshape(-1, 12) * weight[:, None]
-        off = (seen - u - d * bent).ravel() * weight
-        normal = jacobian.T @ jacobian + np.diag(prior**2)
+        jacobian = np.concatenate([(by_u + np.eye(2)) @ by_h, by_x], axis=2)
+        jacobian = jacobian.reshape(-1, len(x)) * weight[:, None]
+        off = (seen - u - bent).ravel() * weight
+        data = jacobian.T @ jacobian
+        normal = data + np.diag(prior**2)
         try:
             step = np.linalg.solve(normal, jacobian.T @ off - prior**2 * x)
         except np.linalg.LinAlgError:
@@ -98,17 +167,25 @@ def _through_lens(at: Array, xy: Array, sigma: Array, shape: tuple[int, int], st
         last = total
     else:
         return None
-    matrix = np.linalg.inv(to_unit) @ np.append(x[:8], 1.0).reshape(3, 3) @ back
-    mapping = of_degree(started(matrix, 1, shape), 5)
-    return with_coefficients(mapping, half * _expanded(x[8], x[9], x[10:]).T)
+
+    def written(values: Array) -> Chain:
+        matrix = np.linalg.inv(to_unit) @ np.append(values[:8], 1.0).reshape(3, 3) @ back
+        mapping = of_degree(started(matrix, 1, shape), _DEGREE)
+        return with_coefficients(mapping, half * _expanded(values[8:]).T)
+
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(normal)).T
+    except np.linalg.LinAlgError:
+        return None
+    redundancy = 2 * len(at) - float(np.trace(np.linalg.solve(normal, data)))
+    scale = np.sqrt(float(off @ off) / redundancy) if redundancy >= _SHOWN else 1.0
+    return FoundMapping(written(x), tuple(written(x + scale * step) for step in root.T))
 
 
-def _expanded(k1: float, k2: float, c: Array) -> Array:
-    """Coefficients (21, 2) of radial distortion in the monomials 1, u, v, u², u v, v², …"""
-    # They are found from values, of which a polynomial of the fifth degree has no residuals.
-    side = np.linspace(-1.0, 1.0, 7)
+def _expanded(x: Array) -> Array:
+    """Coefficients (36, 2) of distortion in the monomials 1, u, v, u², u v, v², …"""
+    # They are found from values, of which a polynomial of that degree has no residuals.
+    side = np.linspace(-1.0, 1.0, _DEGREE + 2)
     u = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    terms = np.stack([u[:, 0] ** (n - j) * u[:, 1] ** j for n in range(6) for j in range(n + 1)], axis=1)
-    d = u - c
-    r2 = (d**2).sum(axis=1)[:, None]
-    return np.asarray(np.linalg.lstsq(terms, d * r2 * (k1 + k2 * r2), rcond=None)[0])
+    terms = [u[:, 0] ** (n - j) * u[:, 1] ** j for n in range(_DEGREE + 1) for j in range(n + 1)]
+    return np.asarray(np.linalg.lstsq(np.stack(terms, axis=1), _distortion(u, x)[0], rcond=None)[0])

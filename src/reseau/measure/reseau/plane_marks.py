@@ -88,6 +88,9 @@ _WHOLE = 0.97
 """Share of the pixels of a mark below which it is seen in part."""
 _BENT_PX = 0.15
 """Distance of one mark in ten from the mapping through all, from which that is adjusted again."""
+_ROUNDS, _SAME = 6, 0.2
+"""Most rounds of matching with the mapping through the last matches; change of the middles of images, in
+sigmas, at which they end."""
 _PER_SMOOTH = 2.5
 """Least number of coordinates for each term of the polynomial about which positions scatter."""
 _PSF_LOG_SIGMA = 0.2
@@ -171,6 +174,11 @@ class Located:
         return np.asarray(self.xy @ self.frame.T + self.origin)
 
 
+def _sure(found: Matches) -> Mask:
+    """Marks that show the mapping."""
+    return found.converged & (found.t > 8) & (found.rejected < 0.1) & (found.seen > _SEEN)
+
+
 class PlaneMarks(ABC):
     """The two rounds of matching, and the tests of every mark.
 
@@ -224,6 +232,7 @@ class PlaneMarks(ABC):
         self.hidden = np.zeros(screened.grey.shape, dtype=bool)
         self.dazzled = np.zeros(len(self.at), dtype=bool)
         self.notes: tuple[Remark, ...] = ()
+        self.displaced: tuple[Chain, ...] = ()
         self.learning = True
         self.own_px = np.zeros(len(self.at))  # pixels of the windows that belong to marks, matched last
         self.rough = 0.0  # residuals of the marks that were learnt from
@@ -267,17 +276,10 @@ class PlaneMarks(ABC):
             self._respond(self._learn(first.select(sure), rows[sure]), rows[sure])
         rows, self.learning = self._in_sight(), False
         found = self._match(rows) if self.eccentric else self._match_all(rows)
-        sure = found.converged & (found.t > 8) & (found.rejected < 0.1) & (found.seen > _SEEN)
         # Marks with something in front of them show neither the mapping nor its errors.
-        plain = sure & ~self._uneasy(found) & (found.seen > _WHOLE) & (found.rejected == 0)
+        plain = _sure(found) & ~self._uneasy(found) & (found.seen > _WHOLE) & (found.rejected == 0)
         if self.eccentric or self._bent(rows[plain], found.select(plain)):
-            sure = sure if self.eccentric else plain
-            if sure.sum() >= _ENOUGH_LIKE:
-                self.start[rows[sure]] = found.xy[sure]
-                h, w = self.screened.grey.shape
-                sigma = np.sqrt(np.trace(found.cov[sure], axis1=1, axis2=2) / 2)
-                self.mapping = mapping_through(self.at[rows[sure]], found.xy[sure], sigma, (h, w))
-            found = self._match_all(rows)
+            found = self._mapped(rows, found, _sure(found) if self.eccentric else plain)
         why, field = self._judged(rows, found)
         # Where paper is saturated, neighbours do not predict the light.
         doubtful = ((why != "") | self._uneasy(found)) & ~self.dazzled[rows]
@@ -289,9 +291,42 @@ class PlaneMarks(ABC):
         found = self._tempered(rows, found, alike) if self.even else alike
         if self.precise_start:
             found = self._with_doubtful_light(rows, found)
-        found = replace(found, cov=found.cov + self.formed_px**2 * np.eye(2))
+        found = replace(found, cov=found.cov + self._misformed(rows))
         why, field = self._judged(rows, found, field)
         return self._spread(rows, found, why, field, with_field)
+
+    def _mapped(self, rows: Rows, found: Matches, sure: Mask) -> Matches:
+        """Matches with the mapping through the marks that are `sure`, which itself depends on the matches."""
+        h, w = self.screened.grey.shape
+        for k in range(_ROUNDS if self.eccentric else 1):
+            before, sigma = self._off_centre(self.mapping, rows), np.full(len(rows), np.inf)
+            if sure.sum() >= _ENOUGH_LIKE:
+                self.start[rows[sure]] = found.xy[sure]
+                sigma = np.sqrt(np.trace(found.cov, axis1=1, axis2=2) / 2)
+                if self.eccentric:
+                    # Growth about the image of the point is not that of the mark on its plane.
+                    self._settle(found.select(sure))
+                through_all = mapping_through(self.at[rows[sure]], found.xy[sure], sigma[sure], (h, w))
+                self.mapping, self.displaced = through_all.mapping, through_all.displaced
+            moved = np.abs(self._off_centre(self.mapping, rows) - before).max(axis=1)
+            if k and (moved < _SAME * sigma)[sure].all():
+                break
+            found = self._match_all(rows)
+            sure = _sure(found)
+        return found
+
+    def _off_centre(self, mapping: Chain, rows: Rows) -> Array:
+        """How far (k, 2) the middles of the images of marks are from the images of their points."""
+        return np.zeros((len(rows), 2))
+
+    def _misformed(self, rows: Rows) -> Array:
+        """Covariances (k, 2, 2) of what formed images lack, and of the mapping that forms them."""
+        cov = np.tile(self.formed_px**2 * np.eye(2), (len(rows), 1, 1))
+        middle = self._off_centre(self.mapping, rows)
+        for mapping in self.displaced:
+            off = self._off_centre(mapping, rows) - middle
+            cov += off[:, :, None] * off[:, None]
+        return cov
 
     def _bent(self, rows: Rows, found: Matches) -> bool:
         """Whether the lens bends the target more than the mapping through the marks found contains."""

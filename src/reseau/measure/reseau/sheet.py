@@ -20,7 +20,7 @@ from ...optics.formation import Outline, PixelResponse, side_rule
 from ..matching import GrownOutline, Matches, Shape, Window
 from ..points import Reason
 from ..screening import Screened, screen
-from ..testfield.lattice_mapping import second_order
+from ..testfield.lattice_mapping import images_of, second_order, slope_of
 from .disks import Disks, find_disks
 from .marks import ReseauOptions
 from .plane_marks import Located, PlaneMarks
@@ -44,6 +44,8 @@ _SIZE_SIGMA = 0.03
 """Spread of relative size over the disks of one frame."""
 _GROWN, _BENT = 0.2, 0.12
 """Tolerances of size and shape (shares) of a disk."""
+_SIDES = 12
+"""Sides of a polygon whose centroid is that of the image of a disk."""
 _NODES_PX = 1.1
 """Distance of nodes on an outline, in widths of the point-spread function."""
 
@@ -119,16 +121,14 @@ class DiskMarks(PlaneMarks):
 
     def _images(self, rows: Rows) -> tuple[Shape, Array]:
         """Images of the disks around the images of their centres."""
-        _, slope, bend = second_order(self.mapping, self.at[rows])
-        scale = float(np.linalg.norm(slope @ self.frame, ord=2, axis=(1, 2)).max())
+        at = self.at[rows]
+        scale = float(np.linalg.norm(slope_of(self.mapping, at) @ self.frame, ord=2, axis=(1, 2)).max())
         flat = Outline.circle(self.look.size / 2, _NODES_PX * self.look.psf_px / scale)
-        step, tangent = flat.xy @ self.frame.T, flat.dxy @ self.frame.T
-        # F(s + d) − F(s) = J d + ½ d H d, and its derivative J + H d.
-        nodes = np.einsum("kab,jb->kja", slope, step) + 0.5 * np.einsum("kabc,jb,jc->kja", bend, step, step)
-        tangents = np.einsum("kab,jb->kja", slope, tangent) + np.einsum(
-            "kabc,jb,jc->kja", bend, step, tangent
-        )
-        outline = Outline(nodes, tangents).oriented().single()
+        around = (at[:, None] + flat.xy @ self.frame.T).reshape(-1, 2)
+        slope = slope_of(self.mapping, around).reshape(len(at), -1, 2, 2)
+        nodes = images_of(self.mapping, around).reshape(len(at), -1, 2)
+        tangents = np.einsum("kjab,jb->kja", slope, flat.dxy @ self.frame.T)
+        outline = Outline(nodes - images_of(self.mapping, at)[:, None], tangents).oriented().single()
         return GrownOutline(outline, _FORM), np.abs(outline.xy).max(axis=1)
 
     def _settle(self, first: Matches) -> Matches:
@@ -156,6 +156,16 @@ class DiskMarks(PlaneMarks):
         """See :class:`PlaneMarks`."""
         slope = second_order(self.mapping, self.at[rows])[1] @ self.frame
         return np.asarray(self.look.size / 2 * np.sqrt(np.abs(np.linalg.det(slope))))
+
+    def _off_centre(self, mapping: Chain, rows: Rows) -> Array:
+        """See :class:`PlaneMarks`: the centroids of the images of disks."""
+        circle = Outline.circle(self.look.size / 2, np.pi * self.look.size / _SIDES).xy @ self.frame.T
+        at = self.at[rows]
+        node = images_of(mapping, (at[:, None] + circle).reshape(-1, 2)).reshape(len(at), -1, 2)
+        a = node - images_of(mapping, at)[:, None]
+        b = np.roll(a, -1, axis=1)
+        twice = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+        return np.asarray(((a + b) * twice[..., None]).sum(axis=1) / (3 * twice.sum(axis=1)[:, None]))
 
     def _misshapen(self, found: Matches) -> list[tuple[Mask, Reason]]:
         """See :class:`PlaneMarks`."""

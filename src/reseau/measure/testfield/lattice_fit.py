@@ -33,13 +33,7 @@ from .lattice_mapping import (
 )
 from .line_profiles import line_nodes
 
-__all__ = [
-    "LatticeFit",
-    "common_part",
-    "fit_lattice",
-    "lattices",
-    "refit",
-]
+__all__ = ["LatticeFit", "common_part", "fit_lattice", "lattices", "monomials_of", "refit"]
 
 _DEGREE = 3
 """Degree of the polynomial determined by lines alone."""
@@ -305,7 +299,7 @@ def _assigned(
 def _adjusted(mapping: Chain, degree: int, xy: Array, normal: Array, at: Array) -> tuple[Chain, Array]:
     """The mapping that minimizes the distances of ridge points from their lines, and the distances (n,)."""
     mapping = of_degree(mapping, degree)
-    monomials, straight = _monomials(mapping, at)
+    monomials, straight = monomials_of(mapping, at)
     design = np.concatenate([normal[:, :1] * monomials, normal[:, 1:] * monomials], axis=1)
     observed = (normal * (xy - straight)).sum(axis=1)
     mapping, residuals = _solved(mapping, design, observed[None], _POINT_PX)
@@ -325,7 +319,7 @@ def refit(mapping: Chain, at: Array, xy: Array, sigma_px: float) -> Chain:
     # At least the degree already determined by the lines.
     before = degree_of(mapping) if len(at) > len(mapping.second.values) // 2 else 1
     mapping = of_degree(mapping, max(before, trend_degree(len(at))))
-    monomials, straight = _monomials(mapping, at)
+    monomials, straight = monomials_of(mapping, at)
     observed = (xy - straight).T
     fit, residuals = _solved(mapping, monomials, observed, sigma_px)
     common = common_part(at, residuals.T)
@@ -355,7 +349,7 @@ def common_part(at: Array, residuals: Array) -> Array | None:
     return common if ((size > _TOGETHER_PX) & (scatter < _SCATTER * size)).any() else None
 
 
-def _monomials(mapping: Chain, at: Array) -> tuple[Array, Array]:
+def monomials_of(mapping: Chain, at: Array) -> tuple[Array, Array]:
     """Monomials (n, m) of the polynomial at lattice coordinates (n, 2), and images by the projectivity."""
     from .compiled_lattice import monomials  # takes half a second to import; not every command needs it
 
