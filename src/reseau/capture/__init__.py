@@ -3,7 +3,16 @@
 from . import by_hand
 from .acquisition import Acquisition, Plan, Procedure, Watch
 from .bench import ROLES, Bench, BenchFile, Checked, InstrumentEntry, drivers, found_instruments, plugin
-from .checks import Limits, Readiness, edge_sigma, exposure_fault, exposure_of, readiness, shift_between
+from .checks import (
+    Limits,
+    Readiness,
+    edge_sigma,
+    exposure_fault,
+    exposure_of,
+    grey_counts,
+    readiness,
+    shift_between,
+)
 from .engine import Control, Decision, Rerun, carry_out, rerun
 from .lock import BenchLock, Holder
 from .operators import RemoteOperator
@@ -40,6 +49,7 @@ __all__ = [
     "exposure_fault",
     "exposure_of",
     "found_instruments",
+    "grey_counts",
     "paper_steps",
     "plugin",
     "read_steps",

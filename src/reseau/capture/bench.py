@@ -28,7 +28,14 @@ from typing import Any, ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
 from pydantic import Field
 
-from ..core.errors import BenchError, FormatError, ReseauError, SettingError, UsageError
+from ..core.errors import (
+    BenchError,
+    FormatError,
+    InstrumentError,
+    ReseauError,
+    SettingError,
+    UsageError,
+)
 from ..instruments import Camera, Identity, Instrument, Oscilloscope, Turntable, UltrasonicScanner
 from ..io import Document, Strict, read_text
 from ..io.refraction import RefractionEntry
@@ -475,6 +482,8 @@ class Bench:
                 return work(instrument)
             except ReseauError as error:
                 return error
+            except Exception as error:  # a defect of a driver is the failure of its instrument alone
+                return InstrumentError(f"its driver failed ({error!r})", where=instrument.name)
 
         if not self.instruments:
             return {}

@@ -13,7 +13,16 @@ import scipy.ndimage
 from ..core.data import Array, Frame
 from ..core.errors import UsageError
 
-__all__ = ["Limits", "Readiness", "edge_sigma", "exposure_fault", "exposure_of", "readiness", "shift_between"]
+__all__ = [
+    "Limits",
+    "Readiness",
+    "edge_sigma",
+    "exposure_fault",
+    "exposure_of",
+    "grey_counts",
+    "readiness",
+    "shift_between",
+]
 
 
 _SMOOTH = 1.5
@@ -124,6 +133,29 @@ def exposure_of(frame: Frame) -> tuple[float, float]:
     pixels = frame.pixels
     bright = np.partition(pixels.ravel(), -1 - pixels.size // 1000)[-1 - pixels.size // 1000]
     return float(np.mean(pixels >= frame.full_scale)), float(bright) / frame.full_scale
+
+
+def grey_counts(frame: Frame, bins: int = 64) -> list[int]:
+    """Return how many pixels have each grey value; the last number is that of saturated ones.
+
+    Of a large frame each second, third, … row and column are counted.
+
+    Parameters
+    ----------
+    frame : Frame
+        The frame.
+    bins : int
+        Number of intervals below full scale.
+
+    Examples
+    --------
+    >>> grey_counts(Frame(np.array([[0, 10, 200, 255], [0, 0, 130, 255]], np.uint8), 255.0), 2)
+    [4, 2, 2]
+    """
+    every = max(1, math.isqrt(frame.pixels.size // 250_000))
+    grey = frame.pixels[::every, ::every].ravel() / frame.full_scale
+    at = np.where(grey >= 1.0, bins, np.clip(grey, 0.0, None) * bins).astype(np.intp)
+    return [int(each) for each in np.bincount(at, minlength=bins + 1)]
 
 
 def edge_sigma(frame: Frame) -> float:

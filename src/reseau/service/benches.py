@@ -25,7 +25,7 @@ from .worker import address_file
 
 __all__ = ["BenchLink"]
 
-_START_S, _LONGEST_PAUSE_S, _END_S = 60.0, 10.0, 5.0
+_START_S, _PAUSE_S, _LONGEST_PAUSE_S, _END_S = 60.0, 0.1, 10.0, 5.0
 _BUSY = ("running", "pausing", "paused", "asking", "ending")
 _MOST_WAITING = 4
 """Commands of a bench that wait for one another; further ones are refused."""
@@ -149,14 +149,14 @@ class BenchLink:
     # The thread that keeps the connection.
 
     def _keep(self) -> None:
-        pause = 0.1
+        pause = _PAUSE_S
         while not self._over.is_set():
             wire = self._found() or self._started()
             if wire is None:
                 self._over.wait(pause)
                 pause = min(2 * pause, _LONGEST_PAUSE_S)
                 continue
-            pause = 0.1
+            begun = time.monotonic()
             # What an earlier worker said last is not true of this one, which has not said anything yet.
             self._status = {}
             self._wire = wire
@@ -176,6 +176,11 @@ class BenchLink:
                         each.set_exception(ConnectionLost("its worker ended", where=f"bench {self.name}"))
                 if not self._over.is_set():
                     self._told("down", {})
+                # One that ends again and again, such as by a driver that crashes, is not started at once.
+                if time.monotonic() - begun > _LONGEST_PAUSE_S:
+                    pause = _PAUSE_S
+                self._over.wait(pause)
+                pause = min(2 * pause, _LONGEST_PAUSE_S)
 
     def _greet(self) -> None:
         with contextlib.suppress(ReseauError):
@@ -273,7 +278,9 @@ class BenchLink:
         return Wire(sock)
 
 
-_AT_ONCE = frozenset({"stop", "status", "bench", "picture", "pause", "continue", "abort", "answer", "end"})
+_AT_ONCE = frozenset(
+    {"stop", "status", "bench", "settings", "picture", "pause", "continue", "abort", "answer", "end"}
+)
 _EMPTY: dict[str, Any] = {
     "state": "starting", "error": "", "session": None, "question": None, "moving": "", "instruments": {},
     "has_camera": False, "has_table": False, "picture": 0, "pid": None,

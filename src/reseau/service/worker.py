@@ -1,13 +1,15 @@
 """The process that holds the hardware of a bench: `python -m reseau.service.worker`.
 
-One thread carries out commands in their order, one a session, one takes live pictures. `stop` is none of
-these: the thread that reads it carries it out. The archive has what happened; the status follows from it and
-from the instruments, so that a service that is started again, or another browser, sees the same.
+One thread carries out commands in their order, one a session, one takes live pictures, one connects
+instruments that were silent. `stop` is none of these: the thread that reads it carries it out. The archive
+has what happened; the status follows from it and from the instruments, so that a service that is started
+again, or another browser, sees the same.
 """
 
 from __future__ import annotations
 
 import contextlib
+import inspect
 import json
 import os
 import queue
@@ -17,14 +19,14 @@ import ssl
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from .. import sessions
 from ..archive import Archive
-from ..capture import Bench, BenchFile, BenchLock, Control, by_hand, edge_sigma, exposure_fault
+from ..capture import Bench, BenchFile, BenchLock, Control, by_hand, edge_sigma, exposure_fault, grey_counts
 from ..core.errors import BenchError, InstrumentError, ReseauError, StateError, UsageError
 from ..instruments import Camera, Turntable
 from ..io import read_text
@@ -36,6 +38,8 @@ __all__ = ["Worker", "address_file", "run"]
 _LIVE_S, _RETRY_S, _WIDTH = 5.0, 3.0, 960
 _STEADY_S = 0.1
 """Time between live pictures, at least."""
+_FOLLOW_S = 0.25
+"""Time between looks at axes that move."""
 _ALONE_S = 600.0
 """Time after which the worker of a service ends that has gone, when no session runs."""
 
@@ -72,7 +76,7 @@ class Worker:
         self._certificates = certificates
         every = Bench(self.file)
         self._bench = every.part(every.instruments, required=())
-        self._answering = self._bench
+        self._silent: dict[str, ReseauError] = {}
         self._lock = threading.RLock()
         self._wires: set[Wire] = set()
         self._commands: queue.Queue[tuple[Wire, dict[str, Any]]] = queue.Queue()
@@ -85,6 +89,7 @@ class Worker:
         self._question: str | None = None
         self._answered = threading.Event()
         self._moving = ""
+        self._places: dict[str, Any] = {}
         self._live: tuple[dict[str, Any], bytes] = ({}, b"")
         self._looked = 0.0
         self._stops = 0
@@ -101,19 +106,43 @@ class Worker:
             try:
                 stack.enter_context(self._bench.lock(f"reseau serve, bench {self.name}"))
                 stack.enter_context(self._bench)
-                silent = self._bench.silent
-                if silent and len(silent) == len(self._bench.instruments):
-                    raise BenchError(list(silent.values()))
-                self._answering = self._bench.without(silent)
+                self._silent = dict(self._bench.silent)
+                if self._silent and len(self._silent) == len(self._bench.instruments):
+                    raise BenchError(list(self._silent.values()))
                 # An earlier worker may have ended while something moved.
                 self._answering.stop()
                 for each in self._answering.instruments.values():
                     each.stage()
-            except ReseauError as error:
+            except Exception as error:
                 stack.close()
-                self._error = str(error)
-                raise
-            self._held, self._error = stack, "; ".join(str(error) for error in silent.values())
+                known = _known(error, "bench")
+                self._error = str(known)
+                raise known from None
+            self._held, self._error = stack, ""
+
+    @property
+    def _answering(self) -> Bench:
+        """The bench without the instruments that are silent."""
+        return self._bench.without(self._silent)
+
+    def _reconnect(self) -> None:
+        """Connect the instruments that were silent, where they answer now and no session runs."""
+        for name in self._silent:
+            instrument = self._bench[name]
+            with contextlib.suppress(Exception):
+                instrument.connect()  # it may take long, and nobody waits for it
+                with self._lock:
+                    if self._held is None:  # released meanwhile
+                        instrument.close()
+                    elif self._control is None and name in self._silent:
+                        instrument.stop()
+                        instrument.stage()
+                        self._answer([name])
+                        self._say("bench")
+
+    def _answer(self, names: Iterable[str]) -> None:
+        """Note that instruments answer that were silent."""
+        self._silent = {name: error for name, error in self._silent.items() if name not in set(names)}
 
     def _release(self) -> None:
         with self._lock:
@@ -130,6 +159,10 @@ class Worker:
 
     # What is told.
 
+    def _wrong(self) -> str:
+        """What is wrong with the bench: why it is not held, or which instruments are silent."""
+        return self._error or "; ".join(str(each) for each in self._silent.values())
+
     def status(self) -> dict[str, Any]:
         """Return the state of the bench, without asking an instrument."""
         session = dict(self._session)
@@ -141,7 +174,7 @@ class Worker:
         if self._question is not None:
             state = "asking"
         return {
-            "name": self.name, "state": state, "error": self._error, "session": session or None,
+            "name": self.name, "state": state, "error": self._wrong(), "session": session or None,
             "question": self._question, "moving": self._moving, "pid": os.getpid(),
             "instruments": {name: entry.driver for name, entry in self.file.instruments.items()},
             "has_camera": self._bench.has(Camera), "has_table": self._bench.has(Turntable),
@@ -163,15 +196,16 @@ class Worker:
         what, given = request.get("do"), request.get("given") or {}
         work: dict[Any, Callable[..., Any]] = {
             "take": self._taken, "release": self._released, "axes": self._axes, "move": self._move,
-            "home": self._home, "settings": self._settings, "configure": self._configure,
-            "check": self._check, "begin": self._begin, "resume_session": self._resume_session,
+            "home": self._home, "configure": self._configure, "check": self._check, "begin": self._begin,
+            "resume_session": self._resume_session,
         }  # fmt: skip
         if what not in work:
             raise UsageError("is no command", where=str(what))
         try:
-            return work[what](**given), b""
+            inspect.signature(work[what]).bind(**given)
         except TypeError as error:
             raise UsageError(f"has other arguments ({error})", where=str(what)) from None
+        return work[what](**given), b""
 
     def _taken(self) -> dict[str, Any]:
         self._wanted = True
@@ -190,34 +224,38 @@ class Worker:
         return found
 
     def _axes(self) -> dict[str, Any]:
-        return {
+        self._places = {
             name: {
                 "position": axis.position, "unit": axis.unit, "limits": list(axis.limits),
                 "homed": axis.homed, "moving": axis.moving,
             }
             for name, axis in by_hand.axes_of(self._table()).items()
         }  # fmt: skip
+        return self._places
 
     def _free(self) -> None:
         if self._control is not None:
             raise StateError("a session runs", where=self.name, do="pause or abort it first")
 
-    def _move(self, axis: str, position: float, relative: bool = False) -> dict[str, Any]:
+    def _move(self, axis: str, position: float, relative: bool = False, by: str = "") -> dict[str, Any]:
         self._free()
         table = self._table()
         target = by_hand.targets(table, {axis: position}, relative=relative)[axis]
-        return self._moved(f"{axis} to {target:g} {table.axes[axis].unit}", lambda: table.move(axis, target))
+        words = f"{axis} to {target:g} {table.axes[axis].unit}"
+        return self._moved(words, by, lambda: table.move(axis, target))
 
-    def _home(self, axis: str) -> dict[str, Any]:
+    def _home(self, axis: str, by: str = "") -> dict[str, Any]:
         self._free()
         table = self._table()
         if axis not in table.axes:
             raise UsageError("is no axis", where=axis, do=f"use {', '.join(table.axes)}")
-        return self._moved(f"{axis} to its reference", lambda: table.home(axis))
+        return self._moved(f"{axis} to its reference", by, lambda: table.home(axis))
 
-    def _moved(self, words: str, work: Callable[[], Any]) -> dict[str, Any]:
-        stops, self._moving = self._stops, words
-        self._say("moving", {"what": words})
+    def _moved(self, words: str, by: str, work: Callable[[], Any]) -> dict[str, Any]:
+        stops, self._moving = self._stops, f"{words}, by {by}" if by else words
+        self._say("moving", {"what": self._moving})
+        arrived = threading.Event()
+        threading.Thread(target=self._follow, args=(arrived,), name="axes", daemon=True).start()
         try:
             for each in self._answering.instruments.values():
                 each.stage()  # allows motion again after a stop
@@ -225,9 +263,17 @@ class Worker:
                 raise StateError("was stopped", where=words)
             work()
         finally:
+            arrived.set()
             self._moving = ""
             self._say("rest")
         return self._axes()
+
+    def _follow(self, arrived: threading.Event) -> None:
+        """Tell where the axes are while they move."""
+        with contextlib.suppress(Exception):  # whoever moves them is told what is wrong
+            while not arrived.wait(_FOLLOW_S):
+                self._axes()
+                self._say("axes")
 
     def _settings(self) -> dict[str, Any]:
         found = {}
@@ -268,9 +314,10 @@ class Worker:
         if plan == "own":
             raise UsageError("is a program of the user, which the service does not run", where="plan own")
         given = sessions.check(name, plan, parameters, inputs, self._required())
-        self._prepare(given)
-        session = sessions.begin(self._archive, name, plan, given, inputs, bench=self._text)
-        return self._run(session, by)
+        with self._lock:
+            self._prepare(given)
+            session = sessions.begin(self._archive, name, plan, given, inputs, bench=self._text)
+            return self._run(session, by)
 
     def _resume_session(self, name: str, by: str = "") -> dict[str, Any]:
         self._free()
@@ -282,17 +329,17 @@ class Worker:
             raise UsageError("was begun on another bench", where=name)
         given = sessions.parameters_of(session)
         given.check_bench(bench)
-        self._prepare(given)
-        session.recover()
-        return self._run(session, by)
+        with self._lock:
+            self._prepare(given)
+            session.recover()
+            return self._run(session, by)
 
     def _prepare(self, given: sessions.SessionParameters) -> None:
         """Check that the instruments of a session answer, and that its axes have their reference."""
         used = given.part_of(self._required())
-        if used.instruments.keys() - self._answering.instruments.keys():
+        if used.instruments.keys() & self._silent.keys():
             used.connect()
-            answering = used.instruments.keys() | self._answering.instruments.keys()
-            self._answering = self._bench.without(self._bench.instruments.keys() - answering)
+            self._answer(used.instruments)
         if not given.home:
             given.check_homed(used)
 
@@ -383,6 +430,10 @@ class Worker:
             return True, self.status(), b""
         if what == "bench":
             return True, self._text, b""
+        if what == "settings":
+            return True, self._settings(), b""
+        if what == "axes" and self._moving and self._places:
+            return True, self._places, b""
         if what == "picture":
             self._looked = time.monotonic()
             return True, *self._live
@@ -427,8 +478,9 @@ class Worker:
                         wire.send({"id": request.get("id"), "value": value}, body)
                     else:
                         self._commands.put((wire, request))
-                except ReseauError as error:
-                    wire.send({"id": request.get("id"), "error": to_error(error)})
+                except Exception as error:
+                    known = _known(error, str(request.get("do")))
+                    wire.send({"id": request.get("id"), "error": to_error(known)})
         except ReseauError:
             pass
         finally:
@@ -451,11 +503,9 @@ class Worker:
             try:
                 value, body = self._do(request)
                 message = {"id": request.get("id"), "value": value}
-            except ReseauError as error:
-                message, body = {"id": request.get("id"), "error": to_error(error)}, b""
-            except Exception as error:  # a defect of a driver is an answer, too
-                failed = InstrumentError(f"{type(error).__name__}: {error}", where=str(request.get("do")))
-                message, body = {"id": request.get("id"), "error": to_error(failed)}, b""
+            except Exception as error:
+                known = _known(error, str(request.get("do")))
+                message, body = {"id": request.get("id"), "error": to_error(known)}, b""
             with contextlib.suppress(ReseauError):
                 wire.send(message, body)
 
@@ -488,15 +538,21 @@ class Worker:
                 facts = {
                     "number": number, "width": frame.width, "height": frame.height,
                     "edge_px": None if edge == float("inf") else round(edge, 2),
-                    "exposure": exposure_fault(frame, _limits()) or "good",
+                    "exposure": exposure_fault(frame, _limits()) or "good", "histogram": grey_counts(frame),
                     "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
                     "points": self._points(frame),
                 }  # fmt: skip
                 _, coded = cv2.imencode(".jpg", preview(frame, _WIDTH), [cv2.IMWRITE_JPEG_QUALITY, 80])
                 self._live = facts, coded.tobytes()
-            except ReseauError as error:
-                self._live = {"number": number, "error": str(error)}, b""
+            except Exception as error:
+                self._live = {"number": number, "error": str(_known(error, "live picture"))}, b""
                 self.over.wait(1.0)
+
+    def reconnect(self) -> None:
+        """Connect again and again the instruments that were silent when the bench was taken."""
+        while not self.over.wait(_RETRY_S):
+            if self._held is not None and self._control is None:
+                self._reconnect()
 
     def _points(self, frame: Any) -> list[list[float]]:
         """Targets found in a frame, where a session of this bench says which target there is."""
@@ -543,7 +599,7 @@ class Worker:
             about = {"port": server.getsockname()[1], "pid": os.getpid(), "bench": self._text}
             if place is not None:
                 private_file(place, json.dumps(about).encode())
-            for each in (self.work, self.live):
+            for each in (self.work, self.live, self.reconnect):
                 threading.Thread(target=each, name=each.__name__, daemon=True).start()
             server.settimeout(0.3)
             heard = time.monotonic()
@@ -578,6 +634,13 @@ class Worker:
             raw.close()
             return
         self.read(Wire(sock))
+
+
+def _known(error: Exception, where: str) -> ReseauError:
+    """An error as one of ours: a defect of a driver is an answer, too, and ends no thread."""
+    if isinstance(error, ReseauError):
+        return error
+    return InstrumentError(f"{type(error).__name__}: {error}", where=where)
 
 
 def _limits() -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +18,10 @@ _INFO = {
     "METADATA": "Metadata-Version: 2.1\nName: fieldcamera\nVersion: 1\n",
     "entry_points.txt": "[reseau.instruments]\nfieldcamera = tests.service.http.driver:FieldCamera\n",
 }
+
+
+DEFECT_US, CRASH_US = 4321.0, 4322.0
+"""Exposures at which the driver has a defect, and at which it ends its process."""
 
 
 class FieldCamera(_Simple):
@@ -35,6 +40,10 @@ class FieldCamera(_Simple):
 
     def expose(self, seconds: float | None = None) -> Taken:
         assert self._table is not None
+        if self.settings.exposure_us == DEFECT_US:
+            raise ZeroDivisionError("a defect of the driver")
+        if self.settings.exposure_us == CRASH_US:
+            os.abort()
         self._number += 1
         at = [self._table.state(axis).position for axis in AXES]
         frame = self._field.record(Station(*at))

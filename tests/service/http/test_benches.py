@@ -24,7 +24,7 @@ from reseau.service.wire import Certificates
 from reseau_sims.serving.bench import SimulatedBench
 
 from ...capture.fieldrig import DESIGN, FieldRig
-from .driver import bench_of, install
+from .driver import CRASH_US, DEFECT_US, bench_of, install
 from .populated import PARAMETERS, STEPS
 from .served import Served, TestClient, served
 
@@ -46,7 +46,7 @@ class Rig:
         return float(self.sim.laboratory.axes[axis])
 
 
-def until(what: Callable[[], Any], seconds: float = 60.0) -> Any:
+def until(what: Callable[[], Any], seconds: float = 180.0) -> Any:
     end = time.monotonic() + seconds
     while not (found := what()):
         assert time.monotonic() < end
@@ -54,7 +54,7 @@ def until(what: Callable[[], Any], seconds: float = 60.0) -> Any:
     return found
 
 
-def state(client: TestClient, *wanted: str, seconds: float = 60.0) -> dict[str, Any]:
+def state(client: TestClient, *wanted: str, seconds: float = 180.0) -> dict[str, Any]:
     last: dict[str, Any] = {}
 
     def there() -> bool:
@@ -362,6 +362,70 @@ def test_an_instrument_that_does_not_answer_is_named_and_does_not_take_the_other
             assert answer.status_code == 409
             assert "sonar" in answer.json()["error"]["text"]
             assert client.get("/api/1/sessions/deaf").status_code == 404
+
+
+def test_an_instrument_that_was_silent_is_connected_when_it_answers(rig: Rig, tmp_path: Path) -> None:
+    with SimulatedBench(seed=5) as sim:
+        another, plugged = Rig(tmp_path, sim), tmp_path / "tty"
+        real = BenchFile.parse_toml(sim.toml, where="").instruments["scanner"].address
+        path = tmp_path / "bench.toml"
+        path.write_text(
+            path.read_text().replace('"field"', '"a third field"')
+            + f'\n[instruments.sonar]\ndriver = "ping360"\naddress = "{plugged}"\n'
+        )
+        with another.serve() as found:
+            client = found.client("operate")
+            assert "sonar" in state(client, "ready")["error"]
+            plugged.symlink_to(real)
+            until(lambda: client.get(BENCH).json()["error"] == "")
+            check = {each["name"]: each["error"] for each in client.post(f"{BENCH}/check").json()}
+            assert check["sonar"] is None
+
+
+def test_a_defect_of_a_driver_is_an_answer_and_a_crash_restarts_the_worker(one: Served, rig: Rig) -> None:
+    client = one.client("operate")
+    pid = one.service.benches["cellar"].status["pid"]
+    given = {"instrument": "camera", "changes": {"exposure_us": DEFECT_US}}
+    assert client.patch(f"{BENCH}/settings", json=given).status_code == 200
+    assert begin(client, "defect").status_code == 201
+    found = state(client, "ready")
+    assert (found["session"]["state"], "a defect of the driver" in found["session"]["why"]) == (
+        "failed",
+        True,
+    )
+    until(lambda: "a defect of the driver" in client.get(f"{BENCH}/picture").json()["error"])
+    assert one.service.benches["cellar"].status["pid"] == pid
+    given["changes"] = {"exposure_us": CRASH_US}
+    restarts = found["restarts"]
+    assert client.patch(f"{BENCH}/settings", json=given).status_code == 200
+    client.get(f"{BENCH}/picture")  # somebody looks: a picture is taken
+    until(lambda: client.get(BENCH).json()["restarts"] == restarts + 1)
+    assert client.get("/api/1/sessions/defect").json()["status"] == "failed"
+    # The new worker has the settings of the file of the bench.
+    assert state(client, "ready")["interrupted"].count("defect") == 1
+    assert client.post(f"{BENCH}/sessions/resume", json={"name": "defect"}).status_code == 200
+    state(client, "ready")
+    assert client.get("/api/1/sessions/defect").json()["status"] == "done"
+
+
+def test_positions_are_told_while_an_axis_moves_and_who_moves_it(one: Served, rig: Rig) -> None:
+    import threading
+
+    client = one.client("operate")
+    client.post(f"{BENCH}/move", json={"axis": "roll", "position": 0.0})
+    mover = threading.Thread(
+        target=lambda: client.post(f"{BENCH}/move", json={"axis": "roll", "position": 100.0})
+    )
+    mover.start()
+    other, seen = one.client(), set[float]()
+    until(lambda: other.get(BENCH).json()["moving"])
+    while (told := other.get(BENCH).json()["moving"]) and mover.is_alive():
+        assert told.startswith("roll to 100 deg, by operate")
+        seen.add(other.get(f"{BENCH}/axes").json()["roll"]["position"])
+        time.sleep(0.1)
+    mover.join(60)
+    assert len([each for each in seen if 0.0 < each < 100.0]) >= 2
+    client.post(f"{BENCH}/move", json={"axis": "roll", "position": 0.0})
 
 
 def test_a_worker_whose_service_has_gone_ends_by_itself(

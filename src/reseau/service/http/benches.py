@@ -148,13 +148,18 @@ class Stopped(Answer):
 
 
 class PictureFacts(Answer):
-    """What the live picture shows; `edge_px` is the width of its sharpest edges, smaller is sharper."""
+    """What the live picture shows; `edge_px` is the width of its sharpest edges, smaller is sharper.
+
+    `histogram` counts grey values in equal intervals from black to full scale; its last number is that of
+    saturated pixels.
+    """
 
     number: int
     width: int = 0
     height: int = 0
     edge_px: float | None = None
     exposure: str = ""
+    histogram: list[int] = Field(default_factory=list)
     at: str = ""
     points: list[list[float]] = Field(default_factory=list)
     error: str = ""
@@ -242,7 +247,7 @@ async def stop(bench: BenchName, request: Request, service: Here) -> Stopped:
 
 @router.get("/benches/{bench}/axes")
 def axes(bench: BenchName, who: Reading, service: Here) -> dict[str, AxisAnswer]:
-    """Axes of the table: positions, limits, whether they have a reference."""
+    """Axes of the table: positions, limits, whether they have a reference; also while they move."""
     found = the_bench(service, bench).request("axes")
     return {name: AxisAnswer(**each) for name, each in found.items()}
 
@@ -250,14 +255,14 @@ def axes(bench: BenchName, who: Reading, service: Here) -> dict[str, AxisAnswer]
 @router.post("/benches/{bench}/move")
 def move(bench: BenchName, given: Move, who: Operating, service: Here) -> dict[str, AxisAnswer]:
     """Move an axis, and wait until it has arrived."""
-    found = _asked(service, bench, who, "move", "move", given.model_dump(), _LONG_S)
+    found = _asked(service, bench, who, "move", "move", given.model_dump() | {"by": who.name}, _LONG_S)
     return {name: AxisAnswer(**each) for name, each in found.items()}
 
 
 @router.post("/benches/{bench}/home")
 def home(bench: BenchName, given: Home, who: Operating, service: Here) -> dict[str, AxisAnswer]:
     """Have an axis find its reference, and wait until it has."""
-    found = _asked(service, bench, who, "home", "home", given.model_dump(), _LONG_S)
+    found = _asked(service, bench, who, "home", "home", given.model_dump() | {"by": who.name}, _LONG_S)
     return {name: AxisAnswer(**each) for name, each in found.items()}
 
 
