@@ -46,6 +46,19 @@ def test_a_whole_log_is_whole(place: Path) -> None:
     assert faults(place) == []
 
 
+def test_what_was_whole_is_verified_again_only_when_asked(place: Path) -> None:
+    state = StateFolder.beside(str(place / "archive"))
+    with Archive.open(place / "archive") as archive:
+        audit = Audit(archive, state)
+        assert audit.verify(again=False) == []
+        tampered(place, "UPDATE entries SET document = replace(document, 'tilt', 'roll') WHERE key = '2'")
+        audit.record("Ada", "login", "home", "bench cellar")
+        assert audit.verify(again=False) == []
+        assert audit.verify()[0] == "entry 2 was changed"
+        tampered(place, "DELETE FROM entries WHERE key = '5'")
+        assert audit.verify(again=False)[-1] == "entries after 4 are missing: a head names entry 5"
+
+
 def test_the_database_refuses_a_change(place: Path) -> None:
     raw = sqlite3.connect(place / "archive" / "index.sqlite")
     for each in ("UPDATE entries SET document = '{}'", "DELETE FROM entries"):

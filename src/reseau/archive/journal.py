@@ -124,25 +124,48 @@ class Journal:
             number += 1
         return made
 
-    def entries(self, kind: str | None = None) -> list[Entry]:
-        """Return the entries in the order in which they were appended, of one kind or all."""
+    def entries(
+        self,
+        kind: str | None = None,
+        *,
+        after: int = 0,
+        before: str | None = None,
+        first: int | None = None,
+        last: int | None = None,
+    ) -> list[Entry]:
+        """Return the entries in the order in which they were appended.
+
+        Parameters
+        ----------
+        kind : str, optional
+            Only those of a kind.
+        after : int
+            Only those with larger numbers.
+        before : str, optional
+            Only those before the entry with this key.
+        first, last : int, optional
+            Only so many, from the beginning or from the end.
+        """
         e = schema.entries.c
-        query = sa.select(e.id, e.key, e.kind, e.document, e.at).where(e.journal == self.name).order_by(e.id)
+        query = sa.select(e.id, e.key, e.kind, e.document, e.at).where(e.journal == self.name, e.id > after)
+        if kind is not None:
+            query = query.where(e.kind == kind)
+        if before is not None:
+            one = sa.select(e.id).where(e.journal == self.name, e.key == before).scalar_subquery()
+            query = query.where(e.id < one)
+        query = query.order_by(e.id).limit(first) if last is None else query.order_by(e.id.desc()).limit(last)
         with schema.connected(self._engine, reading=True) as connection:
             if not schema.extended(connection):
                 return []
-            rows = connection.execute(query if kind is None else query.where(e.kind == kind)).all()
+            rows = list(connection.execute(query).all())
+        if last is not None:
+            rows.reverse()
         return [Entry(*row[:4], at=utc(row[4])) for row in rows]
 
     def last(self) -> Entry | None:
         """Return the last entry, or None."""
-        e = schema.entries.c
-        query = sa.select(e.id, e.key, e.kind, e.document, e.at).where(e.journal == self.name)
-        with schema.connected(self._engine, reading=True) as connection:
-            if not schema.extended(connection):
-                return None
-            row = connection.execute(query.order_by(e.id.desc()).limit(1)).one_or_none()
-        return None if row is None else Entry(*row[:4], at=utc(row[4]))
+        found = self.entries(last=1)
+        return found[0] if found else None
 
 
 def journals(engine: Engine, prefix: str) -> list[str]:

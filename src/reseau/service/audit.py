@@ -14,7 +14,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ..archive import Archive
 from ..core.errors import FormatError, UsageError
@@ -22,10 +22,15 @@ from ..core.optional import optional
 from ..io import Document
 from .state import StateFolder, private_file
 
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
 __all__ = ["Audit", "AuditEntry", "Head", "verify_log"]
 
 _JOURNAL, _KEY, _PUBLIC, _HEAD = "audit", "audit-key.pem", "audit-public.pem", "audit-head.json"
 _FIRST = "0" * 64
+_PART = 1000
+"""Entries that are read at a time."""
 _SIGNED = ("number", "previous", "at", "by", "via", "action", "about", "facts")
 
 
@@ -127,7 +132,7 @@ class Audit:
         key = forms.load_pem_private_key(path.read_bytes(), None)
         if not isinstance(key, Ed25519PrivateKey):
             raise FormatError("is not an Ed25519 key", where=path)
-        self._key = key
+        self._key, self._whole = key, _Whole()
         public = key.public_key().public_bytes(forms.Encoding.PEM, forms.PublicFormat.SubjectPublicKeyInfo)
         if not state.path(_PUBLIC).is_file():
             private_file(state.path(_PUBLIC), public)
@@ -169,11 +174,10 @@ class Audit:
 
     def entries(self, count: int = 100, before: int | None = None) -> list[AuditEntry]:
         """Return the last entries, newest first."""
-        found = [each.document for each in self._journal.entries()]
-        chosen = [each for each in found if before is None or each["number"] < before][::-1][:count]
+        found = self._journal.entries(before=None if before is None else str(before), last=count)
         return [
-            AuditEntry(**{k: v for k, v in each.items() if k in AuditEntry.__dataclass_fields__})
-            for each in chosen
+            AuditEntry(**{k: v for k, v in each.document.items() if k in AuditEntry.__dataclass_fields__})
+            for each in reversed(found)
         ]
 
     def head(self) -> Head | None:
@@ -181,19 +185,36 @@ class Audit:
         path = self._state.path(_HEAD)
         return Head.parse(path.read_text(), where=path) if path.is_file() else None
 
-    def verify(self, heads: Sequence[Head] = ()) -> list[str]:
+    def verify(self, heads: Sequence[Head] = (), *, again: bool = True) -> list[str]:
         """Return what is wrong with the log; nothing if it is whole.
 
         Parameters
         ----------
         heads : sequence of Head
             Heads that were kept elsewhere, in addition to the one beside the key.
+        again : bool
+            Whether entries are verified that this object found whole before.
         """
-        own = self.head()
-        found = verify_log(self._archive, self.public, [*heads, *([] if own is None else [own])])
-        if own is None and self._last() is not None:
+        own, last = self.head(), self._last()
+        every = [*heads, *([] if own is None else [own])]
+        known, end = self._whole, 0 if last is None else last.get("number", 0)
+        if again or any(number < known.number for number in (end, *(each.number for each in every))):
+            known = _Whole()
+        found, whole = _verified(self._archive, self._key.public_key(), every, known)
+        if not found:
+            self._whole = whole
+        if own is None and last is not None:
             found.append("there is no head beside the key: the end may have been cut off")
         return found
+
+
+@dataclass(frozen=True)
+class _Whole:
+    """How far a log is whole: number, hash and row of an entry."""
+
+    number: int = 0
+    hash: str = _FIRST
+    row: int = 0
 
 
 def verify_log(archive: Archive, public: bytes, heads: Sequence[Head]) -> list[str]:
@@ -214,7 +235,7 @@ def verify_log(archive: Archive, public: bytes, heads: Sequence[Head]) -> list[s
         If the key is not one.
     """
     with optional():
-        from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+        from cryptography.exceptions import UnsupportedAlgorithm
         from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
         from cryptography.hazmat.primitives.serialization import load_pem_public_key
     try:
@@ -223,32 +244,46 @@ def verify_log(archive: Archive, public: bytes, heads: Sequence[Head]) -> list[s
         raise UsageError(f"is not a public key ({error})", where="audit log") from None
     if not isinstance(key, Ed25519PublicKey):
         raise UsageError("is not an Ed25519 key", where="audit log")
-    wrong, previous, hashes = list[str](), _FIRST, dict[int, str]()
-    for expected, entry in enumerate(archive.journal(_JOURNAL).entries(), start=1):
-        document = entry.document
-        number = document.get("number")
-        if number != expected:
-            wrong.append(f"entry {expected} is missing: number {number} follows")
-            break
-        signed = {name: document.get(name) for name in _SIGNED}
-        digest = _digest(signed)
-        if document.get("previous") != previous:
-            wrong.append(f"entry {number} does not follow the entry before it")
-        if digest != document.get("hash"):
-            wrong.append(f"entry {number} was changed")
-        good = False
-        with suppress(InvalidSignature, ValueError, TypeError):
-            key.verify(base64.b64decode(document.get("signature", "")), bytes.fromhex(digest))
-            good = True
-        if not good:
-            wrong.append(f"entry {number} is not signed with this key")
-        previous = hashes[expected] = str(document.get("hash"))
+    return _verified(archive, key, heads, _Whole())[0]
+
+
+def _verified(
+    archive: Archive, key: Ed25519PublicKey, heads: Sequence[Head], whole: _Whole
+) -> tuple[list[str], _Whole]:
+    """What is wrong after an entry; and how far the log is whole, if nothing is."""
+    from cryptography.exceptions import InvalidSignature
+
+    journal, wrong, hashes = archive.journal(_JOURNAL), list[str](), {whole.number: whole.hash}
+    while part := journal.entries(after=whole.row, first=_PART):
+        for entry in part:
+            document, expected = entry.document, whole.number + 1
+            number = document.get("number")
+            if number != expected:
+                wrong.append(f"entry {expected} is missing: number {number} follows")
+                break
+            signed = {name: document.get(name) for name in _SIGNED}
+            digest = _digest(signed)
+            if document.get("previous") != whole.hash:
+                wrong.append(f"entry {number} does not follow the entry before it")
+            if digest != document.get("hash"):
+                wrong.append(f"entry {number} was changed")
+            good = False
+            with suppress(InvalidSignature, ValueError, TypeError):
+                key.verify(base64.b64decode(document.get("signature", "")), bytes.fromhex(digest))
+                good = True
+            if not good:
+                wrong.append(f"entry {number} is not signed with this key")
+            whole = _Whole(expected, str(document.get("hash")), entry.number)
+            hashes[expected] = whole.hash
+        else:
+            continue
+        break
     for head in heads:
         if head.number not in hashes:
-            wrong.append(f"entries after {len(hashes)} are missing: a head names entry {head.number}")
+            wrong.append(f"entries after {whole.number} are missing: a head names entry {head.number}")
         elif hashes[head.number] != head.hash:
             wrong.append(f"entry {head.number} is not the one that a head names")
-    return wrong
+    return wrong, whole
 
 
 def _digest(signed: Mapping[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Sequence
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request, Response
@@ -14,8 +14,9 @@ from ...core.version import __version__
 from ..audit import Head
 from .access import Administering, Here, Reading, principal_of
 from .answers import Answer, refusals
+from .service import Service
 
-__all__ = ["open_router", "router"]
+__all__ = ["audited", "open_router", "router"]
 
 router = APIRouter(tags=["service"], responses=refusals(400, 401, 403, 422, 503))
 open_router = APIRouter(tags=["service"], responses=refusals(403))
@@ -81,10 +82,9 @@ def ready(service: Here) -> Response:
 @router.get("/about")
 def about(who: Reading, service: Here) -> About:
     """Version and archive of the service."""
-    uptime = time.time() - service.started
     return About(
         software=f"reseau {__version__}", archive=service.archive.place, started=service.started,
-        uptime_s=round(uptime, 1),
+        uptime_s=round(service.uptime_s, 1),
     )  # fmt: skip
 
 
@@ -142,7 +142,12 @@ def audit_state(
     ] = None,
 ) -> AuditState:
     """Verify the audit log, also against a head that was kept elsewhere."""
-    wrong = service.audit.verify([] if head is None else [Head.read_line(head)])
+    return audited(service, [] if head is None else [Head.read_line(head)])
+
+
+def audited(service: Service, heads: Sequence[Head] = (), *, again: bool = True) -> AuditState:
+    """Return whether the audit log is whole; as :meth:`Audit.verify`."""
+    wrong = service.audit.verify(heads, again=again)
     own = service.audit.head()
     line = "" if own is None else f"{own.number} {own.hash}"
     return AuditState(whole=not wrong, wrong=wrong, number=0 if own is None else own.number, head=line)

@@ -159,7 +159,7 @@ def bench_page(request: Request, bench: str, who: Reading, service: Here) -> Res
     found = benches.bench_answer(service, link)
     settings: dict[str, Any] = {}
     axes: dict[str, Any] = {}
-    if found.state in ("ready", "paused"):
+    if found.state in ("ready", "paused", "moving"):
         try:
             settings = benches.settings(bench, who, service)
             axes = benches.axes(bench, who, service) if found.has_table else {}
@@ -360,5 +360,6 @@ def audit(request: Request, who: Administering, service: Here) -> Response:
     """The audit log."""
     return _rendered(
         request, "audit.html.j2", entries=operations.audit(who, service, 200, None),
-        state=operations.audit_state(who, service, None),
+        # What was whole a moment ago is not verified at each event; `reseau audit verify` verifies all.
+        state=operations.audited(service, again=False),
     )  # fmt: skip
