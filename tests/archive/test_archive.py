@@ -159,6 +159,26 @@ def test_verification_finds_changed_missing_and_unindexed_files(tmp_path: Path) 
         assert len(verify(archive).damaged) == 1
 
 
+def test_parts_of_a_file_are_read_and_a_change_of_it_is_noticed(tmp_path: Path) -> None:
+    objects = LocalObjects(tmp_path)
+    sha256 = objects.put(bytes(range(200)), ".raw")
+    for _ in range(2):
+        with objects.open(sha256, ".raw") as stream:
+            stream.seek(100)
+            assert stream.read(3) == bytes((100, 101, 102))
+    path = objects.path(sha256, ".raw")
+    path.write_bytes(bytes(reversed(range(200))))
+    os.utime(path, ns=(0, 0))
+    with pytest.raises(ArchiveError, match="has been changed"):
+        objects.open(sha256, ".raw")
+    path.unlink()
+    with pytest.raises(ArchiveError, match="cannot be read"):
+        objects.open(sha256, ".raw")
+    remote = RemoteObjects(f"memory://{tmp_path.name}")
+    with remote.open(remote.put(b"pixels", ".raw"), ".raw") as stream:
+        assert stream.read(3) == b"pix"
+
+
 def test_a_frame_on_the_disk_but_not_in_the_index_is_recovered(opened: Callable[[], Archive]) -> None:
     with opened() as archive:
         session = archive.begin("s", "frames", {})

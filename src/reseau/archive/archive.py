@@ -16,7 +16,7 @@ from ..core.version import __version__
 from . import schema
 from .journal import Journal, journals
 from .objects import LocalObjects, Objects, objects_at
-from .records import SessionSummary, utc, utc_now
+from .records import Note, SessionSummary, utc, utc_now
 from .session import INPUT, Session
 
 __all__ = ["Archive"]
@@ -185,7 +185,7 @@ class Archive:
         return Session(self._engine, self.objects, row._asdict(), self.clock)
 
     def sessions(
-        self, *, last: int | None = None, before: str | None = None, like: str = ""
+        self, *, last: int | None = None, before: str | None = None, like: str = "", result: str = ""
     ) -> list[SessionSummary]:
         """Return a summary of each session, in the order in which they were begun.
 
@@ -197,8 +197,10 @@ class Archive:
             Only those that were begun before the session of this name.
         like : str
             Only those whose names or plans contain this text.
+        result : str
+            Only those with a result of this name.
         """
-        s = schema.sessions.c
+        s, r = schema.sessions.c, schema.results.c
 
         def count(table: sa.Table, *where: sa.ColumnElement[bool]) -> sa.ScalarSelect[int]:
             return sa.select(sa.func.count()).where(table.c.session_id == s.id, *where).scalar_subquery()
@@ -218,6 +220,8 @@ class Archive:
             query = query.where(
                 s.name.contains(like, autoescape=True) | s.plan.contains(like, autoescape=True)
             )
+        if result:
+            query = query.where(sa.exists().where(r.session_id == s.id, r.name == result))
         query = query.order_by(s.id) if last is None else query.order_by(s.id.desc()).limit(last)
         with schema.connected(self._engine, reading=True) as connection:
             rows = list(connection.execute(query).all())
@@ -227,6 +231,22 @@ class Archive:
             SessionSummary(name, plan, utc(begun), frames, results, status or "not ended")
             for name, plan, begun, frames, results, status in rows
         ]
+
+    def notes(self, after: int = 0, first: int | None = None) -> list[Note]:
+        """Return what sessions noted, such as the documents of bluesky, in its order.
+
+        Parameters
+        ----------
+        after : int
+            Only what has a larger number.
+        first : int, optional
+            Only so many, from the beginning.
+        """
+        e = schema.events.c
+        query = sa.select(e.id, schema.sessions.c.name, e.kind, e.document).join(schema.sessions)
+        with schema.connected(self._engine, reading=True) as connection:
+            rows = connection.execute(query.where(e.id > after).order_by(e.id).limit(first)).all()
+        return [Note(*row) for row in rows]
 
     def journal(self, name: str) -> Journal:
         """Return the journal of this name, which may be empty yet."""
@@ -242,7 +262,7 @@ class Archive:
             tables = [t for t in schema.metadata.sorted_tables if t is not schema.entries]
             if schema.extended(connection):
                 tables.append(schema.entries)
-            return {t.name: connection.scalar(sa.select(sa.func.max(t.c.id))) or 0 for t in tables}
+            return {str(t.name): connection.scalar(sa.select(sa.func.max(t.c.id))) or 0 for t in tables}
 
     def extend(self) -> bool:
         """Add the tables that archives of earlier versions lack; return whether any was missing."""

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import os
 import uuid
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, BinaryIO, Protocol
 
 from ..core.errors import ArchiveError
 from ..core.provenance import sha256_of
 
 __all__ = ["LocalObjects", "Objects", "RemoteObjects", "objects_at"]
+
+_MOST_CHECKED = 10_000
+"""Files of which is remembered that they were checked."""
 
 
 class Objects(Protocol):
@@ -36,6 +41,9 @@ class Objects(Protocol):
 
     def get(self, sha256: str, suffix: str) -> bytes:
         """Return the bytes of a hash."""
+
+    def open(self, sha256: str, suffix: str) -> BinaryIO:
+        """Return a stream of the bytes of a hash, of which parts can be read."""
 
     def names(self) -> Iterator[tuple[str, str]]:
         """Return SHA-256 and suffix of all files."""
@@ -70,6 +78,7 @@ class LocalObjects:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._checked: dict[Path, tuple[int, int, int]] = {}
 
     @property
     def place(self) -> str:
@@ -146,6 +155,36 @@ class LocalObjects:
         except OSError as error:
             raise ArchiveError(f"cannot be read ({error.strerror})", where=path) from None
         return _sound(data, sha256, path)
+
+    def open(self, sha256: str, suffix: str) -> BinaryIO:
+        """Return a stream of the bytes of a hash; the file is checked once, and again when it was written.
+
+        Raises
+        ------
+        ArchiveError
+            If the file is missing or changed.
+        """
+        path = self.path(sha256, suffix)
+        try:
+            stream = path.open("rb")
+        except OSError as error:
+            raise ArchiveError(f"cannot be read ({error.strerror})", where=path) from None
+        about = os.fstat(stream.fileno())
+        state = about.st_ino, about.st_size, about.st_mtime_ns
+        if self._checked.get(path) != state:
+            try:
+                found = hashlib.file_digest(stream, "sha256").hexdigest()
+            except OSError as error:
+                stream.close()
+                raise ArchiveError(f"cannot be read ({error.strerror})", where=path) from None
+            if found != sha256:
+                stream.close()
+                raise _changed(path)
+            if len(self._checked) > _MOST_CHECKED:
+                self._checked.clear()
+            self._checked[path] = state
+            stream.seek(0)
+        return stream
 
     def names(self) -> Iterator[tuple[str, str]]:
         """Return SHA-256 and suffix of all files, except temporary files of killed processes."""
@@ -224,6 +263,16 @@ class RemoteObjects:
         path = self._path(sha256, suffix)
         return _sound(bytes(self._asked(lambda: self._files.cat_file(path))), sha256, path)
 
+    def open(self, sha256: str, suffix: str) -> BinaryIO:
+        """Return a stream of the bytes of a hash, which are fetched whole and checked.
+
+        Raises
+        ------
+        ArchiveError
+            If the file is missing or changed.
+        """
+        return io.BytesIO(self.get(sha256, suffix))
+
     def write_record(self, key: str, data: bytes) -> None:
         """Write a record, in place of an earlier one; object stores write atomically.
 
@@ -291,8 +340,12 @@ def _record(key: str) -> str:
 
 def _sound(data: bytes, sha256: str, where: object) -> bytes:
     if sha256_of(data) != sha256:
-        raise ArchiveError("has been changed (SHA-256 differs)", where=where, do="restore it from a backup")
+        raise _changed(where)
     return data
+
+
+def _changed(where: object) -> ArchiveError:
+    return ArchiveError("has been changed (SHA-256 differs)", where=where, do="restore it from a backup")
 
 
 def _to_disk(folder: Path) -> None:

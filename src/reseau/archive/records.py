@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
-__all__ = ["ArchivedFrame", "ArchivedResult", "SessionSummary", "Verdict", "utc", "utc_now"]
+__all__ = ["ArchivedFrame", "ArchivedResult", "Note", "SessionSummary", "Verdict", "utc", "utc_now"]
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,31 @@ class ArchivedResult:
     parameters: dict[str, Any]
     inputs: dict[str, str]
     software: str
+
+
+@dataclass(frozen=True)
+class Note:
+    """What a session noted, such as a document of bluesky.
+
+    Parameters
+    ----------
+    number : int
+        Increases from note to note of an archive.
+    session, kind : str
+        Session, and kind.
+    document : dict
+        Content, JSON values.
+
+    Examples
+    --------
+    >>> Note(1, "monday", "start", {"uid": "4f2a"}).kind
+    'start'
+    """
+
+    number: int
+    session: str
+    kind: str
+    document: dict[str, Any]
 
 
 @dataclass(frozen=True)
