@@ -10,6 +10,8 @@ import pytest
 
 from reseau.archive import Archive
 from reseau.cli import run
+from reseau.service.state import StateFolder
+from reseau.service.wire import Certificates
 
 PASSWORD = "correct horse battery"
 
@@ -28,9 +30,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_backup_is_restored_with_accounts_and_keys(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    certificates = Certificates(StateFolder.beside("archive"))
+    certificates.export("192.0.2.5", folder / "attic")
     assert run(["service", "backup", "copy"]) == 0
     assert run(["service", "restore", "copy", "--archive", "again"]) == 0
     assert "1 sessions, 2 files" in capsys.readouterr().out
+    # A worker on another machine goes on with the certificate that it has.
+    Certificates(StateFolder.beside("again")).export("192.0.2.5", folder / "again-attic")
+    authorities = [(folder / name / "authority.pem").read_bytes() for name in ("attic", "again-attic")]
+    assert authorities[0] == authorities[1]
     with Archive.open("again") as archive:
         session = archive.session("monday")
         assert session.content(session.results()[0]) == b"42"

@@ -160,9 +160,8 @@ class Alarms:
             for each in history:
                 if each.outcome == "needs review" or (each.outcome == "rejected" and not each.reviewed_by):
                     said = "was rejected" if each.outcome == "rejected" else "needs a review"
-                    found[f"calibration {name} {each.key}"] = (
-                        f"{name}: the calibration of {each.since:%Y-%m-%d %H:%M}Z ({each.key}) {said}"
-                    )
+                    which = f"{each.since:%Y-%m-%d %H:%M}Z ({each.name or each.key})"
+                    found[f"calibration {name} {each.key}"] = f"{name}: the calibration of {which} {said}"
             events = known.events(name)
             since = events[-1][0] if events else None
             if not [d for d in history if d.outcome != "rejected" and (since is None or d.since >= since)]:

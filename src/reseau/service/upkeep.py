@@ -14,7 +14,7 @@ from ..core.errors import ArchiveError, InputError, UsageError
 
 __all__ = ["Counted", "backup", "restore", "state_beside", "upgrade_archive"]
 
-_ARCHIVE, _STATE, _INDEX, _OBJECTS = "archive", "state", "index.sqlite", "objects"
+_ARCHIVE, _STATE, _INDEX, _OBJECTS, _WORKERS = "archive", "state", "index.sqlite", "objects", "workers"
 _KEPT = ("accounts.sqlite", "audit-key.pem", "audit-public.pem", "audit-head.json", "local-token")
 
 
@@ -108,6 +108,11 @@ def _copied(archive: Path, state: Path, to: Path, to_state: Path, new: Path) -> 
                 else:
                     shutil.copy2(state / name, to_state / name)
                 os.chmod(to_state / name, 0o600)
+        # Workers on other machines know the service by these.
+        for each in (state / _WORKERS).glob("*.pem"):
+            (to_state / _WORKERS).mkdir(mode=0o700, exist_ok=True)
+            shutil.copy2(each, to_state / _WORKERS / each.name)
+            os.chmod(to_state / _WORKERS / each.name, 0o600)
     except (OSError, sqlite3.Error, shutil.Error) as error:
         raise InputError(f"cannot be written ({error})", where=new) from None
     with Archive.open(to) as made:

@@ -10,13 +10,11 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +29,9 @@ from ...capture.fieldrig import DESIGN
 from .browser import Browser, chromium
 from .driver import bench_of, install
 from .populated import FIELD_RULES, PARAMETERS
+from .proxy import Proxy
 from .test_benches import ROOT, until
+from .test_reading import _CERTIFICATE
 
 pytestmark = pytest.mark.slow
 
@@ -91,25 +91,31 @@ class Place:
             self.running.wait(20)
 
 
-@pytest.fixture(scope="module")
-def place(archived: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
-    folder = tmp_path_factory.mktemp("browser")
+@contextmanager
+def placed(archived: Path, folder: Path, more: dict[str, str] | None = None) -> Iterator[Place]:
+    """A copy of an archive, and the simulated bench `cellar`."""
     shutil.copytree(archived, folder, dirs_exist_ok=True)
     install(folder / "drivers")
     paths = [str(folder / "drivers"), str(ROOT), os.environ.get("PYTHONPATH", "")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "TMPDIR": str(folder)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "TMPDIR": str(folder)} | (more or {})
     (folder / "field.json").write_text(DESIGN.to_json())
     (folder / "design.json").write_text(DESIGN.to_json())
-    with Archive.open(folder / "archive") as archive:
-        session = archive.session("monday")
-        for each in session.frames(kind="frame"):
-            if each.verdict is not None and each.verdict.ok:
-                cv2.imwrite(str(folder / f"{each.step}.png"), session.picture(each).pixels)
     with SimulatedBench(seed=3) as sim:
         (folder / "bench.toml").write_text(bench_of(sim.toml))
         made = Place(folder, environment)
         yield made
         made.end()
+
+
+@pytest.fixture(scope="module")
+def place(archived: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+    with placed(archived, tmp_path_factory.mktemp("browser")) as made:
+        with Archive.open(made.folder / "archive") as archive:
+            session = archive.session("monday")
+            for each in session.frames(kind="frame"):
+                if each.verdict is not None and each.verdict.ok:
+                    cv2.imwrite(str(made.folder / f"{each.step}.png"), session.picture(each).pixels)
+        yield made
 
 
 @pytest.fixture(scope="module")
@@ -161,6 +167,23 @@ def written(browser: Browser, css: str, text: str) -> None:
     browser.run("document.querySelector(arguments[0]).value = arguments[1]", css, text)
 
 
+def press(browser: Browser, css: str) -> None:
+    """Click a button as soon as it is there and enabled: those of axes are not while one moves."""
+    find = "const b = document.querySelector(arguments[0]), on = b && !b.disabled;"
+    script = f"{find} if (on) b.click(); return on"
+    until(lambda: browser.run(script, css), 60)
+
+
+def begin_session(place: Place, browser: Browser, name: str) -> None:
+    """Begin a session of the testfield on the page of the bench."""
+    browser.fill("[name=name]", name)
+    browser.run("document.querySelector('[name=plan]').value = 'testfield'")
+    written(browser, "[name=parameters]", json.dumps(PARAMETERS))
+    chosen(browser, "input[data-inputs]", place.folder / "design.json")
+    browser.click("form[data-api$='/sessions'] button")
+    browser.until(f"Session {name}")
+
+
 def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> None:
     begun = time.monotonic()
     entry = place.start()
@@ -177,22 +200,16 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
     browser.until("ready")
     browser.until("sharpest edges", seconds=60)
     for axis in ("tilt", "roll", "camera_roll"):
-        browser.click(f'button[aria-label="Home {axis}"]')
+        press(browser, f'button[aria-label="Home {axis}"]')
         until(lambda: "done" in browser.text("#message") or browser.text("#message"))
-        time.sleep(0.5)
     browser.until("tilt")
-    browser.click('button[aria-label="+10 deg, tilt"]')
+    press(browser, 'button[aria-label="+10 deg, tilt"]')
     until(lambda: "10.0" in browser.text("#axes-title + div"))
     browser.click("button.stop")
     shot(browser, "service-bench")
 
     # A session from a plan: begun, paused, the service killed and started again, resumed, done.
-    browser.fill("[name=name]", "tuesday")
-    browser.run("document.querySelector('[name=plan]').value = 'testfield'")
-    written(browser, "[name=parameters]", json.dumps(PARAMETERS))
-    chosen(browser, "input[data-inputs]", place.folder / "design.json")
-    browser.click("form[data-api$='/sessions'] button")
-    browser.until("Session tuesday")
+    begin_session(place, browser, "tuesday")
     browser.until("1 of 4 poses", seconds=60)
     browser.click("button[data-api$='/pause']")
     browser.until("paused", "#state", 60)
@@ -210,12 +227,7 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
 
     # Another one, aborted and resumed from the page.
     browser.open(f"{base}/benches/cellar")
-    browser.fill("[name=name]", "wednesday")
-    browser.run("document.querySelector('[name=plan]').value = 'testfield'")
-    written(browser, "[name=parameters]", json.dumps(PARAMETERS))
-    chosen(browser, "input[data-inputs]", place.folder / "design.json")
-    browser.click("form[data-api$='/sessions'] button")
-    browser.until("Session wednesday")
+    begin_session(place, browser, "wednesday")
     browser.click("button[data-api$='/abort']")
     browser.accept()
     browser.until("Can be resumed", "#state", 60)
@@ -244,6 +256,16 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
     browser.click("button[data-turn=down]")
     shot(browser, "service-calibration")
 
+    # Its certificate, and a comparison with another calibration.
+    browser.run("document.querySelector('form[data-api$=certificate] [name=form]').value = 'html'")
+    written(browser, "form[data-api$=certificate] [name=data]", json.dumps(_CERTIFICATE))
+    browser.click("form[data-api$=certificate] button")
+    browser.until("saved as certificate.html", "#message")
+    browser.open(f"{base}/compare")
+    browser.run("document.querySelectorAll('select').forEach((s, k) => { s.selectedIndex = k; })")
+    browser.click("form button.primary")
+    browser.until("They differ by at most")
+
     # The drift alarm is acknowledged; an earlier calibration applies again.
     browser.open(f"{base}/history")
     browser.until("c increases")
@@ -268,7 +290,7 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
     browser.fill("[name=free]", "c,x0,y0,K1")
     shot(browser, "service-files")
     browser.click("form button.primary")
-    browser.until("usable", seconds=120)
+    browser.until("Usable", seconds=120)
     browser.open(f"{base}/audit")
     browser.until("whole")
     assert [each for each in browser.complaints() if "Content Security Policy" in each] == []
@@ -302,85 +324,59 @@ def test_pages_fit_a_phone_and_have_no_serious_finding_of_axe(place: Place, brow
     assert found == {}, json.dumps(found, indent=1)
 
 
-class Cutting:
-    """A proxy on the address ::1 that cuts every connection again and again."""
-
-    def __init__(self, port: int, seconds: float) -> None:
-        self._port, self._seconds, self._pairs = port, seconds, set[tuple[socket.socket, socket.socket]]()
-        self._over, self.cut = threading.Event(), 0
-        self._server = socket.create_server(("::1", port), family=socket.AF_INET6)
-        for work in (self._accept, self._cut):
-            threading.Thread(target=work, daemon=True).start()
-
-    def _accept(self) -> None:
-        while not self._over.is_set():
-            with suppress(OSError):
-                here, _ = self._server.accept()
-                there = socket.create_connection(("127.0.0.1", self._port))
-                self._pairs.add((here, there))
-                for a, b in ((here, there), (there, here)):
-                    threading.Thread(target=self._pass, args=(a, b), daemon=True).start()
-
-    def _pass(self, source: socket.socket, target: socket.socket) -> None:
-        with suppress(OSError):
-            while part := source.recv(1 << 16):
-                target.sendall(part)
-        for each in (source, target):
-            with suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
-
-    def _cut(self) -> None:
-        while not self._over.wait(self._seconds):
-            for pair in list(self._pairs):
-                self._pairs.discard(pair)
-                self.cut += 1
-                for each in pair:
-                    with suppress(OSError):
-                        each.shutdown(socket.SHUT_RDWR)
-                    each.close()
-
-    def close(self) -> None:
-        self._over.set()
-        self._server.close()
-
-
 def position(browser: Browser) -> str:
     """The tilt as the page shows it."""
     rows = browser.text("#axes-title + div").splitlines()
     return next((row.split("\t")[1] for row in rows if row.startswith("tilt")), "")
 
 
+@pytest.mark.parametrize("seconds", [4.0, 10.0])
 def test_two_browsers_show_the_same_bench_also_where_connections_are_cut(
+    place: Place, browser: Browser, seconds: float
+) -> None:
+    if place.running is None or place.running.poll() is not None:
+        browser.open(place.start())
+    with Proxy(place.port, "::1", place.port, seconds) as proxy, chromium() as other:
+        other.open(place.link().replace("127.0.0.1", "[::1]"))
+        other.open(f"http://[::1]:{place.port}/benches/cellar")
+        browser.resize(1280, 900)
+        browser.open(f"http://127.0.0.1:{place.port}/benches/cellar")
+        for page in (browser, other):
+            page.until("tilt", "#state", 60)
+        for number in range(4):
+            jogs = browser if number % 2 else other
+            before = position(browser)
+            button = "+1 deg, tilt" if number < 2 else "-1 deg, tilt"
+            until(lambda jogs=jogs: jogs.text("#state").startswith("ready"), 60)
+            press(jogs, f'button[aria-label="{button}"]')
+            until(lambda before=before: position(browser) not in ("", before), 60)
+            until(lambda: position(other) == position(browser), 60)
+            time.sleep(seconds)
+        cut = proxy.cut
+        browser.click("button.stop")
+        until(lambda: proxy.cut > cut, 60)
+        until(lambda: position(other) == position(browser), 60)
+        assert other.text("#state").startswith("ready")
+
+
+def test_a_connection_that_is_dead_without_an_end_is_told_and_opened_again(
     place: Place, browser: Browser
 ) -> None:
     if place.running is None or place.running.poll() is not None:
         browser.open(place.start())
-    seconds = float(os.environ.get("RESEAU_CUT_S", "4"))
-    proxy = Cutting(place.port, seconds)
-    try:
-        with chromium() as other:
-            other.open(place.link().replace("127.0.0.1", "[::1]"))
-            other.open(f"http://[::1]:{place.port}/benches/cellar")
-            browser.resize(1280, 900)
-            browser.open(f"http://127.0.0.1:{place.port}/benches/cellar")
-            for page in (browser, other):
-                page.until("tilt", "#state", 60)
-            for number in range(4):
-                jogs = browser if number % 2 else other
-                before = position(browser)
-                button = "+1 deg, tilt" if number < 2 else "-1 deg, tilt"
-                until(lambda jogs=jogs: jogs.text("#state").startswith("ready"), 60)
-                jogs.click(f'button[aria-label="{button}"]')
-                until(lambda before=before: position(browser) not in ("", before), 60)
-                until(lambda: position(other) == position(browser), 60)
-                time.sleep(seconds)
-            cut = proxy.cut
-            browser.click("button.stop")
-            until(lambda: proxy.cut > cut, 60)
-            until(lambda: position(other) == position(browser), 60)
-            assert other.text("#state").startswith("ready")
-    finally:
-        proxy.close()
+    with Proxy(place.port, "::1", place.port) as proxy, chromium() as other:
+        other.open(place.link().replace("127.0.0.1", "[::1]"))
+        other.open(f"http://[::1]:{place.port}/sessions")
+        other.until("monday")
+        until(lambda: other.run("return document.getElementById('connection').hidden"))
+        proxy.hold()
+        other.until("connection to the service is lost", "#connection", 60)
+        with Archive.open(place.folder / "archive") as archive:
+            archive.begin("while nobody heard", "frames", {"count": 1}).end("done")
+        assert "while nobody heard" not in other.text()
+        proxy.release()
+        other.until("while nobody heard", seconds=60)
+        until(lambda: other.run("return document.getElementById('connection').hidden"), 60)
 
 
 def test_a_login_that_ends_leads_to_the_login(place: Place, browser: Browser) -> None:
@@ -395,3 +391,63 @@ def test_a_login_that_ends_leads_to_the_login(place: Place, browser: Browser) ->
     assert httpx.post(f"{base}/api/1/logout", headers=headers).status_code == 200
     browser.run("document.dispatchEvent(new Event('visibilitychange'))")
     browser.until("Log in", seconds=30)
+
+
+class Clock:
+    """The clock of the processes of a place, shifted by libfaketime; what measures durations is not."""
+
+    def __init__(self, folder: Path) -> None:
+        found = next(Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1"), None)
+        if found is None:
+            pytest.skip("needs libfaketime (apt-get install faketime)")
+        self._file = folder / "clock"
+        self.shift("+0")
+        self.environment = {
+            "LD_PRELOAD": str(found), "FAKETIME_TIMESTAMP_FILE": str(self._file), "FAKETIME_NO_CACHE": "1",
+            "FAKETIME_DONT_FAKE_MONOTONIC": "1",
+        }  # fmt: skip
+
+    def shift(self, by: str) -> None:
+        self._file.write_text(f"{by}\n")
+
+
+def test_pages_stay_true_when_the_clock_is_set_back_and_forth(
+    archived: Path, tmp_path: Path, browser: Browser
+) -> None:
+    clock = Clock(tmp_path)
+    with placed(archived, tmp_path, clock.environment) as place:
+        entry = place.start()
+        bench, sessions = (f"http://127.0.0.1:{place.port}/{name}" for name in ("benches/cellar", "sessions"))
+        browser.resize(1280, 900)
+        browser.open(entry)
+        browser.open(bench)
+        browser.until("ready", "#state", 60)
+        for axis in ("tilt", "roll", "camera_roll"):
+            browser.click(f'button[aria-label="Home {axis}"]')
+            until(lambda axis=axis: f"{axis}\t0.000 deg" in browser.text("#axes-title + div"), 60)
+            browser.until("ready", "#state", 60)
+        # Half a minute, as by a time server, also in the browser: the page goes on.
+        clock.shift("-30")
+        browser.run("const now = Date.now; Date.now = () => now() - 3600e3")
+        press(browser, 'button[aria-label="+1 deg, tilt"]')
+        until(lambda: position(browser).startswith("1.0"), 60)
+        # Two days: the login is from the future, and ends.
+        clock.shift("-2d")
+        browser.until("Log in", seconds=60)
+        browser.open(place.link())
+        browser.open(bench)
+        browser.until("ready", "#state", 60)
+        begin_session(place, browser, "in the past")
+        browser.until("1 of 4 poses", seconds=120)
+        # To the present, while the session runs: the login is older than twelve hours now.
+        clock.shift("+0")
+        browser.until("Log in", seconds=60)
+        browser.open(place.link())
+        browser.open(bench)
+        browser.until("4 of 4 poses", "#state", 120)
+        browser.until("done", "#state", 60)
+        browser.open(sessions)
+        first = browser.run("return document.querySelector('#sessions tbody tr').innerText")
+        assert first.startswith("in the past")
+        assert first.rstrip().endswith("done")
+        assert Archive.open(place.folder / "archive").session("in the past").counts() == (4, 4)

@@ -47,9 +47,9 @@ def test_schemathesis_finds_no_error_of_the_server_and_nothing_undocumented(tmp_
         login = http.post(f"{address}/api/1/login", json=given, headers={"Origin": address})
         cookie = "; ".join(f"{name}={value}" for name, value in login.cookies.items())
         csrf = http.get(f"{address}/api/1/me", headers={"Cookie": cookie}).json()["csrf"]
-        # What ends a login is tried last, by a browser; /events, which does not end, by its own test.
+        # What ends a login is tried last, by a browser; streams, which do not end, by their own test.
         own = [f"--include-path=/api/1/{each}" for each in ("me/password", "me/one-time", "logout")]
-        others = ["--exclude-path-regex=/(events|logout|me/.*)$"]
+        others = ["--exclude-path-regex=^/api/1/(events|documents|logout|me/.*)$"]
         browser = ["-H", f"Cookie: {cookie}", "-H", f"X-CSRF-Token: {csrf}"]
         for options in ([*others, "-H", f"Authorization: Bearer {token}"], [*own, *browser]):
             command = [program, "--config-file", "schemathesis.toml", "run", f"{address}/api/1/openapi.json"]
@@ -62,9 +62,15 @@ def test_schemathesis_finds_no_error_of_the_server_and_nothing_undocumented(tmp_
 
 def test_the_stream_of_events_answers_as_it_is_described(tmp_path: Path) -> None:
     with process(tmp_path) as (address, token, _), httpx.Client(timeout=20) as http:
-        path = f"{address}/api/1/events"
         mine = {"Authorization": f"Bearer {token}"}
         documented = http.get(f"{address}/api/1/openapi.json", headers=mine).json()
+        statuses = set(documented["paths"]["/api/1/documents"]["get"]["responses"])
+        for last in ("", "x", "0", "-1", "9" * 19, "9" * 40, "9" * 41):
+            headers = mine | {"Last-Event-ID": last}
+            with http.stream("GET", f"{address}/api/1/documents", headers=headers) as answer:
+                assert str(answer.status_code) in statuses
+                assert answer.status_code == (422 if len(last) > 40 else 200)
+        path = f"{address}/api/1/events"
         statuses = set(documented["paths"]["/api/1/events"]["get"]["responses"])
         for last in ("", "x", "0-0", "-", "a-999999999999999999999", "\x80", "9" * 40, "9" * 41):
             for given in ({"headers": {"Last-Event-ID": last.encode("latin-1")}}, {"params": {"last": last}}):

@@ -23,7 +23,7 @@ from ..accounts import RefusedLogin
 from .access import Forbidden, NotFound, Unknown
 from .guard import log
 
-__all__ = ["Answer", "Done", "ErrorAnswer", "add_error_handlers", "refusals"]
+__all__ = ["TOO_MANY", "Answer", "Done", "ErrorAnswer", "add_error_handlers", "refusals"]
 
 
 class Answer(BaseModel):
@@ -92,6 +92,11 @@ _ABOUT = {
 }
 
 
+_MANY = "too many clients"
+TOO_MANY = {"error": {"code": "wait", "text": _MANY, "what": _MANY, "where": None, "do": None}}
+"""Answer to one stream of events too many."""
+
+
 def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return the documentation of the errors of an operation."""
     return {each: {"model": ErrorAnswer, "description": _ABOUT[each]} for each in statuses}
@@ -112,7 +117,10 @@ def add_error_handlers(app: FastAPI, page: Callable[[Request, int, str], Respons
         if status == 401:
             target = request.url.path if request.method == "GET" else "/"
             return RedirectResponse(f"/login?next={target}", 303)
-        return page(request, status, text)
+        try:
+            return page(request, status, text)
+        except ReseauError:  # such as accounts that cannot be read, which every page asks for
+            return _error(status, "error", text, text, None, None, {})
 
     @app.exception_handler(ReseauError)
     def known(request: Request, error: ReseauError) -> Response:
@@ -123,7 +131,7 @@ def add_error_handlers(app: FastAPI, page: Callable[[Request, int, str], Respons
         if status == 401:
             headers["WWW-Authenticate"] = "Bearer"
         where = None if error.where is None else str(error.where)
-        if not request.url.path.startswith("/api/") and status in (401, 403, 404):
+        if not request.url.path.startswith("/api/"):
             return shown(request, status, str(error))
         return _error(status, code, str(error), error.what, where, error.do, headers)
 
@@ -131,13 +139,15 @@ def add_error_handlers(app: FastAPI, page: Callable[[Request, int, str], Respons
     def invalid(request: Request, error: RequestValidationError) -> Response:
         first = error.errors()[0]
         where = ".".join(str(each) for each in first["loc"] if each not in ("body", "query", "path"))
+        if not request.url.path.startswith("/api/"):
+            return shown(request, 422, f"{where}: {first['msg']}")
         return _error(422, "usage", f"{where}: {first['msg']}", first["msg"], where or None, None, {})
 
     @app.exception_handler(HTTPException)
     def http(request: Request, error: HTTPException) -> Response:
         text = str(error.detail)
-        if not request.url.path.startswith("/api/") and error.status_code == 404:
-            return shown(request, 404, text)
+        if not request.url.path.startswith("/api/"):
+            return shown(request, error.status_code, text)
         code = {404: "not_found", 405: "method"}.get(error.status_code, "request")
         return _error(error.status_code, code, text, text, None, None, dict(error.headers or {}))
 
@@ -145,6 +155,8 @@ def add_error_handlers(app: FastAPI, page: Callable[[Request, int, str], Respons
     def unexpected(request: Request, error: Exception) -> Response:
         log("error", path=request.url.path, kind=type(error).__name__, request=request.state.request)
         text = f"the service failed; its log has more under {request.state.request}"
+        if not request.url.path.startswith("/api/"):
+            return shown(request, 500, text)
         return _error(500, "error", text, text, None, None, {})
 
 

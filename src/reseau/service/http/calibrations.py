@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal
+from urllib.parse import quote
 
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import AwareDatetime, ConfigDict, Field
@@ -21,12 +25,28 @@ if TYPE_CHECKING:
     from ...calibration import Calibration
     from ..inforce import Configurations, Decision
 
-__all__ = ["ConfigurationRow", "calibration_detail", "comparison", "configuration_detail", "listed", "router"]
+__all__ = [
+    "ConfigurationRow",
+    "calibrated",
+    "calibration_detail",
+    "choices",
+    "chosen",
+    "comparison",
+    "configuration_detail",
+    "listed",
+    "router",
+]
 
 router = APIRouter(tags=["calibrations"], responses=refusals(400, 401, 403, 404, 409, 422, 503))
 
 Name = Annotated[str, Path(max_length=200, description="Name of the configuration.")]
 Key = Annotated[str, Path(max_length=100, description="Decision, by its name or the start of its key.")]
+One = Annotated[
+    str,
+    Query(min_length=1, max_length=300, description="`CONFIGURATION/KEY`, or a session with a calibration."),
+]
+_MOST_CHOICES = 100
+"""Latest sessions among which those with a calibration can be chosen on the page."""
 SVG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/svg+xml": {}}, "description": "The figure"}
 }  # fmt: skip
@@ -375,16 +395,67 @@ def calibration_detail(service: Service, name: str, key: str) -> CalibrationDeta
     )  # fmt: skip
 
 
-def comparison(service: Service, name: str, first: str, second: str) -> tuple[Comparison, Any]:
-    """Return the difference of two calibrations of a configuration, and its field if they are cameras."""
+@dataclass(frozen=True)
+class Chosen:
+    """A calibration that is compared: its key or session, what people call it, and its page."""
+
+    key: str
+    title: str
+    page: str
+    calibration: Calibration
+
+
+def chosen(service: Service, text: str) -> Chosen:
+    """Return a calibration: `CONFIGURATION/KEY`, or the name of a session that has one.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    """
+    from ... import sessions as kinds
+
+    name, slash, key = text.rpartition("/")
+    if not slash:
+        session = the_session(service, text)
+        return Chosen(text, text, f"/sessions/{quote(text, safe='')}", kinds.calibration_of(session))
+    known = _the(service, name)
+    decision = _decision(known, name, key)
+    page = f"/calibrations/{quote(name, safe='')}/{decision.key}"
+    title = f"{name}: {_row(service, decision).name}"
+    return Chosen(decision.key, title, page, known.calibration(name, decision.key))
+
+
+def choices(service: Service) -> list[tuple[str, str]]:
+    """Return what can be compared: the text that :func:`chosen` takes, and what people call it."""
+
+    def compute() -> list[tuple[str, str]]:
+        found, judged = list[tuple[str, str]](), set[str | None]()
+        known = _known(service)
+        for name in known.names():
+            rows = [_row(service, each) for each in reversed(known.history(name))]
+            found += [(f"{name}/{each.key}", f"{name}: {each.name}") for each in rows]
+            judged |= {each.session for each in rows}
+        others = [each for each in calibrated(service) if each not in judged]
+        return found + [(each, f"session {each}") for each in others]
+
+    return service.current("choices", compute)
+
+
+def calibrated(service: Service) -> list[str]:
+    """Return the latest sessions with a calibration."""
+    found = service.archive.sessions(last=_MOST_CHOICES, result="calibration.json")
+    return [each.name for each in reversed(found)]
+
+
+def comparison(first: Chosen, second: Chosen) -> tuple[Comparison, Any]:
+    """Return the difference of two calibrations, and its field if they are cameras."""
     import numpy as np
 
     from ...calibration import CameraMapping, calibration_difference
     from ..rules import difference
 
-    known = _the(service, name)
-    one, two = _decision(known, name, first), _decision(known, name, second)
-    old, new = known.calibration(name, one.key), known.calibration(name, two.key)
+    old, new = first.calibration, second.calibration
     found = difference(new, old)
     field = None
     rms, p = found.greatest, float(getattr(found, "p", float("nan")))
@@ -403,14 +474,9 @@ def comparison(service: Service, name: str, first: str, second: str) -> tuple[Co
         for each in every
     ]
     answer = Comparison(
-        first=one.key,
-        second=two.key,
-        greatest=found.greatest,
-        rms=rms,
-        unit=found.unit,
-        p=p,
+        first=first.key, second=second.key, greatest=found.greatest, rms=rms, unit=found.unit, p=p,
         parameters=values,
-    )
+    )  # fmt: skip
     return answer, field
 
 
@@ -472,12 +538,12 @@ def decision(name: Name, key: Key, who: Reading, service: Here) -> CalibrationDe
 )
 def document(request: Request, name: Name, key: Key, who: Reading, service: Here) -> Response:
     """The calibration as a document, `reseau-calibration/1`."""
-    import hashlib
-
     known = _the(service, name)
     found = known.calibration(name, _decision(known, name, key).key)
     content = found.to_json().encode("utf-8")
-    return file_answer(request, content, f"{name} {key}.json", hashlib.sha256(content).hexdigest())
+    return file_answer(
+        request, io.BytesIO(content), f"{name} {key}.json", hashlib.sha256(content).hexdigest()
+    )
 
 
 @router.get(
@@ -514,36 +580,23 @@ def _drawn(calibration: Calibration, figure: str) -> str:
     return drawn
 
 
-@router.get("/configurations/{name}/compare")
-def compare(
-    name: Name,
-    first: Annotated[str, Query(max_length=64)],
-    second: Annotated[str, Query(max_length=64)],
-    who: Reading,
-    service: Here,
-) -> Comparison:
-    """The difference of two calibrations over the image, and its significance."""
-    return comparison(service, name, first, second)[0]
+@router.get("/comparisons")
+def compare(first: One, second: One, who: Reading, service: Here) -> Comparison:
+    """The difference of any two calibrations over the image, and its significance."""
+    return comparison(chosen(service, first), chosen(service, second))[0]
 
 
-@router.get("/configurations/{name}/compare.svg", response_class=Response, responses=SVG)
-def compare_figure(
-    request: Request,
-    name: Name,
-    first: Annotated[str, Query(max_length=64)],
-    second: Annotated[str, Query(max_length=64)],
-    who: Reading,
-    service: Here,
-) -> Response:
-    """The difference of two calibrations of a camera, as arrows over its uncertainty."""
+@router.get("/comparisons/figure.svg", response_class=Response, responses=SVG)
+def compare_figure(request: Request, first: One, second: One, who: Reading, service: Here) -> Response:
+    """The difference of two calibrations of cameras, as arrows over its uncertainty."""
     from ...report.fields import difference_figure
 
-    found, field = comparison(service, name, first, second)
+    one, two = chosen(service, first), chosen(service, second)
+    _, field = comparison(one, two)
     if field is None:
         raise NotFound("are not of cameras", where=f"{first}, {second}")
-    return picture_answer(
-        request, lambda: difference_figure(field), "image/svg+xml", f"{found.first}-{found.second}"
-    )
+    tag = hashlib.sha256(f"{one.calibration.to_json()}{two.calibration.to_json()}".encode()).hexdigest()[:32]
+    return picture_answer(request, lambda: difference_figure(field), "image/svg+xml", tag)
 
 
 def _audited(

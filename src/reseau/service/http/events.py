@@ -8,21 +8,26 @@ import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["Event", "Events"]
+if TYPE_CHECKING:
+    from ...archive import Archive
+
+__all__ = ["BLUESKY", "Event", "Events"]
 
 _KEPT, _WAITING, _BEAT_S = 5000, 1000, 10.0
-_MOST_CLIENTS = 500
+_MOST_CLIENTS, _PART = 500, 100
+BLUESKY = ("start", "descriptor", "event", "stop")
+"""Kinds of bluesky's documents."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Event:
-    """An event.
+    """An event, as it is sent to all clients: thousands are kept, each as one text.
 
     Parameters
     ----------
@@ -30,32 +35,19 @@ class Event:
         Increases from event to event of one start of the service.
     kind, about : str
         What happened, and to what: ``archive`` and the name of a table, ``bench`` and its name.
-    facts : dict
-        Values.
-    at : str
-        When, ISO 8601.
+    text : str
+        The server-sent event; its id names the start of the service, too.
 
     Examples
     --------
-    >>> Event(1, "archive", "frames", {"last": 7}, "2026-03-02T08:00:00+00:00").about
-    'frames'
+    >>> Events().publish("archive", "frames", {"last": 7}).text.splitlines()[1]
+    'event: change'
     """
 
     number: int
     kind: str
     about: str
-    facts: dict[str, Any]
-    at: str
-
-    def text(self, start: str) -> str:
-        """Return it as a server-sent event; its id names the start of the service, too."""
-        return _text(self, start)
-
-
-@lru_cache(maxsize=256)  # it is the same for all clients
-def _text(event: Event, start: str) -> str:
-    document = {"kind": event.kind, "about": event.about, "at": event.at, "facts": event.facts}
-    return f"id: {start}-{event.number}\nevent: change\ndata: {json.dumps(document, default=str)}\n\n"
+    text: str
 
 
 _Queue = asyncio.Queue[Event | None]
@@ -96,7 +88,10 @@ class Events:
         with self._lock:
             self._number += 1
             at = datetime.now(UTC).isoformat(timespec="milliseconds")
-            event = Event(self._number, kind, about, dict(facts or {}), at)
+            document = {"kind": kind, "about": about, "at": at, "facts": dict(facts or {})}
+            data = json.dumps(document, default=str)
+            text = f"id: {self.start}-{self._number}\nevent: change\ndata: {data}\n\n"
+            event = Event(self._number, kind, about, text)
             self._kept.append(event)
             # Handed over in their order, which the lock keeps.
             loops: dict[asyncio.AbstractEventLoop, list[_Queue]] = {}
@@ -147,13 +142,7 @@ class Events:
         Where events are missing, because the service was restarted or the client was away for long, the first
         event is ``reset``: what the client shows must be fetched again.
         """
-        queue: _Queue = asyncio.Queue(_WAITING)
-        client = asyncio.get_running_loop(), queue
-        with self._lock:  # later events are in the queue, earlier ones among those that are kept
-            self._clients.add(client)
-            sent = self._number
-            kept = list(self._kept)
-        try:
+        with self._client() as (queue, kept, sent):
             missed, complete = self._after(kept, last)
             yield "retry: 1000\n\n"
             if not complete or not last:
@@ -161,14 +150,14 @@ class Events:
                 yield f"id: {self.start}-{sent}\nevent: {kind}\ndata: {{}}\n\n"
             check = time.monotonic() + _BEAT_S
             for event in missed:
-                yield event.text(self.start)
+                yield event.text
             while not self._closed:
                 if time.monotonic() >= check:
                     check = time.monotonic() + _BEAT_S
                     if not await asyncio.to_thread(valid):
                         yield "event: end\ndata: {}\n\n"
                         return
-                    yield ": still here\n\n"
+                    yield "event: beat\ndata: {}\n\n"  # a client that hears nothing is cut off
                 try:
                     next_one = await asyncio.wait_for(queue.get(), check - time.monotonic())
                 except TimeoutError:
@@ -177,7 +166,57 @@ class Events:
                     return
                 if next_one.number > sent:
                     sent = next_one.number
-                    yield next_one.text(self.start)
+                    yield next_one.text
+
+    async def documents(self, archive: Archive, last: int, valid: Callable[[], bool]) -> AsyncIterator[str]:
+        """Yield bluesky's documents as server-sent events, those after a number, then new ones.
+
+        Their ids are their numbers in the archive: a stream is resumed whatever happened to the service.
+        """
+        with self._client() as (queue, _, _):
+            yield "retry: 1000\n\n"
+            check = time.monotonic() + _BEAT_S
+            while not self._closed:
+                while found := await asyncio.to_thread(archive.notes, last, _PART):
+                    last = found[-1].number
+                    for each in found:
+                        if each.kind in BLUESKY:
+                            content = {"session": each.session, "name": each.kind, "document": each.document}
+                            yield f"id: {each.number}\nevent: {each.kind}\ndata: {json.dumps(content)}\n\n"
+                while not any(about == "events" for about in await _all_of(queue, check)):
+                    if self._closed:
+                        return
+                    if time.monotonic() >= check:
+                        check = time.monotonic() + _BEAT_S
+                        if not await asyncio.to_thread(valid):
+                            yield "event: end\ndata: {}\n\n"
+                            return
+                        yield "event: beat\ndata: {}\n\n"
+
+    @contextmanager
+    def _client(self) -> Iterator[tuple[_Queue, list[Event], int]]:
+        """The queue of a client; the events that are kept, and the number of the last one."""
+        queue: _Queue = asyncio.Queue(_WAITING)
+        client = asyncio.get_running_loop(), queue
+        with self._lock:  # later events are in the queue, earlier ones among those that are kept
+            self._clients.add(client)
+            kept, sent = list(self._kept), self._number
+        try:
+            yield queue, kept, sent
         finally:
             with self._lock:
                 self._clients.discard(client)
+
+
+async def _all_of(queue: _Queue, until: float) -> list[str]:
+    """What the events of a queue are about, as soon as there is one; nothing when it is late."""
+    found = list[str]()
+    try:
+        event = await asyncio.wait_for(queue.get(), max(0.0, until - time.monotonic()))
+    except TimeoutError:
+        return found
+    while True:
+        found.append("events" if event is None else event.about)  # None: events were left out, or it ends
+        if queue.empty():
+            return found
+        event = queue.get_nowait()

@@ -46,6 +46,7 @@ _STRICT = b"max-age=31536000"
 SMALL_BODY, LARGE_BODY = 1 << 20, 1 << 30
 """Largest body of a request, and of an upload (bytes)."""
 _LOGIN_BODY = 16 << 10
+_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 UPLOADS, LOGIN = "/api/1/uploads", "/api/1/login"
 _BODY_S, _BODY_PER_S = 20.0, 8192
 """Time that a body may take, besides that at the least rate (bytes/s)."""
@@ -145,12 +146,13 @@ class Guard:
         hosts = [v for k, v in scope["headers"] if k == b"host"]
         request, begun = secrets.token_hex(4), time.perf_counter()
         scope.setdefault("state", {})["request"] = request
-        status = 0
+        status, streamed = 0, False
 
         async def answer(message: MutableMapping[str, Any]) -> None:
-            nonlocal status
+            nonlocal status, streamed
             if message["type"] == "http.response.start":
                 status = message["status"]
+                streamed = any(v.startswith(b"text/event-stream") for _, v in message["headers"])
                 there = {k.lower() for k, _ in message["headers"]}
                 message["headers"] = [
                     *message["headers"],
@@ -175,8 +177,10 @@ class Guard:
             await self.app(scope, _limited(receive, limit), answer)
         spent = time.perf_counter() - begun
         route = getattr(scope.get("route"), "path", "other")
-        self._meters.requests.labels(scope["method"][:8], route, str(status)).inc()
-        if not route.endswith("/events"):
+        # A method is any word of the client; each would be a counter that is kept.
+        method = scope["method"] if scope["method"] in _METHODS else "other"
+        self._meters.requests.labels(method, route, str(status)).inc()
+        if not streamed:
             self._meters.seconds.labels(route).observe(spent)
         state, client = scope["state"], scope.get("client") or ("", 0)
         log(

@@ -13,7 +13,7 @@ from pydantic import ConfigDict
 from ...core.version import __version__
 from ..audit import Head
 from .access import Administering, Here, Reading, principal_of
-from .answers import Answer, refusals
+from .answers import TOO_MANY, Answer, refusals
 from .service import Service
 
 __all__ = ["audited", "open_router", "router"]
@@ -116,8 +116,7 @@ async def events(
     `reset`: what is shown must be fetched again.
     """
     if service.events.full:
-        return JSONResponse({"error": {"code": "wait", "text": "too many clients", "what": "too many clients",
-                                       "where": None, "do": None}}, 429, {"Retry-After": "10"})  # fmt: skip
+        return JSONResponse(TOO_MANY, 429, {"Retry-After": "10"})
     stream = service.events.stream(last_event_id or last, lambda: principal_of(request) is not None)
     return StreamingResponse(stream, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
 

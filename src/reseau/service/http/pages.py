@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from importlib.resources import files
 from typing import Annotated, Any
@@ -52,7 +53,7 @@ def _templates() -> jinja2.Environment:
         loader=jinja2.PackageLoader("reseau.service", "pages/app"), autoescape=True, trim_blocks=True,
         lstrip_blocks=True, undefined=jinja2.StrictUndefined,
     )  # fmt: skip
-    found.filters["plain"] = _plain
+    found.filters |= {"plain": _plain, "powers": _powers, "symbol": _symbol, "sentence": _sentence}
     return found
 
 
@@ -62,9 +63,26 @@ def _plain(value: Any) -> str:
         return ", ".join(f"{key} {_plain(each)}" for key, each in value.items())
     if isinstance(value, list | tuple):
         return ", ".join(_plain(each) for each in value)
-    if isinstance(value, bool) or value is None:
-        return {True: "yes", False: "no", None: "—"}[value]
+    if isinstance(value, bool) or value in (None, ""):
+        return {True: "yes", False: "no"}.get(value, "—")
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _powers(text: str) -> str:
+    """A text with units such as mm^-2, with their powers as people write them."""
+    return re.sub(r"\^(-?[0-9]+)", lambda found: found[1].translate(_RAISED), text)
+
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def _symbol(name: str) -> str:
+    """The name of a standard deviation as people write it."""
+    return "σ₀" if name == "sigma0" else name.replace("sigma_", "σ of ")
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}" + ("" if text.endswith((".", "!", "?")) else ".")
 
 
 def _rendered(request: Request, template: str, status: int = 200, **content: Any) -> HTMLResponse:
@@ -202,14 +220,23 @@ def session_page(request: Request, session: str, who: Reading, service: Here) ->
     return _rendered(
         request, "session.html.j2", s=found, frames=frames[::-1], shown=_SHOWN,
         report=_report(found), scene=sessions.scene_result(kept) is not None,
-        verdict=_verdict(kept, found), bench=running,
+        verdict=_read_verdict(kept, found), bench=running,
         reached=running.session.reached if running is not None and running.session is not None else {},
+        units=running.session.units if running is not None and running.session is not None else {},
         job=service.jobs.of(session),
     )  # fmt: skip
 
 
-def _verdict(session: Session, found: sessions.SessionDetail) -> str:
-    """What the results of a session are good for, in words."""
+def _read_verdict(session: Session, found: sessions.SessionDetail) -> list[str]:
+    """As :func:`_verdict`; a file that is damaged or lost does not hide the session."""
+    try:
+        return _verdict(session, found)
+    except ReseauError as error:
+        return [str(error)]
+
+
+def _verdict(session: Session, found: sessions.SessionDetail) -> list[str]:
+    """What the results of a session are good for, in lines."""
     from ... import sessions as kinds
     from ...io import RollSummary
 
@@ -217,9 +244,9 @@ def _verdict(session: Session, found: sessions.SessionDetail) -> str:
     if found.plan == "film" and "summary.json" in latest:
         summary = RollSummary.parse(session.content(latest["summary.json"]).decode(), where="summary.json")
         counts = ", ".join(f"{count} {what}" for what, count in summary.counts() if count)
-        return f"{len(summary.frames)} frames: {counts}."
+        return [f"{len(summary.frames)} frames: {counts}"]
     if "calibration.json" not in latest:
-        return ""
+        return []
     calibration = kinds.calibration_of(session)
     if found.plan == "oscilloscope":
         points = {
@@ -230,8 +257,8 @@ def _verdict(session: Session, found: sessions.SessionDetail) -> str:
         words = {"PHOTO I": "marks of the reseau", "PHOTO II": "rods", "PHOTO III": "points of the body"}
         parts = [f"{points[photo]} {what}" for photo, what in words.items() if points.get(photo)]
         sigma0 = "" if calibration.sigma0 is None else f"; σ₀ {calibration.sigma0:.2f}"
-        return f"Camera and oscilloscope are corrected: {', '.join(parts)}{sigma0}."
-    return " ".join(calibrations.verdict_of(calibration))
+        return [f"Camera and oscilloscope are corrected: {', '.join(parts)}{sigma0}"]
+    return calibrations.verdict_of(calibration)
 
 
 def _report(session: sessions.SessionDetail) -> int | None:
@@ -267,10 +294,9 @@ def configuration_page(request: Request, name: str, who: Reading, service: Here)
             drift = history.drift(name, who, service)
         except ReseauError:  # such as calibrations of different cameras: the alarms say so
             drift = None
-    done = [each.name for each in sessions.rows(service, 200) if each.results]
     return _rendered(
-        request, "configuration.html.j2", c=found, charted=drift is not None, drift=drift, sessions=done,
-        rules=_last_rules(service, name),
+        request, "configuration.html.j2", c=found, charted=drift is not None, drift=drift,
+        sessions=calibrations.calibrated(service), rules=_last_rules(service, name),
     )  # fmt: skip
 
 
@@ -282,22 +308,26 @@ def _last_rules(service: Service, name: str) -> str:
     return _RULES if found is None else canonical_json(found).strip()
 
 
-@router.get("/calibrations/{name}/compare")
+@router.get("/compare")
 def compare_page(
     request: Request,
-    name: str,
     who: Reading,
     service: Here,
-    first: Annotated[str, Query(max_length=64)],
-    second: Annotated[str, Query(max_length=64)],
+    first: Annotated[str, Query(max_length=300)] = "",
+    second: Annotated[str, Query(max_length=300)] = "",
 ) -> Response:
-    """Two calibrations of a configuration."""
-    found, field = calibrations.comparison(service, name, first, second)
-    names = {d.key: d.name for d in calibrations.configuration_detail(service, name).history}
-    return _rendered(
-        request, "compare.html.j2", name=name, c=found, first=names[found.first], second=names[found.second],
-        drawn=field is not None,
-    )  # fmt: skip
+    """Any two calibrations."""
+    every = calibrations.choices(service)
+    content: dict[str, Any] = {"c": None, "choices": every, "first": first, "second": second}
+    if first and second:
+        one, two = calibrations.chosen(service, first), calibrations.chosen(service, second)
+        content |= {"one": one, "two": two}
+        try:
+            content["c"], field = calibrations.comparison(one, two)
+            content["drawn"] = field is not None
+        except ReseauError as error:  # such as an oscilloscope and a camera
+            content["why"] = str(error)
+    return _rendered(request, "compare.html.j2", **content)
 
 
 @router.get("/calibrations/{name}/{key}")
@@ -316,7 +346,6 @@ def calibration_page(request: Request, name: str, key: str, who: Reading, servic
             tests[each["parameter"]] = f"p = {each['p']:.2g}"
     return _rendered(
         request, "calibration.html.j2", c=found, report=report, scene=scene, tests=tests,
-        verdict=" ".join(found.verdict),
         in_force=current is not None and current.key == found.decision.key,
     )  # fmt: skip
 
@@ -342,7 +371,7 @@ def history_page(request: Request, who: Reading, service: Here) -> Response:
     return _rendered(
         request, "history.html.j2", alarms=[a for a in alarms if not a.acknowledged],
         acknowledged=[a for a in alarms if a.acknowledged], schedules=history.scheduled(service),
-        configurations=found, to_review=waiting, pairs=[[name, each.key] for name, each in waiting],
+        configurations=found, to_review=waiting,
     )  # fmt: skip
 
 

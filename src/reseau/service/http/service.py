@@ -6,9 +6,11 @@ import gc
 import secrets
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -33,17 +35,32 @@ T = TypeVar("T")
 
 
 def _load_the_rest() -> None:
-    """Load what the first requests need, which would otherwise wait for it."""
-    from ...report import overlay
-    from .. import alarms, inforce, schedule
+    """Load what the first requests need, which would otherwise wait for it; first what the overview needs."""
+    from .. import alarms
 
-    del alarms, inforce, overlay, schedule
+    del alarms
+    from ...report import overlay
+
+    del overlay
     # What stays for ever need not be looked at by each collection, which stops all threads meanwhile.
     gc.collect()
     gc.freeze()
 
 
 _LOOK_S, _ENTRY_S = 0.3, 600.0
+_LOGGED = frozenset({"up", "down", "begin", "session", "end", "moving", "stopped", "asking"})
+"""Events of benches that the log has, and not only the streams of events."""
+_MOST_COMPUTED = 200
+"""Results that are kept for further requests: what is asked for least recently is forgotten."""
+
+
+@dataclass
+class _Computed:
+    """A result, and what it was computed from."""
+
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    key: object = None
+    found: Any = None
 
 
 class Service:
@@ -104,10 +121,10 @@ class Service:
 
             self.tiled = TiledPublisher(self.archive, options.tiled)
         self._seen = self.archive.heads()  # what is stored from now on is an event
-        self.started = time.time()
+        self.started, self._begun = time.time(), time.monotonic()
         self._entries: dict[str, float] = {}
-        self._computed: dict[str, tuple[object, Any]] = {}
-        self._locks: dict[str, threading.Lock] = {}
+        self._computed: OrderedDict[str, _Computed] = OrderedDict()
+        self._computing = threading.Lock()
         self._over = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="archive", daemon=True)
         self.failing = ""
@@ -141,10 +158,16 @@ class Service:
         """Name of the cookie; services on other ports of a machine have others."""
         return f"reseau-{self.options.port}"
 
+    @property
+    def uptime_s(self) -> float:
+        """Time since its start (s), whatever was done to the clock."""
+        return time.monotonic() - self._begun
+
     def entry_code(self) -> str:
         """Return a code that lets a browser of this machine in, once, within ten minutes."""
-        code = secrets.token_urlsafe(24)
-        self._entries[code] = time.monotonic() + _ENTRY_S
+        code, now = secrets.token_urlsafe(24), time.monotonic()
+        self._entries = {known: until for known, until in self._entries.items() if until > now}
+        self._entries[code] = now + _ENTRY_S
         return code
 
     def enter(self, code: str) -> str | None:
@@ -165,11 +188,16 @@ class Service:
         heads = self.archive.heads()
         stored = [heads.get(each, 0) for each in ("entries", "sessions", "ends", "results")]
         key = (*stored, int(time.time() // 60))
-        with self._locks.setdefault(name, threading.Lock()):
-            kept = self._computed.get(name)
-            if kept is None or kept[0] != key:
-                kept = self._computed[name] = (key, compute())
-        found: T = kept[1]
+        with self._computing:
+            kept = self._computed.setdefault(name, _Computed())
+            self._computed.move_to_end(name)
+            if len(self._computed) > _MOST_COMPUTED:
+                self._computed.popitem(last=False)
+        with kept.lock:
+            if kept.key != key:
+                kept.found = compute()
+                kept.key = key
+            found: T = kept.found
         return found
 
     @contextmanager
@@ -203,7 +231,9 @@ class Service:
             self.meters.workers.labels(name).set(0 if kind == "down" else 1)
             if kind == "down":
                 self.meters.restarts.labels(name).inc()
-                log("worker", bench=name, state="down")
+            if kind in _LOGGED:
+                session = self.benches[name].status["session"] or {}
+                log(f"bench {kind}", **facts | {"bench": name, "session": session.get("name", "")})
 
         return told
 
@@ -222,7 +252,7 @@ class Service:
         while not self._over.wait(_LOOK_S):
             try:
                 now = self.archive.heads()
-            except ReseauError as error:
+            except Exception as error:  # whatever it is, the service is not ready, and looks again
                 if not self.failing:
                     log("archive", failed=str(error))
                 self.failing = str(error)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic import ConfigDict
 
 from ...archive import ArchivedFrame, ArchivedResult, Session
 from ...core.errors import ArchiveError, ReseauError, UsageError
 from ..decoding import PHOTOGRAPH
-from .access import Here, NotFound, Reading
-from .answers import Answer, refusals
+from .access import Here, NotFound, Reading, principal_of
+from .answers import TOO_MANY, Answer, refusals
+from .events import BLUESKY
 from .service import Service
 from .stored import FILE_ANSWERS, file_answer, marks_of, picture_answer, preview_jpeg, result_named
 
@@ -129,7 +132,6 @@ class BlueskyDocument(Answer):
 
 
 _MOST_REJECTED = 100
-_BLUESKY = ("start", "descriptor", "event", "stop")
 
 
 class MarkRow(Answer):
@@ -295,10 +297,10 @@ def frames(
 def frame_file(
     request: Request, session: SessionName, number: Number, who: Reading, service: Here
 ) -> Response:
-    """The file of a frame, checked against its SHA-256; ranges are answered."""
+    """The file of a frame, checked against its SHA-256 when it is first read; ranges are answered."""
     kept = the_session(service, session)
     frame = the_frame(kept, number)
-    content = kept.objects.get(frame.sha256, frame.suffix)
+    content = kept.objects.open(frame.sha256, frame.suffix)
     return file_answer(
         request, content, f"{kept.name} {frame.name}{frame.suffix}".replace("/", " "), frame.sha256
     )
@@ -362,7 +364,8 @@ def result_file(
     result = result_named(kept, number)
     if result is None:
         raise NotFound("has no such result", where=f"{session}: {number}")
-    return file_answer(request, kept.content(result), result.name, result.sha256)
+    content = kept.objects.open(result.sha256, result.suffix)
+    return file_answer(request, content, result.name, result.sha256)
 
 
 @router.get("/sessions/{session}/scene")
@@ -393,8 +396,34 @@ def documents(
 ) -> list[BlueskyDocument]:
     """Bluesky's documents of a session, in their order: start, descriptor, event, stop."""
     found = the_session(service, session).notes()
-    known = [(kind, document) for kind, document in found if kind in _BLUESKY]
+    known = [(kind, document) for kind, document in found if kind in BLUESKY]
     return [BlueskyDocument(name=kind, document=document) for kind, document in known[after:]]
+
+
+@router.get(
+    "/documents",
+    response_class=StreamingResponse,
+    responses={200: {"content": {"text/event-stream": {}}, "description": "Documents"}, **refusals(429)},
+)
+async def all_documents(
+    request: Request,
+    who: Reading,
+    service: Here,
+    last_event_id: Annotated[str, Header(max_length=40, description="Resume after this document.")] = "",
+    after: Annotated[int | None, Query(ge=0, le=1 << 62, description="As Last-Event-ID; 0: all.")] = None,
+) -> Response:
+    """Bluesky's documents of all sessions as server-sent events; by default those from now on.
+
+    The id of each is its number in the archive: with `Last-Event-ID` a stream is resumed without a gap, also
+    after a restart of the service.
+    """
+    if service.events.full:
+        return JSONResponse(TOO_MANY, 429, {"Retry-After": "10"})
+    last = int(last_event_id) if last_event_id.isdigit() else after
+    if last is None or last >= 1 << 63:
+        last = (await asyncio.to_thread(service.archive.heads))["events"]
+    stream = service.events.documents(service.archive, last, lambda: principal_of(request) is not None)
+    return StreamingResponse(stream, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
 
 
 @router.get("/sessions/{session}/inputs/{name}/file", response_class=Response, responses=FILE_ANSWERS)
@@ -410,4 +439,4 @@ def input_file(
     found = kept.inputs().get(name)
     if found is None:
         raise NotFound("has no such input", where=f"{session}: {name}")
-    return file_answer(request, kept.objects.get(found.sha256, found.suffix), name, found.sha256)
+    return file_answer(request, kept.objects.open(found.sha256, found.suffix), name, found.sha256)

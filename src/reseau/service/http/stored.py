@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from fastapi import Request, Response
+from fastapi.responses import StreamingResponse
 
 from ...archive import ArchivedFrame, ArchivedResult, Session
 
@@ -28,6 +30,7 @@ SANDBOX = (
 )
 """Of files of the archive: they may have inline styles and pictures, but no script, and no origin."""
 _RANGE = re.compile(r"bytes=(\d*)-(\d*)")
+_PIECE = 1 << 18
 _IMMUTABLE = "private, max-age=31536000, immutable"
 FILE_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"content": {"*/*": {}}, "description": "The file"},
@@ -37,15 +40,15 @@ FILE_ANSWERS: dict[int | str, dict[str, Any]] = {
 }
 
 
-def file_answer(request: Request, content: bytes, name: str, sha256: str) -> Response:
+def file_answer(request: Request, content: BinaryIO, name: str, sha256: str) -> Response:
     """Return a file or the range of it that is asked for; what a browser would execute is in a sandbox.
 
     Parameters
     ----------
     request : Request
         Has `Range` and `If-None-Match`.
-    content : bytes
-        The file.
+    content : binary file
+        The file, which is closed when it was sent; large ones are never in memory as a whole.
     name : str
         Its name, for saving.
     sha256 : str
@@ -61,19 +64,36 @@ def file_answer(request: Request, content: bytes, name: str, sha256: str) -> Res
     }  # fmt: skip
     kind = _TYPES.get(suffix, "application/octet-stream")
     if request.headers.get("if-none-match") == tag:
+        content.close()
         return Response(status_code=304, headers=headers)
+    size = content.seek(0, os.SEEK_END)
     wanted = _RANGE.fullmatch(request.headers.get("range", ""))
     if wanted is None or not (wanted[1] or wanted[2]):
-        return Response(content, 200, headers, kind)
-    size = len(content)
+        return _sent(content, 0, size, 200, headers, kind)
     if wanted[1]:
         start, end = int(wanted[1]), min(int(wanted[2] or size - 1), size - 1)
     else:
         start, end = max(0, size - int(wanted[2])), size - 1
     if start > end or start >= size:
+        content.close()
         return Response(status_code=416, headers=headers | {"Content-Range": f"bytes */{size}"})
     headers["Content-Range"] = f"bytes {start}-{end}/{size}"
-    return Response(content[start : end + 1], 206, headers, kind)
+    return _sent(content, start, end + 1, 206, headers, kind)
+
+
+def _sent(
+    content: BinaryIO, start: int, end: int, status: int, headers: dict[str, str], kind: str
+) -> Response:
+    """A part of a file, in pieces."""
+
+    def pieces() -> Iterator[bytes]:
+        with content:
+            left = end - content.seek(start)
+            while left > 0 and (piece := content.read(min(left, _PIECE))):
+                left -= len(piece)
+                yield piece
+
+    return StreamingResponse(pieces(), status, headers | {"Content-Length": str(end - start)}, kind)
 
 
 def picture_answer(request: Request, draw: Callable[[], bytes | str], kind: str, tag: str) -> Response:

@@ -9,10 +9,11 @@ function say(text, good = false) {
   if (text && !good) message.scrollIntoView({block: 'nearest'});
 }
 
-export async function call(operation, body) {
+export async function call(operation, body, patience) {
   const [method, path] = operation.split(/ (.*)/);
   const headers = {'X-CSRF-Token': csrf};
   const request = {method, headers, keepalive: body === undefined};
+  if (patience) request.signal = AbortSignal.timeout(patience);
   if (body instanceof FormData) request.body = body;
   else if (body !== undefined) { headers['Content-Type'] = 'application/json'; request.body = JSON.stringify(body); }
   let answer;
@@ -40,6 +41,11 @@ function fields(form) {
   for (const each of form.elements) {
     if (!each.name || each.disabled || each.type === 'file') continue;
     let value = each.value;
+    if (each.dataset.list !== undefined) {  // boxes of one name are a list
+      found[each.name] ??= [];
+      if (each.checked) found[each.name].push(JSON.parse(value));
+      continue;
+    }
     if (each.type === 'checkbox') value = each.checked;
     else if (each.type === 'radio') { if (!each.checked) continue; }
     else if (value === '' && each.dataset.empty === 'omit') continue;
@@ -66,13 +72,25 @@ function form_data(form) {
   return found;
 }
 
+// A table with a column `calibration` and others, as {calibration: {column: number}}.
+function table_of(text) {
+  const [head, ...rows] = text.trim().split(/\r?\n/).filter(l => !l.startsWith('#')).map(l => l.split(',').map(s => s.trim()));
+  const at = head.indexOf('calibration');
+  if (at < 0) throw new Error('the table has no column calibration');
+  return Object.fromEntries(rows.map(row => [row[at], Object.fromEntries(head.map((n, k) => [n, Number.parseFloat(row[k])]).filter((_, k) => k !== at))]));
+}
+
 async function with_files(form, body) {
+  for (const input of form.querySelectorAll('input[data-table]')) body[input.dataset.table] = table_of(await input.files[0].text());
   for (const input of form.querySelectorAll('input[data-inputs]')) {
     body[input.dataset.inputs] = {};
     for (const file of input.files) body[input.dataset.inputs][file.name] = await file.text();
   }
   return body;
 }
+
+// What the page calls a calibration.
+function called(key) { return [...document.querySelectorAll('a')].find(a => a.getAttribute('href').endsWith(`/${key}`))?.textContent ?? key; }
 
 async function act(element, body) {
   if (element.dataset.ask && !confirm(element.dataset.ask)) return;
@@ -97,6 +115,14 @@ async function act(element, body) {
       const code = document.createElement('code');
       code.textContent = content[element.dataset.show];
       output.append(code);
+    }
+    if (element.dataset.lines && output) {
+      const lines = content[element.dataset.lines].map(([key, ...rest]) => [called(key), ...rest].join(': '));
+      output.replaceChildren(...(lines.length ? lines : ['nothing']).map(each => {
+        const line = document.createElement('p');
+        line.textContent = each;
+        return line;
+      }));
     }
     if (element.dataset.done) {
       const name = content.name ?? content.session ?? '';
@@ -151,58 +177,100 @@ for (const drop of document.querySelectorAll('[data-drop]')) {
 }
 
 // Live parts: replaced by those of the page as the server renders it now.
-let waiting = null, last = 0, running = false;
+const PATIENCE = 15000, AGAIN = 2000;
+let waiting = null, last = -Infinity, running = false;
 export function refresh() {
   if (!document.querySelector('[data-live]')) return;
   if (waiting !== null) return;
-  waiting = setTimeout(fetchAgain, Math.max(0, 400 - (Date.now() - last)));
+  // Not by the clock, which may be set back.
+  waiting = setTimeout(fetchAgain, Math.max(0, 400 - (performance.now() - last)));
 }
 async function fetchAgain() {
   waiting = null;
   if (running) { refresh(); return; }
   running = true;
-  last = Date.now();
+  last = performance.now();
   try {
-    const answer = await fetch(location.href, {headers: {'Accept': 'text/html'}});
+    const answer = await fetch(location.href, {headers: {'Accept': 'text/html'}, signal: AbortSignal.timeout(PATIENCE)});
     if (answer.redirected && new URL(answer.url).pathname === '/login') { location.href = answer.url; return; }
-    if (!answer.ok) return;
-    const page = new DOMParser().parseFromString(await answer.text(), 'text/html');
-    for (const old of document.querySelectorAll('[data-live]')) {
-      const fresh = page.getElementById(old.id);
-      if (!fresh || fresh.innerHTML === old.dataset.was) continue;
-      const active = document.activeElement;
-      if (old.contains(active) && active.matches('input, select, textarea')) { old.dataset.stale = ''; continue; }
-      const key = old.contains(active) ? active.dataset.api ?? active.getAttribute('href') : null;
-      const open = [...old.querySelectorAll('details[open]')].map(d => d.id);
-      old.innerHTML = fresh.innerHTML;
-      old.dataset.was = fresh.innerHTML;
-      for (const id of open) document.getElementById(id)?.setAttribute('open', '');
-      if (key) [...old.querySelectorAll('button, a')].find(e => (e.dataset.api ?? e.getAttribute('href')) === key)?.focus();
-    }
-    document.dispatchEvent(new CustomEvent('refreshed'));
-  } catch { /* the stream says when the service is back */ }
+    if (answer.ok) renew(new DOMParser().parseFromString(await answer.text(), 'text/html'));
+    else if (answer.status >= 500) setTimeout(refresh, AGAIN);
+  } catch { setTimeout(refresh, AGAIN); }
   finally { running = false; }
 }
 
-if (document.querySelector('[data-live]') || document.querySelector('[data-bench]')) {
-  const stream = new EventSource('/api/1/events');
-  stream.addEventListener('open', () => {
+// What somebody has entered already stays when the part of the page is replaced.
+function boxed(e) { return e.type === 'checkbox' || e.type === 'radio'; }
+function edited(e) {
+  if (boxed(e)) return e.checked !== e.defaultChecked;
+  return e.tagName === 'SELECT' ? e.selectedIndex > 0 || e.querySelector('[selected]') !== null : e.value !== e.defaultValue;
+}
+function field(e) { return [e.form?.dataset.api, e.form?.elements.instrument?.value, e.name, boxed(e) ? e.value : ''].join(' '); }
+
+function renew(page) {
+  for (const old of document.querySelectorAll('[data-live]')) {
+    const fresh = page.getElementById(old.id);
+    delete old.dataset.stale;
+    if (!fresh || fresh.innerHTML === old.dataset.was) continue;
+    const active = document.activeElement;
+    if (old.contains(active) && active.matches('input, select, textarea')) { old.dataset.stale = ''; continue; }
+    const key = old.contains(active) ? active.dataset.api ?? active.getAttribute('href') : null;
+    const open = [...old.querySelectorAll('details[open]')].map(d => d.id);
+    const given = new Map([...old.querySelectorAll('input, select, textarea')].filter(edited).map(e => [field(e), e]));
+    old.innerHTML = fresh.innerHTML;
+    old.dataset.was = fresh.innerHTML;
+    for (const id of open) document.getElementById(id)?.setAttribute('open', '');
+    for (const e of old.querySelectorAll('input, select, textarea')) {
+      const before = given.get(field(e));
+      if (!before) continue;
+      if (boxed(e)) e.checked = before.checked; else e.value = before.value;
+    }
+    if (key) [...old.querySelectorAll('button, a')].find(e => (e.dataset.api ?? e.getAttribute('href')) === key)?.focus();
+  }
+}
+// What was not replaced under the hands of somebody is, as soon as they leave it.
+document.addEventListener('focusout', () => { if (document.querySelector('[data-stale]')) refresh(); });
+
+// The stream of events. A connection may be dead without an end, after sleep or in another network: the service
+// says something each ten seconds. A page that nobody sees needs none: browsers open few connections to a server.
+const SILENCE = 25000, TICK = 5000;
+let stream = null, heard = 0, ticked = Date.now();
+function lost() {
+  connection.textContent = 'The connection to the service is lost; what is shown may be old.';
+  connection.hidden = false;
+}
+function listen() {
+  stream?.close();
+  heard = performance.now();
+  const mine = stream = new EventSource('/api/1/events');
+  const on = (kind, work) => mine.addEventListener(kind, event => { heard = performance.now(); work(event); });
+  on('open', () => {
     connection.hidden = true;
     connection.textContent = '';
     refresh();  // also the first time: something may have changed since the page was rendered
   });
-  stream.addEventListener('error', () => {
-    connection.textContent = 'The connection to the service is lost; what is shown may be old.';
-    connection.hidden = false;
-    if (stream.readyState === EventSource.CLOSED) setTimeout(() => location.reload(), 3000);
+  on('error', () => {
+    if (stream !== mine) return;
+    lost();
+    if (mine.readyState === EventSource.CLOSED) setTimeout(() => location.reload(), 3000);
   });
-  stream.addEventListener('change', event => {
-    refresh();
-    document.dispatchEvent(new CustomEvent('service-event', {detail: JSON.parse(event.data)}));
+  on('change', refresh);
+  on('reset', refresh);
+  on('beat', () => {});
+  on('end', () => location.reload());
+}
+if (document.querySelector('[data-live]') || document.querySelector('[data-bench]')) {
+  if (!document.hidden) listen();
+  document.addEventListener('visibilitychange', () => {
+    if (document.hidden) { stream?.close(); stream = null; }
+    else { listen(); refresh(); }
   });
-  stream.addEventListener('reset', refresh);
-  stream.addEventListener('end', () => location.reload());
-  document.addEventListener('visibilitychange', () => { if (!document.hidden) refresh(); });
+  setInterval(() => {
+    const jumped = Math.abs(Date.now() - ticked - TICK) > 10000;  // asleep, or a clock that was set
+    ticked = Date.now();
+    if (document.hidden || stream?.readyState === EventSource.CLOSED) return;
+    if (jumped || performance.now() - heard > SILENCE) { lost(); listen(); }
+  }, TICK);
 }
 for (const live of document.querySelectorAll('[data-live]')) live.dataset.was = live.innerHTML;
 
@@ -211,19 +279,51 @@ function edges(px) {
   return px < 0.3 ? 'sharpest edges narrower than a pixel' : `sharpest edges ${px} px`;
 }
 
+function drawn(kind, attributes) {
+  const found = document.createElementNS('http://www.w3.org/2000/svg', kind);
+  for (const [name, value] of Object.entries(attributes)) found.setAttribute(name, value);
+  return found;
+}
+
+// Exposure: how often each grey value occurs, saturated ones in the last bar. Roots, so that few are seen, too.
+function exposure(place, counts) {
+  const most = Math.max(...counts);
+  place.replaceChildren(...counts.map((n, k) => {
+    const height = 20 * Math.sqrt(n / most);
+    return drawn('rect', {x: k, y: 20 - height, width: 0.9, height, ...(k === counts.length - 1 ? {class: 'last'} : {})});
+  }));
+}
+
+// Focus: the widths of the sharpest edges in the last pictures; the line is the best of them.
+const widths = [];
+function focus(place, px) {
+  widths.push(px);
+  if (widths.length > 120) widths.shift();
+  const known = widths.filter(each => each !== null);
+  if (!known.length) { place.replaceChildren(); return null; }
+  const best = Math.min(...known), top = Math.max(...known, 1.5 * best);
+  const y = each => 19 - 18 * (each - 0.8 * best) / (top - 0.8 * best || 1);
+  const points = widths.map((each, k) => each === null ? null : `${64 * k / 119},${y(each)}`).filter(each => each);
+  place.replaceChildren(
+    drawn('line', {x1: 0, x2: 64, y1: y(best), y2: y(best), class: 'best'}),
+    drawn('polyline', {points: points.join(' ')}));
+  return best;
+}
+
 // The live picture: fetched again and again while the page is visible.
 const picture = document.querySelector('[data-bench]');
 if (picture) {
   const image = picture.querySelector('img'), over = picture.querySelector('svg');
   const words = document.querySelector('[data-facts]');
+  const aids = document.querySelector('[data-aids]'), best = document.querySelector('[data-best]');
   let shown = 0;
   const look = async () => {
     try {
       if (!document.hidden) {
-        const facts = await call(`GET ${picture.dataset.bench}/picture`);
+        const facts = await call(`GET ${picture.dataset.bench}/picture`, undefined, PATIENCE);
         if (facts.error) words.textContent = facts.error;
         else if (facts.number && facts.number !== shown) {
-          const answer = await fetch(`${picture.dataset.bench}/picture.jpg`);
+          const answer = await fetch(`${picture.dataset.bench}/picture.jpg`, {signal: AbortSignal.timeout(PATIENCE)});
           if (answer.ok) {
             const url = URL.createObjectURL(await answer.blob());
             image.onload = () => URL.revokeObjectURL(url);
@@ -231,14 +331,12 @@ if (picture) {
             image.hidden = false;
             shown = facts.number;
             over.setAttribute('viewBox', `-0.5 -0.5 ${facts.width} ${facts.height}`);
-            over.replaceChildren(...facts.points.map(([x, y]) => {
-              const circle = document.createElementNS('http://www.w3.org/2000/svg', 'circle');
-              circle.setAttribute('cx', x);
-              circle.setAttribute('cy', y);
-              circle.setAttribute('r', facts.width / 130);
-              return circle;
-            }));
+            over.replaceChildren(...facts.points.map(([x, y]) => drawn('circle', {cx: x, cy: y, r: facts.width / 130})));
             words.textContent = `exposure ${facts.exposure}; ${edges(facts.edge_px)}; ${facts.points.length} points found; ${facts.at.slice(11, 19)} UTC`;
+            aids.hidden = false;
+            exposure(aids.querySelector('[data-exposure]'), facts.histogram);
+            const least = focus(aids.querySelector('[data-focus]'), facts.edge_px);
+            best.textContent = least === null ? '' : `: best ${least < 0.3 ? 'below 0.3' : least} px`;
           }
         }
       }
