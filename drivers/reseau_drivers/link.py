@@ -359,6 +359,8 @@ class MessageLink(Generic[M]):
         Carries the bytes.
     decoder : Decoder
         Decodes the messages of the instrument.
+    overhear : callable, optional
+        Called with each message that is not an answer: some instruments report events unasked.
 
     Attributes
     ----------
@@ -373,8 +375,10 @@ class MessageLink(Generic[M]):
     0
     """
 
-    def __init__(self, link: Link, decoder: Decoder[M]) -> None:
-        self._link, self._decoder = link, decoder
+    def __init__(
+        self, link: Link, decoder: Decoder[M], overhear: Callable[[M], None] = lambda message: None
+    ) -> None:
+        self._link, self._decoder, self._overhear = link, decoder, overhear
         self._received: deque[M | Damaged] = deque()
         self.ignored = 0
 
@@ -414,10 +418,11 @@ class MessageLink(Generic[M]):
             If the connection is lost.
         """
         # Messages that arrived before the query do not answer it: repeated or abandoned answers.
+        while self._received:
+            self._ignore(self._received.popleft())
         while self._link.pending() and not deadline.expired:
-            self.ignored += len(self._decoder.feed(self._link.read(deadline)))
-        self.ignored += len(self._received)
-        self._received.clear()
+            for message in self._decoder.feed(self._link.read(deadline)):
+                self._ignore(message)
         self.send(data, deadline)
         return self.receive(is_answer, deadline)
 
@@ -431,7 +436,7 @@ class MessageLink(Generic[M]):
                     damaged = message
                 elif is_answer(message):
                     return message
-                self.ignored += 1
+                self._ignore(message)
             if deadline.expired:
                 if damaged is not None:
                     raise ProtocolError(f"the answer was damaged ({damaged})", do="check cable and baud rate")
@@ -440,3 +445,8 @@ class MessageLink(Generic[M]):
                     do="check power, and whether another program uses it",
                 )
             self._received += self._decoder.feed(self._link.read(deadline))
+
+    def _ignore(self, message: M | Damaged) -> None:
+        self.ignored += 1
+        if not isinstance(message, Damaged):
+            self._overhear(message)

@@ -20,12 +20,13 @@ from reseau_drivers.link import link_to
 from reseau_drivers.oscilloscope import Oscilloscope
 from reseau_drivers.oscilloscope.visa import scpi_link
 from reseau_drivers.scanner import BkScanner, CompactPulser, Ping360, Ping360Settings
-from reseau_drivers.turntable import AxisPlan, Smc100, Table, Zaber
+from reseau_drivers.turntable import AxisPlan, Kinesis, Smc100, Table, Zaber
 from reseau_sims import serving
 from reseau_sims.serving import (
     FaultScript,
     FaultyConnection,
     InProcess,
+    KinesisController,
     Machine,
     PtyServer,
     Server,
@@ -109,9 +110,10 @@ def _wired(
     return server.address, server
 
 
-def _table_rig(
-    device: Table, machine: ZaberChain | Smc100Line, script: FaultScript, server: Server | None
-) -> Rig:
+SimulatedTable = ZaberChain | Smc100Line | KinesisController
+
+
+def _table_rig(device: Table, machine: SimulatedTable, script: FaultScript, server: Server | None) -> Rig:
     def work(run: int) -> None:
         for axis, plan in device.plans.items():
             target = 10.0 + (7 * run + plan.axis) % 60
@@ -143,6 +145,19 @@ def smc100_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     machine = Smc100Line(1, low=0.0, high=100.0, speed=800.0)
     address, server = _wired(stack, transport, machine, script)
     device = Table("roll", Smc100(link_to(address), 0.15), {"roll": AxisPlan(1, high=100.0)}, seconds=1.2)
+    device.configure(speed=800.0)
+    return _table_rig(device, machine, script, server)
+
+
+def kinesis_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
+    """A cube on its own port; a rack with two bays in process."""
+    rack = transport == "in process"
+    machine = KinesisController(2 if rack else 0)
+    address, server = _wired(stack, transport, machine, script)
+    plans = {"tilt": AxisPlan(1, per_unit=1919.64, high=100.0, backlash=0.5)}
+    if rack:
+        plans["roll"] = AxisPlan(2, per_unit=1000.0, high=100.0)
+    device = Table("table", Kinesis([link_to(address)], rack=rack, answer_s=0.15), plans, seconds=1.2)
     device.configure(speed=800.0)
     return _table_rig(device, machine, script, server)
 
@@ -352,6 +367,7 @@ Maker = Callable[[ExitStack, str, FaultScript], Rig]
 RIGS: dict[tuple[str, str], Maker] = {
     **{("zaber", transport): zaber_rig for transport in TRANSPORTS},
     **{("smc100", transport): smc100_rig for transport in TRANSPORTS},
+    **{("kinesis", transport): kinesis_rig for transport in TRANSPORTS},
     **{("ping360", transport): ping360_rig for transport in (*TRANSPORTS, "udp")},
     **{("bk", transport): bk_rig for transport in ("tcp", "in process")},
     **{("compactpulser", transport): pulser_rig for transport in TRANSPORTS},

@@ -5,12 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from reseau.core.errors import SettingError
+
 from ..link import Link, link_to
+from .kinesis import Kinesis, MotorKind
 from .smc100 import Smc100
 from .table import Axis, AxisPlan, Table, TableSettings
 from .zaber import Zaber
 
-__all__ = ["Axis", "AxisPlan", "Smc100", "Table", "TableSettings", "Zaber", "smc100", "zaber"]
+__all__ = [
+    "Axis",
+    "AxisPlan",
+    "Kinesis",
+    "Smc100",
+    "Table",
+    "TableSettings",
+    "Zaber",
+    "kinesis",
+    "smc100",
+    "zaber",
+]
 
 
 def zaber(
@@ -76,3 +90,44 @@ def smc100(
         TableSettings().changed(settings or {}),
         **options,
     )
+
+
+def kinesis(
+    name: str,
+    address: str | Link,
+    *,
+    axes: Mapping[str, Mapping[str, Any]],
+    motor: MotorKind = "dc",
+    rack: bool = False,
+    settings: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Table:
+    """Create the driver of a table with Kinesis controllers of Thorlabs; entry point ``kinesis``.
+
+    Parameters
+    ----------
+    name, axes, settings, **options
+        As for :func:`zaber`; `per_unit` of an axis is the number of its encoder counts, or of its microsteps,
+        per unit: 1919.64 per degree for a PRM1-Z8, 136533.33 for a K10CR1.
+    address : str or Link
+        Serial devices of the controllers, separated by commas; `device` of an axis counts them from 1.
+    motor : {"dc", "brushless", "stepper"}
+        Kind of the motors.
+    rack : bool
+        Whether the address is that of a rack; `device` of an axis is then its bay.
+
+    Examples
+    --------
+    >>> axes = {"tilt": {"per_unit": 1919.64, "low": -10.0}, "roll": {"device": 2, "per_unit": 1919.64}}
+    >>> table = kinesis("table", "/dev/ttyUSB0, /dev/ttyUSB1", axes=axes)
+    >>> table.axes["roll"].limits
+    (0.0, 360.0)
+    """
+    links = [link_to(each.strip()) for each in address.split(",")] if isinstance(address, str) else [address]
+    plans = AxisPlan.read(axes)
+    for axis, plan in plans.items():
+        if not rack and not 1 <= plan.device <= len(links):
+            do = "give the addresses of all controllers, separated by commas"
+            raise SettingError(f"device {plan.device} has no address", where=f"axis {axis}", do=do)
+    controller = Kinesis(links, motor, rack=rack)
+    return Table(name, controller, plans, TableSettings().changed(settings or {}), **options)

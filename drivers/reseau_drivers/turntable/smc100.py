@@ -38,6 +38,8 @@ class Smc100:
     >>> controller = Smc100(link_to("/dev/ttyUSB0", baud=57600, xonxoff=True))
     """
 
+    checked = False
+
     def __init__(self, link: Link, answer_s: float = 1.0) -> None:
         self._answer_s = answer_s
         self._link: MessageLink[bytes] = MessageLink(link, LineDecoder(limit=LIMIT))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol, Self
 
 from reseau.core.errors import DeadlineError, ProtocolError, SettingError, StateError
@@ -26,6 +26,8 @@ __all__ = ["Axis", "AxisPlan", "Controller", "Table", "TableSettings"]
 _POLL_S, _HALT_S = 0.02, 1.0
 _ATTEMPTS = 3
 """Number of queries during a movement when answers are invalid: one bad answer must not end the wait."""
+_CONFIRMATIONS = 4
+"""Number of further queries until two states in succession agree, of controllers without checksums."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,8 @@ class AxisPlan:
         Backlash of the gear; every position is approached from below by this distance. 0 moves directly.
     tolerance : float
         Largest accepted distance from the target after a move.
+    name : str
+        Name of the axis; its table sets it.
 
     Raises
     ------
@@ -69,6 +73,7 @@ class AxisPlan:
     high: float = 360.0
     backlash: float = 0.0
     tolerance: float = 0.01
+    name: str = ""
 
     def __post_init__(self) -> None:
         if not (self.per_unit > 0 and self.low < self.high and self.backlash >= 0 and self.tolerance > 0):
@@ -85,7 +90,7 @@ class AxisPlan:
         SettingError
             If a plan has an unknown field, or there is no plan.
         """
-        known = {each.name for each in fields(cls)}
+        known = {each.name for each in fields(cls)} - {"name"}
         for name, plan in axes.items():
             if unknown := set(plan) - known:
                 raise SettingError(f"has unknown fields: {', '.join(sorted(unknown))}", where=f"axis {name}")
@@ -112,6 +117,10 @@ class AxisPlan:
 
 class Controller(Protocol):
     """Motion controller; positions are in the unit of the :class:`AxisPlan`."""
+
+    @property
+    def checked(self) -> bool:
+        """Whether answers carry a checksum; otherwise a state at rest counts once a second one agrees."""
 
     def open(self, deadline: Deadline) -> None:
         """Open the connection."""
@@ -279,7 +288,8 @@ class Table(Device[TableSettings]):
         limits: Limits | None = None,
     ) -> None:
         super().__init__(name, settings or TableSettings(), seconds=seconds, limits=limits)
-        self._controller, self.plans = controller, dict(plans)
+        self._controller = controller
+        self.plans = {key: replace(plan, name=key) for key, plan in plans.items()}
         self.axes: dict[str, Axis] = {key: Axis(self, key) for key in plans}
 
     def _open(self, deadline: Deadline) -> None:
@@ -332,7 +342,23 @@ class Table(Device[TableSettings]):
         """
         plan = self._plan(axis)
         with self._exchange(f"state of {axis}", seconds) as deadline:
-            return self._controller.state(plan, deadline)
+            return self._confirmed(plan, deadline)
+
+    def _confirmed(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
+        """The state of an axis; without checksums, one answer at rest is not believed: a bit may have turned."""
+        state = self._controller.state(plan, deadline)
+        if self._controller.checked or state.moving or state.faults:
+            return state
+        for _ in range(_CONFIRMATIONS):
+            before, state = state, self._controller.state(plan, deadline)
+            if state.moving or state.faults:
+                return state
+            near = abs(state.position - before.position) <= plan.tolerance
+            if state.homed == before.homed and (near or not state.homed):
+                return state
+        raise ProtocolError(
+            f"reports positions of {plan.name} that contradict each other", do="check the cable"
+        )
 
     def home(self, axis: str, seconds: float | None = None) -> AxisState:
         """Find the reference of an axis; required before any movement.

@@ -37,6 +37,8 @@ class Zaber:
     >>> controller = Zaber(link_to("tcp://192.0.2.8:55550"))
     """
 
+    checked = True
+
     def __init__(self, link: Link, answer_s: float = 1.0) -> None:
         self._answer_s = answer_s
         self._link: MessageLink[Message] = MessageLink(link, MessageDecoder())

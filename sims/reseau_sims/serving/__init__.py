@@ -14,6 +14,7 @@ from .faults import DEVICE_KINDS, KINDS, LINE_KINDS, Fault, FaultScript, Kind
 from .gige import GigeCamera, aravis_is_installed
 from .gigevision import GigeVisionCamera, loopback_addresses
 from .imaging import LaboratoryScene, LampScene, Scene, SimulatedCamera, StillScene, StripeScene, View
+from .kinesis import KinesisController
 from .machine import FaultyConnection, Machine, Session
 from .motion import Motor
 from .oscilloscope import FAMILIES, Family, Oscilloscope
@@ -41,6 +42,7 @@ __all__ = [
     "HislipInstrument",
     "InProcess",
     "Kind",
+    "KinesisController",
     "LaboratoryScene",
     "LampScene",
     "Machine",

@@ -80,6 +80,13 @@ class Motor:
         position = self.position
         return position != self._target
 
+    @property
+    def arrival(self) -> float | None:
+        """When the movement ends, on the motor's clock; None if there is none."""
+        if not self.moving:
+            return None
+        return self._began + abs(self._target - self._start) / self.speed
+
     def go(self, target: float) -> None:
         """Start a movement."""
         self._start, self._target, self._began = self.position, target, self.clock()

@@ -446,6 +446,8 @@ class InProcess:
     def pending(self) -> bool:
         """Whether bytes are due."""
         connection = self._opened()
+        if (due := connection.emission) is not None and due <= time.monotonic():
+            connection.put(connection.session.emit())  # type: ignore[attr-defined]
         if not connection.mature():
             self.close()
             raise ConnectionLost("the simulator closed the connection")
@@ -454,7 +456,10 @@ class InProcess:
     def read(self, deadline: Deadline) -> bytes:
         """Return the bytes that are due before the deadline."""
         while not self.pending():
-            due = self._opened().next_due
+            connection = self._opened()
+            due = min(
+                (at for at in (connection.next_due, connection.emission) if at is not None), default=None
+            )
             if due is None or due - time.monotonic() > deadline.left:
                 time.sleep(deadline.left)
                 return b""

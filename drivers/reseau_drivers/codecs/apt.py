@@ -1,0 +1,377 @@
+r"""Thorlabs' APT protocol, which the Kinesis controllers speak: messages of six bytes, with data after some.
+
+Source: Thorlabs, *APT Controllers: Host-Controller Communications Protocol*, "Message structure" and the
+sections on the messages named here. A header is ``<id u16> <parameter> <parameter> <destination> <source>``;
+if data follow, it has their length (u16) in place of the parameters, and the top bit of the destination is
+set. There is no checksum and no mark at the start of a message: a header counts if its id, its length and
+both addresses are possible.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+
+from reseau.core.errors import ProtocolError, SettingError
+
+from .stream import Damaged, excerpt
+
+__all__ = [
+    "HOST",
+    "USB",
+    "Bits",
+    "Id",
+    "Info",
+    "Message",
+    "MessageDecoder",
+    "Velocities",
+    "bay",
+    "decode_info",
+    "decode_status",
+    "decode_velocities",
+    "encode",
+    "encode_info",
+    "encode_move",
+    "encode_status",
+    "encode_velocities",
+]
+
+HOST, USB = 0x01, 0x50
+"""Addresses: the computer, and a controller with one USB connection of its own."""
+_ADDRESSES = frozenset({0x00, HOST, 0x11, *range(0x21, 0x2B), USB})
+_LONG = 0x80
+_HEADER = 6
+
+
+class Id(IntEnum):
+    """Messages."""
+
+    DISCONNECT = 0x0002
+    REQUEST_INFO = 0x0005
+    INFO = 0x0006
+    START_UPDATES = 0x0011
+    STOP_UPDATES = 0x0012
+    NO_FLASH = 0x0018
+    SET_ENABLED = 0x0210
+    REQUEST_ENABLED = 0x0211
+    ENABLED = 0x0212
+    IDENTIFY = 0x0223
+    SET_VELOCITIES = 0x0413
+    REQUEST_VELOCITIES = 0x0414
+    VELOCITIES = 0x0415
+    REQUEST_STATUS_BITS = 0x0429
+    STATUS_BITS = 0x042A
+    REQUEST_HOMING = 0x0441
+    REQUEST_GENERAL = 0x043B
+    REQUEST_JOG = 0x0417
+    HOME = 0x0443
+    HOMED = 0x0444
+    MOVE_RELATIVE = 0x0448
+    MOVE_ABSOLUTE = 0x0453
+    MOVED = 0x0464
+    STOP = 0x0465
+    STOPPED = 0x0466
+    REQUEST_STATUS = 0x0480
+    STATUS = 0x0481
+    REQUEST_DC_STATUS = 0x0490
+    DC_STATUS = 0x0491
+    ACKNOWLEDGE = 0x0492
+
+
+_SIZES: dict[int, tuple[int, ...]] = {each: (0,) for each in Id} | {
+    Id.INFO: (84,),
+    Id.SET_VELOCITIES: (14,),
+    Id.VELOCITIES: (14,),
+    Id.STATUS_BITS: (6,),
+    Id.MOVE_RELATIVE: (0, 6),
+    Id.MOVE_ABSOLUTE: (0, 6),
+    Id.MOVED: (0, 14),
+    Id.STOPPED: (0, 14),
+    Id.STATUS: (14,),
+    Id.DC_STATUS: (14,),
+}
+"""Possible lengths of the data of each message; 0: the header alone."""
+
+
+class Bits(IntFlag):
+    """Status bits of an axis, as far as they are used here."""
+
+    LIMIT_FORWARD = 0x1
+    LIMIT_REVERSE = 0x2
+    MOVING_FORWARD = 0x10
+    MOVING_REVERSE = 0x20
+    JOGGING_FORWARD = 0x40
+    JOGGING_REVERSE = 0x80
+    CONNECTED = 0x100
+    HOMING = 0x200
+    HOMED = 0x400
+    SETTLED = 0x2000
+    POSITION_ERROR = 0x4000
+    OVERCURRENT = 0x1000000
+    ENABLED = 0x80000000
+
+    @property
+    def moving(self) -> bool:
+        """Whether the axis moves."""
+        return bool(self & _MOVING)
+
+
+_MOVING = (
+    Bits.MOVING_FORWARD | Bits.MOVING_REVERSE | Bits.JOGGING_FORWARD | Bits.JOGGING_REVERSE | Bits.HOMING
+)
+
+
+def bay(number: int) -> int:
+    """Return the address of a bay of a rack, from 1.
+
+    Raises
+    ------
+    SettingError
+        If there is no such bay.
+
+    Examples
+    --------
+    >>> hex(bay(1))
+    '0x21'
+    """
+    if not 1 <= number <= 10:
+        raise SettingError(f"{number} is not 1…10", where="bay")
+    return 0x20 + number
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message.
+
+    Parameters
+    ----------
+    id : int
+        One of :class:`Id`.
+    destination, source : int
+        Addresses.
+    parameters : (int, int)
+        Parameters of a message without data: often the channel first.
+    data : bytes
+        Data of a message that has some.
+    """
+
+    id: int
+    destination: int
+    source: int
+    parameters: tuple[int, int] = (0, 0)
+    data: bytes = b""
+
+    @property
+    def channel(self) -> int:
+        """Channel that the message is about: of its data, or of its parameters."""
+        return struct.unpack_from("<H", self.data)[0] if len(self.data) >= 2 else self.parameters[0]
+
+
+def encode(message: Message) -> bytes:
+    r"""Encode a message.
+
+    Raises
+    ------
+    SettingError
+        If it cannot be sent.
+
+    Examples
+    --------
+    >>> encode(Message(Id.HOME, USB, HOST, (1, 0))).hex(" ")
+    '43 04 01 00 50 01'
+    """
+    possible = len(message.data) in _SIZES.get(message.id, ()) and not (
+        message.data and any(message.parameters)
+    )
+    if not possible or not {message.destination, message.source} <= _ADDRESSES:
+        raise SettingError("is not a message of the APT protocol", where=repr(message))
+    if message.data:
+        head = (message.id, len(message.data), message.destination | _LONG, message.source)
+        return struct.pack("<HHBB", *head) + message.data
+    return struct.pack("<HBBBB", message.id, *message.parameters, message.destination, message.source)
+
+
+def encode_move(destination: int, channel: int, position: int, *, id_: Id = Id.MOVE_ABSOLUTE) -> bytes:
+    """Encode an order to move to a position, or by a distance (counts).
+
+    Raises
+    ------
+    SettingError
+        If it has more than 32 bits.
+
+    Examples
+    --------
+    >>> encode_move(USB, 1, 200_000).hex(" ")
+    '53 04 06 00 d0 01 01 00 40 0d 03 00'
+    """
+    if not -(1 << 31) <= position < 1 << 31:
+        raise SettingError(f"{position} counts do not fit into 32 bits", where="position")
+    return encode(Message(id_, destination, HOST, data=struct.pack("<Hi", channel, position)))
+
+
+@dataclass(frozen=True)
+class Velocities:
+    """Parameters of the velocity of a channel, in the controller's units."""
+
+    channel: int
+    acceleration: int
+    maximum: int
+    minimum: int = 0
+
+
+def encode_velocities(velocities: Velocities) -> bytes:
+    """Encode the data of SET_VELOCITIES and VELOCITIES.
+
+    Raises
+    ------
+    SettingError
+        If a value has more than 32 bits.
+
+    Examples
+    --------
+    >>> encode_velocities(Velocities(1, 10, 1000)).hex(" ")
+    '01 00 00 00 00 00 0a 00 00 00 e8 03 00 00'
+    """
+    v = velocities
+    try:
+        return struct.pack("<H3i", v.channel, v.minimum, v.acceleration, v.maximum)
+    except struct.error:
+        raise SettingError("do not fit into 32 bits", where=repr(v)) from None
+
+
+def decode_velocities(message: Message) -> Velocities:
+    """Decode the data of SET_VELOCITIES and VELOCITIES."""
+    channel, minimum, acceleration, maximum = struct.unpack("<H3i", message.data)
+    return Velocities(channel, acceleration, maximum, minimum)
+
+
+def encode_status(channel: int, position: int, bits: int, *, more: bytes = bytes(4)) -> bytes:
+    """Encode the data of STATUS (`more`: encoder count) and DC_STATUS (`more`: velocity and current)."""
+    return struct.pack("<Hi4sI", channel, position, more, bits)
+
+
+def decode_status(message: Message) -> tuple[int, Bits]:
+    """Decode position (counts) and bits of STATUS, DC_STATUS, and MOVED or STOPPED with data.
+
+    Examples
+    --------
+    >>> data = encode_status(1, -5, Bits.HOMED | Bits.ENABLED)
+    >>> position, bits = decode_status(Message(Id.DC_STATUS, HOST, USB, data=data))
+    >>> position, bits.moving, Bits.HOMED in bits
+    (-5, False, True)
+    """
+    _, position, _, bits = struct.unpack("<Hi4sI", message.data)
+    return position, Bits(bits)
+
+
+@dataclass(frozen=True)
+class Info:
+    """What a controller says about itself.
+
+    Parameters
+    ----------
+    serial : int
+        Serial number.
+    model : str
+        Up to eight characters.
+    firmware : (int, int, int)
+        Major, interim and minor version.
+    channels : int
+        Number of channels.
+    """
+
+    serial: int
+    model: str
+    firmware: tuple[int, int, int]
+    channels: int = 1
+
+
+_INFO = struct.Struct("<I8sH3Bx60sHHH")
+
+
+def encode_info(info: Info) -> bytes:
+    """Encode the data of INFO."""
+    model = info.model.encode("ascii")[:8]
+    return _INFO.pack(info.serial, model, 16, *reversed(info.firmware), b"", 1, 0, info.channels)
+
+
+def decode_info(message: Message) -> Info:
+    """Decode the data of INFO.
+
+    Raises
+    ------
+    ProtocolError
+        If the model is no text.
+
+    Examples
+    --------
+    >>> data = encode_info(Info(27001234, "KDC101", (2, 1, 3)))
+    >>> decode_info(Message(Id.INFO, HOST, USB, data=data))
+    Info(serial=27001234, model='KDC101', firmware=(2, 1, 3), channels=1)
+    """
+    serial, model, _, minor, interim, major, _, _, _, channels = _INFO.unpack(message.data)
+    name = model.partition(b"\0")[0]
+    if not name.isascii() or not name.decode("ascii", "replace").isprintable():
+        raise ProtocolError(f"not a model of a controller: {excerpt(name)}")
+    return Info(serial, name.decode(), (major, interim, minor), channels)
+
+
+class MessageDecoder:
+    r"""Decode messages from a stream.
+
+    Examples
+    --------
+    >>> decoder = MessageDecoder()
+    >>> decoder.feed(b"\x44\x04\x01")
+    []
+    >>> decoder.feed(b"\x00\x01\x50")
+    [Message(id=1092, destination=1, source=80, parameters=(1, 0), data=b'')]
+    >>> decoder.feed(b"\xff\xff" + bytes.fromhex("660401000150"))[0].why
+    'not a header of the APT protocol'
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard an incomplete message."""
+        self._held = bytearray()
+
+    def feed(self, data: bytes) -> list[Message | Damaged]:
+        """Return the messages that these bytes complete."""
+        found: list[Message | Damaged] = []
+        self._held += data
+        skipped = bytearray()
+        while len(self._held) >= _HEADER:
+            size = _size(bytes(self._held[:_HEADER]))
+            if size is None:
+                skipped.append(self._held.pop(0))
+                continue
+            if skipped:
+                found.append(Damaged(bytes(skipped), "not a header of the APT protocol"))
+                skipped.clear()
+            if len(self._held) < _HEADER + size:
+                break
+            found.append(_message(bytes(self._held[: _HEADER + size])))
+            del self._held[: _HEADER + size]
+        if skipped:
+            found.append(Damaged(bytes(skipped), "not a header of the APT protocol"))
+        return found
+
+
+def _size(header: bytes) -> int | None:
+    """Length of the data after a header; None if it is none."""
+    id_, length, destination, source = struct.unpack("<HHBB", header)
+    size = length if destination & _LONG else 0
+    if {destination & ~_LONG, source} <= _ADDRESSES and size in _SIZES.get(id_, ()):
+        # A long message has data.
+        return size if bool(size) == bool(destination & _LONG) else None
+    return None
+
+
+def _message(data: bytes) -> Message:
+    id_, first, second, destination, source = struct.unpack("<HBBBB", data[:_HEADER])
+    if destination & _LONG:
+        return Message(id_, destination & ~_LONG, source, data=data[_HEADER:])
+    return Message(id_, destination, source, (first, second))

@@ -1,0 +1,251 @@
+"""Simulated Kinesis controllers of Thorlabs: a cube with its own connection, or a rack with bays.
+
+Source: see :mod:`reseau_drivers.codecs.apt`.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from reseau_drivers.codecs.apt import (
+    HOST,
+    USB,
+    Bits,
+    Id,
+    Info,
+    Message,
+    MessageDecoder,
+    Velocities,
+    bay,
+    decode_velocities,
+    encode,
+    encode_info,
+    encode_status,
+    encode_velocities,
+)
+from reseau_drivers.codecs.stream import Damaged
+
+from .faults import Kind
+from .machine import Machine
+from .motion import Clock, Motor
+
+__all__ = ["KinesisController"]
+
+_VELOCITY = 65536 * 2048 / 6e6
+"""Velocity in the units of a controller of DC motors, for one count per second."""
+_STOP_IMMEDIATE, _STOP_PROFILED = 1, 2
+
+
+@dataclass
+class _Channel:
+    motor: Motor
+    acceleration: int = 263
+    ends: Id | None = None
+    """Message that tells the end of the present movement."""
+
+
+class KinesisController(Machine):
+    r"""Simulated controllers of DC motors behind one connection.
+
+    Parameters
+    ----------
+    bays : int
+        Number of bays of a rack, with a channel each; 0: a cube.
+    low, high : float
+        Positions of the limit switches (counts).
+    clock : callable
+        Returns the time in seconds.
+
+    Examples
+    --------
+    >>> cube = KinesisController()
+    >>> cube.receive(bytes.fromhex("90 04 01 00 50 01"))[0].hex(" ")
+    '91 04 0e 00 81 50 01 00 d2 04 00 00 00 00 00 00 00 01 00 80'
+    """
+
+    def __init__(
+        self,
+        bays: int = 0,
+        *,
+        low: float = -500_000.0,
+        high: float = 800_000.0,
+        clock: Clock = time.monotonic,
+    ) -> None:
+        super().__init__()
+        self._decoder, self._clock = MessageDecoder(), clock
+        self._bays = bays
+        addresses = [bay(number) for number in range(1, bays + 1)] or [USB]
+        self._channels = {at: _Channel(Motor(low, high, 20_000.0, clock)) for at in addresses}
+
+    @property
+    def motors(self) -> dict[int, Motor]:
+        """Motors by bay; 1 is that of a cube."""
+        return {number: channel.motor for number, channel in enumerate(self._channels.values(), 1)}
+
+    def position(self, number: int = 1) -> float:
+        """Return the current position of an axis (counts), independent of queries."""
+        with self.lock:
+            return self.motors[number].position
+
+    def receive(self, data: bytes) -> Sequence[bytes]:
+        """Return the answers to these bytes."""
+        answers: list[bytes] = []
+        for message in self._decoder.feed(data):
+            if isinstance(message, Damaged):
+                self.violations.append(str(message))
+                continue
+            channel = self._channels.get(message.destination)
+            if channel is None:
+                if message.id not in (Id.DISCONNECT, Id.NO_FLASH, Id.STOP_UPDATES):
+                    self.violations.append(
+                        f"{message.id:#06x} to {message.destination:#04x}: nothing is there"
+                    )
+                continue
+            said = self._obey(message, channel)
+            if said is not None:
+                answers.append(encode(said))
+        return answers
+
+    @property
+    def due(self) -> float | None:
+        """When the next movement ends: that is told unasked."""
+        ends = [channel.motor.arrival for channel in self._channels.values() if channel.ends is not None]
+        now = self._clock()
+        return min((now if end is None else end for end in ends), default=None)
+
+    def emit(self) -> Sequence[bytes]:
+        """Return the messages on movements that have ended."""
+        told = []
+        for address, channel in self._channels.items():
+            if channel.ends is not None and not channel.motor.moving:
+                told.append(encode(self._end(address, channel, channel.ends)))
+                channel.ends = None
+        return told
+
+    def disconnected(self) -> None:
+        """Discard an incomplete message."""
+        self._decoder.reset()
+
+    def inject_fault(self, kind: Kind) -> None:
+        """Stuck: a position error; wrong state: motors off; out of range: a limit switch reached."""
+        for channel in self._channels.values():
+            motor, channel.ends = channel.motor, None
+            if kind == "stuck":
+                motor.stall()
+            elif kind == "wrong state":
+                motor.stop()
+                motor.enabled = False
+            elif kind == "out of range":
+                motor.stop()
+                motor.limit = 1
+            elif kind == "power-cycled":
+                motor.cut_power()
+                channel.acceleration = 263
+                motor.speed = 20_000.0
+
+    def _end(self, address: int, channel: _Channel, end: Id) -> Message:
+        if end is Id.HOMED:
+            return Message(end, HOST, address, (1, 0))
+        return Message(end, HOST, address, data=self._status(channel))
+
+    @staticmethod
+    def _bits(channel: _Channel) -> Bits:
+        motor, bits = channel.motor, Bits.CONNECTED
+        before, going = motor.position, motor.target
+        for bit, is_so in (
+            (Bits.LIMIT_FORWARD, motor.limit > 0),
+            (Bits.LIMIT_REVERSE, motor.limit < 0),
+            (Bits.MOVING_FORWARD, motor.moving and going > before),
+            (Bits.MOVING_REVERSE, motor.moving and going < before),
+            (Bits.HOMING, motor.homing),
+            (Bits.HOMED, motor.homed),
+            (Bits.POSITION_ERROR, motor.stalled),
+            (Bits.ENABLED, motor.enabled),
+        ):
+            bits |= bit if is_so else Bits(0)
+        return bits
+
+    def _status(self, channel: _Channel) -> bytes:
+        bits = self._bits(channel)
+        return encode_status(1, round(channel.motor.position), bits)
+
+    def _obey(self, message: Message, channel: _Channel) -> Message | None:
+        address, motor = message.destination, channel.motor
+        if message.source != HOST:
+            self.violations.append(f"{message.id:#06x} came from {message.source:#04x}, not the host")
+        if message.id not in (Id.REQUEST_INFO, Id.DISCONNECT, Id.NO_FLASH, Id.START_UPDATES, Id.STOP_UPDATES):
+            if message.channel != 1:
+                self.violations.append(f"{message.id:#06x} to channel {message.channel}: there is one")
+                return None
+
+        def answer(id_: Id, data: bytes) -> Message:
+            return Message(id_, HOST, address, data=data)
+
+        match message.id:
+            case Id.REQUEST_INFO:
+                return answer(Id.INFO, encode_info(self._info(address)))
+            case Id.REQUEST_STATUS | Id.REQUEST_DC_STATUS:
+                return answer(Id(message.id + 1), self._status(channel))
+            case Id.REQUEST_STATUS_BITS:
+                return answer(Id.STATUS_BITS, struct.pack("<HI", 1, self._bits(channel)))
+            case Id.REQUEST_ENABLED:
+                return Message(Id.ENABLED, HOST, address, (1, 1 if motor.enabled else 2))
+            case Id.REQUEST_VELOCITIES:
+                speed = round(motor.speed * _VELOCITY)
+                return answer(Id.VELOCITIES, encode_velocities(Velocities(1, channel.acceleration, speed)))
+            case Id.SET_VELOCITIES:
+                self._set_velocities(channel, decode_velocities(message))
+            case Id.SET_ENABLED:
+                motor.enabled = message.parameters[1] == 1
+                if not motor.enabled:
+                    motor.stop()
+            case Id.HOME:
+                if motor.enabled:
+                    motor.home()
+                    channel.ends = Id.HOMED
+                else:
+                    self.violations.append("HOME while the motor is off")
+            case Id.MOVE_ABSOLUTE | Id.MOVE_RELATIVE:
+                self._move(message, channel)
+            case Id.STOP:
+                if message.parameters[1] not in (_STOP_IMMEDIATE, _STOP_PROFILED):
+                    self.violations.append(f"STOP with mode {message.parameters[1]}")
+                if motor.moving:
+                    motor.stop()
+                    channel.ends = None
+                    return self._end(address, channel, Id.STOPPED)
+            case _:
+                pass
+        return None
+
+    def _info(self, address: int) -> Info:
+        model = "BSC203" if self._bays else "KDC101"
+        return Info(27_001_234 + address - USB, model, (2, 1, 3))
+
+    def _set_velocities(self, channel: _Channel, wanted: Velocities) -> None:
+        if wanted.maximum <= 0 or wanted.acceleration <= 0:
+            self.violations.append(f"velocities must be positive: {wanted}")
+            return
+        motor, channel.acceleration = channel.motor, wanted.acceleration
+        if motor.moving:
+            homing = motor.homing
+            motor.go(motor.target)
+            motor.homing = homing
+        motor.speed = wanted.maximum / _VELOCITY
+
+    def _move(self, message: Message, channel: _Channel) -> None:
+        motor = channel.motor
+        if not message.data:
+            self.violations.append("a move without a position: the stored one is not simulated")
+            return
+        by = float(struct.unpack("<i", message.data[2:])[0])
+        if not motor.enabled:
+            self.violations.append("a move while the motor is off")
+            return
+        if not motor.homed:
+            self.violations.append("a move without a reference")
+        motor.go(by if message.id == Id.MOVE_ABSOLUTE else motor.position + by)
+        channel.ends = Id.MOVED
