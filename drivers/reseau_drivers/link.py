@@ -55,6 +55,9 @@ class SerialLink:
         Speed (baud), with 8 bits, no parity, one stop bit.
     xonxoff : bool
         Whether to use software flow control.
+    keep_up : bool
+        Whether the line that tells a computer's presence (DTR) stays up after closing: many boards start anew
+        when it comes up.
 
     Examples
     --------
@@ -63,8 +66,8 @@ class SerialLink:
     reseau.core.errors.ConnectionLost: /dev/ttyUSB0 is not open
     """
 
-    def __init__(self, port: str, baud: int, *, xonxoff: bool = False) -> None:
-        self._port, self._baud, self._xonxoff = port, baud, xonxoff
+    def __init__(self, port: str, baud: int, *, xonxoff: bool = False, keep_up: bool = False) -> None:
+        self._port, self._baud, self._xonxoff, self._keep_up = port, baud, xonxoff, keep_up
         self._serial: serial.Serial | None = None
 
     def open(self, deadline: Deadline) -> None:
@@ -79,6 +82,8 @@ class SerialLink:
                 exclusive=True,
                 xonxoff=self._xonxoff,
             )
+            if self._keep_up:
+                _keep_up(self._serial)
             self._serial.reset_input_buffer()
         except (OSError, ValueError) as error:
             self.close()
@@ -132,6 +137,18 @@ class SerialLink:
         if self._serial is None:
             raise ConnectionLost(f"{self._port} is not open")
         return self._serial
+
+
+def _keep_up(port: serial.Serial) -> None:
+    """Keep a terminal from taking DTR down when it is closed; other systems do not offer this."""
+    try:
+        import termios
+    except ImportError:
+        return
+    with suppress(termios.error):
+        flags = termios.tcgetattr(port.fileno())
+        flags[2] &= ~termios.HUPCL
+        termios.tcsetattr(port.fileno(), termios.TCSANOW, flags)
 
 
 class TcpLink:
@@ -305,7 +322,7 @@ def serial_ports() -> tuple[str, ...]:
     return tuple(sorted(port.device for port in list_ports.comports()))
 
 
-def link_to(address: str | Link, *, baud: int = 115200, xonxoff: bool = False) -> Link:
+def link_to(address: str | Link, *, baud: int = 115200, xonxoff: bool = False, keep_up: bool = False) -> Link:
     """Return the link for an address.
 
     Parameters
@@ -314,8 +331,8 @@ def link_to(address: str | Link, *, baud: int = 115200, xonxoff: bool = False) -
         ``tcp://host:port``, ``udp://host:port``, a serial device, or a link (returned as it is).
     baud : int
         Speed of a serial device; the address ``device@baud`` overrides it.
-    xonxoff : bool
-        Software flow control of a serial device.
+    xonxoff, keep_up : bool
+        For a serial device, as for :class:`SerialLink`.
 
     Raises
     ------
@@ -344,7 +361,7 @@ def link_to(address: str | Link, *, baud: int = 115200, xonxoff: bool = False) -
     device, at, speed = address.partition("@")
     if not device or (at and not speed.isdigit()):
         raise UsageError("is not a valid address", where=address, do="write a serial device, or device@baud")
-    return SerialLink(device, int(speed) if at else baud, xonxoff=xonxoff)
+    return SerialLink(device, int(speed) if at else baud, xonxoff=xonxoff, keep_up=keep_up)
 
 
 _NETWORK: dict[str, Callable[[str, int], Link]] = {"tcp": TcpLink, "udp": UdpLink}

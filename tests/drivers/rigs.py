@@ -20,14 +20,16 @@ from reseau_drivers.link import link_to
 from reseau_drivers.oscilloscope import Oscilloscope
 from reseau_drivers.oscilloscope.visa import scpi_link
 from reseau_drivers.scanner import BkScanner, CompactPulser, Ping360, Ping360Settings
-from reseau_drivers.turntable import AxisPlan, Kinesis, Smc100, Table, Zaber
+from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, Marlin, Smc100, Table, Zaber
 from reseau_sims import serving
 from reseau_sims.serving import (
     FaultScript,
     FaultyConnection,
+    GrblController,
     InProcess,
     KinesisController,
     Machine,
+    MarlinController,
     PtyServer,
     Server,
     Smc100Line,
@@ -110,7 +112,7 @@ def _wired(
     return server.address, server
 
 
-SimulatedTable = ZaberChain | Smc100Line | KinesisController
+SimulatedTable = ZaberChain | Smc100Line | KinesisController | GrblController | MarlinController
 
 
 def _table_rig(device: Table, machine: SimulatedTable, script: FaultScript, server: Server | None) -> Rig:
@@ -119,6 +121,8 @@ def _table_rig(device: Table, machine: SimulatedTable, script: FaultScript, serv
             target = 10.0 + (7 * run + plan.axis) % 60
             state = device.move(axis, target, 8.0)
             key: Any = (plan.device, plan.axis) if isinstance(machine, ZaberChain) else plan.device
+            if isinstance(machine, GrblController | MarlinController):
+                key = plan.axis
             assert abs(state.position - target) < 0.01
             assert abs(machine.motors[key].position / plan.per_unit - target) < 0.01
 
@@ -158,6 +162,33 @@ def kinesis_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     if rack:
         plans["roll"] = AxisPlan(2, per_unit=1000.0, high=100.0)
     device = Table("table", Kinesis([link_to(address)], rack=rack, answer_s=0.15), plans, seconds=1.2)
+    device.configure(speed=800.0)
+    return _table_rig(device, machine, script, server)
+
+
+def grbl_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
+    machine = GrblController(2, low=-1.0, high=200.0, speed=1600.0)
+    return _lines_rig(stack, transport, script, machine, Grbl)
+
+
+def marlin_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
+    machine = MarlinController(2, high=200.0, speed=1600.0)
+    return _lines_rig(stack, transport, script, machine, Marlin)
+
+
+def _lines_rig(
+    stack: ExitStack,
+    transport: str,
+    script: FaultScript,
+    machine: GrblController | MarlinController,
+    controller: type[Grbl] | type[Marlin],
+) -> Rig:
+    address, server = _wired(stack, transport, machine, script)
+    plans = {
+        "tilt": AxisPlan(axis=1, per_unit=2.0, high=100.0, backlash=0.5),
+        "z": AxisPlan(axis=2, unit="mm", high=100.0),
+    }
+    device = Table("table", controller(link_to(address, keep_up=True), 0.15), plans, seconds=1.2)
     device.configure(speed=800.0)
     return _table_rig(device, machine, script, server)
 
@@ -368,6 +399,8 @@ RIGS: dict[tuple[str, str], Maker] = {
     **{("zaber", transport): zaber_rig for transport in TRANSPORTS},
     **{("smc100", transport): smc100_rig for transport in TRANSPORTS},
     **{("kinesis", transport): kinesis_rig for transport in TRANSPORTS},
+    **{("grbl", transport): grbl_rig for transport in TRANSPORTS},
+    **{("marlin", transport): marlin_rig for transport in TRANSPORTS},
     **{("ping360", transport): ping360_rig for transport in (*TRANSPORTS, "udp")},
     **{("bk", transport): bk_rig for transport in ("tcp", "in process")},
     **{("compactpulser", transport): pulser_rig for transport in TRANSPORTS},

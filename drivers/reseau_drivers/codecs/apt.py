@@ -79,7 +79,7 @@ class Id(IntEnum):
     ACKNOWLEDGE = 0x0492
 
 
-_SIZES: dict[int, tuple[int, ...]] = {each: (0,) for each in Id} | {
+_SIZES: dict[int, tuple[int, ...]] = dict.fromkeys(Id, (0,)) | {
     Id.INFO: (84,),
     Id.SET_VELOCITIES: (14,),
     Id.VELOCITIES: (14,),
@@ -117,9 +117,8 @@ class Bits(IntFlag):
         return bool(self & _MOVING)
 
 
-_MOVING = (
-    Bits.MOVING_FORWARD | Bits.MOVING_REVERSE | Bits.JOGGING_FORWARD | Bits.JOGGING_REVERSE | Bits.HOMING
-)
+_MOVING = Bits(0x2F0)
+"""Moving and jogging both ways, and homing."""
 
 
 def bay(number: int) -> int:
@@ -181,10 +180,8 @@ def encode(message: Message) -> bytes:
     >>> encode(Message(Id.HOME, USB, HOST, (1, 0))).hex(" ")
     '43 04 01 00 50 01'
     """
-    possible = len(message.data) in _SIZES.get(message.id, ()) and not (
-        message.data and any(message.parameters)
-    )
-    if not possible or not {message.destination, message.source} <= _ADDRESSES:
+    two, ends = message.data and any(message.parameters), {message.destination, message.source}
+    if two or len(message.data) not in _SIZES.get(message.id, ()) or not ends <= _ADDRESSES:
         raise SettingError("is not a message of the APT protocol", where=repr(message))
     if message.data:
         head = (message.id, len(message.data), message.destination | _LONG, message.source)

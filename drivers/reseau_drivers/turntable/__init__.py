@@ -8,7 +8,10 @@ from typing import Any
 from reseau.core.errors import SettingError
 
 from ..link import Link, link_to
+from .gcode import letter_of
+from .grbl import Grbl
 from .kinesis import Kinesis, MotorKind
+from .marlin import Marlin
 from .smc100 import Smc100
 from .table import Axis, AxisPlan, Table, TableSettings
 from .zaber import Zaber
@@ -16,12 +19,16 @@ from .zaber import Zaber
 __all__ = [
     "Axis",
     "AxisPlan",
+    "Grbl",
     "Kinesis",
+    "Marlin",
     "Smc100",
     "Table",
     "TableSettings",
     "Zaber",
+    "grbl",
     "kinesis",
+    "marlin",
     "smc100",
     "zaber",
 ]
@@ -131,3 +138,68 @@ def kinesis(
             raise SettingError(f"device {plan.device} has no address", where=f"axis {axis}", do=do)
     controller = Kinesis(links, motor, rack=rack)
     return Table(name, controller, plans, TableSettings().changed(settings or {}), **options)
+
+
+def grbl(
+    name: str,
+    address: str | Link,
+    *,
+    axes: Mapping[str, Mapping[str, Any]],
+    settings: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Table:
+    """Create the driver of a table with a GRBL controller; entry point ``grbl``.
+
+    Parameters
+    ----------
+    name, address, axes, settings, **options
+        As for :func:`zaber`; `axis` of an axis is 1 for X, 2 for Y and so on, `per_unit` the number of GRBL's
+        units (of ``$100`` and following) per unit, `low` and `high` are machine positions.
+
+    Examples
+    --------
+    >>> table = grbl("table", "/dev/ttyUSB0", axes={"z": {"axis": 3, "unit": "mm", "low": -120, "high": -1}})
+    >>> table.axes["z"].limits
+    (-120, -1)
+    """
+    return _by_lines(Grbl, name, address, axes, settings, options)
+
+
+def marlin(
+    name: str,
+    address: str | Link,
+    *,
+    axes: Mapping[str, Mapping[str, Any]],
+    settings: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Table:
+    """Create the driver of a table with a Marlin controller; entry point ``marlin``.
+
+    Parameters
+    ----------
+    name, address, axes, settings, **options
+        As for :func:`grbl`; `per_unit` is the number of Marlin's units (of M92) per unit. Many boards have
+        the address ``device@250000``.
+
+    Examples
+    --------
+    >>> marlin("table", "/dev/ttyACM0", axes={"roll": {"axis": 4}}).axes["roll"].unit
+    'deg'
+    """
+    return _by_lines(Marlin, name, address, axes, settings, options)
+
+
+def _by_lines(
+    controller: type[Grbl] | type[Marlin],
+    name: str,
+    address: str | Link,
+    axes: Mapping[str, Mapping[str, Any]],
+    settings: Mapping[str, Any] | None,
+    options: Mapping[str, Any],
+) -> Table:
+    """A table whose controller takes lines."""
+    plans = AxisPlan.read(axes)
+    for plan in plans.values():
+        letter_of(plan)
+    made = controller(link_to(address, keep_up=True))
+    return Table(name, made, plans, TableSettings().changed(settings or {}), **options)

@@ -345,7 +345,7 @@ class Table(Device[TableSettings]):
             return self._confirmed(plan, deadline)
 
     def _confirmed(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
-        """The state of an axis; without checksums, one answer at rest is not believed: a bit may have turned."""
+        """The state of an axis; without checksums a second answer confirms one at rest: bits may turn."""
         state = self._controller.state(plan, deadline)
         if self._controller.checked or state.moving or state.faults:
             return state

@@ -13,9 +13,11 @@ from .compactpulser import CompactPulser
 from .faults import DEVICE_KINDS, KINDS, LINE_KINDS, Fault, FaultScript, Kind
 from .gige import GigeCamera, aravis_is_installed
 from .gigevision import GigeVisionCamera, loopback_addresses
+from .grbl import GrblController
 from .imaging import LaboratoryScene, LampScene, Scene, SimulatedCamera, StillScene, StripeScene, View
 from .kinesis import KinesisController
 from .machine import FaultyConnection, Machine, Session
+from .marlin import MarlinController
 from .motion import Motor
 from .oscilloscope import FAMILIES, Family, Oscilloscope
 from .ping360 import Ping360
@@ -39,6 +41,7 @@ __all__ = [
     "FaultyConnection",
     "GigeCamera",
     "GigeVisionCamera",
+    "GrblController",
     "HislipInstrument",
     "InProcess",
     "Kind",
@@ -46,6 +49,7 @@ __all__ = [
     "LaboratoryScene",
     "LampScene",
     "Machine",
+    "MarlinController",
     "Motor",
     "Oscilloscope",
     "Ping360",

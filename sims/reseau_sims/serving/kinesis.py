@@ -37,6 +37,7 @@ __all__ = ["KinesisController"]
 _VELOCITY = 65536 * 2048 / 6e6
 """Velocity in the units of a controller of DC motors, for one count per second."""
 _STOP_IMMEDIATE, _STOP_PROFILED = 1, 2
+_OF_ALL = (Id.DISCONNECT, Id.NO_FLASH, Id.START_UPDATES, Id.STOP_UPDATES)
 
 
 @dataclass
@@ -99,7 +100,7 @@ class KinesisController(Machine):
                 continue
             channel = self._channels.get(message.destination)
             if channel is None:
-                if message.id not in (Id.DISCONNECT, Id.NO_FLASH, Id.STOP_UPDATES):
+                if message.id not in _OF_ALL:
                     self.violations.append(
                         f"{message.id:#06x} to {message.destination:#04x}: nothing is there"
                     )
@@ -176,10 +177,9 @@ class KinesisController(Machine):
         address, motor = message.destination, channel.motor
         if message.source != HOST:
             self.violations.append(f"{message.id:#06x} came from {message.source:#04x}, not the host")
-        if message.id not in (Id.REQUEST_INFO, Id.DISCONNECT, Id.NO_FLASH, Id.START_UPDATES, Id.STOP_UPDATES):
-            if message.channel != 1:
-                self.violations.append(f"{message.id:#06x} to channel {message.channel}: there is one")
-                return None
+        if message.id not in (Id.REQUEST_INFO, *_OF_ALL) and message.channel != 1:
+            self.violations.append(f"{message.id:#06x} to channel {message.channel}: there is one")
+            return None
 
         def answer(id_: Id, data: bytes) -> Message:
             return Message(id_, HOST, address, data=data)
