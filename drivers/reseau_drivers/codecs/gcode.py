@@ -77,7 +77,7 @@ ALARMS: dict[int, str] = {
 """Codes of ``ALARM:``."""
 
 _WORD = re.compile(r"([A-Z])\s*([-+]?\d*\.?\d+|[-+]?\d+\.)")
-_NUMBERED = re.compile(rb"\s*N(\d+)\s*(.*?)\s*\*(\d{1,3})\s*")
+_NUMBERED = re.compile(rb"\s*N(-?\d+)\s*(.*?)\s*\*(\d{1,3})\s*")
 _REPORT = re.compile(r"<([A-Z][a-z]+)(?::(\d+))?((?:\|[^|<>]+)*)>")
 
 

@@ -241,11 +241,12 @@ class KinesisController(Machine):
         if not message.data:
             self.violations.append("a move without a position: the stored one is not simulated")
             return
-        by = float(struct.unpack("<i", message.data[2:])[0])
+        target = float(struct.unpack("<i", message.data[2:])[0])
         if not motor.enabled:
             self.violations.append("a move while the motor is off")
             return
+        here = motor.position  # brings the motor up to date
         if not motor.homed:
             self.violations.append("a move without a reference")
-        motor.go(by if message.id == Id.MOVE_ABSOLUTE else motor.position + by)
+        motor.go(target if message.id == Id.MOVE_ABSOLUTE else here + target)
         channel.ends = Id.MOVED

@@ -198,7 +198,7 @@ class MarlinController(Machine):
         except ProtocolError as error:
             self.violations.append(error.what)
             return [self._again("checksum mismatch")]
-        if text.startswith("M110") and (found := re.search(r"N(\d+)", text[4:])):
+        if text.startswith("M110") and (found := re.search(r"N(-?\d+)", text[4:])):
             self._number = int(found[1])
             return [b"ok\n"]
         if number is not None:
