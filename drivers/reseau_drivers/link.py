@@ -107,7 +107,7 @@ class SerialLink:
         """Send all bytes."""
         port = self._opened()
         try:
-            port.write_timeout = max(0.01, deadline.left)
+            port.write_timeout = max(0.1, deadline.left)
             port.write(data)
         except serial.SerialTimeoutException:
             raise DeadlineError("took no bytes in the time allowed") from None
@@ -446,6 +446,7 @@ class MessageLink(Generic[M]):
     def receive(self, is_answer: Callable[[M], bool], deadline: Deadline) -> M:
         """Wait for a message; raises as :meth:`query`."""
         damaged: Damaged | None = None
+        read = False
         while True:
             while self._received:
                 message = self._received.popleft()
@@ -454,7 +455,8 @@ class MessageLink(Generic[M]):
                 elif is_answer(message):
                     return message
                 self._ignore(message)
-            if deadline.expired:
+            # What has arrived is read, also where a busy machine held this process up until the deadline.
+            if read and deadline.expired:
                 if damaged is not None:
                     raise ProtocolError(f"the answer was damaged ({damaged})", do="check cable and baud rate")
                 raise DeadlineError(
@@ -462,6 +464,7 @@ class MessageLink(Generic[M]):
                     do="check power, and whether another program uses it",
                 )
             self._received += self._decoder.feed(self._link.read(deadline))
+            read = True
 
     def _ignore(self, message: M | Damaged) -> None:
         self.ignored += 1

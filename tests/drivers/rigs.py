@@ -16,11 +16,17 @@ import pytest
 from reseau.instruments import Device
 from reseau_drivers.camera import CameraDriver, aravis, v4l2
 from reseau_drivers.camera import rig as camera_rig
+from reseau_drivers.environment import (
+    EnvironmentSensor,
+    environment_line,
+    environment_modbus,
+    environment_scpi,
+)
 from reseau_drivers.link import link_to
 from reseau_drivers.oscilloscope import Oscilloscope
-from reseau_drivers.oscilloscope.visa import scpi_link
 from reseau_drivers.scanner import BkScanner, CompactPulser, Ping360, Ping360Settings
 from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, Marlin, Smc100, Table, Zaber
+from reseau_drivers.visa import scpi_link
 from reseau_sims import serving
 from reseau_sims.serving import (
     FaultScript,
@@ -28,9 +34,12 @@ from reseau_sims.serving import (
     GrblController,
     InProcess,
     KinesisController,
+    LineSensor,
     Machine,
     MarlinController,
+    ModbusSensor,
     PtyServer,
+    ScpiSensor,
     Server,
     Smc100Line,
     TcpServer,
@@ -270,6 +279,73 @@ def pulser_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     return Rig(device, machine, script, work, device.stop, server)
 
 
+_AIR = {"temperature": 20.0, "humidity": 50.0, "pressure": 1000.0}
+_SENSED: dict[str, dict[str, Any]] = {name: {} for name in _AIR}
+
+
+def environment_scpi_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
+    machine = ScpiSensor(lambda: _AIR)
+    asked = {name: {"query": query} for query, name in ScpiSensor.QUERIES.items()}
+    if transport == "vxi-11":
+        session = partial(serving.Vxi11Session, machine, machine.execute, script)
+        server: Server | None = stack.enter_context(TcpServer(session))
+        assert isinstance(server, TcpServer)
+        address: Any = f"TCPIP::127.0.0.1,{server.port}::inst0::INSTR"
+    else:
+        address, server = _wired(stack, transport, machine, script)
+    device = environment_scpi("air", address, quantities=asked, answer_s=0.15, seconds=1.2)
+    return _sensor_rig(device, machine, script, server)
+
+
+def environment_modbus_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
+    """RTU on a line, in process with two requests; frames of TCP on TCP."""
+    machine = ModbusSensor(lambda: _AIR, unit=7, tcp=transport == "tcp")
+    address, server = _wired(stack, transport, machine, script)
+    far = {"register": 102, "function": 3} if transport == "in process" else {"register": 2}
+    registers: dict[str, dict[str, Any]] = {
+        "temperature": {"register": 0, "scale": 0.1},
+        "humidity": {"register": 1, "scale": 0.1},
+        "pressure": {"format": "float32", **far},
+    }
+    device = environment_modbus("air", address, quantities=registers, unit=7, answer_s=0.15, seconds=1.2)
+    return _sensor_rig(device, machine, script, server)
+
+
+def environment_line_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
+    """Lines that come by themselves on a line; asked for on TCP, and in process with a checksum."""
+    asked, checked = transport != "pty", transport != "tcp"
+    machine = LineSensor(lambda: _AIR, every_s=0.0 if asked else 0.05, checksum=checked)
+    address, server = _wired(stack, transport, machine, script)
+    device = environment_line(
+        "air", address, pattern=LineSensor.PATTERN, quantities=_SENSED, query="?\n" if asked else "",
+        checksum="xor" if checked else "none", answer_s=0.15, seconds=1.2,
+    )  # fmt: skip
+    return _sensor_rig(device, machine, script, server)
+
+
+def _sensor_rig(
+    device: EnvironmentSensor,
+    machine: ScpiSensor | ModbusSensor | LineSensor,
+    script: FaultScript,
+    server: Server | None,
+) -> Rig:
+    def work(run: int) -> None:
+        # Each quantity changes from run to run, by more than what is believed without a checksum.
+        temperature, humidity = 20.0 + 2.5 * (run % 8), 30.0 + 5.0 * (run % 9)
+        now = {"temperature": temperature, "humidity": humidity, "pressure": 900.0 + 20.0 * (run % 7)}
+        machine.conditions = lambda: now
+        if machine.due is not None:
+            device.environment()  # its line may be under way from before
+        # Five answers: a reading takes one of these, of SCPI at least six.
+        for _ in range(1 if isinstance(machine, ScpiSensor) else 5):
+            found = device.environment().conditions
+            for name, value in now.items():
+                # What has no checksum is believed if it comes twice: as exactly as it is asked to agree.
+                assert abs(found[name].value - value) <= device.quantities[name].least, (name, found)
+
+    return Rig(device, machine, script, work, device.environment, server)
+
+
 def v4l2_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     body = SimulatedCamera(script=script)
     camera = VideoCamera(body, first=(1 << 32) - 20)
@@ -404,6 +480,9 @@ RIGS: dict[tuple[str, str], Maker] = {
     **{("ping360", transport): ping360_rig for transport in (*TRANSPORTS, "udp")},
     **{("bk", transport): bk_rig for transport in ("tcp", "in process")},
     **{("compactpulser", transport): pulser_rig for transport in TRANSPORTS},
+    **{("environment_scpi", transport): environment_scpi_rig for transport in (*TRANSPORTS, "vxi-11")},
+    **{("environment_modbus", transport): environment_modbus_rig for transport in TRANSPORTS},
+    **{("environment_line", transport): environment_line_rig for transport in TRANSPORTS},
     **{
         ("oscilloscope", transport): scope_rig
         for transport in ("tcp", "vxi-11", "hislip", "usbtmc", "in process")

@@ -25,7 +25,7 @@ def test_the_driver_of_an_absent_usb_instrument_says_so() -> None:
     code = """
 from reseau.core.errors import ConnectionLost
 from reseau.instruments import Deadline
-from reseau_drivers.oscilloscope.visa import VisaLink
+from reseau_drivers.visa import VisaLink
 try:
     VisaLink("USB0::4617::1::NONE::0::INSTR").open(Deadline(5.0))
 except ConnectionLost as error:

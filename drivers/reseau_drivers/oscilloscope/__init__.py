@@ -7,9 +7,9 @@ from typing import Any
 from reseau.core.errors import SettingError
 
 from ..link import Link
+from ..visa import scpi_link
 from .dialects import DIALECTS, Dialect, dialect_of
 from .scope import Oscilloscope, OscilloscopeSettings
-from .visa import scpi_link
 
 __all__ = [
     "DIALECTS",

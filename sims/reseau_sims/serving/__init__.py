@@ -10,6 +10,7 @@ only.
 from .bench import SimulatedBench
 from .bk import BkScanner
 from .compactpulser import CompactPulser
+from .environment import Air, LineSensor, ModbusSensor, ScpiSensor
 from .faults import DEVICE_KINDS, KINDS, LINE_KINDS, Fault, FaultScript, Kind
 from .gige import GigeCamera, aravis_is_installed
 from .gigevision import GigeVisionCamera, loopback_addresses
@@ -33,6 +34,7 @@ __all__ = [
     "FAMILIES",
     "KINDS",
     "LINE_KINDS",
+    "Air",
     "BkScanner",
     "CompactPulser",
     "Family",
@@ -48,14 +50,17 @@ __all__ = [
     "KinesisController",
     "LaboratoryScene",
     "LampScene",
+    "LineSensor",
     "Machine",
     "MarlinController",
+    "ModbusSensor",
     "Motor",
     "Oscilloscope",
     "Ping360",
     "PortmapperSession",
     "PtyServer",
     "Scene",
+    "ScpiSensor",
     "Server",
     "Session",
     "SimulatedBench",

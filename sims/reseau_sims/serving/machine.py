@@ -93,16 +93,20 @@ class FaultyConnection:
 
     def receive(self, data: bytes) -> list[Output]:
         """Return the outputs in answer to these bytes."""
-        sent: list[Output] = []
         with self.machine.lock:
-            for answer in self.machine.receive(data):
-                fault = self.script.draw()
-                if fault is None:
-                    sent.append((0.0, answer))
-                    continue
-                if fault.kind in DEVICE_KINDS:
-                    self.machine.inject_fault(fault.kind)
-                sent += self.script.spoil(answer, fault)
+            return self._sent(self.machine.receive(data))
+
+    def _sent(self, answers: Sequence[bytes]) -> list[Output]:
+        """The outputs for some answers, with their faults."""
+        sent: list[Output] = []
+        for answer in answers:
+            fault = self.script.draw()
+            if fault is None:
+                sent.append((0.0, answer))
+                continue
+            if fault.kind in DEVICE_KINDS:
+                self.machine.inject_fault(fault.kind)
+            sent += self.script.spoil(answer, fault)
         return sent
 
     @property
@@ -113,7 +117,7 @@ class FaultyConnection:
     def emit(self) -> list[Output]:
         """Return what is due."""
         with self.machine.lock:
-            return [(0.0, data) for data in self.machine.emit()]
+            return self._sent(self.machine.emit())
 
     def disconnected(self) -> None:
         """End the connection."""

@@ -32,7 +32,7 @@ from ..core.errors import (
     UsageError,
 )
 from ..core.version import __version__
-from ..instruments import Camera, Exposure, Oscilloscope, Turntable, UltrasonicScanner
+from ..instruments import Camera, EnvironmentSensor, Exposure, Oscilloscope, Turntable, UltrasonicScanner
 from . import by_hand
 from .bench import ROLES, Bench
 from .checks import Limits, Readiness, exposure_fault, readiness
@@ -506,6 +506,7 @@ class Acquisition:
         }
         if step.exposure_us is not None:
             facts["set_exposure_us"] = step.exposure_us
+        facts |= self._environment()
         return self.session.store(step.name, frame, take=take, facts=facts, clock=_clock(exposures))
 
     def _prepared(self, step: Step) -> Camera:
@@ -537,6 +538,28 @@ class Acquisition:
         if table.name in self._silent:
             return {}
         return self._persist(lambda: {axis: round(table.state(axis).position, 6) for axis in table.axes})
+
+    def _environment(self) -> dict[str, Any]:
+        """Facts of a picture: what the sensors of the environment measure, by their names, or why not.
+
+        A sensor that fails does not end the session: its pictures say so.
+        """
+        found: dict[str, dict[str, Any]] = {}
+        for name, sensor in self.bench.instruments.items():
+            if not isinstance(sensor, EnvironmentSensor):
+                continue
+            try:
+                # One that has failed is asked once for each frame: it may return.
+                measured = sensor.environment() if name in self._silent else self._persist(sensor.environment)
+            except InstrumentError as error:
+                if name not in self._silent:
+                    self._silent |= {name}
+                    self.watch("without", {"instrument": name, "why": str(error)})
+                found[name] = {"error": str(error)}
+            else:
+                self._silent -= {name}
+                found[name] = {key: each.to_dict() for key, each in measured.conditions.items()}
+        return {"environment": found} if found else {}
 
     def _judged(self, frame: ArchivedFrame, step: Step) -> Verdict:
         """The verdict on a frame; the procedure gets each frame once, also those from before a resumption."""
@@ -615,8 +638,10 @@ class Acquisition:
     def _pictured(self, step: Step, kind: str) -> ArchivedFrame:
         if kind == "screen":
             screen = self._persist(self.one(Oscilloscope).screen)
-            clock = {"taken": screen.taken.isoformat()}
-            return self.session.store(step.name, screen.data, kind=kind, suffix=screen.suffix, clock=clock)
+            clock, around = {"taken": screen.taken.isoformat()}, self._environment()
+            return self.session.store(
+                step.name, screen.data, kind=kind, suffix=screen.suffix, facts=around, clock=clock
+            )
         if kind == "scan":
             scan = self._persist(self.one(UltrasonicScanner).scan)
             facts: dict[str, Any] = {
@@ -625,6 +650,7 @@ class Acquisition:
                 "speed_m_s": _finite(scan.speed_m_s),
                 "frequency_khz": _finite(scan.frequency_khz),
                 "gain": _finite(scan.gain),
+                **self._environment(),
             }
             clock = {"taken": scan.taken.isoformat()}
             return self.session.store(step.name, scan.frame(step.name), kind=kind, facts=facts, clock=clock)
@@ -633,6 +659,7 @@ class Acquisition:
             exposure = self._persist(camera.expose)
             frame = _mean_frame([exposure.frame], step.name)
             facts = {"identity": str(camera.connect()), "set_exposure_us": step.exposure_us}
+            facts |= self._environment()
             return self.session.store(step.name, frame, kind=kind, facts=facts, clock=_clock([exposure]))
         raise UsageError("unknown kind of picture", where=kind, do="use screen, scan or probe")
 

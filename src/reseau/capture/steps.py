@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from ..core.environment import Condition
 from ..core.errors import FormatError
 from ..io import read_text
 
@@ -31,6 +32,8 @@ class Step:
         Positions of the axes of the table, in their units. Axes that are not named do not move.
     exposure_us : float, optional
         Exposure of the camera (µs). Default: unchanged.
+    environment : mapping of str to Condition
+        Of a step that was taken: what the sensors of the bench measured with its frame.
 
     Examples
     --------
@@ -41,10 +44,16 @@ class Step:
     name: str
     position: Mapping[str, float] = field(default_factory=dict)
     exposure_us: float | None = None
+    environment: Mapping[str, Condition] = field(default_factory=dict)
 
 
 def as_taken(step: Step, facts: Mapping[str, Any]) -> Step:
-    """Return a step with the exposure of its frame: as reported by the camera, else as set."""
+    """Return a step with what is known of its frame.
+
+    These are the conditions that the sensors measured, and, if the step sets it, the exposure: as reported by
+    the camera, else as set.
+    """
+    step = replace(step, environment=Condition.from_facts(facts))
     if facts.get("set_exposure_us") is None:
         return step
     return replace(step, exposure_us=facts.get("exposure_us") or facts["set_exposure_us"])

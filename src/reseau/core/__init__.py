@@ -1,1 +1,1 @@
-"""What every other package stands on: errors, frames and image points, provenance, worker processes."""
+"""What every other package stands on: errors, frames, image points, surroundings, provenance, processes."""

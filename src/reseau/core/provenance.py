@@ -1,4 +1,4 @@
-"""Provenance of a result: hashes of its inputs, its options, the version of the software."""
+"""Provenance of a result: hashes of its inputs, options, surroundings, version of the software."""
 
 from __future__ import annotations
 
@@ -58,6 +58,8 @@ class Provenance:
         SHA-256 by the role or the name of each input.
     options : dict
         The options that influence the result, JSON values.
+    environment : dict
+        Conditions of its frames; see :meth:`~reseau.core.environment.Surroundings.summary`.
 
     Examples
     --------
@@ -68,11 +70,14 @@ class Provenance:
     inputs: dict[str, str] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
     software: str = f"reseau {__version__}"
+    environment: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Dictionary for a document, with sorted keys."""
+        known = {"environment": self.environment} if self.environment else {}
         return {
             "inputs": dict(sorted(self.inputs.items())),
             "options": dict(sorted(self.options.items())),
             "software": self.software,
+            **known,
         }

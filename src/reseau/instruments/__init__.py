@@ -12,6 +12,7 @@ from .monitor import Monitor
 from .protocols import (
     Camera,
     CameraRig,
+    EnvironmentSensor,
     Exposure,
     ExposureSet,
     Instrument,
@@ -22,7 +23,7 @@ from .protocols import (
 )
 from .settings import Limits, Settings, choice, quantity, text
 from .status import Status
-from .values import AxisState, BScan, Identity, ScreenPicture, Waveform
+from .values import AxisState, BScan, Environment, Identity, ScreenPicture, Waveform
 
 __all__ = [
     "AxisState",
@@ -31,6 +32,8 @@ __all__ = [
     "CameraRig",
     "Deadline",
     "Device",
+    "Environment",
+    "EnvironmentSensor",
     "Exposure",
     "ExposureSet",
     "Identity",

@@ -15,11 +15,12 @@ from typing import Any, Protocol, runtime_checkable
 from ..core.data import Frame
 from .settings import Settings
 from .status import Status
-from .values import AxisState, BScan, Identity, ScreenPicture, Waveform
+from .values import AxisState, BScan, Environment, Identity, ScreenPicture, Waveform
 
 __all__ = [
     "Camera",
     "CameraRig",
+    "EnvironmentSensor",
     "Exposure",
     "ExposureSet",
     "Instrument",
@@ -116,6 +117,20 @@ class UltrasonicScanner(Instrument, Protocol):
 
     def scan(self, seconds: float | None = None) -> BScan:
         """Return one section."""
+
+
+@runtime_checkable
+class EnvironmentSensor(Instrument, Protocol):
+    """Sensor of temperature, humidity, pressure or the like.
+
+    Examples
+    --------
+    >>> hasattr(EnvironmentSensor, "environment")
+    True
+    """
+
+    def environment(self, seconds: float | None = None) -> Environment:
+        """Return what it measures now."""
 
 
 @runtime_checkable

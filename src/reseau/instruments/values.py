@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
@@ -10,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.data import Array, Frame
+from ..core.environment import Condition
 from ..core.errors import ImageError
 from ..core.provenance import sha256_of
 
-__all__ = ["AxisState", "BScan", "Identity", "ScreenPicture", "Waveform", "now"]
+__all__ = ["AxisState", "BScan", "Environment", "Identity", "ScreenPicture", "Waveform", "now"]
 
 
 def now() -> datetime:
@@ -193,3 +195,24 @@ class AxisState:
     moving: bool
     homed: bool
     faults: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Environment:
+    """What a sensor of the environment measures.
+
+    Parameters
+    ----------
+    conditions : mapping of str to Condition
+        Temperature, humidity, pressure and the like, by name.
+    taken : datetime
+        Time of the measurement, UTC.
+
+    Examples
+    --------
+    >>> Environment({"temperature": Condition(21.5, "°C", 0.2)}).conditions["temperature"].value
+    21.5
+    """
+
+    conditions: Mapping[str, Condition]
+    taken: datetime = field(default_factory=now)

@@ -11,6 +11,7 @@ import numpy as np
 from ..archive import Verdict
 from ..bundle import Network, ResultDocument
 from ..core.data import Frame
+from ..core.environment import Surroundings
 from ..core.errors import EstimationError
 from ..core.failure import Failure
 from ..core.provenance import Provenance
@@ -78,6 +79,7 @@ class BlurredProcedure:
         self.document, self.network, self.targets, self.lens = document, network, targets, lens
         self.options, self.name = options, name
         self._parameters, self._inputs = dict(parameters or {}), dict(inputs or {})
+        self._surroundings = Surroundings()
         self._frames: dict[str, Frame] = {}
         self._found: tuple[int, BlurredNetwork | Failure] | None = None
 
@@ -96,6 +98,7 @@ class BlurredProcedure:
         if count < _FEWEST:
             return Verdict(False, f"{count} of {len(rows)} targets stand out near their predicted places")
         self._frames[step.name], self._inputs[step.name] = frame, frame.sha256
+        self._surroundings.add(step.name, step)
         return Verdict(True, facts={"points": count})
 
     def progress(self) -> dict[str, float]:
@@ -110,7 +113,7 @@ class BlurredProcedure:
     @property
     def provenance(self) -> Provenance:
         """Inputs and parameters of the result."""
-        return Provenance(self._inputs, self._parameters)
+        return Provenance(self._inputs, self._parameters, environment=self._surroundings.summary())
 
     def measured(self) -> BlurredNetwork | Failure:
         """Return the network from the frames so far; images without one are left out."""

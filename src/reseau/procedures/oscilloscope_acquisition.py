@@ -7,6 +7,7 @@ from typing import Any, Protocol, TypeVar
 
 from ..archive import Verdict
 from ..core.data import Frame
+from ..core.environment import Surroundings
 from ..core.errors import EstimationError
 from ..core.failure import Code, Failure
 from ..core.provenance import Provenance
@@ -66,6 +67,7 @@ class OscilloscopeProcedure:
         self.reseau, self.test_object, self.name = reseau, test_object, name
         self._check = tuple(check)
         self._options, self._inputs = dict(options or {}), dict(inputs or {})
+        self._surroundings = Surroundings()
         self.first: PhotoI | None = None
         self.second: PhotoII | None = None
         self.third: PhotoIII | None = None
@@ -73,7 +75,7 @@ class OscilloscopeProcedure:
     @property
     def provenance(self) -> Provenance:
         """Inputs and parameters."""
-        return Provenance(self._inputs, self._options)
+        return Provenance(self._inputs, self._options, environment=self._surroundings.summary())
 
     def on_frame(self, frame: Frame, step: _Named) -> Verdict:
         """Correct a photograph; the name of its step says which one it is."""
@@ -81,6 +83,7 @@ class OscilloscopeProcedure:
         if isinstance(found, Failure):
             return Verdict(False, found.reason)
         self._inputs[step.name] = frame.sha256
+        self._surroundings.add(step.name, step)
         points = {PhotoI: "points", PhotoII: "pins", PhotoIII: "points"}[type(found)]
         return Verdict(True, facts={"points": len(getattr(found, points))})
 

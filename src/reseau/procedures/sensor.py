@@ -9,6 +9,7 @@ from typing import Any, Protocol, TypeVar
 from ..archive import Verdict
 from ..calibration.document import Calibration
 from ..core.data import Frame
+from ..core.environment import Surroundings
 from ..core.errors import EstimationError, UsageError
 from ..core.provenance import Provenance
 from ..sensor import Level, LevelSums, SensorResult, SensorSeries, calibrate_sensor, with_edge
@@ -86,6 +87,7 @@ class SensorProcedure:
         self.name, self._region, self._options = name, region, dict(options or {})
         self._levels: dict[str, list[Level]] = {"light": [], "dark": [], "edge": []}
         self._open: tuple[str, LevelSums] | None = None
+        self._surroundings = Surroundings()
         self._inputs: dict[str, str] = {}
         self._full_scale = 0.0
         self._made: tuple[int, SensorResult] | None = None
@@ -105,6 +107,7 @@ class SensorProcedure:
         except UsageError as error:
             return Verdict(False, error.what)
         self._full_scale, self._inputs[step.name] = frame.full_scale, frame.sha256
+        self._surroundings.add(step.name, step)
         return Verdict(True, facts={"mean": round(float(frame.pixels.mean()), 3)})
 
     def _close(self) -> None:
@@ -144,7 +147,7 @@ class SensorProcedure:
     @property
     def provenance(self) -> Provenance:
         """Inputs and parameters of the calibration."""
-        return Provenance(self._inputs, self._options)
+        return Provenance(self._inputs, self._options, environment=self._surroundings.summary())
 
     def calibration(self, name: str) -> Calibration:
         """Return the calibration with a name; see :meth:`calibrated`.

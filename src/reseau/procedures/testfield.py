@@ -24,6 +24,7 @@ from ..bundle import (
     with_estimates,
 )
 from ..core.data import Array, Frame, ImagePoints
+from ..core.environment import Surroundings
 from ..core.errors import EstimationError
 from ..core.failure import Code, Failure
 from ..core.provenance import Provenance
@@ -110,6 +111,7 @@ class TestfieldProcedure:
     ) -> None:
         self.design, self.model, self.name = design, model, name
         self._measure, self._options, self._least = measure, dict(options or {}), least_points
+        self._surroundings = Surroundings()
         self._measured: dict[str, ImagePoints] = {}
         self._places: dict[str, Mapping[str, float]] = {}
         self._sigmas, self._pose, self._refraction = sigmas, dict[str, int](), refraction
@@ -132,6 +134,7 @@ class TestfieldProcedure:
         self._size = size
         self._measured[step.name] = points
         self._places[step.name], self._inputs[step.name] = dict(step.position), sha256
+        self._surroundings.add(step.name, step)
         self._stands = self._at(step)  # only good frames: a rerun has no others
         self._pose[step.name] = self._stands[0]
 
@@ -183,7 +186,7 @@ class TestfieldProcedure:
     @property
     def provenance(self) -> Provenance:
         """Inputs and parameters of the calibration."""
-        return Provenance(self._inputs, self._options)
+        return Provenance(self._inputs, self._options, environment=self._surroundings.summary())
 
     def progress(self) -> dict[str, float]:
         """Return standard deviations of the camera parameters, and sigma0; nothing before the third image.

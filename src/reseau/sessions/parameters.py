@@ -15,7 +15,7 @@ from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
 from ..capture import HEIGHT, ROLES, Bench, Goal, SensorSeriesPlan, Step
 from ..core.errors import FormatError, StateError, UsageError
-from ..instruments import Camera, Turntable
+from ..instruments import Camera, EnvironmentSensor, Turntable
 from ..io import Document
 
 if TYPE_CHECKING:
@@ -115,12 +115,16 @@ class SessionParameters(Document):
     def part_of(self, bench: Bench) -> Bench:
         """Return the part of a bench that the plan uses; its other instruments need not even answer.
 
+        The sensors of the environment belong to it, but need not answer: frames then say so.
+
         Raises
         ------
         UsageError
             If an instrument is missing, or there are several of its kind and none is named.
         """
-        return bench.part(self._used(bench))
+        used = self._used(bench)
+        sensors = [name for name, each in bench.instruments.items() if isinstance(each, EnvironmentSensor)]
+        return bench.part([*used, *sensors], required=bench.part(used).instruments)
 
     def _used(self, bench: Bench) -> list[str]:
         """Names of the instruments that the plan uses."""

@@ -22,8 +22,8 @@ from pyvisa import constants
 from reseau.core.errors import ConnectionLost, DeadlineError, InstrumentError, UsageError
 from reseau.instruments import Deadline
 
-from ..link import Link, TcpLink, link_to
 from .budget import Account
+from .link import Link, TcpLink, link_to
 
 __all__ = ["VisaLink", "resources", "scpi_link"]
 
