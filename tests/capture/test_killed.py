@@ -8,7 +8,6 @@ import json
 import os
 import random
 import signal
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -28,7 +27,7 @@ from reseau_sims.serving.imaging import LaboratoryScene, SimulatedCamera
 from reseau_sims.serving.v4l2 import VideoCamera
 
 from .fieldrig import FieldRig
-from .killing import exit_code
+from .killing import Ended, ended
 
 KILLS = int(os.environ.get("RESEAU_KILLS", "200"))
 POSES = paper_steps()[:12]
@@ -82,11 +81,11 @@ def faulty(seed: int) -> Iterator[Bench]:
             yield bench
 
 
-def finished(place: Path, kind: str, after_s: float | None, seed: int = 0) -> bool:
-    """Whether a process came to its end before it was killed, or an instrument ended it."""
-    code = exit_code(work, (place, kind, seed), after_s, HEAVY)
-    assert code in ((0, 1, -signal.SIGKILL) if kind == "faults" else (0, -signal.SIGKILL))
-    return code == 0
+def run(place: Path, kind: str, after_s: float | None, seed: int = 0) -> Ended:
+    """A process that comes to its end, is killed before, or is ended by an instrument."""
+    found = ended(work, (place, kind, seed), after_s, HEAVY)
+    assert found.code in ((0, 1, -signal.SIGKILL) if kind == "faults" else (0, -signal.SIGKILL))
+    return found
 
 
 def held(place: Path, kind: str) -> tuple[list[tuple[str, int, str]], list[Any]]:
@@ -112,17 +111,16 @@ def held(place: Path, kind: str) -> tuple[list[tuple[str, int, str]], list[Any]]
 @pytest.mark.timeout(7200)
 def test_a_killed_and_resumed_session_gives_the_same_result(kind: str, tmp_path: Path) -> None:
     rng = random.Random(kind)
-    began = time.monotonic()
-    while not finished(tmp_path / "undisturbed", kind, None):
+    while (found := run(tmp_path / "undisturbed", kind, None)).code != 0:
         assert kind == "faults"  # those of the instruments end a session; it is resumed
-    seconds = time.monotonic() - began
+    seconds = found.seconds
     undisturbed = held(tmp_path / "undisturbed", kind)
     assert len(undisturbed[0]) == (FRAMES if kind == "frames" else len(POSES))
     kills = sessions = 0
     while kills < KILLS // 3:
         place = tmp_path / f"killed {sessions}"
         # Half of an undisturbed run on average: each session is killed a few times.
-        while not finished(place, kind, rng.uniform(0, seconds), seed=kills + 7):
-            kills += 1
+        while (found := run(place, kind, rng.uniform(0, seconds), seed=kills + 7)).code != 0:
+            kills += found.code == -signal.SIGKILL
         assert held(place, kind) == undisturbed
         sessions += 1
