@@ -124,7 +124,7 @@ class Cluster:
         return self._known
 
     def _submit(self, run: _Run, name: str, sent: _Sent, series: str) -> Any:
-        return self._client.submit(run, name, sent, key=f"{name}-{series}", pure=False)
+        return self._client.submit(run, name, sent, key=(f"reseau-{series}", name), pure=False)
 
     def _next(self, run: _Run, waiting: deque[tuple[str, _Sent, Any]]) -> tuple[str, Any]:
         from distributed import CancelledError, KilledWorker

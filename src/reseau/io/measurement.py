@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
@@ -218,6 +219,10 @@ class PhotographPoints(Document):
     why: str = ""
     code: str = ""
     notes: tuple[str, ...] = ()
+
+    def to_json(self) -> str:
+        """Return the content of the file in one line: there is one for each photograph of a large number."""
+        return json.dumps(self.to_dict(), ensure_ascii=False, allow_nan=False) + "\n"
 
     @classmethod
     def of(
