@@ -104,6 +104,7 @@ class Processes:
         environment = os.environ | {
             "PYTHONPATH": os.pathsep.join(paths),
             "DASK_LOGGING__DISTRIBUTED": "error",
+            "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
         }
         with (self.folder / "output").open("ab") as output:
             process = subprocess.Popen(
@@ -216,14 +217,19 @@ def report(
     some = sorted((folder / "images").glob("*.png"))[:: max(1, count // 100)]
     work = partial(measured_and_logged, measurer_of(BENCH.design), str(folder / "log of this process"))
     _, photographs = photographs_of([(path.name, path) for path in some], photograph_reader())
+    began = time.process_time()
     here = {each.name: digest(each.found) for each in measured_in_order(photographs, work, Here())}
+    alone = (
+        time.process_time() - began - sum(float(each) for _, each in lines(folder / "log of this process"))
+    )
     same = sum(results[name] == each for name, each in here.items())
     print(f"identical to those of this process: {same} of {len(here)}")
     # From the last start of the client on, when its imports are done.
     late = np.array([each for each in memory if each[0] > 0.6 * count])
     slope = np.polyfit(late[:, 0], late[:, 1], 1)[0]
     print(f"processor time an image: measuring {1000 * spent / sum(measured.values()):.1f} ms, ", end="")
-    print(f"all else {1000 * slope:.1f} ms")
+    reading = alone / len(here)
+    print(f"reading {1000 * reading:.1f} ms, all else {1000 * (slope - reading):.1f} ms")
     for which, column in (("client", 2), ("scheduler", 3)):
         at = [each for each in memory if each[0] > 0 and each[column] > 0]
         quarters = [at[min(len(at) - 1, len(at) * k // 4)][column] for k in range(1, 5)]

@@ -80,3 +80,12 @@ def test_a_cluster_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch:
     monkeypatch.setattr("reseau.execution.cluster._PATIENCE_S", 0.2)
     with pytest.raises(UsageError, match=r"cluster tcp://127\.0\.0\.1:9: does not answer"):
         executor_at(cluster="tcp://127.0.0.1:9", store=str(tmp_path))
+
+
+def test_what_the_work_raises_is_raised_at_its_job(executor: Executor) -> None:
+    jobs = [(f"j{i}", partial(pow, i, 2)) for i in range(30)]
+    jobs[25] = ("bad", partial(operator.truediv, 1, 0))  # type: ignore[arg-type]
+    outcomes = executor.outcomes(operator.call, jobs)
+    assert [next(outcomes)[1] for _ in range(25)] == [i * i for i in range(25)]
+    with pytest.raises(ZeroDivisionError):
+        next(outcomes)

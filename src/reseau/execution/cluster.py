@@ -31,11 +31,11 @@ __all__ = ["Cluster"]
 J = TypeVar("J")
 R = TypeVar("R")
 _AHEAD = 3
-"""Jobs that are queued for each thread of a worker, so that none is idle."""
+"""Messages that are queued for each thread of a worker, so that none is idle."""
 _SMALL = 2048
 """Bytes that may be sent through the scheduler; what is larger is stored."""
-_TRIES = 2
-"""How often a job is given to a cluster whose workers die with it."""
+_TOGETHER_S = 1.0
+"""Jobs that take less are sent together: a message costs client, scheduler and worker some milliseconds."""
 _SUFFIX = ".pickle"
 _PATIENCE_S = 10.0
 _ASK_S = 2.0
@@ -103,18 +103,24 @@ class Cluster:
         EstimationError
             If the cluster is lost; what its workers have stored remains.
         """
-        run = partial(_on_worker, self._place, _sent(self._store, work, always=True))
-        series, waiting = uuid.uuid4().hex[:12], deque[tuple[str, _Sent, Any]]()
+        run: _Run = partial(_on_worker, self._place, _sent(self._store, work, always=True))
+        waiting, pending, size = deque[tuple[_Batch, Any]](), _Batch(), 1
         try:
             for name, job in jobs:
-                sent = _sent(self._store, job)
-                waiting.append((name, sent, self._submit(run, name, sent, series)))
-                if len(waiting) > _AHEAD * self._threads():
-                    yield self._next(run, waiting)
+                pending.append((name, _sent(self._store, job)))
+                if len(pending) >= size:
+                    waiting.append((pending, self._submit(run, pending)))
+                    pending = _Batch()
+                    if len(waiting) > _AHEAD * self._threads():
+                        seconds, found = self._next(run, *waiting.popleft())
+                        size = _next_size(size, seconds / len(found))
+                        yield from self._given(found)
+            if pending:
+                waiting.append((pending, self._submit(run, pending)))
             while waiting:
-                yield self._next(run, waiting)
+                yield from self._given(self._next(run, *waiting.popleft())[1])
         finally:
-            self._client.cancel([future for _, _, future in waiting])
+            self._client.cancel([future for _, future in waiting])
 
     def _threads(self) -> int:
         """Number of threads of all workers, which come and go; the scheduler is asked now and then."""
@@ -123,26 +129,41 @@ class Cluster:
             self._known, self._asked = max(1, sum(self._client.nthreads().values())), now
         return self._known
 
-    def _submit(self, run: _Run, name: str, sent: _Sent, series: str) -> Any:
-        return self._client.submit(run, name, sent, key=(f"reseau-{series}", name), pure=False)
+    def _submit(self, run: _Run, batch: _Batch) -> Any:
+        # Keys of one group: Dask keeps a record of every group that it has ever seen.
+        return self._client.submit(run, batch, key=("reseau", uuid.uuid4().hex), pure=False)
 
-    def _next(self, run: _Run, waiting: deque[tuple[str, _Sent, Any]]) -> tuple[str, Any]:
+    def _next(self, run: _Run, batch: _Batch, future: Any) -> tuple[float, list[tuple[str, _Sent]]]:
         from distributed import CancelledError, KilledWorker
         from distributed.comm.core import CommClosedError
 
-        name, sent, future = waiting.popleft()
-        for tried in range(1, _TRIES + 1):
-            try:
-                return name, _received(self._store, future.result())
-            except KilledWorker:
-                # Its workers died, perhaps of something else: the system's memory, or another's hand.
-                if tried < _TRIES:
-                    future = self._submit(run, name, sent, uuid.uuid4().hex[:12])
-            except (CancelledError, CommClosedError, TimeoutError):
-                raise EstimationError(
-                    "the cluster is lost", where=name, do="start it again, and repeat the command"
-                ) from None
-        return name, crashed(name)
+        names = [name for name, _ in batch]
+        try:
+            seconds, found = future.result()
+            return seconds, list(zip(names, found, strict=True))
+        except KilledWorker:
+            # Workers died with it, perhaps of something else: the system's memory, or another's hand.
+            if len(batch) == 1:
+                return 0.0, [(names[0], _sent(self._store, crashed(names[0])))]
+            each = [_Batch([one]) for one in batch]
+            again = [(one, self._submit(run, one)) for one in each]
+            return 0.0, [found for one, future in again for found in self._next(run, one, future)[1]]
+        except (CancelledError, CommClosedError, TimeoutError):
+            raise EstimationError(
+                "the cluster is lost", where=names[0], do="start it again, and repeat the command"
+            ) from None
+
+    def _given(self, found: Iterable[tuple[str, _Sent]]) -> Iterator[tuple[str, Any]]:
+        for name, sent in found:
+            outcome = _received(self._store, sent)
+            if isinstance(outcome, _Raised):
+                raise outcome.error
+            yield name, outcome
+
+
+def _next_size(size: int, seconds: float) -> int:
+    """Number of jobs that are sent together: as many as take a second, at most twice as many as before."""
+    return min(max(1, int(_TOGETHER_S / max(seconds, 1e-3))), 2 * size)
 
 
 class _Sent(NamedTuple):
@@ -152,7 +173,14 @@ class _Sent(NamedTuple):
     sha256: str
 
 
-_Run = Callable[[str, _Sent], _Sent]
+class _Raised(NamedTuple):
+    """What a job raised; it is raised again where the outcome of the job is asked for."""
+
+    error: Exception
+
+
+_Batch = list[tuple[str, _Sent]]
+_Run = Callable[[_Batch], tuple[float, list[_Sent]]]
 
 
 def _sent(store: Objects, thing: object, *, always: bool = False) -> _Sent:
@@ -169,19 +197,24 @@ def _received(store: Objects, sent: _Sent) -> Any:
 _of_thread = threading.local()
 
 
-def _on_worker(place: str, work: _Sent, name: str, job: _Sent) -> _Sent:
-    """Have a job done by the process that belongs to this thread of a worker."""
+def _on_worker(place: str, work: _Sent, batch: _Batch) -> tuple[float, list[_Sent]]:
+    """Have jobs done by the process that belongs to this thread of a worker; return how long it took."""
     if not hasattr(_of_thread, "processes"):
         # Dask marks its workers as processes without children. These end by themselves with their parent.
         multiprocessing.current_process().daemon = False
         _of_thread.processes = Processes(1, (__name__,))
-    ((_, found),) = _of_thread.processes.outcomes(partial(_done, place, work), [(name, job)])
-    return _sent(objects_at(place), found) if isinstance(found, Failure) else found
+    began, store = time.monotonic(), objects_at(place)
+    outcomes = _of_thread.processes.outcomes(partial(_done, place, work), batch)
+    found = [_sent(store, each) if isinstance(each, Failure) else each for _, each in outcomes]
+    return time.monotonic() - began, found
 
 
 def _done(place: str, work: _Sent, job: _Sent) -> _Sent:
     store = objects_at(place)
-    return _sent(store, _work(place, work)(_received(store, job)))
+    try:
+        return _sent(store, _work(place, work)(_received(store, job)))
+    except Exception as error:
+        return _sent(store, _Raised(error))
 
 
 @lru_cache(maxsize=4)
