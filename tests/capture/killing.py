@@ -7,6 +7,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import psutil
@@ -42,7 +43,8 @@ def ended(
         if after_s is not None and seconds >= after_s:
             # Somewhere in the hundredth of a second that the system counts in, also while it waits.
             time.sleep(0.01 * (after_s * 1000 % 1))
-            os.kill(process.pid, signal.SIGKILL)
+            with suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGKILL)
             break
         time.sleep(0.005)
     process.join(600)
