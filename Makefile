@@ -8,7 +8,7 @@ WORKERS ?= 2
 # What Debian's gir1.2-aravis-0.8 brings: GigE Vision and USB3 Vision.
 ARAVIS  := $(wildcard /usr/lib/*/girepository-1.0/Aravis-0.8.typelib)
 
-.PHONY: demo test lint docs rig slow aravis clean
+.PHONY: demo test lint docs rig slow bench-compare aravis clean
 
 demo: aravis
 	$(BIN)/reseau demo --out $(OUT)
@@ -31,6 +31,10 @@ docs: $(VENV)/.docs
 
 rig: $(VENV)/.test
 	$(BIN)/python -m tests.rig.machine
+
+# Time, memory and accuracy of the main jobs against what was recorded; see benchmarks/history.py.
+bench-compare: $(VENV)/.test
+	$(BIN)/python benchmarks/history.py compare
 
 slow: $(VENV)/.test
 	$(BIN)/python -m pytest -n $(WORKERS) -m slow
