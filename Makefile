@@ -8,7 +8,7 @@ WORKERS ?= 2
 # What Debian's gir1.2-aravis-0.8 brings: GigE Vision and USB3 Vision.
 ARAVIS  := $(wildcard /usr/lib/*/girepository-1.0/Aravis-0.8.typelib)
 
-.PHONY: demo test lint docs rig slow bench-compare aravis clean
+.PHONY: demo test lint docs rig slow bench bench-compare aravis clean
 
 demo: aravis
 	$(BIN)/reseau demo --out $(OUT)
@@ -31,6 +31,11 @@ docs: $(VENV)/.docs
 
 rig: $(VENV)/.test
 	$(BIN)/python -m tests.rig.machine
+
+# All comparisons with peers that are installed; an interrupted run continues where it ended.
+bench: $(VENV)/.test
+	@$(PIP) -e '.[peers]' || echo "without peers of PyPI"
+	$(BIN)/python benchmarks/all.py
 
 # Time, memory and accuracy of the main jobs against what was recorded; see benchmarks/history.py.
 bench-compare: $(VENV)/.test
