@@ -397,7 +397,7 @@ def scan(minutes: float) -> int:
         with serving(folder, "--certificate", "tls.pem", "--key", "tls.key") as (port, _, _):
             base = f"https://localhost:{port}"
             trusted = ssl.create_default_context(cafile=folder / "tls.pem")
-            with httpx.Client(base_url=base, verify=trusted) as http:
+            with httpx.Client(base_url=base, verify=trusted, timeout=120) as http:
                 given = {"name": "Ada", "password": PASSWORD}
                 http.post("/api/1/login", json=given, headers={"Origin": base}).raise_for_status()
                 cookie = "; ".join(f"{key}={value}" for key, value in http.cookies.items())

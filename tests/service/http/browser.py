@@ -24,7 +24,7 @@ class Browser:
 
     def __init__(self, address: str, session: str) -> None:
         self._url = f"{address}/session/{session}"
-        self._http = httpx.Client(timeout=60)
+        self._http = httpx.Client(timeout=300)
 
     def command(self, method: str, path: str, body: dict[str, Any] | None = None) -> Any:
         answer = self._http.request(method, self._url + path, json=body if method == "POST" else None)
@@ -62,7 +62,7 @@ class Browser:
     def text(self, css: str = "main") -> str:
         return str(self.run("return document.querySelector(arguments[0])?.innerText ?? ''", css))
 
-    def until(self, text: str, css: str = "main", seconds: float = 30.0) -> str:
+    def until(self, text: str, css: str = "main", seconds: float = 240.0) -> str:
         end = time.monotonic() + seconds
         while text not in (found := self.text(css)):
             assert time.monotonic() < end, f"{text!r} is not in: {found[:2000]}"
@@ -110,7 +110,7 @@ def chromium() -> Iterator[Browser]:
     )
     address = f"http://127.0.0.1:{port}"
     try:
-        for _ in range(200):
+        for _ in range(2000):
             try:
                 if httpx.get(f"{address}/status").json()["value"]["ready"]:
                     break
@@ -131,7 +131,7 @@ def chromium() -> Iterator[Browser]:
                 "alwaysMatch": {"goog:chromeOptions": options, "goog:loggingPrefs": {"browser": "ALL"}}
             }
         }
-        made = httpx.post(f"{address}/session", content=json.dumps(wanted), timeout=60).json()["value"]
+        made = httpx.post(f"{address}/session", content=json.dumps(wanted), timeout=300).json()["value"]
         assert "sessionId" in made, made
         browser = Browser(address, made["sessionId"])
         try:

@@ -71,7 +71,7 @@ def process(folder: Path, *arguments: str) -> Iterator[tuple[str, str, subproces
         cwd=folder, stderr=errors, text=True,
     )  # fmt: skip
     try:
-        end = time.monotonic() + 60
+        end = time.monotonic() + 300  # a second or two, unless others take the processors
         while True:
             text = (folder / "serve.log").read_text()[begun:]
             found = [line for line in text.splitlines() if line.endswith("(Ctrl-C ends)")]

@@ -167,11 +167,19 @@ def written(browser: Browser, css: str, text: str) -> None:
     browser.run("document.querySelector(arguments[0]).value = arguments[1]", css, text)
 
 
+def enter(place: Place, browser: Browser) -> None:
+    """Let the browser in, after the service was started if it does not run."""
+    if place.running is None or place.running.poll() is not None:
+        place.start()
+    browser.open(place.link())
+    browser.until("Overview")
+
+
 def press(browser: Browser, css: str) -> None:
     """Click a button as soon as it is there and enabled: those of axes are not while one moves."""
     find = "const b = document.querySelector(arguments[0]), on = b && !b.disabled;"
     script = f"{find} if (on) b.click(); return on"
-    until(lambda: browser.run(script, css), 60)
+    until(lambda: browser.run(script, css))
 
 
 def begin_session(place: Place, browser: Browser, name: str) -> None:
@@ -185,9 +193,7 @@ def begin_session(place: Place, browser: Browser, name: str) -> None:
 
 
 def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> None:
-    begun = time.monotonic()
     entry = place.start()
-    assert time.monotonic() - begun < 60  # on a loaded machine; alone under 3 s
     base = entry.partition("/enter")[0]
     browser.open(f"{base}/sessions")
     browser.until("Log in")
@@ -198,7 +204,7 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
     # The bench: live picture, jog, stop.
     browser.open(f"{base}/benches/cellar")
     browser.until("ready")
-    browser.until("sharpest edges", seconds=60)
+    browser.until("sharpest edges")
     for axis in ("tilt", "roll", "camera_roll"):
         press(browser, f'button[aria-label="Home {axis}"]')
         until(lambda: "done" in browser.text("#message") or browser.text("#message"))
@@ -210,19 +216,19 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
 
     # A session from a plan: begun, paused, the service killed and started again, resumed, done.
     begin_session(place, browser, "tuesday")
-    browser.until("1 of 4 poses", seconds=60)
+    browser.until("1 of 4 poses")
     browser.click("button[data-api$='/pause']")
-    browser.until("paused", "#state", 60)
+    browser.until("paused", "#state")
     place.kill()
-    browser.until("connection to the service is lost", "#connection", 20)
+    browser.until("connection to the service is lost", "#connection")
     place.start()
-    browser.until("paused", "#state", 60)  # the login and the page are still there
-    until(lambda: browser.text("#connection") == "", 20)
+    browser.until("paused", "#state")  # the login and the page are still there
+    until(lambda: browser.text("#connection") == "")
     browser.click("button[data-api$='/resume']")
-    browser.until("4 of 4 poses", "#state", 120)
-    browser.until("done", "#state", 60)
+    browser.until("4 of 4 poses", "#state")
+    browser.until("done", "#state")
     browser.open(f"{base}/sessions/tuesday")
-    browser.until("calibration.json", seconds=60)
+    browser.until("calibration.json")
     shot(browser, "service-session")
 
     # Another one, aborted and resumed from the page.
@@ -230,7 +236,7 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
     begin_session(place, browser, "wednesday")
     browser.click("button[data-api$='/abort']")
     browser.accept()
-    browser.until("Can be resumed", "#state", 60)
+    browser.until("Can be resumed", "#state")
 
     # The calibration is judged, accepted, and shown.
     browser.open(f"{base}/calibrations/vidicon")
@@ -241,7 +247,7 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
     browser.click("#configuration tbody a")
     browser.fill("form[data-api$='/review'] [name=comment]", "first calibration")
     browser.click("form[data-api$='/review'] button")
-    browser.until("in force", seconds=30)
+    browser.until("in force")
     time.sleep(2.0)
     browser.until("4 images")
     before = browser.run("return document.querySelector('canvas').dataset.view")
@@ -278,7 +284,7 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
     browser.open(base + key)
     browser.click("button[data-api$='/return']")
     browser.accept()
-    browser.until("in force", "#calibration", 20)
+    browser.until("in force", "#calibration")
 
     # Photographs are dropped.
     browser.open(f"{base}/files")
@@ -290,15 +296,14 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
     browser.fill("[name=free]", "c,x0,y0,K1")
     shot(browser, "service-files")
     browser.click("form button.primary")
-    browser.until("Usable", seconds=120)
+    browser.until("Usable")
     browser.open(f"{base}/audit")
     browser.until("whole")
     assert [each for each in browser.complaints() if "Content Security Policy" in each] == []
 
 
 def test_pages_fit_a_phone_and_have_no_serious_finding_of_axe(place: Place, browser: Browser) -> None:
-    if place.running is None or place.running.poll() is not None:
-        browser.open(place.start())
+    enter(place, browser)
     base = f"http://127.0.0.1:{place.port}"
     browser.open(f"{base}/calibrations/left")
     key = browser.run("return document.querySelector('#configuration tbody a').getAttribute('href')")
@@ -334,54 +339,51 @@ def position(browser: Browser) -> str:
 def test_two_browsers_show_the_same_bench_also_where_connections_are_cut(
     place: Place, browser: Browser, seconds: float
 ) -> None:
-    if place.running is None or place.running.poll() is not None:
-        browser.open(place.start())
+    enter(place, browser)
     with Proxy(place.port, "::1", place.port, seconds) as proxy, chromium() as other:
         other.open(place.link().replace("127.0.0.1", "[::1]"))
         other.open(f"http://[::1]:{place.port}/benches/cellar")
         browser.resize(1280, 900)
         browser.open(f"http://127.0.0.1:{place.port}/benches/cellar")
         for page in (browser, other):
-            page.until("tilt", "#state", 60)
+            page.until("tilt", "#state")
         for number in range(4):
             jogs = browser if number % 2 else other
             before = position(browser)
             button = "+1 deg, tilt" if number < 2 else "-1 deg, tilt"
-            until(lambda jogs=jogs: jogs.text("#state").startswith("ready"), 60)
+            until(lambda jogs=jogs: jogs.text("#state").startswith("ready"))
             press(jogs, f'button[aria-label="{button}"]')
-            until(lambda before=before: position(browser) not in ("", before), 60)
-            until(lambda: position(other) == position(browser), 60)
+            until(lambda before=before: position(browser) not in ("", before))
+            until(lambda: position(other) == position(browser))
             time.sleep(seconds)
         cut = proxy.cut
         browser.click("button.stop")
-        until(lambda: proxy.cut > cut, 60)
-        until(lambda: position(other) == position(browser), 60)
+        until(lambda: proxy.cut > cut)
+        until(lambda: position(other) == position(browser))
         assert other.text("#state").startswith("ready")
 
 
 def test_a_connection_that_is_dead_without_an_end_is_told_and_opened_again(
     place: Place, browser: Browser
 ) -> None:
-    if place.running is None or place.running.poll() is not None:
-        browser.open(place.start())
+    enter(place, browser)
     with Proxy(place.port, "::1", place.port) as proxy, chromium() as other:
         other.open(place.link().replace("127.0.0.1", "[::1]"))
         other.open(f"http://[::1]:{place.port}/sessions")
         other.until("monday")
         until(lambda: other.run("return document.getElementById('connection').hidden"))
         proxy.hold()
-        other.until("connection to the service is lost", "#connection", 60)
+        other.until("connection to the service is lost", "#connection")
         with Archive.open(place.folder / "archive") as archive:
             archive.begin("while nobody heard", "frames", {"count": 1}).end("done")
         assert "while nobody heard" not in other.text()
         proxy.release()
-        other.until("while nobody heard", seconds=60)
-        until(lambda: other.run("return document.getElementById('connection').hidden"), 60)
+        other.until("while nobody heard")
+        until(lambda: other.run("return document.getElementById('connection').hidden"))
 
 
 def test_a_login_that_ends_leads_to_the_login(place: Place, browser: Browser) -> None:
-    if place.running is None or place.running.poll() is not None:
-        browser.open(place.start())
+    enter(place, browser)
     base = f"http://127.0.0.1:{place.port}"
     browser.resize(1280, 900)
     browser.open(f"{base}/sessions")
@@ -390,7 +392,7 @@ def test_a_login_that_ends_leads_to_the_login(place: Place, browser: Browser) ->
     headers = {"Cookie": f"reseau-{place.port}={cookie}", "X-CSRF-Token": csrf}
     assert httpx.post(f"{base}/api/1/logout", headers=headers).status_code == 200
     browser.run("document.dispatchEvent(new Event('visibilitychange'))")
-    browser.until("Log in", seconds=30)
+    browser.until("Log in")
 
 
 class Clock:
@@ -421,31 +423,31 @@ def test_pages_stay_true_when_the_clock_is_set_back_and_forth(
         browser.resize(1280, 900)
         browser.open(entry)
         browser.open(bench)
-        browser.until("ready", "#state", 60)
+        browser.until("ready", "#state")
         for axis in ("tilt", "roll", "camera_roll"):
             browser.click(f'button[aria-label="Home {axis}"]')
-            until(lambda axis=axis: f"{axis}\t0.000 deg" in browser.text("#axes-title + div"), 60)
-            browser.until("ready", "#state", 60)
+            until(lambda axis=axis: f"{axis}\t0.000 deg" in browser.text("#axes-title + div"))
+            browser.until("ready", "#state")
         # Half a minute, as by a time server, also in the browser: the page goes on.
         clock.shift("-30")
         browser.run("const now = Date.now; Date.now = () => now() - 3600e3")
         press(browser, 'button[aria-label="+1 deg, tilt"]')
-        until(lambda: position(browser).startswith("1.0"), 60)
+        until(lambda: position(browser).startswith("1.0"))
         # Two days: the login is from the future, and ends.
         clock.shift("-2d")
-        browser.until("Log in", seconds=60)
+        browser.until("Log in")
         browser.open(place.link())
         browser.open(bench)
-        browser.until("ready", "#state", 60)
+        browser.until("ready", "#state")
         begin_session(place, browser, "in the past")
-        browser.until("1 of 4 poses", seconds=120)
+        browser.until("1 of 4 poses")
         # To the present, while the session runs: the login is older than twelve hours now.
         clock.shift("+0")
-        browser.until("Log in", seconds=60)
+        browser.until("Log in")
         browser.open(place.link())
         browser.open(bench)
-        browser.until("4 of 4 poses", "#state", 120)
-        browser.until("done", "#state", 60)
+        browser.until("4 of 4 poses", "#state")
+        browser.until("done", "#state")
         browser.open(sessions)
         first = browser.run("return document.querySelector('#sessions tbody tr').innerText")
         assert first.startswith("in the past")

@@ -129,7 +129,8 @@ async function act(element, body) {
       location.href = element.dataset.done.replace('{name}', encodeURIComponent(name));
       return;
     }
-    say(content.done ?? 'done', true);
+    const failed = Object.entries(content.failed ?? {}).map(([what, why]) => `${what}: ${why}`);
+    say(failed.length ? failed.join('; ') : content.done ?? 'done', !failed.length);
     if (element.matches('form') && element.dataset.keep === undefined) element.reset();
     refresh();
   } catch (error) {
