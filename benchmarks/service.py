@@ -423,7 +423,7 @@ def protocol(folder: Path, base: str, cookie: str, api: dict[str, Any], minutes:
         "--ip", "127.0.0.1", base)  # fmt: skip
     rows = json.loads((folder / "tls.json").read_text())
     print(f"  {len(rows)} checks: {dict(Counter(each['severity'] for each in rows))}")
-    grave = ("MEDIUM", "HIGH", "CRITICAL", "WARN", "FATAL")
+    grave = ("MEDIUM", "HIGH", "CRITICAL", "FATAL")  # WARN is about the scanner
     return [f"testssl: {each['id']}: {each['finding']}" for each in rows if each["severity"] in grave]
 
 
@@ -444,8 +444,9 @@ def pages(folder: Path, base: str, cookie: str, api: dict[str, Any], minutes: fl
         "-d", "6", "-m", MODULES, "--scope", "domain", "--store-session", str(folder / "wapiti"),
         "--no-bugreport", "--max-scan-time", str(int(60 * minutes)), "--max-attack-time",
         str(int(12 * minutes)), "-t", "30", "-f", "json", "-o", "wapiti.json",
-        *(part for each in STREAMS for part in ("-x", f"{base}{each}")),
     )  # fmt: skip
+    if not (folder / "wapiti.json").is_file():
+        return [f"wapiti: no report: {said[-300:]}"]
     report = json.loads((folder / "wapiti.json").read_text())
     print(f"  {report['infos'].get('crawled_pages', 'unknown')} pages; "
           f"{len(re.findall('Launching module', said))} modules")  # fmt: skip

@@ -34,11 +34,13 @@ __all__ = ["Service"]
 T = TypeVar("T")
 
 
-def _load_the_rest() -> None:
+def _load_the_rest(over: threading.Event) -> None:
     """Load what the first requests need, which would otherwise wait for it; first what the overview needs."""
     from .. import alarms
 
     del alarms
+    if over.wait(_REST_S):  # meanwhile the first page is made
+        return
     from ...report import overlay
 
     del overlay
@@ -47,7 +49,7 @@ def _load_the_rest() -> None:
     gc.freeze()
 
 
-_LOOK_S, _ENTRY_S = 0.3, 600.0
+_LOOK_S, _ENTRY_S, _REST_S = 0.3, 600.0, 3.0
 _LOGGED = frozenset({"up", "down", "begin", "session", "end", "moving", "stopped", "asking"})
 """Events of benches that the log has, and not only the streams of events."""
 _MOST_COMPUTED = 200
@@ -131,7 +133,7 @@ class Service:
 
     def __enter__(self) -> Service:
         self._watcher.start()
-        threading.Thread(target=_load_the_rest, name="load", daemon=True).start()
+        threading.Thread(target=_load_the_rest, args=(self._over,), name="load", daemon=True).start()
         self.jobs.start(self.archive)
         if self.tiled is not None:
             self.tiled.start()
