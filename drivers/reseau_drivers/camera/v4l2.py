@@ -8,7 +8,6 @@ frame.
 from __future__ import annotations
 
 import errno
-import fcntl
 import mmap
 import os
 import select
@@ -21,7 +20,7 @@ from typing import Protocol
 
 import numpy as np
 
-from reseau.core.errors import ConnectionLost, ProtocolError, RefusedError
+from reseau.core.errors import ConnectionLost, ProtocolError, RefusedError, UsageError
 from reseau.instruments import Deadline, Identity, choice, quantity
 
 from ..codecs import v4l2 as uapi
@@ -83,9 +82,16 @@ class KernelNode:
     ------
     ConnectionLost
         If the node cannot be opened.
+    UsageError
+        If the system is not Linux.
     """
 
     def __init__(self, path: str) -> None:
+        try:
+            from fcntl import ioctl
+        except ImportError:
+            raise UsageError("cameras of Video4Linux need Linux", where=path) from None
+        self._ioctl = ioctl
         try:
             self._fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
@@ -97,7 +103,7 @@ class KernelNode:
 
     def ioctl(self, request: int, data: bytearray) -> None:
         """Execute a request; the answer replaces the data."""
-        fcntl.ioctl(self._fd, request, data, True)
+        self._ioctl(self._fd, request, data, True)
 
     def map(self, length: int, offset: int) -> Mapping:
         """Map memory of the device."""

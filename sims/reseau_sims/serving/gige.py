@@ -7,7 +7,6 @@ images and faults come from this module. Aravis (``libaravis-0.8-0``) must be in
 from __future__ import annotations
 
 import ctypes.util
-import fcntl
 import importlib.util
 import mmap
 import os
@@ -18,12 +17,13 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import IO, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reseau.core.errors import UsageError
+from reseau.core.exclusive import lock_file
 from reseau_drivers.codecs.pixels import GENICAM, encode
 
 from . import gige_process
@@ -94,7 +94,7 @@ class GigeCamera:
         self.body, self._serial, self._features = body, serial, features
         self.frames = 0
         """Frames that were asked for."""
-        self._lock_file = _one_at_a_time(wait_s)
+        self._locked = _one_at_a_time(wait_s)
         self._size = _LARGEST * _LARGEST * 2
         self._descriptor = os.memfd_create("reseau-gige")
         os.ftruncate(self._descriptor, self._size)
@@ -267,7 +267,7 @@ class GigeCamera:
         self._memory.close()
         self._said.close()
         os.close(self._descriptor)
-        os.close(self._lock_file)
+        self._locked.close()
 
     def _close_pipes(self) -> None:
         for pipe in (self._process.stdin, self._process.stdout):
@@ -282,19 +282,14 @@ class GigeCamera:
         self.close()
 
 
-def _one_at_a_time(wait_s: float) -> int:
+def _one_at_a_time(wait_s: float) -> IO[bytes]:
     """Acquire a lock that ends with the process: the library binds one port of the machine."""
     path = Path(tempfile.gettempdir()) / f"reseau-gige-{os.getuid()}.lock"
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    handle = path.open("ab")
     until = time.monotonic() + wait_s
-    while True:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return descriptor
-        except OSError:
-            if time.monotonic() >= until:
-                os.close(descriptor)
-                raise UsageError(
-                    "another simulated GigE camera runs on this machine", do="end it first"
-                ) from None
-            time.sleep(0.05)
+    while not lock_file(handle):
+        if time.monotonic() >= until:
+            handle.close()
+            raise UsageError("another simulated GigE camera runs on this machine", do="end it first")
+        time.sleep(0.05)
+    return handle

@@ -14,13 +14,12 @@ import socket
 import tempfile
 import threading
 import time
-import tty
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Self
 
-from reseau.core.errors import ConnectionLost
+from reseau.core.errors import ConnectionLost, UsageError
 from reseau.instruments import Deadline
 
 from .faults import Output
@@ -382,6 +381,12 @@ class PtyServer(Server):
         return os.path.join(self._folder, "tty")
 
     def _plug_in(self) -> None:
+        try:
+            import tty
+        except ImportError:
+            raise UsageError(
+                "this system has none", where="pseudo-terminals", do="use Linux or macOS"
+            ) from None
         master, slave = os.openpty()
         tty.setraw(slave)
         # Keep one end open: otherwise the master is disconnected whenever the client closes.

@@ -349,7 +349,9 @@ def _changed(where: object) -> ArchiveError:
 
 
 def _to_disk(folder: Path) -> None:
-    """Flush the entries of a folder to disk."""
+    """Flush the entries of a folder to disk; Windows flushes them with the file."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)

@@ -416,7 +416,9 @@ def _ended_by_signals(engine: Any, ended: _Asked, in_main: bool) -> Iterator[Non
         with contextlib.suppress(Exception):  # the run may have ended already
             engine.request_pause(False)
 
-    before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
+    # Windows has no SIGHUP.
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {number: signal.signal(number, end) for number in numbers}
     try:
         yield
     finally:

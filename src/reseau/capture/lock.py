@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import getpass
 import hashlib
 import json
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import IO, Self
 
 from ..core.errors import StateError
+from ..core.exclusive import lock_file
 
 __all__ = ["BenchLock", "Holder"]
 
@@ -62,7 +62,7 @@ class BenchLock:
 
     Notes
     -----
-    The operating system releases the lock (``flock``) when the process ends, for any reason: the files that a
+    The operating system releases the lock when the process ends, for any reason: the files that a
     killed process leaves behind lock nothing.
 
     Examples
@@ -126,11 +126,9 @@ class BenchLock:
         # A device is the same under all its names.
         real = os.path.realpath(address) if address.startswith("/") else address
         handle = _shared_file(self._folder / f"{hashlib.sha256(real.encode()).hexdigest()[:20]}.lock")
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        if not lock_file(handle):
             with handle:
-                raise _InUse(address, _read(handle)) from None
+                raise _InUse(address, _read(handle))
         self._held.append(handle)
         handle.truncate(0)
         since = datetime.now(UTC).isoformat(timespec="seconds")
@@ -166,12 +164,14 @@ def _read(handle: IO[str]) -> Holder:
 
 def _shared_file(path: Path) -> IO[str]:
     """Open a file that all users may write."""
+    how = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0)
     try:
         # In a sticky folder, O_CREAT on a file of another user is refused.
-        number = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+        number = os.open(path, how)
     except FileNotFoundError:
-        number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-        os.fchmod(number, 0o666)
+        number = os.open(path, how | os.O_CREAT, 0o666)
+        if hasattr(os, "fchmod"):  # elsewhere the folder of temporary files is that of one user
+            os.fchmod(number, 0o666)
     return os.fdopen(number, "r+", encoding="utf-8")
 
 
@@ -179,5 +179,5 @@ def _user() -> str:
     """Name of the user; in a container the number may have no name."""
     try:
         return getpass.getuser()
-    except (KeyError, OSError):
-        return str(os.getuid())
+    except (KeyError, OSError, ImportError):
+        return str(getattr(os, "getuid", lambda: "unknown user")())

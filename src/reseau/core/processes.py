@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Sequence
-from multiprocessing import forkserver
 from multiprocessing.context import BaseContext
 
 __all__ = ["cores", "process_context", "start_early"]
@@ -40,4 +39,6 @@ def process_context(modules: Sequence[str]) -> BaseContext:
 def start_early(modules: Sequence[str]) -> None:
     """Import the modules for later processes in the background."""
     if process_context(modules).get_start_method() == "forkserver":
+        from multiprocessing import forkserver
+
         forkserver.ensure_running()

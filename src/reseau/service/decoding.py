@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import select
 import signal
 import socket
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from ..archive import Session
 from ..core.data import Frame
-from ..core.errors import ImageError
+from ..core.errors import ImageError, UsageError
 from ..core.tone import ToneCurve
 from ..io.scans import Scan, scan_of
 
@@ -181,6 +180,11 @@ class Decoder:
         return answer == b"\0"
 
     def _start(self) -> None:
+        if not hasattr(os, "fork"):
+            raise UsageError(
+                "are not decoded on this system, which cannot bound memory and time of a process",
+                where="uploaded photographs", do="run the service on Linux or macOS",
+            )  # fmt: skip
         self._end()
         here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         command = [sys.executable, "-I", "-c", _BOOT, *(str(p) for p in sys.path if p), "--"]
@@ -305,6 +309,8 @@ def _main() -> None:
 
 
 def _decode(order: dict[str, Any], writing: int) -> None:
+    import resource
+
     # Nothing of the file has been looked at yet.
     seconds, memory = order["seconds"], order["memory"]
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))

@@ -102,7 +102,7 @@ def private_file(path: Path, content: bytes, *, fresh: bool = False) -> None:
     '0o600'
     """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    number = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+    number = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0), 0o600)
     try:
         with os.fdopen(number, "wb") as file:
             file.write(content)
