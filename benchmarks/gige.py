@@ -1,10 +1,12 @@
 """Frames of 2048 × 2048 pixels over GigE Vision: our driver compared with Aravis's own client.
 
-    python benchmarks/gige.py [--frames 300] [--rounds 3]
+    python benchmarks/gige.py [--frames 300] [--rounds 5] [--cameras 2]
 
-In each round both receive from the same simulated camera, which sends as fast as it can; rates of complete
-frames and CPU seconds per frame are compared. Then our driver receives a long series in blocks: CPU time and
-memory must not grow, and every frame must be identical to the one sent or be counted as lost.
+In each round both receive from the same simulated cameras, each in a process of its own, which send as fast
+as they can; rates of complete frames, of all cameras together, and CPU seconds per frame are compared. Of two
+cameras, Aravis's client is started twice; our driver receives from both in threads of one process. Then our
+driver receives a long series in blocks from one camera: CPU time and memory must not grow, and every frame
+must be identical to the one sent or be counted as lost.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
@@ -28,7 +31,7 @@ import numpy as np
 import psutil
 
 from reseau_drivers.camera import CameraDriver, aravis
-from reseau_sims.serving import GigeCamera, SimulatedCamera, View
+from reseau_sims.serving import GigeCamera, GigeVisionCamera, SimulatedCamera, View, loopback_addresses
 
 SIZE = 2048
 SECONDS = 8.0
@@ -52,18 +55,23 @@ class Numbered:
         return picture
 
 
-def serve(ready: Connection) -> None:
-    """The simulated camera in a separate process, so that it does not use the client's time."""
-    with GigeCamera(SimulatedCamera(Numbered(), SIZE, SIZE), wait_s=120.0) as simulated:
+def serve(ready: Connection, address: str) -> None:
+    """The simulated camera in a separate process, so that it does not use the client's time.
+
+    One camera is the fake camera of the library, several have the protocol of this project.
+    """
+    body = SimulatedCamera(Numbered(), SIZE, SIZE)
+    made = GigeVisionCamera(body, address=address) if address else GigeCamera(body, wait_s=120.0)
+    with made as simulated:
         ready.send(simulated.address)
         ready.recv()
 
 
 @contextmanager
-def simulated_camera() -> Iterator[str]:
+def simulated_camera(at: str = "") -> Iterator[str]:
     """Its address."""
     ours, theirs = multiprocessing.Pipe()
-    process = multiprocessing.get_context("spawn").Process(target=serve, args=(theirs,))
+    process = multiprocessing.get_context("spawn").Process(target=serve, args=(theirs, at))
     process.start()
     try:
         yield ours.recv()
@@ -107,6 +115,13 @@ def peer(address: str) -> Received:
     return Received(rate, 1000 * cpu / max(1, whole), whole, failed)
 
 
+def together(received: Sequence[Received]) -> Received:
+    """What several clients received at the same time."""
+    whole = sum(each.whole for each in received)
+    cpu = sum(each.cpu_ms * each.whole for each in received) / max(1, whole)
+    return Received(sum(each.rate for each in received), cpu, whole, sum(each.lost for each in received))
+
+
 def ours(camera: CameraDriver) -> Received:
     """Our driver, for the same time."""
     first = camera.expose(20.0)
@@ -141,15 +156,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=int(os.environ.get("RESEAU_FRAMES", "300")))
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--cameras", type=int, default=1)
     options = parser.parse_args(arguments)
     sight = Numbered()
     settings = {"width": SIZE, "height": SIZE, "rate": RATE, "packet_size": PACKET, "buffers": 10}
-    with simulated_camera() as address:
-        ratios = []
+    with ExitStack() as stack, ThreadPoolExecutor(options.cameras) as pool:
+        wanted = loopback_addresses(options.cameras) if options.cameras > 1 else ("",)
+        addresses = [stack.enter_context(simulated_camera(each)) for each in wanted]
+        address, ratios = addresses[0], []
         for number in range(options.rounds):
-            theirs = peer(address)
-            with aravis("camera", address, settings=settings, seconds=20.0) as camera:
-                own = ours(camera)
+            theirs = together(list(pool.map(peer, addresses)))
+            with ExitStack() as opened:
+                cameras = [
+                    opened.enter_context(aravis(f"camera {k}", each, settings=settings, seconds=20.0))
+                    for k, each in enumerate(addresses)
+                ]
+                own = together(list(pool.map(ours, cameras)))
             ratios.append(own.rate / theirs.rate)
             print(
                 f"round {number + 1}: Aravis {theirs.rate:6.1f} 1/s ({theirs.lost} failed), "

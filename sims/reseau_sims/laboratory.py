@@ -11,7 +11,7 @@ import copy
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from hashlib import sha256
 from typing import Literal
 
@@ -29,7 +29,7 @@ from .screen import Screen
 from .testfield import FieldBench, FieldTruth, Station
 from .world import World
 
-__all__ = ["AXES", "GRADIANS", "Laboratory", "Room"]
+__all__ = ["AXES", "GRADIANS", "Laboratory", "Room", "Seat"]
 
 AXES = ("tilt", "roll", "camera_roll", "z")
 """Axes of the turntable: tilt of the board, its roll in the mount, roll of the camera (degrees), and
@@ -72,17 +72,54 @@ class Room:
         return cls(light, (float(x), float(y), float(z)), warming)
 
 
+@dataclass(frozen=True)
+class Seat:
+    """Place of a camera on a rig: its projection centre in the axes of the first camera, and its lens.
+
+    Parameters
+    ----------
+    number : int
+        Number of the camera, from 0; each has its own noise.
+    base_mm : (float, float, float)
+        Projection centre. The camera looks at the middle of the board.
+    longer : float
+        Relative difference of its principal distance to that of the first camera.
+
+    Examples
+    --------
+    >>> Seat(1, (80.0, 0.0, 0.0)).matrix(800.0).round(3).tolist()[2]
+    [-0.1, 0.0, 0.995]
+    """
+
+    number: int = 0
+    base_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    longer: float = 0.0
+
+    def matrix(self, distance_mm: float) -> Array:
+        """Rotation (3, 3) from the axes of the first camera, which looks at a board at this distance."""
+        z = np.array([0.0, 0.0, distance_mm]) - self.base_mm
+        z /= np.linalg.norm(z)
+        x = np.array([1.0, 0.0, 0.0]) - z[0] * z
+        x /= np.linalg.norm(x)
+        return np.array([x, np.cross(z, x), z])
+
+
 @dataclass(frozen=True, eq=False)
 class _Mounted(FieldBench):
     """The testfield on its turntable: one set-up for all stations, unlike :class:`FieldBench`."""
 
     shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    seat: Seat = field(default_factory=Seat)
 
     @classmethod
-    def of(cls, field: FieldBench, shift: Array) -> _Mounted:
-        """The same bench with a displaced camera."""
+    def of(cls, field: FieldBench, shift: Array, seat: Seat | None = None) -> _Mounted:
+        """The same bench with a displaced camera, or another one of its rig."""
         same = {each.name: getattr(field, each.name) for each in fields(FieldBench)}
-        return cls(**same, shift_mm=(float(shift[0]), float(shift[1]), float(shift[2])))
+        seat = seat or Seat()
+        if seat.number:
+            c = float(field.camera.values[field.camera.names.index("c")])
+            same["camera"] = field.camera.with_values({"c": (1 + seat.longer) * c})
+        return cls(**same, shift_mm=(float(shift[0]), float(shift[1]), float(shift[2])), seat=seat)
 
     def pose(self, station: Station) -> Pose:
         """Pose of the camera in the system of the board, from that of the first set-up."""
@@ -91,7 +128,10 @@ class _Mounted(FieldBench):
         board = rotation_matrix(np.array([0.0, phi, 0.0])) @ rotation_matrix(np.array([0.0, 0.0, kappa]))
         matrix = rotation_matrix(np.array([0.0, 0.0, camera])) @ first.matrix @ board
         place = board.T @ (first.x0 + np.array(self.shift_mm))
-        return Pose(matrix_to_vector(matrix), place - self._lift(station))
+        # A rig turns with its first camera.
+        place = place + matrix.T @ np.array(self.seat.base_mm)
+        turned = self.seat.matrix(self.distance_mm) @ matrix if self.seat.number else matrix
+        return Pose(matrix_to_vector(turned), place - self._lift(station))
 
 
 def _same_camera(one: World, two: World) -> bool:
@@ -150,7 +190,7 @@ class Laboratory:
         self._clock, self._began = clock, clock()
         self._tank = world.rods
         self._drawn: tuple[bytes, Screen] | None = None
-        self._exposed: tuple[tuple[FieldBench, str], Frame] | None = None
+        self._exposed: dict[int, tuple[tuple[FieldBench, str], Frame]] = {}
         self._stood: World | None = None
         self._lines, self._exposures = 0, 0
 
@@ -276,13 +316,19 @@ class Laboratory:
         with self.lock:
             return self._standing().photograph(name, self.screen())
 
-    def field_truth(self) -> FieldTruth:
+    def field_truth(self, seat: Seat | None = None) -> FieldTruth:
         """Present true positions of the targets of the testfield, in space and in the image."""
         with self.lock:
-            station, bench = self._moved()
+            station, bench = self._moved(seat)
             return bench.truth(station)
 
-    def expose(self, sight: Literal["screen", "testfield"], light: float = 1.0, gain: float = 1.0) -> Frame:
+    def expose(
+        self,
+        sight: Literal["screen", "testfield"],
+        light: float = 1.0,
+        gain: float = 1.0,
+        seat: Seat | None = None,
+    ) -> Frame:
         """Take a frame; each has its own noise, unless `repeatable`.
 
         Parameters
@@ -293,27 +339,33 @@ class Laboratory:
             Exposure relative to the nominal one.
         gain : float
             Gain of the amplifier.
+        seat : Seat, optional
+            Camera of a rig before the testfield.
         """
         with self.lock:
             self._exposures += 1
             if not self.repeatable or sight == "screen":
-                return self._expose(sight, light, gain)
+                return self._expose(sight, light, gain, seat)
             # A video camera exposes all the time, and a frame under water takes a second to draw.
+            number = 0 if seat is None else seat.number
             key = self.field, f"{light} {gain} {self._state()}"
-            if self._exposed is None or self._exposed[0] != key:
-                self._exposed = key, self._expose(sight, light, gain)
-            return self._exposed[1]
+            if number not in self._exposed or self._exposed[number][0] != key:
+                self._exposed[number] = key, self._expose(sight, light, gain, seat)
+            return self._exposed[number][1]
 
-    def _expose(self, sight: Literal["screen", "testfield"], light: float, gain: float) -> Frame:
+    def _expose(
+        self, sight: Literal["screen", "testfield"], light: float, gain: float, seat: Seat | None
+    ) -> Frame:
         with self.lock:
             name = f"exposure {self._state() if self.repeatable else self._exposures}"
+            name += "" if seat is None or not seat.number else f" of camera {seat.number}"
             level = light * gain * max(0.0, 1 + self.room.light_per_hour * self.hours)
             if sight == "screen":
                 screen = copy.copy(self.screen())
                 screen.light = screen.light * np.float32(level)
                 return self._standing().photograph(name, screen)
             rng = self.world.rng(name)
-            station, bench = self._moved()
+            station, bench = self._moved(seat)
             sensor = bench.sensor
             shifts = sensor.row_shifts(rng) if sensor.row_jitter_px else None
             pixels = sensor.expose(level * bench.light(station, shifts), rng)
@@ -347,15 +399,15 @@ class Laboratory:
         station = Station(at["tilt"], at["roll"], at["camera_roll"])
         return _Mounted.of(self.field, np.array([0.0, 0.0, at["z"]])).pose(station)
 
-    def _moved(self) -> tuple[Station, FieldBench]:
-        """Present station of the table, and the testfield on it."""
+    def _moved(self, seat: Seat | None) -> tuple[Station, FieldBench]:
+        """Present station of the table, and the testfield on it, before a camera of a rig."""
         axes = self.axes
         station = Station(axes["tilt"], axes["roll"], axes["camera_roll"])
         field = self.field
         if field.water is not None:
             warmer = field.water.temperature_c + self.hours * self.room.warming_c_per_hour
             field = replace(field, water=replace(field.water, temperature_c=warmer))
-        return station, _Mounted.of(field, self._drift() + np.array([0.0, 0.0, axes["z"]]))
+        return station, _Mounted.of(field, self._drift() + np.array([0.0, 0.0, axes["z"]]), seat)
 
     def _draw(self) -> Screen:
         world = self.world

@@ -61,7 +61,7 @@ def simulated(words: list[str], folder: Path) -> Iterator[None]:
 def test_every_command_of_the_guide_works_as_printed(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(python_of("own.py"), encoding="utf-8")
     parts = commands()
-    assert len(parts) == 4
+    assert len(parts) == 5
     for first, *others in parts:
         with simulated(first, tmp_path):
             for words in others:

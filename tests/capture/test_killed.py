@@ -1,7 +1,8 @@
 """`kill -9` at random moments, resumed each time: no frame lost, none doubled, the same calibration.
 
 The kills are shared between a session that measures, one that only stores, where most time is spent between
-file and index, and one over real protocols with one fault in a hundred answers. `RESEAU_KILLS` says how many.
+file and index, one over real protocols with one fault in a hundred answers, and one of a rig of two cameras,
+of which one frame in a hundred suffers a fault. `RESEAU_KILLS` says how many.
 """
 
 import json
@@ -16,14 +17,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.archive import Archive, verify
+from reseau.archive import Archive, ArchivedFrame, Session, verify
 from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry, carry_out, paper_steps, plans
 from reseau.capture.bench import built
 from reseau.instruments import Instrument
-from reseau_drivers.camera import v4l2
+from reseau_drivers.camera import rig, v4l2
 from reseau_sims.serving import FaultScript
 from reseau_sims.serving.bench import SimulatedBench
-from reseau_sims.serving.imaging import LaboratoryScene, SimulatedCamera
+from reseau_sims.serving.imaging import LaboratoryScene, SimulatedCamera, StripeScene, View
 from reseau_sims.serving.v4l2 import VideoCamera
 
 from .fieldrig import FieldRig
@@ -32,6 +33,8 @@ from .killing import Ended, ended
 KILLS = int(os.environ.get("RESEAU_KILLS", "200"))
 POSES = paper_steps()[:12]
 FRAMES = 40
+FAULTY = ("faults", "two cameras")
+SIDES = ("left", "right")
 HEAVY = (
     "reseau.optics.compiled",
     "reseau.bundle.solver.compiled",
@@ -47,14 +50,18 @@ def work(place: Path, kind: str, seed: int) -> None:
         names = [each.name for each in archive.sessions()]
         kept = archive.session("s") if "s" in names else archive.begin("s", kind, {})
         kept.recover()
-        rig = FieldRig()
-        procedure = None if kind == "frames" else rig.procedure()
-        if kind == "faults":
+        field = FieldRig()
+        procedure = None if kind in ("frames", "two cameras") else field.procedure()
+        if kind == "two cameras":
+            pair = stack.enter_context(two_cameras(seed))
+            taking = Acquisition(pair, kept, camera="rig")
+            carry_out(taking, plans.frames(taking, FRAMES))
+        elif kind == "faults":
             bench = stack.enter_context(faulty(seed))
             run = Acquisition(bench, kept, procedure)
             carry_out(run, plans.homed(run, plans.poses(run, POSES)))
         else:
-            run = rig.acquisition(kept, procedure)
+            run = field.acquisition(kept, procedure)
             carry_out(run, plans.frames(run, FRAMES) if procedure is None else plans.poses(run, POSES))
 
 
@@ -81,10 +88,33 @@ def faulty(seed: int) -> Iterator[Bench]:
             yield bench
 
 
+@contextmanager
+def two_cameras(seed: int) -> Iterator[Bench]:
+    """Two cameras that expose at once; one frame in a hundred of each suffers a fault."""
+    videos = {
+        name: VideoCamera(
+            SimulatedCamera(
+                StripeScene(shift=k), script=FaultScript(rate=0.01, seed=2 * seed + k, seconds=0.05)
+            )
+        )
+        for k, name in enumerate(SIDES)
+    }
+    entries = {name: InstrumentEntry(driver="v4l2", address="in this process") for name in SIDES}
+    entries["rig"] = InstrumentEntry(driver="rig", address=", ".join(SIDES))
+
+    def build(name: str, entry: InstrumentEntry) -> Instrument:
+        if name == "rig":
+            return rig(name, entry.address)
+        return v4l2(name, videos[name].open, settings={"exposure_us": 10_000.0}, seconds=1.0)
+
+    with Bench(BenchFile(name="two", instruments=entries), build) as bench:
+        yield bench
+
+
 def run(place: Path, kind: str, after_s: float | None, seed: int = 0) -> Ended:
     """A process that comes to its end, is killed before, or is ended by an instrument."""
     found = ended(work, (place, kind, seed), after_s, HEAVY)
-    assert found.code in ((0, 1, -signal.SIGKILL) if kind == "faults" else (0, -signal.SIGKILL))
+    assert found.code in ((0, 1, -signal.SIGKILL) if kind in FAULTY else (0, -signal.SIGKILL))
     return found
 
 
@@ -95,6 +125,8 @@ def held(place: Path, kind: str) -> tuple[list[tuple[str, int, str]], list[Any]]
         kept = archive.session("s")
         assert kept.status == "done"
         frames = [f for f in kept.frames(kind="frame") if f.verdict is not None and f.verdict.ok]
+        if kind == "two cameras":
+            return held_sets(kept), []
         if kind != "faults":
             assert len(frames) == len(kept.frames(kind="frame"))
             contents = [kept.content(result) for result in kept.results()]
@@ -106,18 +138,35 @@ def held(place: Path, kind: str) -> tuple[list[tuple[str, int, str]], list[Any]]
         return [(f.step, 0, "") for f in frames], kept_of
 
 
+def held_sets(kept: Session) -> list[tuple[str, int, str]]:
+    """Good exposures in their order; both frames of each are there once, each of its own camera."""
+    frames = kept.frames(kind="frame")
+    exposures: dict[tuple[str, int], list[ArchivedFrame]] = {}
+    for frame in frames:
+        exposures.setdefault((frame.facts["exposure"], frame.take), []).append(frame)
+    for (exposure, _), members in exposures.items():
+        assert [frame.step for frame in members] == [f"{side}/{exposure}" for side in SIDES]
+        assert len({frame.facts["set"] for frame in members}) == 1
+        for k, frame in enumerate(members):
+            view = View(10_000.0, 0.0, 0.0, 0, 0, 96, 64, 255.0)
+            assert (kept.picture(frame).pixels == StripeScene(shift=k)(view)).all()
+    good = [e for e, members in exposures.items() if all(f.verdict and f.verdict.ok for f in members)]
+    # As many as were asked for, each once.
+    return [(exposure, 0, "") for exposure, _ in good]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["testfield", "frames", "faults"])
+@pytest.mark.parametrize("kind", ["testfield", "frames", "faults", "two cameras"])
 @pytest.mark.timeout(7200)
 def test_a_killed_and_resumed_session_gives_the_same_result(kind: str, tmp_path: Path) -> None:
     rng = random.Random(kind)
     while (found := run(tmp_path / "undisturbed", kind, None)).code != 0:
-        assert kind == "faults"  # those of the instruments end a session; it is resumed
+        assert kind in FAULTY  # those of the instruments end a session; it is resumed
     seconds = found.seconds
     undisturbed = held(tmp_path / "undisturbed", kind)
-    assert len(undisturbed[0]) == (FRAMES if kind == "frames" else len(POSES))
+    assert len(undisturbed[0]) == (FRAMES if kind in ("frames", "two cameras") else len(POSES))
     kills = sessions = 0
-    while kills < KILLS // 3:
+    while kills < KILLS // 4:
         place = tmp_path / f"killed {sessions}"
         # Half of an undisturbed run on average: each session is killed a few times.
         while (found := run(place, kind, rng.uniform(0, seconds), seed=kills + 7)).code != 0:

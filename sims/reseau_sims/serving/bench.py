@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
@@ -18,7 +19,7 @@ from reseau.core.errors import UsageError
 from ..frame import DISTANCE_MM as FRAME_DISTANCE_MM
 from ..frame import PROJECT_POSES, SpaceFrame, project
 from ..frame import SIZE as FRAME_SIZE
-from ..laboratory import AXES, Laboratory
+from ..laboratory import AXES, Laboratory, Seat
 from ..pixels import PixelSensor
 from ..reflectors import Reflectors
 from ..streams import stream
@@ -29,6 +30,7 @@ from .bk import BkScanner
 from .compactpulser import CompactPulser
 from .faults import FaultScript
 from .gige import GigeCamera, aravis_is_installed
+from .gigevision import GigeVisionCamera, loopback_addresses
 from .imaging import LaboratoryScene, LampScene, SimulatedCamera
 from .machine import FaultyConnection, Machine
 from .oscilloscope import FAMILIES, Oscilloscope
@@ -104,6 +106,39 @@ gain = 0.0
 """
 
 
+_RIG_CAMERA = """
+[instruments.{name}]
+driver = "aravis"
+address = "{address}"
+options = {{seconds = 30.0}}
+
+[instruments.{name}.settings]
+format = "Mono8"
+trigger = "action"
+action_device_key = {key}
+width = {width}
+height = {height}
+exposure_us = 10000.0
+gain = 0.0
+"""
+_RIG = """
+[instruments.rig]
+driver = "rig"
+address = "{cameras}"
+settings = {{trigger = "action"}}
+options = {{seconds = 30.0}}
+"""
+SEATS = {
+    "left": Seat(),
+    "right": Seat(1, (600.0, 0.0, 0.0), 0.01),
+    "lower": Seat(2, (0.0, 500.0, 0.0), -0.008),
+    "far": Seat(3, (580.0, 520.0, 30.0), 0.004),
+}
+"""Cameras of a rig before the testfield."""
+_LATENCY_US = 40.0
+"""Each camera of a rig starts later than the one before, by so much."""
+
+
 class SimulatedBench:
     """Servers on pseudo-terminals and the loopback interface; see :attr:`toml`.
 
@@ -131,6 +166,9 @@ class SimulatedBench:
         designed. As made, it differs from this by tolerances that are drawn from the seed.
     in_process : bool
         Whether the camera is in this process even if Aravis is installed.
+    cameras : int
+        Number of cameras before the testfield; several are the instrument ``rig``, triggered by action
+        commands of GigE Vision.
 
     Attributes
     ----------
@@ -147,6 +185,8 @@ class SimulatedBench:
         Faults by instrument; initially none.
     video : VideoCamera or None
         Camera in this process, if any.
+    vision : dict of str to GigeVisionCamera
+        Cameras of a rig, by name.
 
     Raises
     ------
@@ -172,7 +212,12 @@ class SimulatedBench:
         flat: bool = False,
         water: Water | None = None,
         in_process: bool = False,
+        cameras: int = 1,
     ) -> None:
+        if not 1 <= cameras <= len(SEATS):
+            raise UsageError(f"is not from 1 to {len(SEATS)}", where=f"{cameras} cameras")
+        if cameras > 1 and (camera != "testfield" or water is not None or in_process):
+            raise UsageError("look at the testfield in air only", where=f"{cameras} cameras")
         for what, known, asked in (
             ("table", get_args(TableKind), table),
             ("oscilloscope", tuple(FAMILIES), family),
@@ -218,6 +263,7 @@ class SimulatedBench:
         self.scripts = {name: FaultScript() for name in self.machines}
         self._servers = ExitStack()
         self.video: VideoCamera | None = None
+        self.vision: dict[str, GigeVisionCamera] = {}
         with ExitStack() as stack:
             addresses = {}
             for name, machine in self.machines.items():
@@ -231,7 +277,10 @@ class SimulatedBench:
                 TcpServer(partial(Vxi11Session, scope, scope.execute, self.scripts["oscilloscope"]))
             )
             addresses["oscilloscope"] = f"TCPIP::{core.HOST},{core.port}::inst0::INSTR"
-            entry = "" if camera is None else self._camera(camera, in_process, stack)
+            if cameras > 1:
+                entry = self._rig(cameras, stack)
+            else:
+                entry = "" if camera is None else self._camera(camera, in_process, stack)
             self._servers = stack.pop_all()
         axes = "".join(_axis_entry(table, name) for name in AXES)
         scanners = "".join(
@@ -299,6 +348,28 @@ class SimulatedBench:
             exposure=_EDGE_US if scene == "sensor" else 10_000.0,
         )  # fmt: skip
         return entry + self.refraction
+
+    def _rig(self, count: int, stack: ExitStack) -> str:
+        """Create the cameras of a rig; return their part of the ``bench.toml``."""
+        if not aravis_is_installed():
+            raise UsageError(
+                "needs Aravis and PyGObject", where=f"{count} cameras", do="install reseau[aravis]"
+            )
+        entries, key = "", os.getpid()
+        for k, (name, seat) in enumerate(list(SEATS.items())[:count]):
+            first = self.laboratory.expose("testfield", seat=seat)  # do the long computations now
+            body = SimulatedCamera(
+                LaboratoryScene(self.laboratory, "testfield", seat), first.width, first.height
+            )
+            self.scripts[name] = body.script
+            address = loopback_addresses(count)[k]
+            self.vision[name] = stack.enter_context(
+                GigeVisionCamera(body, address=address, serial=f"RS{k}", latency_us=_LATENCY_US * k)
+            )
+            entries += _RIG_CAMERA.format(
+                name=name, address=address, width=body.width, height=body.height, key=key
+            )
+        return entries + _RIG.format(cameras=", ".join(self.vision))
 
     def _table(self, kind: TableKind) -> Machine:
         """Create the controllers of the table, and connect them to the axes of the laboratory."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from reseau.core.data import Array, Frame
 
-from ..laboratory import Laboratory
+from ..laboratory import Laboratory, Seat
 from ..pixels import PixelSensor
 from ..streams import stream
 from .faults import FaultScript
@@ -152,6 +152,8 @@ class LaboratoryScene:
         Laboratory with the camera.
     scene : {"screen", "testfield"}
         Object in front of the camera.
+    seat : Seat, optional
+        Camera of a rig before the testfield.
 
     Examples
     --------
@@ -161,10 +163,12 @@ class LaboratoryScene:
 
     laboratory: Laboratory
     scene: Literal["screen", "testfield"] = "screen"
+    seat: Seat | None = None
 
     def __call__(self, view: View) -> NDArray[Any]:
         """Return the image of a view."""
-        return view.seen(_levelled(self.laboratory.expose(self.scene, view.light, view.gain), view, 1.0))
+        frame = self.laboratory.expose(self.scene, view.light, view.gain, self.seat)
+        return view.seen(_levelled(frame, view, 1.0))
 
 
 @dataclass(eq=False)

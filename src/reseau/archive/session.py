@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Engine
 
 from ..core.data import Frame
 from ..core.errors import ArchiveError, InputError
+from ..core.provenance import sha256_of
 from ..core.version import __version__
 from ..io import write_whole
 from ..io.scans import Scan
@@ -24,6 +25,17 @@ __all__ = ["INPUT", "Session"]
 
 INPUT = "input"
 """Kind of the input files of a session."""
+
+
+class _Stored(NamedTuple):
+    """A file in the store, with what its entry in the index says."""
+
+    sha256: str
+    suffix: str
+    size: int
+    key: Mapping[str, Any]
+    facts: dict[str, Any]
+    clock: dict[str, Any]
 
 
 class Session:
@@ -114,41 +126,89 @@ class Session:
         key = {"session": self.name, "step": step, "kind": kind, "take": take}
         data = picture if isinstance(picture, bytes) else tiff_of(picture, known | key)
         suffix = suffix if isinstance(picture, bytes) else ".tif"
-        return self._enter(self.objects.put(data, suffix), suffix, len(data), key, known, dict(clock or {}))
+        stored = _Stored(self.objects.put(data, suffix), suffix, len(data), key, known, dict(clock or {}))
+        return self._enter([stored])[0]
 
-    def _enter(
+    def store_set(
         self,
-        sha256: str,
-        suffix: str,
-        size: int,
-        key: Mapping[str, Any],
-        facts: dict[str, Any],
-        clock: dict[str, Any],
-    ) -> ArchivedFrame:
-        """Enter a stored file into the index."""
-        step, kind, take = key["step"], key["kind"], key["take"]
-        values = {
-            "session_id": self._id,
-            "step": step,
-            "kind": kind,
-            "take": take,
-            "sha256": sha256,
-            "suffix": suffix,
-            "size": size,
-            "facts": facts,
-            "clock": clock,
-            "stored": self._clock(),
-        }
+        step: str,
+        frames: Mapping[str, Frame],
+        *,
+        kind: str = "frame",
+        take: int = 0,
+        facts: Mapping[str, Mapping[str, Any]] | None = None,
+        clock: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> list[ArchivedFrame]:
+        """Store frames that several cameras exposed at once: all of them, or none.
+
+        Parameters
+        ----------
+        step : str
+            Pose or photograph they belong to; each is stored under ``camera/step``.
+        frames : mapping of str to Frame
+            Frame of each camera.
+        kind, take
+            As for :meth:`store`.
+        facts, clock : mapping of str to mapping, optional
+            Metadata, and times and counters, by camera.
+
+        Returns
+        -------
+        list of ArchivedFrame
+            The stored pictures; the existing ones if there are pictures of this step, kind and take.
+
+        Raises
+        ------
+        ArchiveError
+            If they cannot be stored.
+
+        Notes
+        -----
+        They are entered into the index in one transaction. Each file names the others of its exposure by a
+        hash of all pixels, so that a set of which only some files were written is not taken for one.
+        """
+        there = [self.find(f"{camera}/{step}", kind, take) for camera in frames]
+        if all(there):
+            return [each for each in there if each is not None]
+        pixels = "".join(
+            f"{camera} {sha256_of(frame.pixels.tobytes())}\n" for camera, frame in frames.items()
+        )
+        of_set = {"exposure": step, "cameras": list(frames), "set": sha256_of(pixels.encode())}
+        stored = []
+        for camera, frame in frames.items():
+            known = dict((facts or {}).get(camera, {})) | of_set | {"camera": camera}
+            key = {"session": self.name, "step": f"{camera}/{step}", "kind": kind, "take": take}
+            data = tiff_of(frame, known | key)
+            times = dict((clock or {}).get(camera, {}))
+            stored.append(_Stored(self.objects.put(data, ".tif"), ".tif", len(data), key, known, times))
+        return self._enter(stored)
+
+    def _enter(self, stored: Sequence[_Stored]) -> list[ArchivedFrame]:
+        """Enter stored files into the index, all at once."""
+        entered = []
         with schema.connected(self._engine) as connection:
-            made = connection.execute(schema.frames.insert().values(values)).inserted_primary_key
-        assert made is not None
-        return ArchivedFrame(made[0], step, kind, take, sha256, suffix, size, facts, clock)
+            for each in stored:
+                step, kind, take = (each.key[name] for name in ("step", "kind", "take"))
+                values = {
+                    "session_id": self._id, "step": step, "kind": kind, "take": take, "sha256": each.sha256,
+                    "suffix": each.suffix, "size": each.size, "facts": each.facts, "clock": each.clock,
+                    "stored": self._clock(),
+                }  # fmt: skip
+                made = connection.execute(schema.frames.insert().values(values)).inserted_primary_key
+                assert made is not None
+                file = each.sha256, each.suffix, each.size, each.facts, each.clock
+                entered.append(ArchivedFrame(made[0], step, kind, take, *file))
+        return entered
 
     def recover(self) -> list[ArchivedFrame]:
-        """Enter frames into the index whose process was killed after writing the file."""
+        """Enter frames into the index whose process was killed after writing the file.
+
+        Of frames that were exposed at once all must be there, or none is entered.
+        """
         with schema.connected(self._engine, reading=True) as connection:
             known = set(connection.scalars(sa.select(schema.frames.c.sha256)))
-        found = []
+        found: list[ArchivedFrame] = []
+        sets: dict[tuple[Any, ...], dict[str, _Stored]] = {}
         for sha256, suffix in self.objects.names():
             if suffix != ".tif" or sha256 in known:
                 continue
@@ -159,7 +219,19 @@ class Session:
                 continue
             key = {name: facts.pop(name, None) for name in ("session", "step", "kind", "take")}
             if key["session"] == self.name and self.find(key["step"], key["kind"], key["take"]) is None:
-                found.append(self._enter(sha256, suffix, len(data), key, facts, {"recovered": True}))
+                stored = _Stored(sha256, suffix, len(data), key, facts, {"recovered": True})
+                if "set" not in facts:
+                    found += self._enter([stored])
+                    continue
+                exposure = facts["exposure"], key["kind"], key["take"], facts["set"]
+                sets.setdefault(exposure, {})[facts["camera"]] = stored
+        for members in sets.values():
+            cameras = next(iter(members.values())).facts["cameras"]
+            complete = [members[camera] for camera in cameras if camera in members]
+            first = complete[0].key
+            # Another set of this exposure may have been entered just before.
+            if len(complete) == len(cameras) and not self.find(first["step"], first["kind"], first["take"]):
+                found += self._enter(complete)
         return found
 
     def _frames(

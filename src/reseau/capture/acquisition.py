@@ -12,6 +12,7 @@ import asyncio
 import math
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -32,7 +33,15 @@ from ..core.errors import (
     UsageError,
 )
 from ..core.version import __version__
-from ..instruments import Camera, EnvironmentSensor, Exposure, Oscilloscope, Turntable, UltrasonicScanner
+from ..instruments import (
+    Camera,
+    CameraRig,
+    EnvironmentSensor,
+    Exposure,
+    Oscilloscope,
+    Turntable,
+    UltrasonicScanner,
+)
 from . import by_hand
 from .bench import ROLES, Bench
 from .checks import Limits, Readiness, exposure_fault, readiness
@@ -123,7 +132,8 @@ class Acquisition:
     procedure : Procedure, optional
         Measures the frames. Without one, frames are only checked for saturation and motion.
     camera, table, oscilloscope, scanner : str, optional
-        Names of instruments on the bench. Default: the only instrument of that kind.
+        Names of instruments on the bench. Default: the only instrument of that kind. The camera may be a
+        rig: what its cameras expose at once is stored at once, each frame under ``camera/step``.
     retakes : int
         Number of additional attempts after a bad frame.
     limits : Limits, optional
@@ -212,8 +222,12 @@ class Acquisition:
 
     def done(self, step: Step) -> bool:
         """Return whether a step has a good frame, or as many bad ones as are allowed."""
-        frames = self.session.frames(step.name, "frame")
-        return any(f.verdict is not None and f.verdict.ok for f in frames) or len(frames) > self.retakes
+        rig = self._rig
+        names = [step.name] if rig is None else [f"{camera}/{step.name}" for camera in rig.cameras]
+        frames = [frame for name in names for frame in self.session.frames(name, "frame")]
+        return any(f.verdict is not None and f.verdict.ok for f in frames) or len(
+            frames
+        ) > self.retakes * len(names)
 
     # Messages for plans.
 
@@ -441,10 +455,20 @@ class Acquisition:
         with self._busy:
             return [self._exposed(step, 1, source) for step in steps]
 
+    @property
+    def _rig(self) -> CameraRig | None:
+        """The rig, if the camera of the session is one."""
+        name = self._chosen[Camera]
+        found = None if name is None else self.bench[name]
+        return found if isinstance(found, CameraRig) else None
+
     def _exposed(
         self, step: Step, average: int, source: Callable[[], Exposure] | None = None
     ) -> ArchivedFrame:
         self.doing = f"the frame of {step.name}"
+        rig = self._rig
+        if rig is not None:
+            return self._exposed_at_once(rig, step, average)
         for take in range(self.retakes + 1):
             frame = self.session.find(step.name, "frame", take) or self._taken(step, take, average, source)
             verdict = self._judged(frame, step)
@@ -452,6 +476,48 @@ class Acquisition:
             if verdict.ok:
                 break
         return frame
+
+    def _exposed_at_once(self, rig: CameraRig, step: Step, average: int) -> ArchivedFrame:
+        """Take frames with all cameras, again while none is good; return the first good one, or the last."""
+        if step.exposure_us is not None:
+            raise UsageError("has exposures of its own: use one camera", where=step.name)
+        for take in range(self.retakes + 1):
+            there = [self.session.find(f"{camera}/{step.name}", "frame", take) for camera in rig.cameras]
+            frames = [frame for frame in there if frame is not None] or self._taken_at_once(
+                rig, step, take, average
+            )
+            new = any(frame.verdict is None for frame in frames)
+            good = [frame for frame in frames if self._judged(frame, Step(frame.step, step.position)).ok]
+            self._last = good[0] if good else frames[-1]
+            if good and new:
+                self._report_precision(step)
+            if good:
+                return good[0]
+        return frames[-1]
+
+    def _taken_at_once(self, rig: CameraRig, step: Step, take: int, average: int) -> list[ArchivedFrame]:
+        if self._at_rest:
+            raise StateError("the bench was stopped", where=step.name)
+        before = self._position()
+        sets = [self._persist(rig.expose_all) for _ in range(average)]
+        moved = self._moved(before)
+        skews = [each.skew for each in sets]
+        late = [skew - within > rig.largest_skew_s for skew, within in skews]
+        around = self._environment()
+        frames, facts, clock = {}, {}, {}
+        for camera in rig.cameras:
+            exposures = [each.exposures[camera] for each in sets]
+            frames[camera] = _mean_frame([each.frame for each in exposures], f"{camera}/{step.name}")
+            facts[camera] = _facts(camera, exposures, before, moved) | {"late": any(late)} | around
+            clock[camera] = _clock(exposures) | {
+                "skew_s": [skew for skew, _ in skews], "skew_within_s": [within for _, within in skews]
+            }  # fmt: skip
+        return self.session.store_set(step.name, frames, take=take, facts=facts, clock=clock)
+
+    def _moved(self, before: Mapping[str, float]) -> bool:
+        """Whether the table has moved since its axes had these positions."""
+        moved = {axis: abs(value - before[axis]) for axis, value in self._position().items()}
+        return max(moved.values(), default=0.0) > _STILL
 
     def move_axes(self, position: Mapping[str, float]) -> None:
         """Move axes of the table, all at the same time, and wait.
@@ -491,19 +557,10 @@ class Acquisition:
         camera = self._prepared(step)
         before = self._position()
         exposures = [self._persist(source or camera.expose) for _ in range(average)]
-        moved = {axis: abs(value - before[axis]) for axis, value in self._position().items()}
+        moved = self._moved(before)
         frame = _mean_frame([each.frame for each in exposures], step.name)
-        first = exposures[0]
-        facts = {
-            "camera": camera.name,
-            "exposure_us": _finite(first.exposure_us),
-            "gain": _finite(first.gain),
-            "pattern": first.pattern,
-            "position": before,
-            "averaged": average,
-            "moved": max(moved.values(), default=0.0) > _STILL,
-            "fresh": source is not None or all(each.fresh for each in exposures),
-        }
+        facts = _facts(camera.name, exposures, before, moved)
+        facts["fresh"] = source is not None or facts["fresh"]
         if step.exposure_us is not None:
             facts["set_exposure_us"] = step.exposure_us
         facts |= self._environment()
@@ -573,11 +630,15 @@ class Acquisition:
         facts = {"step": step.name, "take": frame.take, "ok": verdict.ok, "why": verdict.why}
         # A frame from before a resumption took no time.
         self.watch("frame", facts | {"there": frame.verdict is not None} | verdict.facts)
-        if self.procedure is not None and verdict.ok and frame.verdict is None:
-            reached = dict(self.procedure.progress())
-            if reached:
-                self.watch("precision", {"step": step.name} | reached)
+        if verdict.ok and frame.verdict is None and "set" not in frame.facts:
+            self._report_precision(step)
         return verdict
+
+    def _report_precision(self, step: Step) -> None:
+        """Report what the procedure has reached, if anything."""
+        reached = {} if self.procedure is None else dict(self.procedure.progress())
+        if reached:
+            self.watch("precision", {"step": step.name} | reached)
 
     def _remember(self, frame: ArchivedFrame, step: Step, verdict: Verdict) -> None:
         """Store what was measured, so that a session that is resumed need not measure it again."""
@@ -610,6 +671,9 @@ class Acquisition:
             return Verdict(False, "the table moved during the exposure")
         if not frame.facts.get("fresh", True):
             return Verdict(False, "the exposure may have started before the request")
+        if frame.facts.get("late"):
+            skew = max(frame.clock.get("skew_s", [math.nan]))
+            return Verdict(False, f"the cameras exposed {1e6 * skew:.3g} µs apart: more than the rig allows")
         fault = exposure_fault(picture, self.limits)
         if fault:
             return Verdict(False, fault)
@@ -710,6 +774,10 @@ class Acquisition:
 
     def check_scene(self, count: int) -> Readiness:
         """Take frames of the static scene, store them, and return what they show."""
+        rig = self._rig
+        if rig is not None:
+            with self._busy:
+                return self._checked_rig(rig, count)
         with self._busy:
             camera: Camera = self.one(Camera)
             start = len(self.session.frames(kind="check"))
@@ -723,6 +791,27 @@ class Acquisition:
             self.session.note(f"check {start}", "check", found.to_dict())
             self.watch("check", found.to_dict())
             return found
+
+    def _checked_rig(self, rig: CameraRig, count: int) -> Readiness:
+        """Check the frames of each camera; return what the first one shows that is not ready, or any one."""
+        start = len(self.session.frames(kind="check"))
+        seen: dict[str, list[Frame]] = {camera: [] for camera in rig.cameras}
+        for k in range(start, start + count):
+            exposures = self._persist(rig.expose_all).exposures
+            frames = {
+                name: _mean_frame([each.frame], f"{name}/check {k}") for name, each in exposures.items()
+            }
+            clocks = {name: _clock([each]) for name, each in exposures.items()}
+            self.session.store_set(f"check {k}", frames, kind="check", clock=clocks)
+            for name, frame in frames.items():
+                seen[name].append(frame)
+        found = {name: readiness(frames, self.limits) for name, frames in seen.items()}
+        for name, each in found.items():
+            faults = [f"{name}: {fault}" for fault in each.faults]
+            self.session.note(f"check {start} {name}", "check", each.to_dict() | {"camera": name})
+            self.watch("check", each.to_dict() | {"camera": name, "faults": faults})
+            found[name] = replace(each, faults=tuple(faults))
+        return next((each for each in found.values() if not each), next(iter(found.values())))
 
 
 def _stream(camera: Camera, count: int) -> Callable[[], Exposure]:
@@ -748,6 +837,21 @@ def _mean_frame(frames: list[Frame], name: str) -> Frame:
     for frame in frames:
         total += frame.pixels
     return Frame((total / len(frames)).astype(np.float32), first.full_scale, name)
+
+
+def _facts(camera: str, exposures: list[Exposure], before: dict[str, float], moved: bool) -> dict[str, Any]:
+    """How frames of a camera were taken."""
+    first = exposures[0]
+    return {
+        "camera": camera,
+        "exposure_us": _finite(first.exposure_us),
+        "gain": _finite(first.gain),
+        "pattern": first.pattern,
+        "position": before,
+        "averaged": len(exposures),
+        "moved": moved,
+        "fresh": all(each.fresh for each in exposures),
+    }
 
 
 def _finite(value: float) -> float | None:

@@ -34,6 +34,8 @@ class Step:
         Exposure of the camera (µs). Default: unchanged.
     environment : mapping of str to Condition
         Of a step that was taken: what the sensors of the bench measured with its frame.
+    camera, exposure : str
+        Of a frame of a rig: its camera, and what it has in common with the others that were exposed at once.
 
     Examples
     --------
@@ -45,15 +47,19 @@ class Step:
     position: Mapping[str, float] = field(default_factory=dict)
     exposure_us: float | None = None
     environment: Mapping[str, Condition] = field(default_factory=dict)
+    camera: str = ""
+    exposure: str = ""
 
 
 def as_taken(step: Step, facts: Mapping[str, Any]) -> Step:
     """Return a step with what is known of its frame.
 
-    These are the conditions that the sensors measured, and, if the step sets it, the exposure: as reported by
-    the camera, else as set.
+    These are the conditions that the sensors measured, the camera and exposure of a frame of a rig, and, if
+    the step sets it, the exposure time: as reported by the camera, else as set.
     """
     step = replace(step, environment=Condition.from_facts(facts))
+    if "set" in facts:
+        step = replace(step, camera=facts["camera"], exposure=facts["exposure"])
     if facts.get("set_exposure_us") is None:
         return step
     return replace(step, exposure_us=facts.get("exposure_us") or facts["set_exposure_us"])

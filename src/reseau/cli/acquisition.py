@@ -182,7 +182,7 @@ def conduct(
             if not given.home:
                 given.check_homed(bench)
             session = begin()
-            with Display(where.as_json, given.expected, plan == "scan", given.units) as display:
+            with Display(where.as_json, given.frames_on(bench), plan == "scan", given.units) as display:
                 facts = {"session": session.name, "archive": where.archive, "poses": given.expected}
                 display.watch("begin", facts)
                 why = sessions.capture(

@@ -420,7 +420,7 @@ def calibrate_camera(
     frames: Iterable[Photograph],
     design: PlaneDesign,
     measure: Measurer,
-    size: tuple[int, int] | None = None,
+    size: tuple[int, int] | Mapping[str, tuple[int, int]] | None = None,
     model: CameraOptions | None = None,
     options: CalibrationOptions | None = None,
     taken: Mapping[str, Taken] | None = None,
@@ -440,7 +440,7 @@ def calibrate_camera(
         Function that measures the target in a frame; see
         :func:`~reseau.procedures.target_measurement.measurer_of`.
     size : (int, int), optional
-        Width and height in pixels; required without frames.
+        Width and height in pixels, or those of each camera by its name; required without frames.
     model : CameraOptions, optional
         Camera model and parameters to estimate.
     options : CalibrationOptions, optional
@@ -589,7 +589,7 @@ def _checked(frames: Iterable[Photograph], taken: Mapping[str, Taken] | None) ->
 
 def _measured(
     photographs: Iterable[MeasuredPhotograph],
-    size: tuple[int, int] | None,
+    size: tuple[int, int] | Mapping[str, tuple[int, int]] | None,
     taken: Mapping[str, Taken] | None,
 ) -> tuple[dict[str, ImagePoints], dict[str, str], dict[str, tuple[int, int]]]:
     """Return the image points of each photograph, reasons of declined ones, and image sizes by camera."""
@@ -607,7 +607,10 @@ def _measured(
         measured[each.name] = each.found
         if each.size is not None:
             seen[each.name] = each.size
-    sizes = {} if size is None else dict.fromkeys(every, size)
+    if size is None or isinstance(size, Mapping):
+        sizes = {camera: one for camera, one in (size or {}).items() if camera in every}
+    else:
+        sizes = dict.fromkeys(every, size)
     for camera in every - sizes.keys():
         own = Counter(seen[name] for name in measured if name in seen and _camera_of(name, taken) == camera)
         if own:

@@ -33,6 +33,7 @@ from ..optics import Pose
 from ..optics.poses import rotation_matrix
 from ..optics.refraction import RefractedRays
 from .calibration import Calibrated, CalibrationOptions, CameraOptions, PlaneDesign, calibrate_camera
+from .exposures import Taken
 from .next_pose import PREDICTED, with_image
 from .target_measurement import Measurer
 from .turntable import HEIGHT, Mount
@@ -41,6 +42,8 @@ from .z_stage import Heights
 __all__ = ["Place", "TestfieldProcedure"]
 
 _LEAST_IMAGES = 3
+_LEAST_EXPOSURES = 6
+"""Exposures of a rig from which it is calibrated: from fewer, often frontal, ones the adjustment is long."""
 
 
 class Place(Protocol):
@@ -54,12 +57,23 @@ class Place(Protocol):
     def position(self) -> Mapping[str, float]:
         """Positions of the axes."""
 
+    @property
+    def camera(self) -> str:
+        """Camera of a rig that took the frame; empty if there is one camera."""
+
+    @property
+    def exposure(self) -> str:
+        """What the frame has in common with those that other cameras of the rig exposed at once."""
+
 
 P = TypeVar("P", bound=Place)
 
 
 class TestfieldProcedure:
-    """Calibration of a camera during the acquisition of its images of a target.
+    """Calibration of a camera, or of a rig of cameras, during the acquisition of images of a target.
+
+    Frames of a rig say which camera took them, and in which exposure. Its cameras are then calibrated
+    together, with their places to each other.
 
     Parameters
     ----------
@@ -117,7 +131,8 @@ class TestfieldProcedure:
         self._sigmas, self._pose, self._refraction = sigmas, dict[str, int](), refraction
         self._stands: tuple[int, dict[str, float] | None] = (-1, None)
         self._inputs = dict(inputs or {})
-        self._size: tuple[int, int] | None = None
+        self._sizes: dict[str, tuple[int, int]] = {}
+        self._taken: dict[str, Taken] = {}
         self._current: tuple[int, Calibrated | Failure] | None = None
 
     def on_frame(self, frame: Frame, step: Place) -> Verdict:
@@ -131,7 +146,9 @@ class TestfieldProcedure:
         return Verdict(True, facts={"points": len(found.points)})
 
     def _keep(self, step: Place, points: ImagePoints, size: tuple[int, int], sha256: str) -> None:
-        self._size = size
+        self._sizes[step.camera] = size
+        if step.camera:
+            self._taken[step.name] = Taken(step.camera, step.exposure)
         self._measured[step.name] = points
         self._places[step.name], self._inputs[step.name] = dict(step.position), sha256
         self._surroundings.add(step.name, step)
@@ -140,11 +157,14 @@ class TestfieldProcedure:
 
     def recollection(self, step: Place) -> dict[str, Any]:
         """Return what was measured in the good frame of a step, for :meth:`recall`."""
-        points, size = self._measured[step.name], self._size
+        points, size = self._measured[step.name], self._sizes[self._camera_of(step.name)]
         return {
             "names": list(points.names), "xy": points.xy.tolist(), "cov": points.cov.tolist(),
-            "size": None if size is None else list(size), "sha256": self._inputs[step.name],
+            "size": list(size), "sha256": self._inputs[step.name],
         }  # fmt: skip
+
+    def _camera_of(self, name: str) -> str:
+        return self._taken[name].camera if name in self._taken else ""
 
     def recall(self, step: Place, measured: Mapping[str, Any]) -> Verdict:
         """Take over what was measured in a frame before, in place of measuring it again."""
@@ -179,7 +199,10 @@ class TestfieldProcedure:
         if self._current is None or self._current[0] != count:
             points = list(self._measured.items())
             options = CalibrationOptions(heights=self._heights(), refraction=self._refraction)
-            found = calibrate_camera(points, self.design, self._measure, self._size, self.model, options)
+            size = self._sizes if self._taken else self._sizes.get("")
+            found = calibrate_camera(
+                points, self.design, self._measure, size, self.model, options, self._taken or None
+            )
             self._current = (count, found)
         return self._current[1]
 
@@ -191,17 +214,25 @@ class TestfieldProcedure:
     def progress(self) -> dict[str, float]:
         """Return standard deviations of the camera parameters, and sigma0; nothing before the third image.
 
+        Of a rig they are the largest of its cameras, from the sixth exposure on.
+
         They are those from the scatter between the images where it is larger. From the sixth image on,
         ``scatter`` is how much larger it is, over all parameters: see :func:`reseau.bundle.image_scatter`.
         """
-        if len(self._measured) < _LEAST_IMAGES:
+        exposures = {taken.exposure for taken in self._taken.values()}
+        if len(self._measured) < _LEAST_IMAGES or 0 < len(exposures) < _LEAST_EXPOSURES:
             return {}
         found = self.calibrated()
         if isinstance(found, Failure):
             return {}
-        names, sigma = _sigmas(found.result)
-        reached = {f"sigma_{name}": float(s) for name, s in zip(names, sigma, strict=True)}
-        scatter = image_scatter(found.result, 0)
+        reached: dict[str, float] = {}
+        scatters = []
+        for c in range(len(found.result.network.cameras)):
+            names, sigma = _sigmas(found.result, c)
+            for name, s in zip(names, sigma, strict=True):
+                reached[f"sigma_{name}"] = max(float(s), reached.get(f"sigma_{name}", 0.0))
+            scatters.append(image_scatter(found.result, c))
+        scatter = float(np.fmax.reduce(scatters))
         more = {"scatter": scatter} if np.isfinite(scatter) else {}
         return reached | {"sigma0": float(found.result.sigma0)} | more
 
@@ -211,15 +242,15 @@ class TestfieldProcedure:
         The image of each candidate is predicted and added to the network with the covariance of the other
         images; the standard deviation follows from the design matrix alone, and is enlarged as that of the
         images so far. While there are too few images
-        for a calibration, the first candidate is returned without a prediction.
+        for a calibration, the first candidate is returned without a prediction. For a rig there is none.
 
         Raises
         ------
         EstimationError
             If the parameter is not estimated, or the axes of the table do not match the mount of a testfield.
         """
-        if not candidates:
-            return None
+        if not candidates or self._taken:
+            return None  # the images of several cameras are not predicted
         found = (
             self.calibrated()
             if len(self._measured) >= _LEAST_IMAGES
@@ -240,7 +271,7 @@ class TestfieldProcedure:
         )
         if isinstance(mount, Failure):
             raise EstimationError(mount.reason, where="next pose")
-        now = float(_sigmas(result)[1][column])
+        now = float(_sigmas(result, 0)[1][column])
         enlarged = float(result.sigma0) * now / float(np.sqrt(result.camera_covariance(0)[column, column]))
         best: tuple[P, float] | None = None
         for candidate in candidates:
@@ -251,7 +282,7 @@ class TestfieldProcedure:
         return best
 
     def finish(self) -> dict[str, str]:
-        """Return the calibration; its ``times`` are empty, because the archive stores them.
+        """Return the calibration, of a rig that of each camera; ``times`` are stored by the archive.
 
         Raises
         ------
@@ -261,14 +292,20 @@ class TestfieldProcedure:
         found = self.calibrated()
         if isinstance(found, Failure):
             raise EstimationError(found.reason, where=self.name)
-        return {"calibration.json": found.calibration(self.name, self.provenance.to_dict()).to_json()}
+        made = self.provenance.to_dict()
+        if not self._taken:
+            return {"calibration.json": found.calibration(self.name, made).to_json()}
+        return {
+            f"calibration-{camera}.json": found.calibration(f"{self.name} {camera}", made, camera).to_json()
+            for camera in found.cameras
+        }
 
 
-def _sigmas(result: Result) -> tuple[tuple[str, ...], Array]:
-    """Names and standard deviations of the parameters of the camera: the larger of the two kinds."""
-    names, _, _ = result.camera_columns(0)
-    formal: Array = np.sqrt(np.diag(result.camera_covariance(0)))
-    return tuple(names), np.fmax(formal, sigma_between_images(result, 0))
+def _sigmas(result: Result, camera: int) -> tuple[tuple[str, ...], Array]:
+    """Names and standard deviations of the parameters of a camera: the larger of the two kinds."""
+    names, _, _ = result.camera_columns(camera)
+    formal: Array = np.sqrt(np.diag(result.camera_covariance(camera)))
+    return tuple(names), np.fmax(formal, sigma_between_images(result, camera))
 
 
 def _joined(

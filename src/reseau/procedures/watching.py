@@ -95,6 +95,8 @@ class _Place:
 
     name: str
     position: Mapping[str, float] = field(default_factory=dict)
+    camera: str = ""
+    exposure: str = ""
 
 
 class Watching:

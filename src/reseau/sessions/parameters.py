@@ -15,7 +15,7 @@ from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
 from ..capture import HEIGHT, ROLES, Bench, Goal, SensorSeriesPlan, Step
 from ..core.errors import FormatError, StateError, UsageError
-from ..instruments import Camera, EnvironmentSensor, Turntable
+from ..instruments import Camera, CameraRig, EnvironmentSensor, Turntable
 from ..io import Document
 
 if TYPE_CHECKING:
@@ -66,6 +66,8 @@ class SessionParameters(Document):
     """Instruments that the bench must have."""
     USES: ClassVar[tuple[str, ...]] = ()
     """Instruments that the bench may have; the operator replaces them."""
+    RIGS: ClassVar[bool] = False
+    """Whether the camera may be a rig."""
 
     retakes: NonNegativeInt = 2
     park: dict[str, float] = Field(default_factory=dict)
@@ -137,7 +139,23 @@ class SessionParameters(Document):
             or (role in self.USES and bench.has(kind))
             or (role == "table" and moves)
         ]
-        return [str(bench.one(ROLES[role], getattr(self, role)).name) for role in roles]
+        return [str(bench.one(self._kind(role, bench), getattr(self, role)).name) for role in roles]
+
+    def _kind(self, role: str, bench: Bench) -> type:
+        """Kind of the instrument of a role."""
+        return CameraRig if role == "camera" and self.RIGS and self.has_rig(bench) else ROLES[role]
+
+    def frames_on(self, bench: Bench) -> int | None:
+        """Number of frames (or sections) on a bench: each camera of a rig takes one at each pose."""
+        count = self.expected
+        if count is None or not self.RIGS or not self.has_rig(bench):
+            return count
+        rig: CameraRig = bench.one(CameraRig, self.camera)
+        return count * len(rig.cameras)
+
+    def has_rig(self, bench: Bench) -> bool:
+        """Return whether the camera of the session is a rig of the bench."""
+        return self.camera is not None and isinstance(bench[self.camera], CameraRig)
 
     def check_bench(self, bench: Bench) -> None:
         """Check that a bench can carry out the plan, before it is connected.
@@ -189,6 +207,7 @@ class FramesParameters(SessionParameters):
     """
 
     SCHEMA: ClassVar[str] = "reseau-frames-parameters/1"
+    RIGS: ClassVar[bool] = True
     NEEDS: ClassVar[tuple[str, ...]] = ("camera",)
 
     retakes: NonNegativeInt = 0
@@ -388,6 +407,7 @@ class TestfieldParameters(SessionParameters):
 
     __test__: ClassVar[bool] = False  # not a class of tests
     SCHEMA: ClassVar[str] = "reseau-testfield-parameters/1"
+    RIGS: ClassVar[bool] = True
     NEEDS: ClassVar[tuple[str, ...]] = ("camera", "table")
 
     steps: tuple[tuple[str, dict[str, float]], ...]
@@ -444,6 +464,17 @@ class TestfieldParameters(SessionParameters):
         """Check instruments, the range of all poses, and that the goal is about an estimated parameter."""
         super().check_bench(bench)
         self._check_goal()
+        if not self.has_rig(bench):
+            return
+        for option, given in (("--until", bool(self.until)), ("--heights", self.sigmas is not None)):
+            if given:
+                raise UsageError("requires one camera", where=option, do="omit it, or choose one of the rig")
+        uses = getattr(bench[self.camera or ""], "uses", ())
+        wet = [name for name in uses if bench.file.instruments[name].refraction is not None]
+        if wet:
+            raise UsageError(
+                "has `refraction`: a rig is calibrated in air only", where=wet[0], do="calibrate it alone"
+            )
 
     def _check_goal(self) -> None:
         model, goal = self.camera_options(), self.goal
