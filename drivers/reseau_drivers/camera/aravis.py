@@ -10,7 +10,7 @@ import math
 import shlex
 import time
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -32,6 +32,7 @@ from ..codecs.gige import Action
 from ..codecs.pixels import GENICAM, decode
 from .camera import CameraSettings, OriginalValues, RawFrame, Ready
 from .clocks import BlockCounter, ExposureTimes, realtime_offset
+from .features import Feature, found_features
 from .gvcp import HEARTBEAT_S, controlled_elsewhere, is_ip, require_answer, require_control, send_action
 
 __all__ = ["Aravis", "AravisSettings", "aravis_cameras"]
@@ -311,6 +312,69 @@ class Aravis:
             if not camera.is_exposure_time_available():
                 return settings
             return replace(settings, exposure_us=max(1.0, float(camera.get_exposure_time_bounds()[0])))
+
+    def features(self) -> list[Feature]:
+        """Return the features that are available now."""
+        library, glib = _library()
+        with self._translated_errors("features") as camera:
+            return list(found_features(library, glib, camera.get_device().get_genicam()))
+
+    def set_features(self, wanted: Mapping[str, str]) -> None:
+        """Stop the acquisition and set features, in their order.
+
+        Raises
+        ------
+        RefusedError
+            If a feature does not exist, or a value is outside its range; those before it are set.
+        """
+        self.halt()
+        with self._translated_errors("set") as camera:
+            for name, value in wanted.items():
+                self._require_range(camera, name, value)
+                self._set_feature(camera, name, value)
+
+    def _require_range(self, camera: Any, name: str, value: str) -> None:
+        """Raise if a number is outside the range of a feature, or a value is none of its entries."""
+        if not camera.is_feature_available(name):
+            raise RefusedError(f"has no feature {name}", do="list them with `reseau bench features`")
+        library, glib = _library()
+        genicam = camera.get_device().get_genicam()
+        found = next((each for each in found_features(library, glib, genicam) if each.name == name), None)
+        if found is None:
+            return
+        if not found.writable:
+            raise RefusedError(f"{name} cannot be changed now")
+        number = _number(value)
+        if found.low is not None and found.high is not None and not found.low <= number <= found.high:
+            raise RefusedError(f"{name} = {value}: {found}")
+        if found.entries and value not in found.entries:
+            raise RefusedError(f"{name} = {value}: it is one of {', '.join(found.entries)}")
+
+    def user_sets(self) -> tuple[str, ...]:
+        """Return the names of the camera's user sets; none if it has none."""
+        with self._translated_errors("user sets") as camera:
+            if not camera.is_feature_available("UserSetSelector"):
+                return ()
+            return tuple(camera.dup_available_enumerations_as_strings("UserSetSelector"))
+
+    def load_user_set(self, name: str) -> None:
+        """Stop the acquisition and give all features the values of a user set."""
+        self._user_set(name, "UserSetLoad")
+
+    def save_user_set(self, name: str) -> None:
+        """Keep the present values of all features in a user set of the camera."""
+        self._user_set(name, "UserSetSave")
+
+    def _user_set(self, name: str, command: str) -> None:
+        known = self.user_sets()
+        if name not in known:
+            raise RefusedError(
+                f"has no user set {name}", do=f"it has {', '.join(known)}" if known else "it has none"
+            )
+        self.halt()
+        with self._translated_errors(command) as camera:
+            camera.set_string("UserSetSelector", name)
+            camera.execute_command(command)
 
     def start(self, deadline: Deadline) -> None:
         """Start the acquisition if it is not running."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -18,6 +18,7 @@ from reseau.core.provenance import sha256_of
 from reseau.instruments import Deadline, Device, Identity, Limits, Settings, quantity
 
 from .clocks import TimeInterval, utc
+from .features import Feature, differences, matching
 
 __all__ = ["CameraDriver", "CameraExposure", "CameraInterface", "CameraSettings", "RawFrame", "Ready"]
 
@@ -278,6 +279,78 @@ class CameraDriver(Device[S]):
             raise RefusedError("has no IP address", where=self.name)
         return host
 
+    def _genicam(self, ask: Callable[[Any], Any], command: str) -> Any:
+        """The answer of a GenICam camera."""
+        if not hasattr(self._source, "user_sets"):
+            raise RefusedError("has no GenICam features", where=self.name, command=command)
+        with self._exchange(command):
+            return ask(self._source)
+
+    def features(self, search: str = "") -> list[Feature]:
+        """Return the features of a GenICam camera, with ranges, units and present values.
+
+        Parameters
+        ----------
+        search : str
+            Only those whose name, category, unit, entries or description contain this text.
+
+        Raises
+        ------
+        RefusedError
+            If the camera has no GenICam features.
+        InstrumentError
+            If the connection is lost.
+        """
+        found: list[Feature] = self._genicam(lambda source: source.features(), "features")
+        return matching(found, search)
+
+    def set_features(self, wanted: Mapping[str, str]) -> None:
+        """Set features of a GenICam camera; the settings of this driver are not changed by it.
+
+        Raises
+        ------
+        RefusedError
+            If a feature does not exist, is read only, or a value is outside its range.
+        """
+        self._genicam(lambda source: source.set_features(wanted), "set features")
+
+    def user_sets(self) -> tuple[str, ...]:
+        """Return the names of the sets of values that a GenICam camera keeps without power."""
+        found: tuple[str, ...] = self._genicam(lambda source: source.user_sets(), "user sets")
+        return found
+
+    def save_user_set(self, name: str) -> None:
+        """Keep the present values of all features in a user set of the camera; raises as :meth:`features`."""
+        self._genicam(lambda source: source.save_user_set(name), "save user set")
+
+    def user_set(self, name: str) -> dict[str, str]:
+        """Return the values of a user set; the present values of the camera are set again afterwards.
+
+        The set is loaded for it: what was not saved, and is not among the settings, is read before.
+        """
+
+        def values(source: Any) -> dict[str, str]:
+            before = _writable(source.features())
+            source.load_user_set(name)
+            found = _writable(source.features())
+            changed = {key: value for key, value in before.items() if found.get(key) != value}
+            source.set_features(changed)
+            return found
+
+        loaded: dict[str, str] = self._genicam(values, "user set")
+        return loaded
+
+    def compare_user_sets(self, one: str, other: str = "") -> dict[str, tuple[str, str]]:
+        """Return the features with different values in two user sets, or in one and at present.
+
+        Raises
+        ------
+        RefusedError
+            If there is no such user set.
+        """
+        present = _writable(self.features())
+        return differences(self.user_set(one), self.user_set(other) if other else present)
+
     def _open(self, deadline: Deadline) -> None:
         self._source.open(deadline)
 
@@ -430,6 +503,20 @@ class CameraDriver(Device[S]):
     def _exchanged(self, ask: Callable[[Deadline], str], command: str, deadline: Deadline) -> str:
         with self._exchange(command, deadline.left_or_minimum) as part:
             return ask(part)
+
+
+def _writable(features: list[Feature]) -> dict[str, str]:
+    """Values of the features that can be set again."""
+    skipped = ("UserSetSelector", "TLParamsLocked")
+    return {
+        each.name: each.value
+        for each in features
+        if each.writable
+        and each.value
+        and each.kind not in ("command", "register")
+        and each.name not in skipped
+        and not each.name.startswith("Gev")
+    }
 
 
 def _differences(old: CameraSettings, new: CameraSettings) -> dict[str, Any]:

@@ -13,7 +13,9 @@ from .checks import (
     readiness,
     shift_between,
 )
+from .discovery import bench_text
 from .engine import Control, Decision, Rerun, carry_out, rerun
+from .lighting import LightRule, Steered, level_of, next_light, steer
 from .lock import BenchLock, Holder
 from .operators import RemoteOperator
 from .plans import Goal, SensorSeriesPlan
@@ -32,6 +34,7 @@ __all__ = [
     "Goal",
     "Holder",
     "InstrumentEntry",
+    "LightRule",
     "Limits",
     "Plan",
     "Procedure",
@@ -39,9 +42,11 @@ __all__ = [
     "RemoteOperator",
     "Rerun",
     "SensorSeriesPlan",
+    "Steered",
     "Step",
     "Watch",
     "at_heights",
+    "bench_text",
     "by_hand",
     "carry_out",
     "drivers",
@@ -50,6 +55,8 @@ __all__ = [
     "exposure_of",
     "found_instruments",
     "grey_counts",
+    "level_of",
+    "next_light",
     "paper_steps",
     "plugin",
     "read_steps",
@@ -57,4 +64,5 @@ __all__ = [
     "rerun",
     "shift_between",
     "spread",
+    "steer",
 ]

@@ -8,8 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
+from ..core.errors import UsageError
 from . import bench_by_hand as by_hand
 from .bench_by_hand import BenchPath
+from .bench_features import features
 from .common import AsJson, Out, say, writable
 
 __all__ = ["app"]
@@ -23,15 +25,26 @@ app.command()(by_hand.stop)
 app.command("set")(by_hand.set_)
 app.command()(by_hand.expose)
 app.command()(by_hand.watch)
+app.command()(features)
 
 
 @app.command("list")
-def list_(as_json: AsJson = False) -> None:
+def list_(
+    as_json: AsJson = False,
+    write: Annotated[
+        Path | None, typer.Option("--write", help="Write a bench file for what was found; a new file.")
+    ] = None,
+) -> None:
     """Search for cameras, VISA instruments and serial ports, and list the installed drivers."""
-    from ..capture import drivers, found_instruments
+    from ..capture import bench_text, drivers, found_instruments
     from ..core.provenance import canonical_json
+    from ..io import write_whole
 
+    if write is not None and write.exists():
+        raise UsageError("exists", where=write, do="name a new file")
     found = found_instruments()
+    if write is not None:
+        write_whole(write, bench_text(found, write.stem))
     if as_json:
         addresses = {k: [] if isinstance(v, Exception) else list(v) for k, v in found.items()}
         errors = {k: str(v) for k, v in found.items() if isinstance(v, Exception)}
@@ -44,6 +57,8 @@ def list_(as_json: AsJson = False) -> None:
         else:
             say("".join(f"{way}: {address}\n" for address in addresses_) or f"{way}: nothing found\n")
     say(f"drivers: {', '.join(drivers())}\n")
+    if write is not None:
+        say(f"{write}: complete it, then run `reseau bench check --bench {write}`\n")
 
 
 @app.command()
@@ -117,6 +132,10 @@ def sim(
     temperature: Annotated[
         float, typer.Option(min=2.0, max=28.0, help="With --water: its temperature (°C), and so its index.")
     ] = 18.0,
+    cameras: Annotated[
+        int,
+        typer.Option(min=1, max=4, help="Number of cameras before the testfield; several are a rig."),
+    ] = 1,
     seconds: Annotated[float, typer.Option(min=0.0, help="Running time (s); 0: until interrupted.")] = 0.0,
 ) -> None:
     """Start simulated instruments on their real protocols, and print a bench.toml for them."""
@@ -128,14 +147,14 @@ def sim(
     if out is not None:
         writable(out)
     options: dict[str, Any] = {"table": table, "family": family, "camera": camera or None, "scanner": scanner}
-    options |= {"repeatable": repeatable, "flat": flat}
+    options |= {"repeatable": repeatable, "flat": flat, "cameras": cameras}
     if water:
         options["water"] = {
             "distance_mm": port_distance, "thickness_mm": port_thickness, "tilt_deg": (0.0, port_tilt),
             "temperature_c": temperature,
         }  # fmt: skip
     with plugin("reseau.simulators", "bench")(seed, **options) as bench:
-        if camera and "[instruments.camera]" not in bench.toml:
+        if camera and cameras == 1 and "[instruments.camera]" not in bench.toml:
             typer.echo("no camera: Aravis or PyGObject is not installed", err=True)
         if out is not None:
             write_whole(out, bench.toml)

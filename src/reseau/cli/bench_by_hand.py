@@ -44,7 +44,7 @@ def _held(bench: Bench, purpose: str) -> Iterator[None]:
 
 
 @contextmanager
-def _one(path: Path, kind: type, name: str | None, purpose: str) -> Iterator[Any]:
+def held_one(path: Path, kind: type, name: str | None, purpose: str) -> Iterator[Any]:
     """An instrument of a bench, connected: the named one, or the only one of its kind."""
     from ..capture import Bench
 
@@ -111,7 +111,7 @@ def home(
     from ..capture import by_hand
     from ..instruments import Turntable
 
-    with _one(bench, Turntable, table, "reseau bench home") as found:
+    with held_one(bench, Turntable, table, "reseau bench home") as found:
         homed = by_hand.home(found, axes or ())
         say(f"{', '.join(homed)}: homed\n" if homed else "all axes have their reference\n")
         _say_axes(found)
@@ -128,7 +128,7 @@ def move(
     from ..instruments import Turntable
 
     wanted = dict(_number(text) for text in positions)
-    with _one(bench, Turntable, table, "reseau bench move") as found:
+    with held_one(bench, Turntable, table, "reseau bench move") as found:
         there = by_hand.targets(found, wanted, relative=by)
         lost = [axis for axis in there if not found.state(axis).homed]
         if lost:
@@ -254,21 +254,47 @@ def expose(
     exposure_us: Annotated[
         float | None, typer.Option(min=0.1, help="Exposure of this frame (µs). Default: as set.")
     ] = None,
+    auto: Annotated[
+        bool,
+        typer.Option(
+            "--auto", help="Set exposure and gain by the rule below, and keep them in the bench file."
+        ),
+    ] = False,
+    percentile: Annotated[
+        float, typer.Option(min=1.0, max=100.0, help="With --auto: percentile of the grey values.")
+    ] = 99.5,
+    share: Annotated[
+        float, typer.Option(min=0.01, max=0.99, help="With --auto: its share of full scale.")
+    ] = 0.8,
+    longest_ms: Annotated[
+        float, typer.Option(min=0.001, help="With --auto: longest exposure; then the gain is raised.")
+    ] = 50.0,
     as_json: AsJson = False,
 ) -> None:
     """Take a frame, and say how it is exposed and how sharp it is; it is not archived."""
+    from ..capture import LightRule, steer
     from ..core.provenance import canonical_json
     from ..instruments import Camera
+    from ..io import read_text, write_whole
     from ..io.images import write_image
 
+    if auto and exposure_us is not None:
+        raise UsageError("cannot be combined with --auto", where="--exposure-us")
     if out is not None:
         writable(out)
-    with _one(bench, Camera, camera, "reseau bench expose") as found:
+    with held_one(bench, Camera, camera, "reseau bench expose") as found:
         # Others set the exposure of the bench file again, when they connect.
         if exposure_us is not None:
             found.configure(exposure_us=exposure_us)
+        steered = None
+        if auto:
+            steered = steer(found, LightRule(percentile, share, longest_us=1000 * longest_ms))
         frame = found.expose().frame
+        name, kept = found.name, {key: found.settings.to_dict()[key] for key in _LIGHT if auto}
     facts = _facts(frame)
+    if steered is not None:
+        facts |= {"auto": {"percentile": percentile, "share": share, **vars(steered)}}
+        write_whole(bench, _with_settings(read_text(bench), name, kept))
     if out is not None:
         write_image(out, frame.pixels)
     if as_json:
@@ -279,8 +305,16 @@ def expose(
         )
         return
     say(f"{frame.width} × {frame.height} px: {_words(facts)}\n")
+    if steered is not None:
+        say(f"{name}: exposure_us {steered.exposure_us:g}, gain {steered.gain:g}, kept in {bench}\n")
+        if not steered:
+            typer.echo(f"warning: {steered.why}", err=True)
     if out is not None:
         say(f"{out}\n")
+
+
+_LIGHT = ("exposure_us", "gain")
+"""Settings that the rule for the light changes."""
 
 
 def _facts(frame: Any) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -38,10 +40,19 @@ def watch(
         int, typer.Option(min=0, max=65535, help="Port of the page on 127.0.0.1; 0: a free one.")
     ] = 0,
     seconds: Annotated[float, typer.Option(min=0.0, help="End after this time (s); 0: no limit.")] = 0.0,
+    auto: Annotated[
+        bool,
+        typer.Option(
+            "--auto", help="First set exposure and gain: 99.5 % of the pixels below 80 % of full scale."
+        ),
+    ] = False,
+    window: Annotated[bool, typer.Option(help="Open the page in a window, where there is a display.")] = True,
 ) -> None:
     """Show the live picture of a camera on a page, and take a frame when it is sharp and new."""
     import time
+    import webbrowser
 
+    from ..capture import steer
     from ..instruments import Camera
     from ..io import parse_design, read_text
     from ..io.images import write_image
@@ -68,6 +79,13 @@ def watch(
     ):
         out.mkdir(parents=True, exist_ok=True)
         typer.echo(f"{page.url}  (Ctrl-C ends)", err=True)
+        if window and _has_display():
+            webbrowser.open(page.url)
+        if auto:
+            steered = steer(source)
+            say(f"{source.name}: exposure_us {steered.exposure_us:g}, gain {steered.gain:g}\n")
+            if not steered:
+                typer.echo(f"warning: {steered.why}", err=True)
         end, taken = time.monotonic() + (seconds or float("inf")), 0
         with suppress(KeyboardInterrupt):
             while taken < count and time.monotonic() < end:
@@ -83,6 +101,13 @@ def watch(
     for line in () if not taken else seen.verdict:
         say(f"{line}\n")
     say(f"{taken} frames in {out}; next: reseau calibrate {out} --design {design}\n")
+
+
+def _has_display() -> bool:
+    """Whether windows can be shown."""
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _bench(path: Path, camera: str | None) -> Bench:

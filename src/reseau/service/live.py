@@ -1,4 +1,4 @@
-"""The page of a live picture, on the loopback interface: marks, coverage, what is reached.
+"""The page of a live picture, on the loopback interface: marks, light, focus, coverage, what is reached.
 
 Nothing can be changed through it: it answers ``GET`` only. A page of another site that has a name of its own
 resolve to this machine is refused, because its requests carry that name in their ``Host``.
@@ -7,13 +7,17 @@ resolve to this machine is refused, because its requests carry that name in thei
 from __future__ import annotations
 
 import json
+import math
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any, Self
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
+from ..capture import edge_sigma, exposure_of
 from ..core.data import Frame
 from ..core.errors import UsageError
 from ..procedures.watching import Seen
@@ -21,7 +25,7 @@ from ..report.overlay import preview
 
 __all__ = ["LivePage"]
 
-_ADDRESS, _WIDTH = "127.0.0.1", 960
+_ADDRESS, _WIDTH, _BINS, _RED = "127.0.0.1", 960, 64, (40, 40, 235)
 _PAGES = {"/": ("live.html", "text/html"), "/live.js": ("live.js", "text/javascript"),
           "/live.css": ("live.css", "text/css")}  # fmt: skip
 _SAFE = {
@@ -56,7 +60,7 @@ class LivePage:
 
     def __init__(self, title: str, port: int = 0) -> None:
         self._lock = threading.Lock()
-        self._picture = b""
+        self._picture, self._sharpest = b"", float("inf")
         self._state: dict[str, Any] = {"title": title, "number": 0, "words": "waiting for the camera"}
         try:
             self._server = ThreadingHTTPServer((_ADDRESS, port), _handler(self))
@@ -76,14 +80,25 @@ class LivePage:
         return f"http://{_ADDRESS}:{self.port}/"
 
     def show(self, frame: Frame, seen: Seen, wanted: int) -> None:
-        """Show a frame, what was seen in it, and how many frames are wanted."""
-        _, coded = cv2.imencode(".jpg", preview(frame, _WIDTH), [cv2.IMWRITE_JPEG_QUALITY, 80])
+        """Show a frame, what was seen in it, and how many frames are wanted.
+
+        The width of the sharpest edges is shown with the smallest one so far: turn the focus until it is
+        reached again.
+        """
+        _, coded = cv2.imencode(".jpg", _marked(frame), [cv2.IMWRITE_JPEG_QUALITY, 80])
+        edge = edge_sigma(frame)
+        self._sharpest = min(self._sharpest, edge)
+        counts, _ = np.histogram(frame.pixels, _BINS, (0, frame.full_scale))
         state = {
             "number": self._state["number"] + 1,
             "width": frame.width,
             "height": frame.height,
             "points": seen.xy.round(1).tolist(),
             "covered": seen.covered.astype(int).tolist(),
+            "histogram": (counts / max(1, counts.max())).round(3).tolist(),
+            "saturated": exposure_of(frame)[0],
+            "edge_px": edge if math.isfinite(edge) else None,
+            "sharpest_px": self._sharpest if math.isfinite(self._sharpest) else None,
             "words": seen.words,
             "taken": seen.taken,
             "frames": seen.frames,
@@ -115,6 +130,16 @@ class LivePage:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+
+
+def _marked(frame: Frame) -> NDArray[np.uint8]:
+    """A small picture of a frame; where a pixel is saturated it is red."""
+    small = preview(frame, _WIDTH)
+    coloured = small if small.ndim == 3 else cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
+    full = (frame.pixels >= frame.full_scale).astype(np.float32)
+    height, width = coloured.shape[:2]
+    coloured[cv2.resize(full, (width, height), interpolation=cv2.INTER_AREA) > 0] = _RED
+    return np.asarray(coloured, np.uint8)
 
 
 def _handler(page: LivePage) -> type[BaseHTTPRequestHandler]:

@@ -28,6 +28,14 @@ function show(state) {
     ...cells.map(([r, c]) => drawn("rect", { x: c * across - 0.5, y: r * down - 0.5, width: across, height: down })),
     ...state.points.map(([x, y]) => drawn("circle", { cx: x, cy: y, r: width / 150, "stroke-width": width / 500 })),
   );
+  at("histogram").replaceChildren(
+    ...state.histogram.map((high, k) => drawn("rect", { x: k, y: 20 * (1 - high), width: 1, height: 20 * high })),
+  );
+  const percent = 100 * state.saturated;
+  at("saturated").textContent = (percent && percent < 0.1 ? "less than 0.1" : percent.toFixed(1)) + " %";
+  const pixels = (value) => (value === null ? "none" : value.toFixed(2) + " px");
+  at("edge").textContent = pixels(state.edge_px);
+  at("sharpest").textContent = pixels(state.sharpest_px);
   at("share").textContent = Math.round((100 * cells.length) / (covered.length * covered[0].length)) + " %";
   at("frames").textContent = state.frames;
   at("wanted").textContent = state.wanted;
