@@ -9,8 +9,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from reseau.cli import run
 from reseau.core.data import Frame, ImagePoints
@@ -86,7 +88,9 @@ def asked(port: int, path: str, host: str | None = None, method: str = "GET") ->
 
 
 def test_the_page_answers_this_machine_alone_and_changes_nothing() -> None:
-    frame = Frame(np.arange(120, dtype=np.uint8).reshape(10, 12), 255.0)
+    pixels = np.arange(120, dtype=np.uint8).reshape(10, 12)
+    pixels[0, :3] = 255
+    frame = Frame(pixels, 255.0)
     seen = Seen(True, "taken", np.array([[3.0, 4.0]]), np.ones((9, 12), dtype=bool), 1, {"sigma_c": 0.01})
     with LivePage("camera: <board>") as page:
         assert asked(page.port, "/frame.jpg")[0] == 404
@@ -95,6 +99,13 @@ def test_the_page_answers_this_machine_alone_and_changes_nothing() -> None:
         state = json.loads(asked(page.port, "/state.json")[1])
         assert state["points"] == [[3.0, 4.0]]
         assert state["sigmas"] == {"sigma_c": "0.01"}
+        assert state["saturated"] == 3 / 120
+        assert len(state["histogram"]) == 64
+        assert max(state["histogram"]) == 1.0
+        assert sum(high > 0 for high in state["histogram"]) == 30  # grey values from 3 to 119, four in each
+        jpeg = cv2.imdecode(np.frombuffer(asked(page.port, "/frame.jpg")[1], np.uint8), cv2.IMREAD_COLOR)
+        assert jpeg.shape[2] == 3
+        assert (jpeg[..., 2].astype(int) - jpeg[..., 0]).max() > 40  # saturated pixels are red
         for path in ("/", "/live.js", "/live.css"):
             status, content = asked(page.port, path)
             assert status == 200
@@ -171,3 +182,19 @@ def test_frames_are_taken_from_cameras_by_their_drivers(
     assert "3 frames in photos; next: reseau calibrate photos" in capsys.readouterr().out
     assert len(list(Path("photos").iterdir())) == 3
     assert body.violations == []
+
+
+def test_the_width_of_edges_is_shown_with_the_best_so_far() -> None:
+    seen = Seen(False, "focus", np.zeros((0, 2)), np.ones((9, 12), dtype=bool), 0)
+    shown = []
+    with LivePage("camera") as page:
+        for sigma in (3.0, 1.0, 2.0, None):
+            if sigma is None:
+                grey = np.full((60, 60), 90.0)
+            else:
+                grey = 20 + 200 * ndtr((np.arange(60.0) - 30) / sigma) * np.ones((60, 1))
+            page.show(Frame(grey, 255.0), seen, 3)
+            shown.append(json.loads(asked(page.port, "/state.json")[1]))
+    assert [state["edge_px"] for state in shown[:3]] == pytest.approx([3.0, 1.0, 2.0], rel=0.1)
+    assert [state["sharpest_px"] for state in shown] == pytest.approx([3.0, 1.0, 1.0, 1.0], rel=0.1)
+    assert shown[3]["edge_px"] is None

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import edge_sigma, exposure_of
+from ..capture import edge_sigma, exposure_of, grey_counts
 from ..core.data import Frame
 from ..core.errors import UsageError
 from ..procedures.watching import Seen
@@ -88,7 +88,7 @@ class LivePage:
         _, coded = cv2.imencode(".jpg", _marked(frame), [cv2.IMWRITE_JPEG_QUALITY, 80])
         edge = edge_sigma(frame)
         self._sharpest = min(self._sharpest, edge)
-        counts, _ = np.histogram(frame.pixels, _BINS, (0, frame.full_scale))
+        counts = np.array(grey_counts(frame, _BINS)[:_BINS])
         state = {
             "number": self._state["number"] + 1,
             "width": frame.width,
