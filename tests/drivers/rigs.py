@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.instruments import Device
+from reseau.instruments import Device, RemoteOperator
 from reseau_drivers.camera import CameraDriver, aravis, v4l2
 from reseau_drivers.camera import rig as camera_rig
 from reseau_drivers.environment import (
@@ -25,7 +25,7 @@ from reseau_drivers.environment import (
 from reseau_drivers.link import link_to
 from reseau_drivers.oscilloscope import Oscilloscope
 from reseau_drivers.scanner import BkScanner, CompactPulser, Ping360, Ping360Settings
-from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, Marlin, Smc100, Table, Zaber
+from reseau_drivers.turntable import AxisPlan, ByHand, Grbl, HandTable, Kinesis, Marlin, Smc100, Table, Zaber
 from reseau_drivers.visa import scpi_link
 from reseau_sims import serving
 from reseau_sims.serving import (
@@ -41,6 +41,7 @@ from reseau_sims.serving import (
     PtyServer,
     ScpiSensor,
     Server,
+    SimulatedHands,
     Smc100Line,
     TcpServer,
     UdpServer,
@@ -200,6 +201,24 @@ def _lines_rig(
     device = Table("table", controller(link_to(address, keep_up=True), 0.15), plans, seconds=1.2)
     device.configure(speed=800.0)
     return _table_rig(device, machine, script, server)
+
+
+def hand_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
+    """A table moved by hand: each request to the person is a connection of its own."""
+    machine = SimulatedHands(["tilt"])
+    server = stack.enter_context(TcpServer(lambda: FaultyConnection(machine, script)))
+    person = RemoteOperator(server.address, 0.4)
+    plan = AxisPlan(high=100.0, tolerance=0.2)
+    device = HandTable("table", ByHand(person, {}), {"tilt": plan}, seconds=2.0)
+
+    def work(run: int) -> None:
+        for k in range(5):
+            target = 10.0 + (7 * run + 3 * k) % 60
+            state = device.move("tilt", target, 4.0)
+            assert abs(state.position - target) <= 0.2
+            assert abs(machine.position("tilt") - state.position) <= 0.01
+
+    return Rig(device, machine, script, work, lambda: device.home("tilt", 4.0), server)
 
 
 def ping360_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
@@ -477,6 +496,7 @@ RIGS: dict[tuple[str, str], Maker] = {
     **{("kinesis", transport): kinesis_rig for transport in TRANSPORTS},
     **{("grbl", transport): grbl_rig for transport in TRANSPORTS},
     **{("marlin", transport): marlin_rig for transport in TRANSPORTS},
+    ("hand", "request"): hand_rig,
     **{("ping360", transport): ping360_rig for transport in (*TRANSPORTS, "udp")},
     **{("bk", transport): bk_rig for transport in ("tcp", "in process")},
     **{("compactpulser", transport): pulser_rig for transport in TRANSPORTS},

@@ -77,7 +77,7 @@ def test_a_fault_gives_the_right_result_or_an_error_in_time(
 
 
 @pytest.mark.parametrize(
-    ("driver", "transport"), [key for key in RIGS if key[1] not in ("in process", "usbtmc", "udp")]
+    ("driver", "transport"), [key for key in RIGS if key[1] not in ("in process", "usbtmc", "udp", "request")]
 )
 def test_reconnection_after_a_cable_was_pulled(driver: str, transport: str) -> None:
     with rig(driver, transport) as found:

@@ -4,17 +4,37 @@ from __future__ import annotations
 
 import threading
 import time
+from typing import Any
 
 import pytest
 
-from reseau.core.errors import ConnectionLost, DeadlineError, SettingError, StateError, UsageError
+from reseau.core.errors import (
+    ConnectionLost,
+    DeadlineError,
+    ProtocolError,
+    SettingError,
+    StateError,
+    UsageError,
+)
 from reseau.instruments import Movable, Turntable
 from reseau_drivers.link import link_to
-from reseau_drivers.turntable import AxisPlan, Table, Zaber, smc100, zaber
-from reseau_sims.serving import Fault, FaultScript, FaultyConnection, InProcess, Smc100Line, ZaberChain
+from reseau_drivers.turntable import AxisPlan, Table, Zaber, grbl, kinesis, marlin, smc100, zaber
+from reseau_sims.serving import (
+    Fault,
+    FaultScript,
+    FaultyConnection,
+    GrblController,
+    InProcess,
+    KinesisController,
+    MarlinController,
+    Smc100Line,
+    ZaberChain,
+)
+
+Board = KinesisController | GrblController | MarlinController
 
 
-def tables() -> list[tuple[Table, ZaberChain | Smc100Line]]:
+def tables() -> list[tuple[Table, ZaberChain | Smc100Line | Board]]:
     chain, line = ZaberChain([1], high=100_000.0), Smc100Line(1, low=-10.0, high=100.0)
     axis = {"high": 100.0, "backlash": 0.5}
     return [
@@ -30,10 +50,104 @@ def tables() -> list[tuple[Table, ZaberChain | Smc100Line]]:
             smc100("table", InProcess(lambda: FaultyConnection(line)), axes={"tilt": axis}),
             line,
         ),
+        *boards(axis),
     ]
 
 
-@pytest.mark.parametrize("which", [0, 1])
+def boards(axis: dict[str, Any]) -> list[tuple[Table, Board]]:
+    cube = KinesisController()
+    mill, printer = (
+        kind(1, low=-10.0, high=100.0, speed=900.0) for kind in (GrblController, MarlinController)
+    )
+    return [
+        (kinesis("table", _in_process(cube), axes={"tilt": axis | {"per_unit": 1920.0}}), cube),
+        (grbl("table", _in_process(mill), axes={"tilt": axis}), mill),
+        (marlin("table", _in_process(printer), axes={"tilt": axis}), printer),
+    ]
+
+
+def _in_process(machine: Board, script: FaultScript | None = None) -> InProcess:
+    return InProcess(lambda: FaultyConnection(machine, script))
+
+
+@pytest.mark.parametrize("which", range(3))
+def test_a_reference_is_known_on_the_next_connection_and_lost_with_the_power(which: int) -> None:
+    table, machine = boards({"high": 100.0})[which]
+    with table:
+        table.configure(speed=500.0)
+        assert not table.state("tilt").homed
+        table.home("tilt")
+        table.move("tilt", 20.0)
+    again = Table("table", table._controller, table.plans)
+    with again:
+        assert again.state("tilt").homed
+        assert again.state("tilt").position == pytest.approx(20.0, abs=2e-3)
+        machine.inject_fault("power-cycled")
+    with again:
+        assert not again.state("tilt").homed
+        with pytest.raises(StateError, match="home tilt first"):
+            again.move("tilt", 30.0)
+
+
+@pytest.mark.parametrize(
+    ("which", "kind", "message"),
+    [
+        (0, "stuck", "stalled"), (0, "out of range", "limit switch"), (0, "wrong state", "switched off"),
+        (1, "stuck", "feed hold"), (1, "out of range", "limit switch"), (1, "wrong state", "door"),
+        (2, "stuck", "stands at"), (2, "out of range", "endstop"), (2, "wrong state", "lost its reference"),
+    ],
+)  # fmt: skip
+def test_a_movement_that_ends_short_is_an_error(which: int, kind: str, message: str) -> None:
+    table, machine = boards({"high": 100.0})[which]
+    with table:
+        table.configure(speed=30.0)
+        table.home("tilt")
+        status = table.axes["tilt"].set(90.0)
+        time.sleep(0.3)
+        with machine.lock:
+            machine.inject_fault(kind)  # type: ignore[arg-type]
+        failed = status.exception(30.0)
+        assert isinstance(failed, StateError)
+        assert message in str(failed)
+        table.home("tilt")
+        table.configure(speed=500.0)
+        assert table.move("tilt", 40.0).position == pytest.approx(40.0, abs=2e-3)
+
+
+@pytest.mark.parametrize(("name", "value"), [("$22", "0"), ("$13", "1")])
+def test_a_grbl_that_is_set_otherwise_is_declined(name: str, value: str) -> None:
+    board = GrblController(1, settings={name: value})
+    with pytest.raises(StateError, match=rf"\{name} is {value}"):
+        grbl("table", _in_process(board), axes={"tilt": {}}).connect()
+    board = GrblController(1, settings={"$10": "0"})
+    with pytest.raises(ProtocolError, match=r"set \$10=1"):
+        grbl("table", _in_process(board), axes={"tilt": {}}).state("tilt")
+
+
+def test_a_target_that_marlin_shortens_is_an_error() -> None:
+    printer = MarlinController(1, low=0.0, high=50.0, speed=900.0)
+    with marlin("table", _in_process(printer), axes={"tilt": {"high": 100.0}}) as table:
+        table.configure(speed=500.0)
+        table.home("tilt")
+        with pytest.raises(StateError, match="stopped at 50"):
+            table.move("tilt", 60.0)
+
+
+def test_search_for_the_reference_can_be_stopped() -> None:
+    for table, machine in boards({"high": 100.0}):
+        with table:
+            machine.motors[1]._stand(80.0 * table.plans["tilt"].per_unit)
+            table.configure(speed=2.0)
+            if not isinstance(machine, KinesisController):
+                machine._largest = 2.0
+            with pytest.raises(DeadlineError, match="home tilt"):
+                table.home("tilt", 0.6)
+            state = table.state("tilt")
+            assert not state.moving
+            assert not state.homed
+
+
+@pytest.mark.parametrize("which", range(5))
 def test_a_table_is_homed_before_it_moves_and_keeps_to_its_limits(which: int) -> None:
     table, machine = tables()[which]
     assert isinstance(table, Turntable)
@@ -54,7 +168,7 @@ def test_a_table_is_homed_before_it_moves_and_keeps_to_its_limits(which: int) ->
     assert machine.violations == []
 
 
-@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("which", range(5))
 def test_every_position_is_reached_from_below(which: int) -> None:
     table, machine = tables()[which]
     motor = next(iter(machine.motors.values()))
@@ -77,7 +191,7 @@ def test_every_position_is_reached_from_below(which: int) -> None:
     assert targets == pytest.approx([50.0, 19.5, 20.0, 19.7, 20.2, 40.0])
 
 
-@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("which", range(5))
 def test_stop_works_from_any_thread(which: int) -> None:
     table, machine = tables()[which]
     with table:
@@ -97,7 +211,7 @@ def test_stop_works_from_any_thread(which: int) -> None:
     assert machine.violations == []
 
 
-@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("which", range(5))
 def test_a_move_that_takes_too_long_is_stopped(which: int) -> None:
     table, _ = tables()[which]
     with table:

@@ -33,6 +33,8 @@ def warm(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for k, t in enumerate(rng.uniform(18.0, 26.0, 30)):
             values = {"c": 8.0 + SLOPE["c"] * (t - 22), "x0": 0.02 + SLOPE["x0"] * (t - 22)}
             drawn = camera(**{name: value + 2e-4 * rng.normal() for name, value in values.items()})
+            stored = {"mean": round(t, 3), "low": t, "high": t, "unit": "°C", "sigma": 0.2, "frames": 9}
+            drawn = drawn.model_copy(update={"provenance": {"environment": {"air.temperature": stored}}})
             made = known.decide("left", drawn, RULES, since=START + timedelta(weeks=k))
             if made.outcome == "needs review":
                 known.review("left", made.key, "accepted", comment="first")
@@ -60,6 +62,21 @@ def test_a_function_is_fitted_evaluated_and_budgeted_from_the_command_line(
     x0 = told["results"]["name"].index("x0")
     assert told["covariance"][c][x0] == pytest.approx(0.25 * SLOPE["c"] * SLOPE["x0"], rel=0.2)
     assert run(["calibrations", "drift", "left", "--covariates", "runs.csv"]) == 0
+
+
+def test_what_sensors_recorded_serves_as_a_table_of_covariates(
+    warm: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(warm)
+    assert run(["calibrations", "function", "left", "--covariates", "runs.csv", "--out", "table.json"]) == 0
+    assert run(["calibrations", "function", "left", "--recorded", "temperature", "--out", "known.json"]) == 0
+    assert Path("known.json").read_text() == Path("table.json").read_text()
+    capsys.readouterr()
+    assert run(["calibrations", "drift", "left", "--recorded", "temperature", "--json"]) == 0
+    assert all(each["verdict"] == "explained" for each in json.loads(capsys.readouterr().out)["verdicts"])
+    for wrong in (["--recorded", "dew"], ["--recorded", "temperature", "--covariates", "runs.csv"]):
+        assert run(["calibrations", "drift", "left", *wrong]) != 0
+    assert "recorded nothing as dew" in capsys.readouterr().err
 
 
 def test_points_measured_at_an_uncertain_temperature_share_its_error(warm: Path) -> None:

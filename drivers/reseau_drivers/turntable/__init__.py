@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from reseau.core.errors import SettingError
+from reseau.instruments import RemoteOperator, TerminalOperator
 
 from ..link import Link, link_to
 from .gcode import letter_of
 from .grbl import Grbl
-from .kinesis import Kinesis, MotorKind
+from .hand import ByHand, HandTable, Marker
+from .kinesis import Kinesis, MotorKind, kinesis_ports
 from .marlin import Marlin
 from .smc100 import Smc100
 from .table import Axis, AxisPlan, Table, TableSettings
@@ -19,15 +21,20 @@ from .zaber import Zaber
 __all__ = [
     "Axis",
     "AxisPlan",
+    "ByHand",
     "Grbl",
+    "HandTable",
     "Kinesis",
+    "Marker",
     "Marlin",
     "Smc100",
     "Table",
     "TableSettings",
     "Zaber",
     "grbl",
+    "hand",
     "kinesis",
+    "kinesis_ports",
     "marlin",
     "smc100",
     "zaber",
@@ -140,6 +147,51 @@ def kinesis(
     return Table(name, controller, plans, TableSettings().changed(settings or {}), **options)
 
 
+def hand(
+    name: str,
+    address: str,
+    *,
+    axes: Mapping[str, Mapping[str, Any]],
+    markers: Mapping[str, Mapping[str, Any]] | None = None,
+    camera: str = "",
+    settings: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> HandTable:
+    """Create the driver of a table that is moved by hand; entry point ``hand``.
+
+    Parameters
+    ----------
+    name, axes, settings, **options
+        As for :func:`zaber`; `tolerance` is how exactly a person can set the axis.
+    address : str
+        ``terminal``, or ``tcp://host:port`` of a program as that of `operator` in ``bench.toml``.
+    markers : mapping, optional
+        Fields of :class:`Marker` of axes that a camera reads; the others are read by the person.
+    camera : str
+        Camera of the bench that sees the markers.
+
+    Examples
+    --------
+    >>> table = hand("table", "terminal", axes={"tilt": {"low": -45.0, "high": 45.0, "tolerance": 0.2}})
+    >>> table.axes["tilt"].limits
+    (-45.0, 45.0)
+    """
+    plans = AxisPlan.read(axes)
+    known = {}
+    for axis, fields in (markers or {}).items():
+        if axis not in plans:
+            raise SettingError("is no axis", where=f"marker of {axis}", do=f"use {', '.join(plans)}")
+        try:
+            known[axis] = Marker(**fields)
+        except TypeError as error:
+            raise SettingError(f"its fields do not fit ({error})", where=f"marker of {axis}") from None
+    if bool(known) != bool(camera):
+        raise SettingError("are given together", where="markers and camera")
+    person = TerminalOperator() if address == "terminal" else RemoteOperator(address)
+    chosen = TableSettings().changed(settings or {})
+    return HandTable(name, ByHand(person, known), plans, camera=camera, settings=chosen, **options)
+
+
 def grbl(
     name: str,
     address: str | Link,
@@ -158,9 +210,10 @@ def grbl(
 
     Examples
     --------
-    >>> table = grbl("table", "/dev/ttyUSB0", axes={"z": {"axis": 3, "unit": "mm", "low": -120, "high": -1}})
+    >>> axes = {"z": {"axis": 3, "unit": "mm", "low": -120.0, "high": -1.0}}
+    >>> table = grbl("table", "/dev/ttyUSB0", axes=axes)
     >>> table.axes["z"].limits
-    (-120, -1)
+    (-120.0, -1.0)
     """
     return _by_lines(Grbl, name, address, axes, settings, options)
 

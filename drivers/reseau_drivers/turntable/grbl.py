@@ -75,8 +75,9 @@ class Grbl:
         """Return the version, which GRBL tells only at rest."""
         for plan in plans.values():
             letter_of(plan)
+        self._ready(deadline)
         try:
-            said = self._line("$I", deadline)
+            said = self._exchange("$I", deadline)
         except StateError:
             return Identity("GRBL", "")
         version = next((text for text in said if text.startswith("[VER:")), "[VER:]")[5:].rstrip("]")

@@ -11,6 +11,8 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
+from serial.tools import list_ports
+
 from reseau.core.errors import ProtocolError, SettingError, StateError
 from reseau.instruments import AxisState, Deadline, Identity
 
@@ -33,7 +35,7 @@ from ..codecs.apt import (
 from ..link import Link, MessageLink
 from .table import AxisPlan
 
-__all__ = ["MOTORS", "Kinesis", "MotorKind"]
+__all__ = ["MOTORS", "Kinesis", "MotorKind", "kinesis_ports"]
 
 MotorKind = Literal["dc", "brushless", "stepper"]
 MOTORS: Mapping[MotorKind, float] = {
@@ -47,6 +49,8 @@ _BEGINS_S = 0.5
 """Time in which an order must show in the status (s)."""
 _POLL_S = 0.01
 _STEPPERS = ("stepper",)
+_CUBE_USB = (0x0403, 0xFAF0)
+"""Vendor and product of the USB converters in Thorlabs' controllers."""
 
 
 class Kinesis:
@@ -203,6 +207,17 @@ class Kinesis:
                 return True
             time.sleep(patience.at_most(_POLL_S))
         return False
+
+
+def kinesis_ports() -> tuple[str, ...]:
+    """List the serial ports of Kinesis controllers; entry point ``kinesis``.
+
+    Examples
+    --------
+    >>> isinstance(kinesis_ports(), tuple)
+    True
+    """
+    return tuple(sorted(port.device for port in list_ports.comports() if (port.vid, port.pid) == _CUBE_USB))
 
 
 class _Cube:

@@ -28,6 +28,8 @@ _HOMED, _FRESH = 101, 100
 """Feed rates (%) of a controller that has homed, and of one that has just started."""
 _BOOT_S, _SILENT_S, _STANDS_S, _POLL_S = 6.0, 4.0, 1.0, 0.01
 _RESENDS = 3
+_ROUNDED = 0.006
+"""M114 reports positions with two decimals."""
 _PAIR = re.compile(r"([A-Z]):\s*(-?\d+(?:\.\d+)?)")
 
 
@@ -144,7 +146,7 @@ class Marlin:
         letter = letter_of(plan)
         target, count = self._positions(letter, deadline)
         position = count / self._steps[letter]
-        moving = abs(position - target) * self._steps[letter] > 1.5
+        moving = abs(position - target) > _ROUNDED + 1.5 / self._steps[letter]
         faults = (f"an endstop was reached: {self._endstop}",) if self._endstop else ()
         if moving:
             now = time.monotonic()

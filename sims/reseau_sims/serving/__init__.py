@@ -21,6 +21,7 @@ from .machine import FaultyConnection, Machine, Session
 from .marlin import MarlinController
 from .motion import Motor
 from .oscilloscope import FAMILIES, Family, Oscilloscope
+from .person import SimulatedHands, SimulatedOperator
 from .ping360 import Ping360
 from .scpi import HislipInstrument, PortmapperSession, Vxi11Session
 from .servers import InProcess, PtyServer, Server, TcpServer, UdpServer
@@ -65,6 +66,8 @@ __all__ = [
     "Session",
     "SimulatedBench",
     "SimulatedCamera",
+    "SimulatedHands",
+    "SimulatedOperator",
     "Smc100Line",
     "StillScene",
     "StripeScene",

@@ -28,13 +28,17 @@ from ..water import Water
 from ..world import World
 from .bk import BkScanner
 from .compactpulser import CompactPulser
+from .environment import Air, LineSensor, ModbusSensor, ScpiSensor
 from .faults import FaultScript
 from .gige import GigeCamera, aravis_is_installed
 from .gigevision import GigeVisionCamera, loopback_addresses
+from .grbl import GrblController
 from .imaging import LaboratoryScene, LampScene, SimulatedCamera
+from .kinesis import KinesisController
 from .machine import FaultyConnection, Machine
+from .marlin import MarlinController
 from .oscilloscope import FAMILIES, Oscilloscope
-from .person import SimulatedOperator
+from .person import SimulatedHands, SimulatedOperator
 from .ping360 import Ping360
 from .scpi import Vxi11Session
 from .servers import PtyServer, Server, TcpServer
@@ -42,9 +46,10 @@ from .smc100 import Smc100Line
 from .v4l2 import VideoCamera
 from .zaber import ZaberChain
 
-__all__ = ["ScannerKind", "SimulatedBench", "TableKind", "serve"]
+__all__ = ["ScannerKind", "SensorKind", "SimulatedBench", "TableKind", "serve"]
 
-TableKind = Literal["zaber", "smc100"]
+TableKind = Literal["zaber", "smc100", "kinesis", "grbl", "marlin", "hand"]
+SensorKind = Literal["scpi", "modbus", "line", "all"]
 SceneName = Literal["screen", "testfield", "frame", "sensor"]
 ScannerKind = Literal["ping360", "bk", "compactpulser", "all"]
 _PATIENCE_S = 120.0
@@ -75,8 +80,8 @@ driver = "{kind}"
 address = "{table}"
 settings = {{speed = 50.0}}
 
-[instruments.table.options.axes]
-{axes}{scanners}
+{more}[instruments.table.options.axes]
+{axes}{scanners}{sensors}
 [instruments.oscilloscope]
 driver = "oscilloscope"
 address = "{oscilloscope}"
@@ -87,6 +92,30 @@ _SCANNERS = {
     "bk": "",
     "compactpulser": 'options = {digitiser = "oscilloscope", carrier = "table", axis = "z"}\n',
 }
+_SENSORS: dict[str, str] = {
+    "scpi": """\
+[instruments.{name}.options.quantities]
+temperature = {{query = "MEAS:TEMP?", sigma = 0.1}}
+humidity = {{query = "MEAS:HUM?", sigma = 2.0}}
+pressure = {{query = "MEAS:PRES?", sigma = 0.5}}
+""",
+    "modbus": """\
+[instruments.{name}.options.quantities]
+temperature = {{register = 0, scale = 0.1, sigma = 0.1}}
+humidity = {{register = 1, scale = 0.1, sigma = 2.0}}
+pressure = {{register = 2, format = "float32", sigma = 0.5}}
+""",
+    "line": """\
+[instruments.{name}.options]
+pattern = '{pattern}'
+
+[instruments.{name}.options.quantities]
+temperature = {{sigma = 0.1}}
+humidity = {{sigma = 2.0}}
+pressure = {{sigma = 0.5}}
+""",
+}
+"""Quantities of the sensors of the environment, as a ``bench.toml`` describes them."""
 _NAMES = {"ping360": "scanner", "bk": "bmode", "compactpulser": "pulser"}
 """Names of the scanners, where there are several."""
 
@@ -146,8 +175,8 @@ class SimulatedBench:
     ----------
     seed : int
         Seed of the world.
-    table : {"zaber", "smc100"}
-        Controllers of the table.
+    table : {"zaber", "smc100", "kinesis", "grbl", "marlin", "hand"}
+        Controllers of the table; `hand`: the simulated operator moves it.
     family : str
         Oscilloscope, one of :data:`~reseau_sims.serving.FAMILIES`.
     camera : {"screen", "testfield", "frame", "sensor"}, optional
@@ -157,6 +186,9 @@ class SimulatedBench:
         Video4Linux camera in this process (`video`) and not part of the ``bench.toml``.
     scanner : {"ping360", "bk", "compactpulser", "all"}
         The scanner, called ``scanner``; of all three the others are called ``bmode`` and ``pulser``.
+    environment : {"scpi", "modbus", "line", "all"}, optional
+        Sensor of the environment, called ``air``; all three are called ``air_scpi``, ``air_modbus`` and
+        ``air_line``.
     repeatable : bool
         See :class:`~reseau_sims.laboratory.Laboratory`.
     flat : bool
@@ -208,6 +240,7 @@ class SimulatedBench:
         family: str = "keysight",
         camera: SceneName | None = None,
         scanner: ScannerKind = "ping360",
+        environment: SensorKind | None = None,
         repeatable: bool = False,
         flat: bool = False,
         water: Water | None = None,
@@ -223,6 +256,7 @@ class SimulatedBench:
             ("oscilloscope", tuple(FAMILIES), family),
             ("scene for a camera", get_args(SceneName), camera),
             ("scanner", get_args(ScannerKind), scanner),
+            ("sensor of the environment", get_args(SensorKind), environment),
         ):
             if asked is not None and asked not in known:
                 raise UsageError(
@@ -255,8 +289,16 @@ class SimulatedBench:
             "bk": lambda: BkScanner(laboratory.section, laboratory.SECTION_MM),
             "compactpulser": lambda: self._pulser,
         }
+        self.air = Air(seed, steady=repeatable)
+        self._sensors = _sensors(environment)
+        sensed: dict[str, Callable[[], Machine]] = {
+            "scpi": lambda: ScpiSensor(self.air),
+            "modbus": lambda: ModbusSensor(self.air),
+            "line": lambda: LineSensor(self.air),
+        }
         self.machines: dict[str, Machine] = {
             "table": self._table(table),
+            **{name: sensed[kind]() for name, kind in self._sensors.items()},
             **{name: made[kind]() for name, kind in self._scanners.items()},
             "oscilloscope": scope,
         }
@@ -268,7 +310,9 @@ class SimulatedBench:
             addresses = {}
             for name, machine in self.machines.items():
                 if name != "oscilloscope":
-                    server: type[Server] = TcpServer if self._scanners.get(name) == "bk" else PtyServer
+                    of_tcp = "bk" in self._scanners.get(name, "") or self._sensors.get(name) == "scpi"
+                    of_tcp = of_tcp or isinstance(machine, SimulatedHands)
+                    server: type[Server] = TcpServer if of_tcp else PtyServer
                     connected = partial(FaultyConnection, machine, self.scripts[name])
                     addresses[name] = stack.enter_context(server(connected)).address
             person = stack.enter_context(TcpServer(partial(FaultyConnection, self._operator())))
@@ -287,7 +331,14 @@ class SimulatedBench:
             f'\n[instruments.{name}]\ndriver = "{kind}"\naddress = "{addresses[name]}"\n{_SCANNERS[kind]}'
             for name, kind in self._scanners.items()
         )
-        self.toml = _BENCH.format(kind=table, axes=axes, scanners=scanners, **addresses) + entry
+        sensors = "".join(
+            f'\n[instruments.{name}]\ndriver = "environment_{kind}"\naddress = "{addresses[name]}"\n\n'
+            + _SENSORS[kind].format(name=name, pattern=LineSensor.PATTERN)
+            for name, kind in self._sensors.items()
+        )
+        more = "[instruments.table.options]\nrack = true\n\n" if table == "kinesis" else ""
+        parts = {"more": more, "axes": axes, "scanners": scanners, "sensors": sensors}
+        self.toml = _BENCH.format(kind=table, **parts, **addresses) + entry
 
     def _documents(self, camera: SceneName | None, water: Water | None) -> dict[str, str]:
         """The files that a session with a camera needs."""
@@ -378,6 +429,16 @@ class SimulatedBench:
             for address, name in enumerate(AXES, 1):
                 self.laboratory.attach(name, partial(line.position, address))
             return line
+        if kind == "hand":
+            hands = SimulatedHands(AXES)
+            for name in AXES:
+                self.laboratory.attach(name, partial(hands.position, name))
+            return hands
+        if kind in _OF_ONE_BOARD:
+            board = _OF_ONE_BOARD[kind]()
+            for number, name in enumerate(AXES, 1):
+                self.laboratory.attach(name, partial(_place, board, number))
+            return board
         chain = ZaberChain([2, 1, 1], low=_LOW * _STEPS)
         for name, key in _CHAIN.items():
             self.laboratory.attach(name, partial(_units, chain, *key))
@@ -418,12 +479,39 @@ def _units(chain: ZaberChain, device: int, axis: int) -> float:
     return chain.position(device, axis) / _STEPS
 
 
+def _sensors(kind: SensorKind | None) -> dict[str, str]:
+    """Kinds of the sensors of the environment by their names."""
+    if kind is None:
+        return {}
+    return {f"air_{each}": each for each in _SENSORS} if kind == "all" else {"air": kind}
+
+
+_OF_ONE_BOARD: dict[str, Callable[[], Any]] = {
+    "kinesis": lambda: KinesisController(len(AXES), low=_LOW * _STEPS, high=400.0 * _STEPS),
+    "grbl": lambda: GrblController(len(AXES), low=_LOW, high=400.0),
+    "marlin": lambda: MarlinController(len(AXES), low=_LOW, high=400.0),
+}
+"""Controllers that have all axes."""
+
+
+def _place(board: Any, number: int) -> float:
+    """Position of an axis, in degrees or millimetres."""
+    place: float = board.position(number)
+    return place / _STEPS if isinstance(board, KinesisController) else place
+
+
 def _axis_entry(kind: TableKind, name: str) -> str:
     """Line of ``bench.toml`` for an axis."""
     device, axis = _CHAIN[name]
     where = f"device = {device}, axis = {axis}, per_unit = {_STEPS}"
-    if kind == "smc100":
-        where = f"device = {AXES.index(name) + 1}"
+    number = AXES.index(name) + 1
+    where = {
+        "smc100": f"device = {number}",
+        "kinesis": f"device = {number}, per_unit = {_STEPS}",
+        "grbl": f"axis = {number}",
+        "marlin": f"axis = {number}",
+        "hand": "tolerance = 0.1",
+    }.get(kind, where)
     unit = ', unit = "mm"' if name == "z" else ", backlash = 0.2"
     return f"{name} = {{{where}, low = {_LOW}, high = {_HIGH[name]}{unit}}}\n"
 

@@ -1,5 +1,6 @@
 """Acquisitions on a bench: instruments, plans, and the engine that carries plans out into an archive."""
 
+from ..instruments import RemoteOperator
 from . import by_hand
 from .acquisition import Acquisition, Plan, Procedure, Watch
 from .bench import ROLES, Bench, BenchFile, Checked, InstrumentEntry, drivers, found_instruments, plugin
@@ -17,7 +18,6 @@ from .discovery import bench_text
 from .engine import Control, Decision, Rerun, carry_out, rerun
 from .lighting import LightRule, Steered, level_of, next_light, steer
 from .lock import BenchLock, Holder
-from .operators import RemoteOperator
 from .plans import Goal, SensorSeriesPlan
 from .steps import HEIGHT, Step, at_heights, paper_steps, read_steps, spread
 

@@ -121,11 +121,15 @@ def home(table: Turntable, axes: Iterable[str] = ()) -> tuple[str, ...]:
     InstrumentError
         If an axis does not find its reference.
     """
-    names = tuple(axes) or tuple(name for name in table.axes if not table.state(name).homed)
+    axes = tuple(axes)
+    names = axes or tuple(name for name in table.axes if not table.state(name).homed)
     for name in names:
         if name not in table.axes:
             raise UsageError("is no axis", where=name, do=f"use {', '.join(table.axes)}")
     for name in names:
+        # Some controllers home all axes at once.
+        if not axes and table.state(name).homed:
+            continue
         state = table.home(name)
         if not state.homed:
             raise InstrumentError("did not find its reference", where=f"{table.name}: {name}")

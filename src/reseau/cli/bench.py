@@ -99,7 +99,9 @@ def check(
 def sim(
     out: Out = None,
     seed: Annotated[int, typer.Option(help="Seed of the simulated world.")] = 0,
-    table: Annotated[str, typer.Option(help="Controller of the turntable: zaber or smc100.")] = "zaber",
+    table: Annotated[
+        str, typer.Option(help="Controller of the turntable: zaber, smc100, kinesis, grbl, marlin, hand.")
+    ] = "zaber",
     family: Annotated[str, typer.Option(help="Oscilloscope family: keysight, rigol-1000z, …")] = "keysight",
     camera: Annotated[
         str, typer.Option(help="Scene of the camera: screen, testfield, frame or sensor. Default: no camera.")
@@ -107,6 +109,9 @@ def sim(
     scanner: Annotated[
         str, typer.Option(help="Ultrasonic scanner: ping360, bk, compactpulser, or all of them.")
     ] = "ping360",
+    environment: Annotated[
+        str, typer.Option(help="Sensor of the environment: scpi, modbus, line, or all. Default: none.")
+    ] = "",
     repeatable: Annotated[
         bool, typer.Option("--repeatable", help="Identical frames for identical states, without drift.")
     ] = False,
@@ -148,6 +153,7 @@ def sim(
         writable(out)
     options: dict[str, Any] = {"table": table, "family": family, "camera": camera or None, "scanner": scanner}
     options |= {"repeatable": repeatable, "flat": flat, "cameras": cameras}
+    options |= {"environment": environment or None}
     if water:
         options["water"] = {
             "distance_mm": port_distance, "thickness_mm": port_thickness, "tilt_deg": (0.0, port_tilt),

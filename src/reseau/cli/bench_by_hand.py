@@ -65,7 +65,8 @@ def status(bench: BenchPath = _BENCH, as_json: AsJson = False) -> None:
     else:
         for row in rows:
             say(f"{row['name']} ({row['driver']}): {row.get('error') or row['identity']}\n")
-            say("".join(f"  {name:<12} {words}\n" for name, words in row.get("axes", {}).items()))
+            lines = row.get("axes", {}) | row.get("environment", {})
+            say("".join(f"  {name:<12} {words}\n" for name, words in lines.items()))
             settings = "  ".join(f"{name} {words}" for name, words in row.get("settings", {}).items())
             say(f"  {settings}\n" if settings else "")
     raise typer.Exit(1 if any("error" in row for row in rows) else 0)
@@ -74,7 +75,7 @@ def status(bench: BenchPath = _BENCH, as_json: AsJson = False) -> None:
 def _states(bench: Bench) -> list[dict[str, Any]]:
     """State of each instrument: what it answers, or why it does not."""
     from ..capture import by_hand
-    from ..instruments import Turntable
+    from ..instruments import EnvironmentSensor, Turntable
 
     rows = []
     for name, entry in bench.file.instruments.items():
@@ -94,6 +95,9 @@ def _states(bench: Bench) -> list[dict[str, Any]]:
                 }
                 if isinstance(instrument, Turntable):
                     row["axes"] = {axis: str(found) for axis, found in by_hand.axes_of(instrument).items()}
+                if isinstance(instrument, EnvironmentSensor):
+                    measured = instrument.environment().conditions
+                    row["environment"] = {key: str(each) for key, each in measured.items()}
         except ReseauError as error:
             row["error"] = str(error)
         rows.append(row)

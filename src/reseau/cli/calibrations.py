@@ -21,6 +21,10 @@ __all__ = ["app", "say_decision", "time_of"]
 app = typer.Typer(no_args_is_help=True, help="Calibrations in force: decide, review, return, history, drift.")
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the configuration.")]
+Recorded = Annotated[
+    list[str] | None,
+    typer.Option("--recorded", help="Covariate that a sensor measured with the frames: temperature; repeat."),
+]
 Key = Annotated[str, typer.Argument(metavar="KEY", help="Decision, by the start of its key; see `history`.")]
 By = Annotated[str, typer.Option(help="By whom. Default: the user.")]
 Comment = Annotated[str, typer.Option("--comment", "-m", help="Why.")]
@@ -261,6 +265,7 @@ def drift(
         Path | None,
         typer.Option(help="Table with the columns calibration and, for example, temperature [°C]."),
     ] = None,
+    recorded: Recorded = None,
     archive: ArchivePlace = "archive",
     objects: ObjectsPlace = None,
     as_json: AsJson = False,
@@ -275,6 +280,9 @@ def drift(
     options = ChartOptions(kind=kind, rate=rate, runs_per_year=runs_per_year)  # type: ignore[arg-type]
     table = None if covariates is None else CovariateTable.read(covariates)
     with _opened(archive, objects) as found:
+        if recorded:
+            _one_source(covariates)
+            table = found.recorded(name, recorded)
         made = found.drift(name, options, table)
     charts, last = made.charts, len(made.keys) - 1
     verdicts = [
@@ -332,13 +340,20 @@ def drift(
     raise typer.Exit(1 if remains else 0)
 
 
+def _one_source(covariates: Path | None) -> None:
+    if covariates is not None:
+        raise UsageError("cannot be given together with --covariates", where="--recorded", do="omit one")
+
+
 @app.command()
 def function(
     name: Name,
-    covariates: Annotated[
-        Path, typer.Option(help="Table with the columns calibration and, for example, temperature [°C].")
-    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Function to write (.json).")],
+    covariates: Annotated[
+        Path | None,
+        typer.Option(help="Table with the columns calibration and, for example, temperature [°C]."),
+    ] = None,
+    recorded: Recorded = None,
     degree: Annotated[int, typer.Option(min=1, max=2, help="Degree of the polynomial.")] = 1,
     archive: ArchivePlace = "archive",
     objects: ObjectsPlace = None,
@@ -351,8 +366,15 @@ def function(
     from ..service import CovariateTable, FunctionOptions
 
     suffix_of(writable(out), (".json",))
-    table = CovariateTable.read(covariates)
+    if covariates is None and not recorded:
+        raise UsageError("none were given", where="covariates", do="give --covariates or --recorded")
     with _opened(archive, objects) as opened:
+        if covariates is None:
+            table = opened.recorded(name, recorded or [])
+        else:
+            table = CovariateTable.read(covariates)
+        if recorded:
+            _one_source(covariates)
         found = opened.function(name, table, FunctionOptions(degree=2 if degree == 2 else 1))
     if isinstance(found, Failure):
         raise EstimationError(found.reason, where=name, do="collect more calibrations, or use a single one")

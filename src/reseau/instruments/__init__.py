@@ -9,6 +9,7 @@ from .assets import ImageStore
 from .deadline import Deadline
 from .device import Device
 from .monitor import Monitor
+from .operators import RemoteOperator, TerminalOperator
 from .protocols import (
     Camera,
     CameraRig,
@@ -43,9 +44,11 @@ __all__ = [
     "Monitor",
     "Movable",
     "Oscilloscope",
+    "RemoteOperator",
     "ScreenPicture",
     "Settings",
     "Status",
+    "TerminalOperator",
     "Turntable",
     "UltrasonicScanner",
     "Waveform",

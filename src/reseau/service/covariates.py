@@ -235,6 +235,41 @@ class CovariateTable:
         columns = {name: column for (name, _), column in zip(named, values.T, strict=True)}
         return cls(keys, columns, dict(named))
 
+    @classmethod
+    def recorded(cls, keys: Sequence[str], calibrations: Sequence[Calibration], names: Sequence[str]) -> Self:
+        """Take covariates from what sensors measured while the calibrations were recorded.
+
+        Parameters
+        ----------
+        keys : sequence of str (n,)
+            Keys of the decisions on the calibrations.
+        calibrations : sequence of Calibration (n,)
+            Their provenance has the conditions of their frames; the means are used.
+        names : sequence of str
+            Conditions, as ``air.temperature``; ``temperature`` where one sensor measures it.
+
+        Raises
+        ------
+        UsageError
+            If a calibration has no such condition, several, or one in another unit than the others.
+
+        Examples
+        --------
+        >>> around = {"air.temperature": {"mean": 21.5, "low": 21.4, "high": 21.6, "unit": "°C", "frames": 9}}
+        >>> known = example_calibration().model_copy(update={"provenance": {"environment": around}})
+        >>> CovariateTable.recorded(["4f2a"], [known], ["temperature"]).of("4f2a")
+        {'temperature': 21.5}
+        """
+        columns, units = {}, {}
+        for name in names:
+            found = [_recorded(key, each, name) for key, each in zip(keys, calibrations, strict=True)]
+            of_all = {unit for _, unit in found}
+            if len(of_all) > 1:
+                raise UsageError(f"has the units {', '.join(sorted(of_all))}", where=name)
+            columns[name] = np.array([value for value, _ in found])
+            units[name] = next(iter(of_all), "")
+        return cls(tuple(keys), columns, units)
+
     def of(self, key: str) -> dict[str, float]:
         """Values of the calibration with this key.
 
@@ -247,6 +282,18 @@ class CovariateTable:
         if len(rows) != 1 or not all(np.isfinite(each[rows[0]]) for each in self.values.values()):
             raise UsageError(f"has {len(rows) or 'no'} lines with it", where=f"covariates: calibration {key}")
         return {name: float(each[rows[0]]) for name, each in self.values.items()}
+
+
+def _recorded(key: str, calibration: Calibration, name: str) -> tuple[float, str]:
+    """Mean and unit of a condition in the provenance of a calibration."""
+    around: Mapping[str, Any] = calibration.provenance.get("environment", {})
+    fitting = [each for each in around if each == name or each.endswith(f".{name}")]
+    if len(fitting) != 1:
+        what = f"recorded {', '.join(fitting) or 'nothing'} as {name}"
+        known = ", ".join(around)
+        do = f"choose from {known}" if known else "state it in a table: --covariates"
+        raise UsageError(what, where=f"calibration {key}", do=do)
+    return float(around[fitting[0]]["mean"]), str(around[fitting[0]]["unit"])
 
 
 def series_of(calibrations: Sequence[Calibration]) -> tuple[tuple[str, ...], Array]:

@@ -503,6 +503,19 @@ class Configurations:
         columns = {each: np.array([row[each] for row in rows]) for each in covariates.values}
         return fit_function(calibrations, columns, covariates.units, options)
 
+    def recorded(self, name: str, conditions: Sequence[str]) -> CovariateTable:
+        """Covariates that sensors measured with the calibrations since the last service event.
+
+        See :meth:`~reseau.service.CovariateTable.recorded`.
+
+        Raises
+        ------
+        UsageError
+            If there are no calibrations, or one has no such condition.
+        """
+        keys, calibrations, _ = self._since_event(name)
+        return CovariateTable.recorded(keys, calibrations, conditions)
+
     def _since_event(self, name: str) -> tuple[list[str], list[Calibration], float]:
         """Keys and calibrations since the last service event in time order, rejected ones left out.
 

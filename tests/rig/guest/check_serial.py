@@ -10,15 +10,24 @@ from typing import Any
 import pytest
 
 from reseau.core.errors import InstrumentError
+from reseau_drivers.environment import environment_line, environment_modbus, environment_scpi
 from reseau_drivers.link import serial_ports
 from reseau_drivers.scanner import compact_pulser, ping360
-from reseau_drivers.turntable import smc100, zaber
+from reseau_drivers.turntable import grbl, kinesis, marlin, smc100, zaber
+from reseau_sims.serving import LineSensor, ScpiSensor
 
 from .gadget import settle
 from .lab import steer, value
 
 PORT = "/dev/ttyACM0"
 TILT = {"tilt": {"per_unit": 1000.0, "high": 100.0}}
+_LINES = {"tilt": {"high": 100.0}}
+_SENSED: dict[str, dict[str, Any]] = {"temperature": {}, "humidity": {}, "pressure": {}}
+_REGISTERS = {
+    "temperature": {"register": 0, "scale": 0.1},
+    "humidity": {"register": 1, "scale": 0.1},
+    "pressure": {"register": 2, "format": "float32"},
+}
 
 
 def _table(device: Any, run: int) -> None:
@@ -34,6 +43,12 @@ def _sonar(device: Any, run: int) -> None:
 def _pulser(device: Any, run: int) -> None:
     device.configure(width_ns=20.0 + run, repetition_hz=100.0)
     assert value("machine.values")["W"] == 20.0 + run
+
+
+def _sensor(device: Any, run: int) -> None:
+    air = steer("machine.values")
+    for name, each in device.environment().conditions.items():
+        assert abs(each.value - air[name]) < 0.3
 
 
 def _home(device: Any) -> None:
@@ -53,6 +68,28 @@ DRIVERS: dict[str, tuple[Callable[[], Any], Callable[[Any, int], None], Callable
     ),
     "ping360": (lambda: ping360("sonar", PORT, answer_s=1.0), _sonar, _stop),
     "compactpulser": (lambda: compact_pulser("pulser", PORT), _pulser, _stop),
+    "kinesis": (
+        lambda: kinesis(
+            "table", PORT, axes={"tilt": {"per_unit": 1920.0, "high": 100.0}}, settings={"speed": 500.0}
+        ),
+        _table,
+        _home,
+    ),
+    "grbl": (lambda: grbl("table", PORT, axes=_LINES, settings={"speed": 500.0}), _table, _home),
+    "marlin": (lambda: marlin("table", PORT, axes=_LINES, settings={"speed": 500.0}), _table, _home),
+    "environment_modbus": (lambda: environment_modbus("air", PORT, quantities=_REGISTERS), _sensor, _stop),
+    "environment_line": (
+        lambda: environment_line("air", PORT, pattern=LineSensor.PATTERN, quantities=_SENSED),
+        _sensor,
+        _stop,
+    ),
+    "environment_scpi": (
+        lambda: environment_scpi(
+            "air", PORT, quantities={name: {"query": query} for query, name in ScpiSensor.QUERIES.items()}
+        ),
+        _sensor,
+        _stop,
+    ),
 }
 
 

@@ -67,6 +67,12 @@ class Lab:
             "smc100": lambda: serving.Smc100Line(1, low=0.0, high=100.0, speed=800.0),
             "ping360": serving.Ping360,
             "compactpulser": serving.CompactPulser,
+            "kinesis": serving.KinesisController,
+            "grbl": lambda: serving.GrblController(1, low=-1.0, high=100.0, speed=800.0),
+            "marlin": lambda: serving.MarlinController(1, high=100.0, speed=800.0),
+            "environment_modbus": lambda: serving.ModbusSensor(serving.Air(steady=True)),
+            "environment_line": lambda: serving.LineSensor(serving.Air(steady=True), every_s=0.2),
+            "environment_scpi": lambda: serving.ScpiSensor(serving.Air(steady=True)),
         }
         self.script = serving.FaultScript()
         self.machine: serving.Machine = self.machines["zaber"]()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import termios
 import threading
 import time
@@ -14,6 +15,8 @@ from reseau_sims.serving import Session
 from .gadget import Gadget, appeared
 
 __all__ = ["SerialPort"]
+
+_POLL_S = 0.05
 
 
 class SerialPort:
@@ -44,6 +47,9 @@ class SerialPort:
     def _serve(self) -> None:
         fd = self._opened()
         while True:
+            if not select.select([fd], [], [], _POLL_S)[0]:
+                self._say(fd)
+                continue
             try:
                 data = os.read(fd, 4096)
             except OSError:
@@ -61,6 +67,14 @@ class SerialPort:
             else:
                 time.sleep(0.05)
             fd = self._opened()
+
+    def _say(self, fd: int) -> None:
+        """Send what the instrument says unasked, if it is due."""
+        due = getattr(self.session, "due", None)
+        if due is not None and due <= time.monotonic():
+            for _, data in self.session.emit():  # type: ignore[attr-defined]
+                with suppress(OSError):  # the next read finds out
+                    os.write(fd, data or b"")
 
     def _answered(self, fd: int, data: bytes) -> bool:
         """Whether the plug is to be pulled, after what was answered."""
