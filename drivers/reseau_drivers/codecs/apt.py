@@ -42,6 +42,7 @@ HOST, USB = 0x01, 0x50
 _ADDRESSES = frozenset({0x00, HOST, 0x11, *range(0x21, 0x2B), USB})
 _LONG = 0x80
 _HEADER = 6
+_NO_HEADER = "not a header of the APT protocol"
 
 
 class Id(IntEnum):
@@ -339,21 +340,22 @@ class MessageDecoder:
         """Return the messages that these bytes complete."""
         found: list[Message | Damaged] = []
         self._held += data
-        skipped = bytearray()
-        while len(self._held) >= _HEADER:
-            size = _size(bytes(self._held[:_HEADER]))
+        held, at, skipped = bytes(self._held), 0, 0
+        while len(held) - at >= _HEADER:
+            size = _size(held[at : at + _HEADER]) if held[at + _HEADER - 1] in _ADDRESSES else None
             if size is None:
-                skipped.append(self._held.pop(0))
+                at, skipped = at + 1, skipped + 1
                 continue
             if skipped:
-                found.append(Damaged(bytes(skipped), "not a header of the APT protocol"))
-                skipped.clear()
-            if len(self._held) < _HEADER + size:
+                found.append(Damaged(held[at - skipped : at][:_HEADER], _NO_HEADER))
+                skipped = 0
+            if len(held) - at < _HEADER + size:
                 break
-            found.append(_message(bytes(self._held[: _HEADER + size])))
-            del self._held[: _HEADER + size]
+            found.append(_message(held[at : at + _HEADER + size]))
+            at += _HEADER + size
         if skipped:
-            found.append(Damaged(bytes(skipped), "not a header of the APT protocol"))
+            found.append(Damaged(held[at - skipped : at][:_HEADER], _NO_HEADER))
+        del self._held[:at]
         return found
 
 

@@ -9,7 +9,8 @@ the axis moves it in the image, and the length of its side gives the scale.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -17,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.core.errors import SettingError, StateError
+from reseau.core.errors import InstrumentError, SettingError, StateError
 from reseau.instruments import AxisState, Camera, Deadline, Identity, Instrument
 
 from .table import AxisPlan, Table
@@ -206,14 +207,19 @@ class ByHand:
 
     def _set(self, plan: AxisPlan, request: str, deadline: Deadline) -> float:
         if plan.name in self._markers:
-            self._person(request)
+            with _about_the_table():
+                self._person(request)
             return self._seen(plan, deadline)
-        return self._person.read(f"{request}, and read its scale", plan.unit, deadline.left) / plan.per_unit
+        return self._asked(plan, f"{request}, and read its scale", deadline)
 
     def _read(self, plan: AxisPlan, request: str, deadline: Deadline) -> float:
         if plan.name in self._markers:
             return self._seen(plan, deadline)
-        return self._person.read(request, plan.unit, deadline.left) / plan.per_unit
+        return self._asked(plan, request, deadline)
+
+    def _asked(self, plan: AxisPlan, request: str, deadline: Deadline) -> float:
+        with _about_the_table():
+            return self._person.read(request, plan.unit, deadline.left) / plan.per_unit
 
     def _seen(self, plan: AxisPlan, deadline: Deadline) -> float:
         if self.camera is None:
@@ -224,6 +230,15 @@ class ByHand:
         if self._markers[plan.name].reads == "angle" and place > plan.high:
             place -= 360.0
         return place
+
+
+@contextmanager
+def _about_the_table() -> Iterator[None]:
+    """Errors name the table, not the person."""
+    try:
+        yield
+    except InstrumentError as error:
+        raise type(error)(error.what, do=error.do, command=error.command) from None
 
 
 class HandTable(Table):

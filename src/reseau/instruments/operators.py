@@ -100,7 +100,7 @@ class RemoteOperator:
         try:
             with socket.create_connection((host, int(port)), max(0.01, seconds)) as connection:
                 connection.sendall(json.dumps(message).encode() + b"\n")
-                while not line.endswith(b"\n") and len(line) < _LONGEST:
+                while b"\n" not in line and len(line) < _LONGEST:
                     connection.settimeout(max(0.01, end - time.monotonic()))
                     more = connection.recv(4096)
                     if not more:
@@ -116,7 +116,7 @@ class RemoteOperator:
                 do="start the program that `operator` names, or remove that line from the bench file",
             ) from None  # fmt: skip
         try:
-            answer: dict[str, Any] = json.loads(line)
+            answer: dict[str, Any] = json.loads(line.partition(b"\n")[0])
             done, reason = bool(answer.get("done")), answer.get("error")
         except (ValueError, AttributeError):
             raise ProtocolError(f"answered {line[:80]!r}", where=self.address, command=request) from None

@@ -13,7 +13,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reseau.core.errors import ProtocolError
-from reseau_drivers.codecs import bk, compactpulser, hislip, ieee488, ping, rpc, smc100, usbtmc, vxi11, zaber
+from reseau_drivers.codecs import (
+    apt,
+    bk,
+    compactpulser,
+    gcode,
+    hislip,
+    ieee488,
+    modbus,
+    ping,
+    rpc,
+    smc100,
+    usbtmc,
+    vxi11,
+    zaber,
+)
+from reseau_drivers.codecs.sentence import Sentence
 from reseau_drivers.codecs.stream import Damaged, LineDecoder
 
 Decoders = dict[str, Callable[[], Any]]
@@ -25,6 +40,10 @@ STREAMS: Decoders = {
     "bk": bk.MessageDecoder,
     "rpc": rpc.RecordDecoder,
     "hislip": hislip.MessageDecoder,
+    "apt": apt.MessageDecoder,
+    "gcode": gcode.AnswerDecoder,
+    "modbus-rtu": modbus.RtuDecoder,
+    "modbus-tcp": modbus.TcpDecoder,
 }
 words = st.text(
     st.characters(min_codepoint=33, max_codepoint=126, exclude_characters="/:\\"), min_size=1, max_size=30
@@ -46,12 +65,30 @@ hislip_messages = st.builds(
     st.integers(0, 2**32 - 1),
     st.binary(max_size=99),
 )
+apt_messages = st.one_of(
+    st.builds(
+        apt.Message, st.sampled_from([apt.Id.HOME, apt.Id.HOMED, apt.Id.STOP]), st.just(apt.HOST),
+        st.sampled_from([apt.USB, 0x21]), st.tuples(st.integers(0, 9), st.integers(0, 255)),
+    ),
+    st.builds(
+        apt.Message, st.sampled_from([apt.Id.STATUS, apt.Id.DC_STATUS]), st.just(apt.HOST), st.just(apt.USB),
+        data=st.binary(min_size=14, max_size=14),
+    ),
+)  # fmt: skip
+modbus_answers = st.builds(
+    modbus.encode_registers, st.sampled_from([3, 4]), st.lists(st.integers(0, 65535), max_size=125)
+)
+rtu_frames = st.builds(modbus.Frame, st.integers(1, 247), modbus_answers)
+tcp_frames = st.builds(modbus.Frame, st.integers(1, 247), modbus_answers, st.integers(0, 65535))
 SPOKEN: dict[str, tuple[Any, Callable[[Any], bytes]]] = {
     "zaber": (zaber_messages, zaber.encode),
     "ping": (ping_frames, ping.encode),
     "bk": (st.binary(max_size=300), bk.encode),
     "rpc": (st.binary(max_size=300), rpc.record),
     "hislip": (hislip_messages, hislip.encode),
+    "apt": (apt_messages, apt.encode),
+    "modbus-rtu": (rtu_frames, modbus.encode),
+    "modbus-tcp": (tcp_frames, modbus.encode),
 }
 
 
@@ -82,7 +119,7 @@ def test_noise_does_not_raise(name: str, garbage: list[bytes]) -> None:
             assert found is not None
 
 
-@pytest.mark.parametrize("name", ["zaber", "ping", "bk"])
+@pytest.mark.parametrize("name", ["zaber", "ping", "bk", "apt", "modbus-rtu"])
 @given(garbage=st.binary(max_size=100), data=st.data())
 def test_decoders_recover_after_noise(name: str, garbage: bytes, data: st.DataObject) -> None:
     messages, encode = SPOKEN[name]
@@ -148,6 +185,11 @@ def test_decoding_one_message_returns_a_value_or_raises_protocol_error(data: byt
         rpc.decode_reply,
         vxi11.WriteParameters.parse,
         vxi11.ReadParameters.parse,
+        gcode.decode,
+        gcode.decode_numbered,
+        modbus.decode_read,
+        Sentence(r"T=(?P<t>\S+)").values,
+        Sentence(r"T=(?P<t>\S+)", "xor").values,
     ):
         with suppress(ProtocolError):
             decode(data)  # type: ignore[no-untyped-call]
