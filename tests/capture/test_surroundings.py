@@ -74,15 +74,23 @@ def test_conditions_are_stored_with_every_frame_and_summarised_in_the_provenance
 
 
 def test_a_sensor_that_fails_is_told_and_does_not_end_the_session(tmp_path: Path) -> None:
-    rig, machine = FieldRig(), ModbusSensor(lambda: AIR)
+    now = 0.0
+    rig, machine = FieldRig(), ModbusSensor(lambda: AIR, clock=lambda: now)
     _with(rig, air=_modbus(machine))
-    rig.camera.during = lambda number: machine.inject_fault("wrong state") if number == 2 else None
+
+    def during(number: int) -> None:
+        nonlocal now
+        now = float(number)
+        if number in (2, 3):
+            machine.inject_fault("wrong state")
+
+    rig.camera.during = during
     with Archive.open(tmp_path / "archive", create=True) as archive:
         session = archive.begin("monday", "own", {})
         run = rig.acquisition(session)
         carry_out(run, plans.poses(run, STEPS, 1, 0))
         found = [frame.facts["environment"]["air"] for frame in session.frames(kind="frame")]
-    assert [("error" in each) for each in found[:2]] == [False, True]
+    assert [("error" in each) for each in found] == [False, True, True, False, False, False]
     assert "device busy" in found[1]["error"]
     assert [facts["instrument"] for kind, facts in rig.events if kind == "without"] == ["air"]
 

@@ -136,7 +136,7 @@ def marker_position(pixels: NDArray[Any], marker: Marker) -> float:
     side = float(np.linalg.norm(np.roll(box, -1, axis=0) - box, axis=1).mean())
     way = math.radians(marker.direction)
     place = box.mean(axis=0) @ np.array([math.cos(way), -math.sin(way)])
-    return marker.sign * (place * marker.side_mm / side - marker.zero)
+    return marker.sign * (float(place) * marker.side_mm / side - marker.zero)
 
 
 class ByHand:

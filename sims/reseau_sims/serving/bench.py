@@ -435,7 +435,7 @@ class SimulatedBench:
                 self.laboratory.attach(name, partial(hands.position, name))
             return hands
         if kind in _OF_ONE_BOARD:
-            board = _OF_ONE_BOARD[kind]()
+            board: Machine = _OF_ONE_BOARD[kind]()
             for number, name in enumerate(AXES, 1):
                 self.laboratory.attach(name, partial(_place, board, number))
             return board

@@ -177,8 +177,13 @@ class TerminalOperator:
                 raise StateError("was stopped", where=question)
             if time.monotonic() > end:
                 raise DeadlineError(f"no answer within {seconds:g} s", where=question)
-            if select.select([sys.stdin], [], [], 0.1)[0]:
-                data = os.read(sys.stdin.fileno(), 1024)
+            data: bytes | None = None
+            try:
+                if select.select([sys.stdin], [], [], 0.1)[0]:
+                    data = os.read(sys.stdin.fileno(), 1024)
+            except (OSError, ValueError):  # it cannot be waited for: on Windows, or replaced
+                data = sys.stdin.readline().encode()
+            if data is not None:
                 if not data:
                     raise StateError("standard input is closed", where=question, do="run it in a terminal")
                 self._held += data
