@@ -18,6 +18,8 @@ from reseau_sims.serving import (
     ZaberChain,
 )
 
+from .zaber_database import STEPS, device_database
+
 
 def test_zaber_motion_homes_and_moves_the_turntable() -> None:
     ascii_ = pytest.importorskip("zaber_motion.ascii", reason="zaber-motion is not installed")
@@ -58,6 +60,36 @@ def test_zaber_motion_homes_and_moves_the_turntable() -> None:
         axis.move_absolute(2_000)
         assert axis.get_position() == 2_000
     assert [said for said in chain.violations if "PARKED" not in said] == []
+
+
+def test_zaber_motion_identifies_the_turntable_and_moves_it_in_degrees() -> None:
+    motion = pytest.importorskip("zaber_motion", reason="zaber-motion is not installed")
+    ascii_ = pytest.importorskip("zaber_motion.ascii")
+    chain, unit = ZaberChain([2, 1]), motion.Units
+    for motor in chain.motors.values():
+        motor.speed = 1e6
+    with (
+        device_database(),
+        TcpServer(lambda: FaultyConnection(chain)) as server,
+        ascii_.Connection.open_tcp("127.0.0.1", server.port) as connection,
+    ):
+        devices = connection.detect_devices()
+        assert [device.axis_count for device in devices] == [2, 1]
+        found = devices[0].identify()
+        assert (found.device_id, found.serial_number, found.is_modified) == (50081, 71234, False)
+        axis = devices[0].get_axis(2)
+        assert axis.axis_type == ascii_.AxisType.ROTARY
+        axis.home()
+        axis.move_absolute(10, unit.ANGLE_DEGREES)
+        assert chain.position(1, 2) == 10 * STEPS
+        axis.move_relative(-0.5, unit.ANGLE_DEGREES)
+        assert chain.position(1, 2) == 9.5 * STEPS
+        assert axis.get_position(unit.ANGLE_DEGREES) == pytest.approx(9.5)
+        axis.settings.set("maxspeed", 90, unit.ANGULAR_VELOCITY_DEGREES_PER_SECOND)
+        assert chain.motors[1, 2].speed == pytest.approx(90 * STEPS)
+        with pytest.raises(motion.exceptions.NotSupportedException):
+            axis.move_max()
+    assert chain.violations == []
 
 
 def test_bluerobotics_ping_scans() -> None:

@@ -28,11 +28,16 @@ _STORED = {
     "limit.home.pos": "0",
     "resolution": "64",
     "peripheral.id": "0",
+    "peripheralid": "0",
     "peripheral.serial": "0",
+    "peripheral.hw.modified": "0",
 }
 """Settings of an axis that do not change its simulated motion, which has a constant speed."""
 _OF_DEVICE = {"comm.alert": "0", "knob.enable": "1", "system.access": "1"}
-_FIXED = ("limit.home.pos", "resolution", "peripheral.id", "peripheral.serial")
+_FIXED = (
+    "limit.home.pos", "resolution", "peripheral.id", "peripheralid", "peripheral.serial",
+    "peripheral.hw.modified",
+)  # fmt: skip
 _RANK = ("FS", "FE", "FD", "WR", "NI")
 """Flags in order of decreasing severity."""
 
@@ -280,6 +285,10 @@ class ZaberChain(Machine):
             "system.temperature": "30.1",
             "comm.address": str(device),
             "comm.packet.size.max": str(_LONGEST),
+            "comm.command.packets.max": "1",
+            "comm.word.size.max": "50",
+            "get.settings.max": "1",
+            "device.hw.modified": "0",
             "system.axiscount": str(sum(1 for d, _ in self.motors if d == device)),
             **self._of_device[device],
         }
