@@ -231,7 +231,7 @@ def _measured(pixels: EdgePixels, values: Array, known: bool) -> EdgeSpread | Fa
         return fit if isinstance(fit, Failure) else EdgeSpread(fit, free)
     if not known:
         pixels = _weighed(free, pixels)
-        free = fit_free(pixels, wide.values, bow=True)
+        free = fit_free(pixels, wide.values, bow=True, start=free)
         if isinstance(free, Failure):
             return free
     bent = free.fit.test_of("bow", alpha=ALPHA)

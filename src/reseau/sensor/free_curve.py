@@ -11,7 +11,7 @@ The pupil of a lens has a rim: whatever its shape and aberrations, its transfer 
 this asymptote is therefore adjusted with the spline; the light beyond the region follows from it.
 
 How far from the edge the spline is needed beside the tail is not known. Splines that end at several distances
-are averaged with weights like Akaike's; the variance includes what they differ by.
+are averaged with weights like Akaike's; the variance is that of the mean, and includes what they differ by.
 """
 
 from __future__ import annotations
@@ -45,6 +45,8 @@ _GROWTH, _WIDEST_PX = 1.25, 2.0
 _LIMIT = 0.375
 """Cycles per distance of knots up to which a spline can follow."""
 _SHORT = 1e-9
+_CHORD = 0.25
+"""Half the length of the chord whose slope is that of the curve at its half, relative to the frequency."""
 _PENALTY = 1.5
 """For each coefficient; with 2, as Akaike has it, a weak flare is taken for the tail and Z is 1 σ too low."""
 
@@ -77,8 +79,8 @@ class _Spline:
         return np.flatnonzero(np.maximum(-self.knots[:-3], self.knots[3:]) > distance + _SHORT)
 
     def outer(self, core: float) -> list[NDArray[np.intp]]:
-        """The same for each distance of knots behind the core."""
-        ends = np.unique(np.abs(self.knots))
+        """The same for each distance of knots behind the core, from the furthest."""
+        ends = np.unique(np.abs(self.knots))[::-1]
         found = [self.beyond(float(end)) for end in ends[ends >= core]]
         return [outer for outer in found if len(outer)]
 
@@ -105,11 +107,21 @@ class _Spline:
 
 
 class _Averaged(NamedTuple):
-    """Solutions with their weights (n,): values (n, k), and covariances (n, k, k)."""
+    """Nested solutions, the largest first, with their weights (n,): values (n, k), covariances (n, k, k).
+
+    Two nested solutions have the covariance of the smaller one. That of the weighted mean is therefore the
+    sum of the covariances with the shares Σ wₖ wₗ over the pairs whose smaller one it is.
+    """
 
     weight: Array
     values: Array
     cov: Array
+
+    @property
+    def share(self) -> Array:
+        """Shares (n,) of the solutions in the covariance of the mean; their sum is 1."""
+        share: Array = self.weight * (2 * np.cumsum(self.weight) - self.weight)
+        return share
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +187,8 @@ class FreeCurve:
         With A the step and ĝ the transform of the Gaussian edge, aⱼ and b̂ⱼ those of the spline and of the
         tail, Z(f) = (A ĝ(f) + Σ aⱼ b̂ⱼ(f)) / (A + Σ aⱼ b̂ⱼ(0)), and
         ∂Z/∂aⱼ = (b̂ⱼ(f) − Z b̂ⱼ(0)) / (A + …). Averaged with the weights w over splines that end at several
-        distances, the covariance is Σ w (C + (Z − Z̄)(Z − Z̄)ᵀ).
+        distances, of the shares v in the covariance of the mean, the covariance is
+        Σ v C + Σ w (Z − Z̄)(Z − Z̄)ᵀ.
         """
         f = np.atleast_1d(np.asarray(frequency, dtype=np.float64))
         step, c, s = self._step
@@ -192,8 +205,8 @@ class FreeCurve:
             own = np.einsum("nmik,nmjk->nmij", parts @ each.cov[:, None], parts)
         mean = each.weight @ z
         away = np.stack([(z - mean).real, (z - mean).imag], axis=-1)
-        spread = own + away[..., :, None] * away[..., None, :]
-        return mean, np.einsum("n,nmij->mij", each.weight, spread)
+        differ = np.einsum("n,nmi,nmj->mij", each.weight, away, away)
+        return mean, np.einsum("n,nmij->mij", each.share, own) + differ
 
     @property
     def core(self) -> float:
@@ -226,21 +239,25 @@ class FreeCurve:
         own, other = (np.einsum("mi,mij,mj->m", v, cov, v) for v in (u, across))
         return np.sqrt(np.maximum(np.abs(z) ** 2 - other, 0.0)), np.sqrt(np.maximum(own, 0.0))
 
-    @property
+    @cached_property
     def mtf50(self) -> tuple[float, float] | None:
-        """Frequency at which the modulation is 0.5, and its sigma; None if it stays above."""
+        """Frequency at which the modulation is 0.5, and its sigma; None if it stays above.
 
-        def above(frequency: float) -> float:
-            return float(self.mtf(frequency)[0][0]) - 0.5
-
+        Notes
+        -----
+        The sigma is that of the modulation over the slope of the curve. Noise bends the curve: at a point,
+        the slope would be steep just where noise moved the crossing, so it is that of a chord.
+        """
         grid = np.linspace(0.0, self.limit, 129)
         below = np.flatnonzero(self.mtf(grid)[0] < 0.5)
         if not len(below):
             return None
         low, high = float(grid[below[0] - 1]), float(grid[below[0]])
-        half = float(brentq(above, low, high, xtol=1e-10))
-        slope = (above(half + 1e-4) - above(half - 1e-4)) / 2e-4
-        return half, float(self.mtf(half)[1][0]) / max(abs(slope), _SHORT)
+        half = float(brentq(lambda f: float(self.mtf(f)[0][0]) - 0.5, low, high, xtol=1e-7))
+        aside = min(_CHORD * half, self.limit - half)
+        values, sigmas = self.mtf(np.array([half - aside, half, half + aside]))
+        slope = float(values[0] - values[2]) / (2 * aside) if aside > 0 else 0.0
+        return half, float(sigmas[1]) / max(slope, _SHORT)
 
     @property
     def nyquist(self) -> tuple[float, float]:
@@ -269,7 +286,7 @@ class FreeCurve:
         by[:, -1] += outside / whole
         mean = float(each.weight @ share)
         own = np.einsum("ni,nij,nj->n", by, each.cov, by)
-        return mean, float(np.sqrt(each.weight @ (own + (share - mean) ** 2)))
+        return mean, float(np.sqrt(each.share @ own + each.weight @ (share - mean) ** 2))
 
     def ends(self) -> tuple[float, float]:
         """Share of the step that rises in the outer quarters of the region beside the tail, and the
@@ -287,7 +304,9 @@ class FreeCurve:
         return float(np.abs(found).sum() / abs(self._step[0])), p
 
 
-def fit_free(pixels: EdgePixels, base: Array, *, bow: bool = False) -> FreeCurve | Failure:
+def fit_free(
+    pixels: EdgePixels, base: Array, *, bow: bool = False, start: FreeCurve | None = None
+) -> FreeCurve | Failure:
     """Adjust the free curve to pixels.
 
     Parameters
@@ -298,6 +317,8 @@ def fit_free(pixels: EdgePixels, base: Array, *, bow: bool = False) -> FreeCurve
         Parameters of the Gaussian edge; see :func:`~reseau.sensor.gaussian_edge.fit_gaussian`.
     bow : bool
         Whether the edge may be curved.
+    start : FreeCurve, optional
+        Curve of the same base, with other sigmas of the pixels, from which to start.
     """
     gap = _gap(pixels, base)
     limit = min(1.0, _LIMIT / max(_STEP_PX, _FEWEST * gap))
@@ -307,9 +328,9 @@ def fit_free(pixels: EdgePixels, base: Array, *, bow: bool = False) -> FreeCurve
         )
     spline = _Spline(_knots(pixels, base, max(_STEP_PX, _FEWEST * gap)))
     names = ["dark", *(f"a{j}" for j in range(spline.size)), "tail", "slope", "bow"]
-    start = [base[3], *np.zeros(spline.size + 1), base[1], base[2]]
+    begin = [base[3], *np.zeros(spline.size + 1), base[1], base[2]] if start is None else start.fit.values
     width = _tail_width(base)
-    parameters = Parameters(names, start)
+    parameters = Parameters(names, begin)
     slant = np.arctan(base[1])
     shape = abs(float(base[5])), float(np.cos(slant)), float(abs(np.sin(slant)))
     step = float(base[4] - base[3])

@@ -25,7 +25,7 @@ _NEAR_PX = 8.0
 _ROUNDS = 3
 _SHARPEST_PX = 0.02
 """Width assigned to an edge that shows none."""
-ENOUGH = Options(tolerance=1e-7)
+ENOUGH = Options(tolerance=1e-4)
 """Iterations end when corrections are below this share of their standard deviations."""
 _Integral = Callable[[Array, float], Array]
 
