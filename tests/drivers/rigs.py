@@ -236,6 +236,7 @@ def ping360_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
 def scope_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
     machine = serving.Oscilloscope("keysight")
     server: Server | None = None
+    extra: dict[str, Any] = {}
     if transport in ("tcp", "in process"):
         address, server = _wired(stack, transport, machine, script)
     elif transport == "vxi-11":
@@ -244,7 +245,7 @@ def scope_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
         address = f"TCPIP::127.0.0.1,{tcp.port}::inst0::INSTR"
     elif transport == "usbtmc":
         plugged = stack.enter_context(plugged_in(UsbInstrument(machine, machine.execute, script)))
-        address = plugged.resource
+        address, extra = plugged.resource, {"usb": plugged}
     else:
         both = serving.HislipInstrument(machine, machine.execute, script)
         server = tcp = stack.enter_context(TcpServer(both.channel))
@@ -258,7 +259,7 @@ def scope_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:
             assert (device.screen().frame().pixels == shown).all()
 
     machine_picture = machine.screen()
-    return Rig(device, machine, script, work, device.screen, server)
+    return Rig(device, machine, script, work, device.screen, server, extra)
 
 
 def bk_rig(stack: ExitStack, transport: str, script: FaultScript) -> Rig:

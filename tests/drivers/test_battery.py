@@ -91,6 +91,19 @@ def test_reconnection_after_a_cable_was_pulled(driver: str, transport: str) -> N
         assert found.machine.violations == []
 
 
+def test_a_usb_instrument_is_found_again_after_its_cable_was_pulled() -> None:
+    with rig("oscilloscope", "usbtmc") as found:
+        usb = found.extra["usb"]
+        usb.present = False
+        for _ in range(2):
+            with pytest.raises(InstrumentError, match="scope"):
+                found.work(1)
+        usb.present = True
+        found.work(2)
+        assert usb.open_handles == 1
+        assert found.machine.violations == []
+
+
 @pytest.mark.parametrize(("driver", "transport"), list(RIGS))
 def test_random_faults_never_give_a_wrong_answer(driver: str, transport: str) -> None:
     _endure(driver, transport, exchanges=120, rate=0.03)

@@ -429,6 +429,7 @@ def _program(name: str) -> str:
     return found
 
 
+@pytest.mark.client("arv-tool", "GigE Vision", "features read and set")
 def test_aravis_s_own_tool_reads_and_sets_its_features(simulated: GigeCamera) -> None:
     tool = [_program("arv-tool-0.8"), "-a", simulated.address]
     names = ["DeviceID", "DeviceModelName", "Width", "PixelFormat", "ExposureTimeAbs"]
@@ -440,13 +441,16 @@ def test_aravis_s_own_tool_reads_and_sets_its_features(simulated: GigeCamera) ->
     assert "Width = 320" in message
 
 
+@pytest.mark.client("arv-camera-test", "GigE Vision", "frames at a rate, whole")
 def test_aravis_s_own_client_receives_whole_frames(simulated: GigeCamera) -> None:
     client = _program("arv-camera-test-0.8")
     options = ["-n", simulated.address, "-w", "640", "-h", "480", "-f", "25", "-d", "stream:0"]
     running = subprocess.Popen(
         [client, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
-    time.sleep(4.0)
+    until, enough = time.monotonic() + 60.0, simulated.frames + 40
+    while simulated.frames < enough and time.monotonic() < until:
+        time.sleep(0.1)
     running.send_signal(2)
     message = running.communicate(timeout=30)[0]
     whole = int(message.split("n_completed_buffers")[1].split()[1])

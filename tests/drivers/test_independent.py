@@ -21,6 +21,11 @@ from reseau_sims.serving import (
 from .zaber_database import STEPS, device_database
 
 
+@pytest.mark.client(
+    "zaber-motion",
+    "Zaber chain, TCP",
+    "home, moves with their own speed, `accel`, `maxspeed`, `limit.max`, park and unpark, settings",
+)
 def test_zaber_motion_homes_and_moves_the_turntable() -> None:
     ascii_ = pytest.importorskip("zaber_motion.ascii", reason="zaber-motion is not installed")
     chain = ZaberChain([2, 1])
@@ -62,6 +67,11 @@ def test_zaber_motion_homes_and_moves_the_turntable() -> None:
     assert [said for said in chain.violations if "PARKED" not in said] == []
 
 
+@pytest.mark.client(
+    "zaber-motion",
+    "Zaber chain, TCP",
+    "`detect_devices()`, `identify()` by a device database on this machine, moves and speeds in degrees",
+)
 def test_zaber_motion_identifies_the_turntable_and_moves_it_in_degrees() -> None:
     motion = pytest.importorskip("zaber_motion", reason="zaber-motion is not installed")
     ascii_ = pytest.importorskip("zaber_motion.ascii")
@@ -92,6 +102,7 @@ def test_zaber_motion_identifies_the_turntable_and_moves_it_in_degrees() -> None
     assert chain.violations == []
 
 
+@pytest.mark.client("bluerobotics-ping", "Ping360, serial", "`initialize()`, `control_transducer()`")
 def test_bluerobotics_ping_scans() -> None:
     brping = pytest.importorskip("brping", reason="bluerobotics-ping is not installed")
     machine = serving.Ping360()
@@ -111,6 +122,11 @@ def test_bluerobotics_ping_scans() -> None:
     assert machine.violations == []
 
 
+@pytest.mark.client(
+    "bluerobotics-ping",
+    "Ping360, UDP",
+    "all single settings, `transmitAngle()`, `transmit()`, automatic scan, motor off",
+)
 def test_bluerobotics_ping_scans_over_udp() -> None:
     brping = pytest.importorskip("brping", reason="bluerobotics-ping is not installed")
     machine = serving.Ping360()

@@ -245,6 +245,7 @@ def _portmapper(core: int) -> TcpServer:
             time.sleep(0.1)
 
 
+@pytest.mark.client("lxi", "{family}", "`screenshot` by its plugin, or by `*IDN?`: equal to the screen")
 @pytest.mark.skipif(shutil.which("lxi") is None, reason="lxi (Debian's lxi-tools) is not installed")
 @pytest.mark.skipif(os.geteuid() != 0, reason="lxi asks the portmapper on port 111, which only root may open")
 @pytest.mark.parametrize(

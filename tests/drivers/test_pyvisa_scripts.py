@@ -13,9 +13,18 @@ import numpy as np
 import pytest
 
 from reseau_sims import serving
-from reseau_sims.serving import FAMILIES, FaultScript, FaultyConnection, TcpServer, Vxi11Session
+from reseau_sims.serving import (
+    FAMILIES,
+    FaultScript,
+    FaultyConnection,
+    HislipInstrument,
+    TcpServer,
+    Vxi11Session,
+)
+from reseau_sims.serving.usbtmc import UsbInstrument, plugged_in
 
 pyvisa = pytest.importorskip("pyvisa")
+CLIENT = partial(pytest.mark.client, "pyvisa, pyvisa-py")
 VOLTS = (np.arange(1000).astype(np.uint8).astype(float) - 128) * 0.04 + 0.12
 
 
@@ -25,11 +34,16 @@ def opened(family: str, transport: str = "socket") -> Iterator[tuple[Any, servin
     session: Any = partial(FaultyConnection, machine)
     if transport == "vxi-11":
         session = partial(Vxi11Session, machine, machine.execute, FaultScript())
-    manager = pyvisa.ResourceManager("@py")
-    with TcpServer(session) as server:
+    elif transport == "hislip":
+        session = HislipInstrument(machine, machine.execute, FaultScript()).channel
+    usb = UsbInstrument(machine, machine.execute, FaultScript())
+    with TcpServer(session) as server, plugged_in(usb):
+        manager = pyvisa.ResourceManager("@py")
         name = {
+            "usbtmc": usb.resource,
             "socket": f"TCPIP::127.0.0.1::{server.port}::SOCKET",
             "vxi-11": f"TCPIP::127.0.0.1,{server.port}::inst0::INSTR",
+            "hislip": f"TCPIP::127.0.0.1::hislip0,{server.port}::INSTR",
         }[transport]
         device = manager.open_resource(name, read_termination="\n", write_termination="\n", timeout=5000)
         try:
@@ -38,6 +52,11 @@ def opened(family: str, transport: str = "socket") -> Iterator[tuple[Any, servin
             device.close()
 
 
+@CLIENT(
+    "{family}",
+    "VXI-11: `query`, joined queries, `write` and `read_stb` with `*ESE`, `*SRE`, `*OPC`, `*STB?`; errors by "
+    "`*ESR?` and `SYST:ERR?`",
+)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_five_styles(family: str) -> None:
     with opened(family, "vxi-11") as (device, machine):
@@ -45,9 +64,15 @@ def test_the_five_styles(family: str) -> None:
         assert device.query("*IDN?") == FAMILIES[family].idn
         assert device.query("*ESE 60;*ESE?;*OPC?") == "60;1"
         device.write("*CLS;*ESE 1;*SRE 32;*OPC")
+        assert device.query("*STB?") == "96"
+        # A service is requested once for each reason, the summary stays as long as the reason.
         assert device.read_stb() & 0x60 == 0x60
-        assert device.query("*ESR?") == "1"
-        assert device.read_stb() & 0x20 == 0
+        assert device.read_stb() & 0x60 == 0x20
+        assert device.query("*STB?;*ESR?;*STB?") == "96;1;0"
+        assert device.read_stb() & 0x60 == 0
+        device.write("*OPC")
+        assert device.read_stb() & 0x60 == 0x60
+        device.write("*CLS")
         # an error: in the queue, in the event register, in the status byte
         device.write("NO:SUCH 1")
         assert device.read_stb() & 0x04
@@ -68,6 +93,7 @@ PICTURES = {
 }
 
 
+@CLIENT("{family}", "VXI-11: pictures by `query_binary_values`")
 @pytest.mark.parametrize("family", PICTURES)
 def test_pictures_are_read_as_binary_values(family: str) -> None:
     query, before = PICTURES[family]
@@ -79,6 +105,7 @@ def test_pictures_are_read_as_binary_values(family: str) -> None:
         assert machine.violations == []
 
 
+@CLIENT("tektronix-files", "VXI-11: a file by `read_raw`")
 def test_bare_files_are_read_raw() -> None:
     with opened("tektronix-files", "vxi-11") as (device, machine):
         device.write('SAVE:IMAGE "C:/x.png"')
@@ -90,6 +117,7 @@ def test_bare_files_are_read_raw() -> None:
         assert machine.violations == []
 
 
+@CLIENT("{family}", "VXI-11: waveforms in bytes, words, text, by `query_binary_values` and `query`")
 @pytest.mark.parametrize("form", ["BYTE", "WORD", "ASCii"])
 @pytest.mark.parametrize("family", ["keysight", "keysight-infiniium", "rigol-1000z"])
 def test_waveforms_in_bytes_words_and_text(family: str, form: str) -> None:
@@ -112,6 +140,7 @@ def test_waveforms_in_bytes_words_and_text(family: str, form: str) -> None:
         assert machine.violations == []
 
 
+@CLIENT("keysight-infiniium", "VXI-11: a block of unknown length")
 def test_a_block_of_unknown_length_is_read() -> None:
     with opened("keysight-infiniium", "vxi-11") as (device, machine):
         device.write(":WAV:FORM BYTE;STR ON")
@@ -120,6 +149,7 @@ def test_a_block_of_unknown_length_is_read() -> None:
         assert machine.violations == []
 
 
+@CLIENT("tektronix", "VXI-11: curves in four codings by `query_binary_values` and `query_ascii_values`")
 @pytest.mark.parametrize(
     ("coding", "datatype", "big", "shift"),
     [("RIB", "b", True, 0), ("rpbinary", "B", True, 128), ("SRI", "h", False, 0), ("ASCII", "", True, 0)],
@@ -140,6 +170,7 @@ def test_curves_of_tektronix_in_every_coding(coding: str, datatype: str, big: bo
         assert machine.violations == []
 
 
+@CLIENT("tektronix-tds3000", "VXI-11: headers of answers; pictures that are printed, saved, compressed")
 def test_answers_of_tektronix_have_headers_until_they_are_switched_off() -> None:
     with opened("tektronix-tds3000", "vxi-11") as (device, machine):
         assert device.query("HARDC:FORM?") == ":HARDCOPY:FORMAT BMP"
@@ -154,6 +185,39 @@ def test_answers_of_tektronix_have_headers_until_they_are_switched_off() -> None
         assert machine.violations == []
 
 
+@CLIENT("keysight over {transport}", "service request by a poll; it cannot wait for one")
+@pytest.mark.parametrize("transport", ["vxi-11", "hislip", "socket"])
+def test_pyvisa_py_polls_for_service_requests_and_cannot_wait_for_them(transport: str) -> None:
+    events, queue = pyvisa.constants.EventType.service_request, pyvisa.constants.EventMechanism.queue
+    with opened("keysight", transport) as (device, machine):
+        # None of its transports has events: nothing can be received, whatever the instrument sends.
+        with pytest.raises(NotImplementedError):
+            device.enable_event(events, queue)
+        with pytest.raises(NotImplementedError):
+            device.wait_on_event(events, 100)
+        # The answer says that all is executed: HiSLIP polls on another channel.
+        assert device.query("*CLS;*ESE 1;*SRE 32;*OPC;*OPC?") == "1"
+        polled = int(device.query("*STB?")) if transport == "socket" else device.read_stb()
+        assert polled & 0x60 == 0x60
+        assert machine.violations == []
+
+
+@CLIENT("keysight over {transport}", "identity, a picture, a waveform")
+@pytest.mark.parametrize("transport", ["socket", "vxi-11", "hislip", "usbtmc"])
+def test_every_transport_carries_text_and_blocks(transport: str) -> None:
+    with opened("keysight", transport) as (device, machine):
+        assert device.query("*IDN?") == FAMILIES["keysight"].idn
+        data = device.query_binary_values(":DISP:DATA? PNG", datatype="B", container=bytes)
+        assert (cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) == machine.screen()).all()
+        codes = device.query_binary_values(":WAV:DATA?", datatype="B", container=np.array)
+        assert (codes.astype(float) - 128) * 0.04 + 0.12 == pytest.approx(VOLTS, abs=1e-6)
+        assert machine.violations == []
+
+
+@CLIENT(
+    "keysight over socket",
+    "suffixes, MIN, MAX, DEF, ON and 1, `#H`, paths after semicolons; six wrong forms by their error numbers",
+)
 def test_parameters_in_all_their_forms() -> None:
     with opened("keysight") as (device, machine):
         for written, value in {

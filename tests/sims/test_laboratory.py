@@ -62,6 +62,7 @@ def centre_of_target(frame: Frame, near: Array) -> Array:
     return np.array([column + dark.sum(0) @ offset / dark.sum(), row + dark.sum(1) @ offset / dark.sum()])
 
 
+@pytest.mark.client("zaber-motion", "Zaber chain, TCP", "poses of the testfield before the camera")
 def test_zaber_motion_moves_the_testfield_that_the_camera_sees() -> None:
     ascii_ = pytest.importorskip("zaber_motion.ascii", reason="zaber-motion is not installed")
     with (

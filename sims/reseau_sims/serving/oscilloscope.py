@@ -292,9 +292,9 @@ class Oscilloscope(Machine):
         bare = any(self._is_picture(header) for header, _ in units) and not self._like.newline
         return joined if bare else joined + b"\n"
 
-    def status_byte(self, available: bool) -> int:
+    def serial_poll(self, available: bool) -> int:
         """Return the status byte, given whether an answer can be read."""
-        return self.status.byte(available)
+        return self.status.poll(available)
 
     def _is_picture(self, header: str) -> bool:
         written = self._like.saves[1] if self._like.saves else self._like.screen

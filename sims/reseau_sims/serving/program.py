@@ -22,7 +22,7 @@ _POWERS = {
     "N": 1e-9, "P": 1e-12, "F": 1e-15, "A": 1e-18,
 }  # fmt: skip
 _BASES = {"H": 16, "Q": 8, "B": 2}
-_ESB, _MAV, _RQS, _ERROR = 0x20, 0x10, 0x40, 0x04
+_ESB, _MAV, _MSS, _ERROR = 0x20, 0x10, 0x40, 0x04
 _DEEP, _OVERFLOW = 30, '-350,"Queue overflow"'
 _POWER_ON, _COMPLETE, _QUERY = 0x80, 0x01, 0x04
 
@@ -183,6 +183,7 @@ class Status:
     ese: int = 0
     sre: int = 0
     errors: list[str] = field(default_factory=list)
+    _requested: int = 0
 
     def error(self, entry: str) -> None:
         """Add an entry to the queue, and set its bit: command, execution, device or query error."""
@@ -196,12 +197,22 @@ class Status:
 
     def clear(self) -> None:
         """``*CLS``."""
-        self.esr, self.errors = 0, []
+        self.esr, self.errors, self._requested = 0, [], 0
 
     def byte(self, available: bool) -> int:
-        """Status byte: error queue, message available, standard events; bit 6 if one is enabled."""
+        """Status byte as ``*STB?`` reports it: error queue, message available, standard events; bit 6 (MSS)
+        as long as one of them is enabled.
+        """
         found = _ERROR * bool(self.errors) | _MAV * available | _ESB * bool(self.esr & self.ese)
-        return found | _RQS * bool(found & self.sre)
+        return found | _MSS * bool(found & self.sre)
+
+    def poll(self, available: bool) -> int:
+        """Status byte as a serial poll reports it: bit 6 (RQS) once for each reason (IEEE 488.2, 11.2.2)."""
+        found = self.byte(available)
+        reasons = found & self.sre
+        requested = bool(reasons & ~self._requested)
+        self._requested = reasons
+        return found & ~_MSS | _MSS * requested
 
     def common(self, header: str, arguments: str) -> str | None:
         """Obey a common command of the registers; None if it has no answer.
@@ -219,7 +230,7 @@ class Status:
             if name == "*ESE":
                 self.ese = mask
             else:
-                self.sre = mask & ~_RQS
+                self.sre = mask & ~_MSS
             return None
         if name == "*OPC":
             self.esr |= _COMPLETE
@@ -231,6 +242,10 @@ class Status:
             return None
         if name == "*ESR?":
             found, self.esr = self.esr, 0
+            self._requested &= ~_ESB
             return str(found)
+        if name == "*STB?":
+            # The answer itself is not available yet.
+            return str(self.byte(False))
         answers = {"*ESE?": str(self.ese), "*SRE?": str(self.sre), "*OPC?": "1", "*TST?": "0", "*OPT?": "0"}
         return answers[name]

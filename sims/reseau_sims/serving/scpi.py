@@ -62,10 +62,10 @@ class AnswerQueue:
         return bool(self._waiting) and self._waiting[0][0] <= time.monotonic()
 
     def status(self) -> int:
-        """Return the status byte: of the instrument, or with the message available alone."""
-        byte: Callable[[bool], int] | None = getattr(self._machine, "status_byte", None)
+        """Poll the status byte: of the instrument, or with the message available alone."""
+        poll: Callable[[bool], int] | None = getattr(self._machine, "serial_poll", None)
         available = self.available()
-        return 0x10 * available if byte is None else byte(available)
+        return 0x10 * available if poll is None else poll(available)
 
     def clear(self) -> None:
         """Discard all answers."""
