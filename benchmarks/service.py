@@ -476,7 +476,8 @@ def patience(folder: Path, base: str, cookie: str, api: dict[str, Any], minutes:
     for way, given in ways.items():
         said = ran(folder, "slowhttptest", *given, "-c", "1000", "-r", "200", "-l", "40", "-p", "10",
                    "-u", f"{base}/login")  # fmt: skip
-        states = re.findall(r"service available:\W*(?:\x1b\[[0-9;]*m)*\W*(YES|NO)", said)
+        plain = re.sub(r"\x1b\[[0-9;]*m", "", said)
+        states = re.findall(r"service available:\s*(YES|NO)", plain)
         print(f"  {way}: available {states.count('YES')} of {len(states)} times")
         if not states or "NO" in states:
             found.append(f"slowhttptest: {way} keep others from being served")

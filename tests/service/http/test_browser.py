@@ -175,6 +175,16 @@ def enter(place: Place, browser: Browser) -> None:
     browser.until("Overview")
 
 
+def home(place: Place) -> None:
+    """Have the tilt find its reference, if it has none."""
+    token = (place.folder / "archive-service" / "local-token").read_text().strip()
+    base, mine = f"http://127.0.0.1:{place.port}/api/1/benches/cellar", {"Authorization": f"Bearer {token}"}
+    with httpx.Client(headers=mine, timeout=300) as http:
+        until(lambda: http.get(base).json()["state"] == "ready")
+        if not http.get(f"{base}/axes").json()["tilt"]["homed"]:
+            http.post(f"{base}/home", json={"axis": "tilt"}).raise_for_status()
+
+
 def press(browser: Browser, css: str) -> None:
     """Click a button as soon as it is there and enabled: those of axes are not while one moves."""
     find = "const b = document.querySelector(arguments[0]), on = b && !b.disabled;"
@@ -340,6 +350,7 @@ def test_two_browsers_show_the_same_bench_also_where_connections_are_cut(
     place: Place, browser: Browser, seconds: float
 ) -> None:
     enter(place, browser)
+    home(place)
     with Proxy(place.port, "::1", place.port, seconds) as proxy, chromium() as other:
         other.open(place.link().replace("127.0.0.1", "[::1]"))
         other.open(f"http://[::1]:{place.port}/benches/cellar")
