@@ -31,7 +31,7 @@ from reseau.procedures.calibration import calibrate_camera, measurer_of
 
 WRONG_PX, WRONG_SIGMA, NORMALISED = 0.15, 5.0, (0.85, 1.2)
 APRIL, ARUCO = "DICT_APRILTAG_36h11", "DICT_4X4_100"
-KINDS: dict[str, tuple[BoardDesign, prints.Print]] = {
+KINDS: dict[str, tuple[BoardDesign, prints.Print | prints.Deltille]] = {
     "aprilgrid2": (
         board("aprilgrid", 6, 6, 28.6, size=22.0, border_bits=2),
         prints.aprilgrid(6, 6, 22.0, 0.3, APRIL, 2),
@@ -61,6 +61,7 @@ KINDS: dict[str, tuple[BoardDesign, prints.Print]] = {
         prints.charuco(9, 6, 30.0, 22.0, ARUCO, True),
     ),
     "chess": (board("chess", 10, 7, 25.0), prints.chess(10, 7, 25.0)),
+    "deltille": (board("deltille", 9, 8, 25.0), prints.Deltille(9, 8, 25.0)),
     "circles": (board("circles", 9, 7, 25.0, size=12.0), prints.circles(9, 7, 25.0, 12.0)),
     "asymmetric": (
         board("circles", 4, 11, 20.0, size=16.0, asymmetric=True),
@@ -92,6 +93,8 @@ def by_others(kind: str, design: BoardDesign, pixels: Any) -> tuple[Array, float
             plan = cv2.aruco.CharucoBoard(size, design.pitch, float(design.size or 0), words)
             plan.setLegacyPattern(design.legacy)
             found = cv2.aruco.CharucoDetector(plan).detectBoard(pixels)[0]
+    elif design.kind == "deltille":
+        pass  # OpenCV knows none
     elif design.kind == "chess":
         flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
         good, found = cv2.findChessboardCornersSB(pixels, (design.columns - 1, design.rows - 1), flags=flags)

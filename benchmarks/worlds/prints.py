@@ -15,7 +15,7 @@ import numpy as np
 
 from .pixels import Array, edge
 
-__all__ = ["Print", "aprilgrid", "charuco", "chess", "circles", "dotted", "markers", "puzzle"]
+__all__ = ["Deltille", "Print", "aprilgrid", "charuco", "chess", "circles", "dotted", "markers", "puzzle"]
 
 _COARSE = 16
 """Step of samples at which disks are looked for."""
@@ -219,3 +219,63 @@ def circles(columns: int, rows: int, pitch: float, size: float, asymmetric: bool
     # An asymmetric grid with an odd number of rows equals itself turned by 180° if its rows do.
     ways = (2 if rows % 2 else 1) if asymmetric else (4 if columns == rows else 2)
     return Print(tuple(map(str, range(len(xy)))), xy, np.zeros((0, 4)), disks, 20.0, ways)
+
+
+@dataclass(frozen=True, eq=False)
+class Deltille:
+    """A grid of equilateral triangles: black ones point upwards; corners row by row from the upper left.
+
+    Triangles lie between three families of lines, of which each changes the colour; the grid ends with a
+    rectangle.
+
+    Parameters
+    ----------
+    columns, rows : int
+        Numbers of corners; every second row is shifted to the right by half a side.
+    side : float
+        Of a triangle, mm.
+    """
+
+    columns: int
+    rows: int
+    side: float
+    symmetries: int = 1
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Names of the corners."""
+        return tuple(map(str, range(self.columns * self.rows)))
+
+    @property
+    def xy(self) -> Array:
+        """Their places (n, 2), y up."""
+        row, column = np.divmod(np.arange(self.columns * self.rows), self.columns)
+        return np.stack([self.side * (column + 0.5 * (row % 2)), -self.side * np.sqrt(3) / 2 * row], axis=1)
+
+    @property
+    def _ends(self) -> tuple[Array, Array]:
+        return self.xy.min(axis=0), self.xy.max(axis=0)
+
+    def printed(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Shares (h, w) of paper, and of ink on it, at places that follow each other closely."""
+        high, sign = self.side * np.sqrt(3) / 2, np.ones(x.shape)
+        for angle in np.deg2rad([90.0, 210.0, 330.0]):
+            away = (x * np.cos(angle) + y * np.sin(angle)) / high
+            line = np.rint(away)
+            inside = (away - line) / np.maximum(np.hypot(*np.gradient(away)), 1e-9)
+            sign *= (2 * edge(inside, 1.0) - 1) * np.where(line % 2 == 0, 1, -1)
+        # No further corners of a row fit into half a side.
+        low, top = (
+            v + s * np.array([0.45 * self.side, high]) for v, s in zip(self._ends, (-1, 1), strict=True)
+        )
+        within, paper = np.ones(x.shape), np.ones(x.shape)
+        for at, a, b in ((x, low[0], top[0]), (y, low[1], top[1])):
+            step = np.maximum(np.hypot(*np.gradient(at)), 1e-9)
+            within *= edge(np.minimum(at - a, b - at) / step, 1.0)
+            paper *= edge(np.minimum(at - a, b - at) / step + self.side / step, 1.0)
+        # Between the upward edges of a corner one sign is positive and two are not: that is white.
+        return paper, within * (1 - sign) / 2
+
+    def design(self) -> dict[str, Any]:
+        """Points by name."""
+        return {"ids": self.ids, "xy": self.xy.tolist()}

@@ -197,6 +197,26 @@ def test_large_circles_through_a_wide_lens_or_in_part_have_the_sigmas_of_their_e
     assert np.sqrt((error**2).mean()) < 0.004
 
 
+DELTILLE, DELTILLE_PRINT = board("deltille", 9, 8, 25.0), prints.Deltille(9, 8, 25.0)
+
+
+@pytest.mark.parametrize(("seed", "nearer", "blur"), [(0, 1.0, 0.7), (2, 0.8, 2.2)])
+def test_corners_of_a_deltille_are_measured_to_their_sigmas_and_named(
+    seed: int, nearer: float, blur: float
+) -> None:
+    """Also where a part is seen: that this contains two borders of the grid."""
+    view = View(DELTILLE_PRINT, *pose(seed, DELTILLE_PRINT, nearer=nearer), seed=seed, blur=blur)
+    found = measured(Frame(view.picture(), 255.0, "deltille"), DELTILLE)
+    assert found.found > 40
+    error = (found.xy - view.truth)[found.ok]
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert np.sqrt((error**2).mean()) < (0.004 if blur < 1 else 0.01)
+    assert 0.8 < np.sqrt(((error / sigma) ** 2).mean()) < 1.25
+    assert np.abs(error.mean(axis=0)).max() < 0.002  # no half pixel
+    chess = measure_board(Frame(view.picture(), 255.0, "deltille"), CHESS)
+    assert isinstance(chess, Failure)
+
+
 DOTS = ((3, 3), (3, 4), (4, 4))
 DOTTED = board("chess", 10, 8, 22.0, dots=DOTS)
 PUZZLE = board("puzzle", 10, 8, 22.0, start=(100, 7))

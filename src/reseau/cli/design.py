@@ -53,6 +53,7 @@ class Kind(StrEnum):
 
     CHESS = "chess"
     PUZZLE = "puzzle"
+    DELTILLE = "deltille"
     CHARUCO = "charuco"
     CIRCLES = "circles"
     APRILGRID = "aprilgrid"
@@ -279,7 +280,7 @@ def board(
     paper: PaperOf = Paper.A4,
     out: Design = None,
 ) -> None:
-    """Design a chessboard, PuzzleBoard, ChArUco board, circle grid, AprilGrid or grid of markers."""
+    """Design a chessboard, PuzzleBoard, deltille, ChArUco board, circle grid or grid of tags."""
     if given is not None:
         from ..exchange import read_board
 

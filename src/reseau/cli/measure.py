@@ -161,7 +161,7 @@ def board(
     sensor: SensorFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure a chessboard, PuzzleBoard, ChArUco board, circle grid, AprilGrid or grid of markers."""
+    """Measure a chessboard, PuzzleBoard, deltille, ChArUco board, circle grid or grid of tags."""
     from ..io import BoardDesign
     from ..measure import BoardOptions, measure_board
 

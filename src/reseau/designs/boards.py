@@ -1,4 +1,4 @@
-"""Boards that other programs use: chessboards, PuzzleBoards, ChArUco boards, circle grids, AprilGrids."""
+"""Boards that other programs use: chessboards, PuzzleBoards, deltilles, ChArUco, circles, AprilGrids."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def board(
 
     Parameters
     ----------
-    kind : {"chess", "puzzle", "charuco", "circles", "aprilgrid", "markers"}
+    kind : {"chess", "puzzle", "deltille", "charuco", "circles", "aprilgrid", "markers"}
         The pattern.
     columns, rows : int
-        Number of squares, circles or tags.
+        Number of squares, circles, corners of a deltille, or tags.
     pitch : float
         Distance between squares, rows of circles or tags, mm.
     size, dictionary, first_id, border_bits, legacy, asymmetric, dots, start, name
@@ -148,6 +148,8 @@ def board_figures(design: BoardDesign) -> tuple[list[Array], Array]:
         return [], np.column_stack([design.xy, np.full(len(design.xy), design.size / 2)])
     if design.kind == "puzzle" or design.dots:
         return dotted_squares(design)
+    if design.kind == "deltille":
+        return _triangles(design), none
     polygons: list[Array] = []
     if design.kind in ("chess", "charuco"):
         row, column = np.divmod(np.arange(design.columns * design.rows), design.columns)
@@ -173,6 +175,18 @@ def board_figures(design: BoardDesign) -> tuple[list[Array], Array]:
                         x1, y1 = corners[0] + cell * high * [1, -1]
                         polygons.append(np.array([(x0, y1), (x1, y1), (x1, y0), (x0, y0)]))
     return polygons, none
+
+
+def _triangles(design: BoardDesign) -> list[Array]:
+    """The black triangles, which point upwards, of all that meet in the corners of a deltille.
+
+    Source: H. Ha, M. Perdoch, H. Alismail, I. S. Kweon, Y. Sheikh, Deltille grids for geometric camera
+    calibration, ICCV 2017.
+    """
+    # Each is named by its left corner: a corner is the left, the right and the upper one of three triangles.
+    left = np.concatenate([design.nodes + away for away in ([0, 0], [-2, 0], [-1, 1])])
+    corners = np.unique(left, axis=0)[:, None] + np.array([[0, 0], [2, 0], [1, -1]])
+    return list(corners * design.step * [1, -1])
 
 
 _BOX = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])

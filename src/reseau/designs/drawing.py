@@ -159,7 +159,7 @@ def _board(design: BoardDesign) -> Content:
     every = np.concatenate(ends)
     low, high = every.min(axis=0) - design.pitch / 2, every.max(axis=0) + design.pitch / 2
     squares = {"chess": "squares", "puzzle": "squares", "charuco": "squares"}
-    what = (squares | {"circles": "circles"}).get(design.kind, "tags")
+    what = (squares | {"circles": "circles", "deltille": "corners"}).get(design.kind, "tags")
     title = f"{design.name}: {design.kind}, {design.columns} × {design.rows} {what}"
     title += f", pitch {design.pitch:g} mm"
     if design.kind == "puzzle":

@@ -1,4 +1,4 @@
-"""``reseau-board/1``: chessboards, PuzzleBoards, ChArUco boards, circles, AprilGrids, grids of markers."""
+"""``reseau-board/1``: chessboards, PuzzleBoards, deltilles, ChArUco boards, circles, grids of tags."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from .document import Document
 
 __all__ = ["BoardDesign", "BoardKind"]
 
-BoardKind = Literal["chess", "puzzle", "charuco", "circles", "aprilgrid", "markers"]
+BoardKind = Literal["chess", "puzzle", "deltille", "charuco", "circles", "aprilgrid", "markers"]
 Length = Annotated[float, Field(gt=1e-6, le=1e6)]
 Count = Annotated[int, Field(ge=1, le=1000)]
 
-_FEWEST = {"chess": 3, "puzzle": 4, "charuco": 2, "circles": 2, "aprilgrid": 1, "markers": 1}
+_FEWEST = {"chess": 3, "puzzle": 4, "deltille": 3, "charuco": 2, "circles": 2, "aprilgrid": 1, "markers": 1}
 _TAGGED = ("aprilgrid", "markers")
 _MARKED = ("charuco", *_TAGGED)
 _SQUARED = ("chess", "puzzle", "charuco")
+_PLAIN = ("chess", "deltille")
 _CODE = 501
 """Number of corners after which the code of a PuzzleBoard repeats."""
 
@@ -30,22 +31,23 @@ class BoardDesign(Document):
 
     Names are those of the programs that the boards come from, coordinates have y up: the inner corners of a
     chessboard, a PuzzleBoard or a ChArUco board are numbered row by row from the upper left, and so are
-    circles, with the origin at the first; each tag of an AprilGrid has the corners ``tag.0`` … ``tag.3``,
-    anticlockwise from the lower left, with the origin at the lower left of the first tag, which is the lower
-    left one; each marker of a grid of OpenCV (`markers`: ArUco markers or AprilTags that touch nothing) has
-    the corners clockwise from the upper left, with the origin at the upper left of the first marker, the
-    upper left one.
+    circles and the corners of a deltille (a grid of equilateral triangles, of which every second row of
+    corners is shifted to the right by half a side), with the origin at the first; each tag of an AprilGrid
+    has the corners ``tag.0`` … ``tag.3``, anticlockwise from the lower left, with the origin at the lower
+    left of the first tag, which is the lower left one; each marker of a grid of OpenCV (`markers`: ArUco
+    markers or AprilTags that touch nothing) has the corners clockwise from the upper left, with the origin
+    at the upper left of the first marker, the upper left one.
 
     Parameters
     ----------
-    kind : {"chess", "puzzle", "charuco", "circles", "aprilgrid", "markers"}
+    kind : {"chess", "puzzle", "deltille", "charuco", "circles", "aprilgrid", "markers"}
         The pattern; a single marker is a grid of 1 × 1.
     columns, rows : int
-        Number of squares, of circles, or of tags. The outer squares of a PuzzleBoard are halves: its
-        generator counts the corners, one less.
+        Number of squares, of circles, of corners of a deltille, or of tags. The outer squares of a
+        PuzzleBoard are halves: its generator counts the corners, one less.
     pitch : float
-        Side of a square; distance of neighbouring circles in a row, or of the rows of an asymmetric grid;
-        distance of tags from centre to centre.
+        Side of a square or a triangle; distance of neighbouring circles in a row, or of the rows of an
+        asymmetric grid; distance of tags from centre to centre.
     size : float, optional
         Diameter of a circle or of the dots of a PuzzleBoard, or side of a marker or a tag with its border.
     dictionary : str, optional
@@ -71,6 +73,9 @@ class BoardDesign(Document):
     >>> board = BoardDesign(name="print", unit="mm", kind="chess", columns=4, rows=3, pitch=25.0)
     >>> board.ids, board.xy[-1].tolist()
     (('0', '1', '2', '3', '4', '5'), [50.0, -25.0])
+    >>> grid = BoardDesign(name="print", unit="mm", kind="deltille", columns=3, rows=3, pitch=20.0)
+    >>> grid.xy[[1, 3]].round(2).tolist()
+    [[20.0, -0.0], [10.0, -17.32]]
     """
 
     SCHEMA: ClassVar[str] = "reseau-board/1"
@@ -94,7 +99,7 @@ class BoardDesign(Document):
         fewest = _FEWEST[self.kind]
         if min(self.columns, self.rows) < fewest:
             raise ValueError(f"a board of kind {self.kind!r} has at least {fewest} columns and rows")
-        if (self.size is None) != (self.kind == "chess"):
+        if (self.size is None) != (self.kind in _PLAIN):
             raise ValueError(f"`size` is {'needed' if self.size is None else 'unknown'} for {self.kind!r}")
         if (self.dictionary is not None) != (self.kind in _MARKED):
             raise ValueError(
@@ -135,11 +140,22 @@ class BoardDesign(Document):
         return "dark"
 
     @property
+    def staggered(self) -> bool:
+        """Whether every second row is shifted by half a step: asymmetric circles and deltilles."""
+        return self.asymmetric or self.kind == "deltille"
+
+    @property
+    def step(self) -> Array:
+        """Distance (2,) of the columns and of the rows of nodes."""
+        triangles = self.kind == "deltille"
+        return self.pitch * np.array([0.5, np.sqrt(0.75)] if triangles else [1.0, 1.0])
+
+    @property
     def nodes(self) -> NDArray[np.intp]:
         """Column and row (n, 2) of each point, rows downwards.
 
-        Corners are counted in corners, the corners of tags in columns and rows of these. Circles of an
-        asymmetric grid have steps of half their distance in a row.
+        Corners are counted in corners, the corners of tags in columns and rows of these. Columns of a
+        staggered grid are steps of half the distance of its points in a row.
         """
         columns, rows = self.columns, self.rows
         if self.kind in _SQUARED:
@@ -152,7 +168,7 @@ class BoardDesign(Document):
             up = -1 if self.kind == "aprilgrid" else 1
             return np.asarray(along.reshape(-1, 2) * [1, up], dtype=np.intp)
         row, column = np.divmod(np.arange(columns * rows), columns)
-        if self.asymmetric:
+        if self.staggered:
             column = 2 * column + row % 2
         return np.stack([column, row], axis=1).astype(np.intp)
 
@@ -172,7 +188,7 @@ class BoardDesign(Document):
             tag, corner = np.divmod(np.abs(self.nodes), 2)
             up = 1 if self.kind == "aprilgrid" else -1
             return np.asarray((tag * self.pitch + corner * self.size) * [1, up])
-        return np.asarray(self.nodes * [self.pitch, -self.pitch], dtype=np.float64)
+        return np.asarray(self.nodes * self.step * [1, -1], dtype=np.float64)
 
     @property
     def dark_corner(self) -> bool:

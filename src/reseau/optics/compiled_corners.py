@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["formed"]
+__all__ = ["formed", "six_formed"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 Floats = NDArray[Any]
@@ -133,3 +133,50 @@ def formed(
                 if curved:
                     images[k, 6, i, j] = -0.5 * by_a * along1 * along1 / s
                     images[k, 7, i, j] = -0.5 * by_b * along2 * along2 / s
+
+
+@_compiled
+def six_formed(
+    normal: Floats,
+    bend: Floats,
+    xy: Floats,
+    sigma: Floats,
+    form: Floats,
+    columns: Floats,
+    rows: Floats,
+    fill: float,
+    images: Floats,
+) -> None:
+    """Fill images (k, 7 or 10, r, c) of corners of three edges; see :mod:`reseau.optics.corners`."""
+    derived, curved = images.shape[1] > 1, form.shape[1] > 3
+    box, fourth = fill**2 / 12, -(fill**4) / 120 / 24
+    images[:], images[:, 0] = 0.0, -1.0
+    for k in range(len(normal)):
+        width = max(sigma[k], _SHARPEST)
+        s = sqrt(width * width + box)
+        for e in range(3):
+            c, t = np.cos(form[k, e]), np.sin(form[k, e])
+            nx, ny = c * normal[k, e, 0] - t * normal[k, e, 1], t * normal[k, e, 0] + c * normal[k, e, 1]
+            bent = bend[k, e] + (form[k, 3 + e] if curved else 0.0)
+            tx, ty = -ny, nx
+            sharp = fourth * (nx**4 + ny**4) / s**4
+            for i in range(images.shape[2]):
+                y = rows[k, i] - xy[k, 1]
+                for j in range(images.shape[3]):
+                    x = columns[k, j] - xy[k, 0]
+                    along = tx * x + ty * y
+                    a = (nx * x + ny * y - 0.5 * bent * along * along) / s
+                    if abs(a) >= _FAR:
+                        images[k, 0, i, j] += 1.0 if a > 0 else 0.0
+                        continue
+                    bell = _bell(a)
+                    images[k, 0, i, j] += _step(a) + sharp * (3 * a - a * a * a) * bell
+                    if not derived:
+                        continue
+                    slope = bent * along
+                    images[k, 1, i, j] -= bell * (nx - slope * tx) / s
+                    images[k, 2, i, j] -= bell * (ny - slope * ty) / s
+                    images[k, 3, i, j] -= a * bell * width / (s * s)
+                    images[k, 4 + e, i, j] = bell * along * (1 + bent * a * s) / s
+                    if curved:
+                        images[k, 7 + e, i, j] = -0.5 * bell * along * along / s

@@ -1,4 +1,4 @@
-r"""Exact images of corners: where two edges cross, as the squares of a chessboard do.
+r"""Exact images of corners: where two edges cross, as the squares of a chessboard do, or three.
 
 Two straight edges with the signed distances :math:`d_1, d_2` of a pixel, positive on the dark side of each,
 divide the plane into four sectors. Blurred by a Gaussian of the width s, the light that a pixel receives from
@@ -13,6 +13,13 @@ A corner of a chessboard is this sector and the opposite one, a corner of a tag 
 aperture of a pixel adds its variance, 1/12 px², to that of the Gaussian, and its fourth cumulant, −1/120 px⁴,
 by the fourth derivatives of the image (Edgeworth's series). Edges may be bent: the distances then are those
 from parabolas, :math:`d = n \cdot q - \tfrac12 c\,(t \cdot q)^2`.
+
+Where three edges cross, as the triangles of a deltille do, six sectors are dark and bright in turn. With
+normals of which a positive combination is zero, two of the three distances are positive in each dark sector,
+and one in each bright one. The dark sectors therefore are the sum of three half planes less the plane, and
+so is their image, whatever the blur:
+
+.. math:: \Phi(d_1/s) + \Phi(d_2/s) + \Phi(d_3/s) - 1 .
 
 Sources: A. Genz, Numerical computation of rectangular bivariate and trivariate normal and t probabilities,
 Statistics and Computing 14 (2004); Z. Drezner, G. O. Wesolowsky, On the computation of the bivariate normal
@@ -33,16 +40,17 @@ __all__ = ["Corners", "corner_images"]
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """Corners in an image, in columns: two edges each, and the sectors that are dark.
+    """Corners in an image, in columns: two or three edges each, and the sectors that are dark.
 
     Parameters
     ----------
-    normal : ndarray (k, 2, 2)
-        Unit normals of the first and the second edge, in rows, towards the dark sector.
-    bend : ndarray (k, 2)
+    normal : ndarray (k, e, 2)
+        Unit normals of the e edges, in rows: of two towards the dark sector, of three so that two of them
+        point towards each dark sector.
+    bend : ndarray (k, e)
         Curvature of each edge, 1/px, positive if it bends towards its normal.
     opposite : ndarray of bool (k,)
-        Whether the sector opposite to the dark one is dark, too, as on a chessboard.
+        Whether the sector opposite to the dark one of two edges is dark, too, as on a chessboard.
 
     Examples
     --------
@@ -84,9 +92,9 @@ def corner_images(
         Their positions in pixels.
     sigma : ndarray (k,)
         Widths of the point-spread function in pixels.
-    form : ndarray (k, 2 or 4)
-        Rotation of each edge in radians, x into y; in four columns also what is added to their curvatures,
-        1/px.
+    form : ndarray (k, e or 2 e)
+        Rotation of each edge in radians, x into y; in twice as many columns also what is added to their
+        curvatures, 1/px.
     columns, rows : ndarray (k, c), (k, r)
         Pixel coordinates.
     fill : float
@@ -96,7 +104,7 @@ def corner_images(
 
     Returns
     -------
-    ndarray (k, 1, 6 or 8, r, c), float32
+    ndarray (k, 4 + e or 4 + 2 e, r, c), float32
         Share of each pixel's light from the dark sectors; its derivatives by x, y, `sigma` and `form`.
 
     Examples
@@ -108,14 +116,25 @@ def corner_images(
     >>> image = corner_images(corners, np.full((1, 2), 4.0), np.ones(1), np.zeros((1, 2)), nine, nine)
     >>> image.shape, float(image[0, 0, 4, 4]), float(image[0, 0, 8, 8].round(3))
     ((1, 6, 9, 9), 0.5, 1.0)
+
+    The same with three edges:
+
+    >>> angle = np.pi / 6 + 2 * np.pi / 3 * np.arange(3)
+    >>> normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)[None]
+    >>> corners = Corners(normal, np.zeros((1, 3)), np.array([True]))
+    >>> sharp = np.full(1, 0.5)
+    >>> image = corner_images(corners, np.full((1, 2), 4.0), sharp, np.zeros((1, 3)), nine, nine)
+    >>> float(image[0, 0, 4, 4]), float(image[0, 0, 8, 4].round(2)), float(image[0, 0, 0, 4].round(2))
+    (0.5, 1.0, 0.0)
     """
-    from .compiled_corners import formed  # takes half a second to import; not every command needs it
+    from .compiled_corners import formed, six_formed  # takes half a second to import
 
     parts = 4 + form.shape[1] if derivatives else 1
     images = np.empty((len(corners), parts, rows.shape[1], columns.shape[1]), np.float32)
+    pixels = np.ascontiguousarray(columns), np.ascontiguousarray(rows), fill, images
     with one_thread():
-        formed(
-            corners.normal, corners.bend, corners.opposite, xy, sigma, form,
-            np.ascontiguousarray(columns), np.ascontiguousarray(rows), fill, images,
-        )  # fmt: skip
+        if corners.normal.shape[1] == 3:
+            six_formed(corners.normal, corners.bend, xy, sigma, form, *pixels)
+        else:
+            formed(corners.normal, corners.bend, corners.opposite, xy, sigma, form, *pixels)
     return np.asarray(images)

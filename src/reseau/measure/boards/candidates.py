@@ -8,6 +8,7 @@ exchanged.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -19,6 +20,7 @@ from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask, Rows
 from ...optics import Chain
+from ..reseau.lens_mapping import lens_through
 from ..reseau.sheet_placement import through
 from ..testfield.lattice_mapping import images_of, started
 
@@ -30,6 +32,7 @@ __all__ = [
     "find_saddles",
     "first_mapping",
     "grown",
+    "grown_through",
     "sector_levels",
     "seeds",
 ]
@@ -45,6 +48,8 @@ _LEAST_T = 5.0
 _MOST = 3000
 _TURNED = np.deg2rad(20)
 """Largest angle between the edges of neighbours."""
+_OPEN = 0.2
+"""Least sine of the angle between the steps of a lattice."""
 _NEAR = 24
 """Number of neighbours examined for a seed."""
 _SEEDS = 12
@@ -61,6 +66,8 @@ _DIAGONAL = 0.3
 """Where the sectors around a node are looked at, in steps along both axes."""
 _CROSSED = 0.3
 """Least difference between the darker of two bright sectors and the brighter of two dark ones."""
+_LENS_FROM, _SADDLE_PX = 8, 0.5
+"""Least number of nodes from which the distortion of a lens is used; their standard deviation."""
 _LARGE_PX = 2_500_000
 """Size of a frame from which it is searched at half its size."""
 
@@ -194,6 +201,9 @@ def _seeds_among(saddles: Saddles) -> list[tuple[int, Array]]:
     step = np.where(np.isfinite(both[0]), both[0], both[1])
     step = np.where(np.isfinite(both[0]) & np.isfinite(both[1]), (both[0] + both[1]) / 2, step)
     usable = np.isfinite(step).all(axis=(1, 2))
+    # Saddles along one edge are no lattice.
+    across = step[:, 0, 0] * step[:, 1, 1] - step[:, 0, 1] * step[:, 1, 0]
+    usable &= np.abs(across) > _OPEN * np.linalg.norm(step, axis=2).prod(axis=1)
     # How many of the diagonal neighbours are there.
     support = np.zeros(len(saddles))
     for i, j in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
@@ -236,9 +246,45 @@ def grown(
     mapping : Chain
         Mapping through them.
     """
+    shape, bright_at_first = (grey.shape[0], grey.shape[1]), odd
+
+    def accepted(mapping: Chain, beside: Array, row: Rows, slopes: Array) -> Mask:
+        nonlocal bright_at_first
+        bright = bright_between(saddles.edges[row], slopes)
+        if bright_at_first is None:
+            bright_at_first = bool(bright[(beside == 0).all(axis=1)][0])
+        expected = (beside.sum(axis=1) % 2 == 0) == bright_at_first
+        taken = (bright == expected) & along(saddles.edges[row], slopes)
+        return np.asarray(taken & crossed(sector_levels(grey, mapping, beside), bright))
+
+    return grown_through(saddles.xy, mapping, extent, shape, accepted)
+
+
+def grown_through(
+    xy: Array,
+    mapping: Chain,
+    extent: int,
+    shape: tuple[int, int],
+    accepted: Callable[[Chain, Array, Rows, Array], Mask],
+) -> tuple[Array, Rows, Chain]:
+    """Grow a lattice through points (m, 2) of a frame.
+
+    Parameters
+    ----------
+    xy, mapping, extent, shape
+        The points; see :func:`grown`; height and width of the frame.
+    accepted : callable
+        Which of some nodes (n, 2) belong to the nearest points (n,), given the mapping and its slopes there
+        (n, 2, 2).
+
+    Returns
+    -------
+    nodes, rows, mapping
+        As :func:`grown`.
+    """
     grid = np.array(list(product(range(-extent, extent + 1), repeat=2)), dtype=np.float64)
-    tree, step, shape = KDTree(saddles.xy), 1e-3, (grey.shape[0], grey.shape[1])
-    nodes, rows = np.zeros((1, 2)), np.zeros(1, dtype=np.intp)
+    tree, step = KDTree(xy), 1e-3
+    nodes, rows, through_lens = np.zeros((1, 2)), np.zeros(1, dtype=np.intp), False
     for _ in range(3 * extent):
         beside = grid[KDTree(nodes).query(grid)[0] < _FROM + 0.5 * (len(nodes) < 4)]
         predicted = images_of(mapping, beside)
@@ -247,22 +293,24 @@ def grown(
         )
         pixels = np.maximum(np.linalg.norm(slopes, axis=1).min(axis=1), 1e-6)
         gap, row = tree.query(predicted)
-        bright = bright_between(saddles.edges[row], slopes)
-        if odd is None:
-            centre = (beside == 0).all(axis=1)
-            odd = bool(bright[centre][0])
-        expected = (beside.sum(axis=1) % 2 == 0) == odd
-        taken = (gap < _GATE * pixels) & (bright == expected) & along(saddles.edges[row], slopes)
-        taken &= crossed(sector_levels(grey, mapping, beside), bright)
+        taken = (gap < _GATE * pixels) & accepted(mapping, beside, row, slopes)
         order = np.argsort(gap / pixels + 1e6 * ~taken, kind="stable")
         _, once = np.unique(row[order], return_index=True)
         keep = np.sort(order[once])
         keep = keep[taken[keep]]
         same = len(keep) == len(rows) and np.array_equal(row[keep], rows)
         nodes, rows = beside[keep], row[keep]
-        if same or len(rows) < 4 or np.ptp(nodes, axis=0).min() < 1:
+        if len(rows) < 4 or np.ptp(nodes, axis=0).min() < 1 or (same and through_lens):
             break
-        mapping = through(nodes, saddles.xy[rows], shape)
+        # A polynomial through few nodes does not predict the next ones through a wide lens.
+        through_lens = same and len(rows) >= _LENS_FROM
+        if same and not through_lens:
+            break
+        free = through(nodes, xy[rows], shape)
+        lens = None
+        if through_lens:
+            lens = lens_through(nodes, xy[rows], np.full(len(rows), _SADDLE_PX), shape, free)
+        mapping = free if lens is None else lens.mapping
     return nodes, rows, mapping
 
 

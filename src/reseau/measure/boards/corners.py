@@ -1,8 +1,8 @@
-"""Matching of corners where squares meet, once they are found and numbered.
+"""Matching of corners where squares or triangles meet, once they are found and numbered.
 
-The image of a corner is formed from its two edges, with the directions and the curvature that the mapping
-through all corners gives them; the directions are adjusted with the position. A window extends half a square
-to all sides, and shows nothing but the four squares that meet; the markers of a ChArUco board are formed as
+The image of a corner is formed from its two or three edges, with the directions and the curvature that the
+mapping through all corners gives them; the directions are adjusted with the position. A window extends half
+a square to all sides, and shows only the squares that meet; the markers of a ChArUco board are formed as
 what lies beside.
 """
 
@@ -25,7 +25,7 @@ from ..reseau.plane_marks import Located, PlaneMarks
 from ..screening import Screened
 from ..testfield.lattice_mapping import images_of, second_order
 
-__all__ = ["CornerMarks", "CornerShape", "Sectors"]
+__all__ = ["CornerMarks", "CornerShape", "DeltilleMarks", "Sectors"]
 
 _TURN = 0.1
 """Standard deviation of the directions of edges before the mapping is known, radians."""
@@ -44,6 +44,8 @@ _EDGE = 1.5
 """Half the width of an edge in widths of the point-spread function."""
 _ALIKE_WIDTH = 0.05
 """Relative change of the sharpness from which markers are formed anew."""
+_LEAST_EDGE = 0.1
+"""Share of the pixels of an edge below which it is not seen."""
 _BORDER = 2.0
 """Least distance of a corner from the outermost pixels, in widths of the point-spread function."""
 _FLAT = 0.6
@@ -63,7 +65,7 @@ class CornerShape:
     corners : Corners
         The corners, with the directions and curvatures that are expected.
     parameters : int
-        Number of parameters of the form: a turn of each edge, or (4) a turn and a curvature.
+        Number of parameters of the form: a turn of each edge, or twice as many, a turn and a curvature.
 
     Examples
     --------
@@ -97,21 +99,22 @@ class Sectors:
 
     Parameters
     ----------
-    dark : ndarray (n, 2)
-        Signs of x and y in a sector of each corner that is dark.
+    normal : ndarray (n, e, 2)
+        Unit normals of the e edges of each corner, see :class:`reseau.optics.corners.Corners`: of two edges,
+        which are those along x and along y, towards a dark sector.
     opposite : ndarray of bool (n,)
-        Whether the opposite sector is dark, too.
+        Whether the sector opposite to this one is dark, too.
     reach : float
         Distance up to which edges are straight and their sides even.
     along : float
-        The same along the edges, on the side of the sector `dark`.
+        The same along two edges, on the side of the dark sector.
     outlines : ndarray (m, j, 2)
         Corners of figures that lie in the sectors.
     ink : ndarray (m,)
         1 for dark figures in bright sectors, -1 for bright ones in dark sectors.
     """
 
-    dark: Array
+    normal: Array
     opposite: Mask
     reach: float
     along: float
@@ -139,21 +142,25 @@ class CornerMarks(PlaneMarks):
         self.sectors = sectors
         self.figures: tuple[Array, Chain, float, Array | None] | None = None
 
-    def _steps(self, rows: Rows) -> tuple[Array, Array]:
-        """Derivatives of the image by coordinates of the design, first (k, 2, 2), and second along each."""
+    def _steps(self, rows: Rows) -> tuple[Array, Array, Array]:
+        """Derivatives of the image by coordinates of the design (k, 2, 2); along edges, and second ones."""
         _, slope, bend = second_order(self.mapping, self.at[rows])
-        along = np.einsum("kabc,bi,ci->kai", bend, self.frame, self.frame)
-        return slope @ self.frame, along
+        # A normal turned by 90°.
+        along = (self.sectors.normal[rows][..., ::-1] * [-1, 1]) @ self.frame.T
+        return (
+            slope @ self.frame,
+            np.einsum("kab,keb->kae", slope, along),
+            np.einsum("kabc,keb,kec->kae", bend, along, along),
+        )
 
     def _images(self, rows: Rows) -> tuple[Shape, Array]:
         """See :class:`PlaneMarks`."""
-        slope, bend = self._steps(rows)
-        length = np.linalg.norm(slope, axis=1)  # of a unit along x and y
-        tangent = slope / length[:, None]
-        # An edge along x has the dark sector on the side of ±y, and one along y on that of ±x.
+        slope, along, bend = self._steps(rows)
+        length = np.linalg.norm(along, axis=1)  # of a unit along each edge
+        tangent = along / length[:, None]
         normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1).transpose(0, 2, 1)  # (k, edge, xy)
-        towards = slope[:, :, ::-1] * self.sectors.dark[rows][:, None, ::-1]
-        side = np.sign(np.einsum("kei,kie->ke", normal, towards))
+        towards = np.einsum("kij,kej->kei", slope, self.sectors.normal[rows])
+        side = np.sign(np.einsum("kei,kei->ke", normal, towards))
         normal = normal * side[..., None]
         curvature = np.einsum("kei,kie->ke", normal, bend) / length**2
         corners = Corners(
@@ -167,7 +174,10 @@ class CornerMarks(PlaneMarks):
         # A few corners do not show how a lens bends their edges.
         small = self.learning or self.found.sum() < _CURVED_FROM
         most = _LEARNING_PX + 2 * self.look.blur_px if small else _MOST_PX
-        return CornerShape(corners, 4 if self._curved else 2), np.minimum(reach, most) - self._ground
+        edges = self.sectors.normal.shape[1]
+        return CornerShape(corners, 2 * edges if self._curved else edges), np.minimum(
+            reach, most
+        ) - self._ground
 
     @property
     def _curved(self) -> bool:
@@ -176,7 +186,7 @@ class CornerMarks(PlaneMarks):
 
     def _form_sigma(self) -> Array:
         """See :class:`PlaneMarks`."""
-        return np.append(self.look.form_sigma, 2 * [_BENT] if self._curved else [])
+        return np.append(self.look.form_sigma, self.sectors.normal.shape[1] * [_BENT] if self._curved else [])
 
     @property
     def _ground(self) -> float:
@@ -185,18 +195,20 @@ class CornerMarks(PlaneMarks):
 
     def _region(self, rows: Rows, half: tuple[int, int]) -> Mask | None:
         """See :class:`PlaneMarks`: the half squares around a corner, and what lies along its edges."""
-        slope, _ = self._steps(rows)
+        slope, _, _ = self._steps(rows)
         centre = np.rint(self.start[rows])
         x = centre[:, :1] + np.arange(-half[0], half[0] + 1) - self.start[rows, :1]
         y = centre[:, 1:] + np.arange(-half[1], half[1] + 1) - self.start[rows, 1:]
         back = np.linalg.inv(slope)[..., None, None]
         one, two = (back[:, k, 0] * x[:, None, :] + back[:, k, 1] * y[:, :, None] for k in (0, 1))
-        near_one, near_two = np.abs(one) < self.sectors.reach, np.abs(two) < self.sectors.reach
-        inside: Mask = near_one & near_two
+        normal = self.sectors.normal[rows][..., None, None]
+        # Distances from the edges on the plane of the board.
+        away = [normal[:, e, 0] * one + normal[:, e, 1] * two for e in range(normal.shape[1])]
+        near = [np.abs(distance) < self.sectors.reach for distance in away]
+        inside: Mask = np.logical_and.reduce(near)
         if self.sectors.along > self.sectors.reach:
-            for near, at, sign in ((near_two, one, 0), (near_one, two, 1)):
-                side = at * self.sectors.dark[rows, sign, None, None]
-                inside |= near & (side > 0) & (side < self.sectors.along)
+            for beside, side in ((near[0], away[1]), (near[1], away[0])):
+                inside |= beside & (side > 0) & (side < self.sectors.along)
         return inside
 
     def _beside(self) -> Array | None:
@@ -250,33 +262,53 @@ class CornerMarks(PlaneMarks):
 
     def _objections(self, rows: Rows, found: Matches) -> list[tuple[Mask, Reason]]:
         """See :class:`PlaneMarks`: where edges nearly coincide, small errors of their directions shift it."""
-        slope, _ = self._steps(rows)
-        tangent = slope / np.linalg.norm(slope, axis=1, keepdims=True)
-        flat = np.abs(np.linalg.det(tangent)) < _FLAT
+        _, along, _ = self._steps(rows)
+        tangent = along / np.linalg.norm(along, axis=1, keepdims=True)
+        # Sines of the angles between each edge and the next.
+        other = np.roll(tangent, 1, axis=2)
+        sine = tangent[:, 0] * other[:, 1] - tangent[:, 1] * other[:, 0]
+        flat = np.abs(sine).max(axis=1) < _FLAT
         seen = Reason("seen at too flat an angle", Code.UNCERTAIN)
         # Of a corner on the border two sectors are not seen, and nothing shows an error of its edges.
         h, w = self.screened.grey.shape
         gap = np.minimum(found.xy, np.array([w - 1, h - 1]) - found.xy).min(axis=1)
         border = gap < _BORDER * self.look.blur_px, Reason("on the border of the frame", Code.OUTSIDE)
-        return [border, *super()._objections(rows, found), (flat, seen)]
+        # Without its pixels an edge is where faint tails of its blur have it.
+        part = found.converged & (np.isfinite(found.residuals).sum(axis=(1, 2)) < self.own_px[rows])
+        unseen = part.copy()
+        unseen[part] = self._edges_seen(rows[part], found.select(part)).min(axis=1) < _LEAST_EDGE
+        hidden = Reason("an edge is hidden or saturated", Code.HIDDEN)
+        return [border, (unseen, hidden), *super()._objections(rows, found), (flat, seen)]
 
     def _edge_seen(self, rows: Rows, found: Matches) -> Array:
         """See :class:`PlaneMarks`."""
+        return np.asarray(self._edges_seen(rows, found).mean(axis=1))
+
+    def _edges_seen(self, rows: Rows, found: Matches) -> Array:
+        """Share (k, e) of the pixels on each blurred edge that were used."""
         used = np.isfinite(found.residuals)
         high, wide = (n // 2 for n in used.shape[1:])
         x, y = self._pixels(rows, (wide, high))
-        slope, _ = self._steps(rows)
-        tangent = slope / np.linalg.norm(slope, axis=1, keepdims=True)
-        rim = np.zeros(used.shape, dtype=bool)
-        for k in range(2):
-            across = tangent[:, 0, k, None, None] * (y - found.xy[:, 1, None, None])
-            across = across - tangent[:, 1, k, None, None] * (x - found.xy[:, 0, None, None])
-            rim |= np.abs(across) < _EDGE * self.look.blur_px
+        _, along, _ = self._steps(rows)
+        tangent = along / np.linalg.norm(along, axis=1, keepdims=True)
         region = self._region(rows, (wide, high))
         assert region is not None
-        rim &= region
-        return np.asarray((used & rim).sum(axis=(1, 2)) / np.maximum(rim.sum(axis=(1, 2)), 1))
+        shares = []
+        for k in range(tangent.shape[2]):
+            across = tangent[:, 0, k, None, None] * (y - found.xy[:, 1, None, None])
+            across = across - tangent[:, 1, k, None, None] * (x - found.xy[:, 0, None, None])
+            rim = region & (np.abs(across) < _EDGE * self.look.blur_px)
+            shares.append((used & rim).sum(axis=(1, 2)) / np.maximum(rim.sum(axis=(1, 2)), 1))
+        return np.stack(shares, axis=1)
 
     def _radius(self, rows: Rows) -> Array:
         """See :class:`PlaneMarks`: corners do not bulge."""
         return np.zeros(len(rows))
+
+
+class DeltilleMarks(CornerMarks):
+    """Corners of triangles."""
+
+    form_sigma = np.full(3, _TURN)
+    learnt_form_sigma = np.full(3, _TURNED)
+    even = False

@@ -23,9 +23,11 @@ from ..reseau.sheet import DiskMarks
 from ..screening import Screened, screen
 from ..testfield.lattice_mapping import second_order
 from .candidates import Saddles, find_saddles
-from .corners import CornerMarks, Sectors
+from .corners import CornerMarks, DeltilleMarks, Sectors
+from .deltilles import find_six_sectors, lay_deltille
 from .markers import find_markers, find_tags
 from .placement import Placed, lay_chessboard, lay_circles, lay_marked
+from .tags import with_seen_edges
 
 __all__ = ["BoardOptions", "BoardResult", "measure_board"]
 
@@ -182,7 +184,8 @@ def _measured(frame: Frame, design: BoardDesign, options: BoardOptions) -> Board
         assert design.size is not None
         marks = CircleMarks(frame, screened, placed.located, common, design.size)
     else:
-        marks = CornerMarks(frame, screened, placed.located, common, sectors_of(design))
+        kind = DeltilleMarks if design.kind == "deltille" else CornerMarks
+        marks = kind(frame, screened, placed.located, common, sectors_of(design))
     columns = marks.columns(with_field=False)
     return BoardResult(**columns | {"notes": placed.notes + columns["notes"]})
 
@@ -194,9 +197,18 @@ def _placed(frame: Frame, screened: Screened, design: BoardDesign) -> Placed | F
         disks = find_disks(screened.grey, screened.valid, screened.noise)
         found = lay_circles(disks, design, shape)
         return replace(found, places=disks.xy) if isinstance(found, Failure) else found
+    if design.kind == "deltille":
+        corners = find_six_sectors(screened.grey, screened.noise)
+        found = lay_deltille(screened.grey, corners, design)
+        if isinstance(found, Failure):
+            blurred = find_six_sectors(screened.grey, screened.noise, halved=True)
+            found = lay_deltille(screened.grey, blurred, design)
+        return replace(found, places=corners.xy) if isinstance(found, Failure) else found
     saddles = find_saddles(screened.grey, screened.noise)
     if design.kind in ("chess", "puzzle"):
         found = lay_chessboard(screened.grey, saddles, design)
+        if isinstance(found, Failure) and found.code is Code.NOT_FOUND:
+            found = lay_chessboard(screened.grey, with_seen_edges(screened.grey, saddles), design)
         if isinstance(found, Failure) and found.code is Code.OTHER_DESIGN and design.kind == "puzzle":
             grey = np.ascontiguousarray(screened.grey[:, ::-1])
             if lay_chessboard(grey, saddles.mirrored(frame.width), design):
@@ -269,7 +281,15 @@ def sectors_of(design: BoardDesign) -> Sectors:
         reach = min(border, free if design.kind == "aprilgrid" else max(free, side))
         touching = np.full(count, design.kind == "aprilgrid")
         along = min(2 * reach, design.size / 2)
-        return Sectors(towards[names], touching, reach, along, outlines, np.full(len(outlines), -1.0))
+        ink = np.full(len(outlines), -1.0)
+        return Sectors(_normals(towards[names]), touching, reach, along, outlines, ink)
+    if design.kind == "deltille":
+        angle = np.deg2rad([90.0, 210.0, 330.0])
+        normal = np.tile(np.stack([np.cos(angle), np.sin(angle)], axis=1), (count, 1, 1))
+        # The corners at the other ends of edges are as near to what lies beyond the middle.
+        reach = design.step[1] / 2
+        none = np.zeros((0, 4, 2))
+        return Sectors(normal, np.ones(count, dtype=bool), reach, reach, none, np.zeros(0))
     below = design.nodes.sum(axis=1) % 2 == (0 if design.dark_corner else 1)
     dark = np.where(below[:, None], [1.0, -1.0], [1.0, 1.0])
     reach = design.pitch / 2
@@ -281,7 +301,12 @@ def sectors_of(design: BoardDesign) -> Sectors:
         if design.size is not None:
             # The dots of a PuzzleBoard take the middles of its edges.
             reach -= design.size / 2
-    return Sectors(dark, np.ones(count, dtype=bool), reach, reach, outlines, ink)
+    return Sectors(_normals(dark), np.ones(count, dtype=bool), reach, reach, outlines, ink)
+
+
+def _normals(dark: Array) -> Array:
+    """Normals (n, 2, 2) of edges along x and y towards the sector with these signs (n, 2) of x and y."""
+    return np.asarray(dark[:, None] * np.eye(2)[::-1])
 
 
 def _bright_cells(design: BoardDesign) -> tuple[Array, float]:

@@ -24,13 +24,14 @@ from ...designs.dots import dot_signs
 from ...io.board import BoardDesign
 from ...optics import Chain
 from ..reseau.disks import Disks
+from ..reseau.lens_mapping import lens_through
 from ..reseau.plane_marks import Located
 from ..reseau.sheet_placement import MOST_DISKS, disk_seeds, grown_disks, through
 from ..testfield.lattice_mapping import images_of, slope_of
 from .bits import Bits, read_bits
 from .candidates import Saddles, along, bright_between, crossed, first_mapping, grown, sector_levels, seeds
 
-__all__ = ["Placed", "lay_chessboard", "lay_circles", "lay_marked"]
+__all__ = ["Placed", "cost_of", "failed", "lay_chessboard", "lay_circles", "lay_marked", "numbered"]
 
 _MISSED, _PLAIN, _FOREIGN = 0.4, 3.0, 3.0
 """What counts against a place: a node in sight that was not found; one between squares as bright as paper and
@@ -54,11 +55,15 @@ _NEAR_PX = 2.5
 """Distance within which a saddle is the corner that markers predict, pixels; or in steps of the lattice."""
 _NEAR = 0.2
 Integers = NDArray[np.signedinteger[Any]]
+_LENS_FROM, _MARKER_PX = 16, 1.0
+"""Corners of markers that determine the distortion of a lens; their standard deviation as they are found."""
 _ASTRAY = 0.25
 """Largest share of the markers read that do not lie where the board has them: misread, or bent aside."""
 _EVEN = 0.5
 """Largest difference of two dark sectors, as a share of their contrast to the paper."""
 _QUARTER = np.array([[0, -1], [1, 0]])
+_THIRD = np.array([[-1, -1], [1, 0]])
+"""A turn of a lattice of triangles, whose steps are at 60°."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +74,8 @@ class Placed:
     notes: tuple[Remark, ...] = ()
 
 
-def _failed(found: int, what: str) -> Failure:
+def failed(found: int, what: str) -> Failure:
+    """Too few points were found."""
     return Failure(f"{found} {what} are too few to show the board", Code.NOT_FOUND)
 
 
@@ -99,7 +105,7 @@ def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDes
             best, mesh = found, size
     least = min(_FEWEST, len(numbers))
     if best is None or len(best[0]) < least:
-        return _failed(0 if best is None else len(best[0]), "corners in a lattice")
+        return failed(0 if best is None else len(best[0]), "corners in a lattice")
     nodes, rows, mapping = best
     # The sector of a corner between the steps to the right and downwards is black where the sum is even, as
     # the square there is the one of the upper left corner, moved diagonally.
@@ -107,23 +113,33 @@ def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDes
     bright = bright_between(saddles.edges[rows], slope_of(mapping, nodes))
     paper = float(np.median(sector_levels(grey, mapping, nodes).max(axis=1)))
     ink = float(np.median(sector_levels(grey, mapping, nodes).min(axis=1)))
-    limits = paper - 0.25 * (paper - ink), ink + 0.25 * (paper - ink)
-
+    each = cost_of(ink, paper)
     even = nodes.sum(axis=1) % 2 == 0
     odd = (bright == even).mean() > 0.5
 
     def cost(missing: Array) -> Array:
         levels = sector_levels(grey, mapping, missing)
-        plain = ((levels > limits[0]) | (levels < limits[1])).all(axis=1)
-        # A corner that is in the frame but was not among the saddles does not count against a place.
-        there = crossed(levels, (missing.sum(axis=1) % 2 == 0) == odd)
-        return np.where(there, 0.0, np.where(plain, _PLAIN, _MISSED))
+        return each(levels, crossed(levels, (missing.sum(axis=1) % 2 == 0) == odd))
 
     coded = design.kind == "puzzle" or bool(design.dots)
     bits = read_bits(grey, mapping, nodes.astype(np.intp), design.kind == "puzzle") if coded else None
     known = nodes.astype(np.intp), saddles.xy[rows], mapping, shape, (dark, ~bright)
     # The dots of a PuzzleBoard tell more than nodes that were not found.
-    return _numbered(design, *known, None if design.kind == "puzzle" else cost, bits)
+    return numbered(design, *known, None if design.kind == "puzzle" else cost, bits)
+
+
+def cost_of(ink: float, paper: float) -> Callable[[Array, Mask], Array]:
+    """What nodes in sight that were not found count against a place, by the levels (n, s) of their sectors.
+
+    A node that is there (n) but was not found does not count.
+    """
+    limits = paper - 0.25 * (paper - ink), ink + 0.25 * (paper - ink)
+
+    def cost(levels: Array, there: Mask) -> Array:
+        plain = ((levels > limits[0]) | (levels < limits[1])).all(axis=1)
+        return np.where(there, 0.0, np.where(plain, _PLAIN, _MISSED))
+
+    return cost
 
 
 def _dark_sectors(design: BoardDesign) -> Mask:
@@ -135,7 +151,7 @@ def _dark_sectors(design: BoardDesign) -> Mask:
     return same if design.dark_corner else ~same
 
 
-def _numbered(
+def numbered(
     design: BoardDesign,
     nodes: NDArray[np.intp],
     xy: Array,
@@ -146,9 +162,9 @@ def _numbered(
     bits: Bits | None = None,
 ) -> Placed | Failure:
     """Lay the lattice found on the design; `cost` of nodes not found, `bits` what dots tell."""
-    # Diagonals of an asymmetric grid are halved: its nodes have columns and rows that are both even or odd.
+    # Diagonals of a staggered grid are halved: its nodes have columns and rows that are both even or odd.
     matrix = _lattice_of(design)
-    numbers = design.nodes @ matrix.T // (2 if design.asymmetric else 1)
+    numbers = design.nodes @ matrix.T // (2 if design.staggered else 1)
     least = numbers.min(axis=0)
     numbers = numbers - least
     size = numbers.max(axis=0) + 1
@@ -158,10 +174,12 @@ def _numbered(
     mirrored = np.linalg.det(slope_of(mapping, np.zeros((1, 2)))[0]) < 0
     found: list[tuple[float, Integers, Integers]] = []
     signs = None if bits is None else dot_signs(design)
-    for quarter in range(4):
+    once, turns = (_THIRD, 3) if design.kind == "deltille" else (_QUARTER, 4)
+    for quarter in range(turns):
         # Rows of a design go downwards as those of a frame do.
-        turn = np.linalg.matrix_power(_QUARTER, quarter)
+        turn = np.linalg.matrix_power(once, quarter)
         turn = turn @ np.diag([-1, 1]) if mirrored else turn
+        inverse = np.rint(np.linalg.inv(turn)).astype(np.intp)
         at = nodes @ turn.T
         low, high = at.min(axis=0), at.max(axis=0)
         ranges = []
@@ -180,7 +198,7 @@ def _numbered(
                 agree = dark[0][of[there]] == seen
                 if agree.mean() < 0.5 if len(agree) else True:
                     continue
-            back = (numbers - np.array(shift)) @ turn  # the inverse of a turn is its transpose
+            back = (numbers - np.array(shift)) @ inverse.T
             missing = np.array([tuple(node) not in known for node in back.tolist()])
             lost = 0.0
             if missing.any():
@@ -224,9 +242,10 @@ def _numbered(
 
 def _to_lattice(design: BoardDesign, turn: Integers, shift: Integers) -> tuple[Array, Array]:
     """Lattice coordinates as a linear function of those of the design: frame (2, 2) and origin (2,)."""
-    # turn · node + shift is the place in the design, of which a point is pitch · (column, −row).
-    scale = _lattice_of(design) @ np.diag([1.0, -1.0]) / design.pitch / (2 if design.asymmetric else 1)
-    return turn.T @ scale, -(turn.T @ shift).astype(np.float64)
+    # turn · node + shift is the place in the design, of which a point is step · (column, −row).
+    scale = _lattice_of(design) @ np.diag([1.0, -1.0] / design.step) / (2 if design.staggered else 1)
+    back = np.linalg.inv(turn)
+    return back @ scale, -back @ shift
 
 
 def _ambiguous(
@@ -275,26 +294,41 @@ def lay_circles(disks: Disks, design: BoardDesign, shape: tuple[int, int]) -> Pl
         if len(best[0]) >= _ENOUGH * len(numbers):
             break
     if best is None or len(best[0]) < min(_FEWEST, len(numbers)):
-        return _failed(0 if best is None else len(best[0]), "circles in a lattice")
+        return failed(0 if best is None else len(best[0]), "circles in a lattice")
     nodes, rows, mapping = best
-    return _numbered(design, nodes.astype(np.intp), disks.xy[rows], mapping, shape, None)
+    return numbered(design, nodes.astype(np.intp), disks.xy[rows], mapping, shape, None)
 
 
 def _lattice_of(design: BoardDesign) -> Integers:
-    """Integer matrix from columns and rows to steps between nearest neighbours; twice them if asymmetric."""
+    """Integer matrix from columns and rows to steps between nearest neighbours; twice them if staggered."""
+    if design.kind == "deltille":
+        return np.array([[1, -1], [0, 2]])
     return np.array([[1, 1], [-1, 1]]) if design.asymmetric else np.eye(2, dtype=np.intp)
 
 
 def _plane_of_markers(
     plane: Array, image: Array, shape: tuple[int, int]
 ) -> tuple[Array | None, NDArray[np.bool_]]:
-    """Projectivity from the board to the corners of markers (4 m, 2), and which of them agree with it."""
+    """Projectivity from the board to the corners of markers (4 m, 2), and which of them agree with it.
+
+    Through a lens more of them agree than with the projectivity alone.
+    """
     if len(plane) == 4:
         matrix = cv2.getPerspectiveTransform(plane.astype(np.float32), image.astype(np.float32))
         return np.asarray(matrix), np.ones(4, dtype=bool)
     # Good to two pixels: distortion bends the board.
-    found, inlier = cv2.findHomography(plane, image, cv2.RANSAC, max(3.0, 0.006 * max(shape)))
+    limit = max(3.0, 0.006 * max(shape))
+    found, inlier = cv2.findHomography(plane, image, cv2.RANSAC, limit)
     good = np.zeros(len(plane), dtype=bool) if inlier is None else np.asarray(inlier.ravel() > 0)
+    while _LENS_FROM <= good.sum() < len(good):
+        start = through(plane[good], image[good], shape)
+        lens = lens_through(plane[good], image[good], np.full(good.sum(), _MARKER_PX), shape, start)
+        if lens is None:
+            break
+        agree = np.hypot(*(lens.mapping(plane) - image).T) < limit
+        if agree.sum() <= good.sum():
+            break
+        good = agree
     return None if found is None else np.asarray(found, dtype=np.float64), good
 
 
@@ -377,7 +411,7 @@ def lay_marked(
             both, there = nodes[known], start[known]
         mapping = through(both, there, shape)
     if known.sum() < 4:
-        return _failed(int(known.sum()), "corners beside the markers read")
+        return failed(int(known.sum()), "corners beside the markers read")
     mapping = through(nodes[known], start[known], shape) if known.sum() >= _FEWEST else mapping
     return Placed(Located(design.ids, design.xy, "dark", mapping, frame, origin, known, start))
 

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from ...core.data import Array, Mask, Rows
 from .candidates import Saddles
 
-__all__ = ["read_tags", "tag_outlines"]
+__all__ = ["read_tags", "tag_outlines", "with_seen_edges"]
 
 _NEIGHBOURS = 160
 """Saddles around a corner among which the next corner is looked for."""
@@ -41,6 +41,14 @@ _EDGE = 0.35
 """Least contrast along an edge, as a share of its median."""
 
 
+def with_seen_edges(grey: NDArray[np.float32], saddles: Saddles) -> Saddles:
+    """Saddles with the directions in which their edges are seen, which second derivatives do not show."""
+    from .compiled_tags import seen_edges  # takes half a second to import; not every command needs it
+
+    edges = seen_edges(grey, saddles.xy, saddles.edges, _RADIUS_PX, _PLACES)
+    return Saddles(saddles.xy, edges, saddles.strength)
+
+
 def tag_outlines(grey: NDArray[np.float32], saddles: Saddles) -> Rows:
     """Saddles (m, 4) that are the corners of dark quadrilaterals, clockwise in the image.
 
@@ -56,9 +64,9 @@ def tag_outlines(grey: NDArray[np.float32], saddles: Saddles) -> Rows:
     strong = np.flatnonzero(saddles.strength > _WEAK * saddles.strength[:30].mean())
     saddles, count = saddles.select(strong), len(strong)
     # The dark sectors of a saddle extend from its second edge to the first, turned by 180°, and opposite.
-    from .compiled_tags import next_corners, seen_edges  # takes half a second to import
+    from .compiled_tags import next_corners  # takes half a second to import; not every command needs it
 
-    first, second = seen_edges(grey, saddles.xy, saddles.edges, _RADIUS_PX, _PLACES).T
+    first, second = with_seen_edges(grey, saddles).edges.T
     turn = np.pi * np.arange(2)[:, None]
     # Seen from a corner, the interior of a tag is the sector from `leaves` to `arrives`, x into y: a cycle
     # that is clockwise in the image leaves along the former and arrives against the latter.

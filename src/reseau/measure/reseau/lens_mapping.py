@@ -24,7 +24,7 @@ from ..testfield.lattice_fit import monomials_of
 from ..testfield.lattice_mapping import of_degree, started, with_coefficients
 from .sheet_placement import through
 
-__all__ = ["FoundMapping", "mapping_through"]
+__all__ = ["FoundMapping", "lens_through", "mapping_through"]
 
 _LENS_SIGMA = np.array([0.3, 0.3, 0.1, 0.1, 0.1, 0.005, 0.003, 0.003])
 """Usual sizes of k1, k2, k3, c, a, p1 and p2; half the width of a frame has r = 1."""
@@ -78,7 +78,7 @@ def mapping_through(at: Array, xy: Array, sigma: Array, shape: tuple[int, int]) 
     """
     degree = next(d for d in (5, 4, 3, 2, 1) if _PER_TERM * (d + 1) * (d + 2) <= 2 * len(at) or d == 1)
     free = through(at, xy, shape, degree)
-    lens = _through_lens(at, xy, sigma, shape, free)
+    lens = lens_through(at, xy, sigma, shape, free)
     weight = 1 / np.hypot(sigma, _ROUGH_PX)
     if lens is not None:
         misfit = [float((((m(at) - xy) * weight[:, None]) ** 2).sum()) for m in (lens.mapping, free)]
@@ -127,10 +127,18 @@ def _distortion(u: Array, x: Array) -> tuple[Array, Array, Array]:
     return q / stretch, by_u, by_x
 
 
-def _through_lens(
+def lens_through(
     at: Array, xy: Array, sigma: Array, shape: tuple[int, int], start: Chain
 ) -> FoundMapping | None:
-    """Least-squares mapping with distortion; None if there is none."""
+    """Least-squares mapping with distortion, see :func:`mapping_through`; None if there is none.
+
+    Parameters
+    ----------
+    at, xy, sigma, shape
+        See :func:`mapping_through`.
+    start : Chain
+        Whose projectivity the iteration starts from.
+    """
     h, w = shape
     middle, half = np.array([w - 1, h - 1]) / 2, max(h, w) / 2
     centre, size = at.mean(axis=0), max(float(np.ptp(at, axis=0).max()) / 2, 1e-9)

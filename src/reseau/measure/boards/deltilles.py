@@ -1,0 +1,244 @@
+r"""Corners of a deltille in a frame: where six triangles meet, dark and bright in turn.
+
+The image of such a corner is a sum of three edges, whose normals are at 120° to each other when it is seen
+from the front. Derivatives of the smoothed image by z = x + i y tell it from all else: of an edge of the
+normal :math:`e^{i\varphi}`, blurred to the width s, :math:`s\,|\partial_z|` and
+:math:`s^3 |\partial_z^3|` are equal on the edge. In a corner the first derivatives of the three cancel each
+other, and the third ones, of the phases :math:`3\varphi`, add up.
+
+Source of the target: H. Ha, M. Perdoch, H. Alismail, I. S. Kweon, Y. Sheikh, Deltille grids for geometric
+camera calibration, ICCV 2017.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ...core.data import Array, Mask, Rows
+from ...core.failure import Failure
+from ...io.board import BoardDesign
+from ...optics import Chain
+from ..testfield.lattice_mapping import images_of
+from .candidates import first_mapping, grown_through
+from .placement import Placed, cost_of, failed, numbered
+
+__all__ = ["SixSectors", "find_six_sectors", "lay_deltille"]
+
+_SMOOTH_PX = 1.8
+"""Width of the smoothing, pixels."""
+_BESIDE = 7
+"""Side of the square in which a corner is the strongest, pixels."""
+_WEAK = 0.1
+"""Least strength of a corner, as a share of the strong ones."""
+_LEAST_T = 6.0
+"""Least strength of a corner over that of noise."""
+_MOST = 3000
+_ALIKE = 0.5
+"""Largest difference of the phases of neighbours, of π; the same sectors of both are dark."""
+_NEAR = 14
+"""Number of neighbours examined for a seed."""
+_GATE = 0.22
+"""Largest distance of a neighbour from where it is expected, in steps."""
+_SEEDS, _SHOWN = 12, 10
+"""Most seeds of corners of one strength; number of the strongest corners, which all boards have."""
+_STRONG = (0.4, 0.15, 0.0)
+"""Strengths, as shares of that of the strongest, of the corners among which a lattice is looked for."""
+_LATTICE = "corners in a lattice of triangles"
+_FEWEST = 6
+"""Least number of corners that show a board."""
+_ENOUGH = 0.6
+"""Share of the corners of the board from which no other seed is tried."""
+_CROSSED = 0.3
+"""Least difference between the darkest of the bright sectors and the brightest of the dark ones, of that
+between their means."""
+_LARGE_PX = 2_500_000
+"""Size of a frame from which it is searched at half its size."""
+
+
+@dataclass(frozen=True, eq=False)
+class SixSectors:
+    """Places of a frame where six sectors meet, in columns.
+
+    Parameters
+    ----------
+    xy : ndarray (m, 2)
+        Positions in pixels, good to a fraction of a pixel.
+    phase : ndarray (m,)
+        Three times the direction of an edge from dark to bright, radians.
+    strength : ndarray (m,)
+        In descending order.
+    """
+
+    xy: Array
+    phase: Array
+    strength: Array
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+
+def _bells() -> list[Array]:
+    """Gaussian and its first three derivatives, times powers of its width."""
+    x = np.arange(-int(4 * _SMOOTH_PX + 1), int(4 * _SMOOTH_PX + 2)) / _SMOOTH_PX
+    bell = np.exp(-0.5 * x * x)
+    bell /= bell.sum()
+    # The kernel of a correlation is the derivative of the reflected Gaussian.
+    return [bell, x * bell, (x * x - 1) * bell, (x**3 - 3 * x) * bell]
+
+
+def find_six_sectors(grey: NDArray[np.float32], noise: float, halved: bool = False) -> SixSectors:
+    """Find the corners of a frame in which six sectors meet, that noise does not explain.
+
+    Parameters
+    ----------
+    grey : ndarray (h, w), float32
+        Grey values.
+    noise : float
+        Their standard deviation.
+    halved : bool
+        Whether to search at half the size, as for blurred frames.
+    """
+    if halved or grey.size > _LARGE_PX:
+        h, w = (n // 2 * 2 for n in grey.shape)
+        half: Any = cv2.resize(grey[:h, :w], (w // 2, h // 2), interpolation=cv2.INTER_AREA)
+        found = find_six_sectors(half, noise / 2)
+        # Pixel 0 at half the size covers pixels 0 and 1.
+        return SixSectors(2 * found.xy + 0.5, found.phase, found.strength)
+    bells = _bells()
+
+    def derived(across: int, down: int) -> Array:
+        return np.asarray(cv2.sepFilter2D(grey, cv2.CV_32F, bells[across], bells[down]))
+
+    xxx, xxy, xyy, yyy = (derived(3 - k, k) for k in range(4))
+    real, imaginary = xxx - 3 * xyy, 3 * xxy - yyy
+    third, first = np.hypot(real, imaginary), np.hypot(derived(1, 0), derived(0, 1))
+    score = (third - first).astype(np.float32)
+    peak = (score >= cv2.dilate(score, np.ones((_BESIDE, _BESIDE), np.uint8))) & (score > 0)
+    powers = [float((bell**2).sum()) for bell in bells]
+    peak &= score > _LEAST_T * noise * np.sqrt(powers[3] * powers[0] + 9 * powers[1] * powers[2])
+    peak[:2], peak[-2:], peak[:, :2], peak[:, -2:] = False, False, False, False
+    v, u = np.nonzero(peak)
+    strength = score[v, u].astype(np.float64)
+    order = np.argsort(-strength, kind="stable")
+    if len(order):
+        order = order[strength[order] > _WEAK * strength[order[:30]].mean()][:_MOST]
+    v, u = v[order], u[order]
+    # The vertex of the parabola along each axis.
+    away = []
+    for dv, du in ((0, 1), (1, 0)):
+        low, mid, high = (score[v + s * dv, u + s * du].astype(np.float64) for s in (-1, 0, 1))
+        away.append(np.clip(0.5 * (low - high) / np.minimum(low - 2 * mid + high, -1e-12), -0.5, 0.5))
+    phase = np.arctan2(imaginary[v, u], real[v, u]).astype(np.float64)
+    return SixSectors(np.stack([u + away[0], v + away[1]], axis=1), phase, strength[order])
+
+
+def lay_deltille(grey: NDArray[np.float32], corners: SixSectors, design: BoardDesign) -> Placed | Failure:
+    """Find a deltille among the corners of a frame, and number them.
+
+    Parameters
+    ----------
+    grey : ndarray (h, w), float32
+        Grey values.
+    corners : SixSectors
+        Its corners.
+    design : BoardDesign
+        A deltille.
+    """
+    found: Placed | Failure = failed(0, _LATTICE)
+    # Edges and texture have weaker corners, some of them beside the true ones.
+    for share in _STRONG if len(corners) else ():
+        strong = corners.strength >= share * corners.strength[:_SHOWN].mean()
+        few = SixSectors(corners.xy[strong], corners.phase[strong], corners.strength[strong])
+        found = _laid(grey, few, design)
+        if not isinstance(found, Failure):
+            break
+    return found
+
+
+def _laid(grey: NDArray[np.float32], corners: SixSectors, design: BoardDesign) -> Placed | Failure:
+    """A deltille among corners of one strength, see :func:`lay_deltille`."""
+    shape = (grey.shape[0], grey.shape[1])
+    extent = design.columns + design.rows
+
+    def accepted(mapping: Chain, beside: Array, row: Rows, slopes: Array) -> Mask:
+        return _crossed(_levels(grey, mapping, beside))
+
+    best: tuple[Array, Rows, Chain] | None = None
+    for row, step in _seeds(corners):
+        mapping = first_mapping(step, corners.xy[row], shape)
+        levels = _levels(grey, mapping, np.zeros((1, 2)))
+        if levels[:, :3].mean() < levels[:, 3:].mean():
+            # A sixth of a turn exchanges the sectors.
+            mapping = first_mapping(step @ np.array([[0, -1], [1, 1]]), corners.xy[row], shape)
+        found = grown_through(corners.xy, mapping, extent, shape, accepted)
+        if best is None or len(found[0]) > len(best[0]):
+            best = found
+        if len(best[0]) >= _ENOUGH * len(design.nodes):
+            break
+    if best is None or len(best[0]) < _FEWEST:
+        return failed(0 if best is None else len(best[0]), _LATTICE)
+    nodes, rows, mapping = best
+    levels = np.median(_levels(grey, mapping, nodes), axis=0)
+    cost = cost_of(float(levels[3:].mean()), float(levels[:3].mean()))
+
+    def missed(missing: Array) -> Array:
+        levels = _levels(grey, mapping, missing)
+        return cost(levels, _crossed(levels))
+
+    return numbered(design, nodes.astype(np.intp), corners.xy[rows], mapping, shape, None, missed)
+
+
+def _seeds(corners: SixSectors) -> list[tuple[int, Array]]:
+    """Corners with neighbours on all six sides, and the steps (2, 2) of the lattice there, in columns."""
+    if len(corners) < _FEWEST:
+        return []
+    most = min(_NEAR + 1, len(corners))
+    near = KDTree(corners.xy).query(corners.xy, k=most)[1][:, 1:]
+    apart = np.abs(np.angle(np.exp(1j * (corners.phase[near] - corners.phase[:, None]))))
+    away = np.where(apart[..., None] < _ALIKE * np.pi, corners.xy[near] - corners.xy[:, None], np.inf)
+    found: list[tuple[int, int, Array]] = []
+    for i, steps in enumerate(away):
+        steps = steps[np.isfinite(steps).all(axis=1)]
+        if len(steps) < 3:
+            continue
+        a, b = (part.ravel() for part in np.meshgrid(*2 * [np.arange(len(steps))], indexing="ij"))
+        one, two = steps[a], steps[b]
+        length = np.hypot(*np.stack([one, two, two - one]).transpose(2, 0, 1))  # (3, pairs)
+        # Clockwise as seen, the second about 60° from the first.
+        turned = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
+        likely = (turned > 0.3 * length[0] * length[1]) & (length.max(axis=0) < 2.5 * length.min(axis=0))
+        if not likely.any():
+            continue
+        one, two = one[likely], two[likely]
+        around = np.stack([one, two, two - one, -one, -two, one - two], axis=1)
+        gap = np.hypot(*np.moveaxis(around[:, :, None] - steps, 3, 0)).min(axis=2)
+        support = (gap < _GATE * length[:, likely].min(axis=0)[:, None]).sum(axis=1)
+        k = int(np.lexsort((length[:, likely].sum(axis=0), -support))[0])
+        if support[k] >= 4:
+            found.append((-int(support[k]), i, np.stack([one[k], two[k]], axis=1)))
+    # Those with most neighbours, and of these the strongest, come first.
+    found.sort(key=lambda seed: seed[:2])
+    return [(i, step) for _, i, step in found[:_SEEDS]]
+
+
+def _levels(grey: NDArray[np.float32], mapping: Chain, nodes: Array) -> Array:
+    """Grey values (n, 6) in the middles of the triangles around nodes: three bright ones, three dark ones."""
+    third = np.array([[1, 1], [-2, 1], [1, -2], [-1, -1], [2, -1], [-1, 2]]) / 3
+    at = images_of(mapping, (nodes[:, None] + third).reshape(-1, 2)).astype(np.float32)
+    # Beside the border of the frame a sector is seen up to there.
+    at = np.clip(np.nan_to_num(at), 0, np.array([grey.shape[1] - 1, grey.shape[0] - 1], np.float32))
+    values = cv2.remap(grey, at[:, 0].reshape(-1, 6), at[:, 1].reshape(-1, 6), cv2.INTER_LINEAR)
+    return np.asarray(values, dtype=np.float64)
+
+
+def _crossed(levels: Array) -> Mask:
+    """Whether all bright sectors (n, 6) are brighter than all dark ones by a share of the contrast."""
+    bright, dark = levels[:, :3], levels[:, 3:]
+    contrast = bright.mean(axis=1) - dark.mean(axis=1)
+    return np.asarray(bright.min(axis=1) - dark.max(axis=1) > _CROSSED * np.maximum(contrast, 1e-9))
