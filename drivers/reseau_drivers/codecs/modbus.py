@@ -65,6 +65,8 @@ WordOrder = Literal["big", "little"]
 
 _ERROR = 0x80
 _BY_COUNT = (1, 2, 3, 4, 17)
+_KNOWN = (1, 2, 3, 4, 5, 6, DIAGNOSTICS, 15, 16, 17)
+_FUNCTIONS = frozenset({*_KNOWN, *(each | _ERROR for each in _KNOWN)})
 """Functions whose answer has the number of its data bytes in front."""
 
 
@@ -78,10 +80,18 @@ def crc(data: bytes) -> bytes:
     """
     found = 0xFFFF
     for each in data:
-        found ^= each
-        for _ in range(8):
-            found = (found >> 1) ^ 0xA001 if found & 1 else found >> 1
+        found = (found >> 8) ^ _TABLE[(found ^ each) & 0xFF]
     return struct.pack("<H", found)
+
+
+def _shifted(byte: int) -> int:
+    """The checksum of one byte, bit by bit."""
+    for _ in range(8):
+        byte = (byte >> 1) ^ 0xA001 if byte & 1 else byte >> 1
+    return byte
+
+
+_TABLE = tuple(map(_shifted, range(256)))
 
 
 @dataclass(frozen=True)
@@ -222,9 +232,16 @@ def words_of(value: float, kind: str, order: WordOrder = "big") -> tuple[int, ..
 class _Decoder:
     """Decode frames from a stream; what is none is skipped up to the next one."""
 
-    def __init__(self, size: Callable[[bytes], int | None], frame: Callable[[bytes], Frame | None]) -> None:
+    def __init__(
+        self,
+        size: Callable[[bytes], int | None],
+        frame: Callable[[bytes], Frame | None],
+        at: int,
+        possible: frozenset[int],
+    ) -> None:
         self._size, self._frame = size, frame
-        self._longest = 0
+        # What the byte at a place of a frame can be: noise is skipped fast.
+        self._at, self._possible = at, possible
         self.reset()
 
     def reset(self) -> None:
@@ -235,12 +252,15 @@ class _Decoder:
         """Return the frames that these bytes complete."""
         found: list[Frame | Damaged] = []
         self._held += data
-        at, skipped = 0, 0
-        while at < len(self._held):
-            size = self._size(bytes(self._held[at : at + 8]))
-            if size is None or (size > 0 and len(self._held) - at < size):
+        held, at, skipped = bytes(self._held), 0, 0
+        while at < len(held):
+            if at + self._at < len(held) and held[at + self._at] not in self._possible:
+                at, skipped = at + 1, skipped + 1
+                continue
+            size = self._size(held[at : at + 8])
+            if size is None or (size > 0 and len(held) - at < size):
                 break  # incomplete
-            frame = self._frame(bytes(self._held[at : at + size])) if size else None
+            frame = self._frame(held[at : at + size]) if size else None
             if frame is None:
                 at, skipped = at + 1, skipped + 1
                 continue
@@ -276,7 +296,7 @@ class RtuDecoder(_Decoder):
     """
 
     def __init__(self, requests: bool = False) -> None:
-        super().__init__(_request_size if requests else _answer_size, _rtu_frame)
+        super().__init__(_request_size if requests else _answer_size, _rtu_frame, 1, _FUNCTIONS)
 
 
 class TcpDecoder(_Decoder):
@@ -289,7 +309,7 @@ class TcpDecoder(_Decoder):
     """
 
     def __init__(self) -> None:
-        super().__init__(_tcp_size, _tcp_frame)
+        super().__init__(_tcp_size, _tcp_frame, 2, frozenset({0}))
 
 
 def _answer_size(head: bytes) -> int | None:
