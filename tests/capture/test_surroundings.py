@@ -63,8 +63,8 @@ def _modbus(machine: ModbusSensor, script: FaultScript | None = None) -> Device[
 
 
 def test_conditions_are_stored_with_every_frame_and_summarised_in_the_provenance(tmp_path: Path) -> None:
-    rig, readings = FieldRig(), iter(np.arange(20.0, 30.0, 0.5))
-    _with(rig, air=_modbus(ModbusSensor(lambda: AIR | {"temperature": float(next(readings))})))
+    rig = FieldRig()
+    _with(rig, air=_modbus(ModbusSensor(lambda: AIR | {"temperature": 20.0 + 0.5 * rig.camera.exposures})))
     with Archive.open(tmp_path / "archive", create=True) as archive:
         session = archive.begin("monday", "own", {})
         carry_out(
@@ -72,11 +72,11 @@ def test_conditions_are_stored_with_every_frame_and_summarised_in_the_provenance
         )
         frames = session.frames(kind="frame")
         taken = [frame.facts["environment"]["air"]["temperature"] for frame in frames]
-        assert taken == [{"value": 20.0 + 0.5 * k, "unit": "°C", "sigma": 0.2} for k in range(6)]
+        assert taken == [{"value": 20.5 + 0.5 * k, "unit": "°C", "sigma": 0.2} for k in range(6)]
         (result,) = session.results()
         around = json.loads(session.content(result))["provenance"]["environment"]
         assert around["air.temperature"] == {
-            "mean": 21.25, "low": 20.0, "high": 22.5, "unit": "°C", "sigma": 0.2, "frames": 6,
+            "mean": 21.75, "low": 20.5, "high": 23.0, "unit": "°C", "sigma": 0.2, "frames": 6,
         }  # fmt: skip
         assert around["air.pressure"]["mean"] == 1004.25
         assert [each.same for each in rerun(session, rig.procedure())] == [True]
