@@ -4,48 +4,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tests.capture.simple import CameraSettings, Simple, Taken
 
 from reseau.core.data import Frame
 from reseau.core.errors import ConnectionLost
-from reseau.instruments import Deadline, Device, Identity, Settings, quantity
 
 PERIOD_S = 0.5
 _ENTRIES = "[reseau.instruments]\nclocked = benchmarks.clocked:ClockedCamera\n"
 
 
-@dataclass(frozen=True)
-class ClockedSettings(Settings):
-    """How a frame is taken."""
-
-    exposure_us: float = quantity(1000.0, "µs", 1.0, 1e6)
-
-
-@dataclass(frozen=True, eq=False)
-class Taken:
-    """A frame with its metadata."""
-
-    frame: Frame
-    sequence: int
-    taken: datetime
-    exposure_us: float
-    gain: float = 0.0
-    dropped: int = 0
-    pattern: str = ""
-    taken_within_s: float = 1e-3
-    fresh: bool = True
-
-
-class ClockedCamera(Device[Any]):
+class ClockedCamera(Simple):
     """Takes a frame each half second of the machine's clock, numbered from its beginning."""
 
     def __init__(self, name: str, address: str, settings: Any = None, limits: Any = None) -> None:
-        super().__init__(name, ClockedSettings(**(settings or {})), limits=limits)
+        super().__init__(name, CameraSettings(**(settings or {})), limits=limits)
         draw = np.random.default_rng(1)
         self._pixels = draw.integers(40, 200, (480, 640), dtype=np.uint8)
         self._last = 0
@@ -64,19 +41,6 @@ class ClockedCamera(Device[Any]):
     def frames(self, count: int, seconds: float | None = None) -> Iterator[Taken]:
         """Yield frames as they come."""
         return (self.expose(seconds) for _ in range(count))
-
-    def _open(self, deadline: Deadline) -> None: ...
-    def _disconnect(self) -> None: ...
-    def _push(self, settings: Any, deadline: Deadline) -> None: ...
-    def _halt(self, deadline: Deadline) -> None: ...
-    def _identify(self, deadline: Deadline) -> Identity:
-        return Identity("reseau", "clocked")
-
-    def _acquire(self) -> dict[str, Any]:
-        return {}
-
-    def _reading_format(self) -> dict[str, dict[str, Any]]:
-        return {}
 
 
 def install(folder: Path) -> None:

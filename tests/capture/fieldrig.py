@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,15 +15,17 @@ import pytest
 from reseau.archive import Session
 from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry
 from reseau.core.data import Frame
-from reseau.core.errors import ConnectionLost, StateError
+from reseau.core.errors import StateError
 from reseau.designs import coded_testfield
-from reseau.instruments import AxisState, BScan, Deadline, Device, Identity, Settings, Status, quantity
+from reseau.instruments import AxisState, BScan, Deadline, Device, Settings, Status
 from reseau.io import TestfieldDesign
 from reseau.measure import TestfieldOptions
 from reseau.procedures.calibration import CameraOptions
 from reseau.procedures.target_measurement import measurer_of
 from reseau.procedures.testfield import TestfieldProcedure
 from reseau_sims import FieldBench, Station
+
+from .simple import CameraSettings, Simple, Taken
 
 AXES = ("tilt", "roll", "camera_roll")
 DESIGN = coded_testfield()
@@ -41,50 +42,6 @@ address = "sim-camera"
 POSES = "tilt,roll,camera_roll\n0,0,0\n30,90,90\n30,180,180\n30,270,270\n30,0,0\n"
 TESTFIELD = ("--design", "field.json", "--poses", "poses.csv", "--pitch", "0.027", "--free", "c,x0,y0,K1",
              "--row-jitter", "0.0086", "--fill", "0.8")  # fmt: skip
-
-
-@dataclass(frozen=True)
-class CameraSettings(Settings):
-    """How a frame is taken."""
-
-    exposure_us: float = quantity(1000.0, "µs", 1.0, 1e6)
-
-
-@dataclass(frozen=True, eq=False)
-class Taken:
-    """A frame with its metadata."""
-
-    frame: Frame
-    sequence: int
-    taken: datetime
-    exposure_us: float
-    gain: float = 0.0
-    dropped: int = 0
-    pattern: str = ""
-    taken_within_s: float = 1e-3
-    fresh: bool = True
-
-
-class _Simple(Device[Any]):
-    """An instrument that is always connected, unless it is silent."""
-
-    silent = False
-
-    def _open(self, deadline: Deadline) -> None:
-        if self.silent:
-            raise ConnectionLost("does not answer", do="is it switched on?")
-
-    def _disconnect(self) -> None: ...
-    def _push(self, settings: Any, deadline: Deadline) -> None: ...
-    def _halt(self, deadline: Deadline) -> None: ...
-    def _identify(self, deadline: Deadline) -> Identity:
-        return Identity("reseau", "simulated")
-
-    def _acquire(self) -> dict[str, Any]:
-        return {}
-
-    def _reading_format(self) -> dict[str, dict[str, Any]]:
-        return {}
 
 
 class Axis:
@@ -109,7 +66,7 @@ class Axis:
         return {self.name: {"source": "sim", "dtype": "number", "shape": []}}
 
 
-class FieldTable(_Simple):
+class FieldTable(Simple):
     """A table that moves at once."""
 
     def __init__(self, name: str, axes: tuple[str, ...] = AXES) -> None:
@@ -142,7 +99,7 @@ class FieldTable(_Simple):
         self.stops += 1
 
 
-class FieldCamera(_Simple):
+class FieldCamera(Simple):
     """A camera that looks at the testfield on the table."""
 
     def __init__(self, name: str, table: FieldTable, field: FieldBench) -> None:
@@ -166,7 +123,7 @@ class FieldCamera(_Simple):
         return (self.expose(seconds) for _ in range(count))
 
 
-class Sweeper(_Simple):
+class Sweeper(Simple):
     """A scanner that does not report its frequency."""
 
     def __init__(self, name: str) -> None:

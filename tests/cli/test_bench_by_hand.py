@@ -61,8 +61,8 @@ def test_axes_are_homed_and_moved_within_their_range(
     assert rig.table.stands == {"tilt": 15.0, "roll": -2.5, "camera_roll": 0.0}
     capsys.readouterr()
     for wrong, said in (
-        ("tilt=400", "tilt: 400 deg is out of range; use -5 to 360"),
-        ("lift=1", "lift: is no axis; use tilt, roll, camera_roll"),
+        ("tilt=400", "table: tilt = 400 deg is out of range; use -5 to 360 deg"),
+        ("lift=1", "table: the table has no axis lift; use tilt, roll, camera_roll"),
         ("tilt", "cannot interpret 'tilt'"),
     ):
         assert bench("move", wrong) == 2

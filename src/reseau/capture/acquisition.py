@@ -265,10 +265,8 @@ class Acquisition:
     def move(self, position: Mapping[str, float]) -> Plan:
         """Move axes of the table, all at the same time."""
         if position:
-            axes = self.one(Turntable).axes
-            unknown = [axis for axis in position if axis not in axes]
-            if unknown:
-                raise UsageError(f"has no axis {unknown[0]}", where="table", do=f"use {', '.join(axes)}")
+            for axis in position:
+                by_hand.axis_of(self.one(Turntable), axis)
             yield message("move", self, dict(position))
 
     def home(self) -> Plan:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from ..core.errors import InstrumentError, UsageError
 from ..instruments import Turntable
+from ..instruments.protocols import Movable
 
-__all__ = ["AxisReport", "axes_of", "home", "move", "targets"]
+__all__ = ["AxisReport", "axes_of", "axis_of", "check_reach", "home", "move", "targets"]
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,37 @@ def axes_of(table: Turntable) -> dict[str, AxisReport]:
     return found
 
 
+def axis_of(table: Turntable, name: str, where: str = "") -> Movable:
+    """Return an axis by its name; the error names `where` it was asked for, or the table.
+
+    Raises
+    ------
+    UsageError
+        If the table has no such axis.
+    """
+    if name not in table.axes:
+        raise UsageError(
+            f"the table has no axis {name}", where=where or table.name, do=f"use {', '.join(table.axes)}"
+        )
+    return table.axes[name]
+
+
+def check_reach(table: Turntable, position: Mapping[str, float], where: str = "") -> None:
+    """Check that a table has the axes of a position, and reaches it.
+
+    Raises
+    ------
+    UsageError
+        If it does not.
+    """
+    for name, value in position.items():
+        axis = axis_of(table, name, where)
+        low, high = axis.limits
+        if not low <= value <= high:
+            what = f"{name} = {value:g} {axis.unit} is out of range"
+            raise UsageError(what, where=where or table.name, do=f"use {low:g} to {high:g} {axis.unit}")
+
+
 def targets(table: Turntable, position: Mapping[str, float], *, relative: bool = False) -> dict[str, float]:
     """Return where axes will stand, all within their ranges.
 
@@ -83,16 +115,12 @@ def targets(table: Turntable, position: Mapping[str, float], *, relative: bool =
     UsageError
         If there is no such axis, or it does not reach the position.
     """
-    found = {}
-    for name, value in position.items():
-        if name not in table.axes:
-            raise UsageError("is no axis", where=name, do=f"use {', '.join(table.axes)}")
-        axis = table.axes[name]
-        found[name] = table.state(name).position + value if relative else value
-        low, high = axis.limits
-        if not low <= found[name] <= high:
-            what = f"{found[name]:g} {axis.unit} is out of range"
-            raise UsageError(what, where=name, do=f"use {low:g} to {high:g}")
+    for name in position:
+        axis_of(table, name)
+    found = {
+        name: table.state(name).position + value if relative else value for name, value in position.items()
+    }
+    check_reach(table, found)
     return found
 
 
@@ -124,8 +152,7 @@ def home(table: Turntable, axes: Iterable[str] = ()) -> tuple[str, ...]:
     axes = tuple(axes)
     names = axes or tuple(name for name in table.axes if not table.state(name).homed)
     for name in names:
-        if name not in table.axes:
-            raise UsageError("is no axis", where=name, do=f"use {', '.join(table.axes)}")
+        axis_of(table, name)
     for name in names:
         # Some controllers home all axes at once.
         if not axes and table.state(name).homed:

@@ -13,6 +13,7 @@ from .common import (
     MaxRotation,
     Mirrored,
     Out,
+    Overlay,
     SensorFile,
     corrected,
     orientation,
@@ -20,7 +21,7 @@ from .common import (
     suffix_of,
     writable,
 )
-from .measure import Overlay, Task
+from .measure import Task
 
 if TYPE_CHECKING:
     from ..core.data import Frame

@@ -35,6 +35,10 @@ class Channel(StrEnum):
 
 AsJson = Annotated[bool, typer.Option("--json", help="Write the result as JSON to standard output.")]
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
+Overlay = Annotated[
+    Path | None,
+    typer.Option(help="PNG to write: the frame with what was measured, what was declined, and why."),
+]
 ArchivePlace = Annotated[
     str,
     typer.Option(

@@ -11,6 +11,7 @@ from .common import (
     AsJson,
     Channel,
     Out,
+    Overlay,
     SensorFile,
     corrected,
     overlay_files,
@@ -21,7 +22,6 @@ from .common import (
     suffix_of,
     writable,
 )
-from .measure import Overlay
 
 if TYPE_CHECKING:
     from ..io.edges import EdgesDocument

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .common import AsJson, Out, overlay_files, progress, required, say, suffix_of, writable
-from .measure import Overlay
+from .common import AsJson, Out, Overlay, overlay_files, progress, required, say, suffix_of, writable
 from .orient import Transform
 
 if TYPE_CHECKING:

@@ -14,6 +14,7 @@ from .common import (
     MaxRotation,
     Mirrored,
     Out,
+    Overlay,
     SensorFile,
     corrected,
     orientation,
@@ -32,13 +33,8 @@ if TYPE_CHECKING:
     from ..io import ReseauMeasurement
     from ..measure.points import Measured
 
-__all__ = ["Overlay", "Task", "app", "measurement_csv"]
+__all__ = ["Task", "app", "measurement_csv"]
 
-
-Overlay = Annotated[
-    Path | None,
-    typer.Option(help="PNG to write: the frame with what was measured, what was declined, and why."),
-]
 
 app = typer.Typer(help="Measure image coordinates of a target.", no_args_is_help=True)
 

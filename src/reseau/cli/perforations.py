@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from .common import AsJson, overlay_files, required, say
-from .measure import Overlay
+from .common import AsJson, Overlay, overlay_files, required, say
 
 __all__ = ["perforations"]
 

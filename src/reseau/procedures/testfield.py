@@ -228,10 +228,10 @@ class TestfieldProcedure:
         reached: dict[str, float] = {}
         scatters = []
         for c in range(len(found.result.network.cameras)):
-            names, sigma = _sigmas(found.result, c)
+            names, sigma, between = _sigmas(found.result, c)
             for name, s in zip(names, sigma, strict=True):
                 reached[f"sigma_{name}"] = max(float(s), reached.get(f"sigma_{name}", 0.0))
-            scatters.append(image_scatter(found.result, c))
+            scatters.append(image_scatter(found.result, c, between))
         scatter = float(np.fmax.reduce(scatters))
         more = {"scatter": scatter} if np.isfinite(scatter) else {}
         return reached | {"sigma0": float(found.result.sigma0)} | more
@@ -301,11 +301,12 @@ class TestfieldProcedure:
         }
 
 
-def _sigmas(result: Result, camera: int) -> tuple[tuple[str, ...], Array]:
-    """Names and standard deviations of the parameters of a camera: the larger of the two kinds."""
+def _sigmas(result: Result, camera: int) -> tuple[tuple[str, ...], Array, Array]:
+    """Parameters of a camera: names, the larger standard deviations of the two kinds, those of scatter."""
     names, _, _ = result.camera_columns(camera)
     formal: Array = np.sqrt(np.diag(result.camera_covariance(camera)))
-    return tuple(names), np.fmax(formal, sigma_between_images(result, camera))
+    between = sigma_between_images(result, camera)
+    return tuple(names), np.fmax(formal, between), between
 
 
 def _joined(

@@ -247,8 +247,7 @@ class Worker:
     def _home(self, axis: str, by: str = "") -> dict[str, Any]:
         self._free()
         table = self._table()
-        if axis not in table.axes:
-            raise UsageError("is no axis", where=axis, do=f"use {', '.join(table.axes)}")
+        by_hand.axis_of(table, axis)
         return self._moved(f"{axis} to its reference", by, lambda: table.home(axis))
 
     def _moved(self, words: str, by: str, work: Callable[[], Any]) -> dict[str, Any]:

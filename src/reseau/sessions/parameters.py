@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
 from ..capture import HEIGHT, ROLES, Bench, Goal, SensorSeriesPlan, Step
+from ..capture.by_hand import check_reach
 from ..core.errors import FormatError, StateError, UsageError
 from ..instruments import Camera, CameraRig, EnvironmentSensor, Turntable
 from ..io import Document
@@ -167,7 +168,9 @@ class SessionParameters(Document):
         """
         self._used(bench)
         if self.positions:
-            check_poses(bench.one(Turntable, self.table), self.positions)
+            table = bench.one(Turntable, self.table)
+            for step in self.positions:
+                check_reach(table, step.position, step.name)
 
     def check_homed(self, bench: Bench) -> None:
         """Check on a connected bench that all axes that the plan moves have their reference.
@@ -348,28 +351,6 @@ class BlurredParameters(SessionParameters):
     def positions(self) -> tuple[Step, ...]:
         """Positions to which the plan moves the table."""
         return (*self.poses(), *super().positions)
-
-
-def check_poses(table: Turntable, steps: Sequence[Step]) -> None:
-    """Check that a table has the axes of poses, and reaches them.
-
-    Raises
-    ------
-    UsageError
-        If it does not.
-    """
-    axes = table.axes
-    for step in steps:
-        for axis, value in step.position.items():
-            if axis not in axes:
-                raise UsageError(
-                    f"the table has no axis {axis}", where=step.name, do=f"use {', '.join(axes)}"
-                )
-            low, high = axes[axis].limits
-            if not low <= value <= high:
-                unit = axes[axis].unit
-                what = f"{axis} = {value:g} {unit} is out of range"
-                raise UsageError(what, where=step.name, do=f"use {low:g} to {high:g} {unit}")
 
 
 class TestfieldParameters(SessionParameters):

@@ -12,7 +12,8 @@ from reseau.core.data import Frame
 from reseau.instruments import Instrument, Turntable
 from reseau_sims import FieldBench, Station
 
-from ...capture.fieldrig import AXES, CameraSettings, Taken, _Simple
+from ...capture.fieldrig import AXES
+from ...capture.simple import CameraSettings, Simple, Taken
 
 _INFO = {
     "METADATA": "Metadata-Version: 2.1\nName: fieldcamera\nVersion: 1\n",
@@ -24,7 +25,7 @@ DEFECT_US, CRASH_US = 4321.0, 4322.0
 """Exposures at which the driver has a defect, and at which it ends its process."""
 
 
-class FieldCamera(_Simple):
+class FieldCamera(Simple):
     """Its frames follow the axes of the instrument `table`."""
 
     def __init__(self, name: str, address: str, settings: Any = None, limits: Any = None) -> None:

@@ -79,7 +79,7 @@ def sigma_between_images(result: Result, c: int) -> Array:
     return sigma
 
 
-def image_scatter(result: Result, c: int) -> float:
+def image_scatter(result: Result, c: int, between: Array | None = None) -> float:
     """Return how much more the images of a camera scatter than their standard deviations say.
 
     Parameters
@@ -88,6 +88,8 @@ def image_scatter(result: Result, c: int) -> float:
         Of the adjustment.
     c : int
         Row of the camera.
+    between : ndarray (k,), optional
+        From :func:`sigma_between_images`, if it is known.
 
     Returns
     -------
@@ -102,6 +104,7 @@ def image_scatter(result: Result, c: int) -> float:
     1.3
     """
     sigma = np.sqrt(np.diag(result.camera_covariance(c)))
-    ratio = sigma_between_images(result, c) / np.where(sigma > 0, sigma, np.inf)
+    between = sigma_between_images(result, c) if between is None else between
+    ratio = between / np.where(sigma > 0, sigma, np.inf)
     ratio = ratio[np.isfinite(ratio)]
     return float(np.sqrt(np.mean(ratio**2))) if len(ratio) else float("nan")
