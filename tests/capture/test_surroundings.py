@@ -67,9 +67,8 @@ def test_conditions_are_stored_with_every_frame_and_summarised_in_the_provenance
     _with(rig, air=_modbus(ModbusSensor(lambda: AIR | {"temperature": 20.0 + 0.5 * rig.camera.exposures})))
     with Archive.open(tmp_path / "archive", create=True) as archive:
         session = archive.begin("monday", "own", {})
-        carry_out(
-            rig.acquisition(session, rig.procedure()), plans.poses(rig.acquisition(session), STEPS, 1, 0)
-        )
+        run = rig.acquisition(session, rig.procedure())
+        carry_out(run, plans.poses(run, STEPS, 1, 0))
         frames = session.frames(kind="frame")
         taken = [frame.facts["environment"]["air"]["temperature"] for frame in frames]
         assert taken == [{"value": 20.5 + 0.5 * k, "unit": "°C", "sigma": 0.2} for k in range(6)]
