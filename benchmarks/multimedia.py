@@ -178,7 +178,7 @@ def monte_carlo(seeds: int) -> None:
                 failed += 1
                 continue
             off, away = world.errors(fit)
-            q, names = fit.cofactors.reduced, fit.unknowns.names
+            q, names = fit.cofactors.reduced.full, fit.unknowns.names
             squares.append(off**2 / np.diag(q))
             size = np.sqrt(np.diag(q))
             pooled.append(off / size @ np.linalg.solve(q / np.outer(size, size), off / size) / len(off))

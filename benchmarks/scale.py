@@ -1,6 +1,7 @@
 """Work at scale: photographs on a cluster whose workers and client die, and networks of growing size.
 
     python benchmarks/scale.py --part cluster [--images 5000]
+    python benchmarks/scale.py --part bundle [--sizes 50 160 500 1600 5000] [--memory GB]
 
 `cluster` starts a Dask scheduler and two workers on this machine, and a client that measures images of a
 testfield through a shared store. At a quarter of the images one worker is killed with -9, at a half the
@@ -8,6 +9,8 @@ client is, and is started again; one image ends every process that measures it. 
 image was measured, whether the results are those of this process to the byte, what the cluster costs besides
 measuring (processor time of client, scheduler and workers, from when all have started), and the memory of
 client and scheduler over time.
+
+`bundle` adjusts networks with the statistics of two collections of photographs, see `scale_bundle.py`.
 """
 
 from __future__ import annotations
@@ -240,8 +243,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--part", choices=("cluster", "client"), required=True)
+    parser.add_argument("--part", choices=("cluster", "client", "bundle"), required=True)
     parser.add_argument("--images", type=int, default=5000)
+    parser.add_argument("--kinds", nargs="+", choices=("ladybug", "venice"), default=["ladybug", "venice"])
+    parser.add_argument("--sizes", nargs="+", type=int, default=[50, 160, 500, 1600, 5000])
+    parser.add_argument("--memory", type=float, help="GB that normal equations may take")
+    parser.add_argument("--no-peer", action="store_true", help="without Ceres")
     parser.add_argument("--address", default="", help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, default=Path(), help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -250,6 +257,10 @@ def main() -> None:
         from benchmarks import scale
 
         scale.client(given.address, given.folder)
+    elif given.part == "bundle":
+        from scale_bundle import part_bundle
+
+        part_bundle(given.kinds, given.sizes, given.memory, peer=not given.no_peer)
     else:
         part_cluster(given.images)
 

@@ -5,6 +5,8 @@
 //   bundle fisheye NETWORK COST  one camera fx, fy, cx, cy, k1 ... k4 of OpenCV's fisheye for all
 //   bundle rig NETWORK COST      cameras c, K1 (object side) fixed to each other; one pose for each exposure
 //
+// With a fourth argument `iterative` the normal equations are solved by conjugate gradients.
+//
 // Prints: processor seconds until half the sum of squares is at most COST, processor seconds in all, final cost, iterations.
 #include <ceres/ceres.h>
 #include <ceres/rotation.h>
@@ -105,9 +107,10 @@ class Watch : public ceres::IterationCallback {
 
 // Adjusts and prints; `begun` is not included.
 void solve(ceres::Problem& problem, std::shared_ptr<ceres::ParameterBlockOrdering> ordering, double target,
-           double built) {
+           double built, bool iterative = false) {
   ceres::Solver::Options options;
-  options.linear_solver_type = ceres::DENSE_SCHUR;
+  options.linear_solver_type = iterative ? ceres::ITERATIVE_SCHUR : ceres::DENSE_SCHUR;
+  options.preconditioner_type = iterative ? ceres::SCHUR_JACOBI : ceres::JACOBI;
   options.linear_solver_ordering = ordering;
   options.num_threads = 2;
   options.max_num_iterations = 200;
@@ -152,7 +155,8 @@ int rig(std::ifstream& file, double target) {
 }  // namespace
 
 int main(int argc, char** argv) {
-  if (argc != 4) return 2;
+  if (argc != 4 && argc != 5) return 2;
+  const bool iterative = argc == 5 && std::string(argv[4]) == "iterative";
   const std::string kind = argv[1];
   std::ifstream file(argv[2]);
   if (kind == "rig") return rig(file, std::atof(argv[3]));
@@ -201,6 +205,6 @@ int main(int argc, char** argv) {
   if (one) ordering->AddElementToGroup(interior.data(), 1);
   const double built = std::chrono::duration<double>(std::chrono::steady_clock::now() - begun).count();
 
-  solve(problem, ordering, std::atof(argv[3]), built);
+  solve(problem, ordering, std::atof(argv[3]), built, iterative);
   return 0;
 }

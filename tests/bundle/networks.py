@@ -266,12 +266,12 @@ def normalised_errors(world: World, fit: Any) -> dict[str, float]:
     at = unknowns.camera[0] + np.arange(len(cam.free))
     rows = [cam.names.index(name) for name in cam.free]
     off = fit.values.cameras[0, rows] - cam.values[rows]
-    found["camera"] = float(off @ np.linalg.solve(fit.cofactors.reduced[np.ix_(at, at)], off)) / len(at)
+    found["camera"] = float(off @ np.linalg.solve(fit.cofactors.reduced.full[np.ix_(at, at)], off)) / len(at)
     images = []
     for i, start in enumerate(unknowns.pose):
         turned = matrix_to_vector(fit.values.rotation[i] @ world.rotation[i].T)
         e = np.concatenate([turned, fit.values.x0[i] - world.x0[i]])
-        q = fit.cofactors.reduced[start : start + 6, start : start + 6]
+        q = fit.cofactors.reduced.full[start : start + 6, start : start + 6]
         images.append(float(e @ np.linalg.solve(q, e)) / 6)
     found["poses"] = float(np.mean(images))
     free = np.flatnonzero(~network.held.any(axis=1) & fit.usable.points)

@@ -111,7 +111,7 @@ def test_the_dense_engine_gives_the_same_estimates_and_statistics() -> None:
         rotation = rotation_matrix([twin[f"{name}.{k}"] for k in range(3)])
         np.testing.assert_allclose(fit.values.rotation[i], rotation, rtol=0, atol=1e-9)
     at = fit.unknowns.camera[0]
-    mine = np.diag(fit.cofactors.reduced)[at : at + len(cam.free)]
+    mine = np.diag(fit.cofactors.reduced.full)[at : at + len(cam.free)]
     theirs = [twin.cofactor[twin.index(name), twin.index(name)] for name in cam.free]
     np.testing.assert_allclose(mine, theirs, rtol=1e-6)
     j = 7
@@ -268,12 +268,12 @@ def test_the_inverse_from_rows_is_that_of_the_normal_equations() -> None:
     world = mixed()
     fit = required(world.problem(world.noisy(3), **TOLERANCE))
     normal = fit.linear.normal(0.0)
-    held = np.diag(fit.cofactors.reduced) == 0
+    held = np.diag(fit.cofactors.reduced.full) == 0
     from_rows = inverse_from_rows(normal, held)
     size = np.sqrt(np.diag(from_rows))
     size[held] = 1.0
     np.testing.assert_allclose(
-        from_rows / np.outer(size, size), fit.cofactors.reduced / np.outer(size, size), rtol=0, atol=1e-8
+        from_rows / np.outer(size, size), fit.cofactors.reduced.full / np.outer(size, size), rtol=0, atol=1e-8
     )
 
 
@@ -370,7 +370,7 @@ def test_camcal_has_its_published_result_without_initial_poses(published: Callab
         "-2.96421e-05",
     ]  # fmt: skip
     at = fit.unknowns.camera[0]
-    sigma = fit.sigma0 * np.sqrt(np.diag(fit.cofactors.reduced)[at : at + 8])
+    sigma = fit.sigma0 * np.sqrt(np.diag(fit.cofactors.reduced.full)[at : at + 8])
     assert [f"{s:.3g}" for s in sigma] == [
         "0.00109", "0.000858", "0.000988", "2.31e-05", "2.76e-06", "1.05e-07", "3.67e-06", "4.05e-06",
     ]  # fmt: skip
@@ -386,7 +386,7 @@ def test_roma_has_its_published_result(published: Callable[[str], Network]) -> N
     c, _, _, k1, k2 = fit.values.cameras[0, :5]
     assert (f"{c:.4f}", f"{k1:.5e}", f"{k2:.5e}") == ("24.5425", "2.21523e-04", "-1.86985e-07")
     at = fit.unknowns.camera[0]
-    sigma = fit.sigma0 * np.sqrt(np.diag(fit.cofactors.reduced)[at : at + 5])
+    sigma = fit.sigma0 * np.sqrt(np.diag(fit.cofactors.reduced.full)[at : at + 5])
     assert (f"{sigma[0]:.5f}", f"{sigma[3]:.2e}", f"{sigma[4]:.2e}") == ("0.00254", "2.54e-07", "5.85e-10")
     assert fit.redundancy_numbers.sum() == pytest.approx(101801, abs=1e-6)
 
@@ -451,7 +451,7 @@ def test_a_joint_prior_of_a_camera_adds_its_inverse_to_the_normal_equations() ->
     observed = replace(network, cameras=(replace(cam, covariance=covariance),))
     prior = required(world.problem(observed, **TOLERANCE))
     at = plain.unknowns.camera[0] + np.arange(len(cam.free))
-    q, p = plain.cofactors.reduced[np.ix_(at, at)], prior.cofactors.reduced[np.ix_(at, at)]
+    q, p = plain.cofactors.reduced.full[np.ix_(at, at)], prior.cofactors.reduced.full[np.ix_(at, at)]
     both = np.linalg.inv(np.linalg.inv(q) + np.linalg.inv(covariance[np.ix_(rows, rows)]))
     size = np.sqrt(np.diag(both))
     np.testing.assert_allclose(p / np.outer(size, size), both / np.outer(size, size), rtol=0, atol=1e-4)

@@ -273,7 +273,7 @@ def normalised(kind: str, seeds: range) -> Array:
             free = np.flatnonzero(network.motion_free[i])
             off += (fit.values.motion[i] - scene.motion[i])[free].tolist()
             at += (own + free).tolist()
-        covariance = fit.cofactors.reduced[np.ix_(at, at)] * fit.variance
+        covariance = fit.cofactors.reduced.full[np.ix_(at, at)] * fit.variance
         scale = np.sqrt(np.diag(covariance))
         z = np.array(off) / scale
         squares.append(z @ np.linalg.solve(covariance / np.outer(scale, scale), z) / len(off))

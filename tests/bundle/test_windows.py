@@ -105,7 +105,7 @@ def test_errors_of_all_unknowns_are_within_their_covariances(kind: str) -> None:
         at = fit.unknowns.refraction_columns
         off = (fit.values.refraction - refraction.values)[fit.unknowns.refracting]
         assert len(off) == len(FREE[kind])
-        errors.append(off @ np.linalg.solve(fit.cofactors.reduced[at, at], off) / len(off))
+        errors.append(off @ np.linalg.solve(fit.cofactors.reduced.full[at, at], off) / len(off))
         for mean in networks.normalised_errors(world, fit).values():
             assert mean < 4.0
     # χ² of 24 or 36 degrees of freedom, between its quantiles 1e-4 and 1 − 1e-4.
@@ -145,7 +145,7 @@ def test_a_window_on_the_object_moves_with_a_free_network() -> None:
     assert refraction is not None
     off = (fit.values.refraction - refraction.values)[fit.unknowns.refracting]
     at = fit.unknowns.refraction_columns
-    sigma = np.sqrt(np.diag(fit.cofactors.reduced)[at])
+    sigma = np.sqrt(np.diag(fit.cofactors.reduced.full)[at])
     assert (np.abs(off) < 4.5 * sigma).all()
     assert (sigma < 0.05).all()
 
@@ -156,7 +156,7 @@ def test_an_observed_parameter_keeps_its_sigma_where_images_say_little() -> None
     fit = world.problem(world.noisy(0)).adjusted(Options(scale="a-priori"))
     assert isinstance(fit, BundleFit)
     at = fit.unknowns.refraction
-    assert np.sqrt(fit.cofactors.reduced[at, at]) == pytest.approx(1e-5, rel=0.01)
+    assert np.sqrt(fit.cofactors.reduced.full[at, at]) == pytest.approx(1e-5, rel=0.01)
     assert len(fit.residuals) == 2 * len(world.network.xy) + 1
 
 
@@ -242,7 +242,7 @@ def test_a_camera_by_its_mapping_gives_the_same_result_as_the_registered_one() -
     assert isinstance(fits[0], BundleFit)
     assert isinstance(fits[1], BundleFit)
     at = fits[0].unknowns.refraction_columns
-    sigma = np.sqrt(np.diag(fits[0].cofactors.reduced)[at])
+    sigma = np.sqrt(np.diag(fits[0].cofactors.reduced.full)[at])
     off = (fits[0].values.refraction - fits[1].values.refraction)[fits[0].unknowns.refracting]
     # Both end at the minimum within the tolerance of the iteration, which is a part of the sigmas.
     np.testing.assert_allclose(off / sigma, 0.0, rtol=0, atol=1e-4)

@@ -111,7 +111,8 @@ class Whitened(ABC):
             size = np.sqrt(np.where(known, diagonal, 1.0))
             numbers.append(np.clip(number, 0.0, None) if k == 1 else number)
             tests.append(np.where(known, turn.times(self.whitened) / size, np.nan))
-            errors.append(np.where(known, 1.0 / size, np.inf))
+            # Cofactors that were not computed are NaN: nothing is known of the observation then.
+            errors.append(np.where(known, 1.0 / size, np.where(np.isnan(diagonal), np.nan, np.inf)))
         return Standardised(np.concatenate(numbers), np.concatenate(tests), np.concatenate(errors))
 
     def diagonal_hats(self) -> Array:

@@ -79,6 +79,7 @@ class Code(StrEnum):
     TOO_FEW_IMAGES = "too-few-images"
     TOO_FEW_LEVELS = "too-few-levels"  # exposures at too few levels of light
     TOO_FEW_POINTS = "too-few-points"
+    TOO_LARGE = "too-large"  # needs more memory than it may take
     TOO_MANY_OUTLIERS = "too-many-outliers"  # the model is probably wrong, not the observations
     TOO_SMALL = "too-small"  # the region or the target covers too few pixels
     UNCERTAIN = "uncertain"  # the standard deviation is larger than allowed

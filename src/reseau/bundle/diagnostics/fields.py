@@ -40,7 +40,7 @@ def camera_mapping(result: Result, c: int, additional: str | None = None) -> Cam
     """
     camera = result.network.cameras[c]
     names, columns, values = own_columns(result, c, additional)
-    covariance = result.fit.cofactors.reduced[np.ix_(columns, columns)] * result.fit.variance
+    covariance = result.fit.cofactors.reduced.block(columns, columns) * result.fit.variance
     found = camera.parameters | dict(zip(names, values.tolist(), strict=True))
     size = (camera.width, camera.height)
     return CameraMapping.of_estimates(camera.plane_mapping(), size, found, names, covariance)
@@ -161,6 +161,6 @@ def _with_mean_pose(result: Result, c: int, columns: Rows) -> Array:
     poses = turn[k:, k:].reshape(6, m, 6)
     poses[:3, :, :3] = np.eye(3)[:, None, :] / m
     poses[3:, :, 3:] = -np.swapaxes(rotation[images], 0, 1) / m
-    cofactor = turn @ result.fit.cofactors.reduced[np.ix_(at, at)] @ turn.T
+    cofactor = turn @ result.fit.cofactors.reduced.block(at, at) @ turn.T
     covariance: Array = cofactor * result.fit.variance
     return covariance

@@ -59,7 +59,7 @@ def sigma_between_images(result: Result, c: int) -> Array:
     kept = fit.usable.observations & ~result.rejected
     count = np.bincount(network.image_of[kept], minlength=len(network.images))
     share = np.bincount(network.image_of[kept], r[kept], len(count)) / np.maximum(2 * count, 1)
-    moved = np.zeros((len(columns), len(images)))
+    moved, own = np.zeros((len(columns), len(images))), cofactors.reduced.rows(columns)
     for begin in range(0, len(images), _AT_ONCE):
         some = images[begin : begin + _AT_ONCE]
         place = np.full(len(network.images), -1)
@@ -73,7 +73,7 @@ def sigma_between_images(result: Result, c: int) -> Array:
                 k = np.flatnonzero((of >= 0) & (pattern.width[:, s] > i))
                 np.add.at(sums, (pattern.start[k, s] + i, of[k]), pulled[k, pattern.column[k, s] + i])
         sums += cofactors.normal.reduced_sides(side)
-        moved[:, begin : begin + len(some)] = cofactors.reduced[columns] @ sums / np.maximum(share[some], 0.1)
+        moved[:, begin : begin + len(some)] = own @ sums / np.maximum(share[some], 0.1)
     m = len(images)
     sigma: Array = np.sqrt((moved**2).sum(axis=1) * m / (m - 1))
     return sigma

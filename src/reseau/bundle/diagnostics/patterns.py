@@ -264,7 +264,7 @@ def _left(result: Result, at: Rows, normal: Array) -> Array:
         turned[:, k : k + _AT_ONCE] += cofactors.normal.reduced_sides(side)
     z = cofactors.reduced if cofactors.referral is None else cofactors.referral.before
     inverse = scipy.sparse.bsr_array((cofactors.normal.inverse, np.arange(p), np.arange(p + 1)))
-    m: Array = -(turned.T @ (z @ turned)) - (by_points.T @ (inverse @ by_points)).toarray()
+    m: Array = -(turned.T @ z.times(turned)) - (by_points.T @ (inverse @ by_points)).toarray()
     own = np.arange(len(normal))
     m.reshape(len(normal), 2, len(normal), 2)[own, :, own, :] += normal
     return m

@@ -127,7 +127,7 @@ def regularised(result: Result, c: int) -> Regularised | None:
     names, columns, values = result.camera_columns(c)
     if not len(names):
         return None
-    covariance = result.fit.cofactors.reduced[np.ix_(columns, columns)] * result.fit.variance
+    covariance = result.fit.cofactors.reduced.block(columns, columns) * result.fit.variance
     found = camera.parameters | dict(zip(names, values.tolist(), strict=True))
     size = (camera.width, camera.height)
     lens = CameraMapping.of_estimates(camera.plane_mapping(), size, found, names, covariance)

@@ -244,9 +244,11 @@ class Result(Display):
         if bent is None or not len(rows):
             return None
         names = tuple(bent.names[row] for row in rows)
-        at, cofactor = unknowns.refraction_columns, fit.cofactors.reduced
+        columns = unknowns.refraction_columns
+        at = np.arange(columns.start, columns.stop)
+        cofactor = fit.cofactors.reduced.block(at, at)
         values, given = fit.values.refraction[rows], bent.values[rows]
-        own = np.diag(cofactor)[at]
+        own = np.diag(cofactor)
         observed = bent.sigma[rows] ** 2
         # The difference from an observed value has the cofactor of its residual.
         difference = np.where(observed > 0, observed - own, own)
@@ -256,9 +258,9 @@ class Result(Display):
             ratio_test(name, float(r), sigma0, self.redundancy) for name, r in zip(names, ratio, strict=True)
         )
         return RefractionEstimate(
-            "windows and media", names, values, cofactor[at, at] * fit.variance,
+            "windows and media", names, values, cofactor * fit.variance,
             tuple(bent.unit_of(name, self.network.unit) for name in names), given, tests,
-            self._partners(np.arange(at.start, at.stop)),
+            self._partners(at),
         )  # fmt: skip
 
     @cached_property
@@ -270,7 +272,7 @@ class Result(Display):
             return None
         at, names = constraints.cameras, [camera.id for camera in self.network.cameras]
         t = constraints.matrix(places, linear.values.rotation, linear.values.x0)
-        cofactors = constraints.cofactors(t, self.fit.cofactors.reduced)
+        cofactors = constraints.cofactors(t, self.fit.cofactors.reduced.full)
         each = np.arange(len(at))
         cameras, references = (tuple(names[k] for k in rows) for rows in (at, constraints.references[at]))
         cov = cofactors[each, :, each] * self.fit.variance
@@ -322,7 +324,7 @@ class Result(Display):
         at = unknowns.camera[c] + np.array([camera.free.index(name) for name in names])
         given = np.array([camera.parameters[name] for name in names])
         sigma = np.array([camera.sigma[name] for name in names])
-        own = self.fit.cofactors.reduced[np.ix_(at, at)]
+        own = self.fit.cofactors.reduced.block(at, at)
         share = np.clip(np.diag(own) / sigma**2, 0.0, 1.0)
         images = np.diag(own) - ((own / sigma) ** 2).sum(axis=1)
         rows = [camera.names.index(name) for name in names]
@@ -343,8 +345,8 @@ class Result(Display):
         if not len(images):
             return None
         at = unknowns.motion[images, None] + np.arange(6)
-        cofactor, values = self.fit.cofactors.reduced, self.fit.values.motion[images]
-        size = np.sqrt(np.maximum(np.diag(cofactor), 0.0))[at]
+        cofactor, values = self.fit.cofactors.reduced.blocks(at), self.fit.values.motion[images]
+        size = np.sqrt(np.maximum(np.diagonal(cofactor, axis1=1, axis2=2), 0.0))
         tests = tuple(
             ratio_test(
                 unknowns.names[at[k, c]], float(values[k, c] / size[k, c]),
@@ -352,17 +354,17 @@ class Result(Display):
             )
             for k, c in np.argwhere(network.motion_free[images])
         )  # fmt: skip
-        cov = cofactor[at[:, :, None], at[:, None, :]] * self.fit.variance
+        cov = cofactor * self.fit.variance
         return MotionEstimates(tuple(network.images[i] for i in images), values, cov, tests, network.unit)
 
     def _partners(self, columns: Rows) -> tuple[tuple[str, float], ...]:
         """Most correlated other reduced unknown of each of these columns, and the correlation."""
-        q, names = self.fit.cofactors.reduced, self.fit.unknowns.names
-        size = np.sqrt(np.maximum(np.diag(q), 0.0))
+        reduced, names = self.fit.cofactors.reduced, self.fit.unknowns.names
+        size = np.sqrt(np.maximum(reduced.diagonal, 0.0))
         size = np.where(size > 0, size, np.inf)
         found = []
-        for column in columns:
-            r = q[column] / (size * size[column])
+        for column, q in zip(columns, reduced.rows(columns), strict=True):
+            r = q / (size * size[column])
             r[column] = 0.0
             best = int(np.argmax(np.abs(r)))
             found.append((names[best], float(r[best])))
@@ -399,14 +401,14 @@ class Result(Display):
     def camera_covariance(self, c: int) -> Array:
         """Return the covariance of the estimated camera parameters, ordered as :meth:`camera_columns`."""
         _, columns, _ = self.camera_columns(c)
-        covariance: Array = self.fit.cofactors.reduced[np.ix_(columns, columns)] * self.fit.variance
+        covariance: Array = self.fit.cofactors.reduced.block(columns, columns) * self.fit.variance
         return covariance
 
     def camera_tests(self, c: int, alpha: float = 0.05) -> tuple[CoefficientTest, ...]:
         """Test each distortion and additional parameter of a camera against zero."""
         names, columns, values = self.camera_columns(c)
         tested = distortion_names(names, self.network.cameras[c].model)
-        size = np.sqrt(np.diag(self.fit.cofactors.reduced)[columns])
+        size = np.sqrt(np.diag(self.fit.cofactors.reduced.block(columns, columns)))
         sigma0 = self.sigma0 if self.redundancy > 0 else None
         return tuple(
             ratio_test(name, float(value / s), sigma0, self.redundancy, alpha)
@@ -444,10 +446,10 @@ class Result(Display):
 
     def _pose_covariance(self, parameters: Callable[[Array], Array]) -> Array:
         """Propagate from rotations about the camera axes to other rotation parameters."""
-        unknowns, cofactor = self.fit.unknowns, self.fit.cofactors.reduced
+        unknowns = self.fit.unknowns
         images = np.flatnonzero(unknowns.pose >= 0)
         at = unknowns.pose[images, None] + np.arange(6)
-        block = cofactor[at[:, :, None], at[:, None, :]] * self.fit.variance
+        block = self.fit.cofactors.reduced.blocks(at) * self.fit.variance
         turn = np.tile(np.eye(6), (len(images), 1, 1))
         rotation = self.fit.values.rotation[images]
         # Projection centres of parallel rays are along the axes of the camera.

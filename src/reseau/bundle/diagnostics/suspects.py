@@ -183,7 +183,7 @@ def doubtful_parameters(problem: BundleProblem, fit: BundleFit) -> list[Remark]:
         if at < 0:
             continue
         columns = np.arange(at, at + count)
-        sigma = np.sqrt(np.diag(again.cofactors.reduced)[columns] * again.variance)
+        sigma = np.sqrt(np.diag(again.cofactors.reduced.block(columns, columns)) * again.variance)
         rows = again.unknowns.free[c, :count]
         change = np.abs(again.values.cameras[c, rows] - old.values[rows])
         named = [

@@ -53,7 +53,7 @@ def covariance_by_targets(result: Result, c: int) -> Array | None:
     k, cofactors = len(columns), fit.cofactors
     total = np.zeros((k, k))
     kept = fit.unknowns.kept[at]
-    between = [cofactors.reduced[np.ix_(columns, start + np.arange(3))] for start in kept[kept >= 0]]
+    between = [cofactors.reduced.block(columns, start + np.arange(3)) for start in kept[kept >= 0]]
     eliminated = at[kept < 0]
     for begin in range(0, len(eliminated), _AT_ONCE):
         some = eliminated[begin : begin + _AT_ONCE]

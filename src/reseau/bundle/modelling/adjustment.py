@@ -70,6 +70,10 @@ class Options:
         Relative offset at which the iteration has converged.
     watch : callable, optional
         Called with the number of iterations and vᵀPv after each iteration.
+    memory_gb : float, optional
+        Memory (GB) that normal equations and their factors may take; by default half of what is available.
+        Where they need more, they are solved by conjugate gradients: the estimates are the same, covariances
+        of single images and cameras are computed when asked for, other statistics are not.
 
     Examples
     --------
@@ -84,12 +88,15 @@ class Options:
     max_iterations: int = 200
     tolerance: float = 1e-6
     watch: Callable[[int, float], None] | None = None
+    memory_gb: float | None = None
 
     def __post_init__(self) -> None:
         if self.outliers not in ("keep", "reject"):
             raise UsageError(f"is {self.outliers!r}, not `keep` or `reject`", where="Options.outliers")
         if not 0 < self.alpha < 1 or not 0 < self.max_fraction < 1:
             raise UsageError("must be between 0 and 1", where="alpha and max_fraction")
+        if self.memory_gb is not None and not self.memory_gb >= 0:
+            raise UsageError(f"is {self.memory_gb!r}, not a number of GB", where="Options.memory_gb")
 
 
 def problem_of(network: Network, options: Options | None = None) -> tuple[BundleProblem, tuple[Remark, ...]]:
@@ -140,8 +147,9 @@ def _begun(
         scale = _scale_of_bases(network, places)
         start, found = Similarity(scale, np.eye(3), np.zeros(3))(start), replace(found, xyz=scale * found.xyz)
     problem = BundleProblem(
-        network, start, found.xyz, None, options.max_iterations, options.tolerance, options.watch
-    )
+        network, start, found.xyz, None, options.max_iterations, options.tolerance, options.watch,
+        memory=None if options.memory_gb is None else 1e9 * options.memory_gb,
+    )  # fmt: skip
     if not settle:
         return replace(problem, rounds=LAST_ROUND), found.notes, doubts
     if len(lost_images(network, start.x0, start.xyz)):
@@ -263,6 +271,13 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
             return Failure(remark.text, remark.code)
     found += doubts
     if options.outliers == "reject":
+        large = problem.too_large
+        if large:
+            return Failure(
+                f"{large}; without them gross errors cannot be rejected: keep them, allow more memory, or "
+                "adjust parts of the network",
+                Code.TOO_LARGE,
+            )
         problem = _within_the_images(problem)
     problem, false_bars = without_false_bars(problem)
     found += false_bars
@@ -282,6 +297,9 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         if isinstance(plain, Failure):
             return _explained(plain, problem, found)
         fit, given = plain, problem.weights
+        if not fit.cofactors.reduced.known:
+            found += [_without_statistics(problem), *notes]
+            return Result(network, fit, np.zeros(len(network.xy), dtype=bool), (), tuple(found))
         _, of_control = (None, []) if grave else _control(problem, fit)
     n = len(network.xy)
     rejected = np.asarray(fit.rejected[: 2 * n].reshape(n, 2).any(axis=1))
@@ -294,6 +312,16 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         found += _frontal(network, bare)
     found += many_rejected(network, rejected)
     return Result(network, fit, rejected, steps, (*found, *notes, *checks(bare)))
+
+
+def _without_statistics(problem: BundleProblem) -> Remark:
+    """Return what to say of an adjustment by conjugate gradients."""
+    return Remark(
+        f"{problem.too_large}: solved by conjugate gradients; covariances of single images and cameras are "
+        "computed when asked for, those of all images and points, redundancy numbers, tests and checks are "
+        "not; allow more memory for them",
+        Code.TOO_LARGE,
+    )
 
 
 def _within_the_images(problem: BundleProblem) -> BundleProblem:

@@ -92,23 +92,55 @@ class Arrow:
         solved: Array = (np.concatenate([head, tail]).T * self.scale).T
         return solved
 
-    def inverse(self) -> Array:
-        """Return the inverse (u, u)."""
-        if len(self.band):
-            u = len(self.scale)
-            whole = np.empty((u, u))
-            # In pieces, so that not all right-hand sides of a large block are in memory at once.
-            for begin in range(0, u, 512):
-                unit = np.zeros((u, min(512, u - begin)))
-                unit[np.arange(begin, begin + unit.shape[1]), np.arange(unit.shape[1])] = 1.0
-                whole[:, begin : begin + unit.shape[1]] = self.solve(unit)
-            return whole
-        inverse, _ = scipy.linalg.lapack.dpotri(self.corner, lower=1)
-        lower = np.tril(inverse)
-        full: Array = lower + np.tril(lower, -1).T
-        full *= self.scale[:, None]
-        full *= self.scale
-        return full
+    def inverse(self) -> tuple[Array, Array]:
+        """Compute the entries of the inverse inside the band (b, w + 1), and its full rows (r, u).
+
+        With L the factor in blocks of the width of the band, the inverse Z has the blocks
+        Z₂₁ = −Z₂₂ L₂₁ L₁₁⁻¹ and Z₁₁ = L₁₁⁻ᵀ L₁₁⁻¹ − (L₂₁ L₁₁⁻¹)ᵀ Z₂₁, from the last to the first; only the
+        factor is needed besides them (Takahashi, Fagan & Chen 1973).
+        """
+        b, r = self.coupling.shape
+        corner = scipy.linalg.lapack.dpotri(self.corner, lower=1)[0] if r else np.zeros((0, 0))
+        _mirror(corner)
+        if not b:
+            corner *= self.scale[:, None]
+            corner *= self.scale
+            return np.zeros((0, 1)), corner
+        across = _backward(self.band, self.coupling) if r else np.zeros((b, 0))
+        rows = np.concatenate([-(across @ corner).T, corner], axis=1)
+        rows *= self.scale[b:, None] * self.scale
+        return self._inside(across, corner), rows
+
+    def _inside(self, across: Array, corner: Array) -> Array:
+        """Entries of the inverse inside the band; `across` (b, r) is A⁻¹ times the full rows' columns."""
+        b, width = self.band.shape
+        size = max(width - 1, 1)
+        inside = np.zeros((b, width))
+        padded = np.concatenate([self.scale[:b], np.zeros(width)])
+        down = np.arange(width)
+        after, later, below = np.zeros((0, 0)), 0, slice(b, b)
+        for begin in range((b - 1) // size * size, -1, -size):
+            end = min(begin + size, b)
+            k = end - begin
+            own = _dense(self.band[begin:end], 0, k)
+            inverse = scipy.linalg.solve_triangular(own, np.eye(k), lower=True, check_finite=False)
+            first = inverse.T @ inverse
+            # Z without the part by the full rows, which is added last.
+            second = np.zeros((later, k))
+            if later:
+                through = _dense(self.band[begin:end], k, later) @ inverse
+                second = -after @ through
+                first -= through.T @ second
+            whole = np.concatenate([first, second])
+            if across.shape[1]:
+                part = across[begin:end] @ corner
+                whole = whole + np.concatenate([across[begin:end], across[below]]) @ part.T
+            whole = np.concatenate([whole, np.zeros((width, k))])
+            at = np.arange(k)[:, None]
+            own_scale = np.lib.stride_tricks.sliding_window_view(padded[begin:], width)[:k]
+            inside[begin:end] = whole[at + down, at] * own_scale * self.scale[begin:end, None]
+            after, later, below = first, k, slice(begin, end)
+        return inside
 
     @property
     def weakest(self) -> float:
@@ -143,3 +175,20 @@ def _backward(lower: Array, sides: Array) -> Array:
 
 def _columns(sides: Array) -> Array:
     return np.asfortranarray(sides[:, None] if sides.ndim == 1 else sides)
+
+
+def _dense(band: Array, below: int, rows: int) -> Array:
+    """Part (rows, k) of the columns (k, w + 1) of a factor, which begins `below` rows under the first."""
+    k, width = band.shape
+    down = np.arange(below, below + rows)[:, None] - np.arange(k)
+    inside = (down >= 0) & (down < width)
+    return np.where(inside, band[np.arange(k), np.clip(down, 0, width - 1)], 0.0)
+
+
+def _mirror(matrix: Array) -> None:
+    """Copy the lower triangle of a matrix to the upper one, in pieces."""
+    for begin in range(0, len(matrix), 512):
+        end = min(begin + 512, len(matrix))
+        own = matrix[begin:end, begin:end]
+        own[:] = np.tril(own) + np.tril(own, -1).T
+        matrix[begin:end, end:] = matrix[end:, begin:end].T

@@ -29,6 +29,9 @@ _GOOD, _SHRINK, _FAIR, _SLOWLY = 0.6, 0.3, 0.2, 0.5
 # Damping at which a step is practically undamped; relative decrease that is rounding; relative offset
 # accepted in the last iteration.
 _SMALL, _FLAT, _NEAR = 1e-6, 1e-9, 1e-3
+# Conjugate gradients: relative length of the error of a step, at first and near the minimum, and its length
+# relative to the largest correction that counts as none.
+_FORCING, _SHARP, _BELOW = 0.1, 1e-3, 0.1
 # Relative increase of the sum of squares that can be rounding.
 _ROUNDING = 1e-10
 # Points farther away than this many times the extent of the network are at infinity.
@@ -114,13 +117,17 @@ def iterate(
             "misfits of image coordinates are not finite at the approximate values", Code.NOT_FINITE
         )
     radius = _HORIZON * _extent(system, start)
-    curved = False
+    curved, forcing = False, _FORCING
     costs, rank = [cost], max(1, 2 * len(linear.misfits) + len(linear.other_misfits) - redundancy)
+    if system.iterative:
+        # Steps are not exact: the next correction of each unknown must be small, not that of all on average.
+        tolerance /= np.sqrt(rank)
     while tried < max_iterations:
         tried += 1
         normal = linear.normal(damping)
+        unit = np.sqrt(rank * max(cost, 1e-300) / max(1, redundancy))
         try:
-            step = normal.correction()
+            step = normal.correction(forcing, _BELOW * tolerance * unit)
         except Singular:
             damping, growth = max(damping, _LEAST_DAMPING) * 10.0 * growth, growth * 2.0
             if damping > _MOST_DAMPING:
@@ -128,8 +135,9 @@ def iterate(
                     "the normal equations are singular", Code.SINGULAR, iterations=tried, costs=tuple(costs)
                 )
             continue
-        offset = np.sqrt(max(step.predicted, 0.0) / rank) / np.sqrt(max(cost, 1e-300) / max(1, redundancy))
-        settled = damping <= _SMALL or step.predicted <= 1e-14 * cost
+        offset = np.sqrt(max(step.predicted, 0.0)) / unit
+        forcing = float(np.clip(offset, _SHARP, _FORCING))
+        settled = (damping <= _SMALL or step.predicted <= 1e-14 * cost) and step.complete
         # In the last iteration a larger offset is accepted; a stalled iteration ends where it is.
         slow = len(costs) > _STALL_ITERATIONS
         stalled = slow and costs[-_STALL_ITERATIONS] - cost <= _STALL_DECREASE * cost

@@ -23,9 +23,11 @@ __all__ = [
     "Pattern",
     "Sums",
     "assemble",
+    "assemble_blocks",
     "gradients",
     "locals_of",
     "posterior",
+    "product",
     "reduce_sides",
     "substitute",
     "through",
@@ -248,6 +250,28 @@ def _touched(j: int, pattern: Pattern) -> int:
     return pattern.offset[last] + pattern.size[last] if last >= pattern.local[j] else 0
 
 
+@called
+def _point(
+    j: int, rows: Array, misfits: Array, pattern: Pattern, prior: Array, damping: float, v: Array,
+    inverse: Array, side: Array, diagonal: Array,
+) -> float:  # fmt: skip
+    """Compute V⁻¹, right-hand side and diagonal of one point; return the smallest pivot. `v` is room."""
+    last = rows.shape[2] - 3
+    for q in range(3):
+        v[q, 0], v[q, 1], v[q, 2] = 0.0, 0.0, 0.0
+        v[q, q], side[j, q] = prior[j, q, 0], prior[j, q, 1]
+    for k in range(pattern.first[j], pattern.first[j + 1]):
+        for q in range(3):
+            b0, b1 = rows[k, 0, last + q], rows[k, 1, last + q]
+            side[j, q] += b0 * misfits[k, 0] + b1 * misfits[k, 1]
+            for s in range(q + 1):
+                v[q, s] += b0 * rows[k, 0, last + s] + b1 * rows[k, 1, last + s]
+    for q in range(3):
+        diagonal[j, q] = v[q, q]
+        v[q, q] *= 1.0 + damping
+    return _inverse(j, v, inverse)
+
+
 @compiled
 def assemble(
     begin: int, end: int, rows: Array, misfits: Array, pattern: Pattern, prior: Array, damping: float,
@@ -263,25 +287,12 @@ def assemble(
     for j in range(begin, end):
         most = max(most, _touched(j, pattern))
     w, t, v, least = np.empty((3, most)), np.empty((most, 3)), np.empty((3, 3)), 1.0
-    last = rows.shape[2] - 3
     for j in range(begin, end):
         for k in range(pattern.first[j], pattern.first[j + 1]):
             _blocks(k, rows, misfits, pattern, sums)
         if not pattern.eliminated[j]:
             continue
-        for q in range(3):
-            v[q, 0], v[q, 1], v[q, 2] = 0.0, 0.0, 0.0
-            v[q, q], side[j, q] = prior[j, q, 0], prior[j, q, 1]
-        for k in range(pattern.first[j], pattern.first[j + 1]):
-            for q in range(3):
-                b0, b1 = rows[k, 0, last + q], rows[k, 1, last + q]
-                side[j, q] += b0 * misfits[k, 0] + b1 * misfits[k, 1]
-                for s in range(q + 1):
-                    v[q, s] += b0 * rows[k, 0, last + s] + b1 * rows[k, 1, last + s]
-        for q in range(3):
-            diagonal[j, q] = v[q, q]
-            v[q, q] *= 1.0 + damping
-        least = min(least, _inverse(j, v, inverse))
+        least = min(least, _point(j, rows, misfits, pattern, prior, damping, v, inverse, side, diagonal))
         _cross(j, rows, pattern, w)
         for i in range(_touched(j, pattern)):
             for q in range(3):
@@ -293,6 +304,93 @@ def assemble(
                 sums.reduced[pattern.at[a] + i] -= part
         _eliminate(j, w, t, pattern, sums)
     return least
+
+
+@compiled
+def assemble_blocks(
+    begin: int, end: int, rows: Array, misfits: Array, pattern: Pattern, prior: Array, damping: float,
+    sums: Sums, inverse: Array, side: Array, diagonal: Array, first: Rows, base: Rows, near: Array,
+) -> float:  # fmt: skip
+    """Form right-hand sides as :func:`assemble` does, and of the matrix only its diagonal blocks.
+
+    Unknowns with the same `first` (u,) are one block; its row of unknown i begins at `base[i]` of `near`, of
+    which the lower triangles are written.
+    """
+    most = 1
+    for j in range(begin, end):
+        most = max(most, _touched(j, pattern))
+    w, t, v, index, least = np.empty((3, most)), np.empty(3), np.empty((3, 3)), np.empty(most, np.int64), 1.0
+    for j in range(begin, end):
+        for k in range(pattern.first[j], pattern.first[j + 1]):
+            r0, r1 = misfits[k, 0], misfits[k, 1]
+            for a in range(SEGMENTS):
+                for i in range(pattern.width[k, a]):
+                    at, column = pattern.start[k, a] + i, pattern.column[k, a] + i
+                    x0, x1 = rows[k, 0, column], rows[k, 1, column]
+                    sums.diagonal[at] += x0 * x0 + x1 * x1
+                    sums.gradient[at] += x0 * r0 + x1 * r1
+                    place = base[at] - first[at]
+                    for b in range(SEGMENTS):
+                        sb, cb = pattern.start[k, b], pattern.column[k, b]
+                        for o in range(pattern.width[k, b]):
+                            if sb + o <= at and first[sb + o] == first[at]:
+                                near[place + sb + o] += x0 * rows[k, 0, cb + o] + x1 * rows[k, 1, cb + o]
+        if not pattern.eliminated[j]:
+            continue
+        least = min(least, _point(j, rows, misfits, pattern, prior, damping, v, inverse, side, diagonal))
+        _cross(j, rows, pattern, w)
+        for a in range(pattern.local[j], pattern.local[j + 1]):
+            for i in range(pattern.size[a]):
+                index[pattern.offset[a] + i] = pattern.at[a] + i
+        for i in range(_touched(j, pattern)):
+            at = index[i]
+            for q in range(3):
+                t[q] = w[0, i] * inverse[j, 0, q] + w[1, i] * inverse[j, 1, q] + w[2, i] * inverse[j, 2, q]
+            sums.reduced[at] -= t[0] * side[j, 0] + t[1] * side[j, 1] + t[2] * side[j, 2]
+            o = i
+            while o >= 0 and first[index[o]] == first[at]:
+                place = base[at] + index[o] - first[at]
+                near[place] -= t[0] * w[0, o] + t[1] * w[1, o] + t[2] * w[2, o]
+                o -= 1
+    return least
+
+
+@compiled
+def product(
+    begin: int, end: int, rows: Array, pattern: Pattern, inverse: Array, x: Array, out: Array
+) -> None:
+    """Add (Σ AᵀA − Σ W V⁻¹ Wᵀ) x of the points begin…end to `out` (u,), without the matrix."""
+    most, last = 1, rows.shape[2] - 3
+    for j in range(begin, end):
+        most = max(most, pattern.first[j + 1] - pattern.first[j])
+    seen, h, g = np.empty((most, 2)), np.empty(3), np.zeros(3)
+    for j in range(begin, end):
+        k0 = pattern.first[j]
+        h[:] = 0.0
+        for k in range(k0, pattern.first[j + 1]):
+            s0, s1 = 0.0, 0.0
+            for a in range(SEGMENTS):
+                at, column = pattern.start[k, a], pattern.column[k, a]
+                for i in range(pattern.width[k, a]):
+                    s0 += rows[k, 0, column + i] * x[at + i]
+                    s1 += rows[k, 1, column + i] * x[at + i]
+            seen[k - k0, 0], seen[k - k0, 1] = s0, s1
+            for q in range(3):
+                h[q] += rows[k, 0, last + q] * s0 + rows[k, 1, last + q] * s1
+        if pattern.eliminated[j]:
+            for q in range(3):
+                g[q] = inverse[j, q, 0] * h[0] + inverse[j, q, 1] * h[1] + inverse[j, q, 2] * h[2]
+        else:
+            g[:] = 0.0
+        for k in range(k0, pattern.first[j + 1]):
+            s0, s1 = seen[k - k0, 0], seen[k - k0, 1]
+            for q in range(3):
+                s0 -= rows[k, 0, last + q] * g[q]
+                s1 -= rows[k, 1, last + q] * g[q]
+            for a in range(SEGMENTS):
+                at, column = pattern.start[k, a], pattern.column[k, a]
+                for i in range(pattern.width[k, a]):
+                    out[at + i] += rows[k, 0, column + i] * s0 + rows[k, 1, column + i] * s1
 
 
 @compiled
@@ -365,11 +463,25 @@ def gradients(
                     side[j, q] += rows[k, 0, last + q] * r0 + rows[k, 1, last + q] * r1
 
 
+@called
+def _entry(band: Array, border: Array, i: int, o: int) -> float:
+    """Entry of a symmetric arrow matrix, both triangles of whose full rows are stored."""
+    bands = len(band)
+    if i >= bands:
+        return float(border[i - bands, o])
+    if o >= bands:
+        return float(border[o - bands, i])
+    return float(band[o, i - o]) if i >= o else float(band[i, o - i])
+
+
 @compiled
 def posterior(
-    begin: int, end: int, rows: Array, pattern: Pattern, inverse: Array, z: Array, points: Array, seen: Array
-) -> None:
-    """Compute cofactors from the inverse z (u, u) of the reduced normal equations.
+    begin: int, end: int, rows: Array, pattern: Pattern, inverse: Array, band: Array, border: Array,
+    points: Array, seen: Array,
+) -> None:  # fmt: skip
+    """Compute cofactors from the inverse Z of the reduced normal equations, stored as they are.
+
+    Only entries inside the band and the full rows are read: both triangles of the latter.
 
     Written to `points` (p, 3, 3): Q = V⁻¹ + Tᵀ Z T with T = W V⁻¹, for the points; to `seen` (n, 2, 2):
     A Z Aᵀ − A Z T Bᵀ − B Tᵀ Z Aᵀ + B Q Bᵀ, for the adjusted image coordinates, whitened.
@@ -394,7 +506,7 @@ def posterior(
             for i in range(m):
                 y0, y1, y2 = 0.0, 0.0, 0.0
                 for o in range(m):
-                    x = z[index[i], index[o]]
+                    x = _entry(band, border, index[i], index[o])
                     y0 += x * t[o, 0]
                     y1 += x * t[o, 1]
                     y2 += x * t[o, 2]
@@ -406,13 +518,14 @@ def posterior(
                         x += t[i, s] * y[i, c]
                     points[j, s, c] = x
         for k in range(pattern.first[j], pattern.first[j + 1]):
-            _hat(j, k, rows, pattern, z, y, points, cross, seen)
+            _hat(j, k, rows, pattern, band, border, y, points, cross, seen)
 
 
 @called
 def _hat(
-    j: int, k: int, rows: Array, pattern: Pattern, z: Array, y: Array, q: Array, cross: Array, out: Array
-) -> None:
+    j: int, k: int, rows: Array, pattern: Pattern, band: Array, border: Array, y: Array, q: Array,
+    cross: Array, out: Array,
+) -> None:  # fmt: skip
     """Compute the cofactor (2, 2) of the adjusted coordinates of one ray; `cross` (2, 3) is room."""
     eliminated, last = pattern.eliminated[j], rows.shape[2] - 3
     h00, h01, h11 = 0.0, 0.0, 0.0
@@ -423,8 +536,9 @@ def _hat(
             for b in range(SEGMENTS):
                 sb, cb = pattern.start[k, b], pattern.column[k, b]
                 for o in range(pattern.width[k, b]):
-                    x0 += z[at, sb + o] * rows[k, 0, cb + o]
-                    x1 += z[at, sb + o] * rows[k, 1, cb + o]
+                    z = _entry(band, border, at, sb + o)
+                    x0 += z * rows[k, 0, cb + o]
+                    x1 += z * rows[k, 1, cb + o]
             a0, a1 = rows[k, 0, pattern.column[k, a] + i], rows[k, 1, pattern.column[k, a] + i]
             h00 += a0 * x0
             h01 += a0 * x1

@@ -16,10 +16,12 @@ from ...adjust.stochastic import Blocks, Weighting
 from ...core.data import Array, Mask, Rows
 from .arrow import Arrow, Singular
 from .compiled import in_parallel
+from .conjugate import Conjugate
 from .constraints import Constraints
 from .datum import Freedom, held_for
 from .normal import SEGMENTS, posterior
 from .rank import PARALLEL
+from .reduced import Reduced, Referral
 from .system import Linear, Normal
 
 __all__ = ["BlockSolution", "Cofactors", "cofactors_of", "inverse_from_rows"]
@@ -30,6 +32,8 @@ _RANK = 1e-14
 _EXACT, _INEXACT = 1e-7, 1e-4
 # The same with a stage: frontal images make the normal equations lose half of their digits.
 _STAGED = 1e-3
+# Accuracy of the solution for a random right-hand side: it is only asked whether there is one.
+_ROUGHLY = 1e-3
 # Largest number of entries of F; up to this, its decomposition takes about a second.
 _ENTRIES = 20_000_000
 # Singular values below this part of the largest count as zero, as in :mod:`reseau.adjust`.
@@ -75,29 +79,14 @@ class BlockSolution(Whitened):
 
 
 @dataclass(frozen=True, eq=False)
-class Referral:
-    """Terms of the transformation of cofactors to inner constraints: Q = Q⁻ − G N Hᵀ − H N Gᵀ + G M Gᵀ.
-
-    N = (GᵀEG)⁻¹ (d, d) is `weight`; H = Q⁻EG of reduced unknowns (u, d) and points (p, 3, d); M = N GᵀE H N
-    is `m`; `before` is Q⁻ of the reduced unknowns.
-    """
-
-    freedom: Freedom
-    before: Array
-    weight: Array
-    h: Array
-    h_points: Array
-    m: Array
-
-
-@dataclass(frozen=True, eq=False)
 class Cofactors:
     """Cofactors after the adjustment.
 
     Parameters
     ----------
-    reduced : ndarray (u, u)
-        Of the reduced unknowns.
+    reduced : Reduced
+        Of the reduced unknowns. Where its attribute `known` is false, as after conjugate gradients, all other
+        cofactors are NaN.
     points : ndarray (p, 3, 3)
         Of the points; zero for points that are held or not adjusted.
     seen : ndarray (n, 2, 2)
@@ -112,7 +101,7 @@ class Cofactors:
         Of readings and axis of a stage.
     """
 
-    reduced: Array
+    reduced: Reduced
     points: Array
     seen: Array
     others: Array
@@ -142,7 +131,8 @@ class Cofactors:
         for q, j in enumerate(points):
             through[k + 3 * q : k + 3 * q + 3] = -(_cross(linear, int(j)) @ inverse[j]).T
         z = self.reduced if self.referral is None else self.referral.before
-        joint = through @ z @ through.T
+        at = np.flatnonzero(through.any(axis=0))
+        joint = through[:, at] @ z.block(at, at) @ through[:, at].T
         for q, j in enumerate(points):
             own = slice(k + 3 * q, k + 3 * q + 3)
             joint[own, own] += inverse[j]
@@ -192,7 +182,10 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
         if datum is not None:
             held[held_for(freedom, system.unknowns, diagonal)] = True
             normal.hold(held)
-        z, points, seen, others = _marginal(linear, normal, held, taking_part)
+        if system.iterative:
+            z, points, seen, others = _unknown(linear, normal, held, taking_part)
+        else:
+            z, points, seen, others = _marginal(linear, normal, held, taking_part)
     kept = np.flatnonzero(system.unknowns.kept >= 0)
     columns = system.unknowns.kept[kept, None] + np.arange(3)
     referral, stage = None, None
@@ -202,14 +195,43 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
         referral = _referral(normal, freedom, datum & taking_part, z)
         if stage is not None:
             stage = _stage_in_datum(referral, stage, linear, q, normal, datum & taking_part)
-        z, points = _in_datum(referral, points)
-        points[kept] = z[columns[:, :, None], columns[:, None, :]]
+        z, points = z.referred(referral), _in_datum(referral, points)
+        points[kept] = z.blocks(columns)
     return Cofactors(z, points, seen, others, normal, referral, stage)
+
+
+def _unknown(
+    linear: Linear, normal: Normal, held: Mask, taking_part: Mask
+) -> tuple[Reduced, Array, Array, Array]:
+    """Cofactors that are solved for when they are asked for; NaN for all points and observations.
+
+    A random right-hand side has a part along every direction: where the observations leave one of them
+    undetermined, the solution does not reach its accuracy.
+
+    Raises
+    ------
+    Singular
+        When the observations do not determine the unknowns.
+    """
+    factors = normal.factorise()
+    if normal.least < PARALLEL or not isinstance(factors, Conjugate):
+        raise Singular
+    side = np.random.default_rng(0).normal(size=len(held)) * np.sqrt(normal.sums.diagonal)
+    factors.solve(np.where(held, 0.0, side), _ROUGHLY)
+    if not factors.complete:
+        raise Singular
+    z = Reduced(held, np.zeros((0, 1)), None, factors, normal.turn)
+    points = np.where(taking_part[:, None, None], np.full((len(linear.prior), 3, 3), np.nan), 0.0)
+    fixed = linear.system.movable == 0
+    points[fixed[:, :, None] | fixed[:, None, :]] = 0.0
+    seen = np.full((len(linear.misfits), 2, 2), np.nan)
+    others = np.full(len(linear.system.sigma_root), np.nan)
+    return z, points, seen, others
 
 
 def _marginal(
     linear: Linear, normal: Normal, held: Mask, taking_part: Mask
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Reduced, Array, Array, Array]:
     """Cofactors of reduced unknowns, points, image coordinates and other observations in some datum.
 
     The trace of the cofactors of the adjusted observations is the number of unknowns. Where it is not, the
@@ -224,10 +246,16 @@ def _marginal(
     free = int((~held).sum()) + _free_coordinates(linear, taking_part)
     try:
         arrow = normal.factorise()
-        if normal.least < PARALLEL:
+        if normal.least < PARALLEL or not isinstance(arrow, Arrow):
             raise Singular
-        z = arrow.inverse()
-        found = _with_inverse(linear, normal, z, held, taking_part, turned=True)
+        band, border = arrow.inverse()
+        bands = len(band)
+        # The rows of held unknowns are those of a unit matrix.
+        border[held[bands:]] = 0.0
+        border[:, held] = 0.0
+        band[held[:bands], 0] = 0.0
+        z = Reduced(held, band, border, arrow if bands else None, normal.turn)
+        found = _with_inverse(linear, normal, z, held, taking_part)
         missing = abs(_total(found) - free)
         if arrow.weakest >= _RANK and missing < _EXACT:
             return found
@@ -236,7 +264,8 @@ def _marginal(
     if normal.least < PARALLEL:
         raise Singular
     if _is_small(linear):
-        found = _with_inverse(linear, normal, inverse_from_rows(normal, held), held, taking_part)
+        z = Reduced.of_matrix(inverse_from_rows(normal, held), held)
+        found = _with_inverse(linear, normal, z, held, taking_part)
         missing = abs(_total(found) - free)
     if not missing < _INEXACT * max(1.0, system.unknowns.size / 1000.0):
         raise Singular
@@ -250,7 +279,7 @@ def _constrained(
     columns: Mask,
     taking_part: Mask,
     inner: Freedom | None,
-) -> tuple[tuple[Array, Array, Array, Array], Array]:
+) -> tuple[tuple[Reduced, Array, Array, Array], Array]:
     """Compute the same cofactors with a stage or a rig, and those of its independent unknowns (size, size).
 
     `inner` is the freedom without a datum.
@@ -268,10 +297,11 @@ def _constrained(
         held[constraints.held_for(inner.reduced, free.back, slopes, np.diag(free.matrix))] = True
     own = normal.constrained(held)
     arrow = Arrow.factorise(np.zeros((0, 1)), own.matrix)
-    q = arrow.inverse()
+    _, q = arrow.inverse()
     q[held], q[:, held] = 0.0, 0.0
     back = linear.sparse_transformation
-    found = _with_inverse(linear, normal, back @ (back @ q).T, columns, taking_part, independent=q)
+    z = Reduced.of_matrix(back @ (back @ q).T, columns)
+    found = _with_inverse(linear, normal, z, columns, taking_part, independent=q)
     slopes = linear.constraint_slopes
     found[3][len(found[3]) - len(slopes) :] = np.einsum("ai,ij,aj->a", slopes, q, slopes, optimize=True)
     missing = abs(_total(found) - int((~held).sum()) - _free_coordinates(linear, taking_part))
@@ -280,7 +310,7 @@ def _constrained(
     return found, q
 
 
-def _total(found: tuple[Array, Array, Array, Array]) -> float:
+def _total(found: tuple[Reduced, Array, Array, Array]) -> float:
     """Trace of the whitened cofactors of the adjusted observations."""
     _, _, seen, others = found
     return float(np.trace(seen, axis1=1, axis2=2).sum() + others.sum())
@@ -293,38 +323,36 @@ def _free_coordinates(linear: Linear, taking_part: Mask) -> int:
 
 
 def _with_inverse(
-    linear: Linear, normal: Normal, z: Array, held: Mask, taking_part: Mask, *, turned: bool = False,
+    linear: Linear, normal: Normal, z: Reduced, held: Mask, taking_part: Mask, *,
     independent: Array | None = None,
-) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+) -> tuple[Reduced, Array, Array, Array]:  # fmt: skip
     """Cofactors from the inverse of the reduced normal equations.
 
-    `turned` tells that these are for the combinations of camera parameters of :class:`Normal`. `independent`
-    is the inverse for the independent unknowns of a stage or a rig.
+    `independent` is the inverse for the independent unknowns of a stage or a rig.
     """
     system = linear.system
-    z[held] = 0.0
-    z[:, held] = 0.0
     points, seen = np.zeros((len(linear.prior), 3, 3)), np.zeros((len(linear.misfits), 2, 2))
-
-    rows, pattern, inverse = linear.turned_rows if turned and normal.bases else linear.rows, system.pattern, z
+    if z.border is None:
+        raise AssertionError("only with stored cofactors")
+    rows, pattern, band, border = linear.rows, system.pattern, z.band, z.border
+    if z.turn is not None:
+        rows = linear.turned_rows
     if independent is not None and linear.blocks is not None:
-        rows, pattern, inverse = linear.rows_through, system.through[0], independent
+        rows, pattern, border = linear.rows_through, system.through[0], independent
 
     def work(_: int, a: int, b: int) -> None:
-        posterior(a, b, rows, pattern, normal.inverse, inverse, points, seen)
+        posterior(a, b, rows, pattern, normal.inverse, band, border, points, seen)
 
     in_parallel(work, system.chunks)
-    if turned:
-        z = normal.in_parameters(normal.in_parameters(z).T)
     points *= system.movable[:, :, None] * system.movable[:, None, :]
     points[~taking_part] = 0.0
     kept = np.flatnonzero(system.unknowns.kept >= 0)
     columns = system.unknowns.kept[kept, None] + np.arange(3)
-    points[kept] = z[columns[:, :, None], columns[:, None, :]]
+    points[kept] = z.blocks(columns)
     return z, points, seen, _others(linear, z, points)
 
 
-def _others(linear: Linear, z: Array, points: Array) -> Array:
+def _others(linear: Linear, z: Reduced, points: Array) -> Array:
     """Cofactors of distances, observed coordinates and interior orientation, divided by their variances."""
     system = linear.system
     hats = np.zeros(len(system.sigma_root))
@@ -332,18 +360,18 @@ def _others(linear: Linear, z: Array, points: Array) -> Array:
     _, coordinates, _ = system.others.slices
     hats[coordinates] = points[j, axis, axis]
     _, _, rows, columns = system.prior_column
-    hats[rows] = z[columns, columns]
+    hats[rows] = z.blocks(columns[:, None])[:, 0, 0]
     hats *= system.sigma_root**2
     for k, column, slope in linear.slopes():
-        hats[k] = slope @ z[np.ix_(column, column)] @ slope
+        hats[k] = slope @ z.block(column, column) @ slope
     return hats
 
 
-def _referral(normal: Normal, freedom: Freedom, chosen: Mask, z: Array) -> Referral:
+def _referral(normal: Normal, freedom: Freedom, chosen: Mask, z: Reduced) -> Referral:
     """Terms of the transformation of cofactors to inner constraints over the chosen points."""
     system, d = normal.linear.system, freedom.defect
     g, g_reduced = _chosen(normal, freedom, chosen)
-    h = z @ (g_reduced + normal.reduced_sides(g))
+    h = z.times(g_reduced + normal.reduced_sides(g))
     h_points = normal.points(g, h) * system.movable[:, :, None]
     inner = g.reshape(-1, d).T @ g.reshape(-1, d) + g_reduced.T @ g_reduced
     weight = np.asarray(np.linalg.inv(inner), dtype=np.float64)
@@ -377,15 +405,13 @@ def _stage_in_datum(
     return np.asarray(stage - one - one.T + own @ referral.m @ own.T)
 
 
-def _in_datum(referral: Referral, points: Array) -> tuple[Array, Array]:
-    """Cofactors of the reduced unknowns and of the points with inner constraints."""
+def _in_datum(referral: Referral, points: Array) -> Array:
+    """Cofactors of the points with inner constraints."""
     freedom, weight, m = referral.freedom, referral.weight, referral.m
-    one = freedom.reduced @ weight @ referral.h.T
-    z = referral.before - one - one.T + freedom.reduced @ m @ freedom.reduced.T
     cross = np.einsum("pad,de,pbe->pab", freedom.points, weight, referral.h_points, optimize=True)
     points = points - cross - np.swapaxes(cross, 1, 2)
     points += np.einsum("pad,de,pbe->pab", freedom.points, m, freedom.points, optimize=True)
-    return z, points
+    return points
 
 
 def _cross(linear: Linear, point: int) -> Array:
@@ -459,11 +485,6 @@ def _reduced_rows(normal: Normal) -> Array:
     root = system.sigma_root
     # An observed coordinate is a row of B only, or a separate column where its point is kept.
     observed = -root[coordinates][:, None] * through[j, axis]
-    own = np.zeros((len(root), u))
-    rows_kept, columns_kept, rows_interior, columns_interior = system.prior_column
-    own[rows_kept, columns_kept] = root[rows_kept]
-    own[rows_interior, columns_interior] = root[rows_interior]
-    for k, column, slope in linear.slopes():
-        own[k, column] = slope
+    own = linear.other_rows.toarray()
     own[coordinates] += observed
     return np.concatenate([image, own])

@@ -18,6 +18,7 @@ from ...core.data import Array, Mask, Rows
 from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure
+from ...core.memory import available_memory
 from ...core.threads import one_thread
 from ..network import Network
 from ..network.network import Usable, finite, usable
@@ -54,6 +55,11 @@ LAST_ROUND = 12
 _BEFORE_WINDOWS, _ROUGHLY = 30, 1e-2
 # Relative standard deviation of a scale above which covariances of first order say nothing about it.
 _LOOSE = 0.2
+# What is wrong where conjugate gradients do not reach their accuracy at the estimates.
+_WEAK = (
+    "the observations determine the images too weakly for conjugate gradients, or not at all: are all of "
+    "them connected? With more memory for the normal equations the unknowns would be named"
+)
 # Iterations after which poorly determined points of an adjustment that has not converged are left out.
 _SLOW = 50
 
@@ -86,6 +92,9 @@ class BundleProblem(Display):
         Called with the number of iterations and vᵀPv after each iteration.
     rounds : int
         Number of rounds so far in which diverging points were left out.
+    memory : float, optional
+        Memory (bytes) that normal equations and their factors may take; by default half of what is available.
+        Where they need more, they are solved by conjugate gradients.
 
     Examples
     --------
@@ -103,6 +112,7 @@ class BundleProblem(Display):
     tolerance: float = 1e-6
     watch: Callable[[int, float], None] | None = None
     rounds: int = 0
+    memory: float | None = None
 
     def _facts(self) -> list[tuple[str, str]]:
         images, points = len(self.network.images), len(self.network.points)
@@ -150,6 +160,24 @@ class BundleProblem(Display):
         points, bars = len(self.network.points), self.others.slices[0].stop
         more = points + np.maximum(np.arange(len(self.others.value)) - bars + 1, 0)
         return np.concatenate([np.repeat(self.network.point_of, 2), more])
+
+    @property
+    def limit(self) -> float:
+        """Memory (bytes) that normal equations and their factors may take."""
+        return available_memory() / 2 if self.memory is None else self.memory
+
+    @property
+    def too_large(self) -> str:
+        """What is said where normal equations are solved by conjugate gradients; empty where they are not."""
+        unknowns, limit = Unknowns.of(self.network, finite(self.start.x0)), self.limit
+        if self.network.rig is not None or self.network.stage is not None:
+            return ""
+        if unknowns.bytes_of_factors <= limit:
+            return ""
+        return (
+            f"the normal equations of {unknowns.size} unknowns beside the points would take "
+            f"{unknowns.bytes_of_factors / 1e9:.3g} GB of memory, more than {limit / 1e9:.3g} GB"
+        )
 
     def with_weights(self, weights: ArrayLike | None) -> Self:
         """Return the problem with other factors on the weights."""
@@ -349,6 +377,8 @@ class _Run:
         self.system = System(
             self.unknowns, others, mine, factors, self.unknowns.dropped.copy(), problem.centre
         )
+        if self.system.constraints is None:
+            self.system.iterative = self.unknowns.bytes_of_factors > problem.limit
 
     def _read(self, reading: Rows) -> tuple[Mask, bool]:
         """Which images with an observed reading of a stage count, and whether any image on the stage does."""
@@ -446,6 +476,8 @@ class _Run:
                 left = self._without(weak, values)
                 left.start.x0[images] = np.nan
                 return left._adjusted(self.options)
+            if self.system.iterative:
+                return AdjustmentFailure(_WEAK, Code.SINGULAR, iterations=found.iterations, costs=found.costs)
             return undetermined(linear, freedom, tuple(found.costs))
         sigma0 = float(np.sqrt(linear.cost / redundancy)) if redundancy > 0 else 1.0
         if self._scale_is_loose((start, values), sigma0, chosen if inner else None):
@@ -490,7 +522,7 @@ class _Run:
             centres = values.x0[images] - values.x0[images].mean(axis=0)
             along = np.zeros(unknowns.size)
             along[unknowns.pose[images, None] + np.arange(3, 6)] = centres / (centres**2).sum()
-            if sigma0 * np.sqrt(along @ cofactors.reduced @ along) > _LOOSE:
+            if sigma0 * np.sqrt(along @ cofactors.reduced.times(along[:, None])[:, 0]) > _LOOSE:
                 return True
         return False
 

@@ -15,9 +15,20 @@ from ..network import Network
 from .arrow import Arrow, full
 from .camera_basis import CameraBasis, camera_bases, with_bases
 from .compiled import chunks_of, in_parallel
+from .conjugate import Conjugate
 from .constraints import Constrained, Constraints
 from .imaging import Bent, Imaging, Seen, mapped
-from .normal import Pattern, Sums, assemble, gradients, reduce_sides, substitute, through
+from .normal import (
+    Pattern,
+    Sums,
+    assemble,
+    assemble_blocks,
+    gradients,
+    product,
+    reduce_sides,
+    substitute,
+    through,
+)
 from .observations import OtherObservations
 from .unknowns import Unknowns
 from .values import Correction, Values
@@ -52,6 +63,8 @@ class System:
     ----------
     fixed : ndarray of int
         Independent unknowns of a stage or a rig that are held as the datum.
+    iterative : bool
+        Whether the normal equations are solved by conjugate gradients, without their matrix.
     """
 
     def __init__(
@@ -72,6 +85,7 @@ class System:
         self.pattern = unknowns.pattern
         self.constraints = Constraints.of(unknowns)
         self.fixed: Rows = np.zeros(0, dtype=np.intp)
+        self.iterative = False
         self.chunks = chunks_of(unknowns.first)
         self.imaging = Imaging(network, unknowns.extra_names, origin, unknowns.mounts)
 
@@ -350,6 +364,8 @@ class Linear:
         system, unknowns = self.system, self.system.unknowns
         if self.blocks is not None:
             return self._normal_through(damping)
+        if system.iterative:
+            return self._implicit(damping)
         u, bands = unknowns.size, unknowns.bands
         bases, rows = (self.bases, self.turned_rows) if turned else ((), self.rows)
         sums, inverse, side, diagonal, least = self._assembled(
@@ -370,6 +386,68 @@ class Linear:
         for basis in bases:
             sums.diagonal[basis.columns] = basis.diagonal
         return Normal(self, sums, inverse, side, diagonal, damping, least, bases)
+
+    def _implicit(self, damping: float) -> Implicit:
+        """Normal equations without their matrix."""
+        system, unknowns, p = self.system, self.system.unknowns, len(self.prior)
+        u, blocks, rows, bases = unknowns.size, unknowns.blocks, self.turned_rows, self.bases
+        inverse, side, points = np.zeros((p, 3, 3)), np.zeros((p, 3)), np.zeros((p, 3))
+        chunks, nothing = system.chunks, np.zeros((0, u))
+        parts = [Sums(np.zeros((0, 1)), nothing, np.zeros(u), np.zeros(u), np.zeros(u)) for _ in chunks]
+        near, least = [np.zeros(blocks.total) for _ in chunks], np.ones(len(chunks))
+
+        def work(part: int, a: int, b: int) -> None:
+            least[part] = assemble_blocks(
+                a, b, rows, self.misfits, system.pattern, self.prior, damping, parts[part], inverse, side,
+                points, blocks.first, blocks.base, near[part],
+            )  # fmt: skip
+
+        in_parallel(work, chunks)
+        sums, own, more = parts[0], near[0], self.other_rows
+        for other, entries in zip(parts[1:], near[1:], strict=True):
+            own += entries
+            for mine, theirs in zip(sums[2:], other[2:], strict=True):
+                mine += theirs
+        sums.gradient[:] += more.T @ self.other_misfits
+        sums.diagonal[:] += more.power(2).sum(axis=0)
+        sums.reduced[:] += sums.gradient
+        held = system.held.copy()
+        kept = np.flatnonzero(unknowns.kept >= 0)
+        held[(unknowns.kept[kept, None] + np.arange(3))[system.movable[kept] == 0]] = True
+        damped = damping * np.where(sums.diagonal > 0, sums.diagonal, 1.0)
+        for basis in bases:
+            damped[basis.columns] = 0.0
+            sums.diagonal[basis.columns] = basis.diagonal
+        added = [scipy.sparse.diags_array(damped).tocoo(), (more.T @ more).tocoo()]
+        if damping:
+            for basis in bases:
+                block = damping * (basis.turn.T * basis.diagonal) @ basis.turn
+                at = np.meshgrid(basis.columns, basis.columns, indexing="ij")
+                added.append(
+                    scipy.sparse.coo_array((block.ravel(), (at[0].ravel(), at[1].ravel())), shape=(u, u))
+                )
+        for part in added:
+            blocks.add(own, part.row, part.col, part.data)
+        extra = sum((part.tocsr() for part in added[1:]), added[0].tocsr())
+        normal = Implicit(self, sums, inverse, side, points, damping, float(least.min(initial=1.0)), bases)
+        normal.near, normal.extra = own, extra
+        normal.hold(held)
+        return normal
+
+    @cached_property
+    def other_rows(self) -> scipy.sparse.csr_array:
+        """Weighted derivatives of the other observations by the reduced unknowns (k, u)."""
+        root = self.system.sigma_root
+        rows_kept, columns_kept, rows_interior, columns_interior = self.system.prior_column
+        row, column = [rows_kept, rows_interior], [columns_kept, columns_interior]
+        value = [root[rows_kept], root[rows_interior]]
+        for k, columns, slope in self.slopes():
+            row.append(np.full(len(columns), k))
+            column.append(columns)
+            value.append(slope)
+        at = (np.concatenate(row), np.concatenate(column))
+        shape = (len(root), self.system.unknowns.size)
+        return scipy.sparse.csr_array((np.concatenate(value), at), shape=shape)
 
     def _assembled(
         self, rows: Array, pattern: Pattern, damping: float, u: int, bands: int, bandwidth: int
@@ -454,14 +532,15 @@ class Normal:
     ) -> None:  # fmt: skip
         self.linear, self.sums, self.inverse, self.side = linear, sums, inverse, side
         self.diagonal, self.damping, self.least, self.bases = diagonal, damping, least, bases
-        self.arrow: Arrow | None = None
+        self.factors: Arrow | Conjugate | None = None
+        self.accuracy = (0.0, 0.0)
 
     def hold(self, held: Mask) -> None:
         """Hold reduced unknowns (u,)."""
         for column in np.flatnonzero(held):
             _hold(self.sums, int(column))
 
-    def factorise(self) -> Arrow:
+    def factorise(self) -> Arrow | Conjugate:
         """Compute the Cholesky factors; the sums are overwritten.
 
         Raises
@@ -488,8 +567,31 @@ class Normal:
             gradient = np.where(held, 0.0, gradient)
         return Constrained(t, matrix, own, gradient)
 
-    def correction(self) -> Correction:
+    @property
+    def turn(self) -> scipy.sparse.csr_array | None:
+        """Reduced unknowns (u, u) from the combinations for which these are formed; None for themselves."""
+        if not self.bases:
+            return None
+        u = self.linear.system.unknowns.size
+        own = np.ones(u)
+        parts = []
+        for basis in self.bases:
+            own[basis.columns] = 0.0
+            at = np.meshgrid(basis.columns, basis.columns, indexing="ij")
+            parts.append((basis.turn.ravel(), at[0].ravel(), at[1].ravel()))
+        kept = np.flatnonzero(own)
+        values, rows, columns = (
+            np.concatenate(column) for column in zip(*parts, (own[kept], kept, kept), strict=True)
+        )
+        return scipy.sparse.csr_array((values, (rows, columns)), shape=(u, u))
+
+    def correction(self, relative: float = 0.0, absolute: float = 0.0) -> Correction:
         """Solve for the correction.
+
+        Parameters
+        ----------
+        relative, absolute : float
+            Accuracy with conjugate gradients: see :meth:`Conjugate.solve`.
 
         Raises
         ------
@@ -497,9 +599,12 @@ class Normal:
             When the matrix is not positive definite.
         """
         constraints, q, by_stage = self.linear.system.constraints, None, 0.0
+        complete = True
         if constraints is None:
-            self.arrow = self.factorise()
-            y = self.arrow.solve(-self.sums.reduced)
+            factors = self.factors = self.factorise()
+            self.accuracy = relative, absolute
+            y = self._solved(factors, -self.sums.reduced)
+            complete = isinstance(factors, Arrow) or factors.complete
             gradient = self.sums.gradient @ y
             y = self.in_parameters(y)
         else:
@@ -513,7 +618,8 @@ class Normal:
         points = self.points(-self.side[:, :, None], y[:, None])[:, :, 0]
         gradient += float((self.side * points).sum()) + by_stage
         bent = (self.sums.diagonal * y) @ y + float((self.diagonal * points**2).sum())
-        return Correction(y, points, float(-gradient + self.damping * bent), float(np.sqrt(bent)), q)
+        predicted = float(-gradient + self.damping * bent)
+        return Correction(y, points, predicted, float(np.sqrt(bent)), q, complete)
 
     def correction_for(self, misfits: Array, other_misfits: Array) -> Correction:
         """Solve for the correction with other misfits, with the factors of :meth:`correction`.
@@ -542,12 +648,15 @@ class Normal:
         held = system.held.copy()
         kept = np.flatnonzero(system.unknowns.kept >= 0)
         held[(system.unknowns.kept[kept, None] + np.arange(3))[system.movable[kept] == 0]] = True
-        arrow = self.factorise() if self.arrow is None else self.arrow
-        y = arrow.solve(np.where(held, 0.0, -(gradient + reduced[:, 0])))
+        factors = self.factorise() if self.factors is None else self.factors
+        y = self._solved(factors, np.where(held, 0.0, -(gradient + reduced[:, 0])))
         y = self.in_parameters(y)
         points = self.points(-side[:, :, None], y[:, None])[:, :, 0]
         bent = (self.sums.diagonal * y) @ y + float((self.diagonal * points**2).sum())
         return Correction(y, points, 0.0, float(np.sqrt(bent)))
+
+    def _solved(self, factors: Arrow | Conjugate, side: Array) -> Array:
+        return factors.solve(side) if isinstance(factors, Arrow) else factors.solve(side, *self.accuracy)
 
     def in_parameters(self, z: Array) -> Array:
         """Return reduced unknowns (u, …) for the parameters of cameras, from those for their combinations."""
@@ -572,6 +681,56 @@ class Normal:
         out = np.zeros((linear.system.unknowns.size, side.shape[2]))
         reduce_sides(0, len(side), linear.rows, linear.system.pattern, self.inverse, side, out)
         return out
+
+
+class Implicit(Normal):
+    """Reduced normal equations without their matrix, for conjugate gradients.
+
+    Attributes
+    ----------
+    near : ndarray
+        Lower triangles of the diagonal blocks of the matrix.
+    extra : sparse array (u, u)
+        Damping, and what observations other than image coordinates add to the matrix.
+    held : ndarray of bool (u,)
+        Held unknowns.
+    """
+
+    near: Array
+    extra: scipy.sparse.csr_array
+    held: Mask | None = None
+
+    def hold(self, held: Mask) -> None:
+        """Hold reduced unknowns (u,)."""
+        self.held = held.copy() if self.held is None else self.held | held
+        for column in (self.sums.gradient, self.sums.reduced, self.sums.diagonal):
+            column[held] = 0.0
+
+    def factorise(self) -> Conjugate:
+        """Invert the diagonal blocks.
+
+        Raises
+        ------
+        Singular
+            When a block is not positive definite.
+        """
+        system = self.linear.system
+        held = system.held if self.held is None else self.held
+        return Conjugate(self._product, system.unknowns.blocks.inverted(self.near, held))
+
+    def _product(self, x: Array) -> Array:
+        """Product of the matrix with a vector (u,)."""
+        system, rows = self.linear.system, self.linear.turned_rows
+        held = system.held if self.held is None else self.held
+        free, chunks = np.where(held, 0.0, x), system.chunks
+        parts = np.zeros((len(chunks), len(x)))
+
+        def work(part: int, a: int, b: int) -> None:
+            product(a, b, rows, system.pattern, self.inverse, free, parts[part])
+
+        in_parallel(work, chunks)
+        out: Array = parts.sum(axis=0) + self.extra @ free
+        return np.where(held, x, out)
 
 
 def _add(sums: Sums, column: int, root: float, misfit_: float, bands: int) -> None:

@@ -12,6 +12,7 @@ import scipy.sparse.csgraph
 from ...core.data import Mask, Rows
 from ..network import Network
 from ..network.shutter import MOTION
+from .conjugate import Blocks
 from .normal import SEGMENTS, Pattern, locals_of
 
 __all__ = ["Unknowns"]
@@ -19,6 +20,8 @@ __all__ = ["Unknowns"]
 # A matrix of more unknowns than the first number is factorised as a band where this is narrower than the part
 # of them that follows: above many unknowns, and above few.
 _BANDS = ((1500, 1 / 4), (200, 1 / 16))
+# Copies of the matrix that are in memory at once: of this step, of the one before it, and their factors.
+_COPIES = 6
 _POINT = ("X", "Y", "Z")
 _POSE = ("dx", "dy", "dz", "X0", "Y0", "Z0")
 # With parallel rays the projection centre moves along the axes of the camera.
@@ -215,6 +218,25 @@ class Unknowns:
                 count = len(extra.names)
                 held[at : at + count] = [extra.name(k, label) in extra.dropped for k in range(count)]
         return held
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        """Diagonal blocks: the unknowns of each image, and each set of shared unknowns."""
+        users = np.bincount(self.network.camera_of[self.active], minlength=len(self.camera))
+        extra_users = np.bincount(
+            self.extra_of[self.active & (self.extra_of >= 0)], minlength=len(self.extra)
+        )
+        starts = (
+            self.pose, self.camera[users > 1], self.extra[extra_users > 1], [self.refraction], self.mount[:1],
+            self.kept,
+        )  # fmt: skip
+        return Blocks.of(np.concatenate([np.asarray(own)[np.asarray(own) >= 0] for own in starts]), self.size)
+
+    @property
+    def bytes_of_factors(self) -> int:
+        """Memory that the matrix of the normal equations, its factors and its inverse take."""
+        band = self.bands * (self.bandwidth + 1)
+        return 8 * _COPIES * (band + (self.size - self.bands) * self.size)
 
     @property
     def width(self) -> int:

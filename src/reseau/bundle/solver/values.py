@@ -33,6 +33,8 @@ class Correction:
         Length of the correction, in the metric of the damping.
     independent : ndarray, optional
         Correction of the independent unknowns, with a stage or a rig.
+    complete : bool
+        Whether the normal equations were solved as accurately as asked for.
     """
 
     reduced: Array
@@ -40,6 +42,7 @@ class Correction:
     predicted: float
     length: float = 0.0
     independent: Array | None = None
+    complete: bool = True
 
     def times(self, factor: float) -> Correction:
         """Return a part of the correction."""
