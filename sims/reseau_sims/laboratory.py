@@ -399,7 +399,7 @@ class Laboratory:
         station = Station(at["tilt"], at["roll"], at["camera_roll"])
         return _Mounted.of(self.field, np.array([0.0, 0.0, at["z"]])).pose(station)
 
-    def _moved(self, seat: Seat | None) -> tuple[Station, FieldBench]:
+    def _moved(self, seat: Seat | None = None) -> tuple[Station, FieldBench]:
         """Present station of the table, and the testfield on it, before a camera of a rig."""
         axes = self.axes
         station = Station(axes["tilt"], axes["roll"], axes["camera_roll"])

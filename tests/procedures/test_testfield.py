@@ -18,7 +18,8 @@ def test_each_image_is_measured_or_declined_by_name() -> None:
     bench, stations = FieldBench(), (Station(30), Station(45, 90))
     empty = Frame(np.tile(np.arange(240, dtype=np.uint8), (240, 1)), 255.0, "empty")
     frames = [bench.record(stations[0]), empty, bench.record(stations[1])]
-    found = dict(measured_in_order(frames, measurer_of(bench.design, TestfieldOptions(fill=0.8))))
+    measure = measurer_of(bench.design, TestfieldOptions(fill=0.8))
+    found = {each.name: each.found for each in measured_in_order(frames, measure)}
     assert list(found) == [stations[0].name, "empty", stations[1].name]
     declined = found.pop("empty")
     assert isinstance(declined, Failure)
@@ -38,7 +39,7 @@ def test_an_image_that_cannot_be_measured_does_not_end_the_others() -> None:
         raise np.linalg.LinAlgError
 
     frames = [Frame(np.zeros((9, 9), np.uint8), 255.0, name) for name in ("dark", "other")]
-    found = dict(measured_in_order(frames, measure))
+    found = {each.name: each.found for each in measured_in_order(frames, measure)}
     assert all(isinstance(each, Failure) for each in found.values())
     assert [each.reason[:19] for each in found.values()] == ["is all black", "could not be measur"]
 

@@ -38,7 +38,7 @@ def with_checksum(content: bytes) -> bytes:
     Examples
     --------
     >>> with_checksum(b"T,21.5")
-    b'$T,21.5*69'
+    b'$T,21.5*60'
     """
     return b"$%b*%02X" % (content, checksum(content))
 

@@ -38,6 +38,14 @@ class ScpiProbe:
     ------
     SettingError
         If a query is none.
+
+    Examples
+    --------
+    >>> from reseau_drivers.link import TcpLink
+    >>> ScpiProbe(TcpLink("127.0.0.1", 5025), {"temperature": "MEAS:TEMP"})
+    Traceback (most recent call last):
+        ...
+    reseau.core.errors.SettingError: quantity temperature: 'MEAS:TEMP' is no query; write MEAS:TEMP?
     """
 
     checked = False
@@ -99,6 +107,17 @@ class LineProbe:
         Whether the line has a checksum.
     answer_s : float
         Time limit of a line (s).
+
+    Raises
+    ------
+    SettingError
+        If the query is not ASCII.
+
+    Examples
+    --------
+    >>> from reseau_drivers.link import TcpLink
+    >>> LineProbe(TcpLink("127.0.0.1", 4001), Sentence(r"T=(?P<temperature>[-.0-9]+)")).checked
+    False
     """
 
     def __init__(
@@ -199,6 +218,19 @@ class ModbusProbe:
         Frames of serial lines, or of TCP.
     answer_s : float
         Time limit of an answer (s).
+
+    Raises
+    ------
+    SettingError
+        If there is no such address or framing.
+
+    Examples
+    --------
+    >>> from reseau_drivers.link import TcpLink
+    >>> ModbusProbe(TcpLink("127.0.0.1", 502), {}, unit=300, framing="tcp")
+    Traceback (most recent call last):
+        ...
+    reseau.core.errors.SettingError: unit: 300 is not 1…247
     """
 
     SPAN = 16

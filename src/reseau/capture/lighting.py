@@ -139,6 +139,14 @@ def steer(camera: Camera, rule: LightRule | None = None) -> Steered:
         If the camera has no setting for its exposure, or does not report it.
     InstrumentError
         If the camera fails.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> steer(SimpleNamespace(name="eye", settings=SimpleNamespace(to_dict=dict)))
+    Traceback (most recent call last):
+        ...
+    reseau.core.errors.UsageError: eye: has no setting for its exposure
     """
     rule = rule or LightRule()
     if "exposure_us" not in camera.settings.to_dict():
