@@ -17,7 +17,7 @@ from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry, Step,
 from reseau.capture.bench import built
 from reseau.core.errors import UsageError
 from reseau.instruments import CameraRig, ExposureSet, Instrument
-from reseau.optics.poses import matrix_to_vector
+from reseau.optics.poses import matrix_to_vector, rotation_matrix
 from reseau.sessions import BlurredParameters, FramesParameters, SensorParameters, TestfieldParameters
 from reseau_drivers.camera import Rig, RigSettings, v4l2
 from reseau_sims.serving import SimulatedCamera, StripeScene, VideoCamera, View
@@ -120,7 +120,7 @@ def test_a_rig_is_refused_by_plans_of_one_camera() -> None:
 
 def given(**more: Any) -> TestfieldParameters:
     steps = tuple((step.name, dict(step.position)) for step in POSES)
-    known = {"pitch": 0.027, "free": ("c", "x0", "y0"), "row_jitter": 0.0086, "fill": 0.8, "checks": 0}
+    known = {"pitch": 0.027, "free": ("c", "x0", "y0", "K1"), "row_jitter": 0.0086, "fill": 0.8, "checks": 0}
     return TestfieldParameters(steps=steps, camera="rig", home=True, **(known | more))
 
 
@@ -173,7 +173,7 @@ def test_a_rig_is_calibrated_live_and_computed_again_to_the_byte(count: int, arc
             continue
         assert place is not None
         assert place.reference == "left"
-        turned = np.array(place.rotation), seat.matrix(distance)
+        turned = rotation_matrix(place.rotation), seat.matrix(distance)
         off = matrix_to_vector(turned[0] @ turned[1].T)
         error = np.concatenate([off, np.array(place.base) - seat.base_mm])
         # Chi square of six degrees of freedom, 1e-5.

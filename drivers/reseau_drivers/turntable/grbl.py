@@ -28,7 +28,7 @@ _MOVING = ("Run", "Jog", "Home")
 _STATES = ("8", "9", "13")
 """Errors that mean: not allowed in this state."""
 _FAULTS = {"Door": "the safety door is open", "Check": "check mode ($C): nothing moves", "Sleep": "it sleeps"}
-_BOOT_S, _BEGINS_S, _POLL_S = 4.0, 0.5, 0.01
+_BOOT_S, _BEGINS_S, _POLL_S = 4.0, 2.0, 0.01
 _REQUIRED = {"$22": ("1", "homing"), "$13": ("0", "reports in millimetres")}
 
 

@@ -45,7 +45,7 @@ MOTORS: Mapping[MotorKind, float] = {
 }
 """Velocity in the controller's units for one count per second; the protocol's section on conversions."""
 
-_BEGINS_S = 0.5
+_BEGINS_S = 2.0
 """Time in which an order must show in the status (s)."""
 _POLL_S = 0.01
 _STEPPERS = ("stepper",)
