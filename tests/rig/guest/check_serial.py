@@ -95,7 +95,7 @@ DRIVERS: dict[str, tuple[Callable[[], Any], Callable[[Any, int], None], Callable
 
 def _recovered(device: Any, recover: Callable[[Any], None]) -> None:
     """Brought back, as soon as it can be: a plug takes its time."""
-    until = time.monotonic() + 60.0
+    until = time.monotonic() + 20.0
     while True:
         try:
             recover(device)

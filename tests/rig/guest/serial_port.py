@@ -47,8 +47,9 @@ class SerialPort:
     def _serve(self) -> None:
         fd = self._opened()
         while True:
-            if not select.select([fd], [], [], _POLL_S)[0]:
-                self._say(fd)
+            asked = select.select([fd], [], [], _POLL_S)[0]
+            self._say(fd)  # also to a client that never stops asking
+            if not asked:
                 continue
             try:
                 data = os.read(fd, 4096)
