@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from reseau.core.errors import ProtocolError, SettingError
 
-from .stream import Damaged, LineDecoder, excerpt
+from .stream import LineMessageDecoder, excerpt
 
 __all__ = [
     "ALARMS",
@@ -303,25 +303,8 @@ def _report(text: str) -> Report:
     return Report(found[1], int(found[2] or 0), fields)
 
 
-class AnswerDecoder:
+class AnswerDecoder(LineMessageDecoder[Message]):
     """Decode answers from a stream."""
 
     def __init__(self) -> None:
-        self._lines = LineDecoder(limit=LIMIT)
-
-    def reset(self) -> None:
-        """Discard an incomplete line."""
-        self._lines.reset()
-
-    def feed(self, data: bytes) -> list[Message | Damaged]:
-        """Return the messages that these bytes complete."""
-        found: list[Message | Damaged] = []
-        for line in self._lines.feed(data):
-            if isinstance(line, Damaged):
-                found.append(line)
-                continue
-            try:
-                found.append(decode(line))
-            except ProtocolError as error:
-                found.append(Damaged(line, error.what))
-        return found
+        super().__init__(decode, limit=LIMIT)

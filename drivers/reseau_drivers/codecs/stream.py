@@ -1,11 +1,14 @@
-"""Common parts of stream decoders, and the decoder of lines."""
+"""Common parts of stream decoders, and decoders of lines and of messages that are lines."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-__all__ = ["Damaged", "Decoder", "LineDecoder", "excerpt"]
+from reseau.core.errors import ProtocolError
+
+__all__ = ["Damaged", "Decoder", "LineDecoder", "LineMessageDecoder", "excerpt"]
 
 T = TypeVar("T")
 
@@ -102,4 +105,42 @@ class LineDecoder:
                 found.append(Damaged(bytes(self._partial[:_SHOWN]), f"longer than {self._limit} bytes"))
                 self._partial.clear()
                 self._skipping = True
+        return found
+
+
+class LineMessageDecoder(Generic[T]):
+    """Decode messages of one line each from a stream.
+
+    Parameters
+    ----------
+    decode : callable
+        Returns the message of a line; raises a ProtocolError for a line that is none.
+    limit : int
+        Largest size of a line (bytes).
+
+    Examples
+    --------
+    >>> decoder = LineMessageDecoder(len, limit=8)
+    >>> decoder.feed(b"ok" + bytes([10]) + b"err")
+    [2]
+    """
+
+    def __init__(self, decode: Callable[[bytes], T], *, limit: int) -> None:
+        self._decode, self._lines = decode, LineDecoder(limit=limit)
+
+    def reset(self) -> None:
+        """Discard an incomplete message."""
+        self._lines.reset()
+
+    def feed(self, data: bytes) -> list[T | Damaged]:
+        """Return the messages that these bytes complete, in order."""
+        found: list[T | Damaged] = []
+        for line in self._lines.feed(data):
+            if isinstance(line, Damaged):
+                found.append(line)
+                continue
+            try:
+                found.append(self._decode(line))
+            except ProtocolError as error:
+                found.append(Damaged(line, error.what))
         return found

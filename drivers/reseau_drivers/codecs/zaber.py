@@ -14,7 +14,7 @@ from typing import ClassVar
 
 from reseau.core.errors import ProtocolError, SettingError
 
-from .stream import Damaged, LineDecoder, excerpt
+from .stream import LineMessageDecoder, excerpt
 
 __all__ = [
     "FAULTS",
@@ -215,25 +215,8 @@ def decode_command(line: bytes) -> Command:
     return Command(device or 0, axis or 0, " ".join(words), id_)
 
 
-class MessageDecoder:
+class MessageDecoder(LineMessageDecoder[Message]):
     """Decode messages of devices from a stream."""
 
     def __init__(self) -> None:
-        self._lines = LineDecoder(limit=LIMIT)
-
-    def reset(self) -> None:
-        """Discard an incomplete message."""
-        self._lines.reset()
-
-    def feed(self, data: bytes) -> list[Message | Damaged]:
-        """Return the messages that these bytes complete."""
-        found: list[Message | Damaged] = []
-        for line in self._lines.feed(data):
-            if isinstance(line, Damaged):
-                found.append(line)
-                continue
-            try:
-                found.append(decode(line))
-            except ProtocolError as error:
-                found.append(Damaged(line, error.what))
-        return found
+        super().__init__(decode, limit=LIMIT)
