@@ -130,15 +130,13 @@ def rerun(
     """Recompute the results of sessions from their frames, and compare them byte for byte."""
     from .. import sessions
     from ..core.failure import Failure
-    from ..core.processes import cores
     from ..core.provenance import canonical_json
     from ..execution import executor_at
 
     with open_archive(archive, objects) as found:
         names = [each.name for each in found.sessions() if each.results] if session is None else [session]
     rows, same = [], True
-    count = max(1, min(jobs or cores(), len(names)))
-    with executor_at(count, cluster, store, ["reseau.sessions"]) as executor:
+    with executor_at(jobs, cluster, store, ["reseau.sessions"], len(names)) as executor:
         for name, done in sessions.rerun_all(archive, objects, names, executor):
             if isinstance(done, Failure):
                 if session is not None:

@@ -356,15 +356,15 @@ def _options(
 
 def _executor(images: list[Path], jobs: int | None, cluster: str, store: str) -> Executor:
     """What measures the photographs; its processes import in the background."""
-    from ..core.processes import cores, start_early
-    from ..execution import executor_at
+    from ..core.processes import start_early
+    from ..execution import Processes, executor_at
     from ..io import is_points
 
-    count = max(1, min(jobs or cores(), sum(not is_points(path) for path in images)))
     modules = ["reseau.procedures.target_measurement"]
-    if count > 1 and not cluster:
+    executor = executor_at(jobs, cluster, store, modules, sum(not is_points(path) for path in images))
+    if isinstance(executor, Processes):
         start_early(modules)
-    return executor_at(count, cluster, store, modules)
+    return executor
 
 
 def _shown(photographs: Iterator[Photograph], step: Callable[[str], None]) -> Iterator[Photograph]:

@@ -99,7 +99,6 @@ def orient(
 
     The JSON document of a frame is the calibration of its scan for `reseau apply`.
     """
-    from ..core.processes import cores
     from ..execution import executor_at
     from ..io import FrameCorners, RollSummary, write_whole
     from ..report.frames import roll_page
@@ -126,10 +125,8 @@ def orient(
         )
         for path, name in zip(images, _names(images), strict=True)
     ]
-    count = min(jobs or cores(), len(work))
-    with executor_at(
-        count, cluster, store, ["reseau.cli.orient", "reseau.procedures.film_frame"]
-    ) as executor:
+    modules = ["reseau.cli.orient", "reseau.procedures.film_frame"]
+    with executor_at(jobs, cluster, store, modules, len(work)) as executor:
         if not executor.local and overlay is not None:
             raise UsageError("is drawn by this machine only", where="--overlay", do="leave out --cluster")
         done = dict(zip((job.name for job in work), _all(work, executor, store), strict=True))

@@ -11,7 +11,11 @@ __all__ = ["executor_at"]
 
 
 def executor_at(
-    jobs: int | None = None, cluster: str = "", store: str = "", modules: Sequence[str] = ()
+    jobs: int | None = None,
+    cluster: str = "",
+    store: str = "",
+    modules: Sequence[str] = (),
+    parts: int | None = None,
 ) -> Executor:
     """Return the executor that a user asks for.
 
@@ -25,6 +29,8 @@ def executor_at(
         Folder or URL that the workers of the cluster share; required with a cluster.
     modules : sequence of str
         Modules to import once for all processes.
+    parts : int, optional
+        Number of parts that the work has; there are no more processes.
 
     Raises
     ------
@@ -41,4 +47,6 @@ def executor_at(
 
         return Cluster(cluster, store)
     count = jobs or cores()
+    if parts is not None:
+        count = max(1, min(count, parts))
     return Here() if count == 1 else Processes(count, modules)
