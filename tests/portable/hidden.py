@@ -2,7 +2,8 @@
 
 Only the packages of this project see less: modules are not found, and `os`, `signal`, `select`, `socket` and
 `multiprocessing` are stand-ins without the names that other systems do not have. Python's own modules and
-other packages, which have their own ways on other systems, are left as they are.
+other packages, which have their own ways on other systems, are left as they are. `msvcrt` is there with its
+lock.
 """
 
 from __future__ import annotations
@@ -33,13 +34,36 @@ PROJECT = ("reseau", "reseau_drivers", "reseau_sims")
 
 
 def _without(module: ModuleType, names: Sequence[str]) -> ModuleType:
+    def found(name: str) -> Any:
+        if name in names:
+            raise AttributeError(f"module {module.__name__!r} has no attribute {name!r}", name=name)
+        return getattr(module, name)  # asked each time: a test may have replaced it
+
     made = ModuleType(module.__name__)
-    made.__dict__.update({key: value for key, value in vars(module).items() if key not in names})
+    made.__dict__["__getattr__"] = found
+    made.__dict__["__dir__"] = lambda: [name for name in dir(module) if name not in names]
+    return made
+
+
+def _locking() -> ModuleType:
+    """What Windows has in place of `fcntl`: its lock of a byte, which is the lock of a file here."""
+    import fcntl
+
+    def locking(number: int, mode: int, length: int) -> None:
+        assert (mode, length) == (made.__dict__["LK_NBLCK"], 1)
+        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    made = ModuleType("msvcrt")
+    made.__dict__.update(locking=locking, LK_NBLCK=2)
     return made
 
 
 def hide() -> None:
     """Hide them from now on; what was imported before sees them."""
+    import getpass  # noqa: F401  # modules that ask for `msvcrt` to know the system
+    import subprocess  # noqa: F401
+
+    sys.modules["msvcrt"] = _locking()
     assert not any(name.partition(".")[0] in PROJECT for name in sys.modules), "imported before"
     real = builtins.__import__
     shown = {name: _without(real(name), names) for name, names in NAMES.items()}
