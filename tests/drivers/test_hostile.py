@@ -8,15 +8,17 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Any
 
 import pytest
 
 from reseau.core.errors import InstrumentError
 from reseau.instruments import Deadline
+from reseau_drivers.environment import environment_line, environment_modbus, environment_scpi
 from reseau_drivers.oscilloscope import oscilloscope
 from reseau_drivers.scanner import bk_oem, compact_pulser, ping360
-from reseau_drivers.turntable import smc100, zaber
+from reseau_drivers.turntable import grbl, kinesis, marlin, smc100, zaber
 from reseau_sims import serving
 from reseau_sims.serving import (
     FaultyConnection,
@@ -28,9 +30,18 @@ from reseau_sims.serving import (
 )
 from reseau_sims.serving.faults import Output
 
+TABLES = {"zaber": zaber, "smc100": smc100, "kinesis": kinesis, "grbl": grbl, "marlin": marlin}
+SENSORS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
+    "environment_scpi": (environment_scpi, {"quantities": {"temperature": {"query": "MEAS:TEMP?"}}}),
+    "environment_modbus": (environment_modbus, {"quantities": {"temperature": {"register": 0}}}),
+    "environment_line": (
+        environment_line,
+        {"pattern": r"(?P<temperature>[-+.0-9]+) C", "quantities": {"temperature": {}}},
+    ),
+}
 DRIVERS: dict[str, Callable[..., Any]] = {
-    "zaber": lambda name, address, seconds: zaber(name, address, axes={"tilt": {}}, seconds=seconds),
-    "smc100": lambda name, address, seconds: smc100(name, address, axes={"tilt": {}}, seconds=seconds),
+    **{name: partial(make, axes={"tilt": {}}) for name, make in TABLES.items()},
+    **{name: partial(make, **given) for name, (make, given) in SENSORS.items()},
     "ping360": ping360,
     "bk": bk_oem,
     "compactpulser": compact_pulser,
@@ -95,7 +106,7 @@ class Talker:
 @pytest.mark.parametrize("noise", NOISE)
 @pytest.mark.parametrize(
     ("driver", "door"),
-    [(driver, PtyServer) for driver in DRIVERS if driver not in ("bk", "oscilloscope")]
+    [(driver, PtyServer) for driver in DRIVERS if driver not in ("bk", "oscilloscope", "environment_scpi")]
     + [("ping360", UdpServer)],
 )
 def test_unsolicited_bytes_on_a_serial_line_or_in_datagrams(
@@ -129,6 +140,12 @@ def test_endless_unsolicited_bytes_use_bounded_time_and_memory(driver: str, nois
 MACHINES: dict[str, Callable[[], Machine]] = {
     "zaber": lambda: serving.ZaberChain([2, 1]),
     "smc100": lambda: serving.Smc100Line(2),
+    "kinesis": serving.KinesisController,
+    "grbl": lambda: serving.GrblController(2),
+    "marlin": lambda: serving.MarlinController(2),
+    "environment_scpi": lambda: serving.ScpiSensor(dict),
+    "environment_modbus": lambda: serving.ModbusSensor(dict),
+    "environment_line": lambda: serving.LineSensor(dict, every_s=0.0),
     "ping360": serving.Ping360,
     "bk": serving.BkScanner,
     "compactpulser": serving.CompactPulser,
@@ -151,14 +168,18 @@ def test_simulators_report_noise_as_violations(machine: str) -> None:
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
 
 
+UNLIMITED = ("configure", "stop", "stage", "read")
+"""Calls that take no time limit: that of the driver holds."""
 CALLS: dict[str, list[str]] = {
-    "zaber": ["check", "home", "move", "state"],
-    "smc100": ["check", "home", "move", "state"],
+    **{name: ["check", "home", "move", "state"] for name in TABLES},
+    **{name: ["check", "environment"] for name in SENSORS},
     "ping360": ["check", "scan", "line"],
     "bk": ["check", "scan"],
     "compactpulser": ["check", "verify"],
     "oscilloscope": ["check", "screen", "waveform", "errors"],
 }
+LOCAL = {"configure": ("grbl", "marlin", *SENSORS), "stop": tuple(SENSORS)}
+"""Calls that ask nothing of an instrument: the speed is part of each move, and sensors never act."""
 ARGUMENTS: dict[str, tuple[Any, ...]] = {
     "home": ("tilt",),
     "move": ("tilt", 5.0),
@@ -174,8 +195,10 @@ def test_every_call_of_a_silent_instrument_ends_at_its_deadline(driver: str) -> 
     try:
         address = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
         device = DRIVERS[driver]("victim", address, seconds=0.3)
-        for call in (*CALLS[driver], "connect", "configure", "stop", "stage", "read"):
-            more = {"seconds": 0.3} if call not in ("configure", "stop", "stage", "read") else {}
+        for call in (*CALLS[driver], "connect", *UNLIMITED):
+            if driver in LOCAL.get(call, ()):
+                continue
+            more = {} if call in UNLIMITED else {"seconds": 0.3}
             began = time.monotonic()
             with pytest.raises(InstrumentError, match="victim") as caught:
                 getattr(device, call)(*ARGUMENTS.get(call, ()), **more)
