@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.special
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,8 +17,6 @@ from reseau.core.errors import FormatError, UsageError
 def scene(shift: tuple[float, float] = (0.0, 0.0), sigma: float = 1.0, noise: float = 0.5, seed: int = 0,
           level: float = 1.0) -> Frame:  # fmt: skip
     """Bright disks with Gaussian edges, moved by a shift."""
-    import scipy.special
-
     y, x = np.mgrid[:120, :160].astype(float)
     light = np.full(x.shape, 40.0)
     for cx, cy in ((40, 30), (110, 40), (60, 90), (125, 95)):
@@ -33,6 +32,21 @@ def scene(shift: tuple[float, float] = (0.0, 0.0), sigma: float = 1.0, noise: fl
 def test_the_width_of_edges_is_measured(sigma: float) -> None:
     # Sampled at points: the scene has no pixels to integrate over. Curvature and noise leave a tenth.
     assert edge_sigma(scene(sigma=sigma)) == pytest.approx(sigma, abs=0.12 * sigma)
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0, 5.0])
+@pytest.mark.parametrize("sigma", [0.0, 0.3, 1.0, 4.0])
+def test_the_width_includes_the_pixel_and_does_not_depend_on_noise(sigma: float, noise: float) -> None:
+    """The peak that is held while the focus is turned must not be one of noise."""
+    inside = (np.arange(8) + 0.5) / 8 - 0.5
+    x = np.arange(200.0)[:, None] + inside
+    edges = (np.abs((x[None] + 0.1 * np.arange(120)[:, None, None]) % 80 - 40) - 20) / max(sigma, 1e-9)
+    light = 60 + 120 * scipy.special.ndtr(edges).mean(axis=2)
+    for seed in range(5):
+        picture = np.random.default_rng(seed).normal(light, noise or 1e-9).round().astype(np.uint8)
+        # A pixel's own 0.29 px is the least. Of narrower edges the slope lies within a pixel.
+        expected = pytest.approx(np.hypot(sigma, 0.29), abs=0.2 if sigma < 0.5 else 0.1 * sigma)
+        assert edge_sigma(Frame(picture, 255.0)) == expected
 
 
 def test_a_frame_without_edges_has_no_focus_value() -> None:

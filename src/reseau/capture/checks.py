@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import scipy.ndimage
+from scipy.special import ndtri
 
 from ..core.data import Array, Frame
 from ..core.errors import UsageError
@@ -25,6 +26,8 @@ __all__ = [
 ]
 
 
+_PIXEL = math.sqrt(1 / 12)
+_REACHES = (6, 12, 24)
 _SMOOTH = 1.5
 _SLOPE = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12
 
@@ -163,8 +166,10 @@ def edge_sigma(frame: Frame) -> float:
 
     Notes
     -----
-    A step of height h, blurred by a Gaussian of σ, has the slope h / (σ √(2π)) in its middle. The central
-    difference gives the mean slope over two pixels, which increases σ² by 2²/12.
+    Of a step of height h, blurred by a Gaussian of σ, the pixels before and after its middle differ by
+    (2 Φ(1 px / σ) − 1) h. The median over the steepest places is inverted; a place is chosen by its
+    neighbours along the edge, so that noise is not taken for a slope. σ includes the width of a pixel,
+    1/√12 = 0.29 px, and nothing smaller is returned.
 
     Examples
     --------
@@ -175,28 +180,35 @@ def edge_sigma(frame: Frame) -> float:
     """
     grey = frame.pixels.astype(np.float64)
     # Along rows, then along columns: the steepest places and the levels on both sides of them.
-    widths = [_steepest(grey), _steepest(grey.T)]
-    return min(widths)
+    quantum = 1.0 if np.issubdtype(frame.pixels.dtype, np.integer) else 0.0
+    sigma = 0.0
+    for reach in _REACHES:
+        share = max(_steepest(grey, reach, quantum), _steepest(grey.T, reach, quantum))
+        if share > 0.0:
+            # Too short a reach and a second edge within it both make the height too small, and so the width.
+            sigma = max(sigma, 1.0 / float(ndtri(0.5 + 0.5 * min(share, 0.9999))), _PIXEL)
+        if sigma <= reach / 4:
+            break
+    return sigma or float("inf")
 
 
-def _steepest(grey: Array) -> float:
-    reach = 6
-    if grey.shape[1] < 2 * reach + 3:
-        return float("inf")
-    slope = 0.5 * np.abs(grey[:, 2:] - grey[:, :-2])
-    inner = slope[:, reach:-reach]
-    count = max(5, inner.size // 5000)
-    at = np.argpartition(inner, -count, axis=None)[-count:]
-    row, column = np.unravel_index(at, inner.shape)
-    centre = column + reach + 1
+def _steepest(grey: Array, reach: int, quantum: float) -> float:
+    """Share of an edge's height that lies between the pixels on its two sides; 0 if there are no edges."""
+    if grey.shape[1] < 2 * reach + 3 or grey.shape[0] < 3:
+        return 0.0
+    slope = np.abs(grey[:, 2:] - grey[:, :-2])[:, reach:-reach]
+    beside = slope[2:] + slope[:-2]
+    count = min(max(100, beside.size // 1000), beside.size)
+    at = np.argpartition(beside, -count, axis=None)[-count:]
+    row, column = np.unravel_index(at, beside.shape)
+    row, centre = row + 1, column + reach + 1
     around = grey[row[:, None], centre[:, None] + np.arange(-reach, reach + 1)]
     height = np.abs(around[:, -2:].mean(axis=1) - around[:, :2].mean(axis=1))
     noise = 1.4826 * np.median(np.abs(np.diff(grey, axis=1))) / np.sqrt(2)
-    real = height > 10 * noise
+    real = height > 10 * max(noise, quantum * _PIXEL)
     if not real.any():
-        return float("inf")
-    sigma = height[real] / (np.sqrt(2 * np.pi) * slope[row, column + reach][real])
-    return float(np.sqrt(max(np.median(sigma) ** 2 - 4 / 12, 0.0)))
+        return 0.0
+    return float(np.median(slope[row, column][real] / height[real]))
 
 
 def shift_between(first: Frame, second: Frame) -> tuple[Array, Array]:
