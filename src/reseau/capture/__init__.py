@@ -2,7 +2,7 @@
 
 from ..instruments import RemoteOperator
 from . import by_hand
-from .acquisition import Acquisition, Plan, Procedure, Watch
+from .acquisition import Acquisition, Plan
 from .bench import ROLES, Bench, BenchFile, Checked, InstrumentEntry, drivers, found_instruments, plugin
 from .checks import (
     Limits,
@@ -16,6 +16,7 @@ from .checks import (
 )
 from .discovery import bench_text
 from .engine import Control, Decision, Rerun, carry_out, rerun
+from .judging import Procedure, Watch
 from .lighting import LightRule, Steered, level_of, next_light, steer
 from .lock import BenchLock, Holder
 from .plans import Goal, SensorSeriesPlan

@@ -13,7 +13,7 @@ import math
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from bluesky import Msg
@@ -24,15 +24,12 @@ from ..core.data import Frame
 from ..core.errors import (
     ConnectionLost,
     DeadlineError,
-    EstimationError,
-    ImageError,
     InstrumentError,
     ProtocolError,
     ReseauError,
     StateError,
     UsageError,
 )
-from ..core.version import __version__
 from ..instruments import (
     Camera,
     CameraRig,
@@ -44,75 +41,20 @@ from ..instruments import (
 )
 from . import by_hand
 from .bench import ROLES, Bench
-from .checks import Limits, Readiness, exposure_fault, readiness
-from .steps import Step, as_taken
+from .checks import Limits, Readiness, readiness
+from .judging import Judge, Procedure, Watch
+from .steps import Step
 
-__all__ = ["Acquisition", "Plan", "Procedure", "Watch"]
+__all__ = ["Acquisition", "Plan"]
 
 T = TypeVar("T")
 _TRIES = 4
 """Attempts on an instrument before its failure ends the session."""
-_MEASURED = "measured"
-"""Kind of the notes about what was measured in frames."""
 _STILL = 0.02
 """Largest movement of an axis during an exposure, in the unit of the axis."""
 
 Plan = Generator[Msg, Any, Any]
 """A plan: a generator of bluesky messages. Its return value is that of :func:`reseau.capture.carry_out`."""
-Watch = Callable[[str, dict[str, Any]], None]
-"""Callback for events: the kind of the event, and its values."""
-
-
-class Procedure(Protocol):
-    """Interface of a procedure: what an acquisition does with its frames.
-
-    Examples
-    --------
-    A procedure that counts frames:
-
-    >>> class Count:
-    ...     frames = 0
-    ...     def on_frame(self, frame, step):
-    ...         self.frames += 1
-    ...         return Verdict(True)
-    ...     def progress(self):
-    ...         return {}
-    ...     def next_pose(self, candidates, wanted):
-    ...         return None
-    ...     def finish(self):
-    ...         return {"count.txt": f"{self.frames}"}
-    >>> procedure: Procedure = Count()
-    >>> procedure.on_frame(Frame(np.zeros((2, 2), np.uint8), 255.0), Step("first")).ok
-    True
-    >>> procedure.finish()
-    {'count.txt': '1'}
-    """
-
-    def on_frame(self, frame: Frame, step: Step) -> Verdict:
-        """Measure a new frame and return whether it is usable."""
-
-    def progress(self) -> Mapping[str, float]:
-        """Return the standard deviations reached so far, by parameter name."""
-
-    def next_pose(self, candidates: Sequence[Step], wanted: str) -> tuple[Step, float | None] | None:
-        """Return the pose that lowers a standard deviation most, and its predicted value if known."""
-
-    def finish(self) -> Mapping[str, str]:
-        """Return the results: file contents by name. Same frames in same order give the same bytes."""
-
-
-class _Candidates(list[Step]):
-    """Candidate poses; iteration raises after a stop, because choosing may take minutes."""
-
-    def __init__(self, stopped: Callable[[], bool], steps: Sequence[Step]) -> None:
-        super().__init__(steps)
-        self._stopped = stopped
-
-    def __iter__(self) -> Iterator[Step]:
-        for each in super().__iter__():
-            if self._stopped():
-                raise StateError("was stopped", where="next pose")
-            yield each
 
 
 def message(command: str, *args: Any, **kwargs: Any) -> Msg:
@@ -189,14 +131,13 @@ class Acquisition:
         self._chosen: dict[type, str | None] = {ROLES[role]: name for role, name in names.items()}
         self.retakes, self.limits, self.watch, self._operator = retakes, limits or Limits(), watch, operator
         self._busy = threading.Lock()
-        self._verdicts: dict[int, Verdict] = {}
+        self._judge = Judge(session, procedure, self.limits, watch)
         self._last: ArchivedFrame | None = None
         self._at_rest = False
         self.doing = ""
         """What is under way, in words."""
         self._silent: frozenset[str] = frozenset()
         self._original_us: float | None = None
-        self._memories: dict[int, Mapping[str, Any]] | None = None
 
     def one(self, kind: type) -> Any:
         """Return the instrument of a kind: the named one, or the only one. See :meth:`Bench.one`."""
@@ -210,15 +151,15 @@ class Acquisition:
 
     def reached(self, parameter: str) -> float | None:
         """Return the standard deviation reached for a parameter; None while there is none."""
-        return None if self.procedure is None else self.procedure.progress().get(f"sigma_{parameter}")
+        return self._judge.progress().get(f"sigma_{parameter}")
 
     def scatter(self) -> float:
         """Return how much more the images scatter than their standard deviations say; 1 if not known."""
-        return 1.0 if self.procedure is None else self.procedure.progress().get("scatter", 1.0)
+        return self._judge.progress().get("scatter", 1.0)
 
     def verdict(self, frame: ArchivedFrame) -> Verdict:
         """Return the verdict on a frame that was taken or checked in this process."""
-        return self._verdicts[frame.id]
+        return self._judge.verdicts[frame.id]
 
     def done(self, step: Step) -> bool:
         """Return whether a step has a good frame, or as many bad ones as are allowed."""
@@ -355,7 +296,7 @@ class Acquisition:
         last = self._last
         if last is None:
             raise StateError("no frame has been taken", where=self.name)
-        verdict = self._verdicts[last.id]
+        verdict = self._judge.verdicts[last.id]
         values = {
             "step": last.step,
             "take": last.take,
@@ -469,7 +410,7 @@ class Acquisition:
             return self._exposed_at_once(rig, step, average)
         for take in range(self.retakes + 1):
             frame = self.session.find(step.name, "frame", take) or self._taken(step, take, average, source)
-            verdict = self._judged(frame, step)
+            verdict = self._judge.judge(frame, step)
             self._last = frame
             if verdict.ok:
                 break
@@ -485,10 +426,10 @@ class Acquisition:
                 rig, step, take, average
             )
             new = any(frame.verdict is None for frame in frames)
-            good = [frame for frame in frames if self._judged(frame, Step(frame.step, step.position)).ok]
+            good = [frame for frame in frames if self._judge.judge(frame, Step(frame.step, step.position)).ok]
             self._last = good[0] if good else frames[-1]
             if good and new:
-                self._report_precision(step)
+                self._judge.report_precision(step)
             if good:
                 return good[0]
         return frames[-1]
@@ -616,72 +557,6 @@ class Acquisition:
                 found[name] = {key: each.to_dict() for key, each in measured.conditions.items()}
         return {"environment": found} if found else {}
 
-    def _judged(self, frame: ArchivedFrame, step: Step) -> Verdict:
-        """The verdict on a frame; the procedure gets each frame once, also those from before a resumption."""
-        if frame.id in self._verdicts:
-            return self._verdicts[frame.id]
-        verdict = self._recalled(frame, step) or self._checked(self.session.picture(frame), frame, step)
-        if frame.verdict is None:
-            self.session.judge(frame, verdict)
-            self._remember(frame, step, verdict)
-        self._verdicts[frame.id] = verdict
-        facts = {"step": step.name, "take": frame.take, "ok": verdict.ok, "why": verdict.why}
-        # A frame from before a resumption took no time.
-        self.watch("frame", facts | {"there": frame.verdict is not None} | verdict.facts)
-        if verdict.ok and frame.verdict is None and "set" not in frame.facts:
-            self._report_precision(step)
-        return verdict
-
-    def _report_precision(self, step: Step) -> None:
-        """Report what the procedure has reached, if anything."""
-        reached = {} if self.procedure is None else dict(self.procedure.progress())
-        if reached:
-            self.watch("precision", {"step": step.name} | reached)
-
-    def _remember(self, frame: ArchivedFrame, step: Step, verdict: Verdict) -> None:
-        """Store what was measured, so that a session that is resumed need not measure it again."""
-        recollection = getattr(self.procedure, "recollection", None)
-        if recollection is not None and verdict.ok:
-            self.session.note(
-                f"measured {frame.id}", _MEASURED,
-                {"frame": frame.id, "software": __version__, "measured": recollection(step)},
-            )  # fmt: skip
-
-    def _recalled(self, frame: ArchivedFrame, step: Step) -> Verdict | None:
-        """The verdict on a frame from before a resumption, as this version of the software found it."""
-        if frame.verdict is None:
-            return None
-        if not frame.verdict.ok:  # no procedure has it
-            return frame.verdict
-        recall = getattr(self.procedure, "recall", None)
-        if recall is None:
-            return None
-        if self._memories is None:
-            notes = (note for _, note in self.session.notes(_MEASURED))
-            self._memories = {
-                int(note["frame"]): note["measured"] for note in notes if note["software"] == __version__
-            }
-        measured = self._memories.get(frame.id)
-        return None if measured is None else recall(as_taken(step, frame.facts), measured)
-
-    def _checked(self, picture: Frame, frame: ArchivedFrame, step: Step) -> Verdict:
-        if frame.facts.get("moved"):
-            return Verdict(False, "the table moved during the exposure")
-        if not frame.facts.get("fresh", True):
-            return Verdict(False, "the exposure may have started before the request")
-        if frame.facts.get("late"):
-            skew = max(frame.clock.get("skew_s", [math.nan]))
-            return Verdict(False, f"the cameras exposed {1e6 * skew:.3g} µs apart: more than the rig allows")
-        fault = exposure_fault(picture, self.limits)
-        if fault:
-            return Verdict(False, fault)
-        if self.procedure is None:
-            return Verdict(True)
-        try:
-            return self.procedure.on_frame(picture, as_taken(step, frame.facts))
-        except ImageError as error:
-            return Verdict(False, error.what)
-
     def take_picture(self, step: Step, kind: str) -> ArchivedFrame:
         """Take and store a picture that is not measured. See :meth:`pictures`.
 
@@ -741,34 +616,13 @@ class Acquisition:
         """Return the pose that the procedure chooses; in a resumed session the pose that it had chosen."""
         with self._busy:
             self.doing = "the choice of the next pose"
-            key = f"choice among {len(candidates)}"
-            names = {step.name: step for step in candidates}
-            for made in (note for _, note in self.session.notes("choice") if note["key"] == key):
-                return None if made["step"] is None else (names[made["step"]], made["predicted"])
-            found = None
-            if self.procedure is not None:
-                found = self.procedure.next_pose(_Candidates(lambda: self._at_rest, candidates), wanted)
-            step, predicted = (None, None) if found is None else (found[0].name, found[1])
-            self.session.note(key, "choice", {"key": key, "step": step, "predicted": predicted})
-            self.watch("next", {"step": step, f"sigma_{wanted}": predicted})
-            return found
+            return self._judge.choose(candidates, wanted, lambda: self._at_rest)
 
     def report_prediction(self, step: Step) -> None:
         """Report what a pose would bring for the first parameter, if the procedure can predict it."""
-        assert self.procedure is not None
         with self._busy:
             self.doing = f"the prediction for {step.name}"
-            reached = next(iter(self.procedure.progress()), "")
-            parameter = reached.removeprefix("sigma_")
-            if not reached or reached == "sigma0":
-                return
-            try:
-                found = self.procedure.next_pose([step], parameter)
-            except EstimationError as error:
-                self.watch("outlook", {"step": step.name, "why": error.what})
-                return
-            if found is not None and found[1] is not None:
-                self.watch("outlook", {"step": step.name, f"sigma_{parameter}": found[1]})
+            self._judge.report_prediction(step)
 
     def check_scene(self, count: int) -> Readiness:
         """Take frames of the static scene, store them, and return what they show."""

@@ -23,7 +23,8 @@ from bluesky.utils import DuringTask, FailedStatus, RunEngineInterrupted
 from ..archive import ArchivedResult, Session
 from ..core.errors import InstrumentError, ReseauError
 from ..core.threads import one_thread
-from .acquisition import Acquisition, Plan, Procedure
+from .acquisition import Acquisition, Plan
+from .judging import Procedure
 from .steps import Step, as_taken
 
 __all__ = ["Control", "Decision", "Rerun", "carry_out", "rerun"]

@@ -172,10 +172,10 @@ def stop(bench: BenchPath = _BENCH) -> None:
         say(f"telling {holder} to stop\n")
         try:
             os.kill(pid, signal.SIGTERM)
-        except ProcessLookupError:
-            continue
         except PermissionError:
             raise StateError("belongs to another user", where=holder, do="stop it there") from None
+        except OSError:  # it has ended meanwhile; Windows has no class for that
+            continue
     end = time.monotonic() + _PATIENCE_S
     while (holders := _holders(found)) and time.monotonic() < end:
         time.sleep(0.05)
