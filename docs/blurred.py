@@ -3,7 +3,7 @@
 It writes `lens.zmx` (a double Gauss f/2 of 25 mm, stopped down to f/2.8), `plate.json` (24 disks) and
 `photo.png` to the folder (`out/blurred`): the plate at 540 mm, tilted, before a camera that is focused at
 500 mm. The photograph is drawn with the rays of batoid (`pip install batoid`), which share nothing with those
-that measure it. Then it runs the commands of the tutorial, compares the coordinates with batoid's principal
+that measure it. Then it runs the commands of the tour, compares the coordinates with batoid's principal
 rays, and keeps the figure as `docs/images/blurred.png`.
 """
 

@@ -31,7 +31,7 @@ exclude_patterns = ["api/_templates"]
 
 templates_path = ["api/_templates"]
 source_suffix = {".rst": "restructuredtext", ".md": "markdown"}
-root_doc = "api/index"
+root_doc = "index"
 
 autosummary_generate = True
 autosummary_imported_members = False
@@ -45,18 +45,20 @@ numpydoc_xref_param_type = False
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
-# Links from the pages to files of the project outside this folder, which are not part of the site.
+# Links between the pages are checked; a file of the project that is not a page is copied to the site for download.
 # Names of types in signatures that two packages define, as Frame, are linked to the first.
-suppress_warnings = ["myst.xref_missing", "misc.highlighting_failure", "ref.python"]
+suppress_warnings = ["misc.highlighting_failure", "ref.python"]
 keep_warnings = True
 
 html_theme = "pydata_sphinx_theme"
 html_theme_options = {
     "show_nav_level": 2,
     "navigation_with_keys": False,
+    "header_links_before_dropdown": 8,
     "secondary_sidebar_items": ["page-toc"],
 }
-html_static_path: list[str] = []
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_show_sourcelink = False
 # Formulas are MathML in the pages: neither the build nor the reader's browser needs a network.
 html_math_renderer = "mathml"
