@@ -15,7 +15,6 @@ from .common import (
     Out,
     Overlay,
     SensorFile,
-    corrected,
     orientation,
     read_frame,
     suffix_of,
@@ -119,7 +118,7 @@ def blurred(
     target, optics = read_design(design), read_lens(lens)
     if isinstance(target, BoardDesign):
         raise UsageError("is a board", where=design, do="give a testfield or a reseau")
-    frame = corrected(read_frame(image), sensor)
+    frame = read_frame(image, sensor=sensor)
     size = frame.width, frame.height
     camera = lens_camera(optics, size, pitch_um=pitch, distance=focus, f_number=f_number)
     options = BlurredOptions(

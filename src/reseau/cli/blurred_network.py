@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from .blurred import FNumber, Focus, Pitch, Psf, Search
-from .common import SensorFile, corrected, progress, read_frame, required, say
+from .common import SensorFile, progress, read_frame, required, say
 
 if TYPE_CHECKING:
     from ..bundle import Network
@@ -93,7 +93,7 @@ def blurred_network(
     space = SpaceTargets.read(targets)
     frames: dict[str, Frame] = {}
     for image, file in _photographs(images, content).items():
-        frames[image] = corrected(read_frame(file), sensor)
+        frames[image] = read_frame(file, sensor=sensor)
     if not frames:
         raise UsageError("has no photograph of an image of the network", where=images)
     matching = BlurredOptions(

@@ -39,7 +39,6 @@ from .common import (
     Out,
     SensorFile,
     Store,
-    corrected,
     overlay_files,
     progress,
     read_frame,
@@ -281,7 +280,7 @@ def _found_target(
     for path in files:
         if not is_points(path) and len(frames) < _TRIED:
             try:
-                frames.append(corrected(read_frame(path, channel.value), sensor))
+                frames.append(read_frame(path, channel.value, sensor))
             except ImageError:
                 continue  # is told with its name when all are measured
     name, design = required(which_target(frames, designs_beside([*folders, Path()])), "--design auto")

@@ -102,19 +102,6 @@ def orientation(mirrored: bool | None, max_rotation: float | None) -> dict[str, 
     return given if max_rotation is None else given | {"max_rotation_deg": max_rotation}
 
 
-def corrected(frame: Frame, sensor: Path | None) -> Frame:
-    """Return the frame, corrected with a calibration of `reseau capture sensor` if one is given.
-
-    Raises
-    ------
-    FormatError
-        If the file is not a calibration of a sensor.
-    UsageError
-        If the size of the frame is not that of the sensor.
-    """
-    return frame if sensor is None else sensor_correction(sensor).correct(frame)
-
-
 @cache
 def sensor_correction(path: Path) -> SensorCorrection:
     """Return the correction of a calibration of a sensor, which is read once for all frames of a command."""
@@ -136,14 +123,24 @@ def open_archive(place: str, objects: str | None, *, create: bool = False) -> Ar
     return Archive.open(place, objects, create=create)
 
 
-def read_frame(path: Path, channel: ChannelName = "luma") -> Frame:
-    """Read an image; notes on how it was read are written to standard error."""
+def read_frame(path: Path, channel: ChannelName = "luma", sensor: Path | None = None) -> Frame:
+    """Read an image; notes on how it was read are written to standard error.
+
+    With a calibration of `reseau capture sensor` the grey values are corrected.
+
+    Raises
+    ------
+    FormatError
+        If a file cannot be read, or `sensor` is not a calibration of a sensor.
+    UsageError
+        If the size of the frame is not that of the sensor.
+    """
     from ..io.images import read_image
 
     frame = read_image(path, channel)
     for note in frame.notes:
         typer.echo(f"note: {note}", err=True)
-    return frame
+    return frame if sensor is None else sensor_correction(sensor).correct(frame)
 
 
 def read_photo(path: Path) -> Frame | ImagePoints:

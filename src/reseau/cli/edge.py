@@ -13,7 +13,6 @@ from .common import (
     Out,
     Overlay,
     SensorFile,
-    corrected,
     overlay_files,
     progress,
     read_frame,
@@ -57,7 +56,7 @@ def edge(
     if report is not None:
         writable(report)
     picture = overlay_files(overlay, [image])[image] if overlay is not None else None
-    frame = corrected(read_frame(image, channel.value), sensor)
+    frame = read_frame(image, channel.value, sensor)
     options = {"regions": regions or None, "channel": channel.value}
     with progress(f"measuring {image.name}", max(1, len(regions))) as step:
         result = measure_sharpness(frame, regions, options=options, step=step)

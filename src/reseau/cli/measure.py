@@ -16,7 +16,6 @@ from .common import (
     Out,
     Overlay,
     SensorFile,
-    corrected,
     orientation,
     overlay_files,
     progress,
@@ -72,7 +71,7 @@ def reseau(
         **orientation(mirrored, max_rotation),
     )
     task.run(
-        lambda: corrected(read_frame(image, channel.value), sensor),
+        lambda: read_frame(image, channel.value, sensor),
         lambda frame: measure_reseau(frame, target, options),
     )
 
@@ -104,9 +103,9 @@ def pins(
     target = ReseauDesign.read(design)
     options = PinOptions(most_length_px=max_length_px, **orientation(mirrored, max_rotation))
     task.run(
-        lambda: corrected(read_frame(image), sensor),
+        lambda: read_frame(image, sensor=sensor),
         lambda frame: measure_pins(
-            frame, target, options, [corrected(read_frame(path), sensor) for path in also or []]
+            frame, target, options, [read_frame(path, sensor=sensor) for path in also or []]
         ),
     )
 
@@ -137,7 +136,7 @@ def coded_field(
         target = target.from_behind()
     options = TestfieldOptions(row_jitter_px=row_jitter, fill=fill)
     task.run(
-        lambda: corrected(read_frame(image), sensor),
+        lambda: read_frame(image, sensor=sensor),
         lambda frame: measure_testfield(frame, target, options),
     )
 
@@ -165,7 +164,7 @@ def board(
     target = BoardDesign.read(design)
     options = BoardOptions(mirrored=mirrored, row_jitter_px=row_jitter, fill=fill)
     task.run(
-        lambda: corrected(read_frame(image, channel.value), sensor),
+        lambda: read_frame(image, channel.value, sensor),
         lambda frame: measure_board(frame, target, options),
     )
 
@@ -193,7 +192,7 @@ def tags(
     marker_dictionary(dictionary)
     options = BoardOptions(row_jitter_px=row_jitter, fill=fill)
     task.run(
-        lambda: corrected(read_frame(image, channel.value), sensor),
+        lambda: read_frame(image, channel.value, sensor),
         lambda frame: measure_tags(frame, dictionary, border_bits, options),
     )
 
