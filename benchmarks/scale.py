@@ -8,7 +8,8 @@ testfield through a shared store. At a quarter of the images one worker is kille
 client is, and is started again; one image ends every process that measures it. Printed are how often each
 image was measured, whether the results are those of this process to the byte, what the cluster costs besides
 measuring (processor time of client, scheduler and workers, from when all have started), and the memory of
-client and scheduler over time.
+client and scheduler over time. What the processes take while they wait is measured beforehand, and counted
+for the time that measuring takes two workers: where the machine is busy with other things they wait longer.
 
 `bundle` adjusts networks with the statistics of two collections of photographs, see `scale_bundle.py`.
 """
@@ -28,6 +29,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import psutil
@@ -45,6 +47,7 @@ from reseau_sims import FieldBench, Station
 ROOT = Path(__file__).resolve().parents[1]
 POISON = "00777.png"
 DISTINCT = 40
+IDLE_S = 15.0
 BENCH = FieldBench(seed=3, bend_mm=0.0).distorted(1.0)
 
 
@@ -108,6 +111,9 @@ class Processes:
             "PYTHONPATH": os.pathsep.join(paths),
             "DASK_LOGGING__DISTRIBUTED": "error",
             "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+            "DASK_DISTRIBUTED__WORKER__MEMORY__MONITOR_INTERVAL": "1s",
+            "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
+            "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
         }
         with (self.folder / "output").open("ab") as output:
             process = subprocess.Popen(
@@ -126,6 +132,15 @@ class Processes:
                         used = each.cpu_times()
                         self.times[each.pid, each.create_time()] = used.user + used.system
 
+    def idle(self) -> float:
+        """Processor time (s) that all take in a second in which they do nothing."""
+        time.sleep(IDLE_S)  # they may still be starting
+        self.sample()
+        before, began = sum(self.times.values()), time.monotonic()
+        time.sleep(IDLE_S)
+        self.sample()
+        return (sum(self.times.values()) - before) / (time.monotonic() - began)
+
     def end(self) -> None:
         """End all processes."""
         for process in self.started:
@@ -135,6 +150,16 @@ class Processes:
                     with suppress(psutil.Error):
                         each.kill()
             process.wait()
+
+
+class Sample(NamedTuple):
+    """Images measured at a time (s), processor time (s) besides measuring them, and memory (MB)."""
+
+    done: int
+    seconds: float
+    besides: float
+    client: float
+    scheduler: float
 
 
 @contextmanager
@@ -176,18 +201,19 @@ def part_cluster(count: int) -> None:
         with cluster(folder) as (processes, address):
             scheduler, first = processes.started[0], processes.started[1]
             own = (str(Path(__file__)), "--part", "client", "--address", address, "--folder", str(folder))
+            idle = processes.idle()
             running, began = processes.start(*own), time.monotonic()
             killed, restarted, done = False, 0.0, 0
-            memory = list[tuple[int, float, float, float]]()
+            memory = list[Sample]()
             while running.poll() is None:
                 time.sleep(0.5)
                 processes.sample()
                 logged = lines(folder / "log")
-                done = len(logged)
+                done, seconds = len(logged), time.monotonic() - began
                 besides = sum(processes.times.values()) - sum(float(each) for _, each in logged)
                 with suppress(psutil.Error):
                     held = [psutil.Process(each.pid).memory_info().rss / 1e6 for each in (running, scheduler)]
-                    memory.append((done, besides, held[0], held[1]))
+                    memory.append(Sample(done, seconds, besides, held[0], held[1]))
                 if not killed and done >= count // 4:
                     victim = worker_of(first)
                     if victim is not None:
@@ -203,12 +229,10 @@ def part_cluster(count: int) -> None:
             seconds = time.monotonic() - began
             if running.returncode:
                 raise SystemExit((folder / "output").read_text()[-2000:])
-        report(folder, count, seconds, memory)
+        report(folder, count, seconds, idle, memory)
 
 
-def report(
-    folder: Path, count: int, seconds: float, memory: Sequence[tuple[int, float, float, float]]
-) -> None:
+def report(folder: Path, count: int, seconds: float, idle: float, memory: Sequence[Sample]) -> None:
     """Print what the runs came to."""
     measured = Counter(name for name, _ in lines(folder / "log"))
     spent = sum(float(each) for _, each in lines(folder / "log"))
@@ -228,14 +252,18 @@ def report(
     same = sum(results[name] == each for name, each in here.items())
     print(f"identical to those of this process: {same} of {len(here)}")
     # From the last start of the client on, when its imports are done.
-    late = np.array([each for each in memory if each[0] > 0.6 * count])
-    slope = np.polyfit(late[:, 0], late[:, 1], 1)[0]
-    print(f"processor time an image: measuring {1000 * spent / sum(measured.values()):.1f} ms, ", end="")
-    reading = alone / len(here)
-    print(f"reading {1000 * reading:.1f} ms, all else {1000 * (slope - reading):.1f} ms")
-    for which, column in (("client", 2), ("scheduler", 3)):
-        at = [each for each in memory if each[0] > 0 and each[column] > 0]
-        quarters = [at[min(len(at) - 1, len(at) * k // 4)][column] for k in range(1, 5)]
+    late = [each for each in memory if each.done > 0.6 * count]
+    done = late[-1].done - late[0].done
+    slope = (late[-1].besides - late[0].besides - idle * (late[-1].seconds - late[0].seconds)) / done
+    measuring, reading = spent / sum(measured.values()), alone / len(here)
+    waiting = idle * measuring / 2
+    print(
+        f"processor time an image: measuring {1000 * measuring:.1f} ms, reading {1000 * reading:.1f} ms, all "
+        f"else {1000 * (slope - reading + waiting):.1f} ms, of which {1000 * waiting:.1f} ms while waiting"
+    )
+    for which in ("client", "scheduler"):
+        at = [float(getattr(each, which)) for each in memory if each.done > 0]
+        quarters = [at[min(len(at) - 1, len(at) * k // 4)] for k in range(1, 5)]
         print(f"memory of {which} at each quarter: " + ", ".join(f"{each:.0f}" for each in quarters) + " MB")
 
 

@@ -179,6 +179,17 @@ def test_parts_of_a_file_are_read_and_a_change_of_it_is_noticed(tmp_path: Path) 
         assert stream.read(3) == b"pix"
 
 
+@pytest.mark.parametrize("left", [b"", b"pix", b"pixelz"])
+def test_a_file_that_a_power_failure_left_partial_is_written_again(tmp_path: Path, left: bytes) -> None:
+    objects = LocalObjects(tmp_path, durable=False)
+    sha256 = objects.put(b"pixels", ".raw")
+    objects.path(sha256, ".raw").write_bytes(left)
+    with pytest.raises(ArchiveError, match="has been changed"):
+        objects.get(sha256, ".raw")
+    assert objects.put(b"pixels", ".raw") == sha256
+    assert objects.get(sha256, ".raw") == b"pixels"
+
+
 def test_a_frame_on_the_disk_but_not_in_the_index_is_recovered(opened: Callable[[], Archive]) -> None:
     with opened() as archive:
         session = archive.begin("s", "frames", {})

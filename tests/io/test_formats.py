@@ -11,7 +11,7 @@ import pytest
 
 from reseau.core.data import ImagePoints
 from reseau.core.errors import FormatError, InputError
-from reseau.io import ReseauDesign, ReseauMeasurement, read_text, write_whole
+from reseau.io import PhotographPoints, ReseauDesign, ReseauMeasurement, read_text, write_whole
 
 
 def design() -> dict[str, Any]:
@@ -212,3 +212,33 @@ def test_an_invalid_csv_is_refused_with_its_line(tmp_path: Path, text: str, comp
     path.write_text(text)
     with pytest.raises(FormatError, match=rf"p\.csv: .*{complaint}"):
         ReseauMeasurement.read_csv(path)
+
+
+def photograph_points() -> dict[str, Any]:
+    cov = np.array([[[0.1 + 0.2, 1e-17], [1e-17, 1 / 3]]])
+    return PhotographPoints.of(ImagePoints(("a",), np.array([[0.1, -2e300]]), cov), (640, 480)).to_dict()
+
+
+def test_points_of_a_photograph_are_read_back_to_the_last_bit() -> None:
+    found = PhotographPoints.parse(json.dumps(photograph_points()), where="p.json").image_points()
+    assert isinstance(found, ImagePoints)
+    assert found.xy.tolist() == [[0.1, -2e300]]
+    assert found.cov.tolist() == [[[0.1 + 0.2, 1e-17], [1e-17, 1 / 3]]]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"names": ["a", "b"]},
+        {"names": []},
+        {"xy": "AAAA"},
+        {"xy": "not base64"},
+        {"xy": "µµµµ"},
+        {"xy": "AAAAAAAA+H8AAAAAAADwPw=="},  # NaN and 1
+    ],
+)
+def test_damaged_points_of_a_photograph_are_refused_in_one_line(change: dict[str, Any]) -> None:
+    document = photograph_points()
+    document["points"] |= change
+    with pytest.raises(FormatError, match=r"^p\.json: `points`: (columns|numbers) that are [a-z ]+$"):
+        PhotographPoints.parse(json.dumps(document), where="p.json")

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from reseau.core.errors import InputError, UsageError
-from reseau.procedures.exposures import exposures_of_files, files_of
+from reseau.core.errors import ArchiveError, InputError, UsageError
+from reseau.io.images import write_image
+from reseau.procedures.exposures import exposures_of_files, files_of, photograph_reader, photographs_of
+from reseau.procedures.target_measurement import Unread
 
 
 def exposures(**files: str) -> dict[str, str]:
@@ -55,3 +58,25 @@ def test_files_are_those_of_a_folder_or_of_a_pattern(tmp_path: Path) -> None:
         files_of(str(tmp_path / "inner"))
     with pytest.raises(InputError, match="matches no file"):
         files_of(str(tmp_path / "*.jpg"))
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_photograph_is_read_from_the_store_unless_it_changed_there(tmp_path: Path, again: bool) -> None:
+    store, image = tmp_path / "store", np.arange(20, dtype=np.uint8).reshape(4, 5)
+    write_image(tmp_path / "a.png", image)
+
+    def photograph() -> Unread:
+        _, found = photographs_of([("a", tmp_path / "a.png")], photograph_reader(), store=str(store))
+        (one,) = found
+        assert isinstance(one, Unread)
+        return one
+
+    one = photograph()
+    (path,) = store.glob("*/*.png")
+    write_image(path, image[::-1])
+    if again:
+        one = photograph()
+        assert np.array_equal(one.read().pixels, image)
+    else:
+        with pytest.raises(ArchiveError, match="has been changed"):
+            one.read()

@@ -65,6 +65,9 @@ class LocalObjects:
     ----------
     folder : path
         Created if it does not exist.
+    durable : bool
+        Whether files are flushed to disk. Otherwise a power failure may leave the last of them empty or
+        partial; `put` replaces such files. For copies, and for what can be computed again.
 
     Examples
     --------
@@ -76,8 +79,8 @@ class LocalObjects:
     True
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, *, durable: bool = True) -> None:
+        self.folder, self._durable = folder, durable
         self._checked: dict[Path, tuple[int, int, int]] = {}
 
     @property
@@ -99,7 +102,7 @@ class LocalObjects:
         """
         sha256 = sha256_of(data)
         path = self.path(sha256, suffix)
-        if not (path.exists() and sha256_of(path) == sha256):
+        if not self._has(path, data):
             self._write(path, data)
         return sha256
 
@@ -122,19 +125,31 @@ class LocalObjects:
         except OSError as error:
             raise ArchiveError(f"cannot be read ({error.strerror})", where=self.folder) from None
 
+    @staticmethod
+    def _has(path: Path, data: bytes) -> bool:
+        try:
+            return path.read_bytes() == data
+        except FileNotFoundError:
+            return False
+        except OSError as error:
+            raise ArchiveError(f"cannot be read ({error.strerror})", where=path) from None
+
     def _write(self, path: Path, data: bytes) -> None:
         # Processes of several machines may share the folder: a number of a process is not enough.
         draft = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}")
         try:
             if not path.parent.is_dir():
                 path.parent.mkdir(parents=True, exist_ok=True)
-                _to_disk(self.folder)
+                if self._durable:
+                    _to_disk(self.folder)
             with draft.open("wb") as stream:
                 stream.write(data)
                 stream.flush()
-                os.fsync(stream.fileno())
+                if self._durable:
+                    os.fsync(stream.fileno())
             draft.replace(path)
-            _to_disk(path.parent)
+            if self._durable:
+                _to_disk(path.parent)
         except OSError as error:
             with suppress(OSError):
                 draft.unlink(missing_ok=True)
@@ -317,8 +332,15 @@ class RemoteObjects:
             raise ArchiveError(f"the object store refused ({error})", where=self._url) from None
 
 
-def objects_at(place: str | Path) -> Objects:
+def objects_at(place: str | Path, *, durable: bool = True) -> Objects:
     """Return the store at a folder or URL.
+
+    Parameters
+    ----------
+    place : str or Path
+        Folder, or URL of fsspec.
+    durable : bool
+        Whether files of a folder are flushed to disk; see :class:`LocalObjects`.
 
     Raises
     ------
@@ -330,7 +352,7 @@ def objects_at(place: str | Path) -> Objects:
     >>> objects_at("memory://frames").place
     'memory://frames'
     """
-    return RemoteObjects(str(place)) if "://" in str(place) else LocalObjects(Path(place))
+    return RemoteObjects(str(place)) if "://" in str(place) else LocalObjects(Path(place), durable=durable)
 
 
 def _record(key: str) -> str:

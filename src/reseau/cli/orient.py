@@ -315,7 +315,7 @@ def _sent(job: _Job, store: str) -> tuple[_Job, dict[str, str]]:
     """A job for another machine: its files by their SHA-256 in the store."""
     from ..archive import objects_at
 
-    objects, files = objects_at(store), {}
+    objects, files = objects_at(store, durable=False), {}
     for path in (job.image, job.corners):
         if path is not None:
             try:
@@ -331,7 +331,7 @@ def _run_apart(store: str, sent: tuple[_Job, dict[str, str]]) -> _Done:
 
     from ..archive import objects_at
 
-    (job, files), objects = sent, objects_at(store)
+    (job, files), objects = sent, objects_at(store, durable=False)
     with TemporaryDirectory() as name:
         folder = Path(name)
         here = {}

@@ -74,7 +74,7 @@ class Cluster:
             raise UsageError("requires a store that all workers share", where="--cluster", do="add --store")
         with optional():
             import distributed
-        self._place, self._store = store, objects_at(store)
+        self._place, self._store = store, _messages(store)
         self._known, self._asked = 1, -_ASK_S
         connect: Any = distributed.Client
         try:
@@ -183,6 +183,12 @@ _Batch = list[tuple[str, _Sent]]
 _Run = Callable[[_Batch], tuple[float, list[_Sent]]]
 
 
+@lru_cache(maxsize=4)
+def _messages(place: str) -> Objects:
+    # A message that is lost in a power failure is lost with the run.
+    return objects_at(place, durable=False)
+
+
 def _sent(store: Objects, thing: object, *, always: bool = False) -> _Sent:
     data = pickle.dumps(thing, protocol=5)
     if always or len(data) > _SMALL:
@@ -203,14 +209,14 @@ def _on_worker(place: str, work: _Sent, batch: _Batch) -> tuple[float, list[_Sen
         # Dask marks its workers as processes without children. These end by themselves with their parent.
         multiprocessing.current_process().daemon = False
         _of_thread.processes = Processes(1, (__name__,))
-    began, store = time.monotonic(), objects_at(place)
+    began, store = time.monotonic(), _messages(place)
     outcomes = _of_thread.processes.outcomes(partial(_done, place, work), batch)
     found = [_sent(store, each) if isinstance(each, Failure) else each for _, each in outcomes]
     return time.monotonic() - began, found
 
 
 def _done(place: str, work: _Sent, job: _Sent) -> _Sent:
-    store = objects_at(place)
+    store = _messages(place)
     try:
         return _sent(store, _work(place, work)(_received(store, job)))
     except Exception as error:
@@ -219,5 +225,5 @@ def _done(place: str, work: _Sent, job: _Sent) -> _Sent:
 
 @lru_cache(maxsize=4)
 def _work(place: str, sent: _Sent) -> Callable[[Any], Any]:
-    found: Callable[[Any], Any] = _received(objects_at(place), sent)
+    found: Callable[[Any], Any] = _received(_messages(place), sent)
     return found

@@ -52,7 +52,8 @@ class Outputs:
 
     @cached_property
     def _store(self) -> Objects:
-        return objects_at(self.place)
+        # What is lost in a power failure is computed again.
+        return objects_at(self.place, durable=False)
 
     def made(self, inputs: Mapping[str, str], compute: Callable[[], bytes]) -> str:
         """Return the SHA-256 of an output; compute and keep it unless it exists and is whole.

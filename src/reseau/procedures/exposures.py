@@ -272,7 +272,8 @@ def photographs_of(
             else:
                 yield Unread(name, partial(_named, partial(read, image), name))
 
-    objects = objects_at(store) if store else None
+    # Copies: the files themselves remain.
+    objects = objects_at(store, durable=False) if store else None
     return said, opened()
 
 
@@ -290,6 +291,7 @@ def _content(path: Path) -> bytes:
 def _of_store(read: Callable[[Path | Frame], Frame], place: str, sha256: str, suffix: str) -> Frame:
     store = objects_at(place)
     if isinstance(store, LocalObjects):
+        store.open(sha256, suffix).close()  # checked: results are kept by this hash
         return read(store.path(sha256, suffix))
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"{sha256}{suffix}"
