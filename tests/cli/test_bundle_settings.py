@@ -92,6 +92,23 @@ def test_one_sigma_for_all_image_coordinates_and_another_datum(reseau: Run, netw
     assert twice["sigma0"] == pytest.approx(free["sigma0"] / 2, rel=1e-6)
 
 
+def test_a_network_beyond_the_memory_is_solved_by_conjugate_gradients(reseau: Run, network: Path) -> None:
+    status, out, err = reseau("bundle", network, "--datum", "free", "--memory", "0", "--json")
+    assert status == 0, err
+    found = json.loads(out)
+    assert "conjugate gradients" in json.dumps(found["warnings"])
+    assert found["provenance"]["options"]["memory"] == 0.0
+    _, out, _ = reseau("bundle", network, "--datum", "free", "--json")
+    whole = json.loads(out)
+    assert "conjugate gradients" not in json.dumps(whole["warnings"])
+    assert "memory" not in whole["provenance"]["options"]
+    one, other = found["cameras"][0]["parameters"], whole["cameras"][0]["parameters"]
+    assert list(one) == list(other)
+    for name, entry in other.items():
+        assert one[name]["value"] == pytest.approx(entry["value"], abs=1e-4 * (entry["sigma"] or 1.0))
+        assert one[name]["sigma"] == pytest.approx(entry["sigma"], rel=1e-4)
+
+
 def test_a_network_is_converted_with_its_settings(reseau: Run, network: Path, tmp_path: Path) -> None:
     target = tmp_path / "converted.json"
     status, out, err = reseau("bundle", network, "--free", "K2", "--convert", target)

@@ -13,6 +13,7 @@ from .bundle_options import (
     DatumChoice,
     Distances,
     Eliminate,
+    Memory,
     Reject,
     component_kind,
     level_of,
@@ -91,6 +92,7 @@ def bundle(
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
     distance: Distances = None,
+    memory: Memory = None,
     as_json: AsJson = False,
 ) -> None:
     """Adjust a network of images: orientation, calibration and object points, with their uncertainty."""
@@ -112,13 +114,14 @@ def bundle(
         return
     with progress("adjusting", 30) as step:
         options = Options(
-            outliers="reject" if reject else "keep", alpha=alpha, watch=lambda k, cost: step(f"iteration {k}")
-        )
+            outliers="reject" if reject else "keep", alpha=alpha, memory_gb=memory,
+            watch=lambda k, cost: step(f"iteration {k}"),
+        )  # fmt: skip
         found = search_model(content, options, component_kind(components), level_of(eliminate, "--eliminate"))
         result = required(found, network)
     settings = {"reject": reject, "alpha": alpha, "components": component_kind(components),
                 "eliminate": eliminate, "free": free, "fix": fix, "datum": chosen,
-                "sigma": sigma}  # fmt: skip
+                "sigma": sigma, "memory": memory}  # fmt: skip
     settings = {key: value for key, value in settings.items() if key in _ALWAYS or value is not None}
     more = [*calibrations.values(), *([] if control is None else [control])]
     hashes = {file.name: sha256_of(file) for file in more}

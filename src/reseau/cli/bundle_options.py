@@ -30,6 +30,7 @@ __all__ = [
     "DatumChoice",
     "Distances",
     "Eliminate",
+    "Memory",
     "Reject",
     "component_kind",
     "level_of",
@@ -78,6 +79,15 @@ Eliminate = Annotated[
     float | None,
     typer.Option(
         help="Drop distortion parameters that are not significant at this level, e.g. 0.05; cross-validate."
+    ),
+]
+Memory = Annotated[
+    float | None,
+    typer.Option(
+        min=0.0,
+        metavar="GB",
+        help="Memory that the normal equations may take, by default half of what is available. Larger "
+        "networks are solved by conjugate gradients, without some of their statistics.",
     ),
 ]
 Distances = Annotated[

@@ -16,6 +16,7 @@ from .bundle_options import (
     ComponentsOf,
     Distances,
     Eliminate,
+    Memory,
     Reject,
     component_kind,
     level_of,
@@ -188,6 +189,7 @@ def calibrate(
         list[Path] | None, typer.Option(help="Calibration of the same camera to compare with; repeatable.")
     ] = None,
     distance: Distances = None,
+    memory: Memory = None,
     jobs: Jobs = None,
     cluster: ClusterAddress = "",
     store: Store = "",
@@ -218,7 +220,7 @@ def calibrate(
     level = level_of(eliminate, "--eliminate")
 
     options = _options(
-        sigma, control, refraction, leave_out or [], reject, kind, level, target_points, turntable
+        sigma, control, refraction, leave_out or [], reject, kind, level, target_points, turntable, memory
     )
     lens = _camera(model, pitch, side, model_option or [], free, rolling, motion)
     measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
@@ -248,6 +250,7 @@ def calibrate(
         model=lens.model, pitch=pitch, options=dict(lens.options), free=free, sigma=sigma,
         reject=reject, row_jitter=row_jitter, fill=fill, channel=channel.value, eliminate=eliminate,
         leave_out=list(leave_out or []), components=kind, rolling_shutter=rolling, motion=motion or None,
+        **({} if memory is None else {"memory": memory}),
     )  # fmt: skip
     differences = _differences(done, others)
     calibrations = [
@@ -332,6 +335,7 @@ def _options(
     level: float | None,
     target: Target,
     turntable: Path | None,
+    memory: float | None,
 ) -> CalibrationOptions:
     """Options of the procedure, from the options of the command."""
     from ..bundle import Options
@@ -346,7 +350,7 @@ def _options(
             raise UsageError(f"is {text!r}", where="--leave-out", do="write image:point, as photo.jpg:A1")
         pairs.append((image, point))
     return CalibrationOptions(
-        Options(outliers="reject" if reject else "keep"), sigma,
+        Options(outliers="reject" if reject else "keep", memory_gb=memory), sigma,
         None if control is None else read_control(control), tuple(pairs), components, level,
         refraction=None if refraction is None else RefractionFile.read(refraction), target=target.value,
         turntable=None if turntable is None else read_turntable(turntable),
