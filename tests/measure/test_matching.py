@@ -250,19 +250,69 @@ def test_compiled_matches_from_known_light_are_those_of_the_general_adjustment(o
     known = {"noise": NOISE, "form_sigma": np.array([0.1]), "searching": False}
     light = np.full(len(xy), 102.0 if bright else 0.68), level
     compiled = match(*given, settings, light=light, **known)
-    monkeypatch.setattr(matcher, "_compiled", lambda *_: (None, np.arange(len(xy)), None))
+    monkeypatch.setattr(matcher, "_compiled", lambda *_: (None, np.arange(len(xy))))
     general = match(*given, settings, light=light, **known)
     assert compiled.converged.sum() > len(xy) - 5
     for name in ("converged", "seen", "rejected"):
         np.testing.assert_allclose(getattr(compiled, name), getattr(general, name), rtol=0, atol=1e-6)
+    compiled, general = compiled.select(general.converged), general.select(general.converged)
     sigma = np.sqrt(np.diagonal(general.cov, axis1=1, axis2=2))
-    # Rounding of sums in single precision; a sigma is 0.01 px.
-    np.testing.assert_allclose((compiled.xy - general.xy) / sigma, 0, rtol=0, atol=2e-3)
-    np.testing.assert_allclose(compiled.cov, general.cov, rtol=1e-4, atol=1e-9)
-    np.testing.assert_allclose(compiled.residuals, general.residuals, rtol=0, atol=2e-3)
-    np.testing.assert_allclose(compiled.form_sigma, general.form_sigma, rtol=1e-4, atol=0)
+    # Rounding of sums in single precision, and other steps where another Jacobian is needed: both end at
+    # corrections of a tenth of a sigma, which is 0.01 px.
+    np.testing.assert_allclose((compiled.xy - general.xy) / sigma, 0, rtol=0, atol=2e-2)
+    np.testing.assert_allclose(compiled.cov, general.cov, rtol=1e-3, atol=1e-9)
+    off = np.linalg.norm((compiled.residuals - general.residuals).reshape(len(sigma), -1), axis=1)
+    np.testing.assert_allclose(off / NOISE, 0, rtol=0, atol=settings.settled)
+    np.testing.assert_allclose(compiled.form_sigma, general.form_sigma, rtol=1e-3, atol=0)
     for name in ("psf_px", "contrast", "level", "noise", "correlation", "t"):
-        np.testing.assert_allclose(getattr(compiled, name), getattr(general, name), rtol=1e-4, atol=0)
+        np.testing.assert_allclose(getattr(compiled, name), getattr(general, name), rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("polarity", ["dark", "bright"])
+def test_compiled_searches_are_those_of_the_general_adjustment(polarity, monkeypatch):
+    xy, bright = places(), polarity == "bright"
+    pixels = formed("square", xy, bright=bright) + noise(8)
+    pixels[20:24, 20:60] += 40.0
+    given = pixels, pixels > -np.inf, GrownOutline(outlines("square", len(xy)).single(), SIZE), xy + 0.7
+    settings = MatchOptions(half_px=9, psf_px=1.5, settled=0.05, polarity=polarity, influence=True)
+    known = {"noise": NOISE, "form_sigma": np.array([0.1])}
+    compiled = match(*given, settings, **known)
+    start = Patches.start
+
+    def general_start(patch, noise):
+        found = start(patch, noise)
+        patch.single = False
+        return found
+
+    monkeypatch.setattr(Patches, "start", general_start)
+    general = match(*given, settings, **known)
+    assert compiled.converged.sum() > len(xy) - 3
+    np.testing.assert_array_equal(compiled.converged, general.converged)
+    sigma = np.sqrt(np.diagonal(general.cov, axis1=1, axis2=2))
+    # Iterations end at corrections of a twentieth of a sigma.
+    np.testing.assert_allclose((compiled.xy - general.xy) / sigma, 0, rtol=0, atol=0.1)
+    # Of a pixel at the limit of rejection either may be right; its residual is a part of the covariance.
+    alike = (np.isfinite(compiled.residuals) == np.isfinite(general.residuals)).all(axis=(1, 2))
+    assert alike.sum() >= len(xy) - 1
+    compiled, general = compiled.select(alike), general.select(alike)
+    np.testing.assert_allclose(compiled.cov, general.cov, rtol=0.05, atol=1e-9)
+    most = np.abs(general.influence).max()
+    np.testing.assert_allclose(compiled.influence, general.influence, rtol=0, atol=0.05 * most)
+
+
+def test_a_match_of_precise_positions_finds_the_light_and_keeps_large_residuals():
+    xy = places()
+    pixels = formed("square", xy) + noise(8)
+    pixels[20:24, 20:60] += 40.0
+    given = pixels, pixels > -np.inf, GrownOutline(outlines("square", len(xy)).single(), SIZE), xy + 0.2
+    settings = MatchOptions(half_px=9, psf_px=0.75, settled=0.05)
+    found = match(*given, settings, noise=NOISE, form_sigma=np.array([0.1]), precise=True)
+    plain = found.noise < 1.5 * np.median(found.noise)
+    assert found.converged[plain].all()
+    assert 0 < (~plain).sum() < 5
+    assert (found.rejected == 0).all()
+    np.testing.assert_allclose(found.xy[plain], xy[plain], rtol=0, atol=0.05)
+    np.testing.assert_allclose(found.contrast[plain], 0.68, rtol=0, atol=0.03)
 
 
 def test_values_without_an_image_do_not_disturb_other_marks():

@@ -131,57 +131,61 @@ class Samples:
     used: Mask
 
     def basis(self, share: Array, slopes: Array) -> Array:
-        """What each mark explains by itself (k, n, b): position, form, contrast and background."""
+        """What each mark explains by itself (k, b, n): position, form, contrast and background."""
         k, rows, columns = share.shape
         u, v = np.linspace(-1, 1, columns)[None, :], np.linspace(-1, 1, rows)[:, None]
-        even = np.broadcast_to(np.stack([u**i * v**j for i, j in _POWERS]), (k, len(_POWERS), rows, columns))
-        parts = [share[:, None] * even[:, :3], slopes, even]
-        return np.moveaxis(np.concatenate(parts, axis=1).reshape(k, -1, rows * columns), 1, 2)
+        even, m = np.stack([u**i * v**j for i, j in _POWERS]), slopes.shape[1]
+        parts = np.empty((k, 3 + m + len(even), rows, columns))
+        np.multiply(share[:, None], even[:3], out=parts[:, :3])
+        parts[:, 3 : 3 + m], parts[:, 3 + m :] = slopes, even
+        return parts.reshape(k, -1, rows * columns)
 
 
 _POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 
 
 def unexplained(values: Array, basis: Array, weight: Array) -> Array:
-    """What weighted values (k, n, s) contain beside a weighted basis (k, n, b)."""
-    known, scaled = basis * weight[..., None], values * weight[..., None]
-    known = known / np.maximum(np.linalg.norm(known, axis=1, keepdims=True), 1e-300)
+    """What weighted values (k, s, n) contain beside a weighted basis (k, b, n)."""
+    known, scaled = _turned(basis * weight[:, None]), values * weight[:, None]
     turned = np.swapaxes(known, 1, 2)
-    normal = turned @ known + _SINGULAR * np.eye(known.shape[2])
+    normal = known @ turned + _SINGULAR * np.eye(known.shape[1])
     for _ in range(2):  # what rounding left the first time
-        scaled = scaled - known @ np.linalg.solve(normal, turned @ scaled)
+        scaled = (
+            scaled - np.swapaxes(np.linalg.solve(normal, known @ np.swapaxes(scaled, 1, 2)), 1, 2) @ known
+        )
     return np.asarray(scaled)
 
 
-def _turned(basis: Array) -> Array:
-    """A basis (k, n, b) as rows (k, b, n) of length 1."""
-    rows = np.swapaxes(basis, 1, 2)
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=2, keepdims=True), 1e-300))
+def _turned(rows: Array) -> Array:
+    """A basis (k, b, n) with rows of length 1."""
+    length = np.sqrt(np.einsum("kbn,kbn->kb", rows, rows))
+    return np.asarray(rows / np.maximum(length, 1e-300)[..., None])
 
 
-def _reduced(parts: Array, last: int) -> Array:
-    """Products (last, last) of the last rows of parts (k, m, n) without what the others explain, summed."""
-    products = parts @ np.swapaxes(parts, 1, 2)
-    first = parts.shape[1] - last
+def _reduced(products: Array, last: int) -> Array:
+    """Products (k, m, m) of the `last` of parts without what the others explain, summed: (last, last)."""
+    first = products.shape[1] - last
     known = products[:, :first, :first] + _SINGULAR * np.eye(first)
     across = products[:, :first, first:]
     left = products[:, first:, first:] - np.swapaxes(across, 1, 2) @ np.linalg.solve(known, across)
     return np.asarray(left.sum(axis=0))
 
 
-def estimate_kernel(samples: Samples) -> tuple[Array, float, float]:
+def estimate_kernel(samples: Samples, sharper: tuple[float, ...] = _SHARPER) -> tuple[Array, float, float]:
     """Estimate the kernel between a Gaussian point-spread function and the images of marks.
 
     Parameters
     ----------
     samples : Samples
         Marks that were matched with images of a Gaussian point-spread function.
+    sharper : tuple of float
+        Shares of the width of that function that are tried beneath the kernel, 1 first.
 
     Returns
     -------
     kernel : ndarray (11, 11)
         The kernel.
-    sharper : float
+    share : float
         Share of the width `psf_px` of the Gaussian to which it belongs.
     gain : float
         Mean square of the residuals with the kernel over that without.
@@ -197,7 +201,7 @@ def estimate_kernel(samples: Samples) -> tuple[Array, float, float]:
     >>> moved = FilteredShape(plain, np.array([[0, 0, 0], [0.3, 0.4, 0.3], [0, 0, 0]]))
     >>> grey = 200 - 150 * moved.image(*place) + np.random.default_rng(0).normal(0, 0.5, (1, 25, 25))
     >>> one = Samples(plain, *place[:3], np.array([-150.0]), window, grey, grey > 0)
-    >>> kernel, sharper, gain = estimate_kernel(one)
+    >>> kernel, share, gain = estimate_kernel(one)
     >>> bool(gain < 0.5), bool(kernel[5, 4] > 2 * kernel[4, 5])
     (True, True)
     """
@@ -206,44 +210,53 @@ def estimate_kernel(samples: Samples) -> tuple[Array, float, float]:
     )
     k, high, wide = samples.grey.shape
     used = samples.used.reshape(k, 1, -1).astype(np.float64)
+    every, best, plain, tried = np.arange(k), (np.inf, 1.0, np.zeros(len(offsets))), np.inf, sharper
     observed = np.where(samples.used, samples.grey, 0.0).reshape(k, 1, -1)
-    every, best = np.arange(k), (np.inf, 1.0, np.zeros(len(offsets)))
-    plain = np.inf
-    for sharper in _SHARPER:
-        place = samples.xy, sharper * samples.psf_px, samples.form, every, _widened(samples.window, _REACH)
+    for share_of_width in tried:
+        place = (
+            *(samples.xy, share_of_width * samples.psf_px, samples.form, every),
+            _widened(samples.window, _REACH),
+        )
         share, slopes = samples.shape.derivatives(*place)
         inner = slice(_REACH, _REACH + high), slice(_REACH, _REACH + wide)
         # The width is explained by the kernel.
-        own = np.delete(slopes, 2, axis=1)[:, :, *inner]
-        middle = share[:, *inner].astype(np.float64)
-
-        def shifted(i: int, j: int, image: Array = share) -> Array:
-            return image[:, _REACH - j : _REACH - j + high, _REACH - i : _REACH - i + wide]
-
-        if sharper == 1.0:
-            wider = _turned(samples.basis(middle, slopes[:, :, *inner])) * used
-            plain = float(_reduced(np.concatenate([wider, observed], axis=1), 1)[0, 0])
-        basis = _turned(samples.basis(middle, own))
-        parts = np.empty((k, basis.shape[1] + 1 + len(offsets), high * wide))
-        parts[:, : basis.shape[1]], parts[:, basis.shape[1]] = basis * used, observed[:, 0]
-        for part, (i, j) in enumerate(offsets.tolist(), basis.shape[1] + 1):
-            moved = shifted(i, j) + shifted(-i, -j) - 2 * middle
-            parts[:, part] = (moved * samples.depth[:, None, None]).reshape(k, -1) * used[:, 0]
-        left = _reduced(parts, 1 + len(offsets))
-        square, across, whole, cost = left[1:, 1:], left[1:, 0], float(left[0, 0]), plain
+        middle, own = share[:, *inner], np.delete(slopes[:, :, *inner], 2, axis=1)
+        basis = _turned(samples.basis(middle, own)) * used
+        if share_of_width == tried[0]:
+            # What a mark does not explain: sums of squares of grey values would drown it in rounding errors.
+            observed = unexplained(observed, basis, used[:, 0])
+            blur = slopes[:, 2:3, *inner].reshape(k, 1, -1) * used
+            wider = np.concatenate([basis, blur, observed], axis=1)
+            plain = float(_reduced(wider @ np.swapaxes(wider, 1, 2), 1)[0, 0])
+        parts = np.empty((basis.shape[1] + 1 + len(offsets), high, wide), np.float32)
+        whole = np.empty((k, len(parts), len(parts)))
+        flat, twice = parts.reshape(len(parts), -1), 2 * middle
+        for mark in every:
+            # One mark at a time: what is formed stays in a cache.
+            flat[: basis.shape[1]], flat[basis.shape[1]] = basis[mark], observed[mark, 0]
+            image, taken = share[mark], parts[basis.shape[1] + 1 :]
+            for part, (i, j) in zip(taken, offsets.tolist(), strict=True):
+                here = image[_REACH - j : _REACH - j + high, _REACH - i : _REACH - i + wide]
+                there = image[_REACH + j : _REACH + j + high, _REACH + i : _REACH + i + wide]
+                np.add(here, there, out=part)
+            taken -= twice[mark]
+            taken *= samples.depth[mark] * samples.used[mark]
+            whole[mark] = flat @ flat.T
+        left = _reduced(whole, 1 + len(offsets))
+        square, across, total, cost = left[1:, 1:], left[1:, 0], float(left[0, 0]), plain
         for _ in range(3):
             # The prior is weighed by what is left with the kernel: noise, not misfit.
             weight_of_prior = cost / max(used.sum(), 1) / _TAP**2
             values = np.linalg.solve(square + weight_of_prior * np.eye(len(offsets)), across)
-            cost = float(whole - 2 * values @ across + values @ square @ values)
+            cost = float(total - 2 * values @ across + values @ square @ values)
         if cost < best[0]:
-            best = cost, sharper, values
+            best = cost, share_of_width, values
         if cost > _FUTILE * plain:
             break
-    cost, sharper, values = best
+    cost, share_of_width, values = best
     kernel = np.zeros((2 * _REACH + 1,) * 2)
     values = np.where(np.abs(values) < _SMALL, 0.0, values)
     for (i, j), value in zip(offsets.tolist(), values, strict=True):
         kernel[_REACH + j, _REACH + i] = kernel[_REACH - j, _REACH - i] = value
     kernel[_REACH, _REACH] = 1 - kernel.sum()
-    return kernel, sharper, cost / max(plain, 1e-300)
+    return kernel, share_of_width, cost / max(plain, 1e-300)

@@ -32,6 +32,8 @@ _LINEAR = 0.15
 """Deviation of an exponent from 1 that does no harm."""
 _ATTEMPTS = 6
 """Iterations of the exponent."""
+_SETTLED = 0.01
+"""Change of the exponent from which it is not iterated."""
 _LEAST, _MOST = 0.35, 3.5
 """Exponents that cameras have."""
 _LIKE_SRGB = 0.5
@@ -131,7 +133,12 @@ class FoundCurve:
 
 
 def find_curve(
-    matched: Matched, full_scale: float, stated: ToneCurve | None, *, suspected: bool = True
+    matched: Matched,
+    full_scale: float,
+    stated: ToneCurve | None,
+    *,
+    suspected: bool = True,
+    beside: float = 1.0,
 ) -> FoundCurve:
     """Find the curve between light and grey values of a frame.
 
@@ -145,6 +152,9 @@ def find_curve(
         The curve that the file states.
     suspected : bool
         Whether to search for a curve where the file states none.
+    beside : float
+        Ratio of mean square residuals that another explanation leaves: a curve is searched for if it leaves
+        less.
 
     Notes
     -----
@@ -164,9 +174,9 @@ def find_curve(
         if misfit < _DOUBTFUL * least:
             best, least, at = FoundCurve(stated), misfit, given
     rest = estimate_gamma(*at, 1.0, full_scale)
-    if not rest.certain or abs(rest.gamma - 1) < _LINEAR:
+    if not rest.certain or abs(rest.gamma - 1) < _LINEAR or not rest.gain < beside:
         return best
-    power = _estimated(matched, straight, full_scale)
+    power = _estimated(matched, rest if at is straight else None, straight, full_scale)
     if power is None:
         return best
     gamma, sigma, there = power
@@ -192,13 +202,16 @@ def _misfit(curve: ToneCurve, at: tuple[Samples, Array], full_scale: float) -> f
 
 
 def _estimated(
-    matched: Matched, at: tuple[Samples, Array], full_scale: float
+    matched: Matched, first: Exponent | None, at: tuple[Samples, Array], full_scale: float
 ) -> tuple[float, float, tuple[Samples, Array]] | None:
-    """Exponent with its standard deviation, and the marks matched with it; None if cameras have no such."""
+    """Exponent with its standard deviation, and the marks matched with it; None if cameras have no such.
+
+    `first` is the exponent estimated `at` marks matched in grey values as they are.
+    """
     gamma = 1.0
     for attempt in range(_ATTEMPTS):
-        found = estimate_gamma(*at, gamma, full_scale)
-        if attempt and abs(found.gamma - gamma) < found.sigma:
+        found = first if first and not attempt else estimate_gamma(*at, gamma, full_scale)
+        if attempt and abs(found.gamma - gamma) < max(found.sigma, _SETTLED):
             break
         gamma = float(np.clip(found.gamma, 0.3, 4.0))
         again = matched(ToneCurve(gamma))
@@ -252,10 +265,9 @@ def estimate_gamma(samples: Samples, formed: Array, gamma: float, full_scale: fl
     # The noise is that of the coded grey values: its slope weights the light.
     weight = np.where(samples.used, light ** (1 / gamma - 1), 0.0).reshape(k, -1)
     change = full_scale * light * np.log(coded)
-    both = np.stack([samples.grey - formed, change], axis=-1)
-    both = np.where(samples.used[..., None], both, 0.0).reshape(k, -1, 2)
-    left = unexplained(both, samples.basis(share.astype(np.float64), slopes), weight)
-    observed, change = left[..., 0], left[..., 1]
+    both = np.where(samples.used[:, None], np.stack([samples.grey - formed, change], axis=1), 0.0)
+    left = unexplained(both.reshape(k, 2, -1), samples.basis(share, slopes), weight)
+    observed, change = left[:, 0], left[:, 1]
     square = float((change**2).sum())
     step = -float((change * observed).sum()) / max(square, 1e-300)
     rest = observed + step * change

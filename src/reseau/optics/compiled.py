@@ -19,7 +19,7 @@ from numba.np.arrayobj import make_array
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-__all__ = ["filtered", "formed", "gathered", "responses"]
+__all__ = ["PER_SIGMA", "filtered", "formed", "gathered", "normal_table", "responses"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 Single = NDArray[Any]
@@ -27,28 +27,28 @@ Double = NDArray[Any]
 
 _SIDE = 5.0
 """End of the table of the normal distribution in standard deviations; 6e-7 of the light is outside."""
-_PER_SIGMA = 64
-"""Entries per standard deviation; with two more terms of the series in between, accurate to 1e-7."""
+PER_SIGMA = 64
+"""Entries of tables per standard deviation; with two more terms of the series, accurate to 1e-7."""
 
 
-def _table() -> tuple[Single, Single]:
-    """Distribution and density of the normal distribution at steps of 1/64 from −5 to 5."""
-    z = np.arange(-_SIDE * _PER_SIGMA, _SIDE * _PER_SIGMA + 1) / _PER_SIGMA
-    return ndtr(z).astype(np.float32), (np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)).astype(np.float32)
-
-
-_STEP, _BELL = _table()
 _FAR = 8.5
 """The same for double precision; 1e-17 of the light is outside."""
 
 
-def _fine_table() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distribution and density at steps of 1/64 from −8.5 to 8.5, in double precision."""
-    z = np.arange(-_FAR * _PER_SIGMA, _FAR * _PER_SIGMA + 1) / _PER_SIGMA
+def normal_table(far: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Distribution and density of the normal distribution at steps of 1/64 from −far to far.
+
+    Examples
+    --------
+    >>> float(normal_table(1.0)[0][64])
+    0.5
+    """
+    z = np.arange(-far * PER_SIGMA, far * PER_SIGMA + 1) / PER_SIGMA
     return ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
 
 
-_FINE_STEP, _FINE_BELL = _fine_table()
+_FINE_STEP, _FINE_BELL = normal_table(_FAR)
+_STEP, _BELL = (values.astype(np.float32) for values in normal_table(_SIDE))
 f32 = np.float32
 _FREE = {"nnan", "ninf", "nsz"}
 """Assumptions allowed to the compiler. Sums must not be reordered, and products not be fused into sums: both
@@ -71,8 +71,8 @@ def _edges(
         z = (offset[k] + shift) * inverse
         z = min(max(z, f32(-_SIDE)), f32(_SIDE))
         # An unsigned index needs no check for negative values, so that the loop is vectorised.
-        i = np.uint32((z + f32(_SIDE)) * f32(_PER_SIGMA) + f32(0.5))
-        middle = f32(i) * f32(1 / _PER_SIGMA) - f32(_SIDE)
+        i = np.uint32((z + f32(_SIDE)) * f32(PER_SIGMA) + f32(0.5))
+        middle = f32(i) * f32(1 / PER_SIGMA) - f32(_SIDE)
         d = z - middle
         b = _BELL[i]
         step[k] = _STEP[i] + b * d * (f32(1) - f32(0.5) * d * middle)
@@ -123,8 +123,8 @@ def _steps(offset: Single, count: int, shift: np.float32, inverse: np.float32, s
     for k in range(count):
         z = (offset[k] + shift) * inverse
         z = min(max(z, f32(-_SIDE)), f32(_SIDE))
-        i = np.uint32((z + f32(_SIDE)) * f32(_PER_SIGMA) + f32(0.5))
-        middle = f32(i) * f32(1 / _PER_SIGMA) - f32(_SIDE)
+        i = np.uint32((z + f32(_SIDE)) * f32(PER_SIGMA) + f32(0.5))
+        middle = f32(i) * f32(1 / PER_SIGMA) - f32(_SIDE)
         d = z - middle
         step[k] = _STEP[i] + _BELL[i] * d * (f32(1) - f32(0.5) * d * middle)
 
@@ -315,8 +315,8 @@ def responses(points: Single, first: Single, sigma: Single, out: Single) -> None
             for c in range(low, high):
                 t = begin + c
                 z = t * inverse
-                i = np.uint32((z + _FAR) * _PER_SIGMA + 0.5)
-                m = np.float64(i) * (1.0 / _PER_SIGMA) - _FAR
+                i = np.uint32((z + _FAR) * PER_SIGMA + 0.5)
+                m = np.float64(i) * (1.0 / PER_SIGMA) - _FAR
                 d, m2 = z - m, m * m
                 # Hermite polynomials over factorials.
                 h2, h3 = (m2 - 1.0) * (1 / 2), m * (m2 - 3.0) * (1 / 6)

@@ -15,7 +15,6 @@ import numpy as np
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code
-from ...optics import Chain
 from ...optics.corners import Corners, corner_images
 from ...optics.formation import PixelResponse, polygons
 from ..matching import GrownOutline, Matches, Shape, Window
@@ -42,8 +41,8 @@ _BENT = 3e-4
 """Standard deviation of these curvatures beside those of the mapping, 1/px."""
 _EDGE = 1.5
 """Half the width of an edge in widths of the point-spread function."""
-_ALIKE_WIDTH = 0.05
-"""Relative change of the sharpness from which markers are formed anew."""
+_ALIKE_WIDTH, _ALIKE_PX = 0.05, 0.05
+"""Relative change of the sharpness, and shift, from which markers are formed anew."""
 _LEAST_EDGE = 0.1
 """Share of the pixels of an edge below which it is not seen."""
 _BORDER = 2.0
@@ -129,6 +128,7 @@ class CornerMarks(PlaneMarks):
     form_sigma = np.array([_TURN, _TURN])
     learnt_form_sigma = np.array([_TURNED, _TURNED])
     learnt_from = 24
+    sampled = 12
     precise_start = True
     curve_first = True
     even = True
@@ -140,7 +140,7 @@ class CornerMarks(PlaneMarks):
     ) -> None:
         super().__init__(image, screened, located, options, sectors.reach)
         self.sectors = sectors
-        self.figures: tuple[Array, Chain, float, Array | None] | None = None
+        self.figures: tuple[Array, Array, float, Array | None] | None = None
 
     def _steps(self, rows: Rows) -> tuple[Array, Array, Array]:
         """Derivatives of the image by coordinates of the design (k, 2, 2); along edges, and second ones."""
@@ -216,14 +216,16 @@ class CornerMarks(PlaneMarks):
         outlines, look = self.sectors.outlines, self.look
         if not len(outlines):
             return None
+        corners = images_of(self.mapping, outlines.reshape(-1, 2) @ self.frame.T + self.origin)
         if self.figures is not None:
-            share, mapping, psf_px, kernel = self.figures
-            alike = abs(psf_px / look.psf_px - 1) < _ALIKE_WIDTH
-            if alike and mapping is self.mapping and kernel is look.kernel:
-                return share
+            share, before, psf_px, kernel = self.figures
+            alike = abs(psf_px / look.psf_px - 1) < _ALIKE_WIDTH and kernel is look.kernel
+            with np.errstate(invalid="ignore"):
+                if alike and np.nanmax(np.abs(corners - before)) < _ALIKE_PX:
+                    return share
+        at = corners
         h, w = self.screened.grey.shape
         share = np.zeros((h, w), dtype=np.float32)
-        corners = images_of(self.mapping, outlines.reshape(-1, 2) @ self.frame.T + self.origin)
         reach = 0 if look.kernel is None else len(look.kernel) // 2
         margin = int(np.ceil(6 * look.psf_px)) + 2 + reach
         corners = corners.reshape(outlines.shape)
@@ -252,7 +254,7 @@ class CornerMarks(PlaneMarks):
                 a, b = max(left, 0), max(top, 0)
                 place = share[b : top + high, a : left + wide]
                 place += image[b - top : b - top + len(place), a - left : a - left + place.shape[1]]
-        self.figures = share, self.mapping, look.psf_px, look.kernel
+        self.figures = share, at, look.psf_px, look.kernel
         return share
 
     def _settle(self, first: Matches) -> Matches:

@@ -16,6 +16,10 @@ __all__ = ["find_markers", "find_tags"]
 
 _WRONG = 0.06
 """Share of the cells of a tag that may be misread; its place on the board tests it, too."""
+_WINDOW_PX = 13
+"""Side of the squares in which the threshold of separate markers is found first."""
+_FEW, _SHARE = 6, 0.25
+"""Number of markers, and share of those of the board, from which no more are looked for."""
 
 
 def find_markers(frame: Frame, design: BoardDesign, *, whole: bool = False) -> tuple[Array, NDArray[np.intp]]:
@@ -31,12 +35,20 @@ def find_markers(frame: Frame, design: BoardDesign, *, whole: bool = False) -> t
         parameters.errorCorrectionRate = 0.0
         parameters.maxErroneousBitsInBorderRate = 0.0
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-    detector = cv2.aruco.ArucoDetector(marker_dictionary(design.dictionary), parameters)
     pixels = frame.pixels
     if pixels.dtype != np.uint8:
         scale = 255.0 / max(float(pixels.max()), 1e-12)
         pixels = np.clip(pixels.astype(np.float64) * scale, 0, 255).astype(np.uint8)
-    corners, numbers, _ = detector.detectMarkers(np.ascontiguousarray(pixels))
+    windows = parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax
+    # The middle of OpenCV's windows finds almost as much as all three. Corners between squares are found by a
+    # part of the markers.
+    enough = design.kind == "charuco" and not whole
+    for least, most in ((_WINDOW_PX, _WINDOW_PX), windows)[0 if enough else 1 :]:
+        parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = least, most
+        detector = cv2.aruco.ArucoDetector(marker_dictionary(design.dictionary), parameters)
+        corners, numbers, _ = detector.detectMarkers(np.ascontiguousarray(pixels))
+        if numbers is not None and len(numbers) >= max(_FEW, _SHARE * len(design.markers[0])):
+            break
     if numbers is None or not len(numbers):
         return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.intp)
     found = np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2)

@@ -237,7 +237,8 @@ class CircleMarks(DiskMarks):
     """Circles of a grid, whose printed size is that of the design to a few hundredths."""
 
     word = "circle"
-    learnt_from = 30
+    learnt_from = 24
+    sampled = 12
     precise_start = True
     curve_first = True
     eccentric = True

@@ -51,6 +51,8 @@ _FEWEST = 6
 """Least number of corners that show a board."""
 _ENOUGH = 0.6
 """Share of the corners of the board from which no other seed is tried."""
+_GROWN = 12
+"""Most steps from the markers read to the corners beside them."""
 _NEAR_PX = 2.5
 """Distance within which a saddle is the corner that markers predict, pixels; or in steps of the lattice."""
 _NEAR = 0.2
@@ -397,7 +399,7 @@ def lay_marked(
     if design.kind == "aprilgrid":
         assert design.size is not None
         apart = min(design.size, design.pitch - design.size) / design.pitch
-    for _ in range(6):
+    for _ in range(_GROWN):
         again, row = _nearest(saddles, mapping, nodes, dark, plane[use], known, apart)
         if design.kind == "charuco":
             again &= _filled(grey, mapping, nodes, dark)

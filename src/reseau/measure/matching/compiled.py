@@ -1,9 +1,9 @@
-"""Least-squares matching of many windows from good start values, compiled.
+"""Least-squares matching of many windows, compiled.
 
 The equations are those of :class:`reseau.measure.matching.patches.Patches` (grey values, derivatives, common
-errors of rows) and of the chord method of :func:`reseau.adjust.adjust_batch`; here they are computed window
-by window, so that they fit into a cache. Windows that need more than the chord method's first Jacobian (a
-refused step, slow convergence, singular normal equations) are marked, and left to the general adjustment.
+errors of rows) and of the damped chord method of :func:`reseau.adjust.adjust_batch`; here they are computed
+window by window, so that they fit into a cache. A window that needs another Jacobian (a refused step, slow
+convergence) is marked STALE: the caller forms its image with derivatives, and linearises it again.
 """
 
 from __future__ import annotations
@@ -18,18 +18,24 @@ from numpy.typing import NDArray
 
 from ...optics.compiled import formed
 
-__all__ = ["ACTIVE", "DONE", "LEFT", "adjusted", "advanced", "compared", "cut", "linearised"]
+__all__ = ["ACTIVE", "DONE", "FAILED", "STALE", "adjusted", "advanced", "compared", "cut", "linearised"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 Floats = NDArray[Any]
 
-ACTIVE, DONE, LEFT = 0, 1, 2
-"""States of a window: to be evaluated at its trial, converged, left to the general adjustment."""
+ACTIVE, DONE, STALE, FAILED = 0, 1, 2, 3
+"""States of a window: to be evaluated at its trial, converged, to be linearised at its estimates, without a
+solution."""
+_COST, _DAMPING, _PREDICTED, _LAST, _FRESH, _GROWTH = range(6)
+"""Columns of an iteration: sum of squares, damping, its decrease that is predicted, and the same in the
+iteration before, whether the Jacobian is that at the estimates, factor of the damping after a refusal."""
 _WIDTH, _CONTRAST, _LEVEL = 2, 3, 4
-_SERVES, _SHRINKS, _SINGULAR, _LEAST_DAMPING = 0.75, 0.1, 1e-12, 1e-10
+_SERVES, _SHRINKS, _SINGULAR, _LEAST_DAMPING, _MOST_DAMPING = 0.75, 0.1, 1e-12, 1e-10, 1e12
+_GAINS, _HELD = 1e-4, 1e-2
 """As in :mod:`reseau.adjust.batch`."""
 _AT_ONCE = 40_000
 """Number of pixels in the windows that are adjusted together."""
+_TINY = 1e-300
 f32 = np.float32
 
 
@@ -220,6 +226,26 @@ def _solve(lower: Floats, right: Floats) -> None:
 
 
 @_compiled
+def _step(
+    normal: Floats, gradient: Floats, damping: float, scale: Floats, lower: Floats, step: Floats
+) -> float:
+    """Fill a damped correction; the decrease of the sum of squares it predicts, negative if there is none."""
+    if not _factorised(normal, damping, scale, lower):
+        return -1.0
+    u = len(gradient)
+    for i in range(u):
+        step[i] = gradient[i] * scale[i]
+    _solve(lower, step)
+    # The decrease 2 sᵀ g − sᵀ N s of the sum of squares, with (N + d I) s = g.
+    predicted = 0.0
+    for i in range(u):
+        predicted += step[i] * (gradient[i] * scale[i] + damping * step[i])
+    for i in range(u):
+        step[i] *= scale[i]
+    return predicted
+
+
+@_compiled
 def _next(
     k: int,
     normal: Floats,
@@ -230,28 +256,25 @@ def _next(
     iteration: Floats,
     state: Floats,
 ) -> None:
-    """Correct window `k`, or place its trial; `iteration` (k, 4) is cost, damping, predicted and last one."""
+    """Correct window `k`, or place its trial."""
     u = len(gradient)
     scale, lower, step = np.empty(u), np.empty((u, u)), np.empty(u)
-    if not _factorised(normal, iteration[k, 1], scale, lower):
-        state[k] = LEFT
+    predicted = _step(normal, gradient, iteration[k, _DAMPING], scale, lower, step)
+    if not predicted >= 0:
+        state[k] = FAILED
         return
-    for i in range(u):
-        step[i] = gradient[i] * scale[i]
-    _solve(lower, step)
-    # The decrease 2 sᵀ g − sᵀ N s of the sum of squares, with (N + d I) s = g.
-    predicted = 0.0
-    for i in range(u):
-        predicted += step[i] * (gradient[i] * scale[i] + iteration[k, 1] * step[i])
-    last = iteration[k, 3]
+    last = iteration[k, _LAST]
     rate2 = predicted / max(last, predicted) if predicted > 0 else 1.0
     done = predicted * rate2 <= limit
-    if not done and last > 0 and predicted > _SHRINKS * last:
-        state[k] = LEFT  # corrections decrease slowly
-        return
-    iteration[k, 2] = iteration[k, 3] = predicted
     for i in range(u):
-        trial[k, i] = x[k, i] + step[i] * scale[i]
+        trial[k, i] = x[k, i] + step[i]
+    if done and iteration[k, _DAMPING] > _HELD:
+        # Damping makes corrections small: the one without it decides.
+        done = _step(normal, gradient, _LEAST_DAMPING, scale, lower, step) <= limit
+    if not done and last > 0 and predicted > _SHRINKS * last:
+        state[k] = STALE  # corrections decrease slowly
+        return
+    iteration[k, _PREDICTED] = iteration[k, _LAST] = predicted
     if done:
         state[k] = DONE
         x[k] = trial[k]
@@ -259,6 +282,7 @@ def _next(
 
 @_compiled
 def linearised(
+    rows: Floats,
     share: Floats,
     slopes: Floats,
     observed: Floats,
@@ -266,6 +290,7 @@ def linearised(
     window: tuple[Floats, Floats, int],
     light: tuple[bool, float, float],
     psf: Floats,
+    mean: Floats,
     prior: Floats,
     share_of_sigma: float,
     x: Floats,
@@ -275,12 +300,12 @@ def linearised(
     state: Floats,
     influence: tuple[Floats, Floats],
 ) -> None:
-    """Form the normal equations of all windows at `x`, and the first trial of each.
+    """Form the normal equations of windows `rows` (m,) at `x`, and the next trial of each.
 
     Parameters
     ----------
-    share, slopes : ndarray (k, n), (k, 3 + p, n), float32
-        Formed images, and their derivatives by x, y, width and form.
+    share, slopes : ndarray (m, n), (m, 3 + p, n), float32
+        Images formed at `x`, and their derivatives by x, y, width and form.
     observed, weights : ndarray (k, n)
         Grey values, and their weights; 0 where a pixel is not used.
     window : tuple
@@ -290,19 +315,19 @@ def linearised(
         value.
     psf : ndarray (k,)
         Lower bound of the width of the point-spread function.
-    prior : ndarray (u,)
-        Weights of the initial values as observations.
+    mean, prior : ndarray (k, u), (u,)
+        Observed parameters, and their weights.
     share_of_sigma : float
         Corrections below this share of their standard deviation end the iteration.
     x : ndarray (k, u)
-        Initial values, replaced by the estimates where the state becomes DONE.
+        Approximate values, replaced by the estimates where the state becomes DONE.
     work : tuple
         Filled: residuals (k, n), Jacobians times weights (k, u, n) float32, normal equations (k, u, u),
         gradients (k, u), cofactors (k, u, u), slope and weighted slope (k, n) of the common errors of rows,
         float32, (0, n) if rows have none.
-    trial, iteration, state : ndarray (k, u), (k, 4), (k,)
-        Filled: next values to evaluate; cost, damping, decrease predicted, and the same in the iteration
-        before; ACTIVE, DONE or LEFT. The damping is given.
+    trial, iteration, state : ndarray (k, u), (k, 6), (k,)
+        Filled: next values to evaluate; columns of the iteration, of which the damping and its factor are
+        given; ACTIVE, DONE or FAILED.
     influence : tuple
         Filled: influence of each pixel on the position (k, 2, n) and its leverage (k, n), float32; (0, …) if
         they are not wanted. With derivatives A, weights W and cofactor Q they are the first rows of Q Aᵀ W,
@@ -312,12 +337,13 @@ def linearised(
     dark, variance, jitter = light
     residuals, kept, normals, gradients, cofactors, slope, weighted = work
     on_position, leverage = influence
-    (count, n), u, ground, forms = observed.shape, x.shape[1], len(monomials), slopes.shape[1] - 3
+    n, u, ground, forms = observed.shape[1], x.shape[1], len(monomials), slopes.shape[1] - 3
     plane, contrast, grey = np.empty(n), np.empty(n), np.empty(n)
     by_share, rest, jacobian = np.empty(n, f32), np.empty(n, f32), np.empty((u, n), f32)
     scale, lower, left = np.empty(u), np.empty((u, u)), np.empty(n, f32)
-    for k in range(count):
-        w, covered = weights[k], share[k]
+    for j in range(len(rows)):
+        k = rows[j]
+        w, covered = weights[k], share[j]
         _formed(x[k], covered, monomials, across, dark, plane, contrast, grey)
         if dark:
             for i in range(n):
@@ -328,9 +354,9 @@ def linearised(
             by_share[:], rest[:] = contrast, f32(1)
             jacobian[_CONTRAST] = covered
         wide = math.exp(x[k, _WIDTH])
-        _multiply(by_share, slopes[k, 0], jacobian[0])
-        _multiply(by_share, slopes[k, 1], jacobian[1])
-        _multiply(by_share, slopes[k, 2], jacobian[_WIDTH])
+        _multiply(by_share, slopes[j, 0], jacobian[0])
+        _multiply(by_share, slopes[j, 1], jacobian[1])
+        _multiply(by_share, slopes[j, 2], jacobian[_WIDTH])
         jacobian[_WIDTH] *= f32(wide * wide / math.hypot(psf[k], wide))
         for m in range(ground):
             _multiply(rest, monomials[m], jacobian[_LEVEL + m])
@@ -339,7 +365,7 @@ def linearised(
             _multiply(jacobian[_CONTRAST], across[m], jacobian[at + m])
         at += len(across)
         for m in range(u - at):
-            _multiply(by_share, slopes[k, 3 + m], jacobian[at + m])
+            _multiply(by_share, slopes[j, 3 + m], jacobian[at + m])
         used = 0
         for i in range(n):
             used += w[i] > 0
@@ -363,16 +389,19 @@ def linearised(
         _multiply(w, residuals[k], left)
         cost = _product(left, residuals[k], 0, n)
         for m in range(u):
+            cost += prior[m] * (mean[k, m] - x[k, m]) ** 2
+        for m in range(u):
             _multiply(jacobian[m], w, kept[k, m])
         left[:] = residuals[k]
         normals[k] = np.dot(kept[k], jacobian.T)
         gradients[k] = -np.dot(kept[k], left)
         for m in range(u):
             normals[k, m, m] += prior[m]
+            gradients[k, m] += prior[m] * (mean[k, m] - x[k, m])
         freedom = used + np.count_nonzero(prior) - u
-        iteration[k, 0], iteration[k, 3] = cost, 0.0
+        iteration[k, _COST], iteration[k, _LAST], iteration[k, _FRESH] = cost, 0.0, 1.0
         if not (math.isfinite(cost) and freedom >= 0 and _factorised(normals[k], 0.0, scale, lower)):
-            state[k] = LEFT
+            state[k] = FAILED
             continue
         for m in range(u):
             for i in range(u):
@@ -389,6 +418,7 @@ def linearised(
                 for i in range(n):
                     leverage[k, i] += gain[i] * row[i]
         limit = share_of_sigma**2 * cost / max(freedom, 1)
+        state[k] = ACTIVE
         _next(k, normals[k], gradients[k], limit, x, trial, iteration, state)
         # What the first correction leaves is smaller than itself by half the relative change of the mark.
         total = math.hypot(psf[k], wide)
@@ -397,10 +427,10 @@ def linearised(
         change = max(change, abs(trial[k, _CONTRAST] / x[k, _CONTRAST] - 1.0))
         for m in range(u - forms, u):
             change = max(change, abs(trial[k, m] - x[k, m]))
-        left_over = iteration[k, 2]
+        left_over = iteration[k, _PREDICTED]
         if state[k] == ACTIVE and left_over * (change / 4) ** 2 <= limit * (1 - left_over / cost):
-            _extrapolated(x[k], trial[k], jacobian, slopes[k], wide * wide / total, covered, residuals[k])
-            iteration[k, 0], state[k] = cost - left_over, DONE
+            _extrapolated(x[k], trial[k], jacobian, slopes[j], wide * wide / total, covered, residuals[k])
+            iteration[k, _COST], state[k] = cost - left_over, DONE
 
 
 @_compiled
@@ -444,9 +474,9 @@ def advanced(
     iteration: Floats,
     state: Floats,
 ) -> None:
-    """Accept the trials of windows `rows` (m,), in which `share` (m, n) was formed, and place the next.
+    """Accept or refuse the trials of windows `rows` (m,), in which `share` (m, n) was formed; place the next.
 
-    Parameters as in :func:`linearised`; `mean` (k, u) are the initial values.
+    Parameters as in :func:`linearised`.
     """
     monomials, across, columns = window
     residuals, kept, normals, gradients, _, slope, weighted = work
@@ -467,17 +497,32 @@ def advanced(
         left[:] = grey
         for m in range(u):
             cost += prior[m] * (trial[k, m] - mean[k, m]) ** 2
-        if not iteration[k, 0] - cost > _SERVES * iteration[k, 2]:
-            state[k] = LEFT
-            continue
-        x[k], residuals[k] = trial[k], grey
-        gradients[k] = -np.dot(kept[k], left)
-        for m in range(u):
-            gradients[k, m] += prior[m] * (mean[k, m] - x[k, m])
-        iteration[k, 0] = cost
-        iteration[k, 1] = max(iteration[k, 1] / 3, _LEAST_DAMPING)
+        gain = (iteration[k, _COST] - cost) / max(iteration[k, _PREDICTED], _TINY)
         limit = share_of_sigma**2 * cost / max(used + np.count_nonzero(prior) - u, 1)
-        _next(k, normals[k], gradients[k], limit, x, trial, iteration, state)
+        if gain > _SERVES:
+            x[k], residuals[k] = trial[k], grey
+            gradients[k] = -np.dot(kept[k], left)
+            for m in range(u):
+                gradients[k, m] += prior[m] * (mean[k, m] - x[k, m])
+            iteration[k, _COST], iteration[k, _FRESH], iteration[k, _GROWTH] = cost, 0.0, 2.0
+            iteration[k, _DAMPING] = max(iteration[k, _DAMPING] / 3, _LEAST_DAMPING)
+            _next(k, normals[k], gradients[k], limit, x, trial, iteration, state)
+        elif iteration[k, _FRESH] == 0.0:
+            state[k] = STALE
+        elif gain > _GAINS:
+            x[k], residuals[k], state[k] = trial[k], grey, STALE
+            iteration[k, _COST], iteration[k, _GROWTH] = cost, 2.0
+            shrink = max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
+            iteration[k, _DAMPING] = max(iteration[k, _DAMPING] * shrink, _LEAST_DAMPING)
+        else:
+            iteration[k, _DAMPING] *= iteration[k, _GROWTH]
+            iteration[k, _GROWTH] *= 2.0
+            iteration[k, _LAST] = 0.0
+            limit = share_of_sigma**2 * iteration[k, _COST] / max(used + np.count_nonzero(prior) - u, 1)
+            if iteration[k, _DAMPING] > _MOST_DAMPING:
+                state[k] = FAILED
+            else:
+                _next(k, normals[k], gradients[k], limit, x, trial, iteration, state)
 
 
 @_compiled
@@ -518,7 +563,8 @@ def adjusted(
         Largest number of iterations.
     found : tuple
         Filled: residuals (k, n), cofactors (k, u, u), numbers of iterations (k,). Filled as in
-        :func:`linearised`: iteration (k, 4), state (k,).
+        :func:`linearised`: iteration (k, 6), state (k,); windows that are neither DONE nor FAILED need
+        another Jacobian, or more iterations.
     influence : tuple
         As in :func:`linearised`.
     observed, weights, window, light, psf, prior, share_of_sigma, x
@@ -537,7 +583,7 @@ def adjusted(
     )
     images, where = np.empty((together, 1, high, wide), f32), np.empty((together, 2), f32)
     form, sigma = np.empty((together, forms), f32), np.empty(together, f32)
-    rows, flat = np.empty(together, np.intp), shares.reshape(count, n)
+    rows, every, flat = np.empty(together, np.intp), np.arange(together), shares.reshape(count, n)
     wanted, (on_position, leverage) = len(influence[1]) > 0, influence
     for begin in range(0, count, together):
         part = slice(begin, min(begin + together, count))
@@ -553,6 +599,7 @@ def adjusted(
             common[1, :some],
         )
         linearised(
+            every[:some],
             flat[part],
             slopes[part],
             observed[part],
@@ -560,6 +607,7 @@ def adjusted(
             window,
             light,
             psf[part],
+            first[:some],
             prior,
             share_of_sigma,
             x[part],
@@ -584,7 +632,7 @@ def adjusted(
                     total += form[active, i]
                 sigma[active] = math.hypot(psf[k], math.exp(trial[j, _WIDTH]))
                 if not math.isfinite(total + sigma[active]):
-                    state[k] = LEFT  # a step may lead to values without an image
+                    state[k] = STALE  # a step may lead to values without an image
                     continue
                 rounds[k] += 1
                 rows[active] = j

@@ -33,6 +33,8 @@ _CANCELLED = 0.3
 """Least share of the variance of independent errors that remains where they cancel each other."""
 _SHOWN = 40
 """Most marks from which correlations are learnt."""
+_SEEN = 60
+"""Most marks that show whether there are any."""
 _FEWEST = 20
 """Marks that are needed to learn correlations."""
 _SPREAD = 5
@@ -82,29 +84,27 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     sure &= np.isfinite(found.influence).all(axis=(1, 2, 3))
     if sure.sum() < _FEWEST:
         return found
-    used = np.isfinite(found.residuals)
-    unit = np.where(used, found.residuals, 0.0) / np.maximum(found.noise, 1e-300)[:, None, None]
-    if centres is not None:
-        unit, used = _odd(unit, used, found.xy - centres)
-    free = 1 - found.leverage
-    influence = found.influence * found.noise[:, None, None, None]
-    activity = uniform_filter((influence**2).sum(axis=1), (0, _SPREAD, _SPREAD))
-    activity /= np.maximum(activity.max(axis=(1, 2), keepdims=True), 1e-300)
-    shown = used[sure]
+    # A part of many marks shows what they have in common.
+    rows = np.flatnonzero(sure)
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, _SEEN).astype(np.intp))]
+    unit, shown, activity = _prepared(found.select(rows), None if centres is None else centres[rows])
+    free = 1 - found.leverage[rows]
     # Beside a mark, where its image is even, residuals show the errors of pixels alone; on it, also what the
     # formed image lacks, which is alike in all marks and symmetric.
-    beside = shown & (activity[sure] <= np.median(activity[sure][shown]))
-    if not _neighbours(unit[sure], beside, free[sure], both_ways=centres is not None):
+    beside = shown & (activity <= np.median(activity[shown]))
+    if not _neighbours(unit, beside, free, both_ways=centres is not None):
         return found
-    limits = np.quantile(activity[sure][shown], np.arange(1, _CLASSES) / _CLASSES)
+    limits = np.quantile(activity[shown], np.arange(1, _CLASSES) / _CLASSES)
     kind = np.digitize(activity, limits)
     variance = np.ones(_CLASSES)
     for k in range(_CLASSES):
-        those = shown & (kind[sure] == k)
+        those = shown & (kind == k)
         if those.any():
-            variance[k] = (unit[sure][those] ** 2).sum() / max(free[sure][those].sum(), 1.0)
+            variance[k] = (unit[those] ** 2).sum() / max(free[those].sum(), 1.0)
+    correlation = _correlation(unit / np.maximum(np.sqrt(variance)[kind], 1e-6), shown, free)
+    influence = found.influence * found.noise[:, None, None, None]
+    kind = np.digitize(_activity(influence), limits)
     spread = np.sqrt(variance)[kind]
-    correlation = _correlation((unit / np.maximum(spread, 1e-6))[sure], shown, free[sure])
     uneven = influence * spread[:, None]
     # The errors that a pixel has in common with those around it, weighted by their influence.
     kernel = np.zeros((2 * _LAGS + 1,) * 2, np.float32)
@@ -128,6 +128,24 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     shrunk = np.linalg.eigvalsh(np.nan_to_num(cov - least))[:, 0] < 0
     cov[shrunk] = _no_less(cov[shrunk], least[shrunk])
     return replace(found, cov=cov)
+
+
+def _prepared(found: Matches, centres: Array | None) -> tuple[Array, Mask, Array]:
+    """Residuals in units of their standard deviations, the pixels used, and their influence on positions.
+
+    See :func:`with_alike_errors` for `centres`.
+    """
+    used = np.isfinite(found.residuals)
+    unit = np.where(used, found.residuals, 0.0) / np.maximum(found.noise, 1e-300)[:, None, None]
+    if centres is not None:
+        unit, used = _odd(unit, used, found.xy - centres)
+    return unit, used, _activity(found.influence * found.noise[:, None, None, None])
+
+
+def _activity(influence: Array) -> Array:
+    """Influence (k, rows, columns) of pixels and those around them on positions; at most 1."""
+    activity = uniform_filter((influence**2).sum(axis=1), (0, _SPREAD, _SPREAD))
+    return np.asarray(activity / np.maximum(activity.max(axis=(1, 2), keepdims=True), 1e-300))
 
 
 def _odd(unit: Array, used: Mask, off: Array) -> tuple[Array, Mask]:

@@ -29,6 +29,8 @@ _PLAIN = 1.25
 
 _FIRST, _MOST = 10, 50
 """Iterations before the search for blunders, and maximum."""
+_LAST = 4
+"""Least number of iterations for marks that have converged with a Jacobian of other approximate values."""
 
 SIZE = np.eye(2)[None]
 """Generator of the form for a mark of unknown size: a change of scale."""
@@ -48,6 +50,7 @@ def match(
     others: NDArray[Any] | None = None,
     region: Mask | None = None,
     light: tuple[Array, Array] | None = None,
+    precise: bool = False,
     searching: bool = True,
     least: tuple[Array, float] | None = None,
 ) -> Matches:
@@ -82,6 +85,9 @@ def match(
     light : tuple, optional
         Contrast (k,) and coefficients of the background (k, b), if these, the positions and the width are
         known approximately. Then only patches with large residuals are searched for blunders.
+    precise : bool
+        Whether positions and width are known so well that the light is found from the grey values, if it is
+        not given; patches with large residuals are then left as they are.
     searching : bool
         Whether to search those patches; if not, they count as not converged.
     least : tuple, optional
@@ -119,9 +125,11 @@ def match(
     free[patch.ground.stop : patch.form_at] = options.contrast_slope or np.inf
     if form_sigma is not None:
         free[patch.form_at :] = form_sigma
-    if light is None:
+    if light is None and not precise:
         return _searched(patch, free, noise)
-    quick, amiss = _continued(patch, patch.begin(*light), free, noise, least)
+    quick, amiss = _continued(patch, patch.begin(light), free, noise, least)
+    if precise:
+        return quick
     came, quick.converged[amiss] = quick.converged[amiss], False
     settled = np.zeros(len(xy), dtype=bool)
     settled[amiss] = came
@@ -158,13 +166,18 @@ def _searched(patch: Patches, free: Array, noise: float) -> Matches:
     start = patch.start(noise)
 
     def adjust(rows: Rows, start_at: Array, most: int = _MOST) -> BatchAdjustment:
+        weights = used[rows] * patch.relative_weights[rows] / scale[rows] ** 2
+        iteration = BatchOptions(share=options.settled, max_iterations=most)
+        if patch.single and patch.whitener is None:
+            formed = patch.slopes(start_at[rows], rows)
+            return _iterated(patch, rows, start_at[rows], start[rows], formed, weights, free, iteration)
         return adjust_batch(
             lambda x, at: patch.form_image(x, rows[at]),
             start_at[rows],
             patch.grey[rows],
-            weights=used[rows] * patch.relative_weights[rows] / scale[rows] ** 2,
+            weights=weights,
             prior=(start[rows], free),
-            options=BatchOptions(share=options.settled, max_iterations=most),
+            options=iteration,
         )
 
     every = np.arange(len(patch.xy))
@@ -189,6 +202,8 @@ def _searched(patch: Patches, free: Array, noise: float) -> Matches:
         # The residuals contain the jitter in the first round; whitened residuals contain the noise alone.
         patch.whiten(found.estimates, _rms(found.residuals, used, start.shape[1]), options.row_jitter_px)
         found = adjust(every, found.estimates)
+    if patch.single and patch.whitener is None:
+        return matches_of(patch, found, used > 0, scale[:, 0], patch.shares, patch.influences)
     return matches_of(patch, found, used > 0, scale[:, 0])
 
 
@@ -201,13 +216,18 @@ def _continued(
     """
     weights = patch.weights * patch.relative_weights / noise**2
     options = BatchOptions(share=patch.options.settled, max_iterations=_FIRST, damping=1e-5)
-    found, rows, influence = _compiled(patch, start, free, noise, weights, options)
+    jitter = patch.options.row_jitter_px
+    found, rows = _compiled(patch, start, free, noise, weights, options)
     if found is not None and least is not None and len(rows):
         rows = rows[patch.correlation(found.estimates, rows) >= least[0][rows]]
-    if found is None or len(rows):
+    if found is not None and len(rows) and jitter == 0:
+        at = found.estimates[rows]
+        again = _iterated(patch, rows, at, start[rows], patch.slopes(at, rows), weights[rows], free, options)
+        found = with_rows(found, rows, again)
+    elif found is None or len(rows):
         formed = patch.shares.copy()
-        if patch.options.row_jitter_px > 0:
-            patch.whiten(start, np.full((len(start), 1), noise), patch.options.row_jitter_px)
+        if jitter > 0:
+            patch.whiten(start, np.full((len(start), 1), noise), jitter)
         general = adjust_batch(
             lambda x, at: patch.form_image(x, rows[at]),
             start[rows],
@@ -229,117 +249,170 @@ def _continued(
         | ~(rms < 2 * noise)
     )
     scale = np.full(len(start), noise)
-    if influence is not None and len(rows):
-        ours = patch.influence(found.estimates[rows], found.cofactor[rows], used[rows], scale[rows], rows)
-        for whole, part in zip(influence, ours, strict=True):
-            whole[rows] = part
-    return matches_of(patch, found, used, scale, patch.shares, influence), np.flatnonzero(amiss)
+    return matches_of(patch, found, used, scale, patch.shares, patch.influences), np.flatnonzero(amiss)
 
 
 def _compiled(
     patch: Patches, start: Array, free: Array, noise: float, weights: Array, options: BatchOptions
-) -> tuple[BatchAdjustment | None, Rows, tuple[Array, Array] | None]:
-    """The adjustment of :func:`_continued` by compiled code, the rows left to the general one, influences."""
-    every, shape = np.arange(len(start)), patch.form
+) -> tuple[BatchAdjustment | None, Rows]:
+    """The adjustment of :func:`_continued` by compiled code, and the rows that it leaves."""
+    every = np.arange(len(start))
     assert patch.first is not None
+    if not patch.single:
+        return None, every
+    outlines = outlines_of(patch.form, every)
+    if outlines is None:
+        found = _iterated(patch, every, start, start, patch.first, weights, free, options, noise)
+        return found, np.empty(0, np.intp)
+    from .compiled import adjusted  # takes half a second to import; not every command needs it
+
     share, slopes = patch.first
-    if share.dtype != np.float32:
-        return None, every, None
-    from .compiled import DONE, adjusted  # takes half a second to import; not every command needs it
-
-    (k, n), u = patch.grey.shape, start.shape[1]
-    jitter, dark = patch.options.row_jitter_px, patch.options.polarity == "dark"
-    window = patch.monomials.T.copy(), patch.across.reshape(len(patch.across), n), patch.shape[2]
-    prior, light = 1 / free**2, (dark, noise**2, (jitter / noise) ** 2)
-    residuals, cofactor = np.empty((k, n)), np.full((k, u, u), np.nan)
-    x, iteration, (state, rounds) = start.copy(), np.zeros((k, 4)), np.zeros((2, k), np.int64)
-    iteration[:, 1] = options.damping
+    (k, n), (plain, at) = patch.grey.shape, outlines
+    work = _Iteration(patch, start, options, noise)
     patch.shares = share.copy()
-    # Errors that rows have in common are not among those of pixels.
-    wanted = k if patch.options.influence and jitter == 0 else 0
-    influence: tuple[Any, Any] = (
-        np.zeros((wanted, 2, n), np.float32),
-        np.zeros((wanted, n), np.float32),
-    )
-    given = patch.grey, weights, window, light, SHARPEST * patch.psf, prior, options.share
-    outlines = outlines_of(shape, every)
-    if outlines is not None:
-        plain, at = outlines
-        with one_thread():
-            adjusted(
-                patch.shares,
-                slopes.reshape(k, -1, n),
-                (plain.nodes.xy, plain.nodes.dxy, plain.generators.astype(np.float32), at),
-                patch.xy - np.stack([patch.window.columns[:, 0], patch.window.rows[:, 0]], axis=1),
-                patch.options.response.fill,
-                *given,
-                options.max_iterations - 1,
-                x,
-                (residuals, cofactor, rounds, iteration, state),
-                influence,
-            )
-    else:
-        filled = residuals, cofactor, rounds, iteration, state
-        _stepwise(patch, start, (share, slopes, *given), options, x, filled, influence)
-    redundancy = (patch.weights > 0).sum(axis=1) + np.count_nonzero(prior) - u
-    left = state != DONE
-    found = BatchAdjustment(
-        estimates=x,
-        cofactor=cofactor,
-        residuals=residuals,
-        sigma0=np.sqrt(iteration[:, 0] / np.maximum(redundancy, 1)),
-        redundancy=redundancy,
-        converged=~left,
-        iterations=rounds,
-        reasons=np.where(left, BatchReason.MAX_ITERATIONS, BatchReason.CONVERGED).astype(np.int64),
-        factors=np.broadcast_to(1.0, (k, n)),
-    )
-    shaped = None
-    if wanted:
-        shaped = influence[0].reshape(k, 2, *patch.shape[1:]), influence[1].reshape(patch.shape)
-    return found, np.flatnonzero(left), shaped
-
-
-def _stepwise(
-    patch: Patches,
-    start: Array,
-    given: tuple[Any, ...],
-    options: BatchOptions,
-    x: Array,
-    found: tuple[Any, ...],
-    influence: tuple[Array, Array],
-) -> None:
-    """The iterations of :func:`reseau.measure.matching.compiled.adjusted` for shapes other than outlines."""
-    from .compiled import ACTIVE, advanced, linearised  # takes half a second to import
-
-    (residuals, cofactor, rounds, iteration, state), (k, n), u = found, patch.grey.shape, start.shape[1]
-    share, slopes, observed, weights, window, light, psf, prior, share_of_sigma = given
-    common = np.zeros((2, k if light[2] > 0 else 0, n), np.float32)
-    kept, trial = np.empty((k, u, n), np.float32), start.copy()
-    work = residuals, kept, np.zeros((k, u, u)), np.zeros((k, u)), cofactor, common[0], common[1]
-    steps: Any = x, work, trial, iteration, state
     with one_thread():
-        begun: Any = *steps, influence
-        linearised(
-            *(share.reshape(k, n), slopes.reshape(k, -1, n), observed, weights),
-            *(window, light, psf, prior, share_of_sigma),
-            *begun,
+        adjusted(
+            patch.shares,
+            slopes.reshape(k, -1, n),
+            (plain.nodes.xy, plain.nodes.dxy, plain.generators.astype(np.float32), at),
+            patch.xy - np.stack([patch.window.columns[:, 0], patch.window.rows[:, 0]], axis=1),
+            patch.options.response.fill,
+            patch.grey,
+            weights,
+            work.window,
+            work.light,
+            SHARPEST * patch.psf,
+            1 / free**2,
+            options.share,
+            options.max_iterations - 1,
+            work.x,
+            (work.residuals, work.cofactor, work.rounds, work.iteration, work.state),
+            work.influence,
         )
-        for _ in range(options.max_iterations - 1):
-            rows = np.flatnonzero(state == ACTIVE)
-            if not len(rows):
-                break
-            around = patch.window if len(rows) == k else patch.window.select(rows)
-            width, form = patch.width(trial[rows], rows), trial[rows, patch.form_at :]
-            tried = patch.form.image(patch.xy[rows] + trial[rows, :2], width, form, rows, around)
-            patch.shares[rows] = tried
-            rounds[rows] += 1
-            advanced(
-                rows,
-                tried.reshape(len(rows), n),
-                *(observed, weights, window, light[0], start, prior, share_of_sigma),
-                *steps,
+    return work.finished(patch, every, weights, free), np.flatnonzero(work.left)
+
+
+class _Iteration:
+    """State of the iteration of some marks, as compiled code takes it."""
+
+    def __init__(self, patch: Patches, start: Array, options: BatchOptions, noise: float | None) -> None:
+        k, u, n = *start.shape, patch.grey.shape[1]
+        jitter = 0.0 if noise is None else patch.options.row_jitter_px / noise
+        self.window = patch.monomials.T.copy(), patch.across.reshape(len(patch.across), n), patch.shape[2]
+        self.light = patch.options.polarity == "dark", 1.0 if noise is None else noise**2, jitter**2
+        self.x, self.residuals, self.cofactor = start.copy(), np.empty((k, n)), np.full((k, u, u), np.nan)
+        self.iteration, (self.state, self.rounds) = np.zeros((k, 6)), np.zeros((2, k), np.int64)
+        self.iteration[:, 1], self.iteration[:, 5] = options.damping, 2.0
+        # Errors that rows have in common are not among those of pixels.
+        wanted = k if patch.options.influence and jitter == 0 else 0
+        self.influence: tuple[Any, Any] = (
+            np.zeros((wanted, 2, n), np.float32),
+            np.zeros((wanted, n), np.float32),
+        )
+
+    @property
+    def left(self) -> Mask:
+        """Marks that have not converged."""
+        from .compiled import DONE  # takes half a second to import; not every command needs it
+
+        return np.asarray(self.state != DONE)
+
+    def finished(self, patch: Patches, rows: Rows, weights: Array, free: Array) -> BatchAdjustment:
+        """Results of the marks `rows`; their influences are left with `patch`."""
+        if len(self.influence[1]):
+            patch.keep(rows, *self.influence)
+        from .compiled import FAILED  # takes half a second to import; not every command needs it
+
+        redundancy = (weights > 0).sum(axis=1) + np.isfinite(free).sum() - self.x.shape[1]
+        reasons = np.where(self.left, BatchReason.MAX_ITERATIONS, BatchReason.CONVERGED)
+        cost = np.where(np.isfinite(self.iteration[:, 0]), self.iteration[:, 0], np.nan)
+        return BatchAdjustment(
+            estimates=self.x,
+            cofactor=self.cofactor,
+            residuals=self.residuals,
+            sigma0=np.sqrt(cost / np.maximum(redundancy, 1)),
+            redundancy=redundancy,
+            converged=~self.left,
+            iterations=self.rounds,
+            reasons=np.where(self.state == FAILED, BatchReason.SINGULAR, reasons).astype(np.int64),
+            factors=np.broadcast_to(1.0, self.residuals.shape),
+        )
+
+
+def _iterated(
+    patch: Patches,
+    rows: Rows,
+    start: Array,
+    mean: Array,
+    formed: tuple[Array, Array],
+    weights: Array,
+    free: Array,
+    options: BatchOptions,
+    noise: float | None = None,
+) -> BatchAdjustment:
+    """Adjust the marks `rows` (m,) with images of any kind in single precision.
+
+    Parameters
+    ----------
+    start, mean : ndarray (m, u)
+        Approximate values, and observed ones, with the standard deviations `free` (u,).
+    formed : (ndarray (m, r, c), ndarray (m, 3 + p, r, c))
+        Images and their derivatives at `start`.
+    weights : ndarray (m, n)
+        Weights of the grey values.
+    noise : float, optional
+        Standard deviation of grey values, if shifts of rows are among the errors.
+    """
+    from .compiled import ACTIVE, DONE, STALE, advanced, linearised  # takes half a second to import
+
+    work, (m, u), n = _Iteration(patch, start, options, noise), start.shape, patch.grey.shape[1]
+    every = len(rows) == len(patch.xy)
+    observed, psf = (v if every else v[rows] for v in (patch.grey, SHARPEST * patch.psf))
+    prior, x, trial = 1 / free**2, work.x, start.copy()
+    common = np.zeros((2, m if work.light[2] > 0 else 0, n), np.float32)
+    space = (
+        *(work.residuals, np.empty((m, u, n), np.float32), np.zeros((m, u, u)), np.zeros((m, u))),
+        *(work.cofactor, common[0], common[1]),
+    )
+    steps: Any = x, space, trial, work.iteration, work.state
+    state, some, left, begun = work.state, np.arange(m), options.max_iterations, start.copy()
+    formed_at, last = start, _LAST
+    if every:
+        patch.shares = np.empty(patch.shape, np.float32)
+    while len(some):
+        share, slopes = formed
+        share, slopes = np.ascontiguousarray(share).reshape(len(some), n), slopes.reshape(len(some), -1, n)
+        with one_thread():
+            linearised(
+                *(some, share, slopes, observed, weights, work.window, work.light, psf, mean, prior),
+                *(options.share, *steps, work.influence),
             )
+        begun[some] = formed_at
+        patch.shares[rows[some]] = share.reshape(-1, *patch.shape[1:])
+        while left > 0 and len(some := np.flatnonzero(state == ACTIVE)):
+            left -= 1
+            tried = np.ascontiguousarray(patch.image(trial[some], rows[some]))
+            before = work.iteration[some, 0]
+            work.rounds[some] += 1
+            with one_thread():
+                advanced(
+                    *(some, tried.reshape(len(some), n), observed, weights, work.window, work.light[0]),
+                    *(mean, prior, options.share, *steps),
+                )
+            taken = work.iteration[some, 0] < before
+            patch.shares[rows[some[taken]]] = tried[taken]
+        # With derivatives of another image the gradient of the noise vanishes at another place.
+        changed = (state == DONE) & (patch.change(begun, x, rows) > options.share)
+        if changed.any() and left < last:
+            left, last = last, 0
+        some = np.flatnonzero(changed | (state == STALE))
+        if left <= 0 or not len(some):
+            break
+        # Trials are counted, as in the general adjustment; only what has converged may go on without any.
+        left -= int(changed.any())
+        formed_at = x[some]
+        formed = patch.slopes(formed_at, rows[some])
+    return work.finished(patch, rows, weights, free)
 
 
 def _robust_sigma(residuals: Array, used: Array) -> Array:

@@ -164,20 +164,40 @@ class Patches:
         self._formed: tuple[Array, Rows, Array, Array] | None = None
         self.first: tuple[Array, Array] | None = None  # images and derivatives where `begin` starts
         self.shares = np.empty(self.shape)
+        self.single = False
+        """Whether images are formed in single precision; known after `begin` or `start`."""
+        self.influences: tuple[Array, Array] | None = None  # of the adjustment, if wanted
 
-    def begin(self, contrast: Array, ground: Array) -> Array:
-        """Approximate values (k, u) of marks whose contrast (k,) and background (k, b) are known."""
+    def begin(self, light: tuple[Array, Array] | None) -> Array:
+        """Approximate values (k, u) of marks at approximate positions.
+
+        `light` is their contrast (k,) and background (k, b), if known; by default both are those that fit the
+        grey values best with images of the expected width.
+        """
         x = np.zeros((len(self.xy), self.form_at + self.forms))
         # Start with the expected width; see `width`.
         x[:, WIDTH] = np.log(self.psf * np.sqrt(1 - SHARPEST**2))
-        x[:, CONTRAST], x[:, self.ground] = contrast, ground
-        self.first = self.form.derivatives(
-            self.xy, self.width(x, every := np.arange(len(x))), x[:, self.form_at :], every, self.window
-        )
+        self.first = self.slopes(x, np.arange(len(x)))
+        self.single = self.first[0].dtype == np.float32
+        if light is None:
+            x[:, LEVEL], depth = self._levels(self.first[0].reshape(len(x), -1))
+            dark = self.options.polarity == "dark"
+            x[:, CONTRAST] = -depth / np.where(x[:, LEVEL] == 0, 1.0, x[:, LEVEL]) if dark else depth
+        else:
+            x[:, CONTRAST], x[:, self.ground] = light
         if self.options.variance is not None:
             grey = self._grey(x, self.first[0])
             self.relative_weights = relative_weights(grey.reshape(len(x), -1), self.options.variance)
         return x
+
+    def _levels(self, share: Array) -> tuple[Array, Array]:
+        """Grey values (k,) of the background, and what a mark adds, by regression on its share (k, n)."""
+        count = np.maximum(self.weights.sum(axis=1), 1.0)
+        part, grey = (np.einsum("kn,kn->k", self.weights, v) / count for v in (share, self.grey))
+        square = np.einsum("kn,kn,kn->k", self.weights, share, share) / count - part**2
+        product = np.einsum("kn,kn,kn->k", self.weights, share, self.grey) / count - part * grey
+        depth = product / np.maximum(square, 1e-12)
+        return grey - depth * part, depth
 
     def correlation(self, x: Array, at: Rows) -> Array:
         """Correlation (m,) of grey values with images of the marks `at` as formed last at `x` (k, u)."""
@@ -211,6 +231,7 @@ class Patches:
         x = np.zeros((len(self.xy), self.form_at + self.forms))
         x[:, WIDTH] = np.log(np.hypot(self.psf, 0.7 * self.options.start_px))
         share = self.share(x)
+        self.single = share.dtype == np.float32
         x[:, WIDTH] = np.log(self.psf)
         around = self.weights * (share.reshape(len(x), -1) < 0.02)
         around[:, 0] = np.where(around.any(axis=1), around[:, 0], 1.0)  # a median needs at least one value
@@ -243,6 +264,40 @@ class Patches:
         """Width of the point-spread function (m,) from its logarithm, with a lower bound."""
         width: Array = np.hypot(SHARPEST * self.psf[at], np.exp(x[:, WIDTH]))
         return width
+
+    def change(self, before: Array, x: Array, at: Rows) -> Array:
+        """Relative change (m,) of the images of the marks `at` from `before` to `x` (m, u)."""
+        width, off = self.width(x, at), np.abs(x - before)
+        parts = [
+            off[:, X] / width,
+            off[:, Y] / width,
+            off[:, WIDTH],
+            off[:, CONTRAST] / np.abs(x[:, CONTRAST]),
+        ]
+        return np.asarray(np.max([*parts, *off[:, self.form_at :].T], axis=0))
+
+    def image(self, x: Array, at: Rows) -> Array:
+        """Images (m, rows, columns) of the marks `at` at `x` (m, u)."""
+        return self.form.image(*self._place(x, at))
+
+    def slopes(self, x: Array, at: Rows) -> tuple[Array, Array]:
+        """Images and their derivatives (m, 3 + p, rows, columns), as :meth:`image`."""
+        return self.form.derivatives(*self._place(x, at))
+
+    def _place(self, x: Array, at: Rows) -> tuple[Array, Array, Array, Rows, Window]:
+        window = self.window if len(at) == len(self.xy) else self.window.select(at)
+        return self.xy[at] + x[:, :2], self.width(x, at), x[:, self.form_at :], at, window
+
+    def keep(self, rows: Rows, on_position: Array, leverage: Array) -> None:
+        """Keep influences (m, 2, n) and leverages (m, n) of the marks `rows`."""
+        if self.influences is None:
+            k, high, wide = self.shape
+            self.influences = (
+                np.zeros((k, 2, high, wide), np.float32),
+                np.zeros((k, high, wide), np.float32),
+            )
+        self.influences[0][rows] = on_position.reshape(len(rows), 2, *self.shape[1:])
+        self.influences[1][rows] = leverage.reshape(len(rows), *self.shape[1:])
 
     def form_image(self, x: Array, at: Rows) -> tuple[Array, Array]:
         """Grey values (m, n) and their derivatives (m, n, u) for the patches `at`."""

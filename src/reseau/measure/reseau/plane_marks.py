@@ -68,8 +68,8 @@ _NEIGHBOURS = 6
 """Number of neighbours whose light is taken."""
 _LIKELY = 0.7
 """Correlation with the formed image from which a mark that was not found at first is looked for."""
-_ENOUGH_LIKE, _SAMPLE = 6, 20
-"""Least number of reliable marks from which something is learnt, and most that show the camera's response."""
+_ENOUGH_LIKE = 6
+"""Least number of reliable marks from which something is learnt."""
 _FEW = 3
 """One in so many of these shows whether a kernel is needed."""
 _KERNELS = 2
@@ -88,9 +88,16 @@ _WHOLE = 0.97
 """Share of the pixels of a mark below which it is seen in part."""
 _BENT_PX = 0.15
 """Distance of one mark in ten from the mapping through all, from which that is adjusted again."""
-_ROUNDS, _SAME = 6, 0.2
+_ROUNDS, _SAME = 6, 0.5
 """Most rounds of matching with the mapping through the last matches; change of the middles of images, in
-sigmas, at which they end."""
+sigmas, by which positions are moved rather than matched again."""
+_SPREAD = 16
+"""Least number of marks that show the mapping through a lens before all are matched."""
+_NEAR_WIDTH, _NEAR_FORM = 0.15, 0.01
+"""Relative error of the sharpness, and change of the form, beyond which marks are matched again before the
+camera's response is learnt."""
+_AROUND_PX, _SHARP = 9, (0.4, 6.0)
+"""Reach around a mark within which the sharpness is seen first; and its limits, pixels."""
 _PER_SMOOTH = 2.5
 """Least number of coordinates for each term of the polynomial about which positions scatter."""
 _PSF_LOG_SIGMA = 0.2
@@ -174,6 +181,11 @@ class Located:
         return np.asarray(self.xy @ self.frame.T + self.origin)
 
 
+def _variance(found: Matches) -> Array:
+    """Mean variance (k,) of both coordinates."""
+    return np.asarray(np.trace(found.cov, axis1=1, axis2=2) / 2)
+
+
 def _sure(found: Matches) -> Mask:
     """Marks that show the mapping."""
     return found.converged & (found.t > 8) & (found.rejected < 0.1) & (found.seen > _SEEN)
@@ -204,6 +216,8 @@ class PlaneMarks(ABC):
     """The same for marks whose common size is known."""
     learnt_from: ClassVar[int] = _LEARNT_FROM
     """Most marks from which mapping and appearance are learnt first."""
+    sampled: ClassVar[int] = 20
+    """Most marks that show the camera's response."""
     precise_start: ClassVar[bool] = False
     """Whether marks are found so precisely that a match can continue from what is known of them."""
     eccentric: ClassVar[bool] = False
@@ -234,7 +248,9 @@ class PlaneMarks(ABC):
         self.notes: tuple[Remark, ...] = ()
         self.displaced: tuple[Chain, ...] = ()
         self.learning = True
+        self.quick = self.precise_start  # whether marks are matched without a search for blunders
         self.own_px = np.zeros(len(self.at))  # pixels of the windows that belong to marks, matched last
+        self.begun_px = options.psf_px  # width of the point-spread function from which the first match began
         self.rough = 0.0  # residuals of the marks that were learnt from
 
     @abstractmethod
@@ -270,20 +286,17 @@ class PlaneMarks(ABC):
         rows = np.flatnonzero(self.found)
         if len(rows) > self.learnt_from:
             rows = rows[np.linspace(0, len(rows) - 1, self.learnt_from).astype(np.intp)]
-        first = self._match(rows)
-        sure = first.converged & (first.t > 8) & (first.rejected < 0.2)
+        first, sure = self._first(rows)
         if sure.sum() >= _ENOUGH_LIKE:
             self._respond(self._learn(first.select(sure), rows[sure]), rows[sure])
-        rows, self.learning = self._in_sight(), False
-        found = self._match(rows) if self.eccentric else self._match_all(rows)
+        rows, self.learning, self.quick = self._in_sight(), False, False
+        found = self._match_all(rows)
         # Marks with something in front of them show neither the mapping nor its errors.
         plain = _sure(found) & ~self._uneasy(found) & (found.seen > _WHOLE) & (found.rejected == 0)
         if self.eccentric or self._bent(rows[plain], found.select(plain)):
             found = self._mapped(rows, found, _sure(found) if self.eccentric else plain)
-        why, field = self._judged(rows, found)
-        # Where paper is saturated, neighbours do not predict the light.
-        doubtful = ((why != "") | self._uneasy(found)) & ~self.dazzled[rows]
-        if doubtful.any() and (~doubtful & ~self.dazzled[rows]).sum() >= _NEIGHBOURS and field is not None:
+        doubtful, field = self._doubtful(rows, found)
+        if doubtful.any() and field is not None and (~doubtful & ~self.dazzled[rows]).sum() >= _NEIGHBOURS:
             # Look again where their neighbours predict them, without what lies in front of them.
             self._uncover(rows, found, doubtful, field)
             found = replaced(found, ~doubtful, self._match_all(rows[doubtful]))
@@ -298,19 +311,20 @@ class PlaneMarks(ABC):
     def _mapped(self, rows: Rows, found: Matches, sure: Mask) -> Matches:
         """Matches with the mapping through the marks that are `sure`, which itself depends on the matches."""
         h, w = self.screened.grey.shape
-        for k in range(_ROUNDS if self.eccentric else 1):
-            before, sigma = self._off_centre(self.mapping, rows), np.full(len(rows), np.inf)
-            if sure.sum() >= _ENOUGH_LIKE:
-                self.start[rows[sure]] = found.xy[sure]
-                sigma = np.sqrt(np.trace(found.cov, axis1=1, axis2=2) / 2)
-                if self.eccentric:
-                    # Growth about the image of the point is not that of the mark on its plane.
-                    self._settle(found.select(sure))
-                through_all = mapping_through(self.at[rows[sure]], found.xy[sure], sigma[sure], (h, w))
-                self.mapping, self.displaced = through_all.mapping, through_all.displaced
-            moved = np.abs(self._off_centre(self.mapping, rows) - before).max(axis=1)
-            if k and (moved < _SAME * sigma)[sure].all():
+        for _ in range(_ROUNDS if self.eccentric else 1):
+            if sure.sum() < _ENOUGH_LIKE:
                 break
+            before, sigma = self._off_centre(self.mapping, rows), np.sqrt(_variance(found))
+            through_all = mapping_through(self.at[rows[sure]], found.xy[sure], sigma[sure], (h, w))
+            self.mapping, self.displaced = through_all.mapping, through_all.displaced
+            moved = self._off_centre(self.mapping, rows) - before
+            if self.eccentric and (np.abs(moved[sure]).max(axis=1) < _SAME * sigma[sure]).all():
+                # A match follows the middle of an image, to first order.
+                return replace(found, xy=found.xy - moved)
+            self.start[rows[sure]] = found.xy[sure]
+            if self.eccentric:
+                # Growth about the image of the point is not that of the mark on its plane.
+                self._settle(found.select(sure))
             found = self._match_all(rows)
             sure = _sure(found)
         return found
@@ -327,6 +341,51 @@ class PlaneMarks(ABC):
             off = self._off_centre(mapping, rows) - middle
             cov += off[:, :, None] * off[:, None]
         return cov
+
+    def _first(self, rows: Rows) -> tuple[Matches, Mask]:
+        """First matches of some marks, and which of them are reliable."""
+        if self.precise_start:
+            psf_px = self._sharpness(rows)
+            self.look, self.begun_px = replace(self.look, psf_px=psf_px, blur_px=psf_px), psf_px
+            first = self._match(rows)
+            sure = first.converged & (first.t > 8)
+            if sure.any():
+                sure &= first.noise < _DISTURBED * np.median(first.noise[sure])
+            if 2 * sure.sum() > len(rows):
+                return first, sure
+            self.begun_px = self.options.psf_px
+            self.look = replace(self.look, psf_px=self.begun_px, blur_px=self.begun_px)
+            self.quick = False
+        first = self._match(rows)
+        return first, first.converged & (first.t > 8) & (first.rejected < 0.2)
+
+    def _sharpness(self, rows: Rows) -> float:
+        """Width of the point-spread function by the steepest slopes around marks, pixels."""
+        half = _AROUND_PX + int(np.ceil(self._radius(rows).max()))
+        x, y = self._pixels(rows, (half, half))
+        grey = self.screened.grey[y, x]
+        # Over two pixels; that and the pixel itself have variances of 1/3 and 1/12.
+        across = (grey[:, 1:-1, 2:] - grey[:, 1:-1, :-2]) / 2
+        down = (grey[:, 2:, 1:-1] - grey[:, :-2, 1:-1]) / 2
+        steep = np.quantile(np.hypot(across, down).reshape(len(rows), -1), 0.98, axis=1)
+        dark, bright = np.quantile(grey.reshape(len(rows), -1), [0.1, 0.9], axis=1)
+        variance = (bright - dark) ** 2 / (2 * np.pi * np.maximum(steep, 1e-9) ** 2) - 1 / 3 - 1 / 12
+        return float(np.clip(np.sqrt(max(float(np.median(variance)), 0.0)), *_SHARP))
+
+    def _doubtful(self, rows: Rows, found: Matches) -> tuple[Mask, SmoothField | None]:
+        """Marks that are looked at again, and the field that predicts them."""
+        # Where paper is saturated, neighbours do not predict the light.
+        if self.precise_start:
+            doubtful = self._uneasy(found)
+            for mask, _ in self._objections(rows, found):
+                doubtful |= mask
+            doubtful |= (np.abs(found.xy - self.mapping(self.at[rows])) > self.options.neighbour_px).any(
+                axis=1
+            )
+            if not (doubtful & ~self.dazzled[rows]).any():
+                return doubtful & ~self.dazzled[rows], None
+        why, field = self._judged(rows, found)
+        return ((why != "") | self._uneasy(found)) & ~self.dazzled[rows], field
 
     def _bent(self, rows: Rows, found: Matches) -> bool:
         """Whether the lens bends the target more than the mapping through the marks found contains."""
@@ -460,6 +519,7 @@ class PlaneMarks(ABC):
                     noise=max(self.screened.noise, self.rough),
                     form_sigma=self._form_sigma(),
                     light=self._known_light(rows[part], background),
+                    precise=self.quick,
                     others=self._light_of(here, rows[part]),
                     region=region,
                     least=(np.where(self.found[rows[part]], -1.0, _LIKELY), self.least_seen),
@@ -515,7 +575,11 @@ class PlaneMarks(ABC):
         """Learn mapping, sharpness, size and noise from reliable marks; their form refers to the new size."""
         self.start[rows] = first.xy
         known = self.found if self.precise_start else np.isin(np.arange(len(self.at)), rows)
-        self.mapping = through(self.at[known], self.start[known], self.screened.grey.shape)
+        h, w = self.screened.grey.shape
+        self.mapping = through(self.at[known], self.start[known], (h, w))
+        if self.eccentric and len(rows) >= _SPREAD:
+            sigma = np.sqrt(_variance(first))
+            self.mapping = mapping_through(self.at[rows], first.xy, sigma, (h, w)).mapping
         self._weigh(first, rows)
         first = self._settle(first)
         self.look = replace(
@@ -533,23 +597,28 @@ class PlaneMarks(ABC):
 
     def _respond(self, first: Matches, rows: Rows) -> None:
         """Learn what motion, sharpening and the curve of the camera make of the images."""
-        some = np.unique(np.linspace(0, len(rows) - 1, _SAMPLE).astype(np.intp))
+        some = np.unique(np.linspace(0, len(rows) - 1, self.sampled).astype(np.intp))
         first, rows = first.select(np.isin(np.arange(len(rows)), some)), rows[some]
-        # The first match began far from the sharpness of these images.
-        first = self._settle(self._match(rows))
-        self._weigh(first, rows)
+        # The first match may have begun far from the sharpness and form of these images, or with other
+        # figures beside them.
+        near = abs(np.log(np.median(first.psf_px) / self.begun_px)) < _NEAR_WIDTH
+        near &= bool((np.median(np.abs(first.form), axis=0) < _NEAR_FORM).all())
+        if not (self.precise_start and near and self._beside() is None):
+            first = self._settle(self._match(rows))
+            self._weigh(first, rows)
         few = np.arange(len(rows)) % _FEW == 0
         kernel, sharper, gain = estimate_kernel(self._samples(first.select(few), rows[few])[0])
         bent = False
         if gain < _FILTERED and self.curve_first:
-            first, bent = self._straighten(first, rows, sure=True)
+            first, bent = self._straighten(first, rows, beside=gain)
             if bent:
-                gain = estimate_kernel(self._samples(first.select(few), rows[few])[0])[2]
+                kernel, sharper, gain = estimate_kernel(self._samples(first.select(few), rows[few])[0])
         if gain < _FILTERED:
-            for _ in range(_KERNELS):
-                # Position and form were those of images without the kernel, or with the one before.
-                self.look = replace(self.look, kernel=None)
-                kernel, sharper, _ = estimate_kernel(self._samples(first, rows)[0])
+            for again in range(_KERNELS):
+                if again:
+                    # Position and form were those of images without the kernel.
+                    self.look = replace(self.look, kernel=None)
+                    kernel, sharper, _ = estimate_kernel(self._samples(first, rows)[0], (1.0,))
                 self.look = replace(self.look, kernel=kernel, psf_px=sharper * self.look.psf_px)
                 first = self._settle(self._match(rows))
                 self._weigh(first, rows)
@@ -558,10 +627,11 @@ class PlaneMarks(ABC):
         if not bent:
             self._straighten(first, rows)
 
-    def _straighten(self, first: Matches, rows: Rows, sure: bool = False) -> tuple[Matches, bool]:
+    def _straighten(self, first: Matches, rows: Rows, beside: float | None = None) -> tuple[Matches, bool]:
         """Learn the curve between light and grey values; whether there is one.
 
-        With `sure`, a curve is adopted only if it leaves much less than grey values as they are.
+        Where a kernel leaves the share `beside` of the mean square residuals, a curve is adopted only if it
+        leaves less than that, and much less than grey values as they are.
         """
         straight, full_scale = ToneCurve(1.0), self.image.full_scale
         tried = {straight: (self.screened, self.look, first)}
@@ -577,11 +647,14 @@ class PlaneMarks(ABC):
                 self.screened = replace(self.screened, noise=float(np.median(again.noise)))
                 tried[curve] = self.screened, self.look, again
             self.screened, self.look, again = tried[curve]
-            return self._samples(again, rows) if again.converged.all() else None
+            good = again.converged
+            if not good.all() and not (self.precise_start and good.sum() >= _ENOUGH_LIKE):
+                return None
+            return self._samples(again.select(good), rows[good])
 
-        found = find_curve(matched, full_scale, self.image.curve)
+        found = find_curve(matched, full_scale, self.image.curve, beside=1.0 if beside is None else beside)
         chosen = found.curve or straight
-        if sure and found:
+        if beside is not None and found:
             # A kernel was suspected: whether the curve explains the residuals instead.
             left, before = (
                 np.median(tried[c][2].noise / np.abs(self._depth(tried[c][2]))) for c in (chosen, straight)
@@ -591,7 +664,7 @@ class PlaneMarks(ABC):
         if chosen is not straight:
             self._weigh(first, rows)
         note = found.remark(f"{self.word}s")
-        if note is not None and (chosen is not straight or not sure):
+        if note is not None and (chosen is not straight or beside is None):
             self.notes += (note,)
         return first, chosen is not straight
 
