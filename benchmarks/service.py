@@ -8,8 +8,9 @@
 whoever asks too late misses one. A session takes them all, while 200 clients read server-sent events and
 requests arrive at a constant rate, whether earlier ones are answered or not. A frame is lost if its number is
 missing in the archive, and late if it is stored after the next one is due. The time of a request counts from
-the moment at which it was due. Clients check that no event is missing or repeated. With `--frames` the
-session has so many frames already, as after hours.
+the moment at which it was due. Clients check that no event is missing or repeated. The memory of service
+and worker (what is resident) is flat if the straight line through the second half of the run rises by less
+than 1 MB. With `--frames` the session has so many frames already, as after hours.
 
 `sessions` fills an archive as after years: sessions with frames and results, configurations with decisions,
 an audit log. It takes the time and the processor time of pages and operations: at first at most 1 s each,
@@ -46,6 +47,7 @@ from typing import Any
 from urllib.parse import quote
 
 import httpx
+import numpy as np
 import psutil
 import sqlalchemy as sa
 
@@ -64,6 +66,8 @@ except ImportError:
 
 PASSWORD = "correct horse battery"
 ROOT = Path(__file__).resolve().parents[1]
+FLAT_MB = 1.0
+"""What memory may grow by in the second half of a load."""
 BENCH = """schema = "reseau-bench/1"
 name = "cellar"
 [instruments.camera]
@@ -159,18 +163,21 @@ class Load:
                     last = number
         writer.close()
 
-    async def memory(self, processes: dict[str, psutil.Process], found: dict[str, list[float]]) -> None:
-        """Note the memory of processes (MB), each ten seconds."""
+    async def memory(
+        self, processes: dict[str, psutil.Process], found: dict[str, list[tuple[float, float]]]
+    ) -> None:
+        """Note time (s) and the memory of processes (MB), each ten seconds."""
         while True:
             for name, process in processes.items():
-                found.setdefault(name, []).append(process.memory_info().rss / 1e6)
+                now = time.monotonic(), process.memory_info().rss / 1e6
+                found.setdefault(name, []).append(now)
             await asyncio.sleep(10.0)
 
     async def run(
         self, clients: int, rate: float, seconds: float, processes: dict[str, psutil.Process]
-    ) -> dict[str, list[float]]:
+    ) -> dict[str, list[tuple[float, float]]]:
         """Put the service under load; return the memory of the processes."""
-        found: dict[str, list[float]] = {}
+        found: dict[str, list[tuple[float, float]]] = {}
         streams = [asyncio.create_task(self.events()) for _ in range(clients)]
         await asyncio.sleep(2.0)
         watch = asyncio.create_task(self.memory(processes, found))
@@ -229,21 +236,30 @@ def load(minutes: float, clients: int, rate: float, already: int) -> int:
           f"{1e3 * max(delays):.0f} ms (longest)")  # fmt: skip
     print(f"processor     service {1e3 * spent[0] / len(every):.1f} ms per request with events, "
           f"{spent[0] / (60 * minutes):.2f} of a core; worker {spent[1] / (60 * minutes):.2f}")  # fmt: skip
-    grown = {}
+    flat = True
     for each, values in memory.items():
-        half = len(values) // 2
-        grown[each] = statistics.median(values[-max(1, half // 2) :]) - statistics.median(
-            values[half // 2 : half] or values
-        )
-        print(f"memory        {each} {values[0]:.0f} MB at first, {values[half]:.0f} MB, "
-              f"{values[-1]:.0f} MB at last; fourth quarter minus second {grown[each]:+.1f} MB")  # fmt: skip
+        quarters = [f"{statistics.median(part[:, 1]):.1f}" for part in np.array_split(np.array(values), 4)]
+        grown, sigma, seconds = growth(values)
+        flat &= grown < FLAT_MB
+        print(f"memory        {each}: {', '.join(quarters)} MB (medians of quarters); "
+              f"{grown:+.2f} ± {sigma:.2f} MB in the last {seconds / 60:.0f} min")  # fmt: skip
     kept = (
         p99 < 200
         and not (made.failed or lost or late or made.missing or made.repeated)
         and set(made.statuses) == {200}
     )
-    print("kept" if kept and max(grown.values()) < 10 else "NOT KEPT")
-    return 0 if kept else 1
+    print("kept" if kept and flat else "NOT KEPT")
+    return 0 if kept and flat else 1
+
+
+def growth(values: list[tuple[float, float]]) -> tuple[float, float, float]:
+    """Growth in the second half (MB) by a straight line, its standard deviation, and the time of it (s)."""
+    times, used = np.array(values[len(values) // 2 :]).T
+    seconds = float(times[-1] - times[0])
+    if len(times) < 4:
+        return float(used[-1] - used[0]), float("inf"), seconds
+    (slope, _), covariance = np.polyfit(times - times[0], used, 1, cov=True)
+    return float(slope * seconds), float(np.sqrt(covariance[0, 0]) * seconds), seconds
 
 
 def filled(folder: Path, count: int) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from bluesky import Msg
 from bluesky import plan_stubs as bps
 
-from ..archive import ArchivedFrame, Session, Verdict
+from ..archive import ArchivedFrame, Session
 from ..core.data import Frame
 from ..core.errors import (
     ConnectionLost,
@@ -157,18 +157,12 @@ class Acquisition:
         """Return how much more the images scatter than their standard deviations say; 1 if not known."""
         return self._judge.progress().get("scatter", 1.0)
 
-    def verdict(self, frame: ArchivedFrame) -> Verdict:
-        """Return the verdict on a frame that was taken or checked in this process."""
-        return self._judge.verdicts[frame.id]
-
     def done(self, step: Step) -> bool:
         """Return whether a step has a good frame, or as many bad ones as are allowed."""
         rig = self._rig
         names = [step.name] if rig is None else [f"{camera}/{step.name}" for camera in rig.cameras]
         frames = [frame for name in names for frame in self.session.frames(name, "frame")]
-        return any(f.verdict is not None and f.verdict.ok for f in frames) or len(
-            frames
-        ) > self.retakes * len(names)
+        return any(_good(each) for each in frames) or len(frames) > self.retakes * len(names)
 
     # Messages for plans.
 
@@ -178,7 +172,7 @@ class Acquisition:
         Returns
         -------
         ArchivedFrame
-            The last frame taken at the pose.
+            The last frame taken at the pose, with its verdict.
         """
         yield from bps.checkpoint()
         if not self.done(step):
@@ -294,9 +288,9 @@ class Acquisition:
     def read(self) -> dict[str, Any]:
         """Return the last frame: step, take, SHA-256 and verdict."""
         last = self._last
-        if last is None:
+        if last is None or last.verdict is None:
             raise StateError("no frame has been taken", where=self.name)
-        verdict = self._judge.verdicts[last.id]
+        verdict = last.verdict
         values = {
             "step": last.step,
             "take": last.take,
@@ -409,10 +403,10 @@ class Acquisition:
         if rig is not None:
             return self._exposed_at_once(rig, step, average)
         for take in range(self.retakes + 1):
-            frame = self.session.find(step.name, "frame", take) or self._taken(step, take, average, source)
-            verdict = self._judge.judge(frame, step)
+            there = self.session.find(step.name, "frame", take)
+            frame = self._judge.judge(there or self._taken(step, take, average, source), step)
             self._last = frame
-            if verdict.ok:
+            if _good(frame):
                 break
         return frame
 
@@ -426,7 +420,8 @@ class Acquisition:
                 rig, step, take, average
             )
             new = any(frame.verdict is None for frame in frames)
-            good = [frame for frame in frames if self._judge.judge(frame, Step(frame.step, step.position)).ok]
+            frames = [self._judge.judge(frame, Step(frame.step, step.position)) for frame in frames]
+            good = [frame for frame in frames if _good(frame)]
             self._last = good[0] if good else frames[-1]
             if good and new:
                 self._judge.report_precision(step)
@@ -664,6 +659,11 @@ class Acquisition:
             self.watch("check", each.to_dict() | {"camera": name, "faults": faults})
             found[name] = replace(each, faults=tuple(faults))
         return next((each for each in found.values() if not each), next(iter(found.values())))
+
+
+def _good(frame: ArchivedFrame) -> bool:
+    """Whether a frame has a verdict that it is usable."""
+    return frame.verdict is not None and frame.verdict.ok
 
 
 def _stream(camera: Camera, count: int) -> Callable[[], Exposure]:

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 from bluesky import RunEngine
@@ -334,19 +335,23 @@ class _Asked:
 
         On a busy machine a pause that is requested while the engine waits for an instrument can be lost.
         """
-
-        def before(message: Any) -> Any:
-            if self._inserted or not self._asked.is_set() or self._interrupted.is_set():
-                return None, None
-            self._inserted = True
-
-            def first() -> Plan:
-                yield from bps.pause()
-                return (yield message)
-
-            return first(), None
-
-        return (yield from bpp.plan_mutator(plan, before))  # type: ignore[no-untyped-call]
+        # bluesky's `plan_mutator` would keep every message of the plan, and sessions have any number of them.
+        todo = partial(next, plan)
+        while True:
+            try:
+                message = todo()
+            except StopIteration as end:
+                return end.value
+            try:
+                if self._asked.is_set() and not (self._inserted or self._interrupted.is_set()):
+                    self._inserted = True
+                    yield from bps.pause()
+                todo = partial(plan.send, (yield message))
+            except GeneratorExit:
+                plan.close()
+                raise
+            except Exception as error:
+                todo = partial(plan.throw, error)
 
 
 class Control:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 from ..archive import ArchivedFrame, Session, Verdict
@@ -96,29 +97,38 @@ class Judge:
 
     def __init__(self, session: Session, procedure: Procedure | None, limits: Limits, watch: Watch) -> None:
         self._session, self._procedure, self._limits, self._watch = session, procedure, limits, watch
-        self.verdicts: dict[int, Verdict] = {}
-        """Verdicts given in this process, by the number of the frame."""
+        there = session.frames(last=1)
+        self._before = there[0].id if there else 0
+        """Number of the last frame that was there before."""
+        self._earlier: dict[int, Verdict] = {}
         self._memories: dict[int, Mapping[str, Any]] | None = None
 
     def progress(self) -> Mapping[str, float]:
         """Return what the procedure has reached; empty without one."""
         return {} if self._procedure is None else self._procedure.progress()
 
-    def judge(self, frame: ArchivedFrame, step: Step) -> Verdict:
-        """Return the verdict on a frame; the procedure gets each once, also those of before a resumption."""
-        if frame.id in self.verdicts:
-            return self.verdicts[frame.id]
+    def judge(self, frame: ArchivedFrame, step: Step) -> ArchivedFrame:
+        """Return a frame with its verdict; the procedure gets each once, also those of before a resumption.
+
+        A session may have any number of frames: the verdicts on those that are taken from now on are in the
+        archive, and only those on the earlier ones, which may be others than before, are kept.
+        """
+        if frame.id in self._earlier:
+            return replace(frame, verdict=self._earlier[frame.id])
+        if frame.verdict is not None and frame.id > self._before:
+            return frame
         verdict = self._recalled(frame, step) or self._checked(self._session.picture(frame), frame, step)
         if frame.verdict is None:
             self._session.judge(frame, verdict)
             self._remember(frame, step, verdict)
-        self.verdicts[frame.id] = verdict
+        if frame.id <= self._before:
+            self._earlier[frame.id] = verdict
         facts = {"step": step.name, "take": frame.take, "ok": verdict.ok, "why": verdict.why}
         # A frame from before a resumption took no time.
         self._watch("frame", facts | {"there": frame.verdict is not None} | verdict.facts)
         if verdict.ok and frame.verdict is None and "set" not in frame.facts:
             self.report_precision(step)
-        return verdict
+        return replace(frame, verdict=verdict)
 
     def report_precision(self, step: Step) -> None:
         """Report what the procedure has reached, if anything."""

@@ -190,9 +190,8 @@ def oscilloscope(run: Acquisition, body: bool = True, average: int = 1, checks: 
         elif sweeps:
             yield from run.pictures(step, "scan")
         frame = yield from run.at(step, average)
-        verdict = run.verdict(frame)
-        if not verdict.ok:
-            raise EstimationError(verdict.why, where=name)
+        if not frame.verdict.ok:
+            raise EstimationError(frame.verdict.why, where=name)
         yield from run.pictures(step, "screen")
 
 

@@ -28,6 +28,7 @@ from .. import sessions
 from ..archive import Archive
 from ..capture import Bench, BenchFile, BenchLock, Control, by_hand, edge_sigma, exposure_fault, grey_counts
 from ..core.errors import BenchError, InstrumentError, ReseauError, StateError, UsageError
+from ..core.memory import keep_loaded, share_freed_memory
 from ..instruments import Camera, Turntable
 from ..io import read_text
 from .state import StateFolder, private_file
@@ -669,6 +670,7 @@ def run(
     ReseauError
         If bench, archive, certificates or address cannot be used.
     """
+    share_freed_memory()
     told = None if address is not None else StateFolder(folder)
     certificates = Certificates.in_folder(folder) if told is None else Certificates(told)
     text = read_text(bench)
@@ -679,6 +681,7 @@ def run(
             stack.enter_context(BenchLock([str(where)], f"worker of {bench}"))
         archive = stack.enter_context(Archive.open(place, objects or None, create=True))
         worker = Worker(text, archive, certificates)
+        keep_loaded()
 
         def end(*_: object) -> None:
             if worker._control is not None:

@@ -12,6 +12,7 @@ import uvicorn
 from fastapi import FastAPI, Request
 
 from ...core.errors import UsageError
+from ...core.memory import share_freed_memory
 from ...core.version import __version__
 from . import accounts, benches, calibrations, files, history, operations, pages, sessions
 from .access import principal_of
@@ -96,6 +97,7 @@ def serve(options: ServeOptions, said: Callable[[str], None], ready: Callable[[S
     """
     import dataclasses
 
+    share_freed_memory()
     sock = _bound(options)
     options = dataclasses.replace(options, port=sock.getsockname()[1])
     handler = logging.StreamHandler(sys.stderr)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import secrets
 import threading
 import time
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from ...archive import Archive
 from ...core.errors import ReseauError, UsageError
+from ...core.memory import keep_loaded
 from ..accounts import Accounts, Principal
 from ..audit import Audit
 from ..state import StateFolder
@@ -44,9 +44,7 @@ def _load_the_rest(over: threading.Event) -> None:
     from ...report import overlay
 
     del overlay
-    # What stays for ever need not be looked at by each collection, which stops all threads meanwhile.
-    gc.collect()
-    gc.freeze()
+    keep_loaded()
 
 
 _LOOK_S, _ENTRY_S, _REST_S = 0.3, 600.0, 3.0
