@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 import re
 import shlex
 from collections.abc import Iterator
@@ -140,16 +141,28 @@ def test_a_how_to_is_one_task_on_at_most_two_screens(page: Path) -> None:
     "page",
     [
         page
-        for folder in ("howto", "concepts")
-        for page in sorted((DOCS / folder).glob("*.md"))
+        for page in (
+            DOCS / "conventions.md",
+            *sorted(DOCS.glob("howto/*.md")),
+            *sorted(DOCS.glob("concepts/*.md")),
+        )
         if "```python" in page.read_text("utf-8")
     ],
     ids=lambda page: page.stem,
 )
-def test_lines_of_python_run_in_the_order_of_the_page(
+def test_lines_of_python_run_in_the_order_of_the_page_and_print_what_it_shows(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    for block in re.findall(r"^```python\n(.*?)^```$", page.read_text("utf-8"), re.DOTALL | re.MULTILINE):
-        exec(compile(block, str(page), "exec"), names)
+    blocks = re.findall(r"^```python\n(.*?)^```$", page.read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    for number, block in enumerate(blocks):
+        if block.startswith(">>>"):
+            shown = doctest.DocTestParser().get_doctest(block, names, f"{page.name}[{number}]", str(page), 0)
+            runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS, verbose=False)
+            said: list[str] = []
+            runner.run(shown, out=said.append, clear_globs=False)
+            assert not runner.failures, "".join(said)
+            names = shown.globs
+        else:
+            exec(compile(block, str(page), "exec"), names)
