@@ -19,7 +19,7 @@ from reseau.designs.boards import marker_cells
 from reseau.designs.dots import dot_signs
 from reseau.io import BoardDesign
 from reseau.io.images import read_image
-from reseau.measure import BoardOptions, BoardResult, measure_board, measure_tags
+from reseau.measure import BoardOptions, BoardResult, measure_board, measure_tags, puzzle_part
 
 from .board_pictures import picture
 
@@ -263,11 +263,30 @@ def test_a_part_of_a_puzzleboard_has_the_names_of_that_part() -> None:
 def test_another_part_of_the_puzzle_and_its_mirror_image_are_declined() -> None:
     frame, _ = puzzle_picture()
     other = measure_board(frame, PUZZLE.model_copy(update={"start": (200, 107)}))
-    assert not other
+    assert isinstance(other, Failure)
     assert other.code is Code.OTHER_DESIGN
+    assert "columns 100 to" in other.reason
     mirrored = measure_board(replace(frame, pixels=np.ascontiguousarray(frame.pixels[:, ::-1])), PUZZLE)
     assert not mirrored
     assert mirrored.code is Code.MIRRORED
+
+
+def test_dots_tell_which_part_of_the_code_of_all_puzzleboards_is_seen() -> None:
+    frame, truth = puzzle_picture()
+    sight = ((truth > 6) & (truth < [frame.width - 7, frame.height - 7])).all(axis=1)
+    seen = PUZZLE.nodes[sight] + PUZZLE.start
+    for quarters in range(4):
+        found = puzzle_part(replace(frame, pixels=np.ascontiguousarray(np.rot90(frame.pixels, quarters))))
+        assert not isinstance(found, Failure)
+        assert np.abs(np.subtract(found.low, seen.min(axis=0))).max() <= 1
+        assert np.abs(np.subtract(found.high, seen.max(axis=0))).max() <= 1
+        assert np.min(np.subtract(found.low, PUZZLE.start)) >= 0
+        assert 0.9 * len(seen) < found.corners <= 63
+    mirrored = replace(frame, pixels=np.ascontiguousarray(frame.pixels[:, ::-1]))
+    x, y = truth[sight].mean(axis=0).astype(int) - 90
+    few = replace(frame, pixels=frame.pixels[y : y + 180, x : x + 180].copy())
+    for other in (mirrored, few, picture(CHESS)[0], picture(CHARUCO)[0], picture(APRIL)[0]):
+        assert not puzzle_part(other)
 
 
 def test_dots_tell_which_part_of_a_chessboard_is_seen() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,17 @@ from PIL import Image
 from reseau.core.data import Frame
 from reseau.core.failure import Failure
 from reseau.designs import board, coded_sheet, coded_testfield
+from reseau.designs.dots import dot_signs
 from reseau.io import BoardDesign
 from reseau.procedures.exposures import of_another_lens
 from reseau.procedures.target_measurement import Measurer, measurer_of
 from reseau.procedures.which_target import Design, which_target
 
 from ..measure.board_pictures import picture
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from worlds import prints
+from worlds.sheets import View, pose
 
 
 def test_a_charuco_board_is_found_among_other_targets() -> None:
@@ -49,6 +55,37 @@ def test_lines_are_not_looked_for_where_markers_are_read(monkeypatch: pytest.Mon
     assert not isinstance(found, Failure)
     assert found[0] == "mine"
     assert tried == ["mine", "mine"]
+
+
+@pytest.mark.parametrize("start", [(100, 7), (333, 492)])
+def test_a_puzzleboard_is_found_by_the_parts_that_photographs_show(start: tuple[int, int]) -> None:
+    signs = dot_signs(board("puzzle", 12, 9, 22.0, start=start))
+    bits = signs[1::2, 2:-1:2].T > 0, signs[2:-1:2, 1::2].T > 0
+    printed = prints.puzzle(22.0, *bits, dark_first=sum(start) % 2 == 0)
+    view = View(printed, *pose(3, printed, nearer=0.7), seed=3)
+    whole, parts = Frame(view.picture(), 255.0), []
+    # Columns of corners 0 to 6, and 4 to 10.
+    for columns in (slice(0, 7), slice(4, 11)):
+        xy = view.truth.reshape(8, 11, 2)[:, columns].reshape(-1, 2)
+        (left, top), (right, bottom) = xy.min(axis=0).astype(int) - 12, xy.max(axis=0).astype(int) + 12
+        parts.append(Frame(whole.pixels[max(top, 0) : bottom, max(left, 0) : right].copy(), 255.0))
+    candidates: dict[str, Design] = {
+        "chess": board("chess", 12, 9, 22.0),
+        "charuco": board("charuco", 7, 6, 24.0),
+    }
+    found = which_target(iter(parts), candidates, tried=1)
+    assert not isinstance(found, Failure)
+    name, design = found
+    assert isinstance(design, BoardDesign)
+    assert (design.kind, design.columns, design.rows, design.start) == ("puzzle", 12, 9, start)
+    assert f"11 × 8 corners from column {start[0]} and row {start[1]}" in name
+    # A given design of the same part comes first, and tells the size of the squares.
+    given = board("puzzle", 12, 9, 15.0, start=start)
+    assert which_target([whole], candidates | {"given": given}) == ("given", given)
+    moved = which_target([whole], candidates | {"given": given.model_copy(update={"start": (0, 0)})})
+    assert not isinstance(moved, Failure)
+    assert isinstance(moved[1], BoardDesign)
+    assert (moved[1].start, moved[1].pitch) == (start, 15.0)
 
 
 def test_photographs_with_another_zoom_are_named(tmp_path: Path) -> None:

@@ -62,9 +62,6 @@ if TYPE_CHECKING:
 
 __all__ = ["calibrate"]
 
-_TRIED = 3
-"""Photographs in which `--design auto` looks for targets."""
-
 Sigma = Annotated[
     float | None,
     typer.Option(min=1e-6, help="Sigma of all image coordinates, pixels; replaces the measured sigmas."),
@@ -273,20 +270,21 @@ def calibrate(
 def _found_target(
     files: list[Path], channel: Channel, sensor: Path | None
 ) -> ReseauDesign | TestfieldDesign | BoardDesign:
-    """The target that the first photographs show."""
-    from ..core.data import Frame
+    """The target that photographs show."""
     from ..io import is_points
     from ..procedures.which_target import designs_beside, which_target
 
     folders = dict.fromkeys(folder for path in files for folder in (path.parent, path.parent.parent))
-    frames = list[Frame]()
-    for path in files:
-        if not is_points(path) and len(frames) < _TRIED:
-            try:
-                frames.append(read_frame(path, channel.value, sensor))
-            except ImageError:
-                continue  # is told with its name when all are measured
-    name, design = required(which_target(frames, designs_beside([*folders, Path()])), "--design auto")
+
+    def frames() -> Iterator[Frame]:
+        for path in files:
+            if not is_points(path):
+                try:
+                    yield read_frame(path, channel.value, sensor)
+                except ImageError:
+                    continue  # is told with its name when all are measured
+
+    name, design = required(which_target(frames(), designs_beside([*folders, Path()])), "--design auto")
     typer.echo(f"note: the target is {name}", err=True)
     return design
 

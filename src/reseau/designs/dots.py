@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..core.data import Array
 from ..io.board import BoardDesign
 
-__all__ = ["dot_signs", "dotted_squares", "halves_of_dots"]
+__all__ = ["dot_signs", "dotted_squares", "halves_of_dots", "puzzle_maps"]
 
 _DOT = 0.34
 """Diameter of a dot in a square of OpenCV's board, in squares."""
@@ -43,6 +43,17 @@ def _map(lines: tuple[str, ...]) -> NDArray[np.int8]:
     return (2 * np.array(bits) - 1).astype(np.int8)
 
 
+def puzzle_maps() -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+    """Maps (3, 167) of 1 (white) and -1: of vertical edges by row and column, of horizontal ones the reverse.
+
+    Examples
+    --------
+    >>> [map_.shape for map_ in puzzle_maps()]
+    [(3, 167), (3, 167)]
+    """
+    return _map(_VERTICAL), _map(_HORIZONTAL)
+
+
 def dot_signs(design: BoardDesign) -> NDArray[np.int8]:
     """What dots say of each place between corners: signs (2 c + 1, 2 r + 1) by twice the column and the row.
 
@@ -62,8 +73,9 @@ def dot_signs(design: BoardDesign) -> NDArray[np.int8]:
     signs = np.zeros((2 * columns + 1, 2 * rows + 1), dtype=np.int8)
     if design.kind == "puzzle":
         x, y = np.arange(columns) + design.start[0], np.arange(rows) + design.start[1]
-        signs[1::2, 2:-1:2] = _map(_VERTICAL)[y[None, :-1] % 3, x[:, None] % _LONG]
-        signs[2:-1:2, 1::2] = _map(_HORIZONTAL)[x[:-1, None] % 3, y[None] % _LONG]
+        vertical, horizontal = puzzle_maps()
+        signs[1::2, 2:-1:2] = vertical[y[None, :-1] % 3, x[:, None] % _LONG]
+        signs[2:-1:2, 1::2] = horizontal[x[:-1, None] % 3, y[None] % _LONG]
     elif design.dots:
         signs[2:-1:2, 2:-1:2] = -1
         signs[tuple(2 * np.array(design.dots).T)] = 1

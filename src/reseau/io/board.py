@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from ..core.data import Array
 from .document import Document
 
-__all__ = ["BoardDesign", "BoardKind"]
+__all__ = ["PUZZLE_CODE", "BoardDesign", "BoardKind"]
 
 BoardKind = Literal["chess", "puzzle", "deltille", "charuco", "circles", "aprilgrid", "markers"]
 Length = Annotated[float, Field(gt=1e-6, le=1e6)]
@@ -22,7 +22,7 @@ _TAGGED = ("aprilgrid", "markers")
 _MARKED = ("charuco", *_TAGGED)
 _SQUARED = ("chess", "puzzle", "charuco")
 _PLAIN = ("chess", "deltille")
-_CODE = 501
+PUZZLE_CODE = 501
 """Number of corners after which the code of a PuzzleBoard repeats."""
 
 
@@ -119,8 +119,8 @@ class BoardDesign(Document):
         if self.start != (0, 0) and self.kind != "puzzle":
             raise ValueError("`start` is for PuzzleBoards")
         ends = [first + n - 1 for first, n in zip(self.start, (self.columns, self.rows), strict=True)]
-        if self.kind == "puzzle" and (min(self.start) < 0 or max(ends) > _CODE):
-            raise ValueError(f"a PuzzleBoard lies within {_CODE} × {_CODE} corners")
+        if self.kind == "puzzle" and (min(self.start) < 0 or max(ends) > PUZZLE_CODE):
+            raise ValueError(f"a PuzzleBoard lies within {PUZZLE_CODE} × {PUZZLE_CODE} corners")
         return self
 
     @property

@@ -1,6 +1,6 @@
 """One frame to image coordinates: marks of a reseau, a testfield or a sheet, pins, edges of film frames."""
 
-from .boards import BoardOptions, BoardResult, measure_board, measure_tags
+from .boards import BoardOptions, BoardResult, PuzzlePart, measure_board, measure_tags, puzzle_part
 from .fitting import fit_mapping, mapping_problem, reduce_mapping
 from .matching import Matches, MatchOptions, match
 from .pins import (
@@ -27,6 +27,7 @@ __all__ = [
     "PinDetections",
     "PinOptions",
     "PinResult",
+    "PuzzlePart",
     "ReseauOptions",
     "ReseauResult",
     "TestfieldOptions",
@@ -42,5 +43,6 @@ __all__ = [
     "measure_reseau",
     "measure_tags",
     "measure_testfield",
+    "puzzle_part",
     "reduce_mapping",
 ]

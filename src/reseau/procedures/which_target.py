@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain, islice
 from pathlib import Path
 
 import cv2
@@ -13,9 +14,11 @@ import numpy as np
 from ..core.data import Frame
 from ..core.errors import ReseauError
 from ..core.failure import Code, Failure
+from ..designs import board
 from ..designs.known import known_designs
 from ..io import BoardDesign, ReseauDesign, TestfieldDesign, read_text
 from ..io.testfield import parse_design
+from ..measure import PuzzlePart, puzzle_part
 from .target_measurement import measurer_of
 
 __all__ = ["designs_beside", "which_target"]
@@ -24,6 +27,10 @@ Design = ReseauDesign | TestfieldDesign | BoardDesign
 _ENOUGH, _LEAST = 0.8, 8
 _LONG_PX = 1600
 """Length of the longer side of a frame from whose double it is reduced."""
+_PUZZLE_MM = 10.0
+"""Side of the squares of a PuzzleBoard of which nothing is known."""
+_APART = 10
+"""Corners between two parts of a code that may belong to one board."""
 _CODED, _PLAIN, _LINED = range(3)
 """Kinds of targets in the order in which they are looked for."""
 
@@ -46,36 +53,82 @@ def designs_beside(folders: Iterable[Path]) -> dict[str, Design]:
     return found | dict(known_designs())
 
 
-def which_target(frames: Iterable[Frame], designs: Mapping[str, Design]) -> tuple[str, Design] | Failure:
+def which_target(
+    frames: Iterable[Frame], designs: Mapping[str, Design], tried: int = 3
+) -> tuple[str, Design] | Failure:
     """Find the target that photographs show.
 
     Targets that identify themselves are tried before plain chessboards and grids, and given ones before
     others; a target is taken if it has nearly as many points as that with the most. Targets of the same
-    pattern in other sizes are not distinguished: the calibration does not depend on the size.
+    pattern in other sizes are not distinguished: the calibration does not depend on the size. A PuzzleBoard
+    that is not among the candidates is found, too, by the part of its code that all photographs show.
 
     Parameters
     ----------
     frames : iterable of Frame
-        A few photographs.
+        Photographs.
     designs : mapping of str to design
         The candidates.
+    tried : int
+        Number of photographs in which targets are looked for; the others are not taken from the iterable
+        unless they show how large a PuzzleBoard is.
 
     Examples
     --------
     >>> which_target([], {}).code
     <Code.NOT_FOUND: 'not-found'>
     """
-    frames = list(frames)
-    small = [_reduced(frame) for frame in frames]
-    points = _counted(small, designs)
-    if not any(points.values()) and any(a is not b for a, b in zip(frames, small, strict=True)):
-        points = _counted(frames, designs)
+    others = iter(frames)
+    full = list(islice(others, tried))
+    small = [_reduced(frame) for frame in full]
+    usual = next((d for d in designs.values() if isinstance(d, BoardDesign) and d.kind == "puzzle"), None)
+    puzzle = _puzzle_of(small, usual)
+    candidates = designs if puzzle is None else {**designs, puzzle[0]: puzzle[1]}
+    points = _counted(small, candidates)
+    if not any(points.values()) and any(a is not b for a, b in zip(full, small, strict=True)):
+        points = _counted(full, candidates)
     most = max(points.values(), default=0)
     if most == 0:
         return Failure("shows none of the known targets; give the design", Code.NOT_FOUND)
-    order = sorted(designs, key=lambda name: _effort(designs[name]) == _PLAIN)
+    order = sorted(candidates, key=lambda name: _effort(candidates[name]) == _PLAIN)
     name = next(name for name in order if points[name] >= _ENOUGH * most)
-    return name, designs[name]
+    if puzzle is not None and name == puzzle[0]:
+        # Those tried may show a part of it.
+        return _puzzle_of(chain(small, map(_reduced, others)), usual) or puzzle
+    return name, candidates[name]
+
+
+def _puzzle_of(frames: Iterable[Frame], usual: BoardDesign | None) -> tuple[str, BoardDesign] | None:
+    """A PuzzleBoard with all corners that frames show, squares and dots as usual, and its description."""
+    parts = [part for part in map(puzzle_part, frames) if not isinstance(part, Failure)]
+    if not parts:
+        return None
+    low, high = _together(parts)
+    columns, rows = (b - a + 1 for a, b in zip(low, high, strict=True))
+    pitch = _PUZZLE_MM if usual is None else usual.pitch
+    size = None if usual is None else usual.size
+    # The outer squares are halves.
+    design = board("puzzle", columns + 1, rows + 1, pitch, size=size, start=low)
+    text = f"PuzzleBoard of {columns} × {rows} corners from column {low[0]} and row {low[1]} of its code"
+    return f"a {text}, with squares of {pitch:g} mm", design
+
+
+def _together(parts: list[PuzzlePart]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """First and last column and row of the parts that belong to the same board as the largest."""
+    rest = sorted(parts, key=lambda part: -part.corners)
+    first = rest.pop(0)
+    low, high = np.array(first.low), np.array(first.high)
+    while True:
+        near = [
+            (np.array(part.low) <= high + _APART).all() and (np.array(part.high) >= low - _APART).all()
+            for part in rest
+        ]
+        if not any(near):
+            return (int(low[0]), int(low[1])), (int(high[0]), int(high[1]))
+        for part, joined in zip(rest, near, strict=True):
+            if joined:
+                low, high = np.minimum(low, part.low), np.maximum(high, part.high)
+        rest = [part for part, joined in zip(rest, near, strict=True) if not joined]
 
 
 def _reduced(frame: Frame) -> Frame:

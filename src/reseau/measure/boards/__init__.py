@@ -1,6 +1,7 @@
 """Boards of other programs, and single tags."""
 
-from .measure import BoardOptions, BoardResult, measure_board
+from .measure import BoardOptions, BoardResult, measure_board, puzzle_part
+from .puzzles import PuzzlePart
 from .single_tags import measure_tags
 
-__all__ = ["BoardOptions", "BoardResult", "measure_board", "measure_tags"]
+__all__ = ["BoardOptions", "BoardResult", "PuzzlePart", "measure_board", "measure_tags", "puzzle_part"]

@@ -13,7 +13,7 @@ from ...core.data import Array
 from ...optics import Chain
 from ..testfield.lattice_mapping import images_of
 
-__all__ = ["Bits", "read_bits"]
+__all__ = ["Bits", "Integers", "read_bits"]
 
 Integers = NDArray[np.signedinteger[Any]]
 _SURE = 0.15

@@ -26,10 +26,11 @@ from .candidates import Saddles, find_saddles
 from .corners import CornerMarks, DeltilleMarks, Sectors
 from .deltilles import find_six_sectors, lay_deltille
 from .markers import find_markers, find_tags
-from .placement import Placed, lay_chessboard, lay_circles, lay_marked
+from .placement import Placed, find_puzzle, lay_chessboard, lay_circles, lay_marked
+from .puzzles import PuzzlePart
 from .tags import with_seen_edges
 
-__all__ = ["BoardOptions", "BoardResult", "measure_board"]
+__all__ = ["BoardOptions", "BoardResult", "measure_board", "puzzle_part"]
 
 _CIRCLE_EDGE = 3.0
 """Distance from the next circle in which pixels are not used, in widths of the point-spread function."""
@@ -137,6 +138,37 @@ def measure_board(
             return _measured(frame, design, options)
         turned = replace(frame, pixels=np.ascontiguousarray(frame.pixels[:, ::-1]))
         return _unmirrored(_measured(turned, design, options), frame.width)
+
+
+def puzzle_part(frame: Frame) -> PuzzlePart | Failure:
+    """Find out which part of the code of PuzzleBoards a frame shows, of a board of any size.
+
+    Some 6 × 6 corners in sight are enough.
+
+    Parameters
+    ----------
+    frame : Frame
+        A photograph.
+
+    Returns
+    -------
+    PuzzlePart or Failure
+        A failure (falsy) if there is no PuzzleBoard, or too little of one.
+
+    Raises
+    ------
+    ImageError
+        When the frame is all black, saturated, or of one grey.
+
+    Examples
+    --------
+    >>> noise = np.random.default_rng(0).normal(100, 2, (80, 80))
+    >>> puzzle_part(Frame(noise, 255.0)).code
+    <Code.NOT_FOUND: 'not-found'>
+    """
+    with one_thread():
+        screened = screen(frame, None)
+        return find_puzzle(screened.grey, find_saddles(screened.grey, screened.noise))
 
 
 def _unmirrored(found: BoardResult | Failure, width: int) -> BoardResult | Failure:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import cv2
 import numpy as np
@@ -28,18 +27,26 @@ from ..reseau.lens_mapping import lens_through
 from ..reseau.plane_marks import Located
 from ..reseau.sheet_placement import MOST_DISKS, disk_seeds, grown_disks, through
 from ..testfield.lattice_mapping import images_of, slope_of
-from .bits import Bits, read_bits
+from .bits import Bits, Integers, read_bits
 from .candidates import Saddles, along, bright_between, crossed, first_mapping, grown, sector_levels, seeds
+from .puzzles import MISREAD, PuzzlePart, part_of_code
 
-__all__ = ["Placed", "cost_of", "failed", "lay_chessboard", "lay_circles", "lay_marked", "numbered"]
+__all__ = [
+    "Placed",
+    "cost_of",
+    "failed",
+    "find_puzzle",
+    "lay_chessboard",
+    "lay_circles",
+    "lay_marked",
+    "numbered",
+]
 
 _MISSED, _PLAIN, _FOREIGN = 0.4, 3.0, 3.0
 """What counts against a place: a node in sight that was not found; one between squares as bright as paper and
 ink, where nothing hides it; one found that the design has not."""
 _ALIKE = 2.0
 """Lead in nodes of a place over another from which it is certain."""
-_MISREAD = 0.2
-"""Largest share of the dots of a PuzzleBoard that are not as on the board."""
 _MISREAD_DOTS = 2
 """Most squares of a chessboard with a dot too many or too few."""
 _CHANCE = 1e-4
@@ -56,13 +63,14 @@ _GROWN = 12
 _NEAR_PX = 2.5
 """Distance within which a saddle is the corner that markers predict, pixels; or in steps of the lattice."""
 _NEAR = 0.2
-Integers = NDArray[np.signedinteger[Any]]
 _LENS_FROM, _MARKER_PX = 16, 1.0
 """Corners of markers that determine the distortion of a lens; their standard deviation as they are found."""
 _ASTRAY = 0.25
 """Largest share of the markers read that do not lie where the board has them: misread, or bent aside."""
 _EVEN = 0.5
 """Largest difference of two dark sectors, as a share of their contrast to the paper."""
+_PUZZLE = 40
+"""Largest number of corners of a PuzzleBoard of unknown size, along an axis from any of them."""
 _QUARTER = np.array([[0, -1], [1, 0]])
 _THIRD = np.array([[-1, -1], [1, 0]])
 """A turn of a lattice of triangles, whose steps are at 60°."""
@@ -127,7 +135,43 @@ def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDes
     bits = read_bits(grey, mapping, nodes.astype(np.intp), design.kind == "puzzle") if coded else None
     known = nodes.astype(np.intp), saddles.xy[rows], mapping, shape, (dark, ~bright)
     # The dots of a PuzzleBoard tell more than nodes that were not found.
-    return numbered(design, *known, None if design.kind == "puzzle" else cost, bits)
+    placed = numbered(design, *known, None if design.kind == "puzzle" else cost, bits)
+    if isinstance(placed, Failure) and design.kind == "puzzle" and bits is not None:
+        part = part_of_code(known[0], bits, _mirrored(mapping))
+        if not isinstance(part, Failure):
+            return Failure(f"the frame shows {part}, others than the board has", Code.OTHER_DESIGN)
+    return placed
+
+
+def find_puzzle(grey: NDArray[np.float32], saddles: Saddles) -> PuzzlePart | Failure:
+    """Find out which part of the code of PuzzleBoards a frame shows.
+
+    Parameters
+    ----------
+    grey : ndarray (h, w), float32
+        Grey values.
+    saddles : Saddles
+        Their saddles.
+    """
+    shape, tried = (grey.shape[0], grey.shape[1]), np.zeros(len(saddles), dtype=bool)
+    least, found = _FEWEST, failed(0, "corners in a lattice")
+    for row, step in seeds(saddles)[:_SEEDS]:
+        if tried[row]:
+            continue
+        nodes, rows, mapping = grown(grey, saddles, first_mapping(step, saddles.xy[row], shape), _PUZZLE)
+        tried[rows] = True
+        if len(nodes) >= least:
+            least, corners = len(nodes), nodes.astype(np.intp)
+            part = part_of_code(corners, read_bits(grey, mapping, corners, True), _mirrored(mapping))
+            if not isinstance(part, Failure):
+                return part
+            found = part
+    return found
+
+
+def _mirrored(mapping: Chain) -> bool:
+    """Whether the axes of a lattice are anticlockwise in the image."""
+    return bool(np.linalg.det(slope_of(mapping, np.zeros((1, 2)))[0]) < 0)
 
 
 def cost_of(ink: float, paper: float) -> Callable[[Array, Mask], Array]:
@@ -173,7 +217,7 @@ def numbered(
     index = np.full(tuple(size + 1), -1, dtype=np.intp)
     index[tuple(numbers.T)] = np.arange(len(numbers))
     known = {tuple(node): k for k, node in enumerate(nodes.tolist())}
-    mirrored = np.linalg.det(slope_of(mapping, np.zeros((1, 2)))[0]) < 0
+    mirrored = _mirrored(mapping)
     found: list[tuple[float, Integers, Integers]] = []
     signs = None if bits is None else dot_signs(design)
     once, turns = (_THIRD, 3) if design.kind == "deltille" else (_QUARTER, 4)
@@ -196,7 +240,7 @@ def numbered(
             there = of >= 0
             if dark is not None:
                 # An odd quarter turn exchanges the sectors of a corner.
-                seen = dark[1][there] ^ (quarter % 2 == 1) ^ bool(mirrored)
+                seen = dark[1][there] ^ (quarter % 2 == 1) ^ mirrored
                 agree = dark[0][of[there]] == seen
                 if agree.mean() < 0.5 if len(agree) else True:
                     continue
@@ -220,7 +264,7 @@ def numbered(
     if bits is not None and signs is not None:
         wrong, total = bits.compared(signs, turn, moved)
         puzzle = design.kind == "puzzle"
-        if wrong > (_MISREAD * total if puzzle else _MISREAD_DOTS):
+        if wrong > (MISREAD * total if puzzle else _MISREAD_DOTS):
             return Failure(
                 f"{wrong} of {total} dots are not as on the board where it fits best", Code.OTHER_DESIGN
             )
