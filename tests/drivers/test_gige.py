@@ -229,10 +229,10 @@ def test_lost_and_damaged_frames_are_counted_and_not_returned(
     simulated: GigeCamera, camera: Cam, kind: Any
 ) -> None:
     camera.configure(rate=50.0)
-    before = next(camera.frames(1))
+    before = next(camera.frames(1, 20.0))
     script = simulated.body.script
     script.fault_at(script.count + 2, Fault(kind))
-    shots = list(camera.frames(8))
+    shots = list(camera.frames(8, 20.0))
     assert [fault.kind for fault in script.happened] == [kind]
     assert all((shot.pixels == expected_image(0)).all() for shot in shots)
     lost = shots[-1].dropped - before.dropped
