@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import textwrap
+import threading
 import uuid
 import zipfile
 from collections.abc import Callable
@@ -25,6 +26,7 @@ from reseau.archive import (
     describe,
     export,
     frame_of,
+    schema,
     tiff_of,
     verify,
 )
@@ -393,3 +395,19 @@ def test_two_processes_can_write_to_one_archive(tmp_path: Path) -> None:
             ("b", 20),
         ]
         assert verify(archive).files == 40
+
+
+def test_who_reads_up_to_a_number_misses_no_smaller_one(opened: Callable[[], Archive]) -> None:
+    # Two benches write at once; what the first one writes is committed last.
+    with opened() as first, opened() as second:
+        one, two = (archive.begin(name, "frames", {}) for archive, name in ((first, "a"), (second, "b")))
+        other = threading.Thread(target=two.note, args=("0", "event", {}))
+        with schema.connected(first._engine) as connection:
+            row = {"session_id": one._id, "key": "0", "kind": "event", "document": {}}
+            connection.execute(schema.events.insert().values(row))
+            other.start()
+            other.join(1.0)  # long enough to be committed, if it could be
+            seen = second.notes()
+        other.join(60.0)
+        seen += second.notes(after=max((each.number for each in seen), default=0))
+        assert sorted(each.session for each in seen) == ["a", "b"]

@@ -194,7 +194,6 @@ def make(url: str, *, create: bool, read_only: bool = False) -> Engine:
     except (SQLAlchemyError, ImportError) as error:
         raise ArchiveError(f"cannot be used as an index ({_brief(error)})", where=_shown(url)) from None
     with connected(engine) as connection:
-        _one_at_a_time(connection)
         there = set(sa.inspect(connection).get_table_names())
         if not create and not there >= _FIRST:
             raise ArchiveError("is not an archive", where=_shown(url), do="create one with `reseau capture`")
@@ -204,8 +203,14 @@ def make(url: str, *, create: bool, read_only: bool = False) -> Engine:
 
 
 def _one_at_a_time(connection: sa.Connection) -> None:
-    """Let one process create tables while others wait; SQLite does it for every transaction."""
+    """Let one transaction write while others wait, as SQLite does.
+
+    Rows are then numbered in the order in which they become visible: whoever has read up to a number, such as
+    a stream of documents, misses no smaller one that is committed later. A machine that stops answering in
+    the middle of a transaction does not hold up the others for ever.
+    """
     if connection.dialect.name == "postgresql":
+        connection.exec_driver_sql(_PATIENCE)
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(zlib.crc32(b"reseau archive"))))
 
 
@@ -224,7 +229,6 @@ def extend(engine: Engine) -> None:
     """
     with connected(engine) as connection:
         if not extended(connection):
-            _one_at_a_time(connection)
             metadata.create_all(connection, tables=[entries])
 
 
@@ -241,7 +245,7 @@ def _sqlite(path: Path, read_only: bool) -> Engine:
         # Without a log none must be created; a log that was left behind has the last changes.
         log = path.with_name(f"{path.name}-wal")
         options += "&mode=ro" if log.is_file() and log.stat().st_size else "&mode=ro&immutable=1"
-    engine = sa.create_engine(f"sqlite:///file:{path}?{options}", connect_args={"timeout": 30})
+    engine = sa.create_engine(f"sqlite:///file:{path}?{options}", connect_args={"timeout": _WAIT_S})
 
     @sa.event.listens_for(engine, "connect")
     def _prepare(raw: sqlite3.Connection, _: object) -> None:
@@ -262,11 +266,18 @@ def _sqlite(path: Path, read_only: bool) -> Engine:
 
 
 _READING = "reseau_reading"
+_WAIT_S = 30
+"""How long a transaction waits for the others that write, and how long one may do nothing."""
+_PATIENCE = (
+    f"SET LOCAL lock_timeout = '{_WAIT_S}s'; SET LOCAL idle_in_transaction_session_timeout = '{_WAIT_S}s'"
+)
 
 
 @contextmanager
 def connected(engine: Engine, *, reading: bool = False) -> Iterator[sa.Connection]:
     """Run a transaction; errors of the database become errors of the archive.
+
+    Transactions that write follow one another: numbers of rows increase in the order of commits.
 
     Parameters
     ----------
@@ -282,6 +293,8 @@ def connected(engine: Engine, *, reading: bool = False) -> Iterator[sa.Connectio
     """
     try:
         with engine.execution_options(**{_READING: reading}).begin() as connection:
+            if not reading:
+                _one_at_a_time(connection)
             yield connection
     except (DBAPIError, PoolTimeout, JSONDecodeError) as error:
         what = f"error of the index ({_brief(error)})"
