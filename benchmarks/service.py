@@ -2,7 +2,7 @@
 
     python benchmarks/service.py --part load [--minutes 10] [--clients 200] [--rate 50] [--frames 0]
     python benchmarks/service.py --part sessions [--sessions 10000]
-    python benchmarks/service.py --part scan [--minutes 10]
+    python benchmarks/service.py --part scan [--minutes 10] [--tools testssl,wapiti,slowhttptest]
 
 `load` starts `reseau serve` with a bench whose camera has a clock of its own: a frame each half second, and
 whoever asks too late misses one. A session takes them all, while 200 clients read server-sent events and
@@ -396,7 +396,7 @@ MODULES = (
 """Of wapiti: all but those that guess names of files or passwords, and those that need a server elsewhere."""
 
 
-def scan(minutes: float) -> int:
+def scan(minutes: float, tools: list[str]) -> int:
     """Print what scanners find above low; return 1 if there is something, or a scanner is missing."""
     found = list[str]()
     with tempfile.TemporaryDirectory() as name:
@@ -418,8 +418,9 @@ def scan(minutes: float) -> int:
                 http.post("/api/1/login", json=given, headers={"Origin": base}).raise_for_status()
                 cookie = "; ".join(f"{key}={value}" for key, value in http.cookies.items())
                 api = http.get("/api/1/openapi.json").json()["paths"]
-            for work in (protocol, pages, patience):
-                found += work(folder, base, cookie, api, minutes)
+            works = {"testssl": protocol, "wapiti": pages, "slowhttptest": patience}
+            for tool in tools:
+                found += works[tool](folder, base, cookie, api, minutes)
     print("\n".join(found) if found else "nothing above low")
     return 1 if found else 0
 
@@ -510,11 +511,12 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=50.0)
     parser.add_argument("--frames", type=int, default=0)
     parser.add_argument("--sessions", type=int, default=10_000)
+    parser.add_argument("--tools", default="testssl,wapiti,slowhttptest")
     given = parser.parse_args()
     if given.part == "load":
         raise SystemExit(load(given.minutes, given.clients, given.rate, given.frames))
     if given.part == "scan":
-        raise SystemExit(scan(given.minutes))
+        raise SystemExit(scan(given.minutes, given.tools.split(",")))
     raise SystemExit(sessions(given.sessions))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import select
 import socket
 import threading
 import time
@@ -218,6 +219,38 @@ def test_requests_that_arrive_too_slowly_and_connections_without_any_are_closed(
             each.close()
 
 
+def test_connections_whose_answers_are_not_read_are_closed_and_keep_nobody_from_being_served(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(patience, "_MOST_WAITING", 5)
+    with served(tmp_path) as one, running(one) as port:
+        asked = f"GET /login HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode()
+        held = []
+        for _ in range(40):
+            held.append(socket.create_connection(("127.0.0.1", port)))
+            held[-1].sendall(asked)
+            assert select.select([held[-1]], [], [], 60)[0], "is neither answered nor closed"
+        with socket.create_connection(("127.0.0.1", port)) as each:
+            each.sendall(asked)
+            assert each.recv(100).startswith(b"HTTP/1.1 200")
+            assert sum(not ended(other) for other in held) <= 6
+        for each in held:
+            each.close()
+
+
+def ended(connection: socket.socket) -> bool:
+    """Whether the service has ended a connection, after what is read before its end."""
+    connection.settimeout(0.5)
+    try:
+        while connection.recv(65536):
+            pass
+    except TimeoutError:
+        return False
+    except ConnectionResetError:
+        pass
+    return True
+
+
 def refused(connection: socket.socket) -> bytes:
     """What arrives before the end of a connection."""
     try:
@@ -235,8 +268,9 @@ def running(one: Served) -> Iterator[int]:
         port = sock.getsockname()[1]
         object.__setattr__(one.service.options, "port", port)
         config = uvicorn.Config(
-            create_app(one.service), http=patience.PatientProtocol, log_config=None, lifespan="off"
-        )
+            create_app(one.service), http=patience.PatientProtocol, log_config=None, lifespan="off",
+            timeout_keep_alive=300,
+        )  # fmt: skip
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [sock]}, daemon=True)
         thread.start()

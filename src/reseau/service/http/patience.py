@@ -12,7 +12,7 @@ __all__ = ["PatientProtocol"]
 _HEAD_S, _READ_S = 10.0, 30.0
 """Time in which the head of a request must arrive, and how long a client may not read."""
 _MOST_WAITING = 250
-"""Connections whose request has not arrived; beyond these the oldest is closed."""
+"""Connections without a request that is being answered; beyond these the oldest is closed."""
 
 
 class PatientProtocol(H11Protocol):
@@ -21,6 +21,7 @@ class PatientProtocol(H11Protocol):
     _all_waiting: ClassVar[dict[PatientProtocol, None]] = {}
     _head: asyncio.TimerHandle | None = None
     _reading: asyncio.TimerHandle | None = None
+    _closing: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:
         """Wait for the first request."""
@@ -35,11 +36,24 @@ class PatientProtocol(H11Protocol):
         elif self._head is None:
             self._wait()
 
+    def on_response_complete(self) -> None:
+        """Wait for the next request, or for the client to read the answer: it may be on its way."""
+        super().on_response_complete()
+        if self.cycle is None or self.cycle.response_complete:
+            self._count()
+
+    def timeout_keep_alive_handler(self) -> None:
+        """Close a connection without requests, also where the client does not read the end of it."""
+        super().timeout_keep_alive_handler()
+        if self._closing is None:
+            self._closing = self.loop.call_later(_READ_S, self.transport.abort)
+
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget the connection."""
         self._no_longer()
-        if self._reading is not None:
-            self._reading.cancel()
+        for timer in (self._reading, self._closing):
+            if timer is not None:
+                timer.cancel()
         super().connection_lost(exc)
 
     def pause_writing(self) -> None:
@@ -56,6 +70,11 @@ class PatientProtocol(H11Protocol):
 
     def _wait(self) -> None:
         self._head = self.loop.call_later(_HEAD_S, self._late)
+        self._count()
+
+    def _count(self) -> None:
+        """Count this connection among those that wait, as the youngest."""
+        self._all_waiting.pop(self, None)
         self._all_waiting[self] = None
         if len(self._all_waiting) > _MOST_WAITING:
             next(iter(self._all_waiting))._late()
