@@ -33,6 +33,7 @@ __all__ = [
     "CovariateTable",
     "Explanation",
     "FunctionOptions",
+    "conditions_of",
     "explain",
     "fit_function",
     "series_of",
@@ -282,6 +283,24 @@ class CovariateTable:
         if len(rows) != 1 or not all(np.isfinite(each[rows[0]]) for each in self.values.values()):
             raise UsageError(f"has {len(rows) or 'no'} lines with it", where=f"covariates: calibration {key}")
         return {name: float(each[rows[0]]) for name, each in self.values.items()}
+
+
+def conditions_of(calibrations: Sequence[Calibration]) -> dict[str, str]:
+    """Units of the conditions that sensors measured with every one of several calibrations, by their names.
+
+    Examples
+    --------
+    >>> around = {"air.temperature": {"mean": 21.5, "low": 21.4, "high": 21.6, "unit": "°C", "frames": 9}}
+    >>> known = example_calibration().model_copy(update={"provenance": {"environment": around}})
+    >>> conditions_of([known, known]), conditions_of([known, example_calibration()])
+    ({'air.temperature': '°C'}, {})
+    """
+    found = [
+        {name: str(each["unit"]) for name, each in one.provenance.get("environment", {}).items()}
+        for one in calibrations
+    ]
+    first = found[0] if found else {}
+    return {name: unit for name, unit in first.items() if all(one.get(name) == unit for one in found)}
 
 
 def _recorded(key: str, calibration: Calibration, name: str) -> tuple[float, str]:

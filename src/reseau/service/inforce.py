@@ -34,6 +34,7 @@ from .covariates import (
     CovariateTable,
     Explanation,
     FunctionOptions,
+    conditions_of,
     explain,
     fit_function,
     series_of,
@@ -502,6 +503,16 @@ class Configurations:
         rows = [covariates.of(key) for key in keys]
         columns = {each: np.array([row[each] for row in rows]) for each in covariates.values}
         return fit_function(calibrations, columns, covariates.units, options)
+
+    def conditions(self, name: str) -> dict[str, str]:
+        """Conditions that sensors measured with every calibration since the last service event, with units.
+
+        Raises
+        ------
+        UsageError
+            If there are no calibrations.
+        """
+        return conditions_of(self._since_event(name)[1])
 
     def recorded(self, name: str, conditions: Sequence[str]) -> CovariateTable:
         """Covariates that sensors measured with the calibrations since the last service event.

@@ -25,6 +25,11 @@ PARAMETERS = {
 }  # fmt: skip
 
 
+def temperature(k: int) -> float:
+    """Temperature (°C) of the air when calibration `k` of `left` was recorded."""
+    return 20.0 + k % 3 + (9.0 if k > 9 else 0.0)
+
+
 def populate(folder: Path) -> None:
     """Session `monday`, judged for `vidicon`; and 12 calibrations of `left`, of which the last drifts."""
     with Archive.open(folder / "archive", create=True) as archive:
@@ -41,8 +46,9 @@ def populate(folder: Path) -> None:
         known.define("left", {"camera": "DMK 33", "lens": "8 mm"})
         for k in range(12):
             off = 1e-6 * k + 2e-5 * (-1) ** k + (2e-3 if k > 9 else 0.0)
-            decision = known.decide(
-                "left", camera(c=8.0 + off, begun=START + timedelta(days=k)), RULES, by="Ada"
-            )
+            made = camera(c=8.0 + off, begun=START + timedelta(days=k))
+            around = {"mean": temperature(k), "low": 19.0, "high": 31.0, "unit": "°C", "frames": 9}
+            made = made.model_copy(update={"provenance": {"environment": {"air.temperature": around}}})
+            decision = known.decide("left", made, RULES, by="Ada")
             if decision.outcome == "needs review" and k < 10:
                 known.review("left", decision.key, "accepted", by="Ada", comment="as expected")

@@ -26,6 +26,7 @@ from reseau.calibration import parse_calibration
 from reseau.service import Configurations
 from reseau.service.http.events import Events
 
+from .populated import temperature
 from .served import Served, TestClient, process, served
 
 LEFT = "/api/1/configurations/left"
@@ -237,6 +238,18 @@ def test_drift_is_charted_and_an_alarm_until_it_is_acknowledged(one: Served) -> 
     table = {key: {"temperature [°C]": 20.0 + k} for k, key in enumerate(found["calibrations"])}
     explained = client.post(f"{LEFT}/drift", json={"table": table})
     assert explained.status_code == 200, explained.text
+    # What a sensor measured with the calibrations explains as much as a table of the same values.
+    assert found["recorded"] == {"air.temperature": "°C"}
+    table = {key: {"t [°C]": temperature(k)} for k, key in enumerate(found["calibrations"])}
+    (by_table, by_sensor) = (
+        client.post(f"{LEFT}/drift", json=given).json()["explained"]
+        for given in ({"table": table}, {"recorded": ["air.temperature"]})
+    )
+    assert by_sensor == by_table != []
+    for wrong in ({}, {"recorded": ["humidity"]}, {"recorded": ["air.temperature"], "table": table}):
+        refused = client.post(f"{LEFT}/drift", json=wrong)
+        assert (refused.status_code, refused.json()["error"]["code"]) == (422, "usage")
+    assert "air.temperature [°C]" in client.get("/calibrations/left").text
     alarm = next(
         each for each in client.get("/api/1/alarms").json() if each["key"].startswith("drift left c")
     )

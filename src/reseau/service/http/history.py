@@ -15,6 +15,7 @@ from .service import Service
 from .stored import picture_answer
 
 if TYPE_CHECKING:
+    from ..covariates import CovariateTable
     from ..inforce import Drift
 
 __all__ = ["AlarmRow", "all_alarms", "drift_of", "router", "scheduled"]
@@ -55,21 +56,36 @@ class DriftAnswer(Answer):
     times: list[str]
     series: list[SeriesRow]
     signals: list[Signal]
-    explained: list[tuple[str, str, str]]
+    explained: list[tuple[str, str, str]] = Field(
+        description="Calibration, parameter, and whether the given covariates explain its signal."
+    )
+    recorded: dict[str, str] = Field(
+        description="Units of the conditions that sensors measured with every one of these calibrations."
+    )
     limit: float | None
     single: float
     conversion_px: float
 
 
 class Covariates(Answer):
-    """Covariates of each calibration, by their names with units."""
+    """Covariates of each calibration: a table of them, or what sensors measured with the calibrations."""
 
     table: dict[str, dict[str, float]] = Field(
-        description="By the key of the calibration: covariates by name, such as `temperature [°C]`."
+        default_factory=dict,
+        description="By the key of the calibration: covariates by name, such as `temperature [°C]`.",
+    )
+    recorded: list[str] = Field(
+        default_factory=list, max_length=20, description="In place of a table: names of recorded conditions."
     )
 
     model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"example": {"table": {"4f2a11d09c3e": {"temperature [°C]": 20.4}}}}
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {"table": {"4f2a11d09c3e": {"temperature [°C]": 20.4}}},
+                {"recorded": ["air.temperature"]},
+            ]
+        },
     )
 
 
@@ -176,6 +192,7 @@ def _answer(service: Service, name: str, made: Drift) -> DriftAnswer:
             (made.keys[run], made.names[k], verdict)
             for run, k, verdict in (() if made.explanation is None else made.explanation.verdicts)
         ],
+        recorded=service.current(f"conditions {name}", lambda: _the(service, name).conditions(name)),
         limit=charts.limits.limit if math.isfinite(charts.limits.limit) else None,
         single=charts.limits.single, conversion_px=made.conversion_px,
     )  # fmt: skip
@@ -234,12 +251,28 @@ def explained(
     name: Name, given: Covariates, who: Reading, service: Here, chart: Chart = "cusum", rate: Rate = 0.1
 ) -> DriftAnswer:
     """Control charts that tell drift that covariates explain from drift; nothing is stored."""
-    import numpy as np
-
     from ..charts import ChartOptions
-    from ..covariates import CovariateTable
 
     known = _the(service, name)
+    if bool(given.table) == bool(given.recorded):
+        raise UsageError("are neither or twice given", where="covariates", do="give `table` or `recorded`")
+    table = known.recorded(name, given.recorded) if given.recorded else _table(given)
+    options = ChartOptions(kind=chart, rate=rate)
+    return _answer(service, name, known.drift(name, options, table))
+
+
+def _table(given: Covariates) -> CovariateTable:
+    """The table of covariates in a request.
+
+    Raises
+    ------
+    UsageError
+        If its calibrations have not the same covariates.
+    """
+    import numpy as np
+
+    from ..covariates import CovariateTable
+
     units = dict[str, str]()
     for key, row in given.table.items():
         found = {each.partition(" [")[0]: each.partition(" [")[2].rstrip("]") for each in row}
@@ -257,9 +290,7 @@ def explained(
         )
         for each in units
     }
-    table = CovariateTable(tuple(given.table), columns, units)
-    options = ChartOptions(kind=chart, rate=rate)
-    return _answer(service, name, known.drift(name, options, table))
+    return CovariateTable(tuple(given.table), columns, units)
 
 
 @router.get("/configurations/{name}/drift.svg", response_class=Response, responses=SVG)
