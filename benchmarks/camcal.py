@@ -16,13 +16,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
 import cv2
 import numpy as np
+from parts import add_options, executor_of, main_of, outcomes
 from shared import of_the_tests
 
 from reseau.bundle import Network, adjust_network
@@ -56,7 +57,8 @@ class Photograph:
         return np.where(np.hypot(*difference.T)[:, None] < _MISNUMBERED_PX, difference, np.nan)
 
 
-def measure(path: Path, design: ReseauDesign, theirs: dict[str, Array], channel: Channel) -> Photograph:
+def measure(design: ReseauDesign, channel: Channel, job: tuple[Path, dict[str, Array]]) -> Photograph:
+    path, theirs = job
     cv2.setNumThreads(1)
     frame = read_image(path, channel)
     start = time.perf_counter()
@@ -228,16 +230,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", nargs="?", default=os.environ.get("RESEAU_DATA", "../shared/data"), type=Path)
     parser.add_argument("--channel", choices=["luma", "red", "green", "blue"], default="green")
-    parser.add_argument("--workers", type=int, default=2)
+    add_options(parser)
     arguments = parser.parse_args()
     folder = arguments.data / "testfield_camcal"
     if not folder.is_dir():
         raise SystemExit(f"no photographs in {folder}")
     camcal = of_the_tests("measure/camcal.py")
     paths, theirs, design = camcal.photographs(folder), camcal.marks(folder), camcal.design(folder)
-    n = len(paths)
-    with ProcessPoolExecutor(arguments.workers) as pool:
-        done = list(pool.map(measure, paths, [design] * n, theirs, [arguments.channel] * n))
+    with executor_of(arguments) as executor:
+        jobs = zip(paths, theirs, strict=True)
+        done = list(outcomes(executor, partial(measure, design, arguments.channel), jobs))
     table(done)
     has = [np.isfinite(p.theirs[:, 0]) for p in done]
     measured = sum(int((p.result.ok & h).sum()) for p, h in zip(done, has, strict=True))
@@ -251,4 +253,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main_of(__file__))

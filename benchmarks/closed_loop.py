@@ -1,6 +1,6 @@
 """Number of poses that the closed loop needs for the precision of the paper's 36 recordings.
 
-    python benchmarks/closed_loop.py [--seeds 2] [--parameter c]
+    python benchmarks/closed_loop.py [--seeds 2] [--parameter c] [--jobs 2]
 
 For every seed the 36 recordings of the paper are simulated first; their standard deviation of the parameter
 is the goal. Then poses are chosen until the goal is reached: the next pose is the one that reduces the
@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
+
+from parts import add_options, executor_of, main_of, outcomes
 
 from reseau.capture import Step, paper_steps, spread
 from reseau.core.data import Frame
-from reseau.core.threads import one_thread
 from reseau.designs import coded_testfield
 from reseau.measure import TestfieldOptions
 from reseau.procedures.calibration import CameraOptions
@@ -78,6 +80,20 @@ def closed(seed: int, candidates: Sequence[Step], parameter: str, goal: float) -
     return reached
 
 
+def lines_of(parameter: str, seed: int) -> str:
+    """The lines of a seed."""
+    paper = Session(seed)
+    for step in paper_steps():
+        paper.take(step)
+    goal = paper.sigma(parameter)
+    lines = [f"seed {seed}: sigma_{parameter} {goal:.3g} of the paper's {paper.poses} poses"]
+    for name, tilts in (("tilts 0, 30, 45", (0.0, 30.0, 45.0)), ("… and 60", (0.0, 30.0, 45.0, 60.0))):
+        reached = closed(seed, grid(tilts, 8), parameter, goal)
+        course = " ".join(f"{sigma:.3g}" for sigma in reached)
+        lines.append(f"  {name:<20} {len(reached) + 3:3d} poses; after 4, 5, …: {course}")
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Print a line for every seed and set of candidates."""
     parser = argparse.ArgumentParser(
@@ -85,27 +101,12 @@ def main() -> None:
     )
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--parameter", default="c")
+    add_options(parser)
     given = parser.parse_args()
-    sets = {
-        "tilts 0, 30, 45": grid((0.0, 30.0, 45.0), 8),
-        "tilts 0, 30, 45, 60": grid((0.0, 30.0, 45.0, 60.0), 8),
-    }
-    with one_thread():
-        for seed in range(given.seeds):
-            paper = Session(seed)
-            for step in paper_steps():
-                paper.take(step)
-            goal = paper.sigma(given.parameter)
-            print(
-                f"seed {seed}: sigma_{given.parameter} {goal:.3g} of the paper's {paper.poses} poses",
-                flush=True,
-            )
-            for name, candidates in sets.items():
-                reached = closed(seed, candidates, given.parameter, goal)
-                count = len(reached) + 3
-                course = " ".join(f"{sigma:.3g}" for sigma in reached)
-                print(f"  {name:<20} {count:3d} poses; after 4, 5, …: {course}", flush=True)
+    with executor_of(given) as executor:
+        for text in outcomes(executor, partial(lines_of, given.parameter), range(given.seeds)):
+            print(text, flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    main_of(__file__)

@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,6 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from film_independent import far_off
+from parts import add_options, executor_of, main_of, outcomes
 from worlds.film import KINDS, World, frame
 
 from reseau.core.data import Array
@@ -95,16 +94,16 @@ def _print(name: str, rows: list[Row]) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--frames", type=int, default=4, help="frames of each kind")
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    add_options(parser)
     parser.add_argument("--only", nargs="*", default=[], help="parts of names of kinds")
     parser.add_argument("--each", action="store_true", help="print every frame that is not oriented, and why")
     given = parser.parse_args()
     kinds = [kind for kind in KINDS if not given.only or any(part in kind for part in given.only)]
     print(f"{'':26} drawn oriented three wrong   rms px  err/σ largest  of σ  outwards")
     every: list[Row] = []
-    with ProcessPoolExecutor(given.jobs) as pool:
+    with executor_of(given) as executor:
         for kind in kinds:
-            rows = list(pool.map(one, [(kind, seed) for seed in range(given.frames)]))
+            rows = list(outcomes(executor, one, ((kind, seed) for seed in range(given.frames))))
             _print(kind, rows)
             for row in rows:
                 if row.wrong or (given.each and row.status != "oriented"):
@@ -119,4 +118,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main_of(__file__))

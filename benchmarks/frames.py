@@ -16,7 +16,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,10 +24,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from cruz import cruz_corners
+from parts import add_options, executor_of, main_of, outcomes
 from real_frames import print_real
 
 from reseau.core.data import Array
 from reseau.core.tone import ToneCurve
+from reseau.execution import Executor, Processes
 from reseau.io.images import open_scan
 from reseau.io.scans import scan_of
 from reseau.measure.film import FrameOptions, FrameResult, Roll, orient_frames, roll_of, transformed
@@ -121,7 +122,7 @@ def with_roll(doubtful: tuple[FrameResult, FilmFrame, Roll]) -> tuple[str, float
     return result.status, float(np.abs(_errors(result, frame)[0]).max())
 
 
-def print_cases(pool: ProcessPoolExecutor, count: int, only: list[str], stated: bool) -> None:
+def print_cases(executor: Executor, count: int, only: list[str], stated: bool) -> None:
     """The table of difficulties."""
     what = "" if stated else ", format and resolution not given"
     print(f"\nSimulated frames at 600 dpi, {count} of every difficulty{what}; errors of corners in pixels")
@@ -130,9 +131,8 @@ def print_cases(pool: ProcessPoolExecutor, count: int, only: list[str], stated: 
     for name, frame in CASES.items():
         if only and not any(part in name for part in only):
             continue
-        rows = list(
-            pool.map(partial(one, known=stated), [frame.with_seed(SEEDS + seed) for seed in range(count)])
-        )
+        drawn = (frame.with_seed(SEEDS + seed) for seed in range(count))
+        rows = list(outcomes(executor, partial(one, known=stated), drawn))
         good = np.array([row[0].status == "oriented" for row in rows])
         error, sigma, theirs = (np.array([row[k] for row in rows]) for k in (1, 2, 3))
         if not good.any():
@@ -146,12 +146,13 @@ def print_cases(pool: ProcessPoolExecutor, count: int, only: list[str], stated: 
         print(
             f"  {name:22s} {100 * good.mean():6.1f} {np.sqrt(np.mean(e**2)):7.3f} {far.max():7.2f} "
             f"{int((far > 1).sum()):7d} {np.sqrt(np.mean((e / s) ** 2)):11.2f} "
-            f"{rms:10.2f} {100 * np.mean(away > 1):6.0f} %{_of_roll(pool, frame, [row[0] for row in rows])}",
+            f"{rms:10.2f} {100 * np.mean(away > 1):6.0f} %"
+            f"{_of_roll(executor, frame, [row[0] for row in rows])}",
             flush=True,
         )
 
 
-def _of_roll(pool: ProcessPoolExecutor, frame: FilmFrame, results: list[FrameResult]) -> str:
+def _of_roll(executor: Executor, frame: FilmFrame, results: list[FrameResult]) -> str:
     """Orient the remaining frames with the shape of the oriented frames of the same camera."""
     roll = roll_of(results, frame.dpi)
     doubtful = [
@@ -161,18 +162,18 @@ def _of_roll(pool: ProcessPoolExecutor, frame: FilmFrame, results: list[FrameRes
     ]
     if not doubtful or not isinstance(roll, Roll):
         return ""
-    again = [far for status, far in pool.map(with_roll, doubtful) if status == "oriented"]
+    again = [far for status, far in outcomes(executor, with_roll, doubtful) if status == "oriented"]
     share = 100 * (1 - (len(doubtful) - len(again)) / len(results))
     return f"  with its roll {share:.1f} %, those by {max(again, default=0.0):.2f} px at most"
 
 
-def print_table_1(pool: ProcessPoolExecutor, count: int) -> None:
+def print_table_1(executor: Executor, count: int) -> None:
     """Table 1 of the paper: transformations to corners calibrated with a roll of frames."""
     print(f"\nTable 1: transformation to calibrated corners (from another {count} frames), σX σY in mm")
     print("                              affine           conformal")
     for name, form, dpi in (("Ricoh, 600 dpi", RICOH, 600.0), ("Hasselblad, 1200 dpi", HASSELBLAD, 1200.0)):
         base = FilmFrame(format=form, dpi=dpi, gate_seed=5, film_mm=0.008, scanner=3e-4)
-        found = list(pool.map(_results, [base.with_seed(seed) for seed in range(2 * count)]))
+        found = list(outcomes(executor, _results, map(base.with_seed, range(2 * count))))
         roll = roll_of(found[count:], dpi)
         if not roll:
             print(f"  {name:22s} {roll.reason}")
@@ -219,15 +220,15 @@ def _commanded(*arguments: object) -> tuple[str, float, float, float]:
 def print_times() -> None:
     """A roll of 36, a frame of 40 megapixels, and scans of 600 MB by the command, for its memory."""
     print("\nWall time, processor time and memory of `reseau orient`, including its start")
-    with tempfile.TemporaryDirectory() as name, ProcessPoolExecutor(2) as pool:
+    with tempfile.TemporaryDirectory() as name, Processes(2) as executor:
         # Other processes make the scans: a child begins with the memory of its parent.
         folder = Path(name)
-        paths = list(pool.map(_roll_frame, [folder] * 36, range(36)))
+        paths = list(outcomes(executor, partial(_roll_frame, folder), range(36)))
         said, took, used, _ = _commanded(*paths, "--out", folder / "out", "--jobs", 2)
         done = said.count(": oriented")
         print(f"  roll of 36 at 1200 dpi, with marked copies: {took:.1f} s, {used:.1f} s, {done} oriented")
-        plain, wide, coded = pool.submit(_large, folder).result()
-        runs = [pool.submit(_oriented_within, plain).result() for _ in range(3)]
+        ((plain, wide, coded),) = outcomes(executor, _large, [folder])
+        runs = [run for _ in range(3) for run in outcomes(executor, _oriented_within, [plain])]
         took, used = (min(run[k] for run in runs) for k in (1, 2))
         print(f"  40 megapixels, uncompressed, without the start: {took:.2f} s, {used:.2f} s, {runs[0][0]}")
         size, out = wide.stat().st_size / 1e6, folder / "large"
@@ -278,7 +279,7 @@ def _oriented_within(path: Path) -> tuple[str, float, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=200)
-    parser.add_argument("--jobs", type=int, default=2)
+    add_options(parser)
     parser.add_argument("--without", action="store_true", help="frames without their format")
     parser.add_argument(
         "--only", nargs="*", default=[], help="parts of names of difficulties, or: table, times, real"
@@ -290,11 +291,11 @@ def main() -> None:
     given = parser.parse_args()
     parts = {"table", "times", "real"}
     only = [name for name in given.only if name not in parts]
-    with ProcessPoolExecutor(given.jobs) as pool:
+    with executor_of(given) as executor:
         if only or not given.only:
-            print_cases(pool, given.frames, only, not given.without)
+            print_cases(executor, given.frames, only, not given.without)
         if not given.only or "table" in given.only:
-            print_table_1(pool, max(6, given.frames // 10))
+            print_table_1(executor, max(6, given.frames // 10))
         if not given.only or "times" in given.only:
             print_times()
     if not given.only or "real" in given.only:
@@ -302,4 +303,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main_of(__file__)

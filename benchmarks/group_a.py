@@ -20,17 +20,18 @@ import io
 import sys
 import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
+from parts import add_options, executor_of, main_of, outcomes
 from scipy.stats import ncx2, norm
 from tables import ALPHA, SIZES, judged, print_power, rms
 
 from reseau.adjust import Adjustment, adjust
 from reseau.core.data import Array, ImagePoints
 from reseau.designs import standard_reseau
+from reseau.execution import Executor
 from reseau.measure import measure_reseau
 from reseau.measure.fitting import fit_mapping, mapping_problem
 from reseau.optics import RationalPolynomial, Similarity
@@ -217,11 +218,11 @@ def print_trials(title: str, found: list[Trial | str]) -> None:
         print(f"    {label:<11} {value:.5f} mm = {px * value:.4f} px")
 
 
-def first_tests(pool: Executor, draws: int) -> None:
+def first_tests(executor: Executor, draws: int) -> None:
     """Simulate and print level and power of the first test of each coefficient."""
     seeds = [draws] + [max(1, draws // 4)] * (len(SIZES) - 1)
     rates = [
-        np.mean(list(pool.map(partial(tested, size=size), range(n), chunksize=50)), axis=0)
+        np.mean(list(outcomes(executor, partial(tested, size=size), range(n), together=50)), axis=0)
         for size, n in zip(SIZES, seeds, strict=True)
     ]
     threshold, sizes = norm.isf(ALPHA / 2), np.array(SIZES)
@@ -234,21 +235,21 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=200, help="worlds through the whole chain")
     parser.add_argument("--first", type=int, default=0, help="seed of the first of these worlds")
     parser.add_argument("--draws", type=int, default=2000, help="corrections from points, and tests of level")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    add_options(parser, jobs=1)
     given = parser.parse_args()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)
     begun = time.perf_counter()
     worlds = max(1, min(200, given.draws // 10))
-    with ProcessPoolExecutor(given.jobs) as pool:
+    with executor_of(given) as executor:
 
         def spread(work: Callable[[int], list[Trial | str]], seeds: Iterable[int]) -> list[Trial | str]:
-            return [one for several in pool.map(work, seeds, chunksize=4) for one in several]
+            return [one for several in outcomes(executor, work, seeds, together=4) for one in several]
 
         if given.draws:
             each = partial(from_points, draws=-(-given.draws // worlds))
             print_trials("From points with normal noise", spread(each, range(worlds)))
-            first_tests(pool, given.draws)
+            first_tests(executor, given.draws)
         if given.frames:
             print_trials("From frames", spread(from_frame, range(given.first, given.first + given.frames)))
     print(f"\n{time.perf_counter() - begun:.0f} s")
@@ -256,4 +257,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main_of(__file__))

@@ -15,18 +15,19 @@ with a linear model of the same design.
 from __future__ import annotations
 
 from collections.abc import Collection
-from concurrent.futures import Executor
 from functools import cache, partial
 
 import numpy as np
 import scipy.stats
 from group_a import EVERYTHING, in_pixels
+from parts import outcomes
 from tables import ALPHA, SIZES, level_band, print_power
 
 from reseau.adjust import Elimination
 from reseau.calibration import CameraCorrection
 from reseau.core.data import Array, ImagePoints
 from reseau.designs import standard_reseau, test_object
+from reseau.execution import Executor
 from reseau.optics import RationalPolynomial
 from reseau.refine import correct_camera, correct_instrument
 
@@ -126,11 +127,11 @@ def kept_of_a_linear_model(present: Collection[str], draws: int = LINEAR_DRAWS) 
     return remain[candidate] / draws
 
 
-def f_tests(pool: Executor, draws: int) -> None:
+def f_tests(executor: Executor, draws: int) -> None:
     """Simulate and print level and power of the first tests, and the result of the elimination."""
     seeds = [draws] + [max(1, draws // 4)] * (len(SIZES) - 1)
     rates = [
-        np.mean(list(pool.map(partial(tested, size=size), range(n), chunksize=25)), axis=0)
+        np.mean(list(outcomes(executor, partial(tested, size=size), range(n), together=25)), axis=0)
         for size, n in zip(SIZES, seeds, strict=True)
     ]
     r = 2 * len(test_object().ids) - len(COEFFICIENTS)
@@ -148,7 +149,8 @@ def f_tests(pool: Executor, draws: int) -> None:
         (f"{', '.join(PAPER)} at {LARGE:.0f} sigmas", PAPER),
     )
     for label, present in worlds:
-        share = np.mean(list(pool.map(partial(kept, present=present), range(draws), chunksize=25)), axis=0)
+        work = partial(kept, present=present)
+        share = np.mean(list(outcomes(executor, work, range(draws), together=25)), axis=0)
         linear = kept_of_a_linear_model(present)
         for text, values in ((label, share), ("  a linear model", linear)):
             print(f"  {text:<34}" + "".join(f"{100 * value:7.1f}" for value in values))

@@ -22,16 +22,20 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import scipy.stats
+from parts import add_options, executor_of, main_of, outcomes
 from shared import of_the_tests
 from worlds.water import Array, Scene, Surface, around
 
 from reseau.adjust import Options
 from reseau.bundle import BundleFit, BundleProblem, Camera, Network, Result, adjust_network, problem_of
 from reseau.core.threads import one_thread
+from reseau.execution import Executor
 from reseau.optics.poses import matrix_to_vector
 from reseau.optics.refraction import Refraction, RefractiveIndex, Window
 
@@ -165,35 +169,46 @@ class World:
         return off, fit.values.xyz - scene.xyz
 
 
-def monte_carlo(seeds: int) -> None:
+class Errors(NamedTuple):
+    """Squared errors over variances of the unknowns, of all of them jointly, and of the points."""
+
+    squares: Array
+    pooled: float
+    points: float
+    sigma0: float
+    names: tuple[str, ...]
+
+
+def drawn(world: World, seed: int) -> Errors | None:
+    """Errors of one adjustment; None where it has no result."""
+    problem, _ = problem_of(world.network(seed))
+    fit = problem.adjusted(Options(scale="a-priori"))
+    if not isinstance(fit, BundleFit):
+        return None
+    off, away = world.errors(fit)
+    q = fit.cofactors.reduced.full
+    size = np.sqrt(np.diag(q))
+    pooled = off / size @ np.linalg.solve(q / np.outer(size, size), off / size) / len(off)
+    own = np.linalg.inv(fit.cofactors.points[CONTROL:])
+    points = np.mean(np.einsum("pi,pij,pj->p", away[CONTROL:], own, away[CONTROL:])) / 3
+    return Errors(off**2 / np.diag(q), float(pooled), float(points), fit.sigma0, fit.unknowns.names)
+
+
+def monte_carlo(executor: Executor, seeds: int) -> None:
     print("errors over standard deviations; every parameter against chi-squared, pooled over all unknowns\n")
     print(f"{'':<12}{'unknowns':>9}{'outside':>9}{'largest':>9}{'pooled':>8}{'points':>8}{'sigma0':>8}")
     for kind in ARRANGEMENTS:
-        world, squares, pooled, points, sigma0, failed = World(kind), [], [], [], [], 0
-        names: tuple[str, ...] = ()
-        for seed in range(seeds):
-            problem, _ = problem_of(world.network(seed))
-            fit = problem.adjusted(Options(scale="a-priori"))
-            if not isinstance(fit, BundleFit):
-                failed += 1
-                continue
-            off, away = world.errors(fit)
-            q, names = fit.cofactors.reduced.full, fit.unknowns.names
-            squares.append(off**2 / np.diag(q))
-            size = np.sqrt(np.diag(q))
-            pooled.append(off / size @ np.linalg.solve(q / np.outer(size, size), off / size) / len(off))
-            own = fit.cofactors.points[CONTROL:]
-            points.append(
-                np.mean(np.einsum("pi,pij,pj->p", away[CONTROL:], np.linalg.inv(own), away[CONTROL:])) / 3
-            )
-            sigma0.append(fit.sigma0)
-        mean, count = np.mean(squares, axis=0), len(squares)
+        every = list(outcomes(executor, partial(drawn, World(kind)), range(seeds), together=4))
+        done = [each for each in every if each is not None]
+        count, failed, names = len(done), len(every) - len(done), done[0].names
+        mean = np.mean([each.squares for each in done], axis=0)
+        pooled, points, sigma0 = (np.mean([each[k] for each in done]) for k in (1, 2, 3))
         part = LEVEL / len(mean) / 2
         low, high = scipy.stats.chi2.ppf([part, 1 - part], count) / count
         outside = np.flatnonzero((mean < low) | (mean > high))
         print(
             f"{kind:<12}{len(mean):>9}{len(outside):>9}{np.sqrt(mean.max()):>9.3f}"
-            f"{np.sqrt(np.mean(pooled)):>8.3f}{np.sqrt(np.mean(points)):>8.3f}{np.mean(sigma0):>8.3f}"
+            f"{np.sqrt(pooled):>8.3f}{np.sqrt(points):>8.3f}{sigma0:>8.3f}"
             + (f"  {failed} of {seeds} not adjusted" if failed else "")
             + (f"  outside: {', '.join(names[k] for k in outside)}" if len(outside) else "")
         )
@@ -334,9 +349,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--part", choices=("montecarlo", "cavity", "unseen", "speed"))
     parser.add_argument("--seeds", type=int, default=200)
+    add_options(parser)
     chosen = parser.parse_args()
+
+    def drawn_often() -> None:
+        with executor_of(chosen) as executor:
+            monte_carlo(executor, chosen.seeds)
+
     parts: dict[str, Callable[[], None]] = {
-        "montecarlo": lambda: monte_carlo(chosen.seeds),
+        "montecarlo": drawn_often,
         "cavity": cavity,
         "unseen": unseen,
         "speed": speed,
@@ -348,4 +369,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main_of(__file__)

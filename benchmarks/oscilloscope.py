@@ -35,7 +35,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -44,12 +43,14 @@ import group_a
 import group_b
 import numpy as np
 from chain import FALSE_PX, FAR_SIGMA, Errors, Found, Trial, trial
+from parts import add_options, executor_of, main_of, outcomes
 from photographs import ECHOES, Physics
 from refined import of_points, print_refined, refined
 from tables import judged, mean_square, rms, rms_over_worlds
 from worlds.oscilloscope import World, write
 
 from reseau.core.data import Array
+from reseau.execution import Executor
 from reseau.report.factors import FACTORS
 
 VERDICTS = {"first": "the polynomials", "second": "Wong's display", "undecided": "neither"}
@@ -170,12 +171,12 @@ def print_physics(physics: Physics, found: Sequence[Trial | str], jobs: int) -> 
 
 
 def through_the_procedure(
-    pool: Executor, physics: Physics, seeds: range, folder: Path | None, echoes: str
+    executor: Executor, physics: Physics, seeds: range, folder: Path | None, echoes: str
 ) -> list[Trial | str]:
     """Process worlds one after the other, and report each on standard error."""
     found = []
     work = partial(trial, physics=physics, folder=folder, echoes=echoes)
-    for seed, one in zip(seeds, pool.map(work, seeds), strict=True):
+    for seed, one in zip(seeds, outcomes(executor, work, seeds), strict=True):
         found.append(one)
         text = one if isinstance(one, str) else f"{len(one.rods.row)} rods, {len(one.body.row)} points"
         print(f"{physics} {seed}: {text}", file=sys.stderr, flush=True)
@@ -216,7 +217,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="seed of the first of these worlds")
     parser.add_argument("--echoes", choices=[*ECHOES], default="beam", help="their form")
     parser.add_argument("--draws", type=int, default=1000, help="tests of level, from points")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    add_options(parser, jobs=1)
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep there what is measured in frames")
     parser.add_argument("--part", choices=["bench", "independent", "worlds", "points"], default="bench")
     parser.add_argument("--count", type=int, default=200, help="worlds of --part worlds and points")
@@ -229,19 +230,18 @@ def main() -> int:
         print(f"\n{time.perf_counter() - begun:.0f} s")
         return 0
     worlds: tuple[tuple[Physics, int], ...] = (("wong", given.frames), ("polynomial", given.polynomial))
-    with ProcessPoolExecutor(given.jobs) as pool:
+    with executor_of(given) as executor:
         for physics, count in worlds:
             if count:
                 seeds = range(given.first, given.first + count)
-                print_physics(
-                    physics, through_the_procedure(pool, physics, seeds, given.keep, given.echoes), given.jobs
-                )
+                found = through_the_procedure(executor, physics, seeds, given.keep, given.echoes)
+                print_physics(physics, found, given.jobs)
         if given.draws:
-            group_a.first_tests(pool, given.draws)
-            group_b.f_tests(pool, given.draws)
+            group_a.first_tests(executor, given.draws)
+            group_b.f_tests(executor, given.draws)
     print(f"\n{time.perf_counter() - begun:.0f} s")
     return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main_of(__file__))

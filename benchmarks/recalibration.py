@@ -15,10 +15,13 @@ import shutil
 import subprocess
 import time
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
+from parts import add_options, executor_of, main_of, outcomes
 
 from reseau.core.data import Array
+from reseau.execution import Executor
 from reseau.service.charts import ChartOptions, KnownSeries, monitor
 from reseau.service.runlength import Cusum, Ewma, Prerun, Shewhart
 
@@ -103,7 +106,11 @@ def _cases() -> Iterator[tuple[str, str, float]]:
         yield "Shewhart", f'xshewhartrunsrules.arl({mu},c=1,type="1")', Shewhart(3.0).arl(mu)
 
 
-def false_alarms(count: int, seed: int) -> None:
+Case = tuple[tuple[str, str, float | Array, float], int]
+"""Name, text of φ, φ and degrees of freedom of a series, and the runs before its year."""
+
+
+def false_alarms(executor: Executor, count: int, seed: int) -> None:
     """Alarms a year without drift."""
     print(f"{count} years of {YEAR} runs without drift, ten parameters and the norm; limit 0.1 a year")
     print(
@@ -117,20 +124,28 @@ def false_alarms(count: int, seed: int) -> None:
         *(("t, 8 degrees", f"{phi:.2f}", phi, 8.0) for phi in (0.0, 0.3, 0.5)),
         *(("t, 4 degrees", f"{phi:.2f}", phi, 4.0) for phi in (0.0, 0.3)),
     ]
-    for (name, written, phi, tails), m in ((case, m) for case in cases for m in both):
-        rng = np.random.default_rng(seed)
-        matrix = correlated() if name == "correlated" else np.eye(PARAMETERS)
-        alarms, told = 0, np.zeros(3)
-        for _ in range(0, count, AT_ONCE):
-            found = monitor(years(rng, AT_ONCE, m + YEAR, phi, matrix, tails), one_sided=(PARAMETERS,))
-            alarms += int(found.alarms[:, m:].sum())
-            beyond = found.autocorrelation[:, -1] > ChartOptions().autocorrelation
-            told += [each.mean() for each in (found.width[:, -1], found.learning[:, -1], beyond)]
+    every = [(case, m) for case in cases for m in both]
+    drawn = outcomes(executor, partial(_alarms, count, seed), every)
+    for ((name, written, _, _), m), (alarms, told) in zip(every, drawn, strict=True):
         rate, most = alarms / count, upper_limit(alarms) / count
         width, learning, beyond = told * [1, 100, 100] / (count / AT_ONCE)
         note = "" if most <= 0.105 else " !"
         counted = f"{m:12d}{rate:15.4f}{most:18.4f}{note:2}"
         print(f"  {name:<15}{written:<8}{counted}{width:7.2f}{learning:8.0f} %{beyond:9.0f} %", flush=True)
+
+
+def _alarms(count: int, seed: int, case: Case) -> tuple[int, Array]:
+    """Number of alarms in the simulated years of a case; sums of width, of learning and correlated series."""
+    (name, _, phi, tails), m = case
+    rng = np.random.default_rng(seed)
+    matrix = correlated() if name == "correlated" else np.eye(PARAMETERS)
+    alarms, told = 0, np.zeros(3)
+    for _ in range(0, count, AT_ONCE):
+        found = monitor(years(rng, AT_ONCE, m + YEAR, phi, matrix, tails), one_sided=(PARAMETERS,))
+        alarms += int(found.alarms[:, m:].sum())
+        beyond = found.autocorrelation[:, -1] > ChartOptions().autocorrelation
+        told += [each.mean() for each in (found.width[:, -1], found.learning[:, -1], beyond)]
+    return alarms, told
 
 
 def upper_limit(events: int) -> float:
@@ -140,36 +155,43 @@ def upper_limit(events: int) -> float:
     return float(chi2.ppf(0.95, 2 * events + 2) / 2)
 
 
-def delays(count: int, seed: int) -> None:
+def delays(executor: Executor, count: int, seed: int) -> None:
     """Runs until a shift of one of ten parameters is found."""
     print("shift of one of ten parameters at a run: mean number of runs to the first alarm of the bench")
-    for name, before, phi in (
+    cases = (
         ("known, from the start", 0, 0.0), ("known, after 20 runs", 20, 0.0), ("known, φ 0.3", 20, 0.3),
         ("estimated from 20 runs", 20, 0.0), ("estimated from 52", 52, 0.0), ("estimated from 150", 150, 0.0),
         ("estimated from 150, φ held 0", 150, 0.0),
-    ):  # fmt: skip
-        rng = np.random.default_rng(seed)
-        known = name.startswith("known")
-        options = ChartOptions(autocorrelation=0.0) if name.endswith("held 0") else ChartOptions()
-        line = ""
-        for shift in (1.0, 2.0, 3.0):
-            runs = 200 if known else 104
-            x = years(rng, count, before + runs, phi, np.eye(PARAMETERS))
-            x[:, before:, 0] += shift
-            if known:
-                series = KnownSeries(np.zeros(PARAMETERS), np.ones(PARAMETERS), np.full(PARAMETERS, phi))
-                alarms = monitor(x[:, :, :PARAMETERS], options, known=series).alarms
-            else:
-                x = with_norm(x[:, :, :PARAMETERS])
-                alarms = monitor(x, options, one_sided=(PARAMETERS,)).alarms
-            # Benches that signalled before the shift do not count.
-            after = alarms[~alarms[:, :before].any(axis=1), before:]
-            found = after.any(axis=1)
-            delay = np.argmax(after, axis=1)[found] + 1.0
-            error = delay.std() / np.sqrt(len(delay))
-            within = "" if found.all() else f" of the {100 * found.mean():.0f} % found in {runs} runs"
-            line += f"   {shift:g} σ: {delay.mean():.2f} ± {error:.2f}{within}"
-        print(f"  {name:<30}{line}", flush=True)
+    )  # fmt: skip
+    for line in outcomes(executor, partial(_delays, count, seed), cases):
+        print(line, flush=True)
+
+
+def _delays(count: int, seed: int, case: tuple[str, int, float]) -> str:
+    """The line of a case."""
+    name, before, phi = case
+    rng = np.random.default_rng(seed)
+    known = name.startswith("known")
+    options = ChartOptions(autocorrelation=0.0) if name.endswith("held 0") else ChartOptions()
+    line = ""
+    for shift in (1.0, 2.0, 3.0):
+        runs = 200 if known else 104
+        x = years(rng, count, before + runs, phi, np.eye(PARAMETERS))
+        x[:, before:, 0] += shift
+        if known:
+            series = KnownSeries(np.zeros(PARAMETERS), np.ones(PARAMETERS), np.full(PARAMETERS, phi))
+            alarms = monitor(x[:, :, :PARAMETERS], options, known=series).alarms
+        else:
+            x = with_norm(x[:, :, :PARAMETERS])
+            alarms = monitor(x, options, one_sided=(PARAMETERS,)).alarms
+        # Benches that signalled before the shift do not count.
+        after = alarms[~alarms[:, :before].any(axis=1), before:]
+        found = after.any(axis=1)
+        delay = np.argmax(after, axis=1)[found] + 1.0
+        error = delay.std() / np.sqrt(len(delay))
+        within = "" if found.all() else f" of the {100 * found.mean():.0f} % found in {runs} runs"
+        line += f"   {shift:g} σ: {delay.mean():.2f} ± {error:.2f}{within}"
+    return f"  {name:<30}{line}"
 
 
 def main() -> None:
@@ -179,16 +201,18 @@ def main() -> None:
     parser.add_argument("--part", choices=("lengths", "false", "delays"))
     parser.add_argument("--years", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=1)
+    add_options(parser)
     given = parser.parse_args()
-    start = time.process_time()
+    start = time.monotonic()
     if given.part in (None, "lengths"):
         lengths()
-    if given.part in (None, "false"):
-        false_alarms(given.years, given.seed)
-    if given.part in (None, "delays"):
-        delays(5000, given.seed)
-    print(f"{time.process_time() - start:.0f} s of processor time")
+    with executor_of(given) as executor:
+        if given.part in (None, "false"):
+            false_alarms(executor, given.years, given.seed)
+        if given.part in (None, "delays"):
+            delays(executor, 5000, given.seed)
+    print(f"{time.monotonic() - start:.0f} s")
 
 
 if __name__ == "__main__":
-    main()
+    main_of(__file__)

@@ -2,6 +2,7 @@
 
     python benchmarks/scale.py --part cluster [--images 5000]
     python benchmarks/scale.py --part bundle [--sizes 50 160 500 1600 5000] [--memory GB]
+    python benchmarks/scale.py --part costs [--frames 10000 100000 1000000]
 
 `cluster` starts a Dask scheduler and two workers on this machine, and a client that measures images of a
 testfield through a shared store. At a quarter of the images one worker is killed with -9, at a half the
@@ -12,6 +13,7 @@ client and scheduler over time. What the processes take while they wait is measu
 for the time that measuring takes two workers: where the machine is busy with other things they wait longer.
 
 `bundle` adjusts networks with the statistics of two collections of photographs, see `scale_bundle.py`.
+`costs` measures what single things cost, see `scale_costs.py`.
 """
 
 from __future__ import annotations
@@ -271,8 +273,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--part", choices=("cluster", "client", "bundle"), required=True)
+    parser.add_argument("--part", choices=("cluster", "client", "bundle", "costs"), required=True)
     parser.add_argument("--images", type=int, default=5000)
+    parser.add_argument("--frames", nargs="+", type=int, default=[10_000, 100_000, 1_000_000])
     parser.add_argument("--kinds", nargs="+", choices=("ladybug", "venice"), default=["ladybug", "venice"])
     parser.add_argument("--sizes", nargs="+", type=int, default=[50, 160, 500, 1600, 5000])
     parser.add_argument("--memory", type=float, help="GB that normal equations may take")
@@ -289,6 +292,10 @@ def main() -> None:
         from scale_bundle import part_bundle
 
         part_bundle(given.kinds, given.sizes, given.memory, peer=not given.no_peer)
+    elif given.part == "costs":
+        from scale_costs import part_costs
+
+        part_costs(given.frames)
     else:
         part_cluster(given.images)
 

@@ -10,13 +10,13 @@ connected. For each image there are
     venice, 52 images           1232        6680             5.4
     venice, 1778 images          559        2813             5.0
 
-The first line was counted in the file itself. Numbers of points are parts of the names of BAL's files. Numbers
-of image points with 1723 and 1778 images are those that other programs' benchmarks state for the files; that
-with 52 images is from memory, and not checked. The drawn ones agree in points, image points and rays (with 49
-images 159, 625, 3.9; half of the points have three rays or fewer in both, 5 % more than 8, in BAL 11), except
-`venice` with few images (with 52 1106, 4688, 4.2). They differ in what is connected: BAL's vehicle comes back
-to places where it was, so that 83 % of the pairs of 49 images have common points, of the drawn ones 34 %.
-Networks of a vehicle that comes back have wider bands, and are closer to `venice`.
+The first line was counted in the file itself. Numbers of points are parts of the names of BAL's files.
+Numbers of image points with 1723 and 1778 images are those that benchmarks of other programs state for the
+files; that with 52 images is from memory, and was not checked. The drawn ones agree in points, image points
+and rays (with 49 images 159, 625, 3.9; 5 % of the points have more than 8 rays, in BAL 11), except `venice`
+with few images (with 52 1106, 4688, 4.2). They differ in what is connected: BAL's vehicle comes back to
+places where it was, so that 83 % of the pairs of 49 images have common points, of the drawn ones 34 %. The
+normal equations of a vehicle that comes back have a wider band; those of `venice` are full.
 
 Each image has a camera of its own with f, k1, k2, as in BAL. Image coordinates have errors of 0.5 px; the
 approximate values are off by amounts that make residuals of some pixels.

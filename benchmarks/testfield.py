@@ -1,6 +1,6 @@
 """The coded testfield: lines, recognition and precision in the paper's recordings, compared with known truth.
 
-Run from the checkout: ``python benchmarks/testfield.py [--seeds N] [--workers N] [--freed]``. The 36
+Run from the checkout: ``python benchmarks/testfield.py [--seeds N] [--jobs N] [--freed]``. The 36
 recordings of Vosselman and Förstner (φ = 0, 30, 45°), and 16 more with φ = 60°, are simulated and measured.
 In the Cramér–Rao bound, position, sharpness, contrast, background (level and slopes) and size are unknown,
 and all simulated noise is included, also row jitter. The figures refer to the 256 targets of the central
@@ -16,13 +16,13 @@ import argparse
 import json
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
 import cv2
 import numpy as np
+from parts import main_of, outcomes
 from scipy.optimize import linear_sum_assignment
 from shared import of_the_tests
 from worlds.boards import OPENCV, Pose, picture
@@ -30,6 +30,7 @@ from worlds.boards import OPENCV, Pose, picture
 from reseau.core.data import Array, Frame
 from reseau.core.tone import ToneCurve
 from reseau.designs import HIDDEN, coded_testfield
+from reseau.execution import Processes
 from reseau.io import SHAPES
 from reseau.measure import TestfieldOptions, TestfieldResult, measure_testfield
 from reseau.measure.testfield.measure import FORMED_PX
@@ -260,7 +261,7 @@ def timed(frame: Frame) -> tuple[float, float]:
     return time.process_time() - cpu, time.perf_counter() - clock
 
 
-def speed(done: list[Recording], workers: int) -> None:
+def speed(done: list[Recording], jobs: int) -> None:
     """Print the time for one image and for all, on one core and on several."""
     frames = [r.frame for r in done]
     for frame in frames[:3]:
@@ -273,12 +274,12 @@ def speed(done: list[Recording], workers: int) -> None:
         f"wall median {np.median(wall) * 1e3:.0f} ms, least {wall.min() * 1e3:.0f} ms"
     )
     print(f"{len(frames)} images on one core: processor {cpu.sum():.2f} s, wall {total:.2f} s")
-    with ProcessPoolExecutor(workers) as pool:
-        list(pool.map(timed, frames[: 4 * workers]))  # the workers have started
+    with Processes(jobs) as executor:
+        list(outcomes(executor, timed, frames[: 4 * jobs]))  # the workers have started
         clock = time.perf_counter()
-        cpu, _ = np.array(list(pool.map(timed, frames))).T
+        cpu, _ = np.array(list(outcomes(executor, timed, frames))).T
         total = time.perf_counter() - clock
-    print(f"{len(frames)} images on {workers} cores: processor {cpu.sum():.2f} s, wall {total:.2f} s")
+    print(f"{len(frames)} images on {jobs} cores: processor {cpu.sum():.2f} s, wall {total:.2f} s")
 
 
 def freed(seeds: int, conditions: list[str]) -> bool:
@@ -383,7 +384,7 @@ def small() -> bool:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=1, help="sets of recordings")
-    parser.add_argument("--workers", type=int, default=2, help="processes")
+    parser.add_argument("--jobs", type=int, default=2, help="processes that are timed")
     parser.add_argument("--condition", nargs="+", default=list(FREED), help="only these, with --freed")
     parser.add_argument("--freed", action="store_true", help="only photographs of freer formation")
     parser.add_argument("--speed", action="store_true", help="only the first picture, and those after it")
@@ -405,9 +406,9 @@ def main() -> int:
     kept.append(table(paper))
     print("\nφ = 60°:", end="")
     kept.append(table(steep))
-    speed(paper[:36], arguments.workers)
+    speed(paper[:36], arguments.jobs)
     return 0 if all(kept) else 1
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main_of(__file__))

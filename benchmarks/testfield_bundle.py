@@ -1,6 +1,6 @@
 """Section 4 of Vosselman and Förstner on simulated recordings: sigma0 compared with theirs, and true errors.
 
-Run from the checkout: ``python benchmarks/testfield_bundle.py [--seed N] [--workers N]``. The 32
+Run from the checkout: ``python benchmarks/testfield_bundle.py [--seed N] [--jobs N]``. The 32
 recordings that the paper adjusted are simulated and measured: the large circles with twelve additional
 parameters for each of eight groups, then all kinds of targets with coordinates corrected by these (table 4),
 and sixteen relative orientations (table 5). The true errors are those of the measured coordinates, which are
@@ -10,12 +10,12 @@ not used in the adjustments. A second board with a bend of its own is adjusted f
 from __future__ import annotations
 
 import argparse
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import scipy.stats
+from parts import add_options, executor_of, main_of, outcomes
 
 from reseau.adjust import compare
 from reseau.bundle import (
@@ -233,14 +233,14 @@ def own_bend(done: list[Recorded], bench: FieldBench) -> bool:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, default=0, help="seed of the recordings")
-    parser.add_argument("--workers", type=int, default=2, help="number of measuring processes")
+    add_options(parser)
     arguments = parser.parse_args()
     stations = list(paper_stations((30.0, 45.0)))
     mount = FieldBench(seed=arguments.seed)
     board = FieldBench(seed=arguments.seed, bend_with="board")
-    with ProcessPoolExecutor(arguments.workers) as pool:
-        done = list(pool.map(partial(record, mount), stations))
-        bent = list(pool.map(partial(record, board), [s for s in stations if s.phi == 45]))
+    with executor_of(arguments) as executor:
+        done = list(outcomes(executor, partial(record, mount), stations))
+        bent = list(outcomes(executor, partial(record, board), [s for s in stations if s.phi == 45]))
     calibrated = systematic(done)
     free = corrected(done, calibrated)
     kept = [table_4(free), table_5(free), own_bend(bent, board)]
@@ -251,4 +251,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main_of(__file__))

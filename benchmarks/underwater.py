@@ -28,6 +28,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from parts import add_options, executor_of, main_of, outcomes
 from worlds.blurred import ROWS, WAVELENGTHS, WEIGHTS, Array
 from worlds.underwater import (
     LENS_SCALE,
@@ -302,6 +303,18 @@ def kept(path: Path | None, compute: Callable[[], dict[str, Figures]]) -> dict[s
     return {text: Figures(**row) for text, row in json.loads(path.read_text()).items()}
 
 
+Job = tuple[str, int, Callable[[], dict[str, Figures]]]
+"""Name of a file, seed, and what computes its figures."""
+
+
+def timed(folder: Path | None, job: Job) -> tuple[dict[str, Figures], float]:
+    """Figures of a seed, and the processor time that they took."""
+    name, seed, compute = job
+    begin = time.process_time()
+    found = kept(None if folder is None else folder / f"{name}-{seed:03d}.json", compute)
+    return found, time.process_time() - begin
+
+
 def _rms(values: Array) -> tuple[float, float]:
     """Root mean square of values of all seeds, and half of its interval of 95 %."""
     square = values**2
@@ -335,6 +348,7 @@ def main() -> None:
     parser.add_argument("--assumed", action="store_true", help="with wrong designs of the lens as well")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the figures of each seed here")
     parser.add_argument("--report", type=Path, help="report of the first seed to write, HTML")
+    add_options(parser)
     chosen = parser.parse_args()
     if chosen.keep is not None:
         chosen.keep.mkdir(parents=True, exist_ok=True)
@@ -350,19 +364,21 @@ def main() -> None:
     )
     # Seed by seed, so that what is kept after a stop is of all strengths.
     rows: dict[str, dict[str, list[Figures]]] = {name: {} for name in ("sharp", *strengths)}
-    begin = time.process_time()
+    jobs, spent = list[Job](), 0.0
     for seed in range(chosen.seeds):
         # Nothing of a sharp photograph but the place of the sensor depends on the strength.
-        jobs = [("sharp", partial(sharp_figures, "medium", seed))]
+        jobs.append(("sharp", seed, partial(sharp_figures, "medium", seed)))
         for strength in strengths:
-            jobs.append((strength, partial(blurred_figures, strength, seed)))
+            jobs.append((strength, seed, partial(blurred_figures, strength, seed)))
             if chosen.assumed:
-                jobs.append((f"{strength}-assumed", partial(assumed_figures, strength, seed)))
-        for name, compute in jobs:
-            path = chosen.keep / f"{name}-{seed:03d}.json" if chosen.keep is not None else None
-            for text, row in kept(path, compute).items():
+                jobs.append((f"{strength}-assumed", seed, partial(assumed_figures, strength, seed)))
+    with executor_of(chosen) as executor:
+        done = outcomes(executor, partial(timed, chosen.keep), jobs)
+        for (name, _, _), (found, seconds) in zip(jobs, done, strict=True):
+            spent += seconds
+            for text, row in found.items():
                 rows[name.removesuffix("-assumed")].setdefault(text, []).append(row)
-    each = (time.process_time() - begin) / chosen.seeds / len(strengths)
+    each = spent / chosen.seeds / len(strengths)
     for strength in strengths:
         blur: Array = np.concatenate(list(project(strength, 0).blur.values()))
         print(f"{strength}: blur to {blur.max():.1f} px; {chosen.seeds} seeds, {each:.1f} s each")
@@ -371,4 +387,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main_of(__file__)

@@ -26,11 +26,13 @@ import json
 import time
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from parts import add_options, executor_of, main_of, outcomes
 
 from reseau.bundle import Camera, Network, Result, adjust_network
 from reseau.bundle.network import Rig
@@ -206,6 +208,8 @@ def main() -> None:
     parser.add_argument("--scenario", choices=tuple(SCENARIOS))
     parser.add_argument("--seeds", type=int, help="by default 50; 1 of the scenario without noise")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the figures of each seed here")
+    # Both programs are timed: one process by default.
+    add_options(parser, jobs=1)
     chosen = parser.parse_args()
     try:
         import aquacal  # noqa: F401
@@ -215,7 +219,8 @@ def main() -> None:
         chosen.keep.mkdir(parents=True, exist_ok=True)
     for name in [chosen.scenario] if chosen.scenario else SCENARIOS:
         seeds = chosen.seeds or SCENARIOS[name]
-        rows = [kept(chosen.keep, name, seed) for seed in range(seeds)]
+        with executor_of(chosen) as executor:
+            rows = list(outcomes(executor, partial(kept, chosen.keep, name), range(seeds)))
         times = np.median([row["seconds"] for row in rows], axis=0)
         largest = max(row["largest_px"] for row in rows)
         print(
@@ -238,4 +243,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main_of(__file__)

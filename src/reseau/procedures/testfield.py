@@ -17,9 +17,9 @@ from ..archive import Verdict
 from ..bundle import (
     Network,
     Result,
-    adjust_network,
     camera_mapping,
     image_scatter,
+    problem_of,
     sigma_between_images,
     with_estimates,
 )
@@ -355,7 +355,9 @@ def _predicted(network: Network, result: Result, mount: Mount, place: Place, hei
 
 def _sigma(network: Network, column: int) -> float:
     """Standard deviation of a parameter of the camera, for unit variance factor."""
-    found = adjust_network(network)
-    if isinstance(found, Failure):
+    # The estimates are those of the images so far: no search for their start, and no checks of the result.
+    fit = problem_of(network)[0].adjusted()
+    if isinstance(fit, Failure):
         return float("inf")
-    return float(np.sqrt(found.camera_covariance(0)[column, column] / found.fit.variance))
+    _, columns, _ = Result(network, fit, np.zeros(len(network.xy), dtype=bool), ()).camera_columns(0)
+    return float(np.sqrt(fit.cofactors.reduced.block(columns, columns)[column, column]))
