@@ -167,15 +167,16 @@ def find_curve(
     if straight is None:
         return FoundCurve(None)
     unused = "" if stated is None else stated.source
-    best, least = FoundCurve(None, stated=unused), _misfit(_STRAIGHT, straight, full_scale)
-    at = straight
-    if stated is not None and (given := matched(stated)) is not None:
-        misfit = _misfit(stated, given, full_scale)
-        if misfit < _DOUBTFUL * least:
-            best, least, at = FoundCurve(stated), misfit, given
+    best, its_own, at = FoundCurve(None, stated=unused), _STRAIGHT, straight
+    given = None if stated is None else matched(stated)
+    if stated is not None and given is not None:
+        misfit = [_misfit(*one, full_scale) for one in ((stated, given), (_STRAIGHT, straight))]
+        if misfit[0] < _DOUBTFUL * misfit[1]:
+            best, its_own, at = FoundCurve(stated), stated, given
     rest = estimate_gamma(*at, 1.0, full_scale)
     if not rest.certain or abs(rest.gamma - 1) < _LINEAR or not rest.gain < beside:
         return best
+    least = _misfit(its_own, at, full_scale)
     power = _estimated(matched, rest if at is straight else None, straight, full_scale)
     if power is None:
         return best

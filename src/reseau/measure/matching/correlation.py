@@ -16,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import uniform_filter
 
 from ...core.data import Array, Mask
@@ -225,11 +226,9 @@ def _neighbours(unit: Array, used: Mask, free: Array, both_ways: bool) -> bool:
 
 def _correlation(unit: Array, used: Mask, free: Array) -> dict[tuple[int, int], float]:
     """Significant correlations by distance; a part of many marks shows them."""
-    from .compiled_lags import lag_sums  # takes half a second to import; not every command needs it
-
     some = np.unique(np.linspace(0, len(unit) - 1, _SHOWN).astype(np.intp))
     unit, used, free = unit[some], used[some], free[some]
-    sums, pairs = lag_sums(np.where(used, unit, 0.0).astype(np.float32), used.astype(np.float32), _LAGS)
+    sums, pairs = (_lag_sums(values.astype(np.float32)) for values in (np.where(used, unit, 0.0), used))
     taken = 1 - float(free[used].mean())
     power = float((unit[used] ** 2).mean()) / (1 - taken)
     rows, columns = unit.shape[1:]
@@ -237,8 +236,21 @@ def _correlation(unit: Array, used: Mask, free: Array) -> dict[tuple[int, int], 
     for down, right in _lags():
         if down >= rows or abs(right) >= columns:
             continue
-        count = max(float(pairs[down, right + _LAGS]), 1.0)
-        r = float(sums[down, right + _LAGS]) / count / power + _TAKEN * taken
+        count = max(float(pairs[down, right]), 1.0)
+        r = float(sums[down, right]) / count / power + _TAKEN * taken
         if abs(r) > _SIGNIFICANT / np.sqrt(count):
             found[down, right] = r
     return found
+
+
+def _lag_sums(windows: Array) -> Array:
+    """Sums of products of pixels of windows (k, rows, columns) at all distances (down, right) up to `_LAGS`.
+
+    Negative distances are counted from the end. By the theorem of Wiener and Khinchin these are the transform
+    of the power spectrum, of windows with as many zeros beside them.
+    """
+    size = [next_fast_len(n + _LAGS, real=True) for n in windows.shape[1:]]
+    spectrum = rfft2(windows, size)
+    power = np.einsum("kij,kij->ij", spectrum.real, spectrum.real)
+    power += np.einsum("kij,kij->ij", spectrum.imag, spectrum.imag)
+    return np.asarray(irfft2(power, size))

@@ -58,13 +58,15 @@ def grey_variance(pixels: NDArray[Any], start: Array, residuals: Array) -> tuple
     square, grey = residuals[used] ** 2, (observed + residuals)[used]
     if square.size < 500 or not square.any():
         return None
-    design = np.stack([np.ones_like(grey), grey], axis=1)
-    variance = np.full(len(grey), square.mean())
+    design = np.stack([np.ones_like(grey), grey])
+    mean = square.mean()
+    variance = np.full(len(grey), mean)
     for _ in range(4):
         # The square of a normal deviate has variance 2σ⁴.
-        normal = (design / variance[:, None] ** 2).T @ design / 2
-        a, b = np.linalg.lstsq(normal, (design / variance[:, None] ** 2).T @ square / 2, rcond=None)[0]
-        variance = np.maximum(design @ [a, b], _LEAST * square.mean())
+        weighted = design / (2 * variance**2)
+        normal = weighted @ design.T
+        a, b = np.linalg.lstsq(normal, weighted @ square, rcond=None)[0]
+        variance = np.maximum(a + b * grey, _LEAST * mean)
     sigma = np.sqrt(np.linalg.pinv(normal)[1, 1])
     return (float(a), float(b)) if b > _SIGNIFICANT * sigma else None
 

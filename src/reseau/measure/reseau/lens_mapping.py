@@ -14,7 +14,9 @@ twenty. Written out it is a polynomial of the seventh degree.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
@@ -47,19 +49,27 @@ class FoundMapping:
     ----------
     mapping : Chain
         The mapping.
-    displaced : tuple of Chain
-        Mappings that are off by one standard deviation in independent directions: the covariance of anything
-        that follows from the mapping is the sum of the squares of what changes with them.
+    displacing : callable
+        Makes `displaced`, which not every use of a mapping needs.
 
     Examples
     --------
     >>> from reseau.measure.testfield.lattice_mapping import started
-    >>> FoundMapping(started(np.eye(3), 1, (480, 640)), ()).displaced
+    >>> FoundMapping(started(np.eye(3), 1, (480, 640)), tuple).displaced
     ()
     """
 
     mapping: Chain
-    displaced: tuple[Chain, ...]
+    displacing: Callable[[], tuple[Chain, ...]]
+
+    @cached_property
+    def displaced(self) -> tuple[Chain, ...]:
+        """Mappings that are off by one standard deviation in independent directions.
+
+        The covariance of anything that follows from the mapping is the sum of the squares of what changes
+        with them.
+        """
+        return self.displacing()
 
 
 def mapping_through(at: Array, xy: Array, sigma: Array, shape: tuple[int, int]) -> FoundMapping:
@@ -84,11 +94,11 @@ def mapping_through(at: Array, xy: Array, sigma: Array, shape: tuple[int, int]) 
         misfit = [float((((m(at) - xy) * weight[:, None]) ** 2).sum()) for m in (lens.mapping, free)]
         if misfit[0] + 2 * (8 + len(_LENS_SIGMA)) <= misfit[1] + 2 * len(free.second.values):
             return lens
-    return FoundMapping(free, _displaced(free, at, xy, weight))
+    return FoundMapping(free, partial(_displaced, free, at, xy, weight))
 
 
 def _displaced(free: Chain, at: Array, xy: Array, weight: Array) -> tuple[Chain, ...]:
-    """See :class:`FoundMapping`; the coefficients of a polynomial are those of a linear problem."""
+    """See :attr:`FoundMapping.displaced`; the coefficients of a polynomial are those of a linear problem."""
     monomials, _ = monomials_of(free, at)
     _, value, right = np.linalg.svd(monomials * weight[:, None], full_matrices=False)
     known = value > 1e-10 * value[0]
@@ -187,13 +197,20 @@ def lens_through(
         return None
     redundancy = 2 * len(at) - float(np.trace(np.linalg.solve(normal, data)))
     scale = np.sqrt(float(off @ off) / redundancy) if redundancy >= _SHOWN else 1.0
-    return FoundMapping(written(x), tuple(written(x + scale * step) for step in root.T))
+    return FoundMapping(written(x), lambda: tuple(written(x + scale * step) for step in root.T))
 
 
 def _expanded(x: Array) -> Array:
     """Coefficients (36, 2) of distortion in the monomials 1, u, v, u², u v, v², …"""
     # They are found from values, of which a polynomial of that degree has no residuals.
+    u, inverse = _expansion()
+    return np.asarray(inverse @ _distortion(u, x)[0])
+
+
+@lru_cache(maxsize=1)
+def _expansion() -> tuple[Array, Array]:
+    """Points (n, 2), and the matrix (36, n) by which values there become coefficients."""
     side = np.linspace(-1.0, 1.0, _DEGREE + 2)
     u = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     terms = [u[:, 0] ** (n - j) * u[:, 1] ** j for n in range(_DEGREE + 1) for j in range(n + 1)]
-    return np.asarray(np.linalg.lstsq(np.stack(terms, axis=1), _distortion(u, x)[0], rcond=None)[0])
+    return u, np.linalg.pinv(np.stack(terms, axis=1))

@@ -96,8 +96,10 @@ _SPREAD = 16
 _NEAR_WIDTH, _NEAR_FORM = 0.15, 0.01
 """Relative error of the sharpness, and change of the form, beyond which marks are matched again before the
 camera's response is learnt."""
-_AROUND_PX, _SHARP = 9, (0.4, 6.0)
-"""Reach around a mark within which the sharpness is seen first; and its limits, pixels."""
+_AROUND_PX, _SHARPNESS_OF, _SHARP = 9, 9, (0.4, 6.0)
+"""Reach around a mark within which the sharpness is seen first, number of marks; and its limits, pixels."""
+_LENGTH_OF = 80
+"""Number of marks from which the correlation length of what a polynomial leaves is that of half as many."""
 _PER_SMOOTH = 2.5
 """Least number of coordinates for each term of the polynomial about which positions scatter."""
 _PSF_LOG_SIGMA = 0.2
@@ -360,7 +362,8 @@ class PlaneMarks(ABC):
         return first, first.converged & (first.t > 8) & (first.rejected < 0.2)
 
     def _sharpness(self, rows: Rows) -> float:
-        """Width of the point-spread function by the steepest slopes around marks, pixels."""
+        """Width of the point-spread function by the steepest slopes around some of the marks, pixels."""
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, _SHARPNESS_OF).astype(np.intp))]
         half = _AROUND_PX + int(np.ceil(self._radius(rows).max()))
         x, y = self._pixels(rows, (half, half))
         grey = self.screened.grey[y, x]
@@ -816,6 +819,10 @@ class PlaneMarks(ABC):
         radius = self._radius(rows)
         while (good := np.flatnonzero(why == "")).size >= 10:
             relative = np.sqrt(variance[good] / np.median(variance[good]))
+            if known is None and good.size >= _LENGTH_OF:
+                # The length that some of them show is that of all.
+                some = good[:: good.size // (_LENGTH_OF // 2)]
+                known = SmoothField.fit(source[some], found.xy[some])
             length = known.length if known is not None and np.isfinite(known.length) else None
             field = known = SmoothField.fit(source[good], found.xy[good], sigma=relative, length=length)
             deviation, sigma = field.leave_one_out()

@@ -22,9 +22,9 @@ from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure
 from ...io import ReseauDesign
-from ...optics import Chain, RationalPolynomial
+from ...optics import Chain
 from ..testfield.lattice_fit import refit
-from ..testfield.lattice_mapping import second_order
+from ..testfield.lattice_mapping import second_order, started
 from .assignment import spacing
 from .disks import Disks
 
@@ -89,12 +89,7 @@ def through(at: Array, xy: Array, shape: tuple[int, int], degree: int = 1) -> Ch
     # Distortion of the lens is smallest there; the polynomial then models the distortion alone.
     some = near if near.sum() >= _ENOUGH and np.ptp(at[near], axis=0).min() > 1 else np.ones_like(near)
     found: Any = cv2.findHomography(at[some], xy[some])[0]
-    straight = RationalPolynomial.projective()
-    if found is None:
-        found = np.eye(3)
-    straight = straight.with_values((found / found[2, 2]).ravel()[:8])
-    curved = RationalPolynomial.polynomial(degree, offset=(float(middle[0]), float(middle[1])), scale=half)
-    return refit(Chain(straight, curved), at, xy, _POINT_PX)
+    return refit(started(np.eye(3) if found is None else found, degree, shape), at, xy, _POINT_PX)
 
 
 def lay_sheet(
@@ -173,10 +168,10 @@ def disk_seeds(disks: Disks, reach: float) -> Iterator[tuple[int, Array]]:
     around = np.array([1, 1j, -1, -1j, 1 + 1j, 1 - 1j, -1 + 1j, -1 - 1j])
     seen = np.where(alike, z, np.inf)
     support = np.zeros(z.shape)
-    for k in range(z.shape[1]):
-        expected = np.where(first[:, k], z[:, k], np.nan)[:, None] * around
-        gap = np.abs(seen[:, None, :] - expected[..., None])
-        support[:, k] = (np.nan_to_num(gap, nan=np.inf).min(axis=2) < _GATE).sum(axis=1)
+    disk, step = np.nonzero(first)
+    expected = z[disk, step, None] * around
+    gap = np.abs(seen[disk, None, :] - expected[..., None]).min(axis=2)
+    support[disk, step] = (gap < _GATE).sum(axis=1)
     best, way = support.max(axis=1), support.argmax(axis=1)
     well = best >= max(3.0, best.max() - 2)
     if not well.any():
@@ -196,9 +191,7 @@ def grown_disks(
     count = int(extent)
     grid = np.array(list(product(range(-count, count + 1), repeat=2)), dtype=np.float64)
     tree, size = KDTree(disks.xy), np.log(np.linalg.det(disks.form))
-    straight = RationalPolynomial.projective()
-    values = np.append(np.column_stack([slope, disks.xy[seed]]).ravel(), [0.0, 0.0])
-    mapping = Chain(straight.with_values(values), RationalPolynomial.polynomial(1))
+    mapping = started(np.vstack([np.column_stack([slope, disks.xy[seed]]), [0.0, 0.0, 1.0]]), 1, shape)
     nodes, rows = np.zeros((1, 2)), np.array([seed])
     for _ in range(3 * count):
         beside = grid[KDTree(nodes).query(grid)[0] < _FROM]

@@ -40,11 +40,17 @@ def _polynomial(degree: int, offset: tuple[float, float], scale: float) -> Ratio
     return RationalPolynomial.polynomial(degree, offset=offset, scale=scale)
 
 
+@lru_cache(maxsize=1)
+def _projectivity() -> RationalPolynomial:
+    """The projectivity that is the identity, as :func:`_polynomial`."""
+    return RationalPolynomial.projective()
+
+
 def started(matrix: Array, degree: int, shape: tuple[int, ...]) -> Chain:
     """A projectivity (3, 3) to a frame of this height and width, followed by a polynomial that is zero."""
     h, w = shape
     curved = _polynomial(degree, ((w - 1) / 2, (h - 1) / 2), max(h, w) / 2)
-    return Chain(RationalPolynomial.projective().with_values((matrix / matrix[2, 2]).ravel()[:8]), curved)
+    return Chain(_projectivity().with_values((matrix / matrix[2, 2]).ravel()[:8]), curved)
 
 
 def of_degree(mapping: Chain, degree: int) -> Chain:
