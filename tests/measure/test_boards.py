@@ -197,6 +197,31 @@ def test_large_circles_through_a_wide_lens_or_in_part_have_the_sigmas_of_their_e
     assert np.sqrt((error**2).mean()) < 0.004
 
 
+@pytest.mark.parametrize(
+    ("design", "printed"),
+    [
+        (board("charuco", 9, 6, 30.0, size=22.0, dictionary="DICT_4X4_100"), CHARUCO_PRINT),
+        (
+            board("aprilgrid", 5, 4, 39.0, size=30.0),
+            prints.aprilgrid(5, 4, 30.0, 0.3, "DICT_APRILTAG_36h11", 1),
+        ),
+    ],
+)
+def test_corners_beside_the_markers_read_are_found_to_the_margin_of_a_wide_view(
+    design: BoardDesign, printed: prints.Print
+) -> None:
+    """A polynomial through the markers read is up to 40 px aside of the other corners."""
+    turn, place = pose(51, printed, nearer=1.7)
+    view = Wide(printed, turn, place * [1, 1, 0.55], seed=901)
+    found = measured(Frame(view.picture(), 255.0, "wide"), design)
+    sight = ((view.truth > 6) & (view.truth < [960 - 7, 720 - 7])).all(axis=1)
+    assert found.ok[sight].all()
+    error = (found.xy - view.truth)[found.ok]
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert np.sqrt((error**2).mean()) < 0.006
+    assert 0.75 < np.sqrt(((error / sigma) ** 2).mean()) < 1.3
+
+
 DELTILLE, DELTILLE_PRINT = board("deltille", 9, 8, 25.0), prints.Deltille(9, 8, 25.0)
 
 

@@ -25,6 +25,8 @@ from ..reseau.sheet_placement import through
 from ..testfield.lattice_mapping import images_of, started
 
 __all__ = [
+    "LENS_FROM",
+    "SADDLE_PX",
     "Saddles",
     "along",
     "bright_between",
@@ -66,7 +68,7 @@ _DIAGONAL = 0.3
 """Where the sectors around a node are looked at, in steps along both axes."""
 _CROSSED = 0.3
 """Least difference between the darker of two bright sectors and the brighter of two dark ones."""
-_LENS_FROM, _SADDLE_PX = 8, 0.5
+LENS_FROM, SADDLE_PX = 8, 0.5
 """Least number of nodes from which the distortion of a lens is used; their standard deviation."""
 _LARGE_PX = 2_500_000
 """Size of a frame from which it is searched at half its size."""
@@ -303,13 +305,13 @@ def grown_through(
         if len(rows) < 4 or np.ptp(nodes, axis=0).min() < 1 or (same and through_lens):
             break
         # A polynomial through few nodes does not predict the next ones through a wide lens.
-        through_lens = same and len(rows) >= _LENS_FROM
+        through_lens = same and len(rows) >= LENS_FROM
         if same and not through_lens:
             break
         free = through(nodes, xy[rows], shape)
         lens = None
         if through_lens:
-            lens = lens_through(nodes, xy[rows], np.full(len(rows), _SADDLE_PX), shape, free)
+            lens = lens_through(nodes, xy[rows], np.full(len(rows), SADDLE_PX), shape, free)
         mapping = free if lens is None else lens.mapping
     return nodes, rows, mapping
 

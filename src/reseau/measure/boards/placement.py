@@ -28,7 +28,18 @@ from ..reseau.plane_marks import Located
 from ..reseau.sheet_placement import MOST_DISKS, disk_seeds, grown_disks, through
 from ..testfield.lattice_mapping import images_of, slope_of
 from .bits import Bits, Integers, read_bits
-from .candidates import Saddles, along, bright_between, crossed, first_mapping, grown, sector_levels, seeds
+from .candidates import (
+    LENS_FROM,
+    SADDLE_PX,
+    Saddles,
+    along,
+    bright_between,
+    crossed,
+    first_mapping,
+    grown,
+    sector_levels,
+    seeds,
+)
 from .puzzles import MISREAD, PuzzlePart, part_of_code
 
 __all__ = [
@@ -58,7 +69,7 @@ _FEWEST = 6
 """Least number of corners that show a board."""
 _ENOUGH = 0.6
 """Share of the corners of the board from which no other seed is tried."""
-_GROWN = 12
+_GROWN = 16
 """Most steps from the markers read to the corners beside them."""
 _NEAR_PX = 2.5
 """Distance within which a saddle is the corner that markers predict, pixels; or in steps of the lattice."""
@@ -443,22 +454,28 @@ def lay_marked(
     if design.kind == "aprilgrid":
         assert design.size is not None
         apart = min(design.size, design.pitch - design.size) / design.pitch
+    through_lens = False
     for _ in range(_GROWN):
         again, row = _nearest(saddles, mapping, nodes, dark, plane[use], known, apart)
         if design.kind == "charuco":
             again &= _filled(grey, mapping, nodes, dark)
         same = np.array_equal(again, known)
         known, start = again, np.where(again[:, None], saddles.xy[row], images_of(mapping, nodes))
-        if known.sum() < 4 or same:
+        if known.sum() < 4 or (same and through_lens):
             break
+        # A polynomial through few corners does not predict the next ones through a wide lens.
+        through_lens |= same
         both = np.concatenate([nodes[known], nodes[known], plane[use]])
         there = np.concatenate([start[known], start[known], image[use]])
+        sigma = np.repeat([np.sqrt(2) * SADDLE_PX, _MARKER_PX], [2 * known.sum(), use.sum()])
         if known.sum() >= _FEWEST and known.sum() > 0.5 * len(rows):
-            both, there = nodes[known], start[known]
+            both, there, sigma = nodes[known], start[known], np.full(known.sum(), SADDLE_PX)
         mapping = through(both, there, shape)
+        if through_lens and len(both) >= LENS_FROM:
+            lens = lens_through(both, there, sigma, shape, mapping)
+            mapping = mapping if lens is None else lens.mapping
     if known.sum() < 4:
         return failed(int(known.sum()), "corners beside the markers read")
-    mapping = through(nodes[known], start[known], shape) if known.sum() >= _FEWEST else mapping
     return Placed(Located(design.ids, design.xy, "dark", mapping, frame, origin, known, start))
 
 
