@@ -42,7 +42,9 @@ for k in range(12):
     turn = cv2.Rodrigues(lean * np.array([np.cos(way), np.sin(way), 0]))[0]
     turn = turn @ cv2.Rodrigues(np.array([0, 0, roll]))[0]
     distance = rng.uniform(330, 470)
-    middle = np.array([*rng.uniform(-0.14, 0.14, 2) * distance, distance])
+    # The board in the middle, then in each corner of the image.
+    aside = np.array([(0, 0), (-1, -1), (1, 1), (1, -1), (-1, 1)][k % 5]) * (0.24, 0.12)
+    middle = np.array([*(aside * rng.uniform(0.8, 1.2, 2) * distance), distance])
     to_image = np.column_stack([turn[:, :2], middle - turn[:, :2] @ (size_mm / 2)])
     on_board = np.c_[rays, np.ones(len(rays))] @ np.linalg.inv(to_image).T
     place = ((on_board[:, :2] / on_board[:, 2:] + margin_mm) * PER_MM - 0.5).astype(np.float32)

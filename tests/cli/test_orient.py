@@ -53,9 +53,9 @@ def test_a_roll_gives_documents_marked_copies_corners_and_an_overview(
     summary = RollSummary.read(tmp_path / "summary.json")
     assert [frame.by_roll for frame in summary.frames] == [False] * 4 + [True]
     assert (tmp_path / "summary.html").read_text("utf-8").count("<img") == 5
-    # A second run finds the results of the first one, and its roll is still the same.
+    # A second run, of the folder, finds the results of the first one, and its roll is still the same.
     (tmp_path / "corners.json").rename(tmp_path / "before.json")
-    assert reseau("orient", *images, "--frame", "36x24", "--out", tmp_path, "--jobs", 1)[1] == out
+    assert reseau("orient", roll, "--frame", "36x24", "--out", tmp_path, "--jobs", 1)[1] == out
     assert (tmp_path / "corners.json").read_text() == (tmp_path / "before.json").read_text()
     corners = FrameCorners.read(tmp_path / "corners.json")
     np.testing.assert_allclose(corners.xy(), frame.gate, rtol=0, atol=0.15)

@@ -291,14 +291,14 @@ def _found_target(
 
 def _photographs(images: list[Path], cameras: list[str]) -> tuple[dict[str, Path], dict[str, Taken]]:
     """Photographs by their names; with several cameras also when each was taken."""
-    from ..procedures.exposures import exposures_of_files, files_of, photographs_in
+    from ..procedures.exposures import exposures_of_files, files_of, photographs_named
 
     if not cameras:
         if not images:
             raise UsageError(
                 "are missing", where="photographs", do="name IMAGES, or --camera for each camera"
             )
-        images = [file for path in images for file in (photographs_in(path) if path.is_dir() else [path])]
+        images = photographs_named(images)
         named = {path.name: path for path in images}
         if len(named) < len(images):
             names = [path.name for path in images]

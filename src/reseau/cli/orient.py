@@ -63,7 +63,9 @@ class _Done:
 
 
 def orient(
-    images: Annotated[list[Path], typer.Argument(help="Scans of film frames: TIFF, PNG, JPEG, BMP.")],
+    images: Annotated[
+        list[Path], typer.Argument(help="Scans of film frames, or folders of them: TIFF, PNG, JPEG, BMP.")
+    ],
     frame: Annotated[
         str | None, typer.Option(help="Format in mm, as 36x24 or 56x56. Default: try the usual formats.")
     ] = None,
@@ -101,8 +103,10 @@ def orient(
     """
     from ..execution import executor_at
     from ..io import FrameCorners, RollSummary, write_whole
+    from ..procedures.exposures import photographs_named
     from ..report.frames import roll_page
 
+    images = photographs_named(images)
     if corners is not None:
         FrameCorners.read(corners)  # an invalid file is reported before the computation
     box = _numbers(near)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from glob import glob
@@ -29,6 +29,7 @@ __all__ = [
     "of_another_lens",
     "photograph_reader",
     "photographs_in",
+    "photographs_named",
     "photographs_of",
 ]
 
@@ -87,6 +88,22 @@ def photographs_in(folder: Path) -> list[Path]:
         if found:
             return found
     raise InputError("has no photograph", where=folder)
+
+
+def photographs_named(paths: Iterable[Path]) -> list[Path]:
+    """Photographs and folders of them as photographs, in this order.
+
+    Raises
+    ------
+    InputError
+        When a folder has no photograph.
+
+    Examples
+    --------
+    >>> [path.name for path in photographs_named([Path("one.tif"), Path("two.tif#2")])]
+    ['one.tif', 'two.tif#2']
+    """
+    return [file for path in paths for file in (photographs_in(path) if path.is_dir() else [path])]
 
 
 def exposures_of_files(files: Mapping[str, Sequence[Path]]) -> dict[str, tuple[Path, Taken]]:
