@@ -45,7 +45,7 @@ numpydoc_xref_param_type = False
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
-# Links between the pages are checked; a file of the project that is not a page is copied to the site for download.
+# Links between the pages are checked; a file that is not a page is copied to the site for download.
 # Names of types in signatures that two packages define, as Frame, are linked to the first.
 suppress_warnings = ["misc.highlighting_failure", "ref.python"]
 keep_warnings = True
@@ -76,6 +76,12 @@ def _magnitudes(app: Any, what: str, name: str, obj: object, options: Any, lines
     for i, line in enumerate(lines):
         if "`" not in line and "\\" not in line:
             lines[i] = re.sub(r"\|(\w)\|", r"\\|\1\\|", line)
+
+
+def _pages(app: Any, what: str, name: str, obj: object, options: Any, lines: list[str]) -> None:
+    """Link a page that a docstring names by its file."""
+    for i, line in enumerate(lines):
+        lines[i] = re.sub(r"``docs/([\w/-]+)\.md``", r":doc:`docs/\1.md </\1>`", line)
 
 
 def _mathml(node: nodes.Node, display: str) -> str:
@@ -114,5 +120,6 @@ def setup(app: Any) -> None:
     """Connect to Sphinx."""
     app.add_html_math_renderer("mathml", (_inline_math, None), (_display_math, None))
     app.connect("autodoc-process-docstring", _magnitudes)
+    app.connect("autodoc-process-docstring", _pages)
     app.connect("autodoc-skip-member", _skip)
     app.connect("builder-inited", _schemas)

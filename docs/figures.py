@@ -1,7 +1,12 @@
-"""Draws `docs/images/calibration.png`: python docs/figures.py."""
+"""Draws `docs/images/calibration.png`: python docs/figures.py.
+
+With the folder of the tour of a camera (docs/tours/camera.md), whose commands were followed, it draws
+`docs/images/tour-camera.png` in its place: python docs/figures.py FOLDER
+"""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +16,7 @@ from reseau.core.figures import drawing
 from reseau.optics import Brown, PixelGrid, Sensor
 from reseau_sims import FieldBench, paper_stations
 
+IMAGES = Path(__file__).with_name("images")
 WIDTH, HEIGHT, PITCH_MM = 800, 600, 0.006
 
 
@@ -28,8 +34,24 @@ def bench() -> FieldBench:
     )
 
 
+def tour(folder: Path) -> None:
+    """A photograph of the tour with its distortion, and without."""
+    from matplotlib.figure import Figure
+
+    with drawing():
+        figure = Figure(figsize=(9.0, 3.2), layout="constrained", facecolor="white")
+        for axes, name in zip(figure.subplots(1, 2), ("photos", "flat"), strict=True):
+            axes.imshow(reseau.read_image(folder / name / "10.png").pixels, cmap="gray", vmin=0, vmax=255)
+            axes.set_title(f"{name}/10.png", loc="left")
+            axes.set_axis_off()
+        figure.savefig(IMAGES / "tour-camera.png", dpi=110, metadata={"Software": None})
+
+
 def main() -> None:
     """Simulate photographs, calibrate, draw."""
+    if len(sys.argv) > 1:
+        tour(Path(sys.argv[1]))
+        return
     world = bench()
     stations = paper_stations()[::3]
     frames = [world.record(station) for station in stations]
@@ -40,7 +62,7 @@ def main() -> None:
         panels[0].set_title(f"measured: {len(calibrated.measured[frames[shown].name])} targets", loc="left")
         figure = panels[0].figure
         figure.set_facecolor("white")
-        path = Path(__file__).with_name("images") / "calibration.png"
+        path = IMAGES / "calibration.png"
         figure.savefig(path, dpi=110, metadata={"Software": None})
     print(calibrated, path)
     assert np.isfinite(calibrated.sigma0)

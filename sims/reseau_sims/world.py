@@ -101,6 +101,10 @@ class World:
     faults : Faults
         Faults.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/bench.md``.
+
     Examples
     --------
     >>> world = World.standard(seed=7)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import doctest
+import importlib
+import inspect
 import re
 import shlex
 from collections.abc import Iterator
@@ -166,3 +168,20 @@ def test_lines_of_python_run_in_the_order_of_the_page_and_print_what_it_shows(
             names = shown.globs
         else:
             exec(compile(block, str(page), "exec"), names)
+
+
+MATHEMATICS = sorted(page for page in (DOCS / "mathematics").glob("*.md") if page.stem != "index")
+
+
+@pytest.mark.parametrize("page", MATHEMATICS, ids=lambda page: page.stem)
+def test_a_page_of_mathematics_names_what_computes_it_and_is_named_by_it(page: Path) -> None:
+    named = re.findall(r"\{py:(func|class)\}`([\w.]+) <([\w.]+)>`", page.read_text("utf-8"))
+    assert named
+    back = []
+    for role, public, defined in named:
+        package, _, name = public.rpartition(".")
+        each = getattr(importlib.import_module(package), name)
+        assert f"{each.__module__}.{each.__qualname__}" == defined
+        assert inspect.isclass(each) == (role == "class")
+        back.append(f"``docs/mathematics/{page.name}``" in (inspect.getdoc(each) or ""))
+    assert any(back)

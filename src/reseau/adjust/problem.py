@@ -449,6 +449,8 @@ def adjust(problem: Problem, options: Options | None = None) -> Adjustment | Adj
 
     Notes
     -----
+    Derived in ``docs/mathematics/adjustment.md``.
+
     Minimises Ω = vᵀPv + (x−x₀)ᵀP₀(x−x₀) subject to linear constraints (Mikhail 1976; Förstner & Wrobel 2016,
     ch. 4). Damping after Nielsen (1999), IMM-REP-1999-05; convergence after Bates & Watts (1981),
     *Technometrics* 23, 179–183.

@@ -228,6 +228,10 @@ def propagate(
     UsageError
         If shapes do not fit, or a covariance is none.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/uncertainty.md``.
+
     Examples
     --------
     >>> same = Contribution("same error", np.full((2, 2), 0.01))

@@ -145,6 +145,8 @@ def correct_camera(
 
     Notes
     -----
+    Derived in ``docs/mathematics/group-a.md``.
+
     The common system is a choice of coordinates, fixed by the measured images of O and S. Their errors
     shift, rotate and scale it; a, b and c absorb that. `cofactor` is the covariance of the coefficients in
     this system, which corrected coordinates have; `coefficient_covariance` contains the errors of O and S,

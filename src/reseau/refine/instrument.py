@@ -160,6 +160,10 @@ def correct_instrument(
     FittedInstrument or Failure
         A failure when there are too few rods, or the adjustment fails.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/group-b.md``.
+
     Examples
     --------
     >>> from reseau.designs import regular_reseau

@@ -196,6 +196,10 @@ def calibrate_sensor(series: SensorSeries) -> SensorResult:
     EstimationError
         When gain and noise cannot be determined.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/sensor.md``.
+
     Examples
     --------
     Frames of a sensor with a gain of 10 electrons per grey value and a read noise of 2 grey values:

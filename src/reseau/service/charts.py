@@ -333,6 +333,8 @@ def monitor(
 
     Notes
     -----
+    Derived in ``docs/mathematics/recalibration.md``.
+
     A missing run counts as none: the next run is predicted from the last one with the same φ, although their
     correlation is smaller, which makes signals rarer.
 

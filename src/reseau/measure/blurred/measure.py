@@ -240,6 +240,10 @@ def measure_blurred(
     UsageError
         When names and targets differ in number, or a target cannot be imaged by any lens.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/blurred.md``.
+
     Examples
     --------
     A disk seen by a lens that is focused behind it; the image is drawn with the same rays:

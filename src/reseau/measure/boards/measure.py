@@ -119,6 +119,10 @@ def measure_board(
     ImageError
         When the frame is all black, saturated, or of one grey.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/boards.md``.
+
     Examples
     --------
     Draw a chessboard with edges half way between pixels, and measure its corners:

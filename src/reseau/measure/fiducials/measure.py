@@ -106,6 +106,10 @@ def measure_fiducials(
     FiducialResult or Failure
         A failure if the marks are not in the scan, or too few of them.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/fiducials.md``.
+
     Examples
     --------
     Four crosses of a camera of 40 mm x 30 mm, scanned at 10 px/mm:

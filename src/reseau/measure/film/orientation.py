@@ -302,6 +302,10 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
     list of FrameResult
         One result for each frame, in reading order; a declined one if no frame was found.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/frame.md``.
+
     Examples
     --------
     A frame of 36 mm × 24 mm, brighter than the film around it:

@@ -171,6 +171,10 @@ def measure_pins(
     UsageError
         When the marks of the design are not rods, or fewer than four have coordinates.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/pins.md``.
+
     Examples
     --------
     >>> from reseau.designs import regular_reseau

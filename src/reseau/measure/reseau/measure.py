@@ -168,6 +168,10 @@ def measure_reseau(
     UsageError
         When the design has neither coordinates nor nominal positions, or all its points lie on one line.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/reseau.md``.
+
     Examples
     --------
     Form an image of dark disks and measure their centres:

@@ -184,6 +184,10 @@ def measure_testfield(
     UsageError
         When the squares of the design do not consist of sixteen targets in a grid.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/testfield.md``.
+
     Examples
     --------
     Form an image of a testfield of one square, one pixel per millimetre, and measure its targets:

@@ -408,6 +408,10 @@ def camera_model(name: str) -> CameraModel:
     UsageError
         When there is none.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/models.md``.
+
     Examples
     --------
     >>> camera_model("pinhole")

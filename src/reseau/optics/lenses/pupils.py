@@ -166,6 +166,10 @@ def aim(lens: Prescription, points: Array, pupil: Array, wavelength_nm: float | 
     UsageError
         When a point lies behind the first surface, or the radius of the stop is not known.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/lenses.md``.
+
     Examples
     --------
     >>> from reseau.optics.lenses import AIR, Prescription, Tracer, glass, in_order

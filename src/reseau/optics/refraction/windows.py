@@ -443,6 +443,10 @@ class Refraction(Display):
         When names occur twice, a medium is unknown, the media of consecutive windows differ, or a window on
         the object precedes one on the camera.
 
+    Notes
+    -----
+    Derived in ``docs/mathematics/refraction.md``.
+
     Examples
     --------
     >>> media = (RefractiveIndex("air", 1.0), RefractiveIndex("glass", 1.52), RefractiveIndex("water", 1.333))

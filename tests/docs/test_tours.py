@@ -1,0 +1,116 @@
+"""The tours: every command and every line of Python, in the order of the page, in an empty folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reseau.archive import Archive
+from reseau.calibration import Calibration
+from reseau.cli import run
+from reseau.io.images import write_image
+from reseau.service import Configurations
+from reseau_sims import World
+
+from ..capture.fieldrig import BENCH, DESIGN, FieldRig, enter
+from .touring import follow, same
+
+
+def test_numbers_may_differ_in_the_last_digits_and_words_not() -> None:
+    assert same("fx 689.986 ± 0.021 px", "fx 689.985 ± 0.021 px")
+    assert not same("fx 689.986 ± 0.021 px", "fx 689.886 ± 0.021 px")
+    assert not same("12 images", "13 images")
+    assert not same("usable for measurement", "not usable")
+
+
+def test_a_bench_is_automated_and_scheduled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    enter(tmp_path, monkeypatch, FieldRig())
+
+    def simulated(words: list[str]) -> bool:
+        return words[1:3] == ["bench", "sim"]
+
+    def waiting() -> str:
+        with Archive.open("archive") as archive:
+            return str(Configurations(archive).history("left")[0].key)
+
+    Path("bench.toml").write_text(BENCH, "utf-8")
+    DESIGN.write("field.json")
+    follow("bench", tmp_path, instead=simulated, values={"KEY": waiting})
+    with Archive.open("archive") as archive:
+        assert len(archive.sessions()) >= 2
+    assert "SUMMARY:weekly: scheduled" in Path("weekly.ics").read_text("utf-8")
+
+
+def test_a_camera_is_calibrated_its_report_read_and_its_certificate_issued(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def waiting() -> str:
+        with Archive.open("archive") as archive:
+            return str(Configurations(archive).history("d1")[0].key)
+
+    follow("camera", tmp_path)
+    truth = {
+        "fx": 690.0,
+        "fy": 689.0,
+        "cx": 363.4,
+        "cy": 236.8,
+        "k1": -0.19,
+        "k2": 0.05,
+        "p1": 8e-4,
+        "p2": -5e-4,
+    }
+    camera = Calibration.read("camera.json")
+    for name, true in truth.items():
+        assert abs(camera.values()[name] - true) < 4 * camera.parameters[name].sigma
+    follow("report", tmp_path)
+    pytest.importorskip("lxml", reason="certificates need the extra `certificates`")
+    follow("certificate", tmp_path, values={"KEY": waiting})
+    assert "R-7" in Path("certificate.html").read_text("utf-8")
+
+
+def test_a_roll_of_film_is_oriented(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    follow("film", tmp_path)
+    assert Path("oriented/summary.html").exists()
+
+
+def test_a_camera_under_water_is_calibrated_without_and_with_the_water(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    follow("underwater", tmp_path)
+    c = Calibration.read("dry.json").parameters["c"]
+    assert abs(c.value - 8.0) < 4 * c.sigma
+
+
+def test_an_instrument_is_corrected_in_three_photographs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the photographs of the demo's world; `make demo`, a part of CI, runs the demo itself."""
+    monkeypatch.chdir(tmp_path)
+
+    def demo(words: list[str]) -> bool:
+        if words[:2] != ["reseau", "demo"]:
+            return words[:3] == ["reseau", "archive", "list"]
+        world, out = World.standard(seed=1), Path("out")
+        out.mkdir()
+        world.design.write(out / "reseau.json")
+        world.test_object.write(out / "rods.json")
+        for name in ("photo_i", "photo_ii", "photo_iii"):
+            write_image(out / f"{name}.png", getattr(world, name)().pixels)
+        photos = ["--photo-i", "out/photo_i.png", "--photo-ii", "out/photo_ii.png"]
+        designs = ["--reseau", "out/reseau.json", "--object", "out/rods.json"]
+        return run(["refine", *photos, *designs, "--out", "out/calibration.json"]) == 0
+
+    follow("instrument", tmp_path, instead=demo)
+    header, *points = Path("true.csv").read_text("utf-8").splitlines()
+    assert header == "id,x,y,sx,sy"
+    truth = World.standard(seed=1).truth_iii()
+    true = dict(zip(truth.names, truth.object_xy, strict=True))
+    for name, x, y, sx, sy in (line.split(",") for line in points):
+        error = np.array([float(x), float(y)]) - true[name]
+        assert (abs(error) < 5 * np.array([float(sx), float(sy)])).all()

@@ -1,0 +1,120 @@
+"""Runs a tour: its commands in the order of the page, in a folder that has only what the page says."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+
+from reseau.cli import run
+
+TOURS = Path(__file__).parents[2] / "docs" / "tours"
+_BLOCK = re.compile(
+    r"^```(\{code-block\} \w+|console|python)\n(?::caption: (\S+)\n)?(.*?)^```$", re.DOTALL | re.M
+)
+_NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e-?\d+)?")
+_UNITS = 5
+"""Units of the last printed digit by which a number may differ: another processor rounds differently."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A file that the page shows, lines of Python, or a command with the output that the page shows."""
+
+    kind: str
+    text: str
+    name: str = ""
+    shown: tuple[str, ...] = ()
+
+
+def steps(page: str) -> list[Step]:
+    """The steps of a tour."""
+    found: list[Step] = []
+    for kind, caption, body in _BLOCK.findall((TOURS / f"{page}.md").read_text("utf-8")):
+        if kind == "console":
+            for part in re.split(r"^\$ ", body, flags=re.MULTILINE)[1:]:
+                command, *shown = part.rstrip("\n").split("\n")
+                while command.endswith("\\"):
+                    command = command[:-1] + shown.pop(0).strip()
+                found.append(Step("command", command, shown=tuple(shown)))
+        elif caption:
+            found.append(Step("file", body, caption))
+        elif kind == "python":
+            found.append(Step("python", body))
+    assert found, page
+    return found
+
+
+def same(shown: str, printed: str) -> bool:
+    """Whether a line was printed as the page shows it, but for numbers in their last digit."""
+    if shown.strip() == "...":
+        return True
+    if _NUMBER.sub("0", shown.rstrip()) != _NUMBER.sub("0", printed.rstrip()):
+        return False
+    for a, b in zip(_NUMBER.findall(shown), _NUMBER.findall(printed), strict=True):
+        digits = len(a.split("e")[0].partition(".")[2]) - int(a.partition("e")[2] or 0)
+        if abs(float(a) - float(b)) > _UNITS * 10.0**-digits * (digits > 0 or "e" in a) + 1e-12:
+            return False
+    return True
+
+
+def check_output(step: Step, printed: str) -> None:
+    """The lines of the page are among those printed, in their order; ``...`` stands for any."""
+    lines = iter(printed.splitlines())
+    for shown in step.shown:
+        if shown.strip() and shown.strip() != "...":
+            assert any(same(shown, line) for line in lines), (
+                f"{step.text}\nshown: {shown}\nprinted:\n{printed}"
+            )
+
+
+def follow(
+    page: str,
+    folder: Path,
+    *,
+    instead: Callable[[list[str]], bool] = lambda words: False,
+    values: dict[str, Callable[[], str]] | None = None,
+) -> None:
+    """Follow a tour in a folder, which is the current one; `instead` carries out some of the commands."""
+    for script in TOURS.glob("*.py"):
+        shutil.copy(script, folder)
+    names: dict[str, object] = {}
+    for step in steps(page):
+        if step.kind == "file":
+            (folder / step.name).write_text(step.text, encoding="utf-8")
+        elif step.kind == "python":
+            exec(compile(step.text, f"{page}.md", "exec"), names)
+        else:
+            command = step.text
+            for word, value in (values or {}).items():
+                if re.search(rf"\b{word}\b", command):
+                    command = re.sub(rf"\b{word}\b", value(), command)
+            may_fail = command.endswith("|| true")
+            words = shlex.split(command.removesuffix("|| true"))
+            if instead(words):
+                continue
+            status, printed = _carried_out(words)
+            print(f"$ {command}\n{printed}")
+            assert status == 0 or may_fail, f"{command}: exit status {status}\n{printed}"
+            check_output(step, printed)
+
+
+def _carried_out(words: list[str]) -> tuple[int, str]:
+    """Exit status and output of a command; `reseau` runs in this process."""
+    if words[0] == "reseau":
+        # One process: each further one would import and compile everything again.
+        alone = ["--jobs", "1"] if words[1] in {"calibrate", "orient"} else []
+        written = StringIO()
+        with redirect_stdout(written), redirect_stderr(written):
+            status = run([*words[1:], *alone])
+        return status, written.getvalue()
+    words[0] = sys.executable if words[0] == "python" else words[0]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout + done.stderr
