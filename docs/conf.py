@@ -50,6 +50,7 @@ myst_heading_anchors = 4
 suppress_warnings = ["misc.highlighting_failure", "ref.python"]
 keep_warnings = True
 
+html_title = "reseau"
 html_theme = "pydata_sphinx_theme"
 html_theme_options = {
     "show_nav_level": 1,

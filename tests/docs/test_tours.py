@@ -109,8 +109,10 @@ def test_an_instrument_is_corrected_in_three_photographs(
     follow("instrument", tmp_path, instead=demo)
     header, *points = Path("true.csv").read_text("utf-8").splitlines()
     assert header == "id,x,y,sx,sy"
-    truth = World.standard(seed=1).truth_iii()
-    true = dict(zip(truth.names, truth.object_xy, strict=True))
-    for name, x, y, sx, sy in (line.split(",") for line in points):
-        error = np.array([float(x), float(y)]) - true[name]
-        assert (abs(error) < 5 * np.array([float(sx), float(sy)])).all()
+    true = World.standard(seed=1).truth_iii().object_xy
+    found = np.array([[float(value) for value in line.split(",")[1:]] for line in points])
+    assert len(found) > 0.8 * len(true)
+    error = found[:, None, :2] - true
+    nearest = error[np.arange(len(found)), np.linalg.norm(error, axis=2).argmin(axis=1)]
+    # Without a list of the points all echoes are measured, numbered anew.
+    assert (abs(nearest) < 5 * found[:, 2:]).all()
