@@ -117,10 +117,10 @@ def _noise(pixels: NDArray[Any], valid: Mask) -> float:
     quantisation = float(np.median(steps) / np.sqrt(12))
     if not bend.size:
         return quantisation
-    return max(1.4826 * _median_size(bend, pixels.dtype) / np.sqrt(1.5), quantisation)
+    return max(float(1.4826 * _median_size(bend, pixels.dtype) / np.sqrt(1.5)), quantisation)
 
 
-def _median_size(bend: NDArray[np.float32], of: np.dtype[Any]) -> float:
+def _median_size(bend: NDArray[Any], of: np.dtype[Any]) -> float:
     """Median of the absolute second differences of grey values of a type."""
     if of.kind != "u" or of.itemsize > 1:
         return float(np.median(np.abs(bend)))

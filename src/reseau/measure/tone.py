@@ -170,8 +170,8 @@ def find_curve(
     best, its_own, at = FoundCurve(None, stated=unused), _STRAIGHT, straight
     given = None if stated is None else matched(stated)
     if stated is not None and given is not None:
-        misfit = [_misfit(*one, full_scale) for one in ((stated, given), (_STRAIGHT, straight))]
-        if misfit[0] < _DOUBTFUL * misfit[1]:
+        with_it, without = (_misfit(*one, full_scale) for one in ((stated, given), (_STRAIGHT, straight)))
+        if with_it < _DOUBTFUL * without:
             best, its_own, at = FoundCurve(stated), stated, given
     rest = estimate_gamma(*at, 1.0, full_scale)
     if not rest.certain or abs(rest.gamma - 1) < _LINEAR or not rest.gain < beside:
