@@ -110,7 +110,7 @@ def refusal(words: list[str]) -> str:
     context = command.context_class(command, info_name=command.name)
     try:
         # Values are not converted: the files of an example need not exist. A mention may end with an option.
-        command.make_parser(context).parse_args([word for word in words if word != "--help"] + ["x"])
+        command.make_parser(context).parse_args([word for word in words if word != "--help"] + ["x", "x"])
     except Exception as error:
         return str(getattr(error, "message", error))
     return ""
