@@ -25,7 +25,7 @@ lint: $(VENV)/.test
 
 # The site: guides, mathematics, decisions and the reference of the API, in build/docs; warnings are errors.
 docs: $(VENV)/.docs
-	rm -rf docs/api/generated
+	rm -rf docs/api/generated docs/examples
 	$(BIN)/python -m sphinx -b html -W --keep-going -q -d build/doctrees docs build/docs
 	@echo build/docs/index.html
 

@@ -1,6 +1,5 @@
 """Sphinx: the pages of this folder and the reference of the API, built without a network by `make docs`."""
 
-import json
 import re
 import sys
 import types
@@ -11,8 +10,10 @@ from docutils import nodes
 from latex2mathml.converter import convert
 
 _ROOT = Path(__file__).resolve().parents[1]
-for _folder in ("src", "drivers", "sims"):
+for _folder in ("src", "drivers", "sims", "docs"):
     sys.path.insert(0, str(_ROOT / _folder))
+
+from generated import schemas, write_pages  # noqa: E402
 
 from reseau.core.version import __version__  # noqa: E402
 
@@ -26,8 +27,9 @@ extensions = [
     "sphinx.ext.autosummary",
     "numpydoc",
     "myst_parser",
+    "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["api/_templates"]
+exclude_patterns = ["api/_templates", "gallery"]
 
 templates_path = ["api/_templates"]
 source_suffix = {".rst": "restructuredtext", ".md": "markdown"}
@@ -49,6 +51,24 @@ myst_heading_anchors = 4
 # Names of types in signatures that two packages define, as Frame, are linked to the first.
 suppress_warnings = ["misc.highlighting_failure", "ref.python"]
 keep_warnings = True
+
+# The examples of `gallery` are run, and become the pages of `examples`.
+sphinx_gallery_conf = {
+    "examples_dirs": "gallery",
+    "gallery_dirs": "examples",
+    "filename_pattern": r"\.py$",
+    "subsection_order": [
+        f"gallery/{name}" for name in ("targets", "images", "networks", "uncertainty", "sensors")
+    ],
+    "within_subsection_order": "FileNameSortKey",
+    "nested_sections": False,
+    "image_scrapers": ("themes.scraper",),
+    "reset_modules": ("themes.reset",),
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_signature": False,
+    "min_reported_time": 3600,
+}
 
 html_title = "reseau"
 html_theme = "pydata_sphinx_theme"
@@ -106,15 +126,13 @@ def _display_math(translator: Any, node: nodes.Element) -> None:
     raise nodes.SkipNode
 
 
-def _schemas(app: Any) -> None:
-    """Write the JSON Schema of every document beside the pages."""
-    from reseau.cli.schema import documents
-
+def _generated(app: Any) -> None:
+    """Write the pages that are generated from the program, and the JSON Schemas beside the pages."""
+    write_pages()
     folder = Path(app.outdir) / "schemas"
     folder.mkdir(parents=True, exist_ok=True)
-    for name, kind in documents().items():
-        text = json.dumps(kind.json_schema(), indent=1, ensure_ascii=False)
-        (folder / f"{name.replace('/', '-')}.json").write_text(text + "\n", "utf-8")
+    for name, text in schemas().items():
+        (folder / name).write_text(text, "utf-8")
 
 
 def setup(app: Any) -> None:
@@ -123,4 +141,4 @@ def setup(app: Any) -> None:
     app.connect("autodoc-process-docstring", _magnitudes)
     app.connect("autodoc-process-docstring", _pages)
     app.connect("autodoc-skip-member", _skip)
-    app.connect("builder-inited", _schemas)
+    app.connect("builder-inited", _generated)

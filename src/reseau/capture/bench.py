@@ -22,7 +22,6 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
@@ -36,6 +35,7 @@ from ..core.errors import (
     SettingError,
     UsageError,
 )
+from ..core.plugins import DISCOVERY, INSTRUMENTS, plugin, plugins
 from ..instruments import Camera, Identity, Instrument, Oscilloscope, Turntable, UltrasonicScanner
 from ..io import Document, Strict, read_text
 from ..io.refraction import RefractionEntry
@@ -71,33 +71,8 @@ ROLES: Mapping[str, type] = {
 }
 """What instruments are for a session, by the name of the option that chooses one."""
 
-INSTRUMENTS, DISCOVERY, SIMULATORS = "reseau.instruments", "reseau.discovery", "reseau.simulators"
-"""Groups of entry points: drivers; functions that list addresses; simulated benches."""
 IN_PROCESS = "in this process"
 """Address of a simulated instrument that is part of this process. No other process can use it."""
-
-
-def plugin(group: str, name: str) -> Any:
-    """Load the entry point of an installed package.
-
-    Raises
-    ------
-    UsageError
-        If no entry point has this name, or it cannot be loaded.
-
-    Examples
-    --------
-    >>> callable(plugin("reseau.instruments", "zaber"))
-    True
-    """
-    found = entry_points(group=group, name=name)
-    if not found:
-        known = ", ".join(sorted(each.name for each in entry_points(group=group)))
-        raise UsageError(f"no such entry point of {group}", where=name, do=f"installed: {known or 'none'}")
-    try:
-        return next(iter(found)).load()
-    except (ImportError, AttributeError) as error:
-        raise UsageError(f"cannot be loaded ({error})", where=name) from None
 
 
 def drivers() -> tuple[str, ...]:
@@ -108,7 +83,7 @@ def drivers() -> tuple[str, ...]:
     >>> "zaber" in drivers()
     True
     """
-    return tuple(sorted({each.name for each in entry_points(group=INSTRUMENTS)}))
+    return plugins(INSTRUMENTS)
 
 
 def found_instruments() -> dict[str, tuple[str, ...] | ReseauError]:
@@ -121,11 +96,11 @@ def found_instruments() -> dict[str, tuple[str, ...] | ReseauError]:
     ('/dev/ttyUSB0',)
     """
     found: dict[str, tuple[str, ...] | ReseauError] = {}
-    for each in sorted(entry_points(group=DISCOVERY), key=lambda each: each.name):
+    for name in plugins(DISCOVERY):
         try:
-            found[each.name] = tuple(plugin(DISCOVERY, each.name)())
+            found[name] = tuple(plugin(DISCOVERY, name)())
         except ReseauError as error:
-            found[each.name] = error
+            found[name] = error
     return found
 
 

@@ -37,6 +37,7 @@ __all__ = [
     "nice",
     "over_picture",
     "plane_axes",
+    "set_style",
     "to_bytes",
     "to_svg",
     "typical_pitch",
@@ -75,12 +76,17 @@ _LEVELS, _SPAN = 8, 25.0
 """Number of contours, and largest ratio of their levels."""
 
 
+def set_style() -> None:
+    """Set the common style for all figures that follow, whatever the user's own settings are."""
+    mpl.rcdefaults()
+    mpl.rcParams.update(_STYLE)  # type: ignore[arg-type]
+
+
 @contextmanager
 def drawing() -> Iterator[None]:
-    """Draw figures in the common style, whatever the user's own settings are."""
+    """Draw figures in the common style; the user's own settings return afterwards."""
     with mpl.rc_context():
-        mpl.rcdefaults()
-        mpl.rcParams.update(_STYLE)  # type: ignore[arg-type]
+        set_style()
         yield
 
 

@@ -32,9 +32,10 @@ from ..capture import (
     plugin,
     spread,
 )
-from ..capture.bench import IN_PROCESS, INSTRUMENTS, built
+from ..capture.bench import IN_PROCESS, built
 from ..core.data import Frame
 from ..core.errors import EstimationError, InputError
+from ..core.plugins import INSTRUMENTS
 from ..core.provenance import Provenance, canonical_json, sha256_of
 from ..core.threads import one_thread
 from ..instruments import Instrument

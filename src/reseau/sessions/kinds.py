@@ -12,6 +12,7 @@ from ..capture import Acquisition, BenchFile, Limits, Plan, Procedure, Step, pla
 from ..core.data import Frame
 from ..core.errors import FormatError, UsageError
 from ..core.failure import Failure
+from ..core.plugins import SESSIONS, plugin, plugins
 from ..io import ReseauDesign, parse_design
 from .parameters import (
     BlurredParameters,
@@ -142,7 +143,9 @@ class Reported:
 
 
 def kind_of(plan: str) -> SessionKind:
-    """Return the kind of the sessions of a plan.
+    """Return the kind of the sessions of a plan: of this module, or of an installed package.
+
+    Packages add kinds by entry points of the group ``reseau.sessions``.
 
     Raises
     ------
@@ -154,9 +157,13 @@ def kind_of(plan: str) -> SessionKind:
     >>> kind_of("sensor").parameters.__name__
     'SensorParameters'
     """
-    if plan not in KINDS:
-        raise UsageError("unknown plan", where=plan, do=f"use {', '.join(KINDS)}")
-    return KINDS[plan]
+    if plan in KINDS:
+        return KINDS[plan]
+    added = plugins(SESSIONS)
+    if plan not in added:
+        raise UsageError("unknown plan", where=plan, do=f"use {', '.join([*KINDS, *added])}")
+    found: SessionKind = plugin(SESSIONS, plan)
+    return found
 
 
 def own_plan(text: str, where: object, arguments: Mapping[str, Any] | None = None) -> Callable[..., Plan]:

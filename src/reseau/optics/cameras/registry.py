@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from ...core.data import Array
 from ...core.errors import UsageError
+from ...core.plugins import CAMERAS, plugin, plugins
 from ..mapping import PlaneMapping
 from .grid import PixelGrid
 from .kernels import Kernel
@@ -401,7 +402,7 @@ def additional_models() -> tuple[AdditionalModel, ...]:
 
 
 def camera_model(name: str) -> CameraModel:
-    """A camera model by its name.
+    """A camera model by its name, also of an installed package (group ``reseau.cameras`` of entry points).
 
     Raises
     ------
@@ -418,6 +419,11 @@ def camera_model(name: str) -> CameraModel:
     Traceback (most recent call last):
     reseau.core.errors.UsageError: camera model 'pinhole': is unknown; use one of brown, brown_higher...
     """
+    known = name in _CAMERAS or name in _OTHER_NAMES
+    if not known and _member(name) is None and name in plugins(CAMERAS):
+        added: CameraModel = plugin(CAMERAS, name)
+        if added.name not in _CAMERAS:  # where importing its module has not registered it
+            register_camera(added)
     return _member(name) or _found(_CAMERAS, name, "camera model")
 
 
