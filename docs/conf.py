@@ -74,7 +74,7 @@ html_title = "reseau"
 html_theme = "pydata_sphinx_theme"
 html_theme_options = {
     "show_nav_level": 1,
-    # Of a thousand pages of the reference, those beside the page shown would take a third of the time to build.
+    # Of a thousand pages of the reference, those beside the page shown would take a third of the build.
     "collapse_navigation": True,
     "navigation_with_keys": False,
     "header_links_before_dropdown": 8,
