@@ -385,6 +385,20 @@ def test_something_over_a_part_hides_only_that_part(hidden: tuple[slice, slice])
         assert np.abs(renamed(found, truth)).max() < 0.1
 
 
+@pytest.mark.parametrize("design", [CHESS, CHARUCO, CIRCLES], ids=lambda design: design.kind)
+def test_points_beside_a_reflection_have_the_sigmas_of_their_errors(design: BoardDesign) -> None:
+    frame, truth = picture(design)
+    y, x = np.indices(frame.pixels.shape)
+    light = 300 * np.exp(-((x - 250) ** 2 + (y - 190) ** 2) / (2 * 30**2))
+    pixels = np.clip(np.rint(frame.pixels + light), 0, 255).astype(np.uint8)
+    found = measured(replace(frame, pixels=pixels), design)
+    away = np.hypot(*(truth - [250, 190]).T) > 75
+    inside = ((truth > 8) & (truth < [471, 391])).all(axis=1)
+    assert found.ok[away & inside].all()
+    sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))[found.ok]
+    assert np.abs(renamed(found, truth) / sigma).max() < 4.5
+
+
 @pytest.mark.parametrize("legacy", [False, True])
 def test_old_and_new_layout_differ_with_an_even_number_of_rows(legacy: bool) -> None:
     design = CHARUCO.model_copy(update={"legacy": legacy})
@@ -475,3 +489,15 @@ def test_a_picture_of_another_program_is_measured_to_three_thousandths() -> None
         error = found.xy - np.array(truth[name]["xy"])
         assert found.ok.all()
         assert np.sqrt((error**2).mean()) < 0.003
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="RESEAU_DATA has no independent/boards")
+def test_corners_beside_a_reflection_of_another_program_are_measured() -> None:
+    import json
+
+    truth = np.array(json.loads((DATA / "truth.json").read_text())["charuco_1_specular.png"]["xy"])
+    found = measured(read_image(DATA / "charuco_1_specular.png"), board("charuco", 11, 11, 23.0, size=17.0))
+    # Of the other ten the reflection saturates an edge or the middle.
+    assert found.ok.sum() >= 90
+    sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
+    assert np.abs((found.xy - truth) / sigma)[found.ok].max() < 4.5

@@ -84,6 +84,8 @@ _FORMED_PX = 0.002
 """Standard deviation of what no formed image contains: edges of prints, unequal pixels."""
 _EXPLAINED = 0.7
 """Ratio of residuals below which a curve explains what looked like motion or sharpening."""
+_UNKNOWN_PX = 1.0
+"""Error of a position that nothing bounds; it is more than is accepted."""
 _WHOLE = 0.97
 """Share of the pixels of a mark below which it is seen in part."""
 _BENT_PX = 0.15
@@ -246,7 +248,8 @@ class PlaneMarks(ABC):
             options.psf_px, 0.5, size, self.form_sigma, None, None, options.psf_px, None, None
         )
         self.hidden = np.zeros(screened.grey.shape, dtype=bool)
-        self.dazzled = np.zeros(len(self.at), dtype=bool)
+        self.dazzled = np.zeros(len(self.at), dtype=bool)  # by reflected light
+        self.lit = np.zeros_like(self.dazzled)  # by so little that no pixels are lost
         self.notes: tuple[Remark, ...] = ()
         self.displaced: tuple[Chain, ...] = ()
         self.learning = True
@@ -300,8 +303,7 @@ class PlaneMarks(ABC):
         doubtful, field = self._doubtful(rows, found)
         if doubtful.any() and field is not None and (~doubtful & ~self.dazzled[rows]).sum() >= _NEIGHBOURS:
             # Look again where their neighbours predict them, without what lies in front of them.
-            self._uncover(rows, found, doubtful, field)
-            found = replaced(found, ~doubtful, self._match_all(rows[doubtful]))
+            found = self._uncovered(rows, found, doubtful, field)
         alike = with_alike_errors(found, np.rint(self.start[rows]) if self.even else None)
         found = self._tempered(rows, found, alike) if self.even else alike
         if self.precise_start:
@@ -309,6 +311,25 @@ class PlaneMarks(ABC):
         found = replace(found, cov=found.cov + self._misformed(rows))
         why, field = self._judged(rows, found, field)
         return self._spread(rows, found, why, field, with_field)
+
+    def _uncovered(self, rows: Rows, found: Matches, doubtful: Mask, field: SmoothField) -> Matches:
+        """Matches of which the doubtful ones are made without what lies in front of them.
+
+        A reflection adds light that neighbours do not have, and so seems to hide marks beside it. It is
+        smooth: a mark that was matched without an objection, and of which then too little is left, keeps
+        its first match.
+        """
+        good, start = np.all([~mask for mask, _ in self._objections(rows, found)], axis=0), self.start.copy()
+        self._uncover(rows, found, doubtful, field)
+        again = self._match_all(rows[doubtful])
+        if self.precise_start:
+            hidden = {Code.HIDDEN, Code.NOT_CONVERGED, Code.UNCERTAIN}
+            lost = [mask for mask, why in self._objections(rows[doubtful], again) if why.code in hidden]
+            lit = good[doubtful] & np.any(lost, axis=0)
+            those = rows[doubtful][lit]
+            self.lit[those], self.start[those] = True, start[those]
+            again = replaced(again, ~lit, found.select(np.flatnonzero(doubtful)[lit]))
+        return replaced(found, ~doubtful, again)
 
     def _mapped(self, rows: Rows, found: Matches, sure: Mask) -> Matches:
         """Matches with the mapping through the marks that are `sure`, which itself depends on the matches."""
@@ -406,21 +427,27 @@ class PlaneMarks(ABC):
         return np.flatnonzero(inside)
 
     def _with_doubtful_light(self, rows: Rows, found: Matches) -> Matches:
-        """Matches with covariances that contain what a plainer background would change.
+        """Matches with covariances that contain what another background would change.
 
         Where a part of a window is saturated or hidden, it is no longer symmetric about its mark, and errors
-        of the background shift the position.
+        of the background shift the position, as those of a reflection do.
         """
         used = np.isfinite(found.residuals).sum(axis=(1, 2))
-        partly = found.converged & (used < _WHOLE * self.own_px[rows])
+        partly = found.converged & ((used < _WHOLE * self.own_px[rows]) | self.lit[rows])
         if not partly.any():
             return found
-        plain = self._match(rows[partly], background=1)
-        change = np.where(plain.converged[:, None], plain.xy - found.xy[partly], 0.0)
         cov = found.cov.copy()
-        cov[partly] += change[:, :, None] * change[:, None, :]
-        # The change shows the size of the error, not its direction.
-        cov[partly] += 0.5 * (change**2).sum(axis=1)[:, None, None] * np.eye(2)
+        # What a parabola leaves of reflected light is seen by a cubic, too.
+        for some, background in ((partly, 1), (partly & self.lit[rows], 3)):
+            if not some.any():
+                continue
+            other = self._match(rows[some], background=background)
+            # Light that another background cannot describe has no known influence.
+            unknown = np.where(self.lit[rows[some]], _UNKNOWN_PX, 0.0)[:, None]
+            change = np.where(other.converged[:, None], other.xy - found.xy[some], unknown)
+            cov[some] += change[:, :, None] * change[:, None, :]
+            # The change shows the size of the error, not its direction.
+            cov[some] += 0.5 * (change**2).sum(axis=1)[:, None, None] * np.eye(2)
         return replace(found, cov=cov)
 
     def _tempered(self, rows: Rows, plain: Matches, alike: Matches) -> Matches:
