@@ -109,7 +109,8 @@ def part_bundle(kinds: Sequence[str], sizes: Sequence[int], memory_gb: float | N
                 words += [] if memory_gb is None else ["--memory", str(memory_gb)]
                 run = subprocess.run(words, capture_output=True, text=True, timeout=LONGEST_S, check=False)
                 if run.returncode:
-                    print(f"{kind} {images}: {run.stderr.strip().splitlines()[-1:]}", flush=True)
+                    said_last = run.stderr.strip().splitlines()[-1:] or [f"ended by signal {-run.returncode}"]
+                    print(f"{kind} {images}: {said_last[0]}", flush=True)
                     continue
                 mine = json.loads(run.stdout)
                 print(f"{kind} {said(mine)}", flush=True)

@@ -10,6 +10,7 @@ import pytest
 from reseau.adjust import variance_components
 from reseau.bundle import (
     BundleFit,
+    BundleProblem,
     Network,
     Options,
     Result,
@@ -104,7 +105,7 @@ def test_unnecessary_parameters_are_dropped_and_necessary_ones_kept() -> None:
     assert reduced < full
 
 
-def test_an_undetermined_camera_is_named() -> None:
+def undetermined_camera() -> BundleProblem:
     """Affinity B1 and the principal distance with the scale of y are one and the same in one view only."""
     cam = networks.camera(free=("c", "K1"))
     world = networks.world(images=4, points=20, cameras=(cam,), control=20)
@@ -121,10 +122,22 @@ def test_an_undetermined_camera_is_named() -> None:
         flat, cameras=(centred,), xyz=ring, xy=xy, image_of=np.repeat(np.arange(4), 20),
         point_of=np.tile(np.arange(20), 4), cov=np.tile(np.eye(2), (80, 1, 1)),
     )  # fmt: skip
-    fit = networks.World(network, rotation, x0, ring).problem().adjusted()
+    return networks.World(network, rotation, x0, ring).problem()
+
+
+def test_an_undetermined_camera_is_named() -> None:
+    fit = undetermined_camera().adjusted()
     assert not isinstance(fit, BundleFit)
     assert "rank defect" in fit.reason
     assert "K1 of camera cam" in fit.reason
+
+
+def test_nothing_is_named_where_the_full_matrix_exceeds_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("reseau.bundle.solver.problem._FULL_COPIES", 10**8)
+    fit = replace(undetermined_camera(), memory=1e9).adjusted()
+    assert isinstance(fit, Failure)
+    assert fit.code is Code.SINGULAR
+    assert "With more memory" in fit.reason
 
 
 def _centred(values: np.ndarray) -> np.ndarray:

@@ -55,9 +55,12 @@ LAST_ROUND = 12
 _BEFORE_WINDOWS, _ROUGHLY = 30, 1e-2
 # Relative standard deviation of a scale above which covariances of first order say nothing about it.
 _LOOSE = 0.2
-# What is wrong where conjugate gradients do not reach their accuracy at the estimates.
+# Copies of the full matrix in memory while its eigenvectors are computed.
+_FULL_COPIES = 6
+# What is wrong where conjugate gradients do not reach their accuracy at the estimates, or where the matrix is
+# singular and there is no memory to name the unknowns.
 _WEAK = (
-    "the observations determine the images too weakly for conjugate gradients, or not at all: are all of "
+    "the observations determine the images too weakly for the normal equations, or not at all: are all of "
     "them connected? With more memory for the normal equations the unknowns would be named"
 )
 # Iterations after which poorly determined points of an adjustment that has not converged are left out.
@@ -476,7 +479,9 @@ class _Run:
                 left = self._without(weak, values)
                 left.start.x0[images] = np.nan
                 return left._adjusted(self.options)
-            if self.system.iterative:
+            # The names follow from the eigenvectors of the full matrix.
+            needed = 8 * _FULL_COPIES * self.unknowns.size**2
+            if self.system.iterative or needed > problem.limit:
                 return AdjustmentFailure(_WEAK, Code.SINGULAR, iterations=found.iterations, costs=found.costs)
             return undetermined(linear, freedom, tuple(found.costs))
         sigma0 = float(np.sqrt(linear.cost / redundancy)) if redundancy > 0 else 1.0
