@@ -2,7 +2,7 @@
 
     python benchmarks/scale.py --part cluster [--images 5000]
     python benchmarks/scale.py --part bundle [--sizes 50 160 500 1600 5000] [--memory GB]
-    python benchmarks/scale.py --part costs [--frames 10000 100000 1000000]
+    python benchmarks/scale.py --part costs [--frames 10000 100000 1000000] [--database URL]
 
 `cluster` starts a Dask scheduler and two workers on this machine, and a client that measures images of a
 testfield through a shared store. At a quarter of the images one worker is killed with -9, at a half the
@@ -276,6 +276,7 @@ def main() -> None:
     parser.add_argument("--part", choices=("cluster", "client", "bundle", "costs"), required=True)
     parser.add_argument("--images", type=int, default=5000)
     parser.add_argument("--frames", nargs="+", type=int, default=[10_000, 100_000, 1_000_000])
+    parser.add_argument("--database", default="", help="URL of an empty database for the index")
     parser.add_argument("--kinds", nargs="+", choices=("ladybug", "venice"), default=["ladybug", "venice"])
     parser.add_argument("--sizes", nargs="+", type=int, default=[50, 160, 500, 1600, 5000])
     parser.add_argument("--memory", type=float, help="GB that normal equations may take")
@@ -295,7 +296,7 @@ def main() -> None:
     elif given.part == "costs":
         from scale_costs import part_costs
 
-        part_costs(given.frames)
+        part_costs(given.frames, given.database)
     else:
         part_cluster(given.images)
 

@@ -13,10 +13,13 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import psutil
 import sqlalchemy as sa
@@ -24,13 +27,39 @@ from benchmarks import scale
 
 from reseau.archive import Archive, schema
 from reseau.archive.objects import LocalObjects
-from reseau.execution import executor_at
+from reseau.execution import Outputs, executor_at
+from reseau.io import PhotographPoints
+from reseau.procedures.exposures import photograph_reader, photographs_of
+from reseau.procedures.target_measurement import measured_in_order, measurer_of
 
 __all__ = ["part_costs"]
 
 FRAMES_OF_A_SESSION = 36
 FILES = 20_000
 JOBS = 4000
+PHOTOGRAPHS = 40
+
+
+@dataclass(frozen=True)
+class Place:
+    """An archive in a folder, with its index there or in a database."""
+
+    folder: Path
+    url: str = ""
+
+    def opened(self, *, create: bool = False) -> Archive:
+        if self.url:
+            return Archive.open(self.url, objects=str(self.folder), create=create)
+        return Archive.open(self.folder, create=create)
+
+    def bytes_of_index(self) -> int:
+        """Size of the index, with up-to-date statistics of its tables."""
+        if not self.url:
+            return sum(path.stat().st_size for path in self.folder.glob("index*"))
+        with sa.create_engine(self.url, isolation_level="AUTOCOMMIT").connect() as connection:
+            connection.execute(sa.text("ANALYZE"))
+            sizes = "SELECT sum(pg_total_relation_size(relid)) FROM pg_stat_user_tables"
+            return int(connection.execute(sa.text(sizes)).scalar_one())
 
 
 def spent_ms(work: Callable[[], object], times: int = 5) -> float:
@@ -43,8 +72,8 @@ def spent_ms(work: Callable[[], object], times: int = 5) -> float:
     return median(taken)
 
 
-def filled(folder: Path, frames: int) -> None:
-    """An archive with sessions as a bench stores them, without their files."""
+def filled(place: Place, frames: int) -> None:
+    """Fill an archive with sessions as a bench stores them, without their files."""
     at, count = datetime(2026, 3, 2, tzinfo=UTC), frames // FRAMES_OF_A_SESSION
     numbers = range(1, count + 1)
     position = {"tilt": 45.0, "roll": 90.0, "camera_roll": 180.0}
@@ -71,26 +100,26 @@ def filled(folder: Path, frames: int) -> None:
             for k in numbers for name in ("calibration.json", "report.html")
         ),
     }  # fmt: skip
-    with Archive.open(folder, create=True) as archive, archive._engine.begin() as connection:
+    with place.opened(create=True) as archive, archive._engine.begin() as connection:
         for table, each in rows.items():
             while part := list(islice(each, 5000)):
                 connection.execute(sa.insert(table), part)
 
 
-def index(frames: int) -> None:
+def index(frames: int, url: str = "") -> None:
     """Print size and times of an index."""
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name) / "archive"
-        filled(folder, frames)
-        size = sum(path.stat().st_size for path in folder.glob("index*"))
-        with Archive.open(folder) as archive:
+        place = Place(Path(name) / "archive", url)
+        filled(place, frames)
+        size = place.bytes_of_index()
+        with place.opened() as archive:
             sessions = len(archive.sessions())
             wanted = f"session {sessions // 2}"
             found = archive.session(wanted)
             fresh = archive.begin("one more", "testfield", {})
             steps = iter(f"{k:05}" for k in range(100))
-            rows = {
-                "opening": lambda: Archive.open(folder).close(),
+            rows: dict[str, Callable[[], object]] = {
+                "opening": lambda: place.opened().close(),
                 "all sessions": archive.sessions,
                 "one session": lambda: archive.session(wanted),
                 "its frames": found.frames,
@@ -113,6 +142,38 @@ def store() -> None:
         print(
             f"store of {FILES} small files: writing one {1e3 * put / FILES:.2f} ms, listing "
             f"{1e3 * listing / FILES:.1f} µs a file"
+        )
+
+
+def photographs() -> None:
+    """Print what a photograph costs on its way through the store, besides measuring it."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "images").mkdir()
+        scale.render(folder / "images", PHOTOGRAPHS)
+        files = [(path.name, path) for path in sorted((folder / "images").glob("*.png"))]
+        place, spent = str(folder / "store"), list[float]()
+        outputs = Outputs(place, {"compute": "points of a target"})
+
+        def timed(each: Callable[[], list[Any]]) -> list[Any]:
+            began = time.process_time()
+            found = each()
+            spent.append(1e3 * (time.process_time() - began) / PHOTOGRAPHS)
+            return found
+
+        sent = timed(lambda: list(photographs_of(files, photograph_reader(), store=place)[1]))
+        measure = measurer_of(scale.BENCH.design)
+        found = [each.found for each in measured_in_order(sent, measure)]
+        texts = timed(lambda: [PhotographPoints.of(each).to_json().encode() for each in found])
+        pairs = list(zip(sent, texts, strict=True))
+        keys = timed(lambda: [outputs.made(each.inputs, partial(bytes, text)) for each, text in pairs])
+        back = timed(lambda: [PhotographPoints.parse(outputs.read(key).decode(), where="") for key in keys])
+        assert len(back) == PHOTOGRAPHS
+        print(
+            "a photograph of {:.0f} kB, points of {:.0f} kB: copied to the store {:.2f} ms (client), "
+            "points as text {:.2f} ms and kept {:.2f} ms (worker), read {:.2f} ms (client)".format(
+                files[0][1].stat().st_size / 1e3, len(texts[0]) / 1e3, *spent
+            )
         )
 
 
@@ -149,9 +210,13 @@ def jobs() -> None:
         )
 
 
-def part_costs(frames: Sequence[int]) -> None:
-    """Print the costs."""
+def part_costs(frames: Sequence[int], url: str = "") -> None:
+    """Print the costs; with the URL of an empty database, those of an index there only."""
+    if url:
+        index(frames[0], url)
+        return
     jobs()
+    photographs()
     store()
     for count in frames:
         index(count)
