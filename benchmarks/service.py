@@ -2,6 +2,7 @@
 
     python benchmarks/service.py --part load [--minutes 10] [--clients 200] [--rate 50] [--frames 0]
     python benchmarks/service.py --part sessions [--sessions 10000]
+    python benchmarks/service.py --part stop [--trials 50]
     python benchmarks/service.py --part scan [--minutes 10] [--tools testssl,wapiti,slowhttptest]
 
 `load` starts `reseau serve` with a bench whose camera has a clock of its own: a frame each half second, and
@@ -9,12 +10,17 @@ whoever asks too late misses one. A session takes them all, while 200 clients re
 requests arrive at a constant rate, whether earlier ones are answered or not. A frame is lost if its number is
 missing in the archive, and late if it is stored after the next one is due. The time of a request counts from
 the moment at which it was due. Clients check that no event is missing or repeated. The memory of service
-and worker (what is resident) is flat if the straight line through the second half of the run rises by less
-than 1 MB. With `--frames` the session has so many frames already, as after hours.
+and worker (what is resident, without pages of files) is flat if the straight line through the second half of
+the run rises by less than 1 MB. With `--frames` the session has so many frames already, as after hours.
 
 `sessions` fills an archive as after years: sessions with frames and results, configurations with decisions,
 an audit log. It takes the time and the processor time of pages and operations: at first at most 1 s each,
 then 0.1 s.
+
+`stop` moves an axis of the simulated bench, and stops it: by the API, and by a click in Chromium (Debian:
+`chromium chromium-driver`). It takes the time from the request, or from the event of the click, until the
+motor of the simulated controller stands: at most 100 ms. Another movement waits each time, and must not be
+carried out.
 
 `scan` starts the service with TLS and a user, and has others look for its weaknesses (Debian: `testssl.sh
 bind9-dnsutils wapiti slowhttptest`): testssl.sh at the protocol, wapiti, logged in, at all pages and at the
@@ -39,7 +45,8 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -169,7 +176,9 @@ class Load:
         """Note time (s) and the memory of processes (MB), each ten seconds."""
         while True:
             for name, process in processes.items():
-                now = time.monotonic(), process.memory_info().rss / 1e6
+                used = process.memory_info()
+                # Pages of files, such as libraries, come and go with what other processes need.
+                now = time.monotonic(), (used.rss - getattr(used, "shared", 0)) / 1e6
                 found.setdefault(name, []).append(now)
             await asyncio.sleep(10.0)
 
@@ -388,6 +397,98 @@ def sessions(count: int) -> int:
     return 0 if kept else 1
 
 
+STOP_S = 0.1
+"""Time from a click until the motor stands, at most."""
+
+
+def stop(trials: int) -> int:
+    """Print how long a stop takes until the motor stands; return 1 if it is too long, or not obeyed."""
+    from tests.service.http.browser import chromium
+    from tests.service.http.driver import bench_of, install
+
+    from reseau_sims.serving.bench import SimulatedBench
+    from reseau_sims.serving.motion import Motor
+
+    stood = list[float]()
+    halt = Motor.stop
+
+    def noted(motor: Motor) -> None:
+        moved = motor.moving
+        halt(motor)
+        if moved:
+            stood.append(time.time())
+
+    Motor.stop = noted  # type: ignore[method-assign]
+    draw, obeyed = random.Random(1), True
+    with tempfile.TemporaryDirectory() as name, SimulatedBench(seed=3) as sim:
+        folder = Path(name)
+        (folder / "bench.toml").write_text(bench_of(sim.toml))
+        install(folder / "drivers")
+        with serving(folder, "--bench", "bench.toml") as (port, token, _):
+            base, mine = f"http://127.0.0.1:{port}", {"Authorization": f"Bearer {token}"}
+            bench = f"{base}/api/1/benches/cellar"
+            with httpx.Client(headers=mine, timeout=60) as http, ThreadPoolExecutor(2) as pool:
+                while http.get(bench).json()["state"] != "ready":
+                    time.sleep(0.1)
+                for axis in ("tilt", "roll", "camera_roll"):
+                    http.post(f"{bench}/home", json={"axis": axis}).raise_for_status()
+                low, high = http.get(f"{bench}/axes").json()["tilt"]["limits"]
+                middle = (low + high) / 2
+
+                def move(position: float) -> int:
+                    given = {"axis": "tilt", "position": position}
+                    return httpx.post(f"{bench}/move", json=given, headers=mine, timeout=60).status_code
+
+                def taken(press: Callable[[], float]) -> float:
+                    """Seconds from a press until the motor stands."""
+                    nonlocal obeyed
+                    moves = [pool.submit(move, high if sim.laboratory.axes["tilt"] < middle else low)]
+                    while not http.get(bench).json()["moving"]:
+                        if moves[0].done():
+                            raise SystemExit(f"the axis does not move: status {moves[0].result()}")
+                        time.sleep(0.01)
+                    moves.append(pool.submit(move, middle))
+                    time.sleep(draw.uniform(0.1, 0.6))
+                    stood.clear()
+                    pressed = press()
+                    obeyed &= [each.result() for each in moves] == [409, 409]
+                    at = sim.laboratory.axes["tilt"]
+                    time.sleep(0.2)
+                    obeyed &= len(stood) > 0 and at == sim.laboratory.axes["tilt"]
+                    return stood[0] - pressed if stood else float("inf")
+
+                def asked() -> float:
+                    now = time.time()
+                    http.post(f"{bench}/stop").raise_for_status()
+                    return now
+
+                found = {"by the API": [taken(asked) for _ in range(trials)]}
+                if shutil.which("chromium") and shutil.which("chromedriver"):
+                    with chromium() as browser:
+                        program = [sys.executable, "-c", "from reseau.cli import main; main()"]
+                        link = [*program, "service", "link", "--port", str(port)]
+                        browser.open(subprocess.check_output(link, cwd=folder, text=True).strip())
+                        browser.open(f"{base}/benches/cellar")
+                        browser.until("ready")
+                        browser.run("addEventListener('click', () => { window.pressed = Date.now(); }, true)")
+
+                        def clicked() -> float:
+                            browser.click("button.stop")
+                            return float(browser.run("return window.pressed")) / 1e3
+
+                        found["by a click"] = [taken(clicked) for _ in range(trials)]
+                else:
+                    print("no click: needs chromium and chromedriver")
+    Motor.stop = halt  # type: ignore[method-assign]
+    for way, seconds in found.items():
+        milliseconds = sorted(1e3 * each for each in seconds)
+        print(f"{way:12} {trials} stops: median {statistics.median(milliseconds):.0f} ms, "
+              f"longest {milliseconds[-1]:.0f} ms")  # fmt: skip
+    kept = obeyed and max(max(each) for each in found.values()) < STOP_S
+    print("kept" if kept else "NOT KEPT" if obeyed else "NOT KEPT: a movement was carried out after a stop")
+    return 0 if kept else 1
+
+
 STREAMS = ("/api/1/events", "/api/1/documents")
 MODULES = (
     "backup,blindsql,cookieflags,crlf,csp,csrf,exec,file,htaccess,http_headers,methods,permanentxss,redirect,"
@@ -505,16 +606,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--part", choices=("load", "sessions", "scan"), required=True)
+    parser.add_argument("--part", choices=("load", "sessions", "stop", "scan"), required=True)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--clients", type=int, default=200)
     parser.add_argument("--rate", type=float, default=50.0)
     parser.add_argument("--frames", type=int, default=0)
     parser.add_argument("--sessions", type=int, default=10_000)
+    parser.add_argument("--trials", type=int, default=50)
     parser.add_argument("--tools", default="testssl,wapiti,slowhttptest")
     given = parser.parse_args()
     if given.part == "load":
         raise SystemExit(load(given.minutes, given.clients, given.rate, given.frames))
+    if given.part == "stop":
+        raise SystemExit(stop(given.trials))
     if given.part == "scan":
         raise SystemExit(scan(given.minutes, given.tools.split(",")))
     raise SystemExit(sessions(given.sessions))

@@ -116,17 +116,33 @@ class BenchLink:
             return _EMPTY | self._status | more | {"name": self.name, "moving": ""}
         return _EMPTY | {"name": self.name} | self._status
 
-    def request(self, do: str, given: dict[str, Any] | None = None, seconds: float = 15.0) -> Any:
+    def request(
+        self, do: str, given: dict[str, Any] | None = None, seconds: float = 15.0, at: float | None = None
+    ) -> Any:
         """Have the worker do something, and return the value that it answers.
+
+        Parameters
+        ----------
+        do : str
+            Name of the command.
+        given : dict, optional
+            Its arguments.
+        seconds : float
+            How long the answer may take.
+        at : float, optional
+            When it was asked for (`time.monotonic`); now by default. What was asked for before a stop is not
+            done after it.
 
         Raises
         ------
         ReseauError
             As the worker answers, or if it does not.
         """
-        return self.asked(do, given, seconds)[0]
+        return self.asked(do, given, seconds, at)[0]
 
-    def asked(self, do: str, given: dict[str, Any] | None = None, seconds: float = 15.0) -> tuple[Any, bytes]:
+    def asked(
+        self, do: str, given: dict[str, Any] | None = None, seconds: float = 15.0, at: float | None = None
+    ) -> tuple[Any, bytes]:
         """As :meth:`request`, with the bytes of the answer."""
         wire = self._wire
         if wire is None:
@@ -138,7 +154,8 @@ class BenchLink:
             number = next(self._numbers)
             self._waiting[number] = answer
         try:
-            wire.send({"id": number, "do": do, "given": given or {}})
+            when = time.monotonic() if at is None else at
+            wire.send({"id": number, "do": do, "given": given or {}, "at": when})
             return answer.result(seconds)
         except FutureTimeout:
             raise DeadlineError(f"did not answer within {seconds:g} s", where=f"bench {self.name}") from None

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import json
+import math
 import os
 import queue
 import signal
@@ -41,6 +42,8 @@ _STEADY_S = 0.1
 """Time between live pictures, at least."""
 _FOLLOW_S = 0.25
 """Time between looks at axes that move."""
+_ASIDE = frozenset({"status", "bench", "settings", "axes", "picture", "pause", "abort", "end", "release"})
+"""Commands that set nothing into motion."""
 _ALONE_S = 600.0
 """Time after which the worker of a service ends that has gone, when no session runs."""
 
@@ -467,19 +470,28 @@ class Worker:
     # Threads.
 
     def read(self, wire: Wire) -> None:
-        """Serve one connection until it ends."""
+        """Serve one connection until it ends.
+
+        What was asked for before a stop, and arrives after it, is not done.
+        """
         self._wires.add(wire)
+        stopped = -math.inf
         try:
             while True:
                 request, _ = wire.receive()
+                do, at = str(request.get("do")), request.get("at")
                 try:
+                    if do == "stop":
+                        stopped = stopped if at is None else max(stopped, float(at))
+                    elif at is not None and at < stopped and do not in _ASIDE:
+                        raise StateError("was stopped", where=do)
                     done, value, body = self._at_once(request)
                     if done:
                         wire.send({"id": request.get("id"), "value": value}, body)
                     else:
                         self._commands.put((wire, request))
                 except Exception as error:
-                    known = _known(error, str(request.get("do")))
+                    known = _known(error, do)
                     wire.send({"id": request.get("id"), "error": to_error(known)})
         except ReseauError:
             pass

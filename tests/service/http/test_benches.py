@@ -140,6 +140,40 @@ def test_a_stop_acts_at_once_and_is_not_queued(one: Served, rig: Rig) -> None:
     assert client.post(f"{BENCH}/move", json={"axis": "tilt", "position": 0.0}).status_code == 200
 
 
+def test_what_was_asked_for_before_a_stop_is_not_done_after_it(
+    one: Served, rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import threading
+
+    asked, stopped, record = threading.Event(), threading.Event(), one.service.audit.record
+
+    def slow(by: str, via: str, action: str, *more: Any) -> Any:
+        if action == "move":  # a stop does not wait for records, and overtakes the movement here
+            asked.set()
+            stopped.wait(60)
+        return record(by, via, action, *more)
+
+    answers = []
+    at = rig.position()
+
+    def move() -> None:
+        given = {"axis": "tilt", "position": at + 3.0}
+        answers.append(one.client("operate").post(f"{BENCH}/move", json=given))
+
+    monkeypatch.setattr(one.service.audit, "record", slow)
+    thread = threading.Thread(target=move)
+    thread.start()
+    assert asked.wait(60)
+    assert one.client("operate").post(f"{BENCH}/stop").status_code == 200
+    stopped.set()
+    thread.join(60)
+    assert answers[0].status_code == 409
+    assert answers[0].json()["error"]["text"].endswith("was stopped")
+    assert rig.position() == at
+    moved = one.client("operate").post(f"{BENCH}/move", json={"axis": "tilt", "position": at + 1.0})
+    assert moved.status_code == 200, moved.text
+
+
 def test_settings_have_units_and_limits_of_the_bench(one: Served) -> None:
     client = one.client("operate")
     rows = client.get(f"{BENCH}/settings").json()["camera"]

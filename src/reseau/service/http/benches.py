@@ -11,6 +11,7 @@ from pydantic import ConfigDict, Field
 from ..accounts import Principal
 from .access import Here, NotFound, Operating, Reading, operating
 from .answers import Answer, refusals
+from .guard import ARRIVED
 from .service import Service
 from .sessions import new_name
 
@@ -213,7 +214,7 @@ def _asked(
     link = the_bench(service, name)
     facts = {k: v for k, v in (given or {}).items() if k not in ("inputs", "parameters", "by")}
     with service.audited(who, action, f"bench {name}", facts):
-        return link.request(do, given, seconds)
+        return link.request(do, given, seconds, ARRIVED.get())
 
 
 @router.get("/benches")
@@ -232,12 +233,14 @@ def bench_(bench: BenchName, who: Reading, service: Here) -> BenchAnswer:
 async def stop(bench: BenchName, request: Request, service: Here) -> Stopped:
     """Stop everything that moves or transmits; a session pauses. It is no emergency stop."""
 
+    arrived = ARRIVED.get()
+
     # Neither the threads of other requests nor the commands of the bench are waited for.
     def at_once() -> Stopped:
         who = operating(request)
         link = the_bench(service, bench)
         try:
-            value = link.request("stop", seconds=5.0)
+            value = link.request("stop", seconds=5.0, at=arrived)
         finally:
             service.record_later(who, "stop", f"bench {bench}")
         return Stopped(ms=value["ms"])

@@ -13,6 +13,7 @@ import logging
 import secrets
 import time
 from collections.abc import Awaitable, Callable, MutableMapping
+from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Any
 
@@ -21,13 +22,15 @@ from starlette.exceptions import HTTPException
 
 from .options import ServeOptions
 
-__all__ = ["Guard", "Meters", "log"]
+__all__ = ["ARRIVED", "Guard", "Meters", "log"]
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 
 _LOG = logging.getLogger("reseau.service")
+ARRIVED: ContextVar[float] = ContextVar("arrived")
+"""When the present request arrived (`time.monotonic`), however long it waits for a thread or a record."""
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
     "manifest-src 'self'; frame-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
@@ -142,6 +145,7 @@ class Guard:
             await receive()
             await send({"type": "websocket.close", "code": 1008})
             return
+        ARRIVED.set(time.monotonic())
         headers = {k.decode("latin-1"): v.decode("latin-1") for k, v in scope["headers"]}
         hosts = [v for k, v in scope["headers"] if k == b"host"]
         request, begun = secrets.token_hex(4), time.perf_counter()
