@@ -80,6 +80,8 @@ html_theme_options = {
     "header_links_before_dropdown": 8,
     "secondary_sidebar_items": ["page-toc"],
 }
+# A section of one page has no pages beside it.
+html_sidebars: dict[str, list[str]] = {"conventions": []}
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_show_sourcelink = False
