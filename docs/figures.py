@@ -1,7 +1,7 @@
-"""Draws `docs/images/calibration.png`: python docs/figures.py.
+"""Draws `docs/images/calibration.png`, and `calibration-dark.png` for dark pages: python docs/figures.py.
 
 With the folder of the tour of a camera (docs/tours/camera.md), whose commands were followed, it draws
-`docs/images/tour-camera.png` in its place: python docs/figures.py FOLDER
+`docs/images/tour-camera.png` and its dark one in its place: python docs/figures.py FOLDER
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from themes import save
 
 import reseau
 from reseau.core.figures import drawing
@@ -39,12 +40,12 @@ def tour(folder: Path) -> None:
     from matplotlib.figure import Figure
 
     with drawing():
-        figure = Figure(figsize=(9.0, 3.2), layout="constrained", facecolor="white")
+        figure = Figure(figsize=(9.0, 3.2), layout="constrained")
         for axes, name in zip(figure.subplots(1, 2), ("photos", "flat"), strict=True):
             axes.imshow(reseau.read_image(folder / name / "10.png").pixels, cmap="gray", vmin=0, vmax=255)
             axes.set_title(f"{name}/10.png", loc="left")
             axes.set_axis_off()
-        figure.savefig(IMAGES / "tour-camera.png", dpi=110, metadata={"Software": None})
+        save(figure, IMAGES / "tour-camera.png")
 
 
 def main() -> None:
@@ -60,10 +61,8 @@ def main() -> None:
         shown = max(range(len(frames)), key=lambda k: len(calibrated.measured.get(frames[k].name, ())))
         panels = calibrated.plot(frames[shown])
         panels[0].set_title(f"measured: {len(calibrated.measured[frames[shown].name])} targets", loc="left")
-        figure = panels[0].figure
-        figure.set_facecolor("white")
         path = IMAGES / "calibration.png"
-        figure.savefig(path, dpi=110, metadata={"Software": None})
+        save(panels[0].figure, path)
     print(calibrated, path)
     assert np.isfinite(calibrated.sigma0)
 
