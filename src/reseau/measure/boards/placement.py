@@ -416,13 +416,13 @@ def lay_marked(
     """
     shape = (grey.shape[0], grey.shape[1])
     corners, numbers = markers
-    own, at = design.markers
+    own, places = design.markers
     row_of = {int(number): k for k, number in enumerate(own)}
     keep = np.array([int(number) in row_of for number in numbers], dtype=bool)
     if not keep.any():
         return Failure("no marker of the board was read", Code.NOT_FOUND)
     corners, rows = corners[keep], np.array([row_of[int(number)] for number in numbers[keep]])
-    plane, image = at[rows].reshape(-1, 2) / design.pitch, corners.reshape(-1, 2)
+    plane, image = places[rows].reshape(-1, 2) / design.pitch, corners.reshape(-1, 2)
     matrix, good = _plane_of_markers(plane, image, shape)
     if matrix is None or good.sum() < 4:
         return Failure("the markers read do not agree with the board", Code.INCONSISTENT)
@@ -467,12 +467,13 @@ def lay_marked(
         through_lens |= same
         both = np.concatenate([nodes[known], nodes[known], plane[use]])
         there = np.concatenate([start[known], start[known], image[use]])
-        sigma = np.repeat([np.sqrt(2) * SADDLE_PX, _MARKER_PX], [2 * known.sum(), use.sum()])
         if known.sum() >= _FEWEST and known.sum() > 0.5 * len(rows):
-            both, there, sigma = nodes[known], start[known], np.full(known.sum(), SADDLE_PX)
+            both, there = nodes[known], start[known]
         mapping = through(both, there, shape)
-        if through_lens and len(both) >= LENS_FROM:
-            lens = lens_through(both, there, sigma, shape, mapping)
+        if through_lens:
+            at, seen = np.concatenate([nodes[known], plane[use]]), np.concatenate([start[known], image[use]])
+            sigma = np.repeat([SADDLE_PX, _MARKER_PX], [known.sum(), use.sum()])
+            lens = lens_through(at, seen, sigma, shape, mapping) if len(at) >= LENS_FROM else None
             mapping = mapping if lens is None else lens.mapping
     if known.sum() < 4:
         return failed(int(known.sum()), "corners beside the markers read")
