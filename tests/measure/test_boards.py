@@ -242,6 +242,21 @@ def test_corners_of_a_deltille_are_measured_to_their_sigmas_and_named(
     assert isinstance(chess, Failure)
 
 
+@pytest.mark.parametrize(("k", "least"), [(0, 65), (1, 22)])
+def test_a_deltille_seen_at_60_degrees_is_numbered(k: int, least: int) -> None:
+    """The directions of its edges are then too uneven for what finds corners seen from the front."""
+    _, place = pose(90 + k, DELTILLE_PRINT, nearer=1.2)
+    tilt = cv2.Rodrigues(np.deg2rad(60) * np.array([np.cos(k), np.sin(k), 0.0]))[0]
+    view = View(DELTILLE_PRINT, tilt @ np.diag([1.0, -1, -1]), place, seed=940 + k)
+    found = measured(Frame(view.picture(), 255.0, "steep"), DELTILLE)
+    assert found.found >= least
+    assert not [note for note in found.notes if note.code is Code.AMBIGUOUS]
+    error = (found.xy - view.truth)[found.ok]
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert np.sqrt((error**2).mean()) < 0.006
+    assert 0.7 < np.sqrt(((error / sigma) ** 2).mean()) < 1.3
+
+
 DOTS = ((3, 3), (3, 4), (4, 4))
 DOTTED = board("chess", 10, 8, 22.0, dots=DOTS)
 PUZZLE = board("puzzle", 10, 8, 22.0, start=(100, 7))

@@ -13,6 +13,7 @@ camera calibration, ICCV 2017.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
@@ -28,7 +29,7 @@ from ..testfield.lattice_mapping import images_of
 from .candidates import first_mapping, grown_through
 from .placement import Placed, cost_of, failed, numbered
 
-__all__ = ["SixSectors", "find_six_sectors", "lay_deltille"]
+__all__ = ["find_deltille"]
 
 _SMOOTH_PX = 1.8
 """Width of the smoothing, pixels."""
@@ -57,6 +58,10 @@ _ENOUGH = 0.6
 _CROSSED = 0.3
 """Least difference between the darkest of the bright sectors and the brightest of the dark ones, of that
 between their means."""
+_MOSTLY = 0.8
+"""Share of the corners in sight with which a deltille is not looked for any further."""
+_SHORTER_PX = 0.7
+"""Width of the smoothing before a frame is shortened, pixels."""
 _LARGE_PX = 2_500_000
 """Size of a frame from which it is searched at half its size."""
 
@@ -136,6 +141,69 @@ def find_six_sectors(grey: NDArray[np.float32], noise: float, halved: bool = Fal
         away.append(np.clip(0.5 * (low - high) / np.minimum(low - 2 * mid + high, -1e-12), -0.5, 0.5))
     phase = np.arctan2(imaginary[v, u], real[v, u]).astype(np.float64)
     return SixSectors(np.stack([u + away[0], v + away[1]], axis=1), phase, strength[order])
+
+
+def find_oblique(grey: NDArray[np.float32], noise: float, angle: float) -> SixSectors:
+    """Find the corners of a deltille seen at some 60°: the frame is shortened along an angle to its half.
+
+    Seen obliquely the directions of the three edges are so uneven that their first derivatives do not cancel.
+
+    Parameters
+    ----------
+    grey, noise
+        See :func:`find_six_sectors`.
+    angle : float
+        Direction along which the frame is shortened, radians, x into y.
+    """
+    h, w = grey.shape
+    along = np.array([np.cos(angle), np.sin(angle)])
+    matrix = np.eye(2) - 0.5 * np.outer(along, along)
+    ends = np.array([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]]) @ matrix.T
+    low = ends.min(axis=0)
+    wide, high = (int(np.ceil(n)) + 1 for n in np.ptp(ends, axis=0))
+    shorter = cv2.warpAffine(
+        cv2.GaussianBlur(grey, (0, 0), _SHORTER_PX), np.column_stack([matrix, -low]), (wide, high),
+        borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    found = find_six_sectors(np.asarray(shorter, dtype=np.float32), noise)
+    xy = (found.xy + low) @ np.linalg.inv(matrix).T
+    inside = ((xy >= 0) & (xy <= [w - 1, h - 1])).all(axis=1)
+    return SixSectors(xy[inside], found.phase[inside], found.strength[inside])
+
+
+def find_deltille(
+    grey: NDArray[np.float32], noise: float, design: BoardDesign
+) -> tuple[Placed | Failure, Array]:
+    """Find a deltille in a frame, blurred or seen obliquely, too; also places (m, 2) that look like corners.
+
+    Parameters
+    ----------
+    grey, noise
+        See :func:`find_six_sectors`.
+    design : BoardDesign
+        A deltille.
+    """
+    ways = [partial(find_six_sectors, grey, noise), partial(find_six_sectors, grey, noise, halved=True)]
+    ways += [partial(find_oblique, grey, noise, angle) for angle in np.pi / 4 * np.arange(4)]
+    corners = ways[0]()
+    first = lay_deltille(grey, corners, design)
+    best: Placed | None = None
+    for k, way in enumerate(ways):
+        found = lay_deltille(grey, way(), design) if k else first
+        if isinstance(found, Failure):
+            continue
+        if best is None or found.located.found.sum() > best.located.found.sum():
+            best = found
+        if not best.notes and _complete(best, grey.shape):
+            break
+    return best or first, corners.xy
+
+
+def _complete(placed: Placed, shape: tuple[int, ...]) -> bool:
+    """Whether most corners that should be in sight were found."""
+    at = images_of(placed.located.mapping, placed.located.at)
+    sight = ((at > 0) & (at < np.array(shape[::-1]) - 1)).all(axis=1)
+    return bool(placed.located.found.sum() >= _MOSTLY * sight.sum())
 
 
 def lay_deltille(grey: NDArray[np.float32], corners: SixSectors, design: BoardDesign) -> Placed | Failure:

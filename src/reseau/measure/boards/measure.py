@@ -24,7 +24,7 @@ from ..screening import Screened, screen
 from ..testfield.lattice_mapping import second_order
 from .candidates import Saddles, find_saddles
 from .corners import CornerMarks, DeltilleMarks, Sectors
-from .deltilles import find_six_sectors, lay_deltille
+from .deltilles import find_deltille
 from .markers import find_markers, find_tags
 from .placement import Placed, find_puzzle, lay_chessboard, lay_circles, lay_marked
 from .puzzles import PuzzlePart
@@ -234,12 +234,8 @@ def _placed(frame: Frame, screened: Screened, design: BoardDesign) -> Placed | F
         found = lay_circles(disks, design, shape)
         return replace(found, places=disks.xy) if isinstance(found, Failure) else found
     if design.kind == "deltille":
-        corners = find_six_sectors(screened.grey, screened.noise)
-        found = lay_deltille(screened.grey, corners, design)
-        if isinstance(found, Failure):
-            blurred = find_six_sectors(screened.grey, screened.noise, halved=True)
-            found = lay_deltille(screened.grey, blurred, design)
-        return replace(found, places=corners.xy) if isinstance(found, Failure) else found
+        found, places = find_deltille(screened.grey, screened.noise, design)
+        return replace(found, places=places) if isinstance(found, Failure) else found
     saddles = find_saddles(screened.grey, screened.noise)
     if design.kind in ("chess", "puzzle"):
         found = lay_chessboard(screened.grey, saddles, design)

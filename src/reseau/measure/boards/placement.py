@@ -477,6 +477,7 @@ def lay_marked(
             mapping = mapping if lens is None else lens.mapping
     if known.sum() < 4:
         return failed(int(known.sum()), "corners beside the markers read")
+    mapping = through(nodes[known], start[known], shape) if known.sum() >= _FEWEST else mapping
     return Placed(Located(design.ids, design.xy, "dark", mapping, frame, origin, known, start))
 
 
