@@ -270,9 +270,14 @@ def _astray(frame: Frame, found: ReseauResult, nominal: Array) -> bool:
 def _without_nominal(
     frame: Frame, design: ReseauDesign, found: ReseauResult, options: ReseauOptions
 ) -> ReseauResult:
-    """The marks as found without the nominal positions, if those are where an uneven design has them."""
+    """The marks as found without the nominal positions, if those are where an uneven design has them.
+
+    Of marks whose names are ambiguous without nominal positions, these positions are the only evidence.
+    """
     freely = measure_reseau(frame, design, replace(options, nominal=False))
     if isinstance(freely, Failure) or freely.found < _CLEARLY * found.found:
+        return found
+    if any(note.code is Code.AMBIGUOUS for note in freely.notes):
         return found
     rms, before = (np.sqrt(np.nanmean(each.deviation**2)) for each in (freely, found))
     if not rms < _UNEVEN * before:
