@@ -83,7 +83,7 @@ def drawn(centre: Array, axes: Array, diameter: float, sigma: float, focus: floa
     first = np.rint(middle) - half
     side = (2 * half + 1) * fine
     at = (np.arange(side) + 0.5) / fine - 0.5
-    samples, total = np.zeros((side, side)), 0.0
+    samples, total = np.zeros((side, side)), np.zeros((side, side))
     jitter = (0.5 + k[:, None] * [0.7548776662, 0.5698402910]) % 1.0 - 0.5
     for _, index in INDICES:
         xy = (
@@ -99,8 +99,12 @@ def drawn(centre: Array, axes: Array, diameter: float, sigma: float, focus: floa
             u, v = at + jitter[p, 0] / fine, (at + jitter[p, 1] / fine)[:, None]
             s = a[0] + a[1] * u + a[2] * v + a[3] * u * u + a[4] * u * v + a[5] * v * v
             t = b[0] + b[1] * u + b[2] * v + b[3] * u * u + b[4] * u * v + b[5] * v * v
-            samples += light[p] * (s * s + t * t <= diameter**2 / 4)
-            total += light[p]
+            # What an area of the target sends through this point of the stop reaches the area of its image.
+            s_x, s_y = a[1] + 2 * a[3] * u + a[4] * v, a[2] + a[4] * u + 2 * a[5] * v
+            t_x, t_y = b[1] + 2 * b[3] * u + b[4] * v, b[2] + b[4] * u + 2 * b[5] * v
+            arriving = light[p] * np.abs(s_x * t_y - s_y * t_x)
+            samples += arriving * (s * s + t * t <= diameter**2 / 4)
+            total += arriving
     blurred = gaussian_filter(samples / total, sigma * fine, truncate=5)
     share = blurred.reshape(2 * half + 1, fine, -1, fine).mean(axis=(1, 3))
     image = np.full((SIZE[1] + 400, SIZE[0] + 400), 200.0)

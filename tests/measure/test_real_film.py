@@ -1,10 +1,11 @@
-"""Real film: still frames are oriented, cine frames beside a soundtrack give no unflagged errors."""
+"""Real film: wavy edges and a soundtrack beside the frame give no unflagged errors; perforations do."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from reseau.core.failure import Code
 from reseau.io.images import open_scan
 from reseau.measure.film import PITCH_MM, FrameOptions, edge_of, film_plane, orient_frames
 
@@ -34,22 +35,19 @@ def options(size, **known):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("how", ["known shape", "as it comes"])
 @pytest.mark.parametrize("name", STILLS)
-def test_a_still_frame_is_oriented_by_its_edges(name, reference_data):
+def test_a_still_frame_with_wavy_edges_gives_no_unflagged_error(name, how, reference_data):
+    """Copies by tilted cameras, blurred over ten pixels, whose edges deviate from lines by several."""
     size, corners = STILLS[name]
-    (result,) = orient_frames(open_scan(reference_data("film_frames") / name), options(size))
-    assert result.status == "oriented", result.why
-    np.testing.assert_allclose(result.lines.corners, corners, rtol=0, atol=16)
-
-
-@pytest.mark.slow
-def test_a_frame_copied_by_a_tilted_camera_is_oriented_with_a_remark(reference_data):
-    size, corners = STILLS["strw_in3.jpg"]
-    scan = open_scan(reference_data("film_frames") / "strw_in3.jpg")
-    (result,) = orient_frames(scan, FrameOptions((size,)))
-    assert result.status == "oriented", result.why
-    assert "opposite edges converge by 1.2°" in result.why
-    np.testing.assert_allclose(result.lines.corners, corners, rtol=0, atol=16)
+    scan = open_scan(reference_data("film_frames") / name)
+    (result,) = orient_frames(scan, options(size) if how == "known shape" else FrameOptions((size,)))
+    if not result:
+        assert result.code is Code.UNCERTAIN, result.why
+        assert "edge is no straight or evenly bowed line" in result.why
+        return
+    sigma = np.sqrt(np.diag(result.lines.covariance)).reshape(4, 2)
+    assert (np.abs(result.lines.corners - corners) < 3 * np.hypot(sigma, 5)).all()
 
 
 @pytest.mark.slow
@@ -85,7 +83,8 @@ def test_two_cine_frames_of_one_strip_agree_in_size_and_angle(reference_data):
     (size, size_variance), (angle, angle_variance) = (
         (found[k][0] - found[k + 2][0], found[k][1] + found[k + 2][1]) for k in (0, 1)
     )
-    assert abs(size) < 2 * np.sqrt(size_variance) < 6.0
+    # The upper edge is a line to some pixels only, and so are the corners on it.
+    assert abs(size) < 2 * np.sqrt(size_variance) < 20.0
     assert abs(angle) * length < 2 * np.sqrt(angle_variance) < 6.0
 
 

@@ -11,7 +11,7 @@ import pytest
 
 MEASURED = """
     import hashlib
-    from reseau.refine import measure_testfield
+    from reseau.measure import measure_testfield
     from reseau_sims import FieldBench, Station
     bench = FieldBench(seed=3)
     found = measure_testfield(bench.record(Station(30, 90, 90)), bench.design)
