@@ -34,8 +34,9 @@ from reseau import sessions
 from reseau.archive import Archive, Session
 from reseau.calibration import Calibration
 from reseau.capture import Bench, BenchFile, BenchLock, InstrumentEntry
-from reseau.capture.bench import IN_PROCESS, INSTRUMENTS, SIMULATORS, built, plugin
+from reseau.capture.bench import IN_PROCESS, built
 from reseau.core.data import Array
+from reseau.core.plugins import INSTRUMENTS, SIMULATORS, plugin
 from reseau.core.threads import one_thread
 from reseau.instruments import Instrument
 from reseau.service import (
