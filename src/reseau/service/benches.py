@@ -75,7 +75,7 @@ class BenchLink:
         self._pid: int | None = None
         self._over = threading.Event()
         self._status: dict[str, Any] = {}
-        self.restarts = -1
+        self.restarts, self._met = -1, False
         self._thread = threading.Thread(target=self._keep, name=f"bench {self.name}", daemon=True)
 
     def start(self) -> None:
@@ -109,9 +109,10 @@ class BenchLink:
     def status(self) -> dict[str, Any]:
         """The state of the bench as the worker said it last; `down` without a worker."""
         if self._wire is None:
+            down = self._met or self.restarts > 0 or bool(self._wrong)
             more = {
-                "state": "down" if self.restarts >= 0 or self._wrong else "starting",
-                "error": self._wrong or "its worker does not answer",
+                "state": "down" if down else "starting",
+                "error": (self._wrong or "its worker does not answer") if down else "",
             }
             return _EMPTY | self._status | more | {"name": self.name, "moving": ""}
         return _EMPTY | {"name": self.name} | self._status
@@ -176,7 +177,7 @@ class BenchLink:
             begun = time.monotonic()
             # What an earlier worker said last is not true of this one, which has not said anything yet.
             self._status = {}
-            self._wire = wire
+            self._wire, self._met = wire, True
             self._told("up", {})
             try:
                 threading.Thread(target=self._greet, daemon=True).start()

@@ -19,6 +19,7 @@ from reseau.archive import Archive
 from reseau.capture import Bench, BenchFile
 from reseau.core.errors import StateError
 from reseau.service import worker
+from reseau.service.benches import BenchLink
 from reseau.service.state import StateFolder
 from reseau.service.wire import Certificates
 from reseau_sims.serving.bench import SimulatedBench
@@ -67,6 +68,16 @@ def state(client: TestClient, *wanted: str, seconds: float = 180.0) -> dict[str,
     except AssertionError:
         raise AssertionError(last) from None
     return last
+
+
+def test_a_bench_whose_first_worker_has_not_answered_yet_is_starting(tmp_path: Path) -> None:
+    (tmp_path / "bench.toml").write_text('schema = "reseau-bench/1"\nname = "cellar"\n[instruments]\n')
+    link = BenchLink(tmp_path / "bench.toml", "archive", None, StateFolder(tmp_path / "s"), lambda *_: None)
+    assert (link.status["state"], link.status["error"]) == ("starting", "")
+    link.restarts = 0  # its process has begun
+    assert (link.status["state"], link.status["error"]) == ("starting", "")
+    link.restarts = 1
+    assert (link.status["state"], link.status["error"]) == ("down", "its worker does not answer")
 
 
 @pytest.fixture(scope="module")

@@ -152,7 +152,7 @@ def home(request: Request, who: Reading, service: Here) -> Response:
 
 def _card(found: benches.BenchAnswer) -> dict[str, str]:
     """A bench in a line."""
-    text = found.error or found.moving or "idle"
+    text = found.error or found.moving or ("its worker starts" if found.state == "starting" else "idle")
     if found.session is not None and found.state in _BUSY:
         text = f"{found.session.name}: {found.session.good}"
         text += "" if found.session.expected is None else f" of {found.session.expected} poses"
