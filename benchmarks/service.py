@@ -442,8 +442,9 @@ def stop(trials: int) -> int:
                 def taken(press: Callable[[], float]) -> float:
                     """Seconds from a press until the motor stands."""
                     nonlocal obeyed
-                    moves = [pool.submit(move, high if sim.laboratory.axes["tilt"] < middle else low)]
-                    while not http.get(bench).json()["moving"]:
+                    begun = sim.laboratory.axes["tilt"]
+                    moves = [pool.submit(move, high if begun < middle else low)]
+                    while sim.laboratory.axes["tilt"] == begun:
                         if moves[0].done():
                             raise SystemExit(f"the axis does not move: status {moves[0].result()}")
                         time.sleep(0.01)
