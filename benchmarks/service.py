@@ -435,27 +435,30 @@ def stop(trials: int) -> int:
                 low, high = http.get(f"{bench}/axes").json()["tilt"]["limits"]
                 middle = (low + high) / 2
 
-                def move(position: float) -> int:
+                clients = [httpx.Client(headers=mine, timeout=60) for _ in range(2)]
+
+                def move(position: float, number: int) -> int:
                     given = {"axis": "tilt", "position": position}
-                    return httpx.post(f"{bench}/move", json=given, headers=mine, timeout=60).status_code
+                    return clients[number].post(f"{bench}/move", json=given).status_code
 
                 def taken(press: Callable[[], float]) -> float:
                     """Seconds from a press until the motor stands."""
                     nonlocal obeyed
                     begun = sim.laboratory.axes["tilt"]
-                    moves = [pool.submit(move, high if begun < middle else low)]
+                    moves = [pool.submit(move, high if begun < middle else low, 0)]
                     while sim.laboratory.axes["tilt"] == begun:
                         if moves[0].done():
                             raise SystemExit(f"the axis does not move: status {moves[0].result()}")
                         time.sleep(0.01)
-                    moves.append(pool.submit(move, middle))
-                    time.sleep(draw.uniform(0.1, 0.6))
+                    moves.append(pool.submit(move, middle, 1))
+                    time.sleep(draw.uniform(0.2, 0.7))
                     stood.clear()
                     pressed = press()
-                    obeyed &= [each.result() for each in moves] == [409, 409]
+                    statuses = [each.result() for each in moves]
+                    time.sleep(0.5)  # a stop is answered when it is sent: the motor stands a little later
                     at = sim.laboratory.axes["tilt"]
-                    time.sleep(0.2)
-                    obeyed &= len(stood) > 0 and at == sim.laboratory.axes["tilt"]
+                    time.sleep(0.3)
+                    obeyed &= statuses == [409, 409] and len(stood) == 1 and at == sim.laboratory.axes["tilt"]
                     return stood[0] - pressed if stood else float("inf")
 
                 def asked() -> float:
