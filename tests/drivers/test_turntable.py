@@ -16,7 +16,7 @@ from reseau.core.errors import (
     StateError,
     UsageError,
 )
-from reseau.instruments import Movable, Turntable
+from reseau.instruments import AxisState, Movable, Turntable
 from reseau_drivers.link import link_to
 from reseau_drivers.turntable import AxisPlan, Table, Zaber, grbl, kinesis, marlin, smc100, zaber
 from reseau_sims.serving import (
@@ -209,6 +209,33 @@ def test_stop_works_from_any_thread(which: int) -> None:
         assert state.position < 80.0
         assert table.state("tilt").position == state.position
     assert machine.violations == []
+
+
+@pytest.mark.parametrize("which", range(5))
+def test_after_a_stop_between_two_queries_the_second_part_of_a_movement_does_not_begin(
+    which: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table, _ = tables()[which]
+    with table:
+        table.home("tilt")
+        table.move("tilt", 90.0)
+        table.configure(speed=20.0)
+        ask, asked = table.state, list[str]()
+
+        def stopped_before(axis: str, seconds: float | None = None) -> AxisState:
+            asked.append(axis)
+            if len(asked) == 3:  # it moves down to where its backlash is, and would then move up
+                table.stop()
+            return ask(axis, seconds)
+
+        monkeypatch.setattr(table, "state", stopped_before)
+        with pytest.raises(StateError, match="was stopped"):
+            table.move("tilt", 10.0)
+        here = ask("tilt")
+        assert not here.moving
+        assert here.position > 20.0
+        time.sleep(0.2)
+        assert ask("tilt").position == here.position
 
 
 @pytest.mark.parametrize("which", range(5))

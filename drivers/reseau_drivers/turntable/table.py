@@ -374,6 +374,7 @@ class Table(Device[TableSettings]):
         self._stopping.clear()
         deadline = Deadline(self.MOVE_S if seconds is None else seconds)
         with self._exchange(command, deadline.left) as time:
+            self._require_unstopped(command)
             self._controller.begin_home(plan, time)
         state = self._wait_until_stopped(axis, plan, deadline, command)
         if not state.homed:
@@ -417,6 +418,7 @@ class Table(Device[TableSettings]):
         )
         for target in (*before, position):
             with self._exchange(command, deadline.at_most(self._seconds)) as time:
+                self._require_unstopped(command)
                 self._controller.begin_move(plan, target, time)
             state = self._wait_until_stopped(axis, plan, deadline, command)
         if not state.homed:

@@ -368,6 +368,15 @@ class Device(ABC, Generic[S]):
                 }
         return found
 
+    def _require_unstopped(self, command: str) -> None:
+        """Raise if a stop was asked for since the call began; asked before a motion, with the connection held.
+
+        A stop sets its mark first, and then waits for the connection: either it is seen here, or the motion
+        has begun and is stopped.
+        """
+        if self._stopping.is_set():
+            raise StateError("was stopped", where=self.name, command=command)
+
     def _wait_until(
         self,
         ask: Callable[[], T],
@@ -378,9 +387,10 @@ class Device(ABC, Generic[S]):
     ) -> T:
         """Repeat a query until a condition is met; raise if stopped or if the deadline passes."""
         while True:
-            if self._stopping.is_set():
-                raise StateError("was stopped", where=self.name, command=command)
+            self._require_unstopped(command)
             answer = ask()
+            # What is seen now may be so because of a stop.
+            self._require_unstopped(command)
             if done(answer):
                 return answer
             if deadline.expired:

@@ -41,6 +41,8 @@ _LIVE_S, _RETRY_S, _WIDTH = 5.0, 3.0, 960
 _STEADY_S = 0.1
 """Time between live pictures, at least."""
 _FOLLOW_S = 0.25
+_INSIST_S = 2.0
+"""For how long a stop is repeated while a movement that it ends has not ended."""
 """Time between looks at axes that move."""
 _ASIDE = frozenset({"status", "bench", "settings", "axes", "picture", "pause", "abort", "end", "release"})
 """Commands that set nothing into motion."""
@@ -427,6 +429,8 @@ class Worker:
                 threading.Thread(target=control.pause, kwargs={"at_once": True}, daemon=True).start()
             self._answering.stop()
             spent = time.perf_counter() - begun
+            if self._moving:
+                threading.Thread(target=self._insist, args=(self._stops,), daemon=True).start()
             self._say("stopped", {"ms": round(1e3 * spent, 1)})
             return True, {"ms": round(1e3 * spent, 1), **self.status()}, b""
         if what == "status":
@@ -468,6 +472,14 @@ class Worker:
         return False, None, b""
 
     # Threads.
+
+    def _insist(self, stops: int) -> None:
+        """Stop again until the movement under way has ended: it may have been about to begin."""
+        end = time.monotonic() + _INSIST_S
+        while self._moving and self._stops == stops and time.monotonic() < end:
+            time.sleep(_INSIST_S / 100)
+            with contextlib.suppress(ReseauError):
+                self._answering.stop()
 
     def read(self, wire: Wire) -> None:
         """Serve one connection until it ends.
