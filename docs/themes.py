@@ -77,10 +77,11 @@ def turn_dark(figure: Figure) -> None:
         if isinstance(artist, Annotation) and artist.arrow_patch is not None:
             artist.arrow_patch.set_color(_turned(artist.arrow_patch.get_edgecolor()))
         if isinstance(artist, Line2D):
+            # Those of markers follow the line's, unless they are set.
+            face, edge = artist.get_markerfacecolor(), artist.get_markeredgecolor()
             artist.set_color(_turned(artist.get_color()))
-            if isinstance(artist.get_markerfacecolor(), str):
-                artist.set_markerfacecolor(_turned(artist.get_markerfacecolor()))
-            artist.set_markeredgecolor(_turned(artist.get_markeredgecolor()))
+            artist.set_markerfacecolor(_turned(face))
+            artist.set_markeredgecolor(_turned(edge))
         elif isinstance(artist, Patch | Collection):
             if isinstance(artist, ScalarMappable) and artist.get_array() is not None:
                 _turn_shades(artist)
