@@ -455,10 +455,16 @@ def stop(trials: int) -> int:
                     stood.clear()
                     pressed = press()
                     statuses = [each.result() for each in moves]
+                    if statuses[0] == 200:  # it had arrived before
+                        return taken(press)
                     time.sleep(0.5)  # a stop is answered when it is sent: the motor stands a little later
                     at = sim.laboratory.axes["tilt"]
                     time.sleep(0.3)
-                    obeyed &= statuses == [409, 409] and len(stood) == 1 and at == sim.laboratory.axes["tilt"]
+                    later = sim.laboratory.axes["tilt"]
+                    good = statuses == [409, 409] and len(stood) == 1 and at == later
+                    if not good:
+                        print(f"statuses {statuses}, {len(stood)} stops, {at} then {later}")
+                    obeyed &= good
                     return stood[0] - pressed if stood else float("inf")
 
                 def asked() -> float:

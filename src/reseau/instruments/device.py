@@ -369,7 +369,7 @@ class Device(ABC, Generic[S]):
         return found
 
     def _require_unstopped(self, command: str) -> None:
-        """Raise if a stop was asked for since the call began; asked before a motion, with the connection held.
+        """Raise if a stop was asked for since the call began; asked before a motion, the connection held.
 
         A stop sets its mark first, and then waits for the connection: either it is seen here, or the motion
         has begun and is stopped.

@@ -41,9 +41,9 @@ _LIVE_S, _RETRY_S, _WIDTH = 5.0, 3.0, 960
 _STEADY_S = 0.1
 """Time between live pictures, at least."""
 _FOLLOW_S = 0.25
+"""Time between looks at axes that move."""
 _INSIST_S = 2.0
 """For how long a stop is repeated while a movement that it ends has not ended."""
-"""Time between looks at axes that move."""
 _ASIDE = frozenset({"status", "bench", "settings", "axes", "picture", "pause", "abort", "end", "release"})
 """Commands that set nothing into motion."""
 _ALONE_S = 600.0
