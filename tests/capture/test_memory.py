@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import itertools
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -18,9 +20,10 @@ from reseau.core.data import Frame
 
 from .simple import CameraSettings, Simple, Taken
 
+ROOT = Path(__file__).resolve().parents[2]
 FRAMES, FIRST, LAST = 260, 60, 240
-MOST = 200
-"""Bytes that may be left of a frame: less than its verdict, or the messages of its plan, would take."""
+MOST = 500
+"""Bytes that may be left of a frame; the messages of its plan alone would take 1700."""
 
 
 class Counting(Simple):
@@ -39,7 +42,8 @@ class Counting(Simple):
         return (self.expose(seconds) for _ in range(count))
 
 
-def test_frames_of_a_session_are_in_the_archive_and_not_in_memory(tmp_path: Path) -> None:
+def growth(folder: Path) -> int:
+    """Bytes that are left of the frames between two of a session."""
     held: dict[str, int] = {}
 
     def watch(kind: str, facts: dict[str, Any]) -> None:
@@ -49,7 +53,7 @@ def test_frames_of_a_session_are_in_the_archive_and_not_in_memory(tmp_path: Path
 
     entry = InstrumentEntry(driver="sim", address="sim-camera")
     bench = Bench(BenchFile(name="b", instruments={"camera": entry}), lambda name, entry: Counting(name))
-    with Archive.open(tmp_path / "archive", create=True) as archive:
+    with Archive.open(folder / "archive", create=True) as archive:
         session = archive.begin("monday", "frames", {"count": FRAMES})
         run = Acquisition(bench, session, watch=watch)
         tracemalloc.start()
@@ -59,4 +63,11 @@ def test_frames_of_a_session_are_in_the_archive_and_not_in_memory(tmp_path: Path
             tracemalloc.stop()
         assert session.counts() == (FRAMES, FRAMES)
     first, last = held.values()
-    assert last - first < MOST * (LAST - FIRST)
+    return last - first
+
+
+def test_frames_of_a_session_are_in_the_archive_and_not_in_memory(tmp_path: Path) -> None:
+    # In a process of its own: what other tests have left there fills caches meanwhile.
+    code = f"from pathlib import Path; from {__name__} import growth; print(growth(Path({str(tmp_path)!r})))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert int(done.stdout) < MOST * (LAST - FIRST)
