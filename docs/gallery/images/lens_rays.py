@@ -41,7 +41,7 @@ assert abs(Paraxial(lens).focal_length - 100) < 3
 
 # %%
 # The lens in section, with rays from far away on the axis and 3° from it.
-figure, (axes, spots) = plt.subplots(2, 1, figsize=(8.0, 5.6), layout="constrained", height_ratios=(1.3, 1))
+figure, axes = plt.subplots(figsize=(8.0, 2.6), layout="constrained")
 for angle, colour in ((0.0, "#9aa3a8"), (3.0, "#b3402a")):
     away = np.array([0.0, -np.sin(np.deg2rad(angle)), -np.cos(np.deg2rad(angle))])
     points = np.tile(1e5 * away, (7, 1))
@@ -60,6 +60,7 @@ axes.set(aspect="equal", xlabel="mm", yticks=[])
 
 # %%
 # Spots: where the rays of one point meet the image surface, in three colours.
+figure, spots = plt.subplots(figsize=(8.0, 3.0), layout="constrained")
 elements, sizes = PupilElements.equal_areas(9), {}
 for k, angle in enumerate((0.0, 1.5, 3.0)):
     away = 1e5 * np.array([0.0, -np.sin(np.deg2rad(angle)), -np.cos(np.deg2rad(angle))])
