@@ -20,7 +20,7 @@ port, focal_px = Water(distance_mm=60.0, thickness_mm=12.0), 8.0 / 0.005
 # The direction in which the camera sees points at four distances, against the direction that they would
 # have in air. First everything: water makes objects look a third larger.
 radius = np.linspace(0.02, 0.5, 25)  # tangent of the true direction
-figure, (whole, rest) = plt.subplots(1, 2, figsize=(8.4, 3.7), layout="constrained")
+figure, whole = plt.subplots(figsize=(6.4, 3.7), layout="constrained")
 seen, reference = {}, np.linspace(0.001, 0.9, 400)
 straight = 1000.0 * np.column_stack([reference, np.zeros(400), np.ones(400)])
 at_1_m = port.directions(straight).xy[:, 0]
@@ -35,6 +35,7 @@ whole.legend(frameon=False, title="distance")
 # %%
 # Then what is left when a camera is calibrated at 1 m and used at another distance: a scale, and a
 # distortion of a few pixels that changes with the distance.
+figure, rest = plt.subplots(figsize=(6.4, 3.7), layout="constrained")
 for distance, shade in zip((200.0, 400.0, 4000.0), (0.15, 0.4, 0.9), strict=True):
     # Where the calibration at 1 m believes the point to be, for the same image.
     believed = np.interp(seen[distance], at_1_m, reference)
@@ -45,6 +46,7 @@ for distance, shade in zip((200.0, 400.0, 4000.0), (0.15, 0.4, 0.9), strict=True
 rest.axhline(0.0, color="#9aa3a8", linewidth=0.6)
 rest.set(xlabel="tangent of the true direction", ylabel="error / px")
 rest.set_title("calibrated at 1 m, after the best scale", loc="left")
+rest.legend(frameon=False, title="distance")
 
 # %%
 # For comparison: looked at steeply, the magnification in deep water is the refractive index.
