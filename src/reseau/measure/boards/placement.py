@@ -40,7 +40,7 @@ from .candidates import (
     sector_levels,
     seeds,
 )
-from .puzzles import MISREAD, PuzzlePart, part_of_code
+from .puzzles import MISREAD, QUARTER, PuzzlePart, part_of_code
 
 __all__ = [
     "Placed",
@@ -82,7 +82,6 @@ _EVEN = 0.5
 """Largest difference of two dark sectors, as a share of their contrast to the paper."""
 _PUZZLE = 40
 """Largest number of corners of a PuzzleBoard of unknown size, along an axis from any of them."""
-_QUARTER = np.array([[0, -1], [1, 0]])
 _THIRD = np.array([[-1, -1], [1, 0]])
 """A turn of a lattice of triangles, whose steps are at 60°."""
 
@@ -231,7 +230,7 @@ def numbered(
     mirrored = _mirrored(mapping)
     found: list[tuple[float, Integers, Integers]] = []
     signs = None if bits is None else dot_signs(design)
-    once, turns = (_THIRD, 3) if design.kind == "deltille" else (_QUARTER, 4)
+    once, turns = (_THIRD, 3) if design.kind == "deltille" else (QUARTER, 4)
     for quarter in range(turns):
         # Rows of a design go downwards as those of a frame do.
         turn = np.linalg.matrix_power(once, quarter)

@@ -22,14 +22,15 @@ from ...designs.dots import puzzle_maps
 from ...io.board import PUZZLE_CODE
 from .bits import Bits, Integers
 
-__all__ = ["MISREAD", "PuzzlePart", "part_of_code"]
+__all__ = ["MISREAD", "QUARTER", "PuzzlePart", "part_of_code"]
 
 MISREAD = 0.2
 """Largest share of the dots of a PuzzleBoard that are not as in the code."""
 _CHANCE = 1e-4
 """Largest probability that dots without any order agree as well with one of the places, and that the place
 is another one."""
-_QUARTER = np.array([[0, -1], [1, 0]])
+QUARTER = np.array([[0, -1], [1, 0]])
+"""A quarter turn of a lattice of squares."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def part_of_code(nodes: NDArray[np.intp], bits: Bits, mirrored: bool) -> PuzzleP
     found = []
     vertical, horizontal = puzzle_maps()
     for quarter in range(4):
-        turn = np.linalg.matrix_power(_QUARTER, quarter) @ np.diag([-1 if mirrored else 1, 1])
+        turn = np.linalg.matrix_power(QUARTER, quarter) @ np.diag([-1 if mirrored else 1, 1])
         # Twice the column and the row; the column of a vertical edge is whole, the row of a horizontal one.
         at = bits.at @ turn.T
         whole = at[:, 0] % 2 == 0
