@@ -36,7 +36,7 @@ def camera(*, size: tuple[int, int] = (640, 480), redundancy: int = 400, codes: 
         kind="camera", name=name, sigma0=1.0, redundancy=redundancy,
         model={"model": "brown", "width": size[0], "height": size[1], "pitch_mm": [0.01, 0.01]},
         parameters={
-            key: Quantity(value=value, sigma=sigma[key], unit="mm")
+            key: Quantity(value=value, sigma=sigma[key], unit="mm^-2" if key == "K1" else "mm")
             for key, value in (FIRST | values).items()
         },
         covariance=Covariance(names=tuple(SIGMA), matrix=matrix),

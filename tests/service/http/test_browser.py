@@ -1,7 +1,8 @@
 """People at the pages: Chromium drives the service in its own process, over a simulated bench.
 
-`RESEAU_AXE` names axe.min.js of axe-core, whose findings are asked for then; `RESEAU_SCREENSHOTS` a folder
-for pictures of the pages. Run with `python -m pytest -m slow tests/service/http/test_browser.py`.
+The findings of axe-core are those of the release in the package `axe-core-python`, or of the axe.min.js that
+`RESEAU_AXE` names; `RESEAU_SCREENSHOTS` names a folder for pictures of the pages. Run with
+`python -m pytest -m slow tests/service/http/test_browser.py`.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import cv2
 import httpx
@@ -140,12 +141,20 @@ def shot(browser: Browser, name: str) -> None:
         cv2.imwrite(str(path), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
-def axe(browser: Browser) -> list[str]:
-    """Serious findings of axe-core on the page; none are looked for without it."""
-    file = os.environ.get("RESEAU_AXE")
-    if not file:
-        return []
-    browser.run(Path(file).read_text())
+@pytest.fixture
+def axe_core() -> str:
+    """axe.min.js."""
+    if named := os.environ.get("RESEAU_AXE"):
+        return Path(named).read_text(encoding="utf-8")
+    package = find_spec("axe_core_python")
+    if package is None or package.origin is None:
+        pytest.skip("needs axe-core-python, or RESEAU_AXE with the path of axe.min.js")
+    return Path(package.origin).with_name("axe.min.js").read_text(encoding="utf-8")
+
+
+def axe(browser: Browser, script: str) -> list[str]:
+    """Serious findings of axe-core on the page."""
+    browser.run(script)
     found = browser.run_async(_AXE)
     serious = [each for each in found if each["impact"] in ("serious", "critical")]
     return [f"{each['id']}: {[n['html'][:120] for n in each['nodes'][:3]]}" for each in serious]
@@ -312,30 +321,40 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
     assert [each for each in browser.complaints() if "Content Security Policy" in each] == []
 
 
-def test_pages_fit_a_phone_and_have_no_serious_finding_of_axe(place: Place, browser: Browser) -> None:
+def every_page(place: Place, browser: Browser, *widths: int) -> Iterator[tuple[str, int]]:
+    """Open every page in every width, and tell its name."""
     enter(place, browser)
     base = f"http://127.0.0.1:{place.port}"
     browser.open(f"{base}/calibrations/left")
     key = browser.run("return document.querySelector('#configuration tbody a').getAttribute('href')")
-    found: dict[str, Any] = {}
     paths = {
         "overview": "/", "bench": "/benches/cellar", "sessions": "/sessions", "session": "/sessions/monday",
         "frame": "/sessions/monday/frames/2", "calibrations": "/calibrations", "charts": "/calibrations/left",
         "calibration": key, "files": "/files", "history": "/history", "account": "/account",
         "audit": "/audit", "login": "/login",
     }  # fmt: skip
-    for width in (1280, 390):
+    for width in widths:
         browser.resize(width, 844)
         for name, path in paths.items():
             browser.open(base + path)
             time.sleep(0.3)
-            over = browser.run("return document.documentElement.scrollWidth - innerWidth")
-            assert over <= 0, (path, width, over)
-            if findings := axe(browser):
-                found[f"{path} {width}"] = findings
-            if width == 390:
-                time.sleep(1.0)
-                shot(browser, f"service-{name}-phone")
+            yield name, width
+
+
+def test_every_page_fits_a_phone(place: Place, browser: Browser) -> None:
+    for name, width in every_page(place, browser, 390):
+        over = browser.run("return document.documentElement.scrollWidth - innerWidth")
+        assert over <= 0, (name, width, over)
+        time.sleep(1.0)
+        shot(browser, f"service-{name}-phone")
+
+
+def test_axe_has_no_serious_finding_on_any_page(place: Place, browser: Browser, axe_core: str) -> None:
+    found = {
+        f"{name} {width}": findings
+        for name, width in every_page(place, browser, 1280, 390)
+        if (findings := axe(browser, axe_core))
+    }
     assert found == {}, json.dumps(found, indent=1)
 
 
