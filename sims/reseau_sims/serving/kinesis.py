@@ -134,16 +134,8 @@ class KinesisController(Machine):
         """Stuck: a position error; wrong state: motors off; out of range: a limit switch reached."""
         for channel in self._channels.values():
             motor, channel.ends = channel.motor, None
-            if kind == "stuck":
-                motor.stall()
-            elif kind == "wrong state":
-                motor.stop()
-                motor.enabled = False
-            elif kind == "out of range":
-                motor.stop()
-                motor.limit = 1
-            elif kind == "power-cycled":
-                motor.cut_power()
+            motor.inject_fault(kind)
+            if kind == "power-cycled":
                 channel.acceleration = 263
                 motor.speed = 20_000.0
 

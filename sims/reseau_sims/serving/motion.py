@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from .faults import Kind
+
 __all__ = ["Motor"]
 
 Clock = Callable[[], float]
@@ -102,15 +104,24 @@ class Motor:
         self._stand(self.position)
         self.homing = False
 
-    def stall(self) -> None:
-        """Stop because of an obstacle."""
-        self.stop()
-        self.stalled = True
-
     def cut_power(self) -> None:
         """Stop and lose the reference."""
         self.stop()
         self.homed, self.stalled, self.limit, self.enabled = False, False, 0, True
+
+    def inject_fault(self, kind: Kind) -> None:
+        """Stuck: an obstacle; wrong state: the driver is off; out of range: a limit switch was reached."""
+        if kind == "stuck":
+            self.stop()
+            self.stalled = True
+        elif kind == "wrong state":
+            self.stop()
+            self.enabled = False
+        elif kind == "out of range":
+            self.stop()
+            self.limit = 1
+        elif kind == "power-cycled":
+            self.cut_power()
 
     def _stand(self, position: float) -> None:
         self._start = self._target = position

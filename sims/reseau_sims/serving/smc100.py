@@ -90,16 +90,7 @@ class Smc100Line(Machine):
     def inject_fault(self, kind: Kind) -> None:
         """Stuck: a following error; wrong state: disabled; out of range: at the end of the run."""
         for motor in self.motors.values():
-            if kind == "stuck":
-                motor.stall()
-            elif kind == "wrong state":
-                motor.stop()
-                motor.enabled = False
-            elif kind == "out of range":
-                motor.stop()
-                motor.limit = 1
-            elif kind == "power-cycled":
-                motor.cut_power()
+            motor.inject_fault(kind)
 
     def _state(self, motor: Motor) -> tuple[int, int]:
         """Return error bits and state."""

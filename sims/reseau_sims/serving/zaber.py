@@ -110,16 +110,7 @@ class ZaberChain(Machine):
     def inject_fault(self, kind: Kind) -> None:
         """Stuck: an obstacle; wrong state: drivers off; out of range: a limit switch reached."""
         for motor in self.motors.values():
-            if kind == "stuck":
-                motor.stall()
-            elif kind == "wrong state":
-                motor.stop()
-                motor.enabled = False
-            elif kind == "out of range":
-                motor.stop()
-                motor.limit = 1
-            elif kind == "power-cycled":
-                motor.cut_power()
+            motor.inject_fault(kind)
         if kind == "power-cycled":
             self._parked.clear()
 
