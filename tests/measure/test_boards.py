@@ -222,6 +222,44 @@ def test_corners_beside_the_markers_read_are_found_to_the_margin_of_a_wide_view(
     assert 0.75 < np.sqrt(((error / sigma) ** 2).mean()) < 1.3
 
 
+@pytest.mark.parametrize(
+    ("dictionary", "border", "shape", "size", "motion", "seed", "nearer"),
+    [
+        ("DICT_APRILTAG_36h11", 2, (6, 6), 22.0, 6.0, 0, 1.0),
+        ("DICT_APRILTAG_16h5", 1, (5, 4), 30.0, 0.0, 110, 2.6),
+    ],
+    ids=["smeared", "two large tags"],
+)
+def test_tags_are_read_behind_motion_and_where_two_fill_the_frame(
+    dictionary: str, border: int, shape: tuple[int, int], size: float, motion: float, seed: int, nearer: float
+) -> None:
+    """Motion turns edges near a corner; between corners of a large tag, noise has many saddles."""
+    printed = prints.aprilgrid(*shape, size, 0.3, dictionary, border)
+    design = board("aprilgrid", *shape, 1.3 * size, size=size, dictionary=dictionary, border_bits=border)
+    turn, place = pose(seed, printed, nearer=nearer)
+    view = View(printed, turn, place, seed=seed, motion=motion)
+    found = measured(Frame(view.picture(), 255.0, "tags"), design)
+    sight = ((view.truth > 6) & (view.truth < [960 - 7, 720 - 7])).all(axis=1)
+    assert found.ok[sight].all()
+    error = (found.xy - view.truth)[found.ok]
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert np.sqrt((error**2).mean()) < 0.006
+    assert 0.75 < np.sqrt(((error / sigma) ** 2).mean()) < 1.3
+
+
+def test_of_two_tags_that_contradict_each_other_none_names_the_board() -> None:
+    """Half a turn of one of two tags that fill the frame: which of them is misread, nothing tells."""
+    frame, truth = picture(board("aprilgrid", 2, 1, 26.0), 0.0, 0.0, 120.0)
+    pixels = frame.pixels.copy()
+    corners = np.rint(truth[4:8]).astype(int)
+    low, high = corners.min(axis=0) + 4, corners.max(axis=0) - 3
+    part = pixels[low[1] : high[1], low[0] : high[0]]
+    pixels[low[1] : high[1], low[0] : high[0]] = part[::-1, ::-1].copy()
+    other = measure_board(replace(frame, pixels=pixels), board("aprilgrid", 2, 1, 26.0))
+    assert isinstance(other, Failure)
+    assert other.code is Code.INCONSISTENT
+
+
 DELTILLE, DELTILLE_PRINT = board("deltille", 9, 8, 25.0), prints.Deltille(9, 8, 25.0)
 
 

@@ -5,17 +5,19 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import bdtr
 
 from ...core.data import Array, Frame
 from ...designs.boards import marker_cells, marker_dictionary
 from ...io.board import BoardDesign
 from .candidates import Saddles
-from .tags import read_tags, tag_outlines
+from .tags import SEARCHES, read_tags, tag_outlines
 
 __all__ = ["find_markers", "find_tags"]
 
-_WRONG = 0.06
-"""Share of the cells of a tag that may be misread; its place on the board tests it, too."""
+_WRONG, _CHANCE = 0.06, 0.01
+"""Share of the cells of a tag that may be misread; probability, not to be exceeded, that cells without any
+order are read as a tag of the board."""
 _WINDOW_PX = 13
 """Side of the squares in which the threshold of separate markers is found first."""
 _FEW, _SHARE = 6, 0.25
@@ -59,9 +61,15 @@ def find_tags(
     grey: NDArray[np.float32], saddles: Saddles, design: BoardDesign
 ) -> tuple[Array, NDArray[np.intp]]:
     """Corners (m, 4, 2) of the tags of an AprilGrid, clockwise from the upper left, and their numbers."""
-    outlines = saddles.xy[tag_outlines(grey, saddles)]
     words = marker_cells(design)[1]
-    most = int(_WRONG * words[0].size)
-    index, corners = read_tags(grey, outlines, words, design.border_bits, most)
-    read = index >= 0
+    bits = (words.shape[1] - 2 * design.border_bits) ** 2
+    likely = 4 * len(words) * bdtr(np.arange(bits), bits, 0.5) < _CHANCE
+    most = min(int(_WRONG * words[0].size), max(int(likely.sum()) - 1, 0))
+    rings = np.zeros((0, 4), dtype=np.intp)
+    for search in SEARCHES:
+        rings = np.unique(np.concatenate([rings, tag_outlines(grey, saddles, *search)]), axis=0)
+        index, corners = read_tags(grey, saddles.xy[rings], words, design.border_bits, most)
+        read = index >= 0
+        if read.sum() >= max(_FEW, _SHARE * len(words)):
+            break
     return corners[read], design.markers[0][index[read]]

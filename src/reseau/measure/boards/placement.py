@@ -78,6 +78,8 @@ _LENS_FROM, _MARKER_PX = 16, 1.0
 """Corners of markers that determine the distortion of a lens; their standard deviation as they are found."""
 _ASTRAY = 0.25
 """Largest share of the markers read that do not lie where the board has them: misread, or bent aside."""
+_FEW_READ = 3
+"""Number of markers up to which as many that agree as do not are not enough."""
 _EVEN = 0.5
 """Largest difference of two dark sectors, as a share of their contrast to the paper."""
 _PUZZLE = 40
@@ -427,7 +429,10 @@ def lay_marked(
         return Failure("the markers read do not agree with the board", Code.INCONSISTENT)
     whole = good.reshape(-1, 4).all(axis=1)
     astray = int((~whole).sum())
-    if len(rows) > 3 and astray > 1:
+    if 0 < len(rows) <= min(2 * astray, _FEW_READ):
+        # Nothing tells which of them are misread.
+        return Failure(f"the {len(rows)} markers read do not agree with each other", Code.INCONSISTENT)
+    if len(rows) > _FEW_READ and astray > 1:
         other = design.model_copy(update={"legacy": not design.legacy}).markers[1][rows].reshape(-1, 2)
         alike = _plane_of_markers(other / design.pitch, image, shape)[1].reshape(-1, 4).all(axis=1)
         if astray > _ASTRAY * len(rows) or (~alike).sum() < astray:

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from ...core.data import Array, Mask, Rows
 from .candidates import Saddles
 
-__all__ = ["read_tags", "tag_outlines", "with_seen_edges"]
+__all__ = ["SEARCHES", "read_tags", "tag_outlines", "with_seen_edges"]
 
 _NEIGHBOURS = 160
 """Saddles around a corner among which the next corner is looked for."""
@@ -27,10 +27,12 @@ _AIMED = np.deg2rad(7)
 """Largest angle between an edge and the direction to the next corner."""
 _PARALLEL = np.deg2rad(15)
 """Largest angle between the edges of a tag at its two ends: lenses bend it."""
-_WEAK = 0.08
-"""Least strength of a corner as a share of the strong ones of the frame; texture has weaker ones."""
-_RADIUS_PX, _PLACES = 4.0, 48
-"""Circle around a saddle on which its edges are seen: radius, and number of places."""
+SEARCHES = ((0.08, 4.0), (0.25, 4.0), (0.25, 12.0))
+"""How tags are looked for, one way after the other while few are found. Least strength of a corner, as a share
+of the strong ones of the frame: between the corners of a large tag, noise and texture have many weak ones.
+Radius of the circle on which edges are seen, pixels: motion turns them near a corner."""
+_NEAR_PX, _PLACES = 4.0, 48
+"""This radius where corners are not those of tags; number of places on the circle."""
 _STRONG = 0.25
 """Least strength of the next corner as a share of that of a corner: noise has saddles on straight edges."""
 _ALONG = 9
@@ -41,15 +43,15 @@ _EDGE = 0.35
 """Least contrast along an edge, as a share of its median."""
 
 
-def with_seen_edges(grey: NDArray[np.float32], saddles: Saddles) -> Saddles:
+def with_seen_edges(grey: NDArray[np.float32], saddles: Saddles, radius: float = _NEAR_PX) -> Saddles:
     """Saddles with the directions in which their edges are seen, which second derivatives do not show."""
     from .compiled_tags import seen_edges  # takes half a second to import; not every command needs it
 
-    edges = seen_edges(grey, saddles.xy, saddles.edges, _RADIUS_PX, _PLACES)
+    edges = seen_edges(grey, saddles.xy, saddles.edges, radius, _PLACES)
     return Saddles(saddles.xy, edges, saddles.strength)
 
 
-def tag_outlines(grey: NDArray[np.float32], saddles: Saddles) -> Rows:
+def tag_outlines(grey: NDArray[np.float32], saddles: Saddles, weak: float, radius: float) -> Rows:
     """Saddles (m, 4) that are the corners of dark quadrilaterals, clockwise in the image.
 
     Parameters
@@ -58,15 +60,19 @@ def tag_outlines(grey: NDArray[np.float32], saddles: Saddles) -> Rows:
         Grey values.
     saddles : Saddles
         Their saddles.
+    weak : float
+        Least strength of a corner, as a share of the strong ones of the frame.
+    radius : float
+        Of the circle around a saddle on which its edges are seen, pixels.
     """
     if len(saddles) < 4:
         return np.zeros((0, 4), dtype=np.intp)
-    strong = np.flatnonzero(saddles.strength > _WEAK * saddles.strength[:30].mean())
+    strong = np.flatnonzero(saddles.strength > weak * saddles.strength[:30].mean())
     saddles, count = saddles.select(strong), len(strong)
     # The dark sectors of a saddle extend from its second edge to the first, turned by 180°, and opposite.
     from .compiled_tags import next_corners  # takes half a second to import; not every command needs it
 
-    first, second = with_seen_edges(grey, saddles).edges.T
+    first, second = with_seen_edges(grey, saddles, radius).edges.T
     turn = np.pi * np.arange(2)[:, None]
     # Seen from a corner, the interior of a tag is the sector from `leaves` to `arrives`, x into y: a cycle
     # that is clockwise in the image leaves along the former and arrives against the latter.
