@@ -28,8 +28,8 @@ _AIMED = np.deg2rad(7)
 _PARALLEL = np.deg2rad(15)
 """Largest angle between the edges of a tag at its two ends: lenses bend it."""
 SEARCHES = ((0.08, 4.0), (0.25, 4.0), (0.25, 12.0))
-"""How tags are looked for, one way after the other while few are found. Least strength of a corner, as a share
-of the strong ones of the frame: between the corners of a large tag, noise and texture have many weak ones.
+"""How tags are looked for, one way after the other while few are found. Least strength of a corner, a share
+of the strong ones of the frame: between corners of a large tag, noise and texture have many that are weak.
 Radius of the circle on which edges are seen, pixels: motion turns them near a corner."""
 _NEAR_PX, _PLACES = 4.0, 48
 """This radius where corners are not those of tags; number of places on the circle."""
