@@ -188,7 +188,8 @@ def estimate_kernel(samples: Samples, sharper: tuple[float, ...] = _SHARPER) -> 
     share : float
         Share of the width `psf_px` of the Gaussian to which it belongs.
     gain : float
-        Mean square of the residuals with the kernel over that without.
+        Mean square of the residuals, per redundancy, with the kernel over that without; 1 where too few pixels
+        are left to tell.
 
     Examples
     --------
@@ -210,7 +211,7 @@ def estimate_kernel(samples: Samples, sharper: tuple[float, ...] = _SHARPER) -> 
     )
     k, high, wide = samples.grey.shape
     used = samples.used.reshape(k, 1, -1).astype(np.float64)
-    every, best, plain, tried = np.arange(k), (np.inf, 1.0, np.zeros(len(offsets))), np.inf, sharper
+    every, best, plain, tried = np.arange(k), (np.inf, 1.0, np.zeros(len(offsets)), 0.0), np.inf, sharper
     observed = np.where(samples.used, samples.grey, 0.0).reshape(k, 1, -1)
     for share_of_width in tried:
         place = (
@@ -249,14 +250,20 @@ def estimate_kernel(samples: Samples, sharper: tuple[float, ...] = _SHARPER) -> 
             weight_of_prior = cost / max(used.sum(), 1) / _TAP**2
             values = np.linalg.solve(square + weight_of_prior * np.eye(len(offsets)), across)
             cost = float(total - 2 * values @ across + values @ square @ values)
+        # A weak observation of a value of the kernel takes a part of one from the redundancy.
+        taken_by = float(np.trace(np.linalg.solve(square + weight_of_prior * np.eye(len(offsets)), square)))
+        spare = float(used.sum()) - k * basis.shape[1] - taken_by
         if cost < best[0]:
-            best = cost, share_of_width, values
+            best = cost, share_of_width, values, spare
         if cost > _FUTILE * plain:
             break
-    cost, share_of_width, values = best
+    cost, share_of_width, values, spare = best
     kernel = np.zeros((2 * _REACH + 1,) * 2)
     values = np.where(np.abs(values) < _SMALL, 0.0, values)
     for (i, j), value in zip(offsets.tolist(), values, strict=True):
         kernel[_REACH + j, _REACH + i] = kernel[_REACH - j, _REACH - i] = value
     kernel[_REACH, _REACH] = 1 - kernel.sum()
-    return kernel, share_of_width, cost / max(plain, 1e-300)
+    before = float(used.sum()) - k * (basis.shape[1] + 1)
+    if min(spare, before) < 1:
+        return kernel, share_of_width, 1.0
+    return kernel, share_of_width, (cost / spare) / max(plain / before, 1e-300)
