@@ -19,8 +19,9 @@ from ...optics.corners import Corners, corner_images
 from ...optics.formation import PixelResponse, polygons
 from ..matching import GrownOutline, Matches, Shape, Window
 from ..points import Reason
+from ..reseau.mark_windows import Located
 from ..reseau.marks import ReseauOptions
-from ..reseau.plane_marks import Located, PlaneMarks
+from ..reseau.plane_marks import PlaneMarks
 from ..screening import Screened
 from ..testfield.lattice_mapping import images_of, second_order
 
@@ -211,7 +212,7 @@ class CornerMarks(PlaneMarks):
                 inside |= beside & (side > 0) & (side < self.sectors.along)
         return inside
 
-    def _beside(self) -> Array | None:
+    def beside(self) -> Array | None:
         """See :class:`PlaneMarks`: the markers in bright squares, as solid figures; bright cells of tags."""
         outlines, look = self.sectors.outlines, self.look
         if not len(outlines):
@@ -257,7 +258,7 @@ class CornerMarks(PlaneMarks):
         self.figures = share, at, look.psf_px, look.kernel
         return share
 
-    def _settle(self, first: Matches) -> Matches:
+    def settle(self, first: Matches) -> Matches:
         """See :class:`PlaneMarks`."""
         self.look = replace(self.look, psf_px=float(np.median(first.psf_px)))
         return first
@@ -290,7 +291,7 @@ class CornerMarks(PlaneMarks):
         """Share (k, e) of the pixels on each blurred edge that were used."""
         used = np.isfinite(found.residuals)
         high, wide = (n // 2 for n in used.shape[1:])
-        x, y = self._pixels(rows, (wide, high))
+        x, y = self.pixels(rows, (wide, high))
         _, along, _ = self._steps(rows)
         tangent = along / np.linalg.norm(along, axis=1, keepdims=True)
         region = self._region(rows, (wide, high))
@@ -303,7 +304,7 @@ class CornerMarks(PlaneMarks):
             shares.append((used & rim).sum(axis=(1, 2)) / np.maximum(rim.sum(axis=(1, 2)), 1))
         return np.stack(shares, axis=1)
 
-    def _radius(self, rows: Rows) -> Array:
+    def radius(self, rows: Rows) -> Array:
         """See :class:`PlaneMarks`: corners do not bulge."""
         return np.zeros(len(rows))
 

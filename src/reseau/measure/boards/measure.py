@@ -17,8 +17,9 @@ from ...designs.dots import halves_of_dots
 from ...io.board import BoardDesign
 from ..points import Measured
 from ..reseau.disks import find_disks
+from ..reseau.mark_windows import Located
 from ..reseau.marks import ReseauOptions
-from ..reseau.plane_marks import Located, PlaneMarks
+from ..reseau.plane_marks import PlaneMarks
 from ..reseau.sheet import DiskMarks
 from ..screening import Screened, screen
 from ..testfield.lattice_mapping import second_order

@@ -24,7 +24,7 @@ from ...io.board import BoardDesign
 from ...optics import Chain
 from ..reseau.disks import Disks
 from ..reseau.lens_mapping import lens_through
-from ..reseau.plane_marks import Located
+from ..reseau.mark_windows import Located
 from ..reseau.sheet_placement import MOST_DISKS, disk_seeds, grown_disks, through
 from ..testfield.lattice_mapping import images_of, slope_of
 from .bits import Bits, Integers, read_bits

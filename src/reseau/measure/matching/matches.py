@@ -91,6 +91,11 @@ class Matches:
     def __len__(self) -> int:
         return len(self.xy)
 
+    @property
+    def variance(self) -> Array:
+        """Mean variance (k,) of both coordinates."""
+        return np.asarray(np.trace(self.cov, axis1=1, axis2=2) / 2)
+
     def select(self, keep: Mask | Rows) -> Matches:
         """Matches selected by a mask (k,), or by rows."""
         return Matches(**{column.name: getattr(self, column.name)[keep] for column in fields(self)})

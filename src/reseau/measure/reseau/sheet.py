@@ -22,8 +22,9 @@ from ..points import Reason
 from ..screening import Screened, screen
 from ..testfield.lattice_mapping import images_of, second_order, slope_of
 from .disks import Disks, find_disks
+from .mark_windows import Located
 from .marks import ReseauOptions
-from .plane_marks import Located, PlaneMarks
+from .plane_marks import PlaneMarks
 from .sheet_placement import MOST_DISKS, SheetPlacement, lay_sheet, through
 
 __all__ = ["DiskMarks", "measure_sheet"]
@@ -131,7 +132,7 @@ class DiskMarks(PlaneMarks):
         outline = Outline(nodes - images_of(self.mapping, at)[:, None], tangents).oriented().single()
         return GrownOutline(outline, _FORM), np.abs(outline.xy).max(axis=1)
 
-    def _settle(self, first: Matches) -> Matches:
+    def settle(self, first: Matches) -> Matches:
         """Learn sharpness and size; the form of the matches refers to the new size."""
         growth = float(np.median(first.form[:, 0]))
         self.look = replace(
@@ -143,7 +144,7 @@ class DiskMarks(PlaneMarks):
         """Share (k,) of the pixels on the blurred edge of each disk that were used."""
         used = np.isfinite(found.residuals)
         high, wide = (n // 2 for n in used.shape[1:])
-        x, y = self._pixels(rows, (wide, high))
+        x, y = self.pixels(rows, (wide, high))
         radii = second_order(self.mapping, self.at[rows])[1] @ self.frame * (self.look.size / 2)
         off = np.stack(np.broadcast_arrays(x, y), axis=-1) - found.xy[:, None, None]
         # The unit circle is the edge.
@@ -152,7 +153,7 @@ class DiskMarks(PlaneMarks):
         rim = np.abs(distance - 1) < width[:, None, None]
         return np.asarray((used & rim).sum(axis=(1, 2)) / np.maximum(rim.sum(axis=(1, 2)), 1))
 
-    def _radius(self, rows: Rows) -> Array:
+    def radius(self, rows: Rows) -> Array:
         """See :class:`PlaneMarks`."""
         slope = second_order(self.mapping, self.at[rows])[1] @ self.frame
         return np.asarray(self.look.size / 2 * np.sqrt(np.abs(np.linalg.det(slope))))
@@ -205,7 +206,7 @@ class _Sheet(DiskMarks):
         self.design = design
         self.ring: tuple[Array, Chain, float, Array | None] | None = None
 
-    def _beside(self) -> Array | None:
+    def beside(self) -> Array | None:
         """Share (h, w) of each pixel that the coded rings take; formed anew when they have changed."""
         look, rings = self.look, self.design.rings
         if rings is None:

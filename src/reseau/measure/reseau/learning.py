@@ -1,0 +1,237 @@
+"""The appearance of the marks of a frame, learnt from some of them.
+
+These are matched first as they come. They show the mapping, the sharpness, the size of the marks, noise and
+light; what they leave shows motion or sharpening, and the curve between light and grey values.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.data import Array, Mask, Rows
+from ...core.failure import Code, Remark
+from ...core.tone import ToneCurve
+from ..matching import Matches, grey_variance
+from ..response import Samples, estimate_kernel
+from ..tone import find_curve
+from .lens_mapping import mapping_through
+from .mark_windows import DISTURBED, ENOUGH, Appearance, MarkWindows
+from .sheet_placement import through
+
+__all__ = ["learn"]
+
+_FEW = 3
+"""One in so many of these shows whether a kernel is needed."""
+_KERNELS = 2
+"""Number of times a kernel is estimated."""
+_FILTERED = 0.85
+"""Ratio of mean square residuals below which a kernel is used."""
+_EXPLAINED = 0.7
+"""Ratio of residuals below which a curve explains what looked like motion or sharpening."""
+_SPREAD = 16
+"""Least number of marks that show the mapping through a lens before all are matched."""
+_NEAR_WIDTH, _NEAR_FORM = 0.15, 0.01
+"""Relative error of the sharpness, and change of the form, beyond which marks are matched again before the
+camera's response is learnt."""
+_AROUND_PX, _SHARPNESS_OF, _SHARP = 9, 9, (0.4, 6.0)
+"""Reach around a mark within which the sharpness is seen first, number of marks; and its limits, pixels."""
+_PSF_LOG_SIGMA = 0.2
+"""Spread of sharpness (logarithm) over the marks of one frame."""
+
+
+def learn(marks: MarkWindows) -> tuple[Remark, ...]:
+    """Learn the appearance of marks, and adopt it.
+
+    Parameters
+    ----------
+    marks : MarkWindows
+        Of which `look` is learnt, with positions and mapping, and grey values proportional to the light.
+
+    Returns
+    -------
+    tuple of Remark
+        What a user should know.
+    """
+    rows = np.flatnonzero(marks.found)
+    if len(rows) > marks.learnt_from:
+        rows = rows[np.linspace(0, len(rows) - 1, marks.learnt_from).astype(np.intp)]
+    first, sure, begun_px = _first(marks, rows)
+    if sure.sum() < ENOUGH:
+        return ()
+    return _respond(marks, _learn(marks, first.select(sure), rows[sure]), rows[sure], begun_px)
+
+
+def _first(marks: MarkWindows, rows: Rows) -> tuple[Matches, Mask, float]:
+    """First matches of some marks, which of them are reliable, and the sharpness from which they began."""
+    if marks.precise_start:
+        psf_px = _sharpness(marks, rows)
+        marks.look = replace(marks.look, psf_px=psf_px, blur_px=psf_px)
+        first = marks.match(rows)
+        sure = first.converged & (first.t > 8)
+        if sure.any():
+            sure &= first.noise < DISTURBED * np.median(first.noise[sure])
+        if 2 * sure.sum() > len(rows):
+            return first, sure, psf_px
+        psf_px = marks.options.psf_px
+        marks.look = replace(marks.look, psf_px=psf_px, blur_px=psf_px)
+        marks.quick = False
+    first = marks.match(rows)
+    return first, first.converged & (first.t > 8) & (first.rejected < 0.2), marks.options.psf_px
+
+
+def _sharpness(marks: MarkWindows, rows: Rows) -> float:
+    """Width of the point-spread function by the steepest slopes around some of the marks, pixels."""
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, _SHARPNESS_OF).astype(np.intp))]
+    half = _AROUND_PX + int(np.ceil(marks.radius(rows).max()))
+    x, y = marks.pixels(rows, (half, half))
+    grey = marks.screened.grey[y, x]
+    # Over two pixels; that and the pixel itself have variances of 1/3 and 1/12.
+    across = (grey[:, 1:-1, 2:] - grey[:, 1:-1, :-2]) / 2
+    down = (grey[:, 2:, 1:-1] - grey[:, :-2, 1:-1]) / 2
+    steep = np.quantile(np.hypot(across, down).reshape(len(rows), -1), 0.98, axis=1)
+    dark, bright = np.quantile(grey.reshape(len(rows), -1), [0.1, 0.9], axis=1)
+    variance = (bright - dark) ** 2 / (2 * np.pi * np.maximum(steep, 1e-9) ** 2) - 1 / 3 - 1 / 12
+    return float(np.clip(np.sqrt(max(float(np.median(variance)), 0.0)), *_SHARP))
+
+
+def _learn(marks: MarkWindows, first: Matches, rows: Rows) -> Matches:
+    """Learn mapping, sharpness, size and noise from reliable marks; their form refers to the new size."""
+    marks.start[rows] = first.xy
+    known = marks.found if marks.precise_start else np.isin(np.arange(len(marks.at)), rows)
+    h, w = marks.screened.grey.shape
+    marks.mapping = through(marks.at[known], marks.start[known], (h, w))
+    if marks.eccentric and len(rows) >= _SPREAD:
+        sigma = np.sqrt(first.variance)
+        marks.mapping = mapping_through(marks.at[rows], first.xy, sigma, (h, w)).mapping
+    _weigh(marks, first, rows)
+    first = marks.settle(first)
+    marks.look = replace(
+        marks.look,
+        psf_log_sigma=_PSF_LOG_SIGMA,
+        form_sigma=marks.learnt_form_sigma,
+        blur_px=marks.look.psf_px,
+    )
+    marks.start = np.where(marks.found[:, None], marks.start, marks.mapping(marks.at))
+    return first
+
+
+def _respond(marks: MarkWindows, first: Matches, rows: Rows, begun_px: float) -> tuple[Remark, ...]:
+    """Learn what motion, sharpening and the curve of the camera make of the images.
+
+    `begun_px` is the sharpness from which the first match began.
+    """
+    some = np.unique(np.linspace(0, len(rows) - 1, marks.sampled).astype(np.intp))
+    first, rows = first.select(np.isin(np.arange(len(rows)), some)), rows[some]
+    # The first match may have begun far from the sharpness and form of these images, or with other
+    # figures beside them.
+    near = abs(np.log(np.median(first.psf_px) / begun_px)) < _NEAR_WIDTH
+    near &= bool((np.median(np.abs(first.form), axis=0) < _NEAR_FORM).all())
+    if not (marks.precise_start and near and marks.beside() is None):
+        first = marks.settle(marks.match(rows))
+        _weigh(marks, first, rows)
+    few = np.arange(len(rows)) % _FEW == 0
+    kernel, sharper, gain = estimate_kernel(marks.samples(first.select(few), rows[few])[0])
+    bent = False
+    notes: tuple[Remark, ...] = ()
+    if gain < _FILTERED and marks.curve_first:
+        first, bent, notes = _straighten(marks, first, rows, beside=gain)
+        if bent:
+            kernel, sharper, gain = estimate_kernel(marks.samples(first.select(few), rows[few])[0])
+    if gain < _FILTERED:
+        for again in range(_KERNELS):
+            if again:
+                # Position and form were those of images without the kernel.
+                marks.look = replace(marks.look, kernel=None)
+                kernel, sharper, _ = estimate_kernel(marks.samples(first, rows)[0], (1.0,))
+            marks.look = replace(marks.look, kernel=kernel, psf_px=sharper * marks.look.psf_px)
+            first = marks.settle(marks.match(rows))
+            _weigh(marks, first, rows)
+        text = "the images are smeared by motion or sharpened: this was estimated and is modelled"
+        notes = (*notes, Remark(text, Code.FILTERED))
+    if not bent:
+        notes = (*notes, *_straighten(marks, first, rows)[2])
+    return notes
+
+
+def _straighten(
+    marks: MarkWindows, first: Matches, rows: Rows, beside: float | None = None
+) -> tuple[Matches, bool, tuple[Remark, ...]]:
+    """Learn the curve between light and grey values; whether there is one, and what a user should know.
+
+    Where a kernel leaves the share `beside` of the mean square residuals, a curve is adopted only if it
+    leaves less than that, and much less than grey values as they are.
+    """
+    straight, full_scale = ToneCurve(1.0), marks.image.full_scale
+    tried = {straight: (marks.screened, marks.look, first)}
+
+    def matched(curve: ToneCurve) -> tuple[Samples, Array] | None:
+        if curve not in tried:
+            marks.screened = replace(marks.screened, grey=_linear(marks, curve))
+            # The noise of grey values is alike, that of light grows with it where curves are steeper.
+            bent = float(curve.light(np.array(0.5), 1.0)) < 0.5
+            variance = (0.02 * full_scale, 1.0) if bent else None
+            marks.look = _relit(marks, replace(marks.look, variance=variance), tried[straight][1], curve)
+            again = marks.settle(marks.match(rows))
+            marks.screened = replace(marks.screened, noise=float(np.median(again.noise)))
+            tried[curve] = marks.screened, marks.look, again
+        marks.screened, marks.look, again = tried[curve]
+        good = again.converged
+        if not good.all() and not (marks.precise_start and good.sum() >= ENOUGH):
+            return None
+        return marks.samples(again.select(good), rows[good])
+
+    found = find_curve(matched, full_scale, marks.image.curve, beside=1.0 if beside is None else beside)
+    chosen = found.curve or straight
+    if beside is not None and found:
+        # A kernel was suspected: whether the curve explains the residuals instead.
+        left, before = (
+            np.median(tried[c][2].noise / np.abs(marks.depth(tried[c][2]))) for c in (chosen, straight)
+        )
+        chosen = chosen if left < _EXPLAINED * before else straight
+    marks.screened, marks.look, first = tried[chosen]
+    if chosen is not straight:
+        _weigh(marks, first, rows)
+    note = found.remark(f"{marks.word}s")
+    noted = note is not None and (chosen is not straight or beside is None)
+    return first, chosen is not straight, (note,) if note and noted else ()
+
+
+def _relit(marks: MarkWindows, look: Appearance, straight: Appearance, curve: ToneCurve) -> Appearance:
+    """An appearance with the contrast and light of another one in grey values along a curve."""
+    if straight.light is None or straight.contrast is None or marks.polarity != "dark":
+        return replace(look, light=None)
+    level = np.abs(straight.light / straight.contrast)
+    paper, ink = (curve.light(v, marks.image.full_scale) for v in (level, level + straight.light))
+    contrast = 1 - ink / np.maximum(paper, 1e-12)
+    return replace(look, contrast=contrast, light=ink - paper)
+
+
+def _weigh(marks: MarkWindows, first: Matches, rows: Rows) -> None:
+    """Learn noise, contrast and light from some of the marks; those of the others change as much."""
+
+    def renewed(known: Array | None, values: Array) -> Array:
+        whole = np.full(len(marks.at), np.median(values))
+        if known is not None:
+            whole = known * np.median(values / known[rows])
+        whole[rows] = values
+        return np.asarray(whole)
+
+    look, marks.rough = marks.look, float(np.median(first.noise))
+    marks.look = replace(
+        look,
+        variance=grey_variance(marks.screened.grey, marks.start[rows], first.residuals),
+        contrast=renewed(look.contrast, first.contrast),
+        light=renewed(look.light, marks.depth(first)),
+    )
+
+
+def _linear(marks: MarkWindows, curve: ToneCurve) -> NDArray[np.float32]:
+    """Grey values of the frame that are proportional to the light."""
+    pixels, full_scale = marks.image.pixels, marks.image.full_scale
+    if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2:
+        return curve.light(pixels.astype(np.float32), full_scale)
+    levels = np.arange(np.iinfo(pixels.dtype).max + 1, dtype=np.float32)
+    return np.asarray(curve.light(levels, full_scale)[pixels])
