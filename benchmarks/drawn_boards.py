@@ -155,6 +155,10 @@ def line(kind: str, label: str, view: View) -> bool:
               f"{'ok' if good else 'MISSED'}", flush=True)  # fmt: skip
         return good
     own = np.flatnonzero(found.ok)
+    if not len(own):
+        print(f"{kind:12} {label:14}    0 of {int(sight.sum()):4} {len(others):4}  "
+              f"{'MISSED' if len(others) else 'ok'}", flush=True)  # fmt: skip
+        return not len(others)
     near = np.hypot(*(found.xy[own, None] - xy[None]).transpose(2, 0, 1)).argmin(axis=1)
     error = found.xy[own] - xy[near]
     sigma = np.sqrt(np.diagonal(found.cov[own], axis1=1, axis2=2))

@@ -314,6 +314,7 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     "lowcon": {"contrast": 0.12},
     "specular": {"gloss": 150.0, "light": 190.0},
     "saturated": {"light": 251.0, "fall": 0.3},
+    "overexposed": {"light": 340.0},
     "hand": {"hand": True},
     "gamma": {"gamma": 2.2},
     "jpeg60": {"jpeg": 60},

@@ -260,6 +260,20 @@ def test_of_two_tags_that_contradict_each_other_none_names_the_board() -> None:
     assert other.code is Code.INCONSISTENT
 
 
+def test_corners_on_paper_that_is_saturated_everywhere_are_measured_to_their_sigmas() -> None:
+    """The middle of every edge is not, and tells where it is: as many corners as ``aprilgrid`` finds, 132."""
+    printed = prints.aprilgrid(6, 6, 22.0, 0.3, "DICT_APRILTAG_36h11", 2)
+    view = View(printed, *pose(1, printed), seed=10, light=340.0)
+    found = measured(
+        Frame(view.picture(), 255.0, "bright"), board("aprilgrid", 6, 6, 28.6, size=22.0, border_bits=2)
+    )
+    assert found.found >= 132
+    error = (found.xy - view.truth)[found.ok]
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert np.sqrt((error**2).mean()) < 0.006
+    assert 0.8 < np.sqrt(((error / sigma) ** 2).mean()) < 1.2
+
+
 DELTILLE, DELTILLE_PRINT = board("deltille", 9, 8, 25.0), prints.Deltille(9, 8, 25.0)
 
 

@@ -33,6 +33,8 @@ from .tags import with_seen_edges
 
 __all__ = ["BoardOptions", "BoardResult", "measure_board", "puzzle_part"]
 
+_BRIGHT = 0.75
+"""Share of the range of the sensor below which no noise makes a pixel clipped."""
 _CIRCLE_EDGE = 3.0
 """Distance from the next circle in which pixels are not used, in widths of the point-spread function."""
 
@@ -205,9 +207,10 @@ def _measured(frame: Frame, design: BoardDesign, options: BoardOptions) -> Board
             where=frame.name,
             places=placed.places,
         )
-    # Whether a pixel beside a clipped one is itself clipped depends on its noise.
+    # Whether a bright pixel beside a clipped one is itself clipped depends on its noise.
     clipped = cv2.dilate((frame.pixels >= frame.full_scale).astype(np.uint8), np.ones((3, 3), np.uint8))
-    screened = replace(screened, valid=screened.valid & (clipped == 0))
+    bright = frame.pixels > _BRIGHT * frame.full_scale
+    screened = replace(screened, valid=screened.valid & ~(bright & (clipped > 0)))
     common = ReseauOptions(
         psf_px=options.psf_px,
         row_jitter_px=options.row_jitter_px,

@@ -35,7 +35,7 @@ _ROUGH_PX = 0.005
 """Deviation that does not count in the comparison of mappings: positions were formed with another one."""
 _PER_TERM = 2.0
 """Least number of points for each term of a polynomial."""
-_STEPS, _SETTLED = 12, 1e-3
+_STEPS, _SETTLED = 24, 1e-3
 """Most iterations, and change of the sum of squares at which they end."""
 _SHOWN = 4
 """Redundancy from which misfits tell more about the errors of a mapping than sigmas do."""
