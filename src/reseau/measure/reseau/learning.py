@@ -21,7 +21,7 @@ from .lens_mapping import mapping_through
 from .mark_windows import DISTURBED, ENOUGH, Appearance, MarkWindows
 from .sheet_placement import through
 
-__all__ = ["learn"]
+__all__ = ["learn", "weigh"]
 
 _FEW = 3
 """One in so many of these shows whether a kernel is needed."""
@@ -106,7 +106,7 @@ def _learn(marks: MarkWindows, first: Matches, rows: Rows) -> Matches:
     if marks.eccentric and len(rows) >= _SPREAD:
         sigma = np.sqrt(first.variance)
         marks.mapping = mapping_through(marks.at[rows], first.xy, sigma, (h, w)).mapping
-    _weigh(marks, first, rows)
+    weigh(marks, first, rows)
     first = marks.settle(first)
     marks.look = replace(
         marks.look,
@@ -131,7 +131,7 @@ def _respond(marks: MarkWindows, first: Matches, rows: Rows, begun_px: float) ->
     near &= bool((np.median(np.abs(first.form), axis=0) < _NEAR_FORM).all())
     if not (marks.precise_start and near and marks.beside() is None):
         first = marks.settle(marks.match(rows))
-        _weigh(marks, first, rows)
+        weigh(marks, first, rows)
     few = np.arange(len(rows)) % _FEW == 0
     kernel, sharper, gain = estimate_kernel(marks.samples(first.select(few), rows[few])[0])
     bent = False
@@ -148,7 +148,7 @@ def _respond(marks: MarkWindows, first: Matches, rows: Rows, begun_px: float) ->
                 kernel, sharper, _ = estimate_kernel(marks.samples(first, rows)[0], (1.0,))
             marks.look = replace(marks.look, kernel=kernel, psf_px=sharper * marks.look.psf_px)
             first = marks.settle(marks.match(rows))
-            _weigh(marks, first, rows)
+            weigh(marks, first, rows)
         text = "the images are smeared by motion or sharpened: this was estimated and is modelled"
         notes = (*notes, Remark(text, Code.FILTERED))
     if not bent:
@@ -193,7 +193,7 @@ def _straighten(
         chosen = chosen if left < _EXPLAINED * before else straight
     marks.screened, marks.look, first = tried[chosen]
     if chosen is not straight:
-        _weigh(marks, first, rows)
+        weigh(marks, first, rows)
     note = found.remark(f"{marks.word}s")
     noted = note is not None and (chosen is not straight or beside is None)
     return first, chosen is not straight, (note,) if note and noted else ()
@@ -209,7 +209,7 @@ def _relit(marks: MarkWindows, look: Appearance, straight: Appearance, curve: To
     return replace(look, contrast=contrast, light=ink - paper)
 
 
-def _weigh(marks: MarkWindows, first: Matches, rows: Rows) -> None:
+def weigh(marks: MarkWindows, first: Matches, rows: Rows) -> None:
     """Learn noise, contrast and light from some of the marks; those of the others change as much."""
 
     def renewed(known: Array | None, values: Array) -> Array:

@@ -28,7 +28,7 @@ from ..matching import (
 from ..points import Reason
 from ..screening import Screened
 from ..testfield.targets import replaced
-from .learning import learn
+from .learning import learn, weigh
 from .lens_mapping import mapping_through
 from .mark_windows import DISTURBED, ENOUGH, SEEN, Located, MarkWindows
 from .marks import ReseauOptions
@@ -156,6 +156,7 @@ class PlaneMarks(MarkWindows):
             if self.eccentric:
                 # Growth about the image of the point is not that of the mark on its plane.
                 self.settle(found.select(sure))
+            weigh(self, found.select(sure), rows[sure])
             found = self._match_all(rows)
             sure = _sure(found)
         return found
