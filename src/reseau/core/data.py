@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arrays import Array, Mask, Rows
+from .arrays import Array, Mask, Rows, rows_of_groups
 from .display import Display
 from .errors import ImageError, UsageError
 from .files import write_whole
@@ -19,7 +19,7 @@ from .tone import ToneCurve
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Array", "Frame", "ImagePoints", "Mask", "Rows"]
+__all__ = ["Array", "Frame", "ImagePoints", "Mask", "Rows", "rows_of_groups"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -151,7 +151,8 @@ def write_colmap(result: Result, folder: Path | str) -> dict[str, Exported]:
     seen = used & fit.usable.points[network.point_of] & fit.usable.images[network.image_of]
     lines, place = list[str](), np.full(len(network.xy), -1)
     for i in np.flatnonzero(fit.usable.images):
-        rows = np.flatnonzero(seen & (network.image_of == i))
+        rows = network.rays_of_images[i]
+        rows = rows[seen[rows]]
         place[rows] = np.arange(len(rows))
         pose = [*_quaternion(turns[i]), *(-turns[i] @ fit.values.x0[i])]
         name = network.images[i]
@@ -161,7 +162,8 @@ def write_colmap(result: Result, folder: Path | str) -> dict[str, Exported]:
     size = np.linalg.norm(np.nan_to_num(result.residuals), axis=1)
     points = []
     for j in np.flatnonzero(fit.usable.points):
-        rows = np.flatnonzero(seen & (network.point_of == j))
+        rows = network.rays_of_points[j]
+        rows = rows[seen[rows]]
         track = " ".join(f"{network.image_of[k] + 1} {place[k]}" for k in rows)
         error = float(size[rows].mean()) if len(rows) else -1.0
         points.append(f"{j + 1} {_words(fit.values.xyz[j])} 128 128 128 {error!r} {track}")

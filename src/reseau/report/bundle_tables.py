@@ -26,15 +26,15 @@ def images_table(result: Result) -> list[tuple[str, ...]]:
     q = np.sqrt(np.maximum(np.diagonal(result.pose_covariance, axis1=1, axis2=2), 0.0))[:, 3:]
     rows: list[tuple[str, ...]] = []
     for i, name in enumerate(network.images):
-        at = network.image_of == i
-        at[at] = np.isfinite(v[at]).all(axis=1)
+        at = network.rays_of_images[i]
+        at = at[np.isfinite(v[at]).all(axis=1)]
         if not result.fit.usable.images[i]:
-            rows.append((name, str(int(at.sum())), "left out", *[""] * 7))
+            rows.append((name, str(len(at)), "left out", *[""] * 7))
             continue
         rows.append(
             (
                 name,
-                str(int(at.sum())),
+                str(len(at)),
                 _pair(np.sqrt((v[at] ** 2).mean(axis=0)), ".3f"),
                 _pair(result.variance_factors[i], ".2f"),
                 _pair(r[at].mean(axis=0), ".2f"),

@@ -168,8 +168,7 @@ def outside_image(network: Network) -> Rows:
     array([], dtype=int64)
     """
     found = [np.zeros(0, dtype=np.intp)]
-    for c, camera in enumerate(network.cameras):
-        rows = np.flatnonzero(network.camera_of[network.image_of] == c)
+    for camera, rows in zip(network.cameras, network.rays_of_cameras, strict=True):
         size = np.array([camera.width, camera.height], dtype=np.float64)
         out, swapped = _beyond(network.xy[rows], size)
         found += [] if swapped or _centred(network.xy[rows], size) else [rows[out]]
@@ -193,8 +192,7 @@ def _centred(xy: Array, size: Array) -> bool:
 def _outside(network: Network) -> list[Remark]:
     """Image coordinates outside the image, or in another unit."""
     found = []
-    for c, camera in enumerate(network.cameras):
-        rows = np.flatnonzero(network.camera_of[network.image_of] == c)
+    for camera, rows in zip(network.cameras, network.rays_of_cameras, strict=True):
         if not len(rows):
             continue
         size = np.array([camera.width, camera.height], dtype=np.float64)

@@ -479,9 +479,9 @@ def _parallel(network: Network, fit: BundleFit) -> list[Remark]:
 def _corners(network: Network, fit: BundleFit) -> list[Remark]:
     """Image corners without points, for cameras with free parameters."""
     found, used = [], fit.usable.observations
-    for c, camera in enumerate(network.cameras):
-        rows = used & (network.camera_of[network.image_of] == c)
-        if not camera.free or not rows.any():
+    for camera, rays in zip(network.cameras, network.rays_of_cameras, strict=True):
+        rows = rays[used[rays]]
+        if not camera.free or not len(rows):
             continue
         x, y = (network.xy[rows] / [camera.width, camera.height]).T
         corners = {

@@ -534,10 +534,8 @@ def _gross(network: Network, rows: Rows) -> Remark:
 
 def _worst_images(network: Network, size: Array) -> list[Remark]:
     """Name the images with the largest misfits (px), where nothing else can be said."""
-    median = [
-        float(np.median(own)) if (own := size[(network.image_of == i) & np.isfinite(size)]).size else 0.0
-        for i in range(len(network.images))
-    ]
+    each = [size[rows] for rows in network.rays_of_images]
+    median = [float(np.median(own)) if (own := v[np.isfinite(v)]).size else 0.0 for v in each]
     order = np.argsort(-np.array(median), kind="stable")[:3]
     names = listed(f"{network.images[i]} ({median[i]:.3g} px)" for i in order if median[i] > 0)
     return [Remark(f"the largest median misfits are in image {names}", Code.NOT_CONVERGED)] if names else []

@@ -10,7 +10,7 @@ from typing import Literal, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.data import Array, Mask, Rows
+from ...core.data import Array, Mask, Rows, rows_of_groups
 from ...core.display import Display
 from ...core.errors import UsageError
 from ...io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Network1
@@ -617,6 +617,21 @@ class Network(Display):
     def rays(self) -> Rows:
         """Number of images of each point (p,)."""
         return np.bincount(self.point_of, minlength=len(self.points)).astype(np.intp)
+
+    @cached_property
+    def rays_of_images(self) -> list[Rows]:
+        """Image observations of each image."""
+        return rows_of_groups(self.image_of, len(self.images))
+
+    @cached_property
+    def rays_of_cameras(self) -> list[Rows]:
+        """Image observations of each camera."""
+        return rows_of_groups(self.camera_of[self.image_of], len(self.cameras))
+
+    @cached_property
+    def rays_of_points(self) -> list[Rows]:
+        """Image observations of each point."""
+        return rows_of_groups(self.point_of, len(self.points))
 
     @cached_property
     def seen(self) -> Rows:

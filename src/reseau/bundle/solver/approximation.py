@@ -120,9 +120,11 @@ class _Block:
 
     def __init__(self, network: Network) -> None:
         self.network = network = _with_windows_on_cameras(network)
-        self.seen = directions(network)
-        self.uv = self.seen
         self.known = finite(network.xyz)
+        # Where all poses are known, only rays to unknown points are intersected.
+        ready = network.posed.all() and network.refraction is None
+        self.seen = directions(network, ~(ready & self.known[network.point_of]))
+        self.uv = self.seen
         self.xyz = network.xyz.copy()
         self.rotation = np.full((len(network.images), 3, 3), np.nan)
         self.x0 = network.x0.copy()
@@ -229,8 +231,7 @@ class _Block:
         waiting = np.flatnonzero(~self.posed & (count >= 4))
         waiting = waiting[count[waiting] >= 0.5 * count[waiting].max(initial=0)]
         for i in waiting.tolist():
-            rows = (network.image_of == i) & usable[network.point_of] & finite(self.uv)
-            self._resect(i, rows)
+            self._resect(i, self._seeing(i, usable))
         if (
             int(self.posed.sum()) == before
             and len(waiting)
@@ -241,21 +242,24 @@ class _Block:
 
     def _resect_one_by_one(self, usable: Mask, count: Rows) -> bool:
         """Orient one of the other images when those with the most points fail."""
-        network = self.network
         for i in np.flatnonzero(~self.posed & (count >= 4)).tolist():
-            rows = (network.image_of == i) & usable[network.point_of] & finite(self.uv)
-            if self._resect(i, rows):
+            if self._resect(i, self._seeing(i, usable)):
                 return True
         return False
 
-    def _resect(self, i: int, rows: Mask) -> bool:
+    def _seeing(self, i: int, usable: Mask) -> Rows:
+        """Rays of an image with a direction, to points that are usable (p,)."""
+        rows = self.network.rays_of_images[i]
+        return rows[usable[self.network.point_of[rows]] & finite(self.uv[rows])]
+
+    def _resect(self, i: int, rows: Rows) -> bool:
         """Orient an image by some of its points; return whether it could be oriented."""
         refraction, xyz = self.network.refraction, self.xyz[self.network.point_of[rows]]
         if self.lines[i]:
             return self._resect_line(i, rows)
         if self.network.parallel[i]:
             straight = resect_parallel(xyz, self.uv[rows], _LOOSE)
-            if straight is None or straight.agree.sum() < max(4, 0.5 * rows.sum()):
+            if straight is None or straight.agree.sum() < max(4, 0.5 * len(rows)):
                 return False
             self.rotation[i], self.x0[i] = straight.rotation, straight.x0
             return True
@@ -265,12 +269,12 @@ class _Block:
             # The bend of the rays depends on the pose.
             only = replace(refraction, path_of=refraction.path_of[[i]])
             found = resect_through(only, found, xyz, self.seen[rows], _LOOSE)
-        if found is None or found.agree.sum() < max(4, 0.5 * rows.sum()):
+        if found is None or found.agree.sum() < max(4, 0.5 * len(rows)):
             return False
         self.rotation[i], self.x0[i] = found.rotation, found.x0
         return True
 
-    def _resect_line(self, i: int, rows: Mask) -> bool:
+    def _resect_line(self, i: int, rows: Rows) -> bool:
         """Orient an image of a line camera, and find its velocity; return whether it could be oriented."""
         if self.network.parallel[i]:
             return False
@@ -331,9 +335,10 @@ class _Block:
         refraction, network = self.network.refraction, self.network
         if refraction is None:
             return
-        uv = behind_ports(refraction, self.seen, network.image_of)
+        uv, known = behind_ports(refraction, self.seen, network.image_of), finite(self.xyz)
         for i in np.flatnonzero(self.posed & (refraction.path_of >= 0)).tolist():
-            rows = np.flatnonzero((network.image_of == i) & finite(self.xyz)[network.point_of])
+            rows = self.network.rays_of_images[i]
+            rows = rows[known[network.point_of[rows]]]
             if len(rows):
                 bend = self._bend(rows, self.rotation[i], self.x0[i], self.xyz[network.point_of[rows]])
                 uv[rows] = self.seen[rows] - bend
@@ -371,7 +376,7 @@ class _Block:
         if network.parallel[[a, b]].any() or self.lines[[a, b]].any():
             # Two images with parallel rays do not determine their angle.
             return None
-        in_a, in_b = np.flatnonzero(network.image_of == a), np.flatnonzero(network.image_of == b)
+        in_a, in_b = network.rays_of_images[a], network.rays_of_images[b]
         _, left, right = np.intersect1d(
             network.point_of[in_a], network.point_of[in_b], assume_unique=True, return_indices=True
         )

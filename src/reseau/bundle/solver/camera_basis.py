@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from ...core.data import Array, Rows
+from ...core.data import Array, Rows, rows_of_groups
 from .compiled import compiled
 from .normal import Sums
 from .unknowns import Unknowns
@@ -72,13 +72,13 @@ def camera_bases(
     derivatives : ndarray (n, 2, w)
         Weighted derivatives of the image coordinates; those by the camera begin in the seventh column.
     """
-    found = []
+    found, rays = [], rows_of_groups(camera_of, len(unknowns.count))
     every = products_of(derivatives, camera_of, unknowns.count)
     weakest = _least_eigenvalues(every, unknowns.count)
     for c in np.flatnonzero((unknowns.camera >= 0) & (unknowns.count > 1) & ~(weakest > _GOOD)).tolist():
         if c in observed:
             continue
-        own, count = np.flatnonzero(camera_of == c), int(unknowns.count[c])
+        own, count = rays[c], int(unknowns.count[c])
         j = derivatives[own, :, 6 : 6 + count].reshape(-1, count)
         diagonal = np.einsum("ni,ni->i", j, j)
         if len(j) < j.shape[1] or not (diagonal > 0).all() or not np.isfinite(diagonal).all():
@@ -133,9 +133,9 @@ def with_bases(
     """Return the derivatives (n, 2, w) of the image coordinates by the combinations."""
     if not bases:
         return derivatives
-    rows = derivatives.copy()
+    rows, rays = derivatives.copy(), rows_of_groups(camera_of, len(unknowns.count))
+    camera_at = {int(column): c for c, column in enumerate(unknowns.camera)}
     for basis in bases:
-        c = int(np.flatnonzero(unknowns.camera == basis.columns[0])[0])
-        own, part = np.flatnonzero(camera_of == c), slice(6, 6 + len(basis.columns))
+        own, part = rays[camera_at[int(basis.columns[0])]], slice(6, 6 + len(basis.columns))
         rows[own, :, part] = rows[own, :, part] @ basis.turn
     return rows

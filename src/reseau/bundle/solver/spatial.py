@@ -56,13 +56,12 @@ class Pair(NamedTuple):
     agree: Mask
 
 
-def directions(network: Network) -> Array:
-    """Compute ideal directions u = xc/zc, v = yc/zc (n, 2) of all image coordinates."""
+def directions(network: Network, wanted: Mask | None = None) -> Array:
+    """Compute ideal directions u = xc/zc, v = yc/zc (n, 2) of image coordinates; NaN for those not wanted."""
     found = np.full((len(network.xy), 2), np.nan)
-    camera = network.camera_of[network.image_of]
-    for c, entry in enumerate(network.cameras):
-        rows = camera == c
-        if rows.any():
+    for entry, own in zip(network.cameras, network.rays_of_cameras, strict=True):
+        rows = own if wanted is None else own[wanted[own]]
+        if len(rows):
             xy = network.xy[rows]
             if entry.shutter is not None and entry.shutter.mode == "line":
                 xy = np.column_stack([xy[:, 0], np.full(len(xy), entry.shutter.row)])

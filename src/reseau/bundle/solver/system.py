@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 
 from ...adjust.stochastic import Weighting
-from ...core.data import Array, Mask, Rows
+from ...core.data import Array, Mask, Rows, rows_of_groups
 from ...optics import PlaneMapping
 from ..network import Network
 from .arrow import Arrow, full
@@ -791,12 +791,10 @@ def residuals(
 
 def _mappings(network: Network, camera_of: Rows, values: Values) -> list[tuple[PlaneMapping, int, Rows]]:
     """Return mapping, number and rows of the observations of each camera without a kernel."""
+    without = [c for c, camera in enumerate(network.cameras) if camera.compiled_kind is None]
+    if not without:
+        return []
+    rays, at = rows_of_groups(camera_of, len(network.cameras)), values.cameras
     return [
-        (
-            camera.bare_mapping(values.cameras[c, : len(camera.names)]),
-            c,
-            np.flatnonzero(camera_of == c).astype(np.intp),
-        )
-        for c, camera in enumerate(network.cameras)
-        if camera.compiled_kind is None
+        (network.cameras[c].bare_mapping(at[c, : len(network.cameras[c].names)]), c, rays[c]) for c in without
     ]
