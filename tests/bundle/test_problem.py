@@ -14,7 +14,7 @@ from reseau.adjust import GaussMarkov, Parameters, Prior, adjust
 from reseau.adjust import Options as AdjustOptions
 from reseau.bundle import BundleFit, BundleProblem, Network, Options, Result, adjust_network
 from reseau.bundle.diagnostics.checks import checks
-from reseau.bundle.solver.posterior import inverse_from_rows
+from reseau.bundle.solver.orthogonal import cofactors_from_rows
 from reseau.bundle.solver.problem import _Run
 from reseau.bundle.solver.system import residuals
 from reseau.core.data import Array
@@ -267,9 +267,8 @@ def test_the_inverse_from_rows_is_that_of_the_normal_equations() -> None:
     """From the rows of the observations of all kinds, never multiplied out."""
     world = mixed()
     fit = required(world.problem(world.noisy(3), **TOLERANCE))
-    normal = fit.linear.normal(0.0)
     held = np.diag(fit.cofactors.reduced.full) == 0
-    from_rows = inverse_from_rows(normal, held)
+    from_rows = cofactors_from_rows(fit.linear, held).border
     size = np.sqrt(np.diag(from_rows))
     size[held] = 1.0
     np.testing.assert_allclose(
