@@ -131,6 +131,7 @@ class CornerMarks(PlaneMarks):
     learnt_from = 24
     sampled = 12
     precise_start = True
+    bounded = True
     curve_first = True
     even = True
     formed_px = 0.0007

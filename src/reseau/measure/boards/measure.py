@@ -276,6 +276,7 @@ class CircleMarks(DiskMarks):
     learnt_from = 24
     sampled = 12
     precise_start = True
+    bounded = True
     curve_first = True
     eccentric = True
     even = True

@@ -345,10 +345,15 @@ def lay_circles(disks: Disks, design: BoardDesign, shape: tuple[int, int]) -> Pl
     disks = disks.strongest(MOST_DISKS * len(numbers))
     extent = int(np.ptp(numbers, axis=0).max()) + 1
     best: tuple[Array, Rows, Chain] | None = None
+    again = False
     for seed in disk_seeds(disks, 2 * step / design.size):
+        if again and best is not None and seed[0] in best[1]:
+            continue
         found = grown_disks(*seed, disks, shape, extent)
+        # The other disks of a lattice that has grown twice from different seeds grow to the same.
+        again |= best is not None and np.array_equal(np.sort(found[1]), np.sort(best[1]))
         if best is None or len(found[0]) > len(best[0]):
-            best = found
+            best, again = found, False
         if len(best[0]) >= _ENOUGH * len(numbers):
             break
     if best is None or len(best[0]) < min(_FEWEST, len(numbers)):

@@ -39,6 +39,8 @@ _GROUND_PX, _GROUND_WIDTHS = 5, 3.0
 """Background shown by a window around its mark: pixels, and widths of the point-spread function."""
 _AT_ONCE_PX = 60_000
 """Number of pixels of windows matched together; what is formed in them fits into the cache of a processor."""
+_SHARED_PX = 20_000
+"""Number of pixels whose matching takes as long as what windows of one more size take beside it."""
 _LEARNT_FROM = 120
 """Most marks from which mapping and appearance are learnt first."""
 _SLOPE = 0.3
@@ -161,6 +163,8 @@ class MarkWindows(ABC):
     one through all of them."""
     least_seen: ClassVar[float] = SEEN
     """Least share of a mark on pixels that can be used."""
+    bounded: ClassVar[bool] = False
+    """Whether a window may be larger than its mark needs: :meth:`_region` excludes what else it shows."""
     curve_first: ClassVar[bool] = False
     """Whether a curve between light and grey values is looked for before motion and sharpening."""
 
@@ -264,12 +268,16 @@ class MarkWindows(ABC):
         """Marks with windows of one size, not too many, and half their width and height."""
         ground = max(_GROUND_PX, int(np.ceil(_GROUND_WIDTHS * self.look.blur_px)))
         sizes, of = np.unique(np.ceil(reach / _CLASS_PX).astype(np.intp), axis=0, return_inverse=True)
-        for k, size in enumerate(sizes):
-            half = size * _CLASS_PX + ground
-            part = np.flatnonzero(of.ravel() == k)
-            some = max(1, int(_AT_ONCE_PX // (2 * half + 1).prod()))
+        of = of.ravel()
+        sides = 2 * (sizes * _CLASS_PX + ground) + 1
+        if self.bounded:
+            sides, joined = _joined(sides, np.bincount(of))
+            of = joined[of]
+        for k, side in enumerate(sides):
+            part = np.flatnonzero(of == k)
+            some = max(1, int(_AT_ONCE_PX // side.prod()))
             for piece in np.array_split(part, -(-len(part) // some)):
-                yield piece, (int(half[0]), int(half[1]))
+                yield piece, (int(side[0] // 2), int(side[1] // 2))
 
     def pixels(self, rows: Rows, half: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Columns (k, 1, c) and rows (k, r, 1) of the windows of marks, within the frame."""
@@ -324,3 +332,21 @@ class MarkWindows(ABC):
             np.isfinite(residuals),
         )
         return samples, grey + np.nan_to_num(residuals)
+
+
+def _joined(sides: Rows, count: Rows) -> tuple[Rows, Rows]:
+    """Sizes (m, 2) that serve `count` (k,) windows of the sizes (k, 2), and which one serves each."""
+    of = np.arange(len(sides))
+    while len(sides) > 1:
+        both = np.maximum(sides[:, None], sides)
+        area = count * sides.prod(axis=1)
+        more = (count[:, None] + count) * both.prod(axis=2) - area[:, None] - area
+        more[np.arange(len(sides)), np.arange(len(sides))] = _SHARED_PX
+        one, two = sorted(divmod(int(more.argmin()), len(sides)))
+        if more[one, two] >= _SHARED_PX:
+            break
+        sides, count = sides.copy(), count.copy()
+        sides[one], count[one] = both[one, two], count[one] + count[two]
+        sides, count = np.delete(sides, two, axis=0), np.delete(count, two)
+        of = np.where(of == two, one, of - (of > two))
+    return sides, of

@@ -53,9 +53,10 @@ _WHOLE = 0.97
 """Share of the pixels of a mark below which it is seen in part."""
 _BENT_PX = 0.15
 """Distance of one mark in ten from the mapping through all, from which that is adjusted again."""
-_ROUNDS, _SAME = 6, 0.5
-"""Most rounds of matching with the mapping through the last matches; change of the middles of images, in
-sigmas, by which positions are moved rather than matched again."""
+_ROUNDS, _SAME, _NEAR = 6, 0.5, 2.0
+"""Most rounds of matching with the mapping through the last matches; change of positions with the mapping,
+in sigmas, from which both follow each other, and total change from which marks are matched again: what a
+match gives is the middle of an image to first order only."""
 _LENGTH_OF = 80
 """Number of marks from which the correlation length of what a polynomial leaves is that of half as many."""
 _PER_SMOOTH = 2.5
@@ -141,17 +142,12 @@ class PlaneMarks(MarkWindows):
 
     def _mapped(self, rows: Rows, found: Matches, sure: Mask) -> Matches:
         """Matches with the mapping through the marks that are `sure`, which itself depends on the matches."""
-        h, w = self.screened.grey.shape
         for _ in range(_ROUNDS if self.eccentric else 1):
             if sure.sum() < ENOUGH:
                 break
-            before, sigma = self._off_centre(self.mapping, rows), np.sqrt(found.variance)
-            through_all = mapping_through(self.at[rows[sure]], found.xy[sure], sigma[sure], (h, w))
-            self.mapping, self.displaced = through_all.mapping, through_all.displaced
-            moved = self._off_centre(self.mapping, rows) - before
-            if self.eccentric and (np.abs(moved[sure]).max(axis=1) < _SAME * sigma[sure]).all():
-                # A match follows the middle of an image, to first order.
-                return replace(found, xy=found.xy - moved)
+            found, settled = self._moved(rows, found, sure)
+            if settled:
+                return found
             self.start[rows[sure]] = found.xy[sure]
             if self.eccentric:
                 # Growth about the image of the point is not that of the mark on its plane.
@@ -160,6 +156,28 @@ class PlaneMarks(MarkWindows):
             found = self._match_all(rows)
             sure = _sure(found)
         return found
+
+    def _moved(self, rows: Rows, found: Matches, sure: Mask) -> tuple[Matches, bool]:
+        """Matches moved with the mapping through those that are `sure`; whether they need no other match.
+
+        A match gives the middle of an image. Its point follows with the mapping, and that with the points.
+        """
+        (h, w), sigma = self.screened.grey.shape, np.sqrt(found.variance)
+        xy, last = found.xy, np.inf
+        middle = xy + self._off_centre(self.mapping, rows)
+        while True:
+            through_all = mapping_through(self.at[rows[sure]], xy[sure], sigma[sure], (h, w))
+            self.mapping, self.displaced = through_all.mapping, through_all.displaced
+            moved = middle - self._off_centre(self.mapping, rows)
+            change, total = (
+                float((np.abs(moved - before)[sure].max(axis=1) / sigma[sure]).max())
+                for before in (xy, found.xy)
+            )
+            if not (self.eccentric and total < _NEAR and change < last):
+                return found, False
+            xy, last = moved, change
+            if change < _SAME:
+                return replace(found, xy=xy), True
 
     def _off_centre(self, mapping: Chain, rows: Rows) -> Array:
         """How far (k, 2) the middles of the images of marks are from the images of their points."""
