@@ -247,7 +247,7 @@ def test_compiled_matches_from_known_light_are_those_of_the_general_adjustment(o
     level[:, 0] = 0.4 * LEVEL if bright else LEVEL
     given = pixels, pixels > -np.inf, GrownOutline(outlines("square", len(xy)).single(), SIZE), xy + 0.2
     settings = MatchOptions(**{"half_px": 9, "psf_px": 0.75, "settled": 0.1} | options)
-    known = {"noise": NOISE, "form_sigma": np.array([0.1]), "searching": False}
+    known = {"noise": NOISE, "form_sigma": np.array([0.1]), "searching": 0.0}
     light = np.full(len(xy), 102.0 if bright else 0.68), level
     compiled = match(*given, settings, light=light, **known)
     monkeypatch.setattr(matcher, "_compiled", lambda *_: (None, np.arange(len(xy))))

@@ -46,7 +46,7 @@ def filtered(images: Floats, kernel: Floats) -> Floats:
     found = np.empty((m, high - 2 * reach, wide - 2 * reach), np.float32)
     for k in range(m):
         image = flat[k]
-        _times(image[first:], np.float32(kernel[reach, reach]), total)
+        _times(image[first:], kernel[reach, reach], total)
         for t in range(0, used, 2):
             _add(image, first, offsets[t : t + 2], weights[t : t + 2], total)
         for row in range(high - 2 * reach):

@@ -51,7 +51,7 @@ def match(
     region: Mask | None = None,
     light: tuple[Array, Array] | None = None,
     precise: bool = False,
-    searching: bool = True,
+    searching: float = np.inf,
     least: tuple[Array, float] | None = None,
 ) -> Matches:
     """Match every patch with the formed image of its mark.
@@ -88,8 +88,9 @@ def match(
     precise : bool
         Whether positions and width are known so well that the light is found from the grey values, if it is
         not given; patches with large residuals are then left as they are.
-    searching : bool
-        Whether to search those patches; if not, they count as not converged.
+    searching : float
+        Multiple of `noise` up to which residuals are searched; patches with larger ones count as not
+        converged, with 0 all of them.
     least : tuple, optional
         Least correlation (k,) with the formed image, and least share of a mark on pixels that may be used,
         from which patches are searched. By default all.
@@ -136,7 +137,8 @@ def match(
     if least is not None:
         likely = (quick.correlation >= least[0]) & (quick.seen >= least[1])
         amiss = amiss[likely[amiss]]
-    if not len(amiss) or not searching:
+    amiss = amiss[~(quick.noise[amiss] > searching * noise)] if searching > 0 else amiss[:0]
+    if not len(amiss):
         return quick
     contrast = options.contrast
     few = Patches(

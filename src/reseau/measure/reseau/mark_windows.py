@@ -37,8 +37,8 @@ _CLASS_PX = 4
 """Step of the window sizes."""
 _GROUND_PX, _GROUND_WIDTHS = 5, 3.0
 """Background shown by a window around its mark: pixels, and widths of the point-spread function."""
-_AT_ONCE_PX = 60_000
-"""Number of pixels of windows matched together; what is formed in them fits into the cache of a processor."""
+_AT_ONCE_PX = 250_000
+"""Number of pixels of windows matched together: what is formed in them takes some 30 MB."""
 _SHARED_PX = 20_000
 """Number of pixels whose matching takes as long as what windows of one more size take beside it."""
 _LEARNT_FROM = 120
@@ -50,6 +50,10 @@ SEEN = 0.6
 """Least share of a mark on pixels that can be used."""
 DISTURBED = 1.6
 """Multiple of the usual residuals from which a mark is declined."""
+_HIDING = 6.0
+"""Residuals, in units of the noise, from which something large lies in front of a mark: no search for single
+blunders finds the mark, but another look without what its neighbours do not predict. Reflected light leaves
+less."""
 _LIKELY = 0.7
 """Correlation with the formed image from which a mark that was not found at first is looked for."""
 ENOUGH = 6
@@ -182,6 +186,7 @@ class MarkWindows(ABC):
         self.hidden = np.zeros(screened.grey.shape, dtype=bool)
         self.learning = True
         self.quick = self.precise_start  # whether marks are matched without a search for blunders
+        self.searching = _HIDING if self.precise_start else np.inf  # see :func:`match`
         self.own_px = np.zeros(len(self.at))  # pixels of the windows that belong to marks, matched last
         self.rough = 0.0  # residuals of the marks that were learnt from
 
@@ -247,6 +252,7 @@ class MarkWindows(ABC):
                     form_sigma=self._form_sigma(),
                     light=self._known_light(rows[part], background),
                     precise=self.quick,
+                    searching=self.searching,
                     others=self._light_of(here, rows[part]),
                     region=region,
                     least=(np.where(self.found[rows[part]], -1.0, _LIKELY), self.least_seen),

@@ -110,9 +110,12 @@ class PlaneMarks(MarkWindows):
         if self.eccentric or self._bent(rows[plain], found.select(plain)):
             found = self._mapped(rows, found, _sure(found) if self.eccentric else plain)
         doubtful, field = self._doubtful(rows, found)
+        all_searched, self.searching = self.searching == np.inf, np.inf
         if doubtful.any() and field is not None and (~doubtful & ~self.dazzled[rows]).sum() >= _NEIGHBOURS:
             # Look again where their neighbours predict them, without what lies in front of them.
             found = self._uncovered(rows, found, doubtful, field)
+        elif doubtful.any() and not all_searched:
+            found = replaced(found, ~doubtful, self._match_all(rows[doubtful]))
         alike = with_alike_errors(found, np.rint(self.start[rows]) if self.even else None)
         found = self._tempered(rows, found, alike) if self.even else alike
         if self.precise_start:

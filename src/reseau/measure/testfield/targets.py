@@ -389,7 +389,7 @@ class _Canvas:
             form_sigma=np.array([0.05]),
             others=others,
             light=(contrast, np.stack([level, down, right], axis=1)) if background == 1 else None,
-            searching=searching,
+            searching=np.inf if searching else 0.0,
         )
 
 
