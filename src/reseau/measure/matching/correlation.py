@@ -13,13 +13,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import uniform_filter
 
-from ...core.data import Array, Mask
+from ...core.data import Array, Mask, Rows
 from .matches import Matches
 
 __all__ = ["displaced", "with_alike_errors"]
@@ -96,33 +95,33 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     if not _neighbours(unit, beside, free, both_ways=centres is not None):
         return found
     limits = np.quantile(activity[shown], np.arange(1, _CLASSES) / _CLASSES)
-    kind = np.digitize(activity, limits)
+    kind = _kinds(activity, limits)
     variance = np.ones(_CLASSES)
     for k in range(_CLASSES):
         those = shown & (kind == k)
         if those.any():
             variance[k] = (unit[those] ** 2).sum() / max(free[those].sum(), 1.0)
     correlation = _correlation(unit / np.maximum(np.sqrt(variance)[kind], 1e-6), shown, free)
-    influence = found.influence * found.noise[:, None, None, None]
-    kind = np.digitize(_activity(influence), limits)
-    spread = np.sqrt(variance)[kind]
-    uneven = influence * spread[:, None]
+    single = np.float32
+    influence = found.influence.astype(single, copy=False) * found.noise.astype(single)[:, None, None, None]
+    kind = _kinds(_activity(influence), limits)
+    uneven = influence * np.sqrt(variance).astype(single)[kind][:, None]
     # The errors that a pixel has in common with those around it, weighted by their influence.
-    kernel = np.zeros((2 * _LAGS + 1,) * 2, np.float32)
+    kernel = np.zeros((2 * _LAGS + 1,) * 2, single)
     kernel[_LAGS, _LAGS] = 1.0
     for (down, right), r in correlation.items():
         kernel[_LAGS + down, _LAGS + right] = kernel[_LAGS - down, _LAGS - right] = r
-    # One window below the other, apart as far as errors extend, each in units of its largest value: the
-    # filter works on all of them at once, and one without finite values would take the others with it.
+    # Windows in units of their largest value; beside them are no errors.
     largest = np.abs(uneven).max(axis=(1, 2, 3))
     known = np.isfinite(largest) & (largest > 0)
-    unity = np.where(known, largest, 1.0)
+    unity = np.where(known, largest, 1.0).astype(single)
     scaled = np.where(known[:, None, None, None], uneven, 0.0) / unity[:, None, None, None]
-    wide = np.pad(scaled, ((0, 0), (0, 0), (0, _LAGS), (0, _LAGS))).astype(np.float32)
-    column = wide.reshape(-1, wide.shape[-1])
-    together = cv2.filter2D(column, -1, kernel, borderType=cv2.BORDER_CONSTANT).reshape(wide.shape)
-    extra = np.einsum("kirc,kjrc->kij", wide, together) * unity[:, None, None] ** 2
-    extra -= np.where(known[:, None, None], np.einsum("kirc,kjrc->kij", influence, influence), 0.0)
+    wide = np.pad(scaled, ((0, 0), (0, 0), (_LAGS, _LAGS), (_LAGS, _LAGS)))
+    from ..compiled_filter import filtered  # takes half a second to import; not every command needs it
+
+    together = filtered(wide.reshape(-1, *wide.shape[2:]), kernel)
+    extra = _products(scaled, together.reshape(scaled.shape)) * unity[:, None, None].astype(np.float64) ** 2
+    extra -= np.where(known[:, None, None], _products(influence, influence), 0.0)
     extra = (extra + np.swapaxes(extra, 1, 2)) / 2
     # Errors that cancel each other, as after sharpening, are not relied upon without further evidence.
     cov, least = found.cov + extra, found.cov if centres is None else _CANCELLED * found.cov
@@ -141,6 +140,20 @@ def _prepared(found: Matches, centres: Array | None) -> tuple[Array, Mask, Array
     if centres is not None:
         unit, used = _odd(unit, used, found.xy - centres)
     return unit, used, _activity(found.influence * found.noise[:, None, None, None])
+
+
+def _kinds(activity: Array, limits: Array) -> Rows:
+    """Number of `limits` that each value reaches."""
+    kind = np.zeros(activity.shape, np.uint8)
+    for limit in limits:
+        kind += activity >= limit
+    return kind.astype(np.intp)
+
+
+def _products(one: Array, other: Array) -> Array:
+    """Scalar products (k, 2, 2) of pairs of windows (k, 2, rows, columns)."""
+    a, b = (part.reshape(*part.shape[:2], -1) for part in (one, other))
+    return np.asarray(a @ np.swapaxes(b, 1, 2), dtype=np.float64)
 
 
 def _activity(influence: Array) -> Array:

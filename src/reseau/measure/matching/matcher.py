@@ -128,7 +128,7 @@ def match(
         free[patch.form_at :] = form_sigma
     if light is None and not precise:
         return _searched(patch, free, noise)
-    quick, amiss = _continued(patch, patch.begin(light), free, noise, least)
+    quick, amiss = _continued(patch, patch.begin(light), free, noise, least, not precise)
     if precise:
         return quick
     came, quick.converged[amiss] = quick.converged[amiss], False
@@ -210,11 +210,16 @@ def _searched(patch: Patches, free: Array, noise: float) -> Matches:
 
 
 def _continued(
-    patch: Patches, start: Array, free: Array, noise: float, least: tuple[Array, float] | None = None
+    patch: Patches,
+    start: Array,
+    free: Array,
+    noise: float,
+    least: tuple[Array, float] | None = None,
+    trimming: bool = False,
 ) -> tuple[Matches, Rows]:
     """Matches from good start values, and the rows with blunders or without convergence.
 
-    See :func:`match` for `least`.
+    See :func:`match` for `least`; `trimming` rejects pixels of marks that were found.
     """
     weights = patch.weights * patch.relative_weights / noise**2
     options = BatchOptions(share=patch.options.settled, max_iterations=_FIRST, damping=1e-5)
@@ -245,13 +250,39 @@ def _continued(
     used = patch.weights > 0
     worst = np.where(used, np.abs(found.residuals), 0.0).max(axis=1)
     rms = found.sigma0 * noise
-    amiss = (
-        ~found.converged
-        | ~(worst < _PLAIN * patch.options.rejection * np.maximum(rms, noise))
-        | ~(rms < 2 * noise)
-    )
+    amiss = ~found.converged | ~(rms < 2 * noise)
+    large = ~amiss & ~(worst < _PLAIN * patch.options.rejection * np.maximum(rms, noise))
+    if trimming and large.any() and patch.single and jitter == 0:
+        rows = np.flatnonzero(large)
+        found, used[rows] = _trimmed(patch, rows, found, start, weights, free, noise, options)
+        large = ~found.converged | ~(found.sigma0 < 2)
+    amiss |= large
     scale = np.full(len(start), noise)
     return matches_of(patch, found, used, scale, patch.shares, patch.influences), np.flatnonzero(amiss)
+
+
+def _trimmed(
+    patch: Patches,
+    rows: Rows,
+    found: BatchAdjustment,
+    start: Array,
+    weights: Array,
+    free: Array,
+    noise: float,
+    options: BatchOptions,
+) -> tuple[BatchAdjustment, Mask]:
+    """Matches of which those in `rows` are continued without their blunders, and the pixels they use."""
+    x, used = found.estimates[rows], patch.weights[rows] > 0
+    off, share = np.abs(found.residuals[rows]), patch.shares[rows].reshape(len(rows), -1)
+    limit = patch.options.rejection * np.maximum(_robust_sigma(off, patch.weights[rows]), noise)
+    kept = used & (off < limit + patch.tolerated(x, share))
+    fewer = np.flatnonzero((kept != used).any(axis=1))
+    if len(fewer):
+        some, at = rows[fewer], x[fewer]
+        weighted = weights[some] * kept[fewer]
+        again = _iterated(patch, some, at, start[some], patch.slopes(at, some), weighted, free, options)
+        found = with_rows(found, some, again)
+    return found, kept
 
 
 def _compiled(

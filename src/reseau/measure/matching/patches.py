@@ -388,13 +388,18 @@ class Patches:
         """
         share = self.share(x).reshape(len(x), -1)
         plane, contrast = self.background(x).reshape(len(x), -1), self.contrast(x).reshape(len(x), -1)
-        amplitude = np.abs(contrast)
         if self.options.polarity == "dark":
             formed = plane * (1 - contrast * share)
-            amplitude = amplitude * np.abs(x[:, LEVEL, None])
         else:
             formed = plane + contrast * share
-        return formed - self.grey, _FORM_ERROR * amplitude * (share > 0.02)
+        return formed - self.grey, self.tolerated(x, share)
+
+    def tolerated(self, x: Array, share: Array) -> Array:
+        """Part (m, n) of residuals at `x` (m, u) that is tolerated where `share` (m, n) is covered."""
+        amplitude = np.abs(self.contrast(x).reshape(len(x), -1))
+        if self.options.polarity == "dark":
+            amplitude = amplitude * np.abs(x[:, LEVEL, None])
+        return np.asarray(_FORM_ERROR * amplitude * (share > 0.02))
 
     def influence(self, x: Array, cofactor: Array, used: Mask, scale: Array, at: Rows) -> tuple[Array, Array]:
         """Influence of each pixel on the position (m, 2, rows, columns), and leverage (m, rows, columns).
