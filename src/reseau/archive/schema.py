@@ -253,6 +253,9 @@ def _sqlite(path: Path, read_only: bool) -> Engine:
         if not read_only:
             raw.execute("PRAGMA journal_mode=WAL")
             raw.execute("PRAGMA synchronous=FULL")
+        # Each connection has a cache of its own, of 2 MB unless told: a service would grow with its archive up to
+        # that for each. The system has these pages, too.
+        raw.execute(f"PRAGMA cache_size=-{_CACHE_KB}")
         raw.execute("PRAGMA foreign_keys=ON")
 
     @sa.event.listens_for(engine, "begin")
@@ -268,6 +271,7 @@ def _sqlite(path: Path, read_only: bool) -> Engine:
 _READING = "reseau_reading"
 _WAIT_S = 30
 """How long a transaction waits for the others that write, and how long one may do nothing."""
+_CACHE_KB = 256
 _PATIENCE = (
     f"SET LOCAL lock_timeout = '{_WAIT_S}s'; SET LOCAL idle_in_transaction_session_timeout = '{_WAIT_S}s'"
 )
