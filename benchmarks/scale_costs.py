@@ -12,11 +12,9 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -24,8 +22,9 @@ from typing import Any
 import psutil
 import sqlalchemy as sa
 from benchmarks import scale
+from filled import fill_index
 
-from reseau.archive import Archive, schema
+from reseau.archive import Archive
 from reseau.archive.objects import LocalObjects
 from reseau.execution import Outputs, executor_at
 from reseau.io import PhotographPoints
@@ -73,37 +72,17 @@ def spent_ms(work: Callable[[], object], times: int = 5) -> float:
 
 
 def filled(place: Place, frames: int) -> None:
-    """Fill an archive with sessions as a bench stores them, without their files."""
-    at, count = datetime(2026, 3, 2, tzinfo=UTC), frames // FRAMES_OF_A_SESSION
-    numbers = range(1, count + 1)
+    """Fill an archive with sessions as a bench stores them."""
     position = {"tilt": 45.0, "roll": 90.0, "camera_roll": 180.0}
     facts = {"exposure_us": 20000.0, "gain": 1.0, "width": 1024, "height": 1024, "position": position}
     clock = {"taken": "2026-03-02T10:00:00.123456+00:00", "sequence": [1, 2]}
-    frame = {"kind": "frame", "take": 0, "suffix": ".tif", "size": 1048576, "facts": facts, "clock": clock}
-    session = {"plan": "testfield", "parameters": {"count": 36}, "bench": "a bench", "software": "0.2.0"}
-    result = {"parameters": {}, "software": "0.2.0", "size": 60000, "stored": at}
-    rows: dict[sa.Table, Iterator[dict[str, object]]] = {
-        schema.sessions: (
-            {"name": f"session {k}", "begun": at + timedelta(hours=k), **session} for k in numbers
-        ),
-        schema.ends: ({"session_id": k, "status": "done", "why": "", "at": at} for k in numbers),
-        schema.frames: (
-            {"session_id": k, "step": f"{n:05}", "sha256": f"{k * 1000 + n:064x}", "stored": at, **frame}
-            for k in numbers for n in range(FRAMES_OF_A_SESSION)
-        ),
-        schema.verdicts: (
-            {"frame_id": k, "ok": True, "why": "", "facts": {"points": 380}}
-            for k in range(1, count * FRAMES_OF_A_SESSION + 1)
-        ),
-        schema.results: (
-            {"session_id": k, "name": name, "suffix": Path(name).suffix, "sha256": f"{k:064x}", **result}
-            for k in numbers for name in ("calibration.json", "report.html")
-        ),
-    }  # fmt: skip
-    with place.opened(create=True) as archive, archive._engine.begin() as connection:
-        for table, each in rows.items():
-            while part := list(islice(each, 5000)):
-                connection.execute(sa.insert(table), part)
+    with place.opened(create=True) as archive:
+        fill_index(
+            archive, frames // FRAMES_OF_A_SESSION, FRAMES_OF_A_SESSION,
+            {"calibration.json": "", "report.html": ""},
+            session={"plan": "testfield", "parameters": {"count": 36}, "bench": "a bench"},
+            frame={"size": 1048576, "facts": facts, "clock": clock},
+        )  # fmt: skip
 
 
 def index(frames: int, url: str = "") -> None:

@@ -32,7 +32,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import itertools
 import json
 import os
 import random
@@ -57,6 +56,7 @@ import httpx
 import numpy as np
 import psutil
 import sqlalchemy as sa
+from filled import FIRST, fill_index
 
 from reseau.archive import Archive, schema
 from reseau.service import AcceptanceRules, Configurations, Limits
@@ -316,44 +316,23 @@ FRAMES, CONFIGURATIONS, DECISIONS, RECORDED = 20, 5, 52, 2000
 
 def accumulated(folder: Path, count: int, decisions: int = DECISIONS, recorded: int = RECORDED) -> None:
     """Fill an archive as after years: sessions with frames and results, decisions, an audit log."""
-    at = datetime(2026, 3, 2, tzinfo=UTC)
     with Archive.open(folder / "archive", create=True) as archive:
-        numbers = range(1, count + 1)
         kept = {
             "calibration.json": archive.objects.put(example_calibration().to_json().encode(), ".json"),
             "report.html": archive.objects.put(b"<!DOCTYPE html><title>Report</title>", ".html"),
         }
-        session = {"plan": "frames", "parameters": {"count": FRAMES}, "bench": "", "software": "reseau"}
-        frame = {"kind": "frame", "take": 0, "suffix": ".tif", "facts": {}, "clock": {}, "sha256": "0" * 64}
-        frame |= {"size": 1, "stored": at}
-        verdict = {"ok": True, "why": "", "facts": {"points": 9}}
-        result = {"parameters": {}, "software": "reseau", "size": 1, "stored": at}
-        rows: dict[sa.Table, Iterator[dict[str, object]]] = {
-            schema.sessions: (
-                {"name": f"session {k - 1}", "begun": at + timedelta(minutes=k), **session} for k in numbers
-            ),
-            schema.ends: ({"session_id": k, "status": "done", "why": "", "at": at} for k in numbers),
-            schema.frames: (
-                {"session_id": k, "step": f"{n:05}", **frame} for k in numbers for n in range(FRAMES)
-            ),
-            schema.verdicts: ({"frame_id": k, **verdict} for k in range(1, count * FRAMES + 1)),
-            schema.results: (
-                {"session_id": k, "name": name, "suffix": Path(name).suffix, "sha256": sha256, **result}
-                for k in numbers
-                for name, sha256 in kept.items()
-            ),
-        }
-        with archive._engine.begin() as connection:
-            for table, each in rows.items():
-                while part := list(itertools.islice(each, 5000)):
-                    connection.execute(sa.insert(table), part)
+        fill_index(
+            archive, count, FRAMES, kept, apart=timedelta(minutes=1),
+            session={"plan": "frames", "parameters": {"count": FRAMES}, "bench": ""},
+            frame={"size": 1, "facts": {}, "clock": {}},
+        )  # fmt: skip
         known = Configurations(archive)
         rules = AcceptanceRules(version=1, image=Limits(warning=0.1, action=0.3))
         for number in range(CONFIGURATIONS):
             known.define(f"camera {number}", {"camera": f"DMK 33, {number}"})
             for k in range(decisions):
                 made = example_calibration(8.0 + 1e-5 * ((7 * k + number) % 11) + 1e-9 * k)
-                since = at + timedelta(weeks=k)
+                since = FIRST + timedelta(weeks=k)
                 decision = known.decide(f"camera {number}", made, rules, since=since, by="Ada")
                 if decision.outcome == "needs review":
                     known.review(f"camera {number}", decision.key, "accepted", by="Ada", comment="first")
