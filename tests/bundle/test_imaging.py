@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from reseau.adjust.stochastic import Weighting
+from reseau.bundle.solver.linear import Linear, linearised
 from reseau.bundle.solver.observations import OtherObservations
-from reseau.bundle.solver.system import Linear, System, residuals
+from reseau.bundle.solver.system import System, residuals
 from reseau.bundle.solver.unknowns import Unknowns
 from reseau.bundle.solver.values import Correction, Values
 from reseau.core.data import Array
@@ -57,7 +58,7 @@ def by_differences(system: System, values: Values) -> Array:
     movable = np.where(kept[:, None] >= 0, 0.0, system.movable)
     at = np.flatnonzero(kept >= 0)
     still = (kept[at, None] + np.arange(3))[system.movable[at] == 0]
-    size = np.abs(dense(system.linearise(values))).max(axis=0)
+    size = np.abs(dense(linearised(system, values))).max(axis=0)
     for k in range(u + 3 * p):
         h = 1e-2 / size[k] if size[k] > 0 else 1.0
 
@@ -123,7 +124,7 @@ def test_derivatives_by_every_unknown_agree_with_differences(name: str) -> None:
     )
     system, values = system_of(replace(world, network=network))
     values = replace(values, extra=np.random.default_rng(1).normal(0, 1e-4, values.extra.shape))
-    analytic, numeric = dense(system.linearise(values)), by_differences(system, values)
+    analytic, numeric = dense(linearised(system, values)), by_differences(system, values)
     size = np.maximum(np.abs(numeric).max(axis=0), 1e-30)
     assert np.abs((analytic - numeric) / size).max() < 1e-8
 
@@ -148,7 +149,7 @@ def test_derivatives_through_windows_agree_with_differences(name: str) -> None:
     assert refraction is not None
     refraction = replace(refraction, path_of=np.array([0, -1, 0, 0]))
     system, values = system_of(replace(world, network=replace(world.network, refraction=refraction)))
-    analytic, numeric = dense(system.linearise(values)), by_differences(system, values)
+    analytic, numeric = dense(linearised(system, values)), by_differences(system, values)
     # A plate in one medium may be at any distance: that derivative is zero but for rounding.
     size = np.maximum(np.abs(numeric).max(axis=0), 1.0)
     assert np.abs((analytic - numeric) / size).max() < 1e-7
@@ -181,7 +182,7 @@ def test_ebner_is_orthogonal_over_its_grid_and_as_defined() -> None:
     system, values = system_of(
         networks.World(network, np.eye(3)[None], np.zeros((1, 3)), xyz),
     )
-    linear = system.linearise(values)
+    linear = linearised(system, values)
     at = system.unknowns.extra[0]
     effects = dense(linear)[:, at : at + 12]
     gram = effects.T @ effects

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from reseau.adjust import Options
+from reseau.bundle.solver.implicit import normal_of
+from reseau.bundle.solver.linear import Linear, linearised
 from reseau.bundle.solver.problem import _Run
-from reseau.bundle.solver.system import Linear
 
 from . import networks
 
@@ -27,12 +28,12 @@ def test_a_correction_for_other_misfits_is_that_of_new_normal_equations(kind: st
     """Of second-order steps: with the factors of the first, for the curvature of the misfits."""
     world = networks.world(images=8, points=60, cameras=CAMERAS[kind], control=12)
     run = _Run(world.problem(), Options())
-    linear, rng = run.system.linearise(run._start()), np.random.default_rng(1)
+    linear, rng = linearised(run.system, run._start()), np.random.default_rng(1)
     other = rng.normal(size=linear.misfits.shape), rng.normal(size=linear.other_misfits.shape)
-    normal = linear.normal(1e-4)
+    normal = normal_of(linear, 1e-4)
     normal.correction()
     found = normal.correction_for(*other)
-    expected = Linear(run.system, linear.values, linear.rows, *other).normal(1e-4).correction()
+    expected = normal_of(Linear(run.system, linear.values, linear.rows, *other), 1e-4).correction()
     size = np.abs(expected.reduced).max()
     assert np.abs(found.reduced - expected.reduced).max() < 1e-8 * size
     assert np.abs(found.points - expected.points).max() < 1e-8 * np.abs(expected.points).max()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from reseau.bundle import Network, Options, Result, adjust_network, problem_of
+from reseau.bundle.solver.implicit import normal_of
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.io.refraction import RefractionEntry
@@ -100,7 +101,7 @@ def test_the_gradient_by_places_and_window_is_that_of_the_cost(window: Window) -
     assert fit
     linear, constraints = fit.linear, fit.linear.system.constraints
     assert constraints is not None
-    normal = linear.normal(0.0)
+    normal = normal_of(linear, 0.0)
     own = normal.constrained()
     rng = np.random.default_rng(1)
     scale = 1.0 / np.sqrt(np.diagonal(own.matrix))

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from reseau.bundle import Camera, Network, Result, Shutter, adjust_network
 from reseau.bundle.network import network_document
 from reseau.bundle.network.shutter import MOTION
+from reseau.bundle.solver.linear import linearised
 from reseau.bundle.solver.pushbroom import resect_line
 from reseau.bundle.solver.values import Correction
 from reseau.cli import run
@@ -181,7 +182,7 @@ def test_derivatives_agree_with_finite_differences(kind: str) -> None:
     world = world_of(scene)
     system, _ = system_of(world)
     unknowns, start = system.unknowns, begun(world, scene.motion).start
-    linear = system.linearise(start)
+    linear = linearised(system, start)
     design = dense(linear)
     for column in range(unknowns.size):
         size = float(np.abs(design[:, column]).max())

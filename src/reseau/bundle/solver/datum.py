@@ -183,7 +183,7 @@ def freedom_of(system: System, values: Values, taking_part: Mask, *, windows: bo
     fixed = np.concatenate(rows) * scale
     length = np.linalg.norm(fixed, axis=1, keepdims=True)
     fixed = fixed / np.where(length > 0, length, 1.0)
-    _, singular, vt = np.linalg.svd(np.vstack([fixed, np.zeros((7, 7))]))
+    _, singular, vt = np.linalg.svd(np.vstack([fixed, np.zeros((7, 7))]), full_matrices=False)
     free = vt[singular < 1e-6 * max(1.0, singular[0])].T
     names = tuple(
         name for name, part in zip(_NAMES, free, strict=True) if np.abs(part).max(initial=0.0) > 0.1

@@ -18,7 +18,10 @@ from ...adjust import AdjustmentFailure
 from ...core.data import Rows
 from ...core.failure import Code, Failure
 from .arrow import Singular
-from .system import Linear, Normal, System
+from .direct import Normal
+from .implicit import normal_of
+from .linear import Linear, linearised
+from .system import System
 from .values import Correction, Values
 
 __all__ = ["Iterated", "iterate"]
@@ -110,7 +113,7 @@ def iterate(
     Iterated or Failure
         A failure when the misfits are not finite or the normal equations are singular.
     """
-    linear = system.linearise(start)
+    linear = linearised(system, start)
     cost, growth, tried = linear.cost, 2.0, 0
     if not np.isfinite(cost):
         return Failure(
@@ -124,7 +127,7 @@ def iterate(
         tolerance /= np.sqrt(rank)
     while tried < max_iterations:
         tried += 1
-        normal = linear.normal(damping)
+        normal = normal_of(linear, damping)
         unit = np.sqrt(rank * max(cost, 1e-300) / max(1, redundancy))
         try:
             step = normal.correction(forcing, _BELOW * tolerance * unit)
@@ -156,7 +159,7 @@ def iterate(
         flat = step.predicted <= _FLAT * cost and there <= cost * (1.0 + _ROUNDING)
         gain = (cost - there) / step.predicted if np.isfinite(there) and step.predicted > 0 else -1.0
         if gain > 1e-4 or flat:
-            linear, cost, growth = system.linearise(trial), there, 2.0
+            linear, cost, growth = linearised(system, trial), there, 2.0
             costs.append(cost)
             shrink = _SHRINK if gain > _GOOD else _SLOWLY if gain > _FAIR else 1.0
             if flat and gain < _FAIR:
@@ -193,7 +196,8 @@ def _accelerated(normal: Normal, step: Correction) -> Correction:
         bend = normal.correction_for(second[0], second[1])
         return step.plus(bend) if bend.length <= _TRUSTED * step.length else step
     try:
-        bend = Linear(system, values, linear.rows, second[0], second[1]).normal(normal.damping).correction()
+        bent = Linear(system, values, linear.rows, second[0], second[1])
+        bend = normal_of(bent, normal.damping).correction()
     except Singular:
         return step
     return step.plus(bend) if bend.length <= _TRUSTED * step.length else step

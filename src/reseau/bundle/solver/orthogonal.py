@@ -29,8 +29,8 @@ import scipy.sparse
 from ...core.data import Array, Mask, Rows, rows_of_groups
 from .arrow import Arrow, Singular
 from .compiled import compiled
+from .linear import Linear
 from .normal import SEGMENTS, Pattern
-from .system import Linear
 
 __all__ = ["FromRows", "cofactors_from_rows"]
 
@@ -231,7 +231,7 @@ def _triangles(rows: _Rows, blocks: list[_Block]) -> list[Array]:
         pivots = np.abs(np.diagonal(triangle)[:size])
         if len(pivots) < size or not (pivots > 0).all():
             raise Singular
-        found.append(triangle[:size])
+        found.append(triangle[:size].copy())
         # The columns that follow this block are the first of the next one, then the full rows.
         carried, shared = triangle[size:, block.size :], block.inside - block.size
     return found

@@ -19,11 +19,13 @@ from .compiled import in_parallel
 from .conjugate import Conjugate
 from .constraints import Constraints
 from .datum import Freedom, held_for
+from .direct import Normal
+from .implicit import normal_of
+from .linear import Linear
 from .normal import posterior
 from .orthogonal import cofactors_from_rows
 from .rank import PARALLEL
 from .reduced import Reduced, Referral
-from .system import Linear, Normal
 
 __all__ = ["BlockSolution", "Cofactors", "cofactors_of"]
 
@@ -167,7 +169,7 @@ def cofactors_of(linear: Linear, freedom: Freedom, datum: Mask | None, taking_pa
         When the observations do not determine the unknowns in this datum.
     """
     system = linear.system
-    normal = linear.normal(0.0)
+    normal = normal_of(linear, 0.0)
     diagonal = normal.sums.diagonal.copy()
     held = system.held.copy()
     ends = np.flatnonzero(system.unknowns.kept >= 0)

@@ -24,7 +24,9 @@ from ..network import Network
 from ..network.network import Usable, finite, usable
 from .arrow import Singular
 from .datum import Freedom, freedom_of, held_minimally, scaled_by_windows, similarity_onto
+from .implicit import normal_of
 from .iteration import Iterated, iterate
+from .linear import Linear, linearised
 from .observations import OtherObservations
 from .posterior import BlockSolution, Cofactors, cofactors_of
 from .rank import (
@@ -39,7 +41,7 @@ from .rank import (
     why_without_effect,
     without_effect,
 )
-from .system import Linear, System, residuals
+from .system import System, residuals
 from .unknowns import Unknowns
 from .values import Values
 
@@ -461,9 +463,9 @@ class _Run:
             if int(chosen.sum()) < 3:
                 return Failure("inner constraints require three determined datum points", Code.TOO_FEW_POINTS)
             if network.datum_points.all() and not network.datum_chosen:
-                chosen = steady_points(self.system.linearise(values), chosen)
+                chosen = steady_points(linearised(self.system, values), chosen)
             values = self._aligned(values, freedom, chosen)
-        linear = self.system.linearise(values)
+        linear = linearised(self.system, values)
         idle = self._idle(linear, found.costs)
         if idle is not None:
             return idle
@@ -519,7 +521,7 @@ class _Run:
         for values in at:
             if self.network.refraction is None or not scaled_by_windows(self.system, values, part):
                 return False
-            linear = self.system.linearise(values)
+            linear = linearised(self.system, values)
             try:
                 cofactors = cofactors_of(linear, freedom_of(self.system, values, part), datum, part)
             except Singular:
@@ -552,7 +554,7 @@ class _Run:
         constraints, stage = self.system.constraints, self.network.stage
         if constraints is None or constraints.stage is None or stage is None:
             return None
-        open_ = axis_without_effect(self.system.linearise(start))
+        open_ = axis_without_effect(linearised(self.system, start))
         if not open_:
             return None
         what = "angles" if stage.rotary else "readings"
@@ -570,8 +572,8 @@ class _Run:
         if constraints is None or constraints.stage is None:
             self.system.held[held_minimally(freedom, self.unknowns, start)] = True
             return
-        linear = self.system.linearise(start)
-        free, slopes = linear.normal(0.0).constrained(), linear.constraint_slopes
+        linear = linearised(self.system, start)
+        free, slopes = normal_of(linear, 0.0).constrained(), linear.constraint_slopes
         self.system.fixed = constraints.held_for(freedom.reduced, free.back, slopes, np.diag(free.matrix))
 
     def approach(self) -> Values | None:

@@ -11,7 +11,8 @@ from ...optics.refraction import RefractedRays, Refraction
 from ..network import Network
 from .arrow import full
 from .datum import Freedom, held_for, similarity_changes
-from .system import Linear
+from .direct import formed
+from .linear import Linear
 from .values import Values
 
 __all__ = [
@@ -297,7 +298,7 @@ def _own_normals(linear: Linear) -> Array:
 def _null_vectors(linear: Linear, freedom: Freedom) -> list[dict[str, float]]:
     """Basis of the null space of the reduced normal equations, with as many zeros as possible."""
     system = linear.system
-    normal = linear.normal(0.0, turned=False)
+    normal = formed(linear, 0.0, turned=False)
     if system.constraints is not None:
         constraints, free = system.constraints, normal.constrained()
         held = constraints.held(system.held)
