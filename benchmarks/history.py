@@ -18,6 +18,8 @@ benchmarks/explained.toml:
     figure = "time"
     commit = "0123abc"        # the last record before
     reason = "why"
+
+Once there is a record with the explained loss, figures are compared with that and later ones.
 """
 
 from __future__ import annotations
@@ -259,36 +261,77 @@ def records() -> list[dict[str, Any]]:
     return [json.loads(line) for line in HISTORY.read_text().splitlines()] if HISTORY.exists() else []
 
 
-def losses(before: list[dict[str, Any]], now: dict[str, dict[str, float]]) -> list[Loss]:
-    """Figures that are worse than in the last records, beyond the noise."""
+def losses(
+    before: list[dict[str, Any]], now: dict[str, dict[str, float]], reasons: dict[tuple[str, str, str], str]
+) -> list[Loss]:
+    """Figures that are worse than in the last records, beyond the noise.
+
+    Records up to a loss that was explained no longer count once there are later ones.
+    """
     found = []
     for job, figures in now.items():
-        earlier = [each["jobs"][job] for each in before[-LAST:] if job in each["jobs"]]
-        if not earlier:
-            continue
         for key, value in figures.items():
             if key in ("spread", "seconds"):
                 continue
-            values = [each[key] for each in earlier if key in each]
+            known = [each for each in before if key in each["jobs"].get(job, {})]
+            begin = max(
+                (k + 1 for k, each in enumerate(known) if (job, key, each["commit"]) in reasons), default=0
+            )
+            earlier = [each["jobs"][job] for each in (known[begin:] or known)[-LAST:]]
+            values = [each[key] for each in earlier]
             if not values:
                 continue
             usual, noise = statistics.median(values), 0.0
             if key == "time":
-                # Between records of one code: other processes, other versions of libraries.
-                scatter = statistics.stdev(values) if len(values) > 1 else 0.0
+                # Between records of one code: other processes, other versions of libraries. A record with a
+                # loss is no scatter: by the median, it does not hide itself or the next one.
+                scatter = 1.4826 * statistics.median(abs(each - usual) for each in values)
                 noise = float(np.hypot(figures["spread"], max(scatter, earlier[-1]["spread"])))
             if value > (1 + LOSS) * usual and value - usual > SIGMAS * noise + 1e-9:
-                found.append(Loss(job, key, usual, value, before[-1]["commit"]))
+                found.append(Loss(job, key, usual, value, known[-1]["commit"]))
     return found
 
 
-def explained(loss: Loss) -> str:
-    """The reason that was given for a loss, or nothing."""
-    entries = tomllib.loads(EXPLAINED.read_text())["explained"] if EXPLAINED.exists() else []
-    for each in entries:
-        if (each["job"], each["figure"], each["commit"]) == (loss.job, loss.figure, loss.commit):
-            return str(each["reason"])
-    return ""
+def explanations() -> dict[tuple[str, str, str], str]:
+    """The reasons that were given for losses, by job, figure and the last commit before.
+
+    Raises
+    ------
+    SystemExit
+        When an entry is incomplete: it would explain nothing, or everything.
+    """
+    if not EXPLAINED.exists():
+        return {}
+    found = {}
+    for number, each in enumerate(tomllib.loads(EXPLAINED.read_text()).get("explained", []), 1):
+        missing = [key for key in ("job", "figure", "commit", "reason") if not each.get(key)]
+        if missing or each["job"] not in JOBS:
+            why = f"has no {missing[0]}" if missing else f"names no job: {each['job']}"
+            raise SystemExit(f"{EXPLAINED}: entry {number} {why}")
+        found[each["job"], each["figure"], each["commit"]] = str(each["reason"])
+    return found
+
+
+def compare(jobs: list[str]) -> int:
+    """Compare jobs with the records; return 1 where there is a loss that is not explained."""
+    before, reasons = records(), explanations()
+    if not before:
+        print("nothing was recorded yet: python benchmarks/history.py record")
+        return 1
+    now = measured(jobs)
+    # A loss on a machine that does something else at the time: what seems worse is measured once more.
+    doubtful = sorted({each.job for each in losses(before, now, reasons)})
+    if doubtful:
+        print("measured again:")
+        again = measured(doubtful)
+        now |= {job: min(now[job], again[job], key=lambda each: each["time"]) for job in doubtful}
+    failed = 0
+    for loss in losses(before, now, reasons):
+        reason = reasons.get((loss.job, loss.figure, loss.commit), "")
+        failed += not reason
+        print(f"{'explained' if reason else 'LOSS'}: {loss}" + (f": {reason}" if reason else ""))
+    print(f"{failed} losses that are not explained")
+    return 1 if failed else 0
 
 
 def commit() -> str:
@@ -309,29 +352,14 @@ def main() -> int:
     if given.what == "run":
         run(given.jobs[0])
         return 0
-    now = measured(given.jobs or list(JOBS))
-    if given.what == "record":
-        entry = {"commit": commit(), "python": sys.version.split()[0], "numpy": np.__version__, "jobs": now}
-        with HISTORY.open("a") as stream:
-            stream.write(json.dumps(entry) + "\n")
-        return 0
-    before = records()
-    if not before:
-        print("nothing was recorded yet: python benchmarks/history.py record")
-        return 1
-    # A loss on a machine that does something else at the time: what seems worse is measured once more.
-    doubtful = sorted({each.job for each in losses(before, now)})
-    if doubtful:
-        print("measured again:")
-        again = measured(doubtful)
-        now |= {job: min(now[job], again[job], key=lambda each: each["time"]) for job in doubtful}
-    failed = 0
-    for loss in losses(before, now):
-        reason = explained(loss)
-        failed += not reason
-        print(f"{'explained' if reason else 'LOSS'}: {loss}" + (f": {reason}" if reason else ""))
-    print(f"{failed} losses that are not explained")
-    return 1 if failed else 0
+    jobs = given.jobs or list(JOBS)
+    if given.what == "compare":
+        return compare(jobs)
+    entry: dict[str, Any] = {"commit": commit(), "python": sys.version.split()[0], "numpy": np.__version__}
+    entry["jobs"] = measured(jobs)
+    with HISTORY.open("a") as stream:
+        stream.write(json.dumps(entry) + "\n")
+    return 0
 
 
 if __name__ == "__main__":
