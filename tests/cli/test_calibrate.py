@@ -399,3 +399,22 @@ def test_a_cluster_without_a_store_is_one_line(reseau: Run, measured: tuple[Path
     status, _, err = reseau(*common(measured), "--cluster", "tcp://127.0.0.1:9")
     assert (status, err.count("\n")) == (2, 1)
     assert "--cluster: requires a store that all workers share; add --store" in err
+
+
+def test_a_calibration_beyond_the_memory_is_that_of_the_direct_solution(
+    reseau: Run, measured: tuple[Path, ...], tmp_path: Path
+) -> None:
+    """Within a part of its sigmas; what conjugate gradients do not compute is said."""
+    found = []
+    for memory in (("--memory", "0"), ("--memory", "1")):
+        out = tmp_path / "K.json"
+        status, _, err = reseau(*common(measured), "--free", "c,x0,y0,K1", *memory, "-o", out)
+        assert status == 0, err
+        found.append((Calibration.read(out), out.read_text()))
+    (iterative, said), (direct, plain) = found
+    assert "conjugate gradients" in said
+    assert "conjugate gradients" not in plain
+    for name in ("c", "x0", "y0", "K1"):
+        one, other = iterative.parameters[name], direct.parameters[name]
+        assert one.value == pytest.approx(other.value, abs=1e-3 * other.sigma)
+        assert one.sigma == pytest.approx(other.sigma, rel=1e-4)
