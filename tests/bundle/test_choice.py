@@ -14,6 +14,7 @@ import pytest
 from reseau.bundle import Camera, Candidate, ModelChoice, Network, Options, camera_candidates, choose_model
 from reseau.bundle.modelling import choice
 from reseau.core.errors import UsageError
+from reseau.core.executors import Here, Processes
 from reseau.io.network import Network1
 from reseau.optics.cameras import camera_model
 from reseau.optics.poses import rotation_matrix
@@ -206,3 +207,13 @@ def test_a_lens_without_perspective_is_telecentric() -> None:
     assert isinstance(found, ModelChoice)
     assert found.chosen.candidate.model == "telecentric"
     assert found.camera.values[0] == pytest.approx(0.5, rel=1e-3)
+
+
+def test_the_choice_is_the_same_whatever_adjusts_the_parts() -> None:
+    network = network_of(lens_of(-0.1))
+    with Processes(2, ["reseau.bundle"]) as executor:
+        one, other = (choose_model(network, LADDER[:3], executor=each) for each in (Here(), executor))
+    assert isinstance(one, ModelChoice)
+    assert isinstance(other, ModelChoice)
+    assert one.entries() == other.entries()
+    assert np.isfinite([each.predicted for each in one.compared]).sum() >= 2

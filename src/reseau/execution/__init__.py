@@ -5,8 +5,8 @@ whichever does the work. :class:`Outputs` keeps them by what they were computed 
 that is started again takes up where it ended.
 """
 
+from ..core.executors import Executor, Here, Processes
 from .choice import executor_at
-from .executors import Executor, Here, Processes
 from .outputs import Outputs
 
 __all__ = ["Executor", "Here", "Outputs", "Processes", "executor_at"]

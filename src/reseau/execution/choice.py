@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ..core.executors import Executor, Here, Processes
 from ..core.processes import cores
-from .executors import Executor, Here, Processes
 
 __all__ = ["executor_at"]
 

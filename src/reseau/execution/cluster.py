@@ -22,9 +22,9 @@ from typing import Any, NamedTuple, Self, TypeVar
 
 from ..archive.objects import Objects, objects_at
 from ..core.errors import EstimationError, UsageError
+from ..core.executors import Processes, crashed
 from ..core.failure import Failure
 from ..core.optional import optional
-from .executors import Processes, crashed
 
 __all__ = ["Cluster"]
 

@@ -449,7 +449,7 @@ def calibrate_camera(
         Camera and exposure of each photograph, by its name, of cameras that are fixed to each other; see
         :func:`~reseau.procedures.exposures.exposures_of_files`. By default all are of one camera.
     executor : Executor, optional
-        What measures the photographs; by default this process.
+        What measures the photographs, and compares camera models; by default this process.
     outputs : Outputs, optional
         Where measurements are kept; see
         :func:`~reseau.procedures.target_measurement.measured_in_order`.
@@ -513,7 +513,7 @@ def calibrate_camera(
         network = replace(network, cov=np.tile(np.eye(2) * options.sigma_px**2, (len(network.xy), 1, 1)))
     choice = None
     if model is not None and model.automatic:
-        chosen = choose_model(network, options=options.adjustment)
+        chosen = choose_model(network, options=options.adjustment, executor=executor)
         if isinstance(chosen, Failure):
             return chosen
         choice, network = chosen, replace(network, cameras=(chosen.camera,))

@@ -9,7 +9,7 @@ coordinates from those of the chosen model, after the best rotation, says what t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,6 +21,7 @@ from ...calibration.compare import calibration_difference
 from ...core.data import Array, Mask
 from ...core.display import Display
 from ...core.errors import UsageError
+from ...core.executors import Executor, Here
 from ...core.failure import Code, Failure
 from ...optics import PixelGrid, PlaneMapping
 from ...optics.cameras import SplineGrid, camera_model, convert
@@ -275,6 +276,7 @@ def choose_model(
     *,
     folds: int = 5,
     seed: int = 0,
+    executor: Executor | None = None,
 ) -> ModelChoice | Failure:
     """Choose the model of the only camera of a network.
 
@@ -293,6 +295,8 @@ def choose_model(
         Number of parts of the images, each left out once.
     seed : int
         Seed of the random division.
+    executor : Executor, optional
+        What adjusts the network without each part of the images; by default this process.
 
     Returns
     -------
@@ -346,7 +350,7 @@ def choose_model(
     if _least(fits) is None:
         reason = first.reason if isinstance(first, Failure) else "no camera model can be adjusted"
         return Failure(reason, Code.NOT_CONVERGED)
-    return _chosen(network, candidates, fits, folds, seed)
+    return _chosen(network, candidates, fits, folds, seed, executor or Here())
 
 
 def _least(fits: Sequence[BundleFit | Failure]) -> BundleFit | None:
@@ -560,6 +564,7 @@ def _chosen(
     fits: Sequence[BundleFit | Failure],
     folds: int,
     seed: int,
+    executor: Executor,
 ) -> ModelChoice:
     """Compare the adjusted candidates."""
     good = [k for k, fit in enumerate(fits) if isinstance(fit, BundleFit)]
@@ -573,7 +578,7 @@ def _chosen(
     length -= length.min()
     order = sorted(range(len(fits)), key=lambda k: (length[k], k))
     close = [k for k in order if length[k] < _HOPELESS][:_VALIDATED]
-    squares = _predicted([fits[k] for k in close], folds, seed) if len(close) > 1 else None
+    squares = _predicted([fits[k] for k in close], folds, seed, executor) if len(close) > 1 else None
     worse = _worse(squares)
     equal = [k for row, k in enumerate(close) if length[k] <= _EQUAL and row not in worse] or close[:1]
     best = min(equal, key=lambda k: (number[k], length[k], k))
@@ -675,7 +680,9 @@ def _result(fit: BundleFit) -> Result:
     return Result(network, fit, np.zeros(len(network.xy), dtype=bool), ())
 
 
-def _predicted(fits: Sequence[BundleFit | Failure], folds: int, seed: int) -> Array | None:
+def _predicted(
+    fits: Sequence[BundleFit | Failure], folds: int, seed: int, executor: Executor
+) -> Array | None:
     """Sums of squares of predicted coordinates and their number (k, m, 2), of each image left out once."""
     first = fits[0]
     assert isinstance(first, BundleFit)
@@ -685,26 +692,35 @@ def _predicted(fits: Sequence[BundleFit | Failure], folds: int, seed: int) -> Ar
     parts = np.full(len(first.usable.images), -1)
     parts[images] = np.random.default_rng(seed).permutation(len(images)) % min(folds, len(images))
     found = np.zeros((len(fits), len(parts), 2))
-    for row, fit in enumerate(fits):
-        assert isinstance(fit, BundleFit)
-        for part in range(int(parts.max()) + 1):
-            for image, square, count in _left_out(fit, parts == part):
-                found[row, image] = square, count
+    jobs = [
+        (f"model {row}, part {part}", (replace(fit.problem.continued(fit), watch=None), parts == part))
+        for row, fit in enumerate(fits)
+        if isinstance(fit, BundleFit)
+        for part in range(int(parts.max()) + 1)
+    ]
+    rows = np.repeat(np.arange(len(fits)), int(parts.max()) + 1)
+    for row, (_, left) in zip(rows, executor.outcomes(_left_out, jobs), strict=True):
+        for image, square, count in [] if isinstance(left, Failure) else left:
+            found[row, image] = square, count
     # Images that one of the models cannot predict are not compared.
     found[:, (found[:, :, 1] == 0).any(axis=0)] = 0.0
     return found
 
 
-def _left_out(fit: BundleFit, out: Mask) -> Iterator[tuple[int, float, int]]:
-    """Adjust without some images, then each of these alone with camera and points held."""
-    problem, network = fit.problem.continued(fit), fit.problem.network
+def _left_out(job: tuple[BundleProblem, Mask]) -> list[tuple[int, float, int]]:
+    """Adjust without some images (m,), then each of these alone with camera and points held.
+
+    Returned are numbers of images, and sum of squares and number of their predicted coordinates.
+    """
+    problem, out = job
+    network = problem.network
     n = len(network.xy)
     weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
     used = np.asarray((weights[: 2 * n].reshape(n, 2) > 0).all(axis=1))
     weights[: 2 * n][np.repeat(out[network.image_of], 2)] = 0.0
     without = problem.with_weights(weights).adjusted()
     if isinstance(without, Failure):
-        return
+        return []
     camera = network.cameras[0]
     held = replace(camera, values=without.values.cameras[0, : len(camera.values)], free=(), sigma={})
     if camera.additional is not None:
@@ -715,7 +731,7 @@ def _left_out(fit: BundleFit, out: Mask) -> Iterator[tuple[int, float, int]]:
     known = finite(without.values.xyz)
     mine = network.select(out[network.image_of] & used & known[network.point_of])
     if not len(mine.xy):
-        return
+        return []
     control = replace(
         mine, cameras=(held,), xyz=without.values.xyz,
         sigma=np.where(known, 0.0, np.nan)[:, None] * np.ones(3),
@@ -724,12 +740,14 @@ def _left_out(fit: BundleFit, out: Mask) -> Iterator[tuple[int, float, int]]:
     start = replace(problem.start, cameras=held.values[None], xyz=without.values.xyz, extra=np.zeros((1, 0)))
     again = replace(problem, network=control, start=start, weights=None).adjusted()
     if isinstance(again, Failure):
-        return
+        return []
     v = again.residuals[: 2 * len(mine.xy)].reshape(-1, 2) / np.sqrt(np.diagonal(mine.cov, axis1=1, axis2=2))
+    found = []
     for image in np.flatnonzero(out).tolist():
         own = v[(mine.image_of == image) & np.isfinite(v).all(axis=1)]
         if len(own) >= _LEAST_POINTS:
-            yield image, float((own**2).sum()), 2 * len(own)
+            found.append((image, float((own**2).sum()), 2 * len(own)))
+    return found
 
 
 def _mean(squares: Array) -> float:

@@ -17,9 +17,9 @@ from contextlib import suppress
 from multiprocessing import connection, parent_process
 from typing import Any, Protocol, Self, TypeVar
 
-from ..core.failure import Code, Failure
-from ..core.processes import process_context
-from ..core.threads import always_one_thread, one_thread
+from .failure import Code, Failure
+from .processes import process_context
+from .threads import always_one_thread, one_thread
 
 __all__ = ["Executor", "Here", "Processes", "crashed", "prepare_process"]
 
