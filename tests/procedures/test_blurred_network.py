@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import UsageError
+from reseau.core.executors import Processes
 from reseau.core.failure import Failure
 from reseau.io.targets import SpaceTargets
 from reseau.optics.lenses import LensCamera, Paraxial, in_order
@@ -51,6 +52,18 @@ def test_corresponding_rays_are_measured_where_centroids_are_biased() -> None:
     ordinary = project.network.xy - project.true
     assert np.sqrt((ordinary**2).mean()) > 0.08
     assert np.sqrt((off**2).mean()) < 0.02
+
+
+def test_several_processes_measure_the_same() -> None:
+    project, options = drawn(), NetworkOptions(rounds=1)
+    with Processes(2, ["reseau.procedures.blurred_network"]) as executor:
+        found = measure_blurred_network(
+            project.network, project.frames, project.targets, underwater.CAMERA, options, executor=executor
+        )
+    assert isinstance(found, BlurredNetwork)
+    one, other = (each.rounds[1].result.network for each in (found, measured()))
+    assert one.xy.tobytes() == other.xy.tobytes()
+    assert one.cov.tobytes() == other.cov.tobytes()
 
 
 def test_residuals_and_errors_of_the_points_fall() -> None:

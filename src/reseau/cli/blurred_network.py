@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from .blurred import FNumber, Focus, Pitch, Psf, Search
-from .common import SensorFile, progress, read_frame, required, say
+from .common import Jobs, SensorFile, progress, read_frame, required, say
 
 if TYPE_CHECKING:
     from ..bundle import Network
@@ -71,12 +71,14 @@ def blurred_network(
         ),
     ] = True,
     sensor: SensorFile = None,
+    jobs: Jobs = None,
 ) -> None:
     """Measure the blurred targets of a network by rays and adjust it, until sigma0 no longer falls."""
     from ..bundle import ResultDocument
     from ..core.errors import UsageError
     from ..core.provenance import Provenance, sha256_of
     from ..exchange import calibration_files, read_network
+    from ..execution import executor_at
     from ..io import write_whole
     from ..io.network import Network1
     from ..io.targets import SpaceTargets
@@ -102,7 +104,8 @@ def blurred_network(
         search_px=search,
         fill=fill,
     )
-    with progress("measuring", 5) as step:
+    modules = ["reseau.procedures.blurred_network"]
+    with executor_at(jobs, "", "", modules, len(frames)) as executor, progress("measuring", 5) as step:
         found = required(
             measure_blurred_network(
                 content,
@@ -111,6 +114,7 @@ def blurred_network(
                 lenses,
                 NetworkOptions(matching, rounds, keep_sharp, initial=cast(Any, initial)),
                 watch=step,
+                executor=executor,
             ),
             network,
         )

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from ..bundle import Options as BundleOptions
 from ..core.data import Array, Frame, Mask, Rows
 from ..core.display import Display
 from ..core.errors import UsageError
+from ..core.executors import Executor, Here
 from ..core.failure import Code, Failure, Remark
 from ..io.network import Network1, ObservationColumns
 from ..io.targets import SpaceTargets
@@ -187,6 +188,7 @@ def measure_blurred_network(
     options: NetworkOptions | None = None,
     *,
     watch: Callable[[str], None] | None = None,
+    executor: Executor | None = None,
 ) -> BlurredNetwork | Failure:
     """Measure the blurred targets of a network, and adjust it.
 
@@ -207,6 +209,8 @@ def measure_blurred_network(
     options : NetworkOptions, optional
     watch : callable, optional
         Called with a line about what is done.
+    executor : Executor, optional
+        What measures the photographs of each round; by default this process.
 
     Returns
     -------
@@ -242,7 +246,7 @@ def measure_blurred_network(
     first = adjust_network(network, chosen.bundle)
     if isinstance(first, Failure):
         return first
-    run = _Run(network, frames, targets, cameras, chosen)
+    run = _Run(network, frames, targets, cameras, chosen, executor)
     none = np.zeros(len(network.xy), dtype=bool)
     rounds = [BlurredRound(first, {}, none, ~none, none, 0.0)]
     say(f"ordinary coordinates: sigma0 {first.sigma0:.4g}")
@@ -364,6 +368,20 @@ def _rows_of(network: Network, image: int, named: Collection[str]) -> list[int]:
     return [k for k in rows if network.points[network.point_of[k]] in named]
 
 
+class _Job(NamedTuple):
+    """A photograph, its camera, and names and planes of the targets that are measured in it."""
+
+    frame: Frame
+    camera: RayMap
+    names: list[str]
+    planes: list[PlaneTarget]
+    options: BlurredOptions
+
+
+def _measured(job: _Job) -> BlurredResult:
+    return measure_blurred(*job)
+
+
 class _Run:
     """What stays the same in all rounds."""
 
@@ -374,12 +392,13 @@ class _Run:
         targets: SpaceTargets,
         cameras: LensCamera | ThinLens | Mapping[str, LensCamera | ThinLens],
         options: NetworkOptions,
+        executor: Executor | None = None,
     ) -> None:
         unit = {"mm": 1.0, "m": 1000.0}.get(network.unit)
         if unit is None:
             raise UsageError(f"the network is in {network.unit!r}, lenses are in mm", do="use m or mm")
         self.network, self.frames, self.targets, self.options = network, frames, targets, options
-        self.unit_mm = unit
+        self.unit_mm, self.executor = unit, executor or Here()
         self.row = {name: k for k, name in enumerate(targets.targets.id)}
         self.cameras: dict[str, LensCamera | ThinLens] = {}
         for camera in network.cameras:
@@ -395,7 +414,7 @@ class _Run:
         network, n = self.network, len(self.network.xy)
         xy, cov = network.xy.copy(), network.cov.copy()
         replaced, declined = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-        measured = {}
+        measured, of_image = dict[str, BlurredResult](), dict[str, list[int]]()
         # Points that were left out stay where they were: their images may touch others.
         usable = last.fit.usable.points[:, None]
         self.xyz = np.where(usable, last.fit.values.xyz, self.xyz)
@@ -404,11 +423,14 @@ class _Run:
                 continue
             rows = _rows_of(network, i, self.row)
             rows = [k for k in rows if np.isfinite(self.xyz[network.point_of[k]]).all()]
-            if not rows:
-                continue
-            found = self._measured(last, i, rows)
+            if rows:
+                of_image[image] = rows
+        jobs = ((image, self._job(last, image, rows)) for image, rows in of_image.items())
+        for image, found in self.executor.outcomes(_measured, jobs):
+            if isinstance(found, Failure):
+                return found
             measured[image] = found
-            for k, own in enumerate(rows):
+            for k, own in enumerate(of_image[image]):
                 if self._stays(found, k, own):
                     continue
                 if found.ok[k]:
@@ -431,8 +453,9 @@ class _Run:
             result, measured, replaced & ~declined, ~replaced & ~declined, declined, float(shift.mean())
         )
 
-    def _measured(self, last: Result, i: int, rows: list[int]) -> BlurredResult:
-        network, values = self.network, last.fit.values
+    def _job(self, last: Result, image: str, rows: list[int]) -> _Job:
+        """The targets of an image at the estimates of an adjustment, and what they are measured with."""
+        network, values, i = self.network, last.fit.values, self.network.images.index(image)
         _, camera = self._camera(last, i)
         rotation, x0 = values.rotation[i], values.x0[i]
         points = network.point_of[rows]
@@ -454,7 +477,7 @@ class _Run:
             )
             planes.append(PlaneTarget(centre, across, scaled))
         names = [network.points[j] for j in points]
-        return measure_blurred(self.frames[network.images[i]], camera, names, planes, self.matching)
+        return _Job(self.frames[image], camera, names, planes, self.matching)
 
     def _reduction(self, last: Result) -> Array:
         """What aberrations of the pupil shift corresponding rays by, beside a fixed projection centre (n, 2).
