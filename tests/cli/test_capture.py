@@ -384,4 +384,4 @@ def test_a_goal_is_not_reached_by_images_of_a_target_that_bends(
     assert "the images contradict each other by" in said.err
     assert "the images scatter" in said.out
     assert "warning: camera: the scatter between images is larger than the sigmas" in said.out
-    assert "photograph next" in said.out
+    assert "the photograph that would help most: " in said.out

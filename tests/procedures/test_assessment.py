@@ -51,12 +51,16 @@ def test_a_covered_and_accurate_calibration_is_usable_for_measurement() -> None:
     assert found.lines[0].startswith("usable for measurement: 0.00")
     assert 29.0 < found.tilt_deg < 31.0
     assert "straight" not in found.lines[1]
-    assert "more photographs are not needed" in found.lines[1] or "no further" in found.lines[1]
+    assert found.covered > 0.9
+    assert found.lines[1].startswith(f"points cover {int(100 * found.covered)} % of the image; ")
+    assert "enough for measurement" in found.lines[1] or "no further" in found.lines[1]
 
 
 def test_the_part_without_points_is_named_and_the_next_photograph_shows_the_target_there() -> None:
     found = calibrated(measured(side=70.0)).assessments["camera"]
     assert {"upper right corner", "right edge", "lower right corner"} <= set(found.uncovered)
+    assert found.covered < 0.8
+    assert "the result is extrapolated there" in found.lines[1]
     then = found.next_photograph
     assert then is not None
     assert then.xy[:, 0].max() > 0.8 * SIZE[0]

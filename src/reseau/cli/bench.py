@@ -161,7 +161,12 @@ def sim(
         }  # fmt: skip
     with plugin("reseau.simulators", "bench")(seed, **options) as bench:
         if camera and cameras == 1 and "[instruments.camera]" not in bench.toml:
-            typer.echo("no camera: Aravis or PyGObject is not installed", err=True)
+            typer.echo(
+                "no camera: it needs Aravis and PyGObject, which are not installed (on Debian: apt-get "
+                "install gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev pkg-config gcc, then "
+                "pip install 'reseau[aravis]')",
+                err=True,
+            )
         if out is not None:
             write_whole(out, bench.toml)
             for name, text in bench.documents.items():

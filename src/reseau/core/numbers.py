@@ -37,14 +37,14 @@ def grouped(value: float) -> str:
 
 
 def plain(value: float, digits: int) -> str:
-    """Return a number rounded to some digits, without a power of ten up to a million.
+    """Return a number rounded to some digits, without a power of ten.
 
     Examples
     --------
-    >>> plain(5012.3, 3), plain(0.0004567, 2), plain(3600.0, 2)
-    ('5010', '0.00046', '3600')
+    >>> plain(5012.3, 3), plain(0.0004567, 2), plain(3600.0, 2), plain(0.00005, 2)
+    ('5010', '0.00046', '3600', '0.00005')
     """
-    return f"{float(f'{value:.{digits}g}'):g}"
+    return np.format_float_positional(float(f"{value:.{digits}g}"), trim="-")
 
 
 class Power(NamedTuple):

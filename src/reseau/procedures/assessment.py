@@ -79,6 +79,8 @@ class Assessment:
         Number of photographs.
     tilt_deg : float
         Largest angle at which a plane target was seen, but for one photograph; NaN where it is not plane.
+    covered : float
+        Share of the image in which there are points, or beside which there are.
     uncovered : tuple of str
         Parts of the image with few points.
     next_photograph : NextPose, optional
@@ -102,6 +104,7 @@ class Assessment:
     misfit_px: float
     images: int
     tilt_deg: float
+    covered: float
     uncovered: tuple[str, ...]
     next_photograph: NextPose | None
     warnings: tuple[Remark, ...]
@@ -123,9 +126,10 @@ class Assessment:
             first += f"; the model fits (to {_rounded(self.misfit_px)})"
         else:
             first += f"; the model does not fit by {_two(self.misfit_px)} px: try --model auto"
-        second = "the image is covered"
+        # Rounded down: the whole image is covered only where no part is left.
+        second = f"points cover {int(100 * self.covered)} % of the image"
         if self.uncovered:
-            second = f"not covered, and extrapolated there: {_listed(self.uncovered)}"
+            second += f", and few are in the {_listed(self.uncovered)}: the result is extrapolated there"
         if self.images < _ENOUGH:
             second += f"; {self.images} photographs are few, take 10 or more"
         if self.tilt_deg < _STRAIGHT:
@@ -133,8 +137,8 @@ class Assessment:
         if self.next_photograph is not None:
             then = self.next_photograph
             enough = self.use is Use.MEASUREMENT and not self.uncovered and self.images >= _ENOUGH
-            second += "; more photographs are not needed; most would help" if enough else "; photograph next"
-            second += f": {then.words} (then {_two(then.worst_px)} px at most)"
+            which = "enough for measurement; the next photograph" if enough else "the photograph"
+            second += f"; {which} that would help most: {then.words} (then {_two(then.worst_px)} px at most)"
         elif not self.uncovered:
             second += "; no further photograph is needed"
         return first, second
@@ -216,8 +220,8 @@ def assess(result: Result, camera: int = 0) -> Assessment:
     focal = float("nan") if lens.mapping.parallel else float(np.sqrt(abs(np.linalg.det(slope))))
     images = int((result.fit.usable.images & (result.network.camera_of == camera)).sum())
     return Assessment(
-        use, centre, corners, focal, fits, misfit, images, _tilted(result, camera), uncovered, then,
-        important, tests,
+        use, centre, corners, focal, fits, misfit, images, _tilted(result, camera), float(covered.mean()),
+        uncovered, then, important, tests,
     )  # fmt: skip
 
 

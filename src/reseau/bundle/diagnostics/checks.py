@@ -21,6 +21,8 @@ from .result import Result
 __all__ = ["LISTED", "checks", "listed", "unmodelled_pattern"]
 
 LISTED = 8
+SHOWN = 3
+"""Names of points where the images that see them say more."""
 _CORRELATED, _WEAK, _ALPHA = 0.95, 5.0, 1e-4
 # Size of the next correction, in standard deviations, that counts as converged.
 _NEAR = 1e-3
@@ -37,11 +39,11 @@ _CORNER = 0.2
 _PLANE = 1e-4
 
 
-def listed(names: Iterable[object]) -> str:
+def listed(names: Iterable[object], most: int = LISTED) -> str:
     """Join names with commas; of many names only the first, and the number of the others."""
     every = [str(name) for name in names]
-    more = f" and {len(every) - LISTED} more" if len(every) > LISTED else ""
-    return ", ".join(every[:LISTED]) + more
+    more = f" and {len(every) - most} more" if len(every) > most else ""
+    return ", ".join(every[:most]) + more
 
 
 def _gaps(result: Result) -> list[Remark]:
@@ -63,12 +65,13 @@ def _gaps(result: Result) -> list[Remark]:
         )
     single = np.flatnonzero(lost & (rays == 1))
     if len(single):
-        of = {int(j): network.images[i] for i, j in zip(network.image_of, network.point_of, strict=True)}
-        where = [f"{network.points[j]} (image {of[int(j)]})" for j in single]
+        alone = np.isin(network.point_of, single)
+        where = listed(network.images[i] for i in np.unique(network.image_of[alone]))
         found.append(
             Remark(
-                f"rank defect {len(single)}: a single ray does not determine {_plural('point', single)} "
-                f"{listed(where)}; left out",
+                f"rank defect {len(single)}: {_points(network, single, SHOWN)} in one image only ({where}); "
+                "a single ray does not determine a point; left out, until a second image shows "
+                f"{'it' if len(single) == 1 else 'them'} from another place",
                 Code.RANK_DEFECT,
             )
         )
@@ -154,9 +157,9 @@ def _plural(word: str, rows: Rows) -> str:
     return word if len(rows) == 1 else f"{word}s"
 
 
-def _points(network: Network, rows: Rows) -> str:
+def _points(network: Network, rows: Rows, most: int = LISTED) -> str:
     verb = "is" if len(rows) == 1 else "are"
-    return f"{_plural('point', rows)} {listed(network.points[int(j)] for j in rows)} {verb}"
+    return f"{_plural('point', rows)} {listed((network.points[int(j)] for j in rows), most)} {verb}"
 
 
 def _global(result: Result) -> list[Remark]:

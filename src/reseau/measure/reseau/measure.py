@@ -349,7 +349,8 @@ def _oriented(
     others = ", ".join(alike[:-1]) + (" or " if len(alike) > 1 else "") + alike[-1]
     text = (
         f"the orientation is ambiguous: {others}, the design fits as well; its names are those of the "
-        "upright one (give nominal positions, or say whether it is mirrored and how far it may be turned)"
+        "upright one (give nominal positions, or say whether it is mirrored and how far it may be turned: "
+        "--not-mirrored, --max-rotation)"
     )
     return placed, (Remark(text, Code.AMBIGUOUS),)
 
