@@ -1,17 +1,16 @@
-"""Example of a blurred photograph, from a lens file to measured targets: python docs/blurred.py [FOLDER].
+"""The photograph of the tour of blurred targets: python docs/blurred.py [FOLDER] [--check].
 
 It writes `lens.zmx` (a double Gauss f/2 of 25 mm, stopped down to f/2.8), `plate.json` (24 disks) and
 `photo.png` to the folder (`out/blurred`): the plate at 540 mm, tilted, before a camera that is focused at
 500 mm. The photograph is drawn with the rays of batoid (`pip install batoid`), which share nothing with those
-that measure it. Then it runs the commands of the tour, compares the coordinates with batoid's principal
-rays, and keeps the figure as `docs/images/blurred.png`.
+that measure it; `truth.json` has its principal rays. With `--check`, after the command of the tour, it
+compares `targets.json` with them.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -32,6 +31,8 @@ from reseau.procedures.blurred import focused
 SIZE, PITCH = (1600, 1200), 0.006
 FOCUS, DISTANCE = 500.0, 540.0
 F_NUMBER = 2.8
+RAYS = 4500
+"""Rays through the pupil for each target: more change the grey values by less than their noise."""
 
 
 def zmx() -> str:
@@ -49,9 +50,8 @@ def zmx() -> str:
     return "\n".join([*lines, f"SURF {len(ROWS) + 1}", "  TYPE STANDARD", "  CURV 0.0", "  DISZ 0.0", ""])
 
 
-def main() -> None:
-    """Write the files, measure, compare, and keep the figure."""
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/blurred")
+def write(folder: Path) -> None:
+    """Write lens, plate, photograph, and the true coordinates."""
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / "lens.zmx", zmx())
     plate = regular_reseau(6, 4, 27.0, Mark(shape="disk", size=4.0), name="plate")
@@ -66,26 +66,33 @@ def main() -> None:
         target = Target("disk", 4.0, turn[:, :2] @ xy + [0, 0, DISTANCE], turn[:, :2])
         point = lens.principal_ray(target.centre, WAVELENGTHS[1])
         columns, rows = (np.arange(-34.0, 35.0) + round(v) for v in point)
-        share = light(lens, target, columns, rows, 0.5)
+        share = light(lens, target, columns, rows, 0.5, RAYS)
         image[np.ix_(rows.astype(int), columns.astype(int))] -= 150.0 * share
-        truth[name] = point
+        truth[name] = np.asarray(point).tolist()
     write_image(folder / "photo.png", noisy(image, 150.0, 40.0, np.random.default_rng(0)))
-    arguments = (
-        f"measure blurred photo.png --design plate.json --lens lens.zmx --pitch {1e3 * PITCH:g} "
-        f"--focus {FOCUS:g} --not-mirrored --max-rotation 40 --out targets.json --overlay targets.png "
-        "--figure target.png"
-    )
-    print("reseau", arguments)
-    subprocess.run([Path(sys.executable).with_name("reseau"), *arguments.split()], cwd=folder, check=True)
-    points = json.loads((folder / "targets.json").read_text())["points"]
-    errors = np.array([[p["x"], p["y"]] - truth[p["id"]] for p in points if p["ok"]])
-    sigmas = np.array([[p["sx"], p["sy"]] for p in points if p["ok"]])
+    write_whole(folder / "truth.json", json.dumps(truth, indent=1))
+
+
+def check(folder: Path) -> None:
+    """Compare what was measured with the true coordinates."""
+    truth = json.loads((folder / "truth.json").read_text("utf-8"))
+    points = [p for p in json.loads((folder / "targets.json").read_text("utf-8"))["points"] if p["ok"]]
+    errors = np.array([np.subtract((p["x"], p["y"]), truth[p["id"]]) for p in points])
+    sigmas = np.array([[p["sx"], p["sy"]] for p in points])
     print(
         f"{len(errors)} of {len(truth)} targets: errors {np.sqrt((errors**2).mean()):.4f} px rms, "
         f"{np.sqrt(((errors / sigmas) ** 2).mean()):.2f} times their sigmas, at most "
         f"{np.abs(errors).max():.4f} px"
     )
-    shutil.copy(folder / "target.png", Path(__file__).with_name("images") / "blurred.png")
+
+
+def main() -> None:
+    """Write the files, or check what was measured."""
+    parser = argparse.ArgumentParser(description="The photograph of the tour of blurred targets.")
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("out/blurred"))
+    parser.add_argument("--check", action="store_true", help="compare targets.json with the truth")
+    given = parser.parse_args()
+    (check if given.check else write)(given.folder)
 
 
 if __name__ == "__main__":

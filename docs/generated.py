@@ -127,14 +127,14 @@ def errors_page() -> str:
         "Misuse, files and instruments raise an exception. Its message says what to do; on the "
         "command line it is printed, and the exit status is that of the table.",
         "",
-        "| exception | is a | meaning | exit status |",
-        "|---|---|---|---|",
+        "| exception | is a | meaning | cause | cure | exit status |",
+        "|---|---|---|---|---|---|",
     ]
     for kind in kinds:
         base = kind.__base__.__name__ if kind.__base__ is not None else ""
         about = (inspect.getdoc(kind) or "").splitlines()[0]
         shown = f"{{py:class}}`~reseau.core.errors.{kind.__name__}`"
-        lines.append(f"| {shown} | {base} | {about} | {kind.exit_status} |")
+        lines.append(f"| {shown} | {base} | {about} | {kind.cause} | {kind.cure} | {kind.exit_status} |")
     return "\n".join([*lines, ""])
 
 

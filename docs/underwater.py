@@ -1,15 +1,15 @@
-"""Example of a network of blurred targets under water: python docs/underwater.py [FOLDER].
+"""The photographs of the tour of blurred targets under water: python docs/underwater.py [FOLDER] [--check].
 
 It writes the underwater project of Meid (1992, section 4) as files to the folder (`out/underwater`): the
 lens, a network with rough image coordinates and a port, the targets, and three photographs drawn with the
-rays of batoid (`pip install batoid`). Then it runs `reseau blurred`, compares the object points with the
-truth, and draws the residuals before and after to `docs/images/underwater.png`.
+rays of batoid (`pip install batoid`); `truth.json` has the object points. With `--check`, after the command
+of the tour, it compares those of every round with them.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -18,22 +18,21 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 from underwater import camera_of, network_of, targets_of
-from worlds.underwater import GLASS, PITCH, PSF, SIZE, WATER, Project, project
+from worlds.underwater import GLASS, PITCH, SIZE, WATER, Project, project
 
-from reseau.core.figures import drawing, to_bytes
 from reseau.core.files import write_whole
-from reseau.exchange import read_network
 from reseau.io import LensDocument, LensSensor
 from reseau.io.images import write_image
 
 STRENGTH = "medium"
+RAYS = 600
+"""Rays for each target and wavelength: more change the grey values by a thirtieth of their noise."""
 
 
-def main() -> None:
-    """Write the files, measure, compare, and draw the figure."""
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/underwater")
+def write(folder: Path) -> None:
+    """Write lens, network, targets, photographs, and the true object points."""
     (folder / "photographs").mkdir(parents=True, exist_ok=True)
-    drawn = project(STRENGTH, 0)
+    drawn = project(STRENGTH, 0, count=RAYS)
     for name, pixels in drawn.images.items():
         write_image(folder / "photographs" / f"{name}.png", pixels)
     camera = camera_of(STRENGTH)
@@ -41,18 +40,27 @@ def main() -> None:
     LensDocument.of(camera.lens, sensor).write(folder / "lens.toml")
     targets_of(drawn).write(folder / "frame.json")
     write_whole(folder / "network.json", json.dumps(network(drawn), indent=1))
-    arguments = (
-        "blurred network.json --images photographs --targets frame.json --lens lens.toml --initial centroid "
-        f"--psf {PSF:g} --search 8 --out measured"
-    )
-    print("reseau", arguments)
-    subprocess.run([Path(sys.executable).with_name("reseau"), *arguments.split()], cwd=folder, check=True)
-    for number in (0, 1):
-        points = json.loads((folder / "measured" / f"round-{number}.json").read_text())["points"]
-        free = [k for k, role in enumerate(points["role"]) if role == "tie"]
-        off = np.array([points["xyz"][k] for k in free]) - drawn.xyz[free]
+    truth = dict(zip(drawn.points, drawn.xyz.tolist(), strict=True))
+    write_whole(folder / "truth.json", json.dumps(truth, indent=1))
+
+
+def check(folder: Path) -> None:
+    """Compare the object points of every round, but for control points, with the truth."""
+    truth = json.loads((folder / "truth.json").read_text("utf-8"))
+    for number, path in enumerate(sorted((folder / "measured").glob("round-?.json"))):
+        points = json.loads(path.read_text("utf-8"))["points"]
+        rows = zip(points["id"], points["role"], points["xyz"], strict=True)
+        off = np.array([np.subtract(xyz, truth[name]) for name, role, xyz in rows if role == "tie"])
         print(f"round {number}: object points wrong by {np.sqrt((off**2).mean()):.4f} mm rms")
-    write_whole(Path(__file__).with_name("images") / "underwater.png", figure(folder))
+
+
+def main() -> None:
+    """Write the files, or check what was measured."""
+    parser = argparse.ArgumentParser(description="The photographs of the tour of targets under water.")
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("out/underwater"))
+    parser.add_argument("--check", action="store_true", help="compare the object points with the truth")
+    given = parser.parse_args()
+    (check if given.check else write)(given.folder)
 
 
 def network(drawn: Project) -> dict[str, object]:
@@ -86,37 +94,6 @@ def network(drawn: Project) -> dict[str, object]:
             "windows": [{"id": "port", "shape": "plane", "on": "camera", "media": list(window.media),
                          "parameters": dict(window.values)}]},
     }  # fmt: skip
-
-
-def figure(folder: Path) -> bytes:
-    """Residuals of the middle photograph before and after, to one scale."""
-    from matplotlib.figure import Figure
-
-    final = read_network(folder / "measured" / "network.json")
-    with drawing():
-        picture = Figure(figsize=(8.6, 3.6), layout="constrained")
-        for axes, (name, title) in zip(
-            picture.subplots(1, 2),
-            (("round-0", "centres of gravity"), ("result", "measured by rays")),
-            strict=True,
-        ):
-            table = json.loads((folder / "measured" / f"{name}.json").read_text())["image_points"]
-            rows = [k for k, image in enumerate(table["image"]) if image == "middle"]
-            v = np.array([(table["vx"][k], table["vy"][k]) for k in rows], dtype=np.float64)
-            names = [table["point"][k] for k in rows]
-            at = {
-                final.points[j]: xy
-                for i, j, xy in zip(final.image_of, final.point_of, final.xy, strict=True)
-                if final.images[i] == "middle"
-            }
-            xy = np.array([at.get(point, (np.nan, np.nan)) for point in names])
-            axes.plot(*xy.T, ".", color="#9aa3a8", markersize=2)
-            axes.quiver(
-                *xy.T, *(2000 * v).T, angles="xy", scale_units="xy", scale=1, width=0.004, color="#b3402a"
-            )
-            axes.set(xlim=(0, SIZE[0]), ylim=(SIZE[1], 0), aspect="equal")
-            axes.set_title(f"{title}: {np.sqrt((v**2).mean()):.4f} px rms (× 2000)")
-        return to_bytes(picture, "png", dpi=110)
 
 
 if __name__ == "__main__":

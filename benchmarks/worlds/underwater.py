@@ -86,7 +86,7 @@ PSF = 0.45
 BRIGHT, DARK, DECIBELS = 200.0, 50.0, 40.0
 """Grey values of ground and targets; noise in all, in decibels below their difference."""
 COUNT = 3000
-"""Points of the stop for each wavelength."""
+"""Points of the stop for each wavelength, unless others are asked for."""
 GLASS = (1.03961212, 0.231792344, 1.01046945, 0.00600069867, 0.0200179144, 103.560653)
 """Of the window, N-BK7: B1, B2, B3, C1, C2, C3 (µm²) as published by Schott."""
 WATER = (
@@ -267,7 +267,7 @@ class Project:
     blur: dict[str, Array]
 
 
-def project(strength: str, seed: int, *, sharp: bool = False) -> Project:
+def project(strength: str, seed: int, *, sharp: bool = False, count: int = COUNT) -> Project:
     """The images with noise; the network is the same for all strengths and seeds.
 
     Parameters
@@ -277,12 +277,14 @@ def project(strength: str, seed: int, *, sharp: bool = False) -> Project:
         Of the noise.
     sharp : bool
         The same network, formed by the rays of 546.1 nm through the middle of the stop alone.
+    count : int
+        Points of the stop for each wavelength.
     """
     centres, rotations = stations()
     points, xyz, normals, radius = frame()
     images, corresponding, blur = {}, {}, {}
     for k, name in enumerate(centres):
-        image, corresponding[name], blur[name] = drawn(strength, name, sharp)
+        image, corresponding[name], blur[name] = drawn(strength, name, sharp, count)
         images[name] = noisy(image, BRIGHT - DARK, DECIBELS, np.random.default_rng((seed, k, int(sharp))))
     return Project(images, centres, rotations, points, xyz, normals, radius, corresponding, blur)
 
@@ -335,14 +337,14 @@ def principal_rays(view: View, centre: Array, axes: Array) -> tuple[Array, Array
 
 
 @cache
-def drawn(strength: str, name: str, sharp: bool) -> tuple[Array, Array, Array]:
+def drawn(strength: str, name: str, sharp: bool, count: int = COUNT) -> tuple[Array, Array, Array]:
     """One image without noise, its corresponding points and blurs; kept in the folder for temporary files."""
     sources = [Path(__file__), Path(__file__).with_name("blurred.py")]
     key = hashlib.sha256(b"".join(p.read_bytes() for p in sources)).hexdigest()[:16]
-    kept = Path(tempfile.gettempdir()) / f"underwater-{key}" / f"{strength}-{name}-{sharp:d}.npz"
+    kept = Path(tempfile.gettempdir()) / f"underwater-{key}" / f"{strength}-{name}-{sharp:d}-{count}.npz"
     if not kept.exists():
         kept.parent.mkdir(exist_ok=True)
-        image, corresponding, blur = draw(strength, name, sharp)
+        image, corresponding, blur = draw(strength, name, sharp, count)
         part = kept.with_name(f"{os.getpid()}-{kept.name}")
         np.savez(part, image=image, corresponding=corresponding, blur=blur)
         part.replace(kept)
@@ -350,14 +352,16 @@ def drawn(strength: str, name: str, sharp: bool) -> tuple[Array, Array, Array]:
         return found["image"], found["corresponding"], found["blur"]
 
 
-def draw(strength: str, name: str, sharp: bool) -> tuple[Array, Array, Array]:
+def draw(strength: str, name: str, sharp: bool, count: int = COUNT) -> tuple[Array, Array, Array]:
     """One image without noise, its corresponding points (28, 2), and blurs (28,)."""
     views = [View(STRENGTHS[strength], w) for w in ((CORRESPONDING,) if sharp else WAVELENGTHS)]
     centre, axes = targets(name)
     corresponding = principal_rays(View(STRENGTHS[strength], CORRESPONDING), centre, axes)[1]
     image, blur = np.full(SIZE[::-1], BRIGHT), []
     for k, radius in enumerate(frame()[3]):
-        share, (column, row), wide = taken(views, np.rint(corresponding[k]), centre[k], axes[k], radius)
+        share, (column, row), wide = taken(
+            views, np.rint(corresponding[k]), centre[k], axes[k], radius, count
+        )
         blur.append(wide)
         rows, columns = (np.arange(n) + first for n, first in zip(share.shape, (row, column), strict=True))
         r = (rows >= 0) & (rows < SIZE[1])
@@ -368,7 +372,7 @@ def draw(strength: str, name: str, sharp: bool) -> tuple[Array, Array, Array]:
 
 
 def taken(
-    views: list[View], middle: Array, centre: Array, axes: Array, radius: float
+    views: list[View], middle: Array, centre: Array, axes: Array, radius: float, count: int = COUNT
 ) -> tuple[Array, tuple[int, int], float]:
     """Share (r, c) of the light of pixels that a target takes, the first column and row, and its blur.
 
@@ -377,8 +381,8 @@ def taken(
     sharp = len(views) == 1
     grid = 1.1 * radius * np.array([[u, v] for u in (-1, 0, 1) for v in (-1, 0, 1)])
     maps, weights, places, spots = [], [], [], []
-    k = np.arange(COUNT) + 0.5
-    even = np.sqrt(k / COUNT)[:, None] * spiral(k)
+    k = np.arange(count) + 0.5
+    even = np.sqrt(k / count)[:, None] * spiral(k)
     # A sharp image needs one point of the stop; that it is repeated samples the pixels.
     stop = np.zeros((200, 2)) if sharp else views[0].strength.stop_radius * even
     n = len(stop)

@@ -76,6 +76,12 @@ def test_exceptions_that_are_raised_are_on_the_page(generated: ModuleType) -> No
     page = generated.errors_page()
     assert [name for name in sorted(raised) if f"reseau.core.errors.{name}`" not in page] == []
     assert set(errors.__all__) == {name for name in errors.__all__ if f"reseau.core.errors.{name}`" in page}
+    for name in errors.__all__:
+        own = vars(getattr(errors, name))
+        assert own["cause"]
+        assert own["cure"]
+        assert f"| {own['cause']} | {own['cure']} |" in page
+        assert not own["cure"].endswith(".")
 
 
 def test_every_document_has_a_schema_file_and_a_row(generated: ModuleType) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +86,28 @@ def test_a_camera_under_water_is_calibrated_without_and_with_the_water(
     follow("underwater", tmp_path)
     c = Calibration.read("dry.json").parameters["c"]
     assert abs(c.value - 8.0) < 4 * c.sigma
+
+
+def test_blurred_targets_are_measured_by_the_rays_of_their_lens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("batoid", reason="batoid's rays draw the photograph")
+    monkeypatch.chdir(tmp_path)
+    follow("blurred", tmp_path)
+    truth = json.loads(Path("out/blurred/truth.json").read_text("utf-8"))
+    points = json.loads(Path("out/blurred/targets.json").read_text("utf-8"))["points"]
+    assert len(points) == len(truth) == 24
+    errors = np.array([np.subtract((p["x"], p["y"]), truth[p["id"]]) for p in points])
+    sigmas = np.array([(p["sx"], p["sy"]) for p in points])
+    assert np.sqrt(((errors / sigmas) ** 2).mean()) < 1.4
+    assert np.abs(errors).max() < 0.03
+
+
+def test_blurred_targets_are_measured_under_water(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("batoid", reason="batoid's rays draw the photographs")
+    monkeypatch.chdir(tmp_path)
+    follow("blurred-under-water", tmp_path)
+    assert Path("out/underwater/measured/report.html").exists()
 
 
 def test_an_instrument_is_corrected_in_three_photographs(

@@ -15,7 +15,8 @@ from pathlib import Path
 
 from reseau.cli import run
 
-TOURS = Path(__file__).parents[2] / "docs" / "tours"
+ROOT = Path(__file__).parents[2]
+TOURS = ROOT / "docs" / "tours"
 _BLOCK = re.compile(
     r"^```(\{code-block\} \w+|console|python)\n(?::caption: (\S+)\n)?(.*?)^```$", re.DOTALL | re.M
 )
@@ -119,6 +120,8 @@ def _carried_out(words: list[str]) -> tuple[int, str]:
         with redirect_stdout(written), redirect_stderr(written):
             status = run([*words[1:], *alone])
         return status, written.getvalue()
-    words[0] = sys.executable if words[0] == "python" else words[0]
+    if words[0] == "python":
+        # A tour that needs a checkout begins in its folder; here it writes to the folder of the test.
+        words = [sys.executable, str(ROOT / words[1]) if "/" in words[1] else words[1], *words[2:]]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout + done.stderr

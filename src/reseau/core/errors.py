@@ -18,9 +18,9 @@
         ├── StateError           its state does not allow it: not homed, stalled, at a limit, stopped
         └── BenchError           several instruments failed
 
-Each message says in one line *what* is wrong, *where*, and what to *do*. An estimator that fails does not
-raise: it returns a :class:`reseau.core.failure.Failure`; `EstimationError` is raised where the estimate is
-required.
+Each message says in one line *what* is wrong, *where*, and what to *do*; `cause` and `cure` of its class say
+so in general terms. An estimator that fails does not raise: it returns a
+:class:`reseau.core.failure.Failure`; `EstimationError` is raised where the estimate is required.
 """
 
 from __future__ import annotations
@@ -64,6 +64,8 @@ class ReseauError(Exception):
     'photo1.png: is all black; open the shutter'
     """
 
+    cause = "one of those below"
+    cure = "as for the one that is named"
     exit_status = 1
 
     def __init__(self, what: str, *, where: object = None, do: str | None = None) -> None:
@@ -75,33 +77,54 @@ class ReseauError(Exception):
 class UsageError(ReseauError):
     """Wrong or contradictory arguments."""
 
+    cause = "an argument or an option is wrong, or two of them contradict each other"
+    cure = "correct what the message names; `--help` lists what a command takes"
     exit_status = 2
 
 
 class InputError(ReseauError):
     """A file or external value that cannot be used."""
 
+    cause = "a file is missing, cannot be read or written, or its content does not suit the task"
+    cure = "check the path and its permissions, and correct what the message names"
     exit_status = 2
 
 
 class ImageError(InputError):
     """A file or an array that is not a usable image."""
 
+    cause = "the file is no image, is damaged, or is of a kind that is not supported"
+    cure = "copy the file again, or convert it to TIFF or PNG"
+
 
 class FormatError(InputError):
     """A document that does not conform to its schema."""
+
+    cause = "a document lacks a key, has one that is not known, or a value of another kind"
+    cure = "correct the key that is named; `reseau schema NAME` prints the format"
 
 
 class ArchiveError(ReseauError):
     """The archive cannot store or return an item: full, read-only, damaged, or missing."""
 
+    cause = "the archive is full, read-only or damaged, or does not have the item"
+    cure = "`reseau archive list` shows what there is, `reseau archive verify` what is damaged"
+
 
 class EstimationError(ReseauError):
     """A required estimate failed."""
 
+    cause = "an estimate failed without which there is no result"
+    cure = "that of its code, in the table above"
+
 
 class SettingError(UsageError):
     """A setting that an instrument does not have, or a value out of its limits; nothing was sent."""
+
+    cause = "the instrument does not have this setting, or the value is beyond its limits"
+    cure = (
+        "choose a value within the limits that the message states; `reseau bench status` shows the settings"
+    )
 
 
 class InstrumentError(ReseauError):
@@ -120,6 +143,9 @@ class InstrumentError(ReseauError):
     'table (home): did not answer; is it switched on?'
     """
 
+    cause = "the instrument did not do what it was asked for, in another way than those below"
+    cure = "`reseau bench check` runs the self-test of every instrument"
+
     def __init__(
         self, what: str, *, where: object = None, do: str | None = None, command: str | None = None
     ) -> None:
@@ -131,21 +157,36 @@ class InstrumentError(ReseauError):
 class ConnectionLost(InstrumentError):
     """The instrument cannot be reached, or the connection broke."""
 
+    cause = "it is off, unplugged, at another address, or in use by another program"
+    cure = "check power, cable and `address`; `reseau bench list` shows what answers"
+
 
 class DeadlineError(InstrumentError):
     """The instrument did not answer or finish in time."""
+
+    cause = "it is busy, stuck, or slower than the time limit that the message states"
+    cure = "wait or switch it off and on; give a longer limit where the work takes longer"
 
 
 class ProtocolError(InstrumentError):
     """The answer of the instrument violates its protocol."""
 
+    cause = "the answer is damaged, or that of another kind of instrument"
+    cure = "check cable, speed of the line and `driver`; switch it off and on"
+
 
 class RefusedError(InstrumentError):
     """The instrument refused the command."""
 
+    cause = "the instrument understood the command and declined it; the message has its reason"
+    cure = "correct the value, or release the instrument from its front panel"
+
 
 class StateError(InstrumentError):
     """The state of the instrument does not allow the command: not homed, stalled, at a limit, stopped."""
+
+    cause = "an axis is not homed, stalled, at a limit or stopped, or the instrument is not ready"
+    cure = "home it (`reseau bench home`), or remove what is in its way"
 
 
 class BenchError(InstrumentError):
@@ -162,6 +203,9 @@ class BenchError(InstrumentError):
     >>> str(BenchError([first, second]))
     'bench: 2 failed: table: is not homed | scope: timed out'
     """
+
+    cause = "one or more instruments failed; the message names all of them"
+    cure = "that of each, as above"
 
     def __init__(self, failures: Sequence[ReseauError]) -> None:
         self.failures = tuple(failures)
