@@ -75,6 +75,12 @@ class Browser:
         body = {"cmd": "Emulation.setDeviceMetricsOverride", "params": metrics}
         self.command("POST", "/goog/cdp/execute", body)
 
+    def prefer(self, theme: str) -> None:
+        """Let the reader prefer a `light` or a `dark` page; with an empty text, none."""
+        params = {"features": [{"name": "prefers-color-scheme", "value": theme}]}
+        body = {"cmd": "Emulation.setEmulatedMedia", "params": params}
+        self.command("POST", "/goog/cdp/execute", body)
+
     def screenshot(self, path: Path, whole: bool = True) -> None:
         if whole:
             size = self.run("return [innerWidth, Math.min(document.documentElement.scrollHeight, 4000)]")

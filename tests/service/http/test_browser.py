@@ -126,11 +126,13 @@ def browser() -> Iterator[Browser]:
 
 
 def shot(browser: Browser, name: str) -> None:
-    """Keep a picture of the page for the documentation: its upper part, that of a desk at half its size."""
+    """Keep the upper part of the page for both themes of the documentation; that of a desk at half its size."""
     folder = os.environ.get("RESEAU_SCREENSHOTS")
-    if folder:
-        path = Path(folder) / f"{name}.png"
+    for theme, suffix in (("light", ""), ("dark", "-dark")) if folder else ():
+        path = Path(folder or "") / f"{name}{suffix}.png"
         path.parent.mkdir(exist_ok=True)
+        browser.prefer(theme)
+        time.sleep(0.5)
         browser.screenshot(path)
         picture = cv2.imread(str(path))
         assert picture is not None
@@ -139,6 +141,7 @@ def shot(browser: Browser, name: str) -> None:
         if wide:
             picture = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         cv2.imwrite(str(path), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        browser.prefer("")
 
 
 @pytest.fixture
