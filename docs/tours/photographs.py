@@ -26,13 +26,13 @@ sheet = cv2.GaussianBlur(25 + 0.7 * sheet.astype(np.float32), (0, 0), 1.5)
 
 # Where each sample of the image looks: pixels are squares around their coordinates.
 x, y = ((np.arange(n * FINE) + 0.5) / FINE - 0.5 for n in (WIDTH, HEIGHT))
-seen = np.stack(np.meshgrid((x - CX) / FX, (y - CY) / FY), axis=-1).reshape(-1, 2)
-rays = seen.copy()
+seen_x, seen_y = np.meshgrid((x - CX) / FX, (y - CY) / FY)
+u, v = seen_x, seen_y
 for _ in range(15):  # the inverse of OpenCV's distortion, by its own iteration
-    u, v = rays.T
     r2 = u * u + v * v
-    aside = np.stack([2 * P1 * u * v + P2 * (r2 + 2 * u * u), P1 * (r2 + 2 * v * v) + 2 * P2 * u * v], axis=1)
-    rays = (seen - aside) / (1 + r2 * (K1 + r2 * K2))[:, None]
+    radial = 1 + r2 * (K1 + r2 * K2)
+    aside_x, aside_y = 2 * P1 * u * v + P2 * (r2 + 2 * u * u), P1 * (r2 + 2 * v * v) + 2 * P2 * u * v
+    u, v = (seen_x - aside_x) / radial, (seen_y - aside_y) / radial
 
 rng = np.random.default_rng(28)
 Path("photos").mkdir(exist_ok=True)
@@ -46,12 +46,10 @@ for k in range(12):
     aside = np.array([(0, 0), (-1, -1), (1, 1), (1, -1), (-1, 1)][k % 5]) * (0.24, 0.12)
     middle = np.array([*(aside * rng.uniform(0.8, 1.2, 2) * distance), distance])
     to_image = np.column_stack([turn[:, :2], middle - turn[:, :2] @ (size_mm / 2)])
-    on_board = np.c_[rays, np.ones(len(rays))] @ np.linalg.inv(to_image).T
-    place = ((on_board[:, :2] / on_board[:, 2:] + margin_mm) * PER_MM - 0.5).astype(np.float32)
+    across, down, depth = (a * u + b * v + c for a, b, c in np.linalg.inv(to_image))
     light = cv2.remap(
         sheet,
-        place.reshape(HEIGHT * FINE, WIDTH * FINE, 2),
-        None,
+        *(((mm / depth + margin_mm) * PER_MM - 0.5).astype(np.float32) for mm in (across, down)),
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=110.0,
@@ -59,3 +57,4 @@ for k in range(12):
     light = cv2.GaussianBlur(light, (0, 0), 0.6 * FINE)
     pixels = light.reshape(HEIGHT, FINE, WIDTH, FINE).mean(axis=(1, 3)) + rng.normal(0, 1.5, (HEIGHT, WIDTH))
     cv2.imwrite(f"photos/{k + 1:02}.png", np.clip(np.rint(pixels), 0, 255).astype(np.uint8))
+    print(f"photos/{k + 1:02}.png")

@@ -80,7 +80,7 @@ class Assessment:
     tilt_deg : float
         Largest angle at which a plane target was seen, but for one photograph; NaN where it is not plane.
     covered : float
-        Share of the image in which there are points, or beside which there are.
+        Share of the image, in cells of a twelfth of its width and height, with points.
     uncovered : tuple of str
         Parts of the image with few points.
     next_photograph : NextPose, optional
@@ -126,8 +126,8 @@ class Assessment:
             first += f"; the model fits (to {_rounded(self.misfit_px)})"
         else:
             first += f"; the model does not fit by {_two(self.misfit_px)} px: try --model auto"
-        # Rounded down: the whole image is covered only where no part is left.
-        second = f"points cover {int(100 * self.covered)} % of the image"
+        # Rounded down: points are in the whole image only where no part is left.
+        second = f"points are in {int(100 * self.covered)} % of the image"
         if self.uncovered:
             second += f", and few are in the {_listed(self.uncovered)}: the result is extrapolated there"
         if self.images < _ENOUGH:
@@ -195,7 +195,7 @@ def assess(result: Result, camera: int = 0) -> Assessment:
     lens = camera_mapping(result, camera)
     used = result.fit.usable.observations & ~result.rejected
     rows = np.flatnonzero(used & (result.network.camera_of[result.network.image_of] == camera))
-    covered = _covered(result.network.xy[rows], lens)
+    seen, covered = _covered(result.network.xy[rows], lens)
     share = covered.reshape(3, _CELLS // 3, 3, _CELLS // 3).mean(axis=(1, 3))
     uncovered = tuple(_ZONES[r][c] for r in range(3) for c in range(3) if share[r, c] < _EMPTY)
     centre, corners = _sigmas(lens, _enlarged(result, camera))
@@ -220,7 +220,7 @@ def assess(result: Result, camera: int = 0) -> Assessment:
     focal = float("nan") if lens.mapping.parallel else float(np.sqrt(abs(np.linalg.det(slope))))
     images = int((result.fit.usable.images & (result.network.camera_of == camera)).sum())
     return Assessment(
-        use, centre, corners, focal, fits, misfit, images, _tilted(result, camera), float(covered.mean()),
+        use, centre, corners, focal, fits, misfit, images, _tilted(result, camera), float(seen.mean()),
         uncovered, then, important, tests,
     )  # fmt: skip
 
@@ -267,14 +267,14 @@ def sorted_remarks(
     return tuple(remark for remark in rest if remark.code is not Code.COVERAGE), tests
 
 
-def _covered(xy: Array, lens: CameraMapping) -> Mask:
-    """Cells of the image that have points, or a neighbour that has."""
+def _covered(xy: Array, lens: CameraMapping) -> tuple[Mask, Mask]:
+    """Cells of the image that have points, and those that have points or a neighbour that has."""
     cell = np.clip((xy / np.array(lens.size) * _CELLS).astype(int), 0, _CELLS - 1)
     seen = np.zeros((_CELLS + 2, _CELLS + 2), dtype=np.bool_)
     seen[1 + cell[:, 1], 1 + cell[:, 0]] = True
     shifts = [(i, k) for i in range(3) for k in range(3) if 1 in (i, k)]
     near = [seen[i : i + _CELLS, k : k + _CELLS] for i, k in shifts]
-    return np.asarray(np.any(near, axis=0), dtype=np.bool_)
+    return seen[1:-1, 1:-1], np.asarray(np.any(near, axis=0), dtype=np.bool_)
 
 
 def _enlarged(result: Result, camera: int) -> float:
