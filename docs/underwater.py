@@ -25,8 +25,8 @@ from reseau.io import LensDocument, LensSensor
 from reseau.io.images import write_image
 
 STRENGTH = "medium"
-RAYS = 600
-"""Rays for each target and wavelength: more change the grey values by a thirtieth of their noise."""
+RAYS = 1500
+"""Rays for each target and wavelength."""
 
 
 def write(folder: Path) -> None:
