@@ -126,13 +126,18 @@ def browser() -> Iterator[Browser]:
 
 
 def shot(browser: Browser, name: str) -> None:
-    """Keep the upper part of the page for both themes of the documentation; that of a desk at half its size."""
+    """Keep the upper part of the page for both themes of the documentation, from a desk at half its size."""
     folder = os.environ.get("RESEAU_SCREENSHOTS")
-    for theme, suffix in (("light", ""), ("dark", "-dark")) if folder else ():
-        path = Path(folder or "") / f"{name}{suffix}.png"
+    if not folder:
+        return
+    width, height = browser.run("return [innerWidth, innerHeight]")
+    # What is below the window, such as the report in its frame, would not be drawn.
+    browser.resize(width, 1600)
+    for theme, suffix in (("light", ""), ("dark", "-dark")):
+        path = Path(folder) / f"{name}{suffix}.png"
         path.parent.mkdir(exist_ok=True)
         browser.prefer(theme)
-        time.sleep(0.5)
+        time.sleep(1.0)
         browser.screenshot(path)
         picture = cv2.imread(str(path))
         assert picture is not None
@@ -141,7 +146,8 @@ def shot(browser: Browser, name: str) -> None:
         if wide:
             picture = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         cv2.imwrite(str(path), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-        browser.prefer("")
+    browser.prefer("")
+    browser.resize(width, height)
 
 
 @pytest.fixture

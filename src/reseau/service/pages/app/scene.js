@@ -100,5 +100,6 @@ async function show(place) {
   });
   canvas.addEventListener('wheel', event => { event.preventDefault(); turn(event.deltaY < 0 ? 'in' : 'out'); }, {passive: false});
   new ResizeObserver(() => requestAnimationFrame(draw)).observe(canvas);
+  matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => requestAnimationFrame(draw));
   draw();
 }
