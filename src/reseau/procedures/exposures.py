@@ -80,14 +80,14 @@ def photographs_in(folder: Path) -> list[Path]:
     >>> photographs_in(Path("src/reseau/optics"))
     Traceback (most recent call last):
     ...
-    reseau.core.errors.InputError: src/reseau/optics: has no photograph; put in files such as .jpg, .png, .tif or .heic
+    reseau.core.errors.InputError: src/reseau/optics: has no photograph; put some in: .jpg, .png, .tif, .heic
     """
     files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
     for suffixes in (PHOTOGRAPHS, (".csv",)):
         found = [path for path in files if path.suffix.lower() in suffixes]
         if found:
             return found
-    raise InputError("has no photograph", where=folder, do="put in files such as .jpg, .png, .tif or .heic")
+    raise InputError("has no photograph", where=folder, do="put some in: .jpg, .png, .tif, .heic")
 
 
 def photographs_named(paths: Iterable[Path]) -> list[Path]:
