@@ -8,6 +8,7 @@ from typing import Any
 
 from docutils import nodes
 from latex2mathml.converter import convert
+from sphinx.transforms import SphinxTransform
 
 _ROOT = Path(__file__).resolve().parents[1]
 for _folder in ("src", "drivers", "sims", "docs"):
@@ -107,6 +108,26 @@ def _pages(app: Any, what: str, name: str, obj: object, options: Any, lines: lis
         lines[i] = re.sub(r"``docs/([\w/-]+)\.md``", r":doc:`docs/\1.md </\1>`", line)
 
 
+class _Themes(SphinxTransform):
+    """Show `picture-dark.png` beside `picture.png` on dark pages in its place."""
+
+    default_priority = 400
+
+    def apply(self, **options: Any) -> None:
+        """Give every picture that has one its twin."""
+        for image in list(self.document.findall(nodes.image)):
+            path = Path(image["uri"])
+            dark = path.with_name(f"{path.stem}-dark{path.suffix}")
+            chosen = {"only-light", "only-dark"} & set(image["classes"])
+            if chosen or not (Path(self.document["source"]).parent / dark).exists():
+                continue
+            twin = image.deepcopy()
+            twin["uri"] = dark.as_posix()
+            twin["classes"].append("only-dark")
+            image["classes"].append("only-light")
+            image.parent.insert(image.parent.index(image) + 1, twin)
+
+
 def _mathml(node: nodes.Node, display: str) -> str:
     """Convert a formula from LaTeX to MathML; an unknown command is an error."""
     found = convert(node.astext(), display=display)
@@ -139,6 +160,7 @@ def _generated(app: Any) -> None:
 
 def setup(app: Any) -> None:
     """Connect to Sphinx."""
+    app.add_transform(_Themes)
     app.add_html_math_renderer("mathml", (_inline_math, None), (_display_math, None))
     app.connect("autodoc-process-docstring", _magnitudes)
     app.connect("autodoc-process-docstring", _pages)
