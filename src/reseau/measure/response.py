@@ -145,14 +145,15 @@ _POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 
 def unexplained(values: Array, basis: Array, weight: Array) -> Array:
     """What weighted values (k, s, n) contain beside a weighted basis (k, b, n)."""
-    known, scaled = _turned(basis * weight[:, None]), values * weight[:, None]
-    turned = np.swapaxes(known, 1, 2)
-    normal = known @ turned + _SINGULAR * np.eye(known.shape[1])
-    for _ in range(2):  # what rounding left the first time
-        scaled = (
-            scaled - np.swapaxes(np.linalg.solve(normal, known @ np.swapaxes(scaled, 1, 2)), 1, 2) @ known
-        )
-    return np.asarray(scaled)
+    left = np.empty(values.shape)
+    for mark, (parts, w) in enumerate(zip(basis, weight, strict=True)):
+        # One mark at a time: what is formed stays in a cache.
+        known = _turned(parts[None] * w)[0]
+        normal, scaled = known @ known.T + _SINGULAR * np.eye(len(known)), values[mark] * w
+        for _ in range(2):  # what rounding left the first time
+            scaled = scaled - np.linalg.solve(normal, known @ scaled.T).T @ known
+        left[mark] = scaled
+    return left
 
 
 def _turned(rows: Array) -> Array:

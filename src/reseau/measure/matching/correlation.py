@@ -103,7 +103,8 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
             variance[k] = (unit[those] ** 2).sum() / max(free[those].sum(), 1.0)
     correlation = _correlation(unit / np.maximum(np.sqrt(variance)[kind], 1e-6), shown, free)
     single = np.float32
-    influence = found.influence.astype(single, copy=False) * found.noise.astype(single)[:, None, None, None]
+    influence: Any = found.influence.astype(single, copy=False)
+    influence = influence * found.noise.astype(single)[:, None, None, None]
     kind = _kinds(_activity(influence), limits)
     uneven = influence * np.sqrt(variance).astype(single)[kind][:, None]
     # The errors that a pixel has in common with those around it, weighted by their influence.
@@ -115,7 +116,7 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     largest = np.abs(uneven).max(axis=(1, 2, 3))
     known = np.isfinite(largest) & (largest > 0)
     unity = np.where(known, largest, 1.0).astype(single)
-    scaled = np.where(known[:, None, None, None], uneven, 0.0) / unity[:, None, None, None]
+    scaled: Any = np.where(known[:, None, None, None], uneven, 0.0) / unity[:, None, None, None]
     wide = np.pad(scaled, ((0, 0), (0, 0), (_LAGS, _LAGS), (_LAGS, _LAGS)))
     from ..compiled_filter import filtered  # takes half a second to import; not every command needs it
 

@@ -39,7 +39,7 @@ _GROUND_PX, _GROUND_WIDTHS = 5, 3.0
 """Background shown by a window around its mark: pixels, and widths of the point-spread function."""
 _AT_ONCE_PX = 250_000
 """Number of pixels of windows matched together: what is formed in them takes some 30 MB."""
-_SHARED_PX = 20_000
+_SHARED_PX = 8_000
 """Number of pixels whose matching takes as long as what windows of one more size take beside it."""
 _LEARNT_FROM = 120
 """Most marks from which mapping and appearance are learnt first."""
