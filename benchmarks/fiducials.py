@@ -1,9 +1,9 @@
 """Fiducial marks in photographs that another renderer drew: errors compared with their sigmas.
 
-Run from the checkout: ``python benchmarks/fiducials.py [--count N] [--kind K] [--keep FOLDER]``. The
-photographs of ``benchmarks/worlds/fiducials.py`` share no formation of images with the project. Reported for
-each kind: photographs declined, marks measured, rms of the errors in pixels, errors over their sigmas (1 is
-right), wrong marks (beyond 5 sigma and 0.15 px), and orientations that are wrong without a remark.
+Run from the checkout: ``python benchmarks/fiducials.py [--count N] [--kind K] [--keep FOLDER] [--jobs N]``.
+The photographs of ``benchmarks/worlds/fiducials.py`` share no formation of images with the project. Reported
+for each kind: photographs declined, marks measured, rms of the errors in pixels, errors over their sigmas (1
+is right), wrong marks (beyond 5 sigma and 0.15 px), and orientations that are wrong without a remark.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from parts import add_options, executor_of, main_of, outcomes
 from worlds.fiducials import KINDS, photograph, write
 
 from reseau.core.failure import Code, Failure
@@ -23,6 +24,18 @@ from reseau.io.images import open_scan
 from reseau.measure.fiducials import FiducialOptions, measure_fiducials
 
 WRONG_PX, WRONG_SIGMA = 0.15, 5.0
+
+
+def drawn_and_assessed(job: tuple[str, int, Path, bool, bool]) -> tuple[str, dict[str, object]]:
+    """Name and errors of a photograph of a kind and number, drawn into a folder unless it is there."""
+    kind, seed, folder, keep, verbose = job
+    name = f"{kind}_{seed}"
+    there = [p for p in folder.glob(f"{name}.*") if p.suffix in (".tif", ".jpg")]
+    image = there[0] if there else write(folder, name, photograph(kind, seed))
+    found = assessed(image, verbose)
+    if not keep:
+        image.unlink()
+    return image.name, found
 
 
 def assessed(image: Path, verbose: bool) -> dict[str, object]:
@@ -45,6 +58,7 @@ def assessed(image: Path, verbose: bool) -> dict[str, object]:
     error = (found.xy - places)[found.ok]
     sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))[found.ok]
     if verbose:
+        print("   ", image.name)
         for i, (e, s) in enumerate(zip(error, sigma, strict=True)):
             print(
                 f"      {found.points.names[i]}: {e.round(3)} sigma {s.round(3)}",
@@ -71,25 +85,21 @@ def main() -> None:
     parser.add_argument("--kind", choices=KINDS, action="append")
     parser.add_argument("--keep", type=Path, help="folder with photographs; missing ones are drawn")
     parser.add_argument("--verbose", action="store_true")
+    add_options(parser)
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as scratch:
+    with tempfile.TemporaryDirectory() as scratch, executor_of(given) as executor:
         folder = given.keep or Path(scratch)
         print("kind      photos declined  marks  rms px  err/sigma  wrong  silent turns   s")
         every: list[dict[str, object]] = []
         for kind in given.kind or KINDS:
+            seeds = range(given.first, given.first + given.count)
+            jobs = ((kind, seed, folder, given.keep is not None, given.verbose) for seed in seeds)
             done = []
-            for seed in range(given.first, given.first + given.count):
-                name = f"{kind}_{seed}"
-                there = [p for p in folder.glob(f"{name}.*") if p.suffix in (".tif", ".jpg")]
-                image = there[0] if there else write(folder, name, photograph(kind, seed))
-                if given.verbose:
-                    print("   ", image.name)
-                done.append(assessed(image, given.verbose))
-                if "declined" in done[-1]:
-                    print(f"  {image.name}: {done[-1]['declined']}")
-                if not given.keep:
-                    image.unlink()
-            print(line(kind, done))
+            for name, found in outcomes(executor, drawn_and_assessed, jobs):
+                done.append(found)
+                if "declined" in found:
+                    print(f"  {name}: {found['declined']}")
+            print(line(kind, done), flush=True)
             every += done
         print(line("all", every))
 
@@ -112,4 +122,4 @@ def line(name: str, done: list[dict[str, object]]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    main_of(__file__)
