@@ -1,9 +1,9 @@
 """Coverage of covariances of cameras that are fixed to each other: a sphere of cameras, a stereo pair.
 
-Run from the checkout: ``python benchmarks/rigs.py [--part sphere|stereo] [--seeds 200]``. Image coordinates
-are drawn with OpenCV's ``projectPoints`` and noise of a known size; none of the project's projections takes
-part. Printed are root mean squares of errors over standard deviations, one by one and jointly, each with its
-standard error over the seeds.
+Run from the checkout: ``python benchmarks/rigs.py [--part sphere|stereo] [--seeds 200] [--jobs N]``. Image
+coordinates are drawn with OpenCV's ``projectPoints`` and noise of a known size; none of the project's
+projections takes part. Printed are root mean squares of errors over standard deviations, one by one and
+jointly, each with its standard error over the seeds.
 
 sphere
     Twelve cameras on the vertices of an icosahedron look inwards at a ball with 80 points, of which each
@@ -21,13 +21,16 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+from parts import add_options, executor_of, main_of, outcomes
 
 from reseau.bundle import Camera, Network, adjust_network
 from reseau.bundle.network import Rig
 from reseau.core.data import Array
+from reseau.execution import Executor
 from reseau.io.network import CameraEntry
 
 DATA = (
@@ -193,35 +196,52 @@ def printed(what: str, squares: list[Array]) -> None:
     print(f"  {what:<34} {rms:.3f} ± {means.std(ddof=1) / np.sqrt(len(means)) / (2 * rms):.3f}")
 
 
-def cover(title: str, drawn: Iterator[Drawn]) -> None:
-    start, rotations, bases, joint, interior, points = time.process_time(), [], [], [], [], []
-    count = 0
-    for network, turns, centres, xyz in drawn:
-        result = adjust_network(network).required()
-        count, found = count + 1, result.rig
-        assert found is not None
-        off, away, whole = [], [], []
-        for k, name in enumerate(found.cameras):
-            c = [camera.id for camera in network.cameras].index(name)
-            error = np.concatenate([vector(found.rotation[k] @ turns[c].T), found.base[k] - centres[c]])
-            off.append((error[:3] / found.sigma[k, :3]) ** 2)
-            away.append((error[3:] / found.sigma[k, 3:]) ** 2)
-            whole.append(error @ np.linalg.solve(found.cov[k], error) / 6)
-        rotations.append(np.array(off))
-        bases.append(np.array(away))
-        joint.append(np.array(whole))
-        interior.append(np.concatenate([
-            ((each.values - [camera.parameters[name] for name in each.parameters]) / each.sigma) ** 2
-            for each, camera in zip(result.cameras.values(), network.cameras, strict=True)
-        ]))  # fmt: skip
-        if network.datum == "free":
-            points.append(((result.points.xyz - xyz) / result.points.sigma) ** 2)
-    print(f"{title}: {len(network.images)} images, {len(network.xy)} image points, {count} seeds, "
-          f"{(time.process_time() - start) / count:.2f} s of processor time each")  # fmt: skip
-    printed("relative rotations", rotations)
-    printed("bases", bases)
-    printed("rotation and base jointly", joint)
-    printed("interior orientations", interior)
+class Squares(NamedTuple):
+    """Squared errors of one network over their variances, and its size: images, image points, seconds."""
+
+    rotations: Array
+    bases: Array
+    joint: Array
+    interior: Array
+    points: Array | None
+    images: int
+    seen: int
+    seconds: float
+
+
+def squares_of(drawn: Drawn) -> Squares:
+    """Adjust a drawn network, and compare it with the truth."""
+    start, (network, turns, centres, xyz) = time.process_time(), drawn
+    result = adjust_network(network).required()
+    found = result.rig
+    assert found is not None
+    off, away, whole = [], [], []
+    for k, name in enumerate(found.cameras):
+        c = [camera.id for camera in network.cameras].index(name)
+        error = np.concatenate([vector(found.rotation[k] @ turns[c].T), found.base[k] - centres[c]])
+        off.append((error[:3] / found.sigma[k, :3]) ** 2)
+        away.append((error[3:] / found.sigma[k, 3:]) ** 2)
+        whole.append(error @ np.linalg.solve(found.cov[k], error) / 6)
+    interior = np.concatenate([
+        ((each.values - [camera.parameters[name] for name in each.parameters]) / each.sigma) ** 2
+        for each, camera in zip(result.cameras.values(), network.cameras, strict=True)
+    ])  # fmt: skip
+    points = ((result.points.xyz - xyz) / result.points.sigma) ** 2 if network.datum == "free" else None
+    return Squares(
+        np.array(off), np.array(away), np.array(whole), interior, points,
+        len(network.images), len(network.xy), time.process_time() - start,
+    )  # fmt: skip
+
+
+def cover(title: str, drawn: Iterator[Drawn], executor: Executor) -> None:
+    done = list(outcomes(executor, squares_of, drawn))
+    print(f"{title}: {done[-1].images} images, {done[-1].seen} image points, {len(done)} seeds, "
+          f"{sum(each.seconds for each in done) / len(done):.2f} s of processor time each")  # fmt: skip
+    printed("relative rotations", [each.rotations for each in done])
+    printed("bases", [each.bases for each in done])
+    printed("rotation and base jointly", [each.joint for each in done])
+    printed("interior orientations", [each.interior for each in done])
+    points = [each.points for each in done if each.points is not None]
     if points:
         printed("object points", points)
 
@@ -230,16 +250,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--part", choices=("sphere", "stereo"))
     parser.add_argument("--seeds", type=int, default=200)
+    add_options(parser)
     options = parser.parse_args()
-    if options.part != "stereo":
-        cover("sphere of twelve cameras", sphere(options.seeds))
-    if options.part != "sphere":
-        if DATA.exists():
-            cover("stereo pair of OpenCV's chessboards", stereo(options.seeds))
-        else:
-            print(f"no reference data {DATA}")
+    with executor_of(options) as executor:
+        if options.part != "stereo":
+            cover("sphere of twelve cameras", sphere(options.seeds), executor)
+        if options.part != "sphere":
+            if DATA.exists():
+                cover("stereo pair of OpenCV's chessboards", stereo(options.seeds), executor)
+            else:
+                print(f"no reference data {DATA}")
     return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main_of(__file__))
