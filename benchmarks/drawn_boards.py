@@ -24,7 +24,7 @@ import numpy as np
 from scipy.stats import chi2
 from worlds import prints
 from worlds.pixels import Array
-from worlds.sheets import CONDITIONS, View, Wide, pose, views
+from worlds.sheets import CONDITIONS, Fisheye, View, Wide, pose, views
 
 from reseau.core.data import Frame, Rows
 from reseau.core.failure import Failure
@@ -181,11 +181,13 @@ def line(kind: str, label: str, view: View) -> bool:
 
 
 def held_out(kind: str, count: int) -> list[tuple[str, View]]:
-    """Wide lenses, near 60°, small boards, partial views."""
+    """Wide lenses, fisheyes, near 60°, small boards, partial views."""
     printed, found = KINDS[kind][1], []
     for k in range(count):
         turn, place = pose(50 + k, printed, nearer=1.7)
         found.append((f"wide_{k}", Wide(printed, turn, place * [1, 1, 0.55], seed=900 + k)))
+        turn, place = pose(60 + k, printed, most_tilt_deg=30.0, nearer=1.0)
+        found.append((f"fish_{k}", Fisheye(printed, turn, place * [1, 1, 0.45], seed=980 + k)))
         turn, place = pose(70 + k, printed, nearer=0.4)
         found.append((f"far_{k}", View(printed, turn, place, seed=920 + k, noise=3.0)))
         turn, place = pose(90 + k, printed, nearer=1.2)

@@ -25,7 +25,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from worlds.pixels import Array, edge, form, interpolated
 
-__all__ = ["CONDITIONS", "Printed", "Sheet", "View", "Wide", "coded", "pose", "views"]
+__all__ = ["CONDITIONS", "Fisheye", "Printed", "Sheet", "View", "Wide", "coded", "pose", "views"]
 
 _WIDTH, _HEIGHT = 960, 720
 _OVERSAMPLING = 4
@@ -286,6 +286,21 @@ class Wide(View):
     _focal = np.array([520.0, 518.0])
     _centre = np.array([471.2, 366.4])
     _lens = (-0.24, 0.045, -0.0006, 0.0008)
+
+
+class Fisheye(View):
+    """A view through a fisheye: the angle from the axis, not its tangent, is proportional to the radius."""
+
+    _focal = np.array([420.0, 419.0])
+    _centre = np.array([486.8, 352.2])
+
+    def _distorted(self, at: Array) -> Array:
+        r = np.maximum(np.hypot(*np.moveaxis(at, -1, 0)), 1e-12)
+        return np.asarray(at * (np.arctan(r) / r)[..., None])
+
+    def _undistorted(self, at: Array) -> Array:
+        r = np.maximum(np.hypot(*np.moveaxis(at, -1, 0)), 1e-12)
+        return np.asarray(at * (np.tan(r) / r)[..., None])
 
 
 def pose(seed: int, sheet: Printed, most_tilt_deg: float = 50.0, nearer: float = 1.0) -> tuple[Array, Array]:

@@ -25,7 +25,7 @@ from .board_pictures import picture
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from worlds import prints
-from worlds.sheets import View, Wide, pose
+from worlds.sheets import Fisheye, View, Wide, pose
 
 CHESS = board("chess", 9, 8, 20.0)
 CHARUCO = board("charuco", 7, 6, 25.0, size=18.0)
@@ -272,6 +272,30 @@ def test_corners_on_paper_that_is_saturated_everywhere_are_measured_to_their_sig
     sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
     assert np.sqrt((error**2).mean()) < 0.006
     assert 0.8 < np.sqrt(((error / sigma) ** 2).mean()) < 1.2
+
+
+@pytest.mark.parametrize(
+    ("design", "printed"),
+    [
+        (board("charuco", 9, 8, 24.0, size=18.0), prints.charuco(9, 8, 24.0, 18.0, "DICT_5X5_100")),
+        (board("chess", 14, 9, 18.0), prints.chess(14, 9, 18.0)),
+        (board("circles", 11, 8, 18.0, size=9.0), prints.circles(11, 8, 18.0, 9.0)),
+    ],
+    ids=["charuco", "chess", "circles"],
+)
+def test_errors_behind_a_fisheye_are_those_of_their_sigmas(
+    design: BoardDesign, printed: prints.Print
+) -> None:
+    """Neither the mapping of a lens nor a polynomial describes it; with their curvatures z was up to 18."""
+    turn, place = pose(60, printed, most_tilt_deg=30.0)
+    view = Fisheye(printed, turn, place * [1, 1, 0.45], seed=980)
+    found = measured(Frame(view.picture(), 255.0, "fisheye"), design)
+    sight = ((view.truth > 8) & (view.truth < [960 - 9, 720 - 9])).all(axis=1)
+    assert found.found > 0.85 * sight.sum()
+    error = renamed(found, view.truth)
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert 0.75 < np.sqrt(((error / sigma) ** 2).mean()) < 1.3
+    assert np.abs(error / sigma).max() < 5
 
 
 DELTILLE, DELTILLE_PRINT = board("deltille", 9, 8, 25.0), prints.Deltille(9, 8, 25.0)

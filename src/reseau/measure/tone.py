@@ -28,6 +28,8 @@ _LEAST_GAIN, _STRONG = 0.995, 0.9
 """Ratios of mean square residuals below which a curve matters, and is beyond doubt."""
 _CERTAIN, _CORRELATED = 6.0, 0.12
 """Least significance of a curve; correlation of residuals from which they have another cause."""
+_USUAL, _KNOWN = 2.2, 0.2
+"""Exponent of most cameras; its standard deviation up to which one that agrees with it is no accident."""
 _LINEAR = 0.15
 """Deviation of an exponent from 1 that does no harm."""
 _ATTEMPTS = 6
@@ -80,7 +82,8 @@ class Exponent:
     def certain(self) -> bool:
         """Whether there is a curve; correlated residuals, as of compression, can look like a weak one."""
         significant = self.gain < _LEAST_GAIN and abs(self.gamma - 1) > _CERTAIN * self.sigma
-        return significant and (self.gain < _STRONG or self.correlation < _CORRELATED)
+        usual = abs(self.gamma - _USUAL) < 3 * self.sigma and self.sigma < _KNOWN
+        return significant and (self.gain < _STRONG or self.correlation < _CORRELATED or usual)
 
 
 @dataclass(frozen=True)

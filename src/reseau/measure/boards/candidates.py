@@ -286,7 +286,7 @@ def grown_through(
     """
     grid = np.array(list(product(range(-extent, extent + 1), repeat=2)), dtype=np.float64)
     tree, step = KDTree(xy), 1e-3
-    nodes, rows, through_lens = np.zeros((1, 2)), np.zeros(1, dtype=np.intp), False
+    nodes, rows, through_lens, led = np.zeros((1, 2)), np.zeros(1, dtype=np.intp), False, False
     for _ in range(3 * extent):
         beside = grid[KDTree(nodes).query(grid)[0] < _FROM + 0.5 * (len(nodes) < 4)]
         predicted = images_of(mapping, beside)
@@ -294,6 +294,8 @@ def grown_through(
             [(images_of(mapping, beside + d) - predicted) / step for d in step * np.eye(2)], axis=2
         )
         pixels = np.maximum(np.linalg.norm(slopes, axis=1).min(axis=1), 1e-6)
+        if led:
+            predicted = predicted + _led(nodes, xy[rows] - images_of(mapping, nodes), beside)
         gap, row = tree.query(predicted)
         taken = (gap < _GATE * pixels) & accepted(mapping, beside, row, slopes)
         order = np.argsort(gap / pixels + 1e6 * ~taken, kind="stable")
@@ -302,10 +304,12 @@ def grown_through(
         keep = keep[taken[keep]]
         same = len(keep) == len(rows) and np.array_equal(row[keep], rows)
         nodes, rows = beside[keep], row[keep]
-        if len(rows) < 4 or np.ptp(nodes, axis=0).min() < 1 or (same and through_lens):
+        if len(rows) < 4 or np.ptp(nodes, axis=0).min() < 1 or (same and led):
             break
-        # A polynomial through few nodes does not predict the next ones through a wide lens.
-        through_lens = same and len(rows) >= LENS_FROM
+        # A polynomial through few nodes does not predict the next ones through a wide lens; a fisheye is
+        # followed by what the nodes beside them have in excess.
+        led |= same and through_lens
+        through_lens = (same or led) and len(rows) >= LENS_FROM
         if same and not through_lens:
             break
         free = through(nodes, xy[rows], shape)
@@ -314,6 +318,19 @@ def grown_through(
             lens = lens_through(nodes, xy[rows], np.full(len(rows), SADDLE_PX), shape, free)
         mapping = free if lens is None else lens.mapping
     return nodes, rows, mapping
+
+
+def _led(nodes: Array, excess: Array, beside: Array) -> Array:
+    """What nodes have in excess (n, 2) of a mapping, continued to those beside them (m, 2)."""
+    low = nodes.min(axis=0) - 3
+    field = np.full((*(np.ptp(nodes, axis=0) + 7).astype(np.intp), 2), np.nan)
+    field[tuple((nodes - low).astype(np.intp).T)] = excess
+    at, found = (beside - low).astype(np.intp), []
+    for step in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        near, far = (field[tuple((at + k * np.array(step)).T)] for k in (1, 2))
+        found.append(np.where(np.isfinite(far), 2 * near - far, near))
+    known = np.isfinite(found)
+    return np.asarray(np.where(known, found, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1))
 
 
 def sector_levels(grey: NDArray[np.float32], mapping: Chain, nodes: Array, share: float = _DIAGONAL) -> Array:

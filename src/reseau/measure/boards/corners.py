@@ -15,13 +15,15 @@ import numpy as np
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code
+from ...optics import Chain
 from ...optics.corners import Corners, corner_images
 from ...optics.formation import PixelResponse, polygons
 from ..matching import GrownOutline, Matches, Shape, Window
 from ..points import Reason
-from ..reseau.mark_windows import Located
+from ..reseau.lens_mapping import mapping_through
+from ..reseau.mark_windows import ENOUGH, Located
 from ..reseau.marks import ReseauOptions
-from ..reseau.plane_marks import PlaneMarks
+from ..reseau.plane_marks import UNFIT, PlaneMarks
 from ..screening import Screened
 from ..testfield.lattice_mapping import images_of, second_order
 
@@ -40,6 +42,8 @@ _SURE_CURVES = 60
 """Number of corners up to which curvatures are adjusted, too: a mapping through few has few terms."""
 _BENT = 3e-4
 """Standard deviation of these curvatures beside those of the mapping, 1/px."""
+_BENT_SIGMA = 0.5
+"""Shift of an edge by another curvature, in sigmas, from which corners are matched again."""
 _EDGE = 1.5
 """Half the width of an edge in widths of the point-spread function."""
 _ALIKE_WIDTH, _ALIKE_PX = 0.05, 0.05
@@ -144,9 +148,16 @@ class CornerMarks(PlaneMarks):
         self.sectors = sectors
         self.figures: tuple[Array, Array, float, Array | None] | None = None
 
-    def _steps(self, rows: Rows) -> tuple[Array, Array, Array]:
+    def _curvature(self, mapping: Chain, rows: Rows) -> Array:
+        """Curvatures (k, e) of the edges with a mapping, 1/px; their signs are those of the normals."""
+        _, along, bend = self._steps(rows, mapping)
+        length = np.linalg.norm(along, axis=1)
+        normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / length[:, None]
+        return np.asarray(np.einsum("kie,kie->ke", normal, bend) / length**2)
+
+    def _steps(self, rows: Rows, mapping: Chain | None = None) -> tuple[Array, Array, Array]:
         """Derivatives of the image by coordinates of the design (k, 2, 2); along edges, and second ones."""
-        _, slope, bend = second_order(self.mapping, self.at[rows])
+        _, slope, bend = second_order(mapping or self.mapping, self.at[rows])
         # A normal turned by 90°.
         along = (self.sectors.normal[rows][..., ::-1] * [-1, 1]) @ self.frame.T
         return (
@@ -184,7 +195,19 @@ class CornerMarks(PlaneMarks):
     @property
     def _curved(self) -> bool:
         """Whether the curvatures of edges are adjusted; a wrong one of c shifts an edge by c L²/6."""
-        return not self.learning and _CURVED_FROM <= self.found.sum() <= _SURE_CURVES
+        few = self.found.sum() <= _SURE_CURVES
+        return not self.learning and self.found.sum() >= _CURVED_FROM and (few or self.misfit > UNFIT)
+
+    def _bent(self, rows: Rows, found: Matches) -> bool:
+        """See :class:`PlaneMarks`: whether the mapping through all corners bends edges otherwise."""
+        if len(rows) < ENOUGH:
+            return False
+        h, w = self.screened.grey.shape
+        sigma = np.sqrt(found.variance)
+        other = mapping_through(self.at[rows], found.xy, sigma, (h, w)).mapping
+        reach = self._images(rows)[1].max(axis=1, keepdims=True) + self._ground
+        change = np.abs(self._curvature(other, rows) - self._curvature(self.mapping, rows)) * reach**2 / 6
+        return bool(np.quantile(change / sigma[:, None], 0.95) > _BENT_SIGMA) or super()._bent(rows, found)
 
     def _form_sigma(self) -> Array:
         """See :class:`PlaneMarks`."""
@@ -234,7 +257,8 @@ class CornerMarks(PlaneMarks):
         low = np.floor(np.nan_to_num(corners.min(axis=1), nan=-_FAR_PX)) - margin
         size = np.ceil(np.ptp(np.nan_to_num(corners), axis=1)) + 2 * margin + 2
         seen = np.isfinite(corners).all(axis=(1, 2)) & (np.abs(corners) < _FAR_PX).all(axis=(1, 2))
-        seen &= (low + size > 0).all(axis=1) & (low < (w, h)).all(axis=1)
+        # Far from the corners found a polynomial may have any size.
+        seen &= (low + size > 0).all(axis=1) & (low < (w, h)).all(axis=1) & (size < 2 * max(h, w)).all(axis=1)
         classes, of = np.unique(np.ceil(size / _FIGURES_PX), axis=0, return_inverse=True)
         for k, (wide, high) in enumerate((classes * _FIGURES_PX).astype(np.intp)):
             part = np.flatnonzero((of.ravel() == k) & seen)

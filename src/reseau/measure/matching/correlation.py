@@ -223,6 +223,8 @@ def displaced(values: NDArray[Any], down: int, right: int) -> tuple[NDArray[Any]
 
 def _at(lag: tuple[int, int], unit: Array, used: Mask, free: Array) -> tuple[float, float]:
     """Correlation of residuals in units of their standard deviations, and its standard deviation."""
+    if not used.any() or not unit[used].any():
+        return 0.0, np.inf
     here, there = displaced(np.where(used, unit, 0.0), *lag)
     both = np.logical_and(*displaced(used, *lag))
     count = max(int(both.sum()), 1)

@@ -26,11 +26,12 @@ from ..testfield.lattice_fit import monomials_of
 from ..testfield.lattice_mapping import of_degree, started, with_coefficients
 from .sheet_placement import through
 
-__all__ = ["FoundMapping", "lens_through", "mapping_through"]
+__all__ = ["FoundMapping", "free_through", "lens_through", "mapping_through"]
 
 _LENS_SIGMA = np.array([0.3, 0.3, 0.1, 0.1, 0.1, 0.005, 0.003, 0.003])
 """Usual sizes of k1, k2, k3, c, a, p1 and p2; half the width of a frame has r = 1."""
-_DEGREE = 7
+_DEGREE, _USUAL = 7, 5
+"""Degree of the polynomial; and of a free one that is tried with any number of points."""
 _ROUGH_PX = 0.005
 """Deviation that does not count in the comparison of mappings: positions were formed with another one."""
 _PER_TERM = 2.0
@@ -86,15 +87,39 @@ def mapping_through(at: Array, xy: Array, sigma: Array, shape: tuple[int, int]) 
     shape : (int, int)
         Height and width of the frame.
     """
-    degree = next(d for d in (5, 4, 3, 2, 1) if _PER_TERM * (d + 1) * (d + 2) <= 2 * len(at) or d == 1)
-    free = through(at, xy, shape, degree)
-    lens = lens_through(at, xy, sigma, shape, free)
     weight = 1 / np.hypot(sigma, _ROUGH_PX)
+
+    def criterion(mapping: Chain, parameters: int) -> float:
+        return float((((mapping(at) - xy) * weight[:, None]) ** 2).sum()) + 2 * parameters
+
+    known = [d for d in range(1, _DEGREE + 1) if d == 1 or _PER_TERM * (d + 1) * (d + 2) <= 2 * len(at)]
+    # A fisheye is described by no lens of the above kind: as high a degree as there are points for.
+    free = [through(at, xy, shape, d) for d in {min(known[-1], _USUAL), known[-1]}]
+    best = min(free, key=lambda mapping: criterion(mapping, len(mapping.second.values)))
+    lens = lens_through(at, xy, sigma, shape, free[0])
     if lens is not None:
-        misfit = [float((((m(at) - xy) * weight[:, None]) ** 2).sum()) for m in (lens.mapping, free)]
-        if misfit[0] + 2 * (8 + len(_LENS_SIGMA)) <= misfit[1] + 2 * len(free.second.values):
+        least = criterion(best, len(best.second.values))
+        if criterion(lens.mapping, 8 + len(_LENS_SIGMA)) <= least:
             return lens
-    return FoundMapping(free, partial(_displaced, free, at, xy, weight))
+    return FoundMapping(best, partial(_displaced, best, at, xy, weight))
+
+
+def free_through(mapping: Chain, at: Array, xy: Array, sigma: Array) -> Chain:
+    """The projectivity of a mapping with a polynomial of the seventh degree through points, by least squares.
+
+    Where no lens describes the points (a fisheye), the difference from `mapping` shows what is unknown.
+
+    Parameters
+    ----------
+    mapping : Chain
+        The mapping.
+    at, xy, sigma
+        See :func:`mapping_through`.
+    """
+    free, weight = of_degree(mapping, _DEGREE), 1 / np.hypot(sigma, _ROUGH_PX)[:, None]
+    monomials, straight = monomials_of(free, at)
+    values = np.linalg.lstsq(monomials * weight, (xy - straight) * weight, rcond=1e-10)[0]
+    return with_coefficients(free, np.asarray(values.T, dtype=np.float64))
 
 
 def _displaced(free: Chain, at: Array, xy: Array, weight: Array) -> tuple[Chain, ...]:

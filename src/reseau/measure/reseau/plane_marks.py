@@ -29,11 +29,11 @@ from ..points import Reason
 from ..screening import Screened
 from ..testfield.targets import replaced
 from .learning import learn, weigh
-from .lens_mapping import mapping_through
+from .lens_mapping import free_through, mapping_through
 from .mark_windows import DISTURBED, ENOUGH, SEEN, Located, MarkWindows
 from .marks import ReseauOptions
 
-__all__ = ["PlaneMarks"]
+__all__ = ["UNFIT", "PlaneMarks"]
 
 _HIGH_RESIDUALS = 1.25
 """Multiple of the usual residuals from which something is suspected in front of a mark."""
@@ -51,6 +51,8 @@ _UNKNOWN_PX = 1.0
 """Error of a position that nothing bounds; it is more than is accepted."""
 _WHOLE = 0.97
 """Share of the pixels of a mark below which it is seen in part."""
+UNFIT = 2.0
+"""Misfit of the mapping through all marks, in their sigmas, from which it does not tell its derivatives."""
 _BENT_PX = 0.15
 """Distance of one mark in ten from the mapping through all, from which that is adjusted again."""
 _ROUNDS, _SAME, _NEAR = 6, 0.5, 2.0
@@ -91,6 +93,8 @@ class PlaneMarks(MarkWindows):
         self.lit = np.zeros_like(self.dazzled)  # by so little that no pixels are lost
         self.notes: tuple[Remark, ...] = ()
         self.displaced: tuple[Chain, ...] = ()
+        self.misfit = 1.0  # of the mapping through all marks, in sigmas
+        self.other: Chain | None = None  # another mapping, where that one does not fit
 
     @abstractmethod
     def _edge_seen(self, rows: Rows, found: Matches) -> Array:
@@ -152,6 +156,8 @@ class PlaneMarks(MarkWindows):
             if settled:
                 return found
             self.start[rows[sure]] = found.xy[sure]
+            lost = rows[~sure & ~self.found[rows]]
+            self.start[lost] = self.mapping(self.at[lost])
             if self.eccentric:
                 # Growth about the image of the point is not that of the mark on its plane.
                 self.settle(found.select(sure))
@@ -169,8 +175,12 @@ class PlaneMarks(MarkWindows):
         xy, last = found.xy, np.inf
         middle = xy + self._off_centre(self.mapping, rows)
         while True:
-            through_all = mapping_through(self.at[rows[sure]], xy[sure], sigma[sure], (h, w))
+            known = self.at[rows[sure]], xy[sure], sigma[sure]
+            through_all = mapping_through(*known, (h, w))
             self.mapping, self.displaced = through_all.mapping, through_all.displaced
+            off = (self.mapping(known[0]) - xy[sure]) / sigma[sure, None]
+            self.misfit = float(np.sqrt((off**2).mean()))
+            self.other = free_through(self.mapping, *known) if self.misfit > UNFIT else None
             moved = middle - self._off_centre(self.mapping, rows)
             change, total = (
                 float((np.abs(moved - before)[sure].max(axis=1) / sigma[sure]).max())
@@ -193,6 +203,10 @@ class PlaneMarks(MarkWindows):
         for mapping in self.displaced:
             off = self._off_centre(mapping, rows) - middle
             cov += off[:, :, None] * off[:, None]
+        if self.other is not None:
+            # The change shows the size of the error, not its direction.
+            off = self._off_centre(self.other, rows) - middle
+            cov += off[:, :, None] * off[:, None] + 0.5 * (off**2).sum(axis=1)[:, None, None] * np.eye(2)
         return cov
 
     def _doubtful(self, rows: Rows, found: Matches) -> tuple[Mask, SmoothField | None]:
