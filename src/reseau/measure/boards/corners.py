@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code
@@ -44,6 +45,8 @@ _BENT = 3e-4
 """Standard deviation of these curvatures beside those of the mapping, 1/px."""
 _BENT_SIGMA = 0.5
 """Shift of an edge by another curvature, in sigmas, from which corners are matched again."""
+_UNLIKE_WIDTH, _NEAR = 0.1, 4
+"""Relative difference of the sharpness of corners from which figures have that of so many near them."""
 _EDGE = 1.5
 """Half the width of an edge in widths of the point-spread function."""
 _ALIKE_WIDTH, _ALIKE_PX = 0.05, 0.05
@@ -146,7 +149,8 @@ class CornerMarks(PlaneMarks):
     ) -> None:
         super().__init__(image, screened, located, options, sectors.reach)
         self.sectors = sectors
-        self.figures: tuple[Array, Array, float, Array | None] | None = None
+        self.figures: tuple[Array, Array, Array, Array | None] | None = None
+        self.widths = np.full(len(self.xy), np.nan)  # of the point-spread function at corners, if it varies
 
     def _curvature(self, mapping: Chain, rows: Rows) -> Array:
         """Curvatures (k, e) of the edges with a mapping, 1/px; their signs are those of the normals."""
@@ -207,6 +211,10 @@ class CornerMarks(PlaneMarks):
         other = mapping_through(self.at[rows], found.xy, sigma, (h, w)).mapping
         reach = self._images(rows)[1].max(axis=1, keepdims=True) + self._ground
         change = np.abs(self._curvature(other, rows) - self._curvature(self.mapping, rows)) * reach**2 / 6
+        unlike = np.quantile(np.abs(np.log(found.psf_px / self.look.psf_px)), 0.9) > _UNLIKE_WIDTH
+        if unlike and len(self.sectors.outlines):
+            self.widths[rows] = found.psf_px
+            return True
         return bool(np.quantile(change / sigma[:, None], 0.95) > _BENT_SIGMA) or super()._bent(rows, found)
 
     def _form_sigma(self) -> Array:
@@ -241,10 +249,11 @@ class CornerMarks(PlaneMarks):
         outlines, look = self.sectors.outlines, self.look
         if not len(outlines):
             return None
-        corners = images_of(self.mapping, outlines.reshape(-1, 2) @ self.frame.T + self.origin)
+        lattice = outlines @ self.frame.T + self.origin
+        corners, width = images_of(self.mapping, lattice.reshape(-1, 2)), self._width(lattice.mean(axis=1))
         if self.figures is not None:
             share, before, psf_px, kernel = self.figures
-            alike = abs(psf_px / look.psf_px - 1) < _ALIKE_WIDTH and kernel is look.kernel
+            alike = np.abs(psf_px / width - 1).max() < _ALIKE_WIDTH and kernel is look.kernel
             with np.errstate(invalid="ignore"):
                 if alike and np.nanmax(np.abs(corners - before)) < _ALIKE_PX:
                     return share
@@ -252,7 +261,7 @@ class CornerMarks(PlaneMarks):
         h, w = self.screened.grey.shape
         share = np.zeros((h, w), dtype=np.float32)
         reach = 0 if look.kernel is None else len(look.kernel) // 2
-        margin = int(np.ceil(6 * look.psf_px)) + 2 + reach
+        margin = int(np.ceil(6 * width.max())) + 2 + reach
         corners = corners.reshape(outlines.shape)
         low = np.floor(np.nan_to_num(corners.min(axis=1), nan=-_FAR_PX)) - margin
         size = np.ceil(np.ptp(np.nan_to_num(corners), axis=1)) + 2 * margin + 2
@@ -264,11 +273,11 @@ class CornerMarks(PlaneMarks):
             part = np.flatnonzero((of.ravel() == k) & seen)
             if not len(part):
                 continue
-            nodes = polygons(corners[part], _NODES_PX * look.psf_px).oriented().single()
+            nodes = polygons(corners[part], _NODES_PX * width[part].min()).oriented().single()
             x, y = (low[part, i, None] + np.arange(n) for i, n in ((0, wide), (1, high)))
             taken = GrownOutline(nodes, np.zeros((0, 2, 2))).image(
                 np.zeros((len(part), 2)),
-                np.full(len(part), look.psf_px),
+                width[part],
                 np.zeros((len(part), 0)),
                 np.arange(len(part)),
                 Window(x, y, PixelResponse(self.options.fill)),
@@ -280,8 +289,16 @@ class CornerMarks(PlaneMarks):
                 a, b = max(left, 0), max(top, 0)
                 place = share[b : top + high, a : left + wide]
                 place += image[b - top : b - top + len(place), a - left : a - left + place.shape[1]]
-        self.figures = share, at, look.psf_px, look.kernel
+        self.figures = share, at, width, look.kernel
         return share
+
+    def _width(self, at: Array) -> Array:
+        """Widths (m,) of the point-spread function at places of the lattice; if it varies, those near."""
+        known = np.flatnonzero(np.isfinite(self.widths))
+        if len(known) < _NEAR:
+            return np.full(len(at), self.look.psf_px)
+        near = KDTree(self.at[known]).query(at, k=_NEAR)[1]
+        return np.asarray(np.median(self.widths[known][near], axis=1))
 
     def settle(self, first: Matches) -> Matches:
         """See :class:`PlaneMarks`."""
