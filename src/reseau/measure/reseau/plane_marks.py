@@ -27,6 +27,7 @@ from ..matching import (
 )
 from ..points import Reason
 from ..screening import Screened
+from ..testfield.lattice_mapping import slope_of
 from ..testfield.targets import replaced
 from .learning import learn, weigh
 from .lens_mapping import free_through, mapping_through
@@ -65,6 +66,8 @@ _PER_SMOOTH = 2.5
 """Least number of coordinates for each term of the polynomial about which positions scatter."""
 _BLURRED = 1.8
 """Tolerated factor of the sharpness of a mark."""
+_LARGER = 3.0
+"""Scale of the mapping at a mark that was not found, beside that at the others, from which it is not true."""
 _LEAST_RIM = 0.25
 """Share of the edge of a mark below which the level of the paper is hardly seen, and has no slope."""
 
@@ -237,7 +240,10 @@ class PlaneMarks(MarkWindows):
         """Indices of disks whose centres lie in the frame."""
         h, w = self.screened.grey.shape
         inside = ((self.start > 0) & (self.start < (w - 1, h - 1))).all(axis=1)
-        return np.flatnonzero(inside)
+        # Far from the marks found a polynomial may have any slope.
+        scale = np.linalg.norm(slope_of(self.mapping, self.at), axis=(1, 2))
+        largest = scale[self.found].max() if self.found.any() else np.inf
+        return np.flatnonzero(inside & (self.found | (scale < _LARGER * largest)))
 
     def _with_doubtful_light(self, rows: Rows, found: Matches) -> Matches:
         """Matches with covariances that contain what another background would change.
