@@ -499,6 +499,22 @@ def test_old_and_new_layout_differ_with_an_even_number_of_rows(legacy: bool) -> 
     assert isinstance(other, Failure)
 
 
+@pytest.mark.parametrize("legacy", [False, True])
+def test_both_layouts_are_what_opencv_draws_with_corners_between_its_pixels(legacy: bool) -> None:
+    """Squares of 60 px from pixel 40 on meet at 39.5 + 60 k."""
+    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    drawn = cv2.aruco.CharucoBoard((7, 6), 25.0, 18.0, words)
+    drawn.setLegacyPattern(legacy)
+    sheet = drawn.generateImage((7 * 60 + 80, 6 * 60 + 80), marginSize=40, borderBits=1)
+    noise = np.random.default_rng(0).normal(0, 1, sheet.shape)
+    pixels = cv2.GaussianBlur(sheet / 255.0 * 180 + 30, (0, 0), 0.8) + noise
+    design = CHARUCO.model_copy(update={"legacy": legacy})
+    found = measured(Frame(np.rint(pixels).astype(np.uint8), 255.0, "drawn"), design)
+    assert found.ok.all()
+    corners = np.asarray(drawn.getChessboardCorners())[:, :2] / 25.0
+    assert np.abs(found.xy - (39.5 + 60 * corners)).max() < 0.03
+
+
 @pytest.mark.parametrize(
     ("dictionary", "legacy"),
     [("4X4_50", False), ("6X6_250", True), ("7X7_1000", False), ("ARUCO_ORIGINAL", True),
