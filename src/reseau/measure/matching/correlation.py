@@ -160,7 +160,7 @@ def _products(one: Array, other: Array) -> Array:
 def _activity(influence: Array) -> Array:
     """Influence (k, rows, columns) of pixels and those around them on positions; at most 1."""
     activity = uniform_filter((influence**2).sum(axis=1), (0, _SPREAD, _SPREAD))
-    return np.asarray(activity / np.maximum(activity.max(axis=(1, 2), keepdims=True), 1e-300))
+    return np.asarray(activity / np.maximum(activity.max(axis=(1, 2), keepdims=True), 1e-30))
 
 
 def _odd(unit: Array, used: Mask, off: Array) -> tuple[Array, Mask]:
