@@ -260,6 +260,17 @@ def test_of_two_tags_that_contradict_each_other_none_names_the_board() -> None:
     assert other.code is Code.INCONSISTENT
 
 
+def test_a_corner_from_which_sharpening_reaches_beyond_the_frame_is_declined() -> None:
+    """What the camera's filter took from there is unknown: one at 1.4 px from the border was off by 25 sigma."""
+    printed = prints.chess(10, 7, 25.0)
+    view = View(printed, *pose(0, printed), sharpening=1.2)
+    found = measured(Frame(view.picture(), 255.0, "sharpened"), board("chess", 10, 7, 25.0))
+    error = (found.xy - view.truth)[found.ok]
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert found.found >= 40
+    assert np.abs(error / sigma).max() < 4.5
+
+
 def test_corners_on_paper_that_is_saturated_everywhere_are_measured_to_their_sigmas() -> None:
     """The middle of every edge is not, and tells where it is: as many corners as ``aprilgrid`` finds, 132."""
     printed = prints.aprilgrid(6, 6, 22.0, 0.3, "DICT_APRILTAG_36h11", 2)

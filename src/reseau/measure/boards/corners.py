@@ -317,7 +317,10 @@ class CornerMarks(PlaneMarks):
         # Of a corner on the border two sectors are not seen, and nothing shows an error of its edges.
         h, w = self.screened.grey.shape
         gap = np.minimum(found.xy, np.array([w - 1, h - 1]) - found.xy).min(axis=1)
-        border = gap < _BORDER * self.look.blur_px, Reason("on the border of the frame", Code.OUTSIDE)
+        # What the kernel takes from beyond the frame is unknown.
+        beyond = 0 if self.look.kernel is None else len(self.look.kernel) // 2
+        near = gap < max(_BORDER * self.look.blur_px, beyond)
+        border = near, Reason("on the border of the frame", Code.OUTSIDE)
         # Without its pixels an edge is where faint tails of its blur have it.
         part = found.converged & (np.isfinite(found.residuals).sum(axis=(1, 2)) < self.own_px[rows])
         unseen = part.copy()
