@@ -261,7 +261,7 @@ def test_of_two_tags_that_contradict_each_other_none_names_the_board() -> None:
 
 
 def test_a_corner_from_which_sharpening_reaches_beyond_the_frame_is_declined() -> None:
-    """What the camera's filter took from there is unknown: one at 1.4 px from the border was off by 25 sigma."""
+    """What the filter took from there is unknown: one at 1.4 px from the border was off by 25 sigma."""
     printed = prints.chess(10, 7, 25.0)
     view = View(printed, *pose(0, printed), sharpening=1.2)
     found = measured(Frame(view.picture(), 255.0, "sharpened"), board("chess", 10, 7, 25.0))
