@@ -43,7 +43,7 @@ _SURE_CURVES = 60
 """Number of corners up to which curvatures are adjusted, too: a mapping through few has few terms."""
 _BENT = 3e-4
 """Standard deviation of these curvatures beside those of the mapping, 1/px."""
-_BENT_SIGMA = 0.5
+_BENT_SIGMA = 1.5
 """Shift of an edge by another curvature, in sigmas, from which corners are matched again."""
 _UNLIKE_WIDTH, _NEAR = 0.1, 4
 """Relative difference of the sharpness of corners from which figures have that of so many near them."""
