@@ -20,6 +20,8 @@ from reseau.designs.dots import dot_signs
 from reseau.io import BoardDesign
 from reseau.io.images import read_image
 from reseau.measure import BoardOptions, BoardResult, measure_board, measure_tags, puzzle_part
+from reseau.measure.boards.placement import numbered
+from reseau.measure.testfield.lattice_mapping import started
 
 from .board_pictures import picture
 
@@ -471,6 +473,19 @@ def test_a_row_of_corners_near_the_border_of_the_frame_tells_how_a_chessboard_is
     assert not [note for note in found.notes if note.code is Code.AMBIGUOUS]
     assert np.abs(found.xy - truth)[found.ok].max() < 0.05
     assert found.ok.mean() > 0.85
+
+
+def test_a_lattice_with_many_corners_missing_beside_it_is_declined() -> None:
+    """Where they are expected there is plain paper: the mapping is wrong there, or the place is."""
+    nodes = np.stack(np.meshgrid(np.arange(8), np.arange(8)), axis=-1).reshape(-1, 2)
+    matrix = np.array([[40.0, 0, 150], [0, 40, 150], [0, 0, 1]])
+    known = nodes, nodes * 40.0 + 150, started(matrix, 1, (700, 900)), (700, 900)
+    for cost, placed in ((0.0, True), (3.0, False)):
+        costs = functools.partial(np.full, fill_value=cost)
+        found = numbered(
+            board("chess", 14, 9, 12.0), *known, None, lambda gone, costs=costs: costs(len(gone))
+        )
+        assert isinstance(found, Failure) != placed
 
 
 @pytest.mark.parametrize("hidden", [(slice(120, 260), slice(180, 330)), (slice(0, 400), slice(0, 230))])

@@ -58,6 +58,12 @@ _MISSED, _PLAIN, _FOREIGN = 0.4, 3.0, 3.0
 ink, where nothing hides it; one found that the design has not."""
 _ALIKE = 2.0
 """Lead in nodes of a place over another from which it is certain."""
+_FITS = 0.4
+"""Least lead of the points found over what counts against their place, as their share.
+
+A hand in front of a third of a board leaves 0.77, a grid of triangles at 60° 0.44. Of half a lattice behind a
+strong lens, whose mapping does not tell where the rest should be, the best place is a wrong one, with 0.28.
+"""
 _MISREAD_DOTS = 2
 """Most squares of a chessboard with a dot too many or too few."""
 _CHANCE = 1e-4
@@ -282,9 +288,10 @@ def numbered(
             )
         if puzzle and len(found) * bdtr(wrong, total, 0.5) > _CHANCE:
             return Failure(f"{total} dots are too few to tell which part it is", Code.NOT_IDENTIFIED)
-    if score < 0.25 * min(len(nodes), len(numbers)):
+    if score < _FITS * min(len(nodes), len(numbers)):
         return Failure(
-            f"{len(nodes)} points in a lattice were found, which the board does not have", Code.OTHER_DESIGN
+            f"{len(nodes)} points in a lattice were found; the board has others, or more beside them",
+            Code.OTHER_DESIGN,
         )
     alike = [one for one in found[1:] if score - one[0] < _ALIKE]
     place = nodes @ turn.T + moved
