@@ -2,9 +2,9 @@
 
 Run from the checkout: ``python benchmarks/april_photographs.py --design grid.json PHOTOGRAPH …``, with a
 design by ``reseau design board --from aprilgrid.yaml --json grid.json``. The grids of EuRoC and TUM VI have
-6 × 6 tags of 88 mm and a spacing of 0.3. For every photograph: corners measured, and those of the package; rms
-deviation of the corners that both have from a smooth mapping of the plane (a lens, or a polynomial), fitted to
-each of them in turn. It contains by what the board is not plane.
+6 × 6 tags of 88 mm and a spacing of 0.3. For every photograph: corners measured, and those of the package;
+rms deviation of the corners that both have from a smooth mapping of the plane (a lens, or a polynomial),
+fitted to each of them in turn. It contains by what the board is not plane.
 """
 
 from __future__ import annotations
