@@ -195,7 +195,7 @@ def test_values_and_covariances_are_those_of_the_budget_in_si_units() -> None:
     made = certificate()
     root = etree.fromstring(dcc_of(made))
     vector = root.find(f".//{{https://ptb.de/dcc}}result[@refType='reseau_parameters']//{SI}realListXMLList")
-    to_metres = np.array([1e-3, 1e-3, 1e-3, 1e-3])
+    to_metres = np.array([1e-3, 1e-3, 1e-3, 1e6])  # the last is K1, in mm^-2
     values = np.array(vector.findtext(f"{SI}valueXMLList").split(), float)
     assert values == pytest.approx(made.parameters.values * to_metres, rel=1e-15)
     assert vector.findtext(f"{SI}unitXMLList") == "\\metre"

@@ -69,8 +69,10 @@ class Exponent:
 
     Examples
     --------
-    >>> Exponent(2.2, 0.04, 0.97, 0.02).certain, Exponent(2.2, 0.04, 0.97, 0.25).certain
+    >>> Exponent(1.6, 0.04, 0.97, 0.02).certain, Exponent(1.6, 0.04, 0.97, 0.25).certain
     (True, False)
+    >>> Exponent(2.2, 0.04, 0.97, 0.25).certain  # one that cameras have
+    True
     """
 
     gamma: float
