@@ -198,7 +198,7 @@ def test_values_and_covariances_are_those_of_the_budget_in_si_units() -> None:
     to_metres = np.array([1e-3, 1e-3, 1e-3, 1e6])  # the last is K1, in mm^-2
     values = np.array(vector.findtext(f"{SI}valueXMLList").split(), float)
     assert values == pytest.approx(made.parameters.values * to_metres, rel=1e-15)
-    assert vector.findtext(f"{SI}unitXMLList") == "\\metre"
+    assert vector.findtext(f"{SI}unitXMLList") == "\\metre \\metre \\metre \\metre\\tothe{-2}"
     region = vector.find(f"{SI}measurementUncertaintyMultivariateXMLList/{SI}ellipsoidalRegionMUXMLList")
     columns = [
         [float(each.text) for each in column.iter(f"{SI}valueXMLList")]
@@ -206,7 +206,9 @@ def test_values_and_covariances_are_those_of_the_budget_in_si_units() -> None:
     ]
     expected = made.parameters.covariance * np.outer(to_metres, to_metres)
     assert np.allclose(columns, expected, rtol=1e-14, atol=0)
-    assert {each.text for each in region.iter(f"{SI}unitXMLList")} == {"\\metre\\tothe{2}"}
+    exponents = np.add.outer([1, 1, 1, -2], [1, 1, 1, -2]).ravel()
+    units = [each.text for each in region.iter(f"{SI}unitXMLList")]
+    assert units == [f"\\metre\\tothe{{{n}}}" for n in exponents]
     factor = float(region.findtext(f"{SI}coverageFactorXMLList"))
     assert factor == pytest.approx(made.parameters.joint_factor(0.95), abs=1e-6)
     assert [digital_unit(u).number(0.1) for u in ("mm", "mm^-2", "px", "1", "%")] == [
