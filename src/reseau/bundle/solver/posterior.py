@@ -445,7 +445,7 @@ def _cross(linear: Linear, point: int) -> Array:
 
 
 def _is_small(linear: Linear) -> bool:
-    """Whether the rows of all observations are few enough for the full triangle."""
+    """Whether the rows of all observations are few enough to be decomposed at once."""
     return 2 * len(linear.misfits) * linear.system.unknowns.size <= _ENTRIES
 
 
