@@ -273,7 +273,7 @@ def _marginal(
         found = _with_inverse(linear, normal, z, held, taking_part)
         missing = abs(_total(found) - free)
     elif not missing < enough and _is_narrow(linear):
-        # Ends of a long chain have such sigmas although neighbours are determined well.
+        # The ends of a long chain are determined weakly, although neighbours are determined well.
         own = cofactors_from_rows(linear, held)
         z = Reduced(held, own.band, own.border, own.arrow, normal.turn)
         found = _complete(linear, z, own.points, own.seen, taking_part)
