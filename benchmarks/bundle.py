@@ -68,13 +68,18 @@ def peer(program: Path, kind: str, network: Path, target: float) -> tuple[float,
     return float(words[0]), float(words[1]), float(words[2]), int(words[3])
 
 
+def colmap_command(kind: str, network: Path) -> list[str | Path]:
+    """The command that adjusts a network by COLMAP; nothing where it is not installed."""
+    installed = importlib.util.find_spec("pycolmap") is not None
+    return [sys.executable, COLMAP, kind, network] if installed else []
+
+
 def colmap(kind: str, network: Path) -> tuple[float, float, float, int] | None:
     """Only the total time is known."""
-    if importlib.util.find_spec("pycolmap") is None:
+    command = colmap_command(kind, network)
+    if not command:
         return None
-    words = subprocess.run(
-        [sys.executable, COLMAP, kind, network], check=True, capture_output=True, text=True
-    ).stdout.split()
+    words = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
     return float("nan"), float(words[0]), float(words[1]), int(words[2])
 
 

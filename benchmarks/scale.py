@@ -215,7 +215,9 @@ def part_cluster(count: int) -> None:
                 besides = sum(processes.times.values()) - sum(float(each) for _, each in logged)
                 with suppress(psutil.Error):
                     held = [psutil.Process(each.pid).memory_info().rss / 1e6 for each in (running, scheduler)]
-                    memory.append(Sample(done, seconds, besides, held[0], held[1]))
+                    # One that has ended since, and was not waited for, holds nothing.
+                    if all(held):
+                        memory.append(Sample(done, seconds, besides, held[0], held[1]))
                 if not killed and done >= count // 4:
                     victim = worker_of(first)
                     if victim is not None:
@@ -280,7 +282,8 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", choices=("ladybug", "venice"), default=["ladybug", "venice"])
     parser.add_argument("--sizes", nargs="+", type=int, default=[50, 160, 500, 1600, 5000])
     parser.add_argument("--memory", type=float, help="GB that normal equations may take")
-    parser.add_argument("--no-peer", action="store_true", help="without Ceres")
+    parser.add_argument("--no-peer", action="store_true", help="without Ceres and COLMAP")
+    parser.add_argument("--longest", type=float, default=3600.0, help="seconds for each network and program")
     parser.add_argument("--address", default="", help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, default=Path(), help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -292,7 +295,8 @@ def main() -> None:
     elif given.part == "bundle":
         from scale_bundle import part_bundle
 
-        part_bundle(given.kinds, given.sizes, given.memory, peer=not given.no_peer)
+        peers, longest = not given.no_peer, given.longest
+        part_bundle(given.kinds, given.sizes, given.memory, peers=peers, longest_s=longest)
     elif given.part == "costs":
         from scale_costs import part_costs
 

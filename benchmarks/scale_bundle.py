@@ -1,37 +1,38 @@
-"""Networks of growing size adjusted with the covariances of all images, beside Ceres: time and memory.
+"""Networks of growing size adjusted with the covariances of all images, beside Ceres and COLMAP.
 
 Run as ``python benchmarks/scale.py --part bundle [--kinds ladybug venice] [--sizes 50 160 500 1600 5000]``.
-Every network and program has a process of its own. Times are those of all processors together, without
-import, compilation, making or reading the network; memory is the peak of the process. Ceres (libceres-dev,
-g++) uses ITERATIVE_SCHUR with the preconditioner SCHUR_JACOBI and stops when the relative change of the sum
-of squares is below 1e-6 (ours: corrections below 1e-6 standard deviations); it computes no covariances here,
-because those of a network without a datum need its dense singular value decomposition.
+Every network and program has a process of its own; one that takes more memory than the machine has, or longer
+than ``--longest``, is ended, and its line says so. All start from the same values, minimise the same sum of
+squares and use two threads. Times are those of all processors together, without import, compilation, making
+or reading the network. Memory is what the adjustment needs besides the network, of Ceres with it.
+
+Ceres (libceres-dev, g++) uses ITERATIVE_SCHUR with the preconditioner SCHUR_JACOBI. COLMAP (pycolmap), with a
+camera RADIAL for each image, chooses by their number: up to 50 DENSE_SCHUR, up to 1000 SPARSE_SCHUR, then
+ITERATIVE_SCHUR. Both stop when the relative change of the sum of squares is below 1e-6 (ours: corrections
+below 1e-6 standard deviations). They compute no covariances here: those of a network without a datum need
+Ceres's dense singular value decomposition.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import resource
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scale_networks import KINDS
+from watched import forget_peak, peak_mb, run_watched
 
-from bundle import compiled_peer
+from bundle import colmap_command, compiled_peer
 from reseau.bundle import BundleFit, problem_of
 
 __all__ = ["part_bundle"]
-
-# Room above what is read: an adjustment that takes longer says so.
-LONGEST_S = 3600
 
 
 def adjusted(kind: str, images: int, memory_gb: float | None, rounds: int) -> dict[str, Any]:
@@ -45,13 +46,13 @@ def adjusted(kind: str, images: int, memory_gb: float | None, rounds: int) -> di
         problem_of(network)[0], rounds=rounds, memory=None if memory_gb is None else 1e9 * memory_gb,
         watch=lambda _, cost: seen.append((time.process_time() - begun, cost)),
     )  # fmt: skip
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+    before = forget_peak()
     begun = time.process_time()
     fit = problem.adjusted()
     spent = time.process_time() - begun
     found = {
         "images": len(network.images), "points": len(network.points), "rays": len(network.xy),
-        "before_mb": before, "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10,
+        "before_mb": before, "peak_mb": peak_mb(),
         "to_minimum_s": seen[-1][0] if seen else float("nan"), "total_s": spent,
     }  # fmt: skip
     if not isinstance(fit, BundleFit):
@@ -68,64 +69,52 @@ def adjusted(kind: str, images: int, memory_gb: float | None, rounds: int) -> di
     }  # fmt: skip
 
 
-def ceres(program: Path, kind: str, images: int, target: float, folder: Path) -> dict[str, Any]:
-    """Adjust the same network by Ceres, with conjugate gradients."""
-    file = folder / f"{kind}-{images}.txt"
-    KINDS[kind](images).write(file)
-    timed = [
-        "/usr/bin/env",
-        sys.executable,
-        "-c",
-        PEAK,
-        str(program),
-        "bal",
-        str(file),
-        repr(target),
-        "iterative",
-    ]
-    out = subprocess.run(timed, check=True, capture_output=True, text=True, timeout=LONGEST_S).stdout.split()
-    file.unlink()
-    return {
-        "to_target_s": float(out[0]), "total_s": float(out[1]), "half_cost": float(out[2]),
-        "iterations": int(out[3]), "peak_mb": float(out[5]),
-    }  # fmt: skip
+def peer_line(name: str, command: Sequence[str | Path], mine: dict[str, Any], longest_s: float) -> str:
+    """One line about the adjustment by a peer of the network of `mine`."""
+    ended = run_watched(command, longest_s)
+    if ended.why:
+        return f"    {name}: {ended.why}; {ended.seconds:.0f} s, at most {ended.peak_mb:.0f} MB"
+    words = ended.out.split()
+    to_it = "" if name == "COLMAP" else words.pop(0)
+    spent, half_cost, steps = float(words[0]), float(words[1]), words[2]
+    said = [f"{spent:.1f} s ({1e6 * spent / (2 * mine['rays']):.1f} µs a coordinate)"]
+    if to_it:
+        said.append(f"{float(to_it):.1f} s to this minimum" if float(to_it) >= 0 else "not to this minimum")
+    said.append(f"½Σr² {half_cost:.8g} ({half_cost / mine['half_cost'] - 1:+.1e})")
+    said.append(f"{steps} steps" + ("" if to_it else f" ({words[3]})"))
+    memory = f"{ended.peak_mb if to_it else float(words[5]) - float(words[4]):.0f} MB"
+    return f"    {name} {', '.join(said)}; {memory}"
 
 
-PEAK = """
-import resource, subprocess, sys
-subprocess.run(sys.argv[1:], check=True)
-print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**10)
-"""
-"""Runs a program and prints its peak memory (MB) after what it prints."""
-
-
-def part_bundle(kinds: Sequence[str], sizes: Sequence[int], memory_gb: float | None, *, peer: bool) -> None:
+def part_bundle(
+    kinds: Sequence[str], sizes: Sequence[int], memory_gb: float | None, *, peers: bool, longest_s: float
+) -> None:
     """Print a line for each network and program."""
     with tempfile.TemporaryDirectory() as name:
-        program = compiled_peer(Path(name)) if peer else None
+        program = compiled_peer(Path(name)) if peers else None
+        file = Path(name) / "network.txt"
+        others: dict[str, Callable[[float], Sequence[str | Path]]] = {}
+        if program is not None:
+            others["Ceres"] = lambda target: [program, "bal", file, repr(target), "iterative"]
+        if peers and colmap_command("bal", file):
+            others["COLMAP"] = lambda _: colmap_command("bal", file)
+        elif peers:
+            print("no pycolmap: no comparison with COLMAP")
         for kind in kinds:
             for images in sizes:
-                words = [sys.executable, __file__, kind, str(images)]
+                words: list[str | Path] = [sys.executable, __file__, kind, str(images)]
                 words += [] if memory_gb is None else ["--memory", str(memory_gb)]
-                run = subprocess.run(words, capture_output=True, text=True, timeout=LONGEST_S, check=False)
-                if run.returncode:
-                    said_last = run.stderr.strip().splitlines()[-1:] or [f"ended by signal {-run.returncode}"]
-                    print(f"{kind} {images}: {said_last[0]}", flush=True)
+                ended = run_watched(words, longest_s)
+                if ended.why:
+                    print(f"{kind} {images}: {ended.why}; at most {ended.peak_mb:.0f} MB", flush=True)
                     continue
-                mine = json.loads(run.stdout)
+                mine = json.loads(ended.out)
                 print(f"{kind} {said(mine)}", flush=True)
-                if program is not None and "half_cost" in mine:
-                    target = mine["half_cost"] * (1 + 1e-6)
-                    theirs = ceres(program, kind, images, target, Path(name))
-                    each = 1e6 * theirs["total_s"] / (2 * mine["rays"])
-                    to_it = theirs["to_target_s"]
-                    print(
-                        f"    Ceres {theirs['total_s']:.1f} s ({each:.1f} µs), "
-                        f"{'not at that sum of squares' if to_it < 0 else f'{to_it:.1f} s to it'}, "
-                        f"½Σr² {theirs['half_cost']:.8g}, {theirs['iterations']} steps, "
-                        f"{theirs['peak_mb']:.0f} MB",
-                        flush=True,
-                    )
+                if others and "half_cost" in mine:
+                    KINDS[kind](images).write(file)
+                    for which, command in others.items():
+                        target = mine["half_cost"] * (1 + 1e-6)
+                        print(peer_line(which, command(target), mine, longest_s), flush=True)
 
 
 def said(found: dict[str, Any]) -> str:

@@ -3,9 +3,11 @@
     colmap.py bal NETWORK        BAL file; each image has f, k1, k2 of its own
     colmap.py shared NETWORK     one camera for all, as benchmarks/bundle.py writes it
 
-Prints processor seconds in all, final half of the sum of squares, iterations. The sums are COLMAP's own: an
-observation whose point lies behind its camera counts nothing there, and it has no distortion on the image
-side, so that of `shared` networks it adjusts f, cx, cy, k1, k2 of its model RADIAL, on the object side.
+Prints processor seconds in all, final half of the sum of squares, iterations, how the normal equations were
+solved (COLMAP chooses it by the number of images), memory (MB) before the adjustment and its peak. The sums
+are COLMAP's own: an observation whose point lies behind its camera counts nothing there, and it has no
+distortion on the image side, so that of `shared` networks it adjusts f, cx, cy, k1, k2 of its model RADIAL,
+on the object side.
 """
 
 from __future__ import annotations
@@ -17,12 +19,15 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from watched import forget_peak, peak_mb
+
 TURNED = np.diag([1.0, -1.0, -1.0])
 """From a camera that looks along −z with y up to one that looks along z with y down."""
 
 
 def numbers(path: Path) -> np.ndarray:
-    return np.array(path.read_text().split(), dtype=np.float64)
+    return np.fromfile(path, sep=" ")
 
 
 def pose(rotation: np.ndarray, shift: np.ndarray) -> pycolmap.Rigid3d:
@@ -99,11 +104,14 @@ def main() -> int:
     for image in network.images:
         config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    before = forget_peak()
     begun = time.process_time()
     summary = pycolmap.create_default_bundle_adjuster(options, config, network).solve()
     spent = time.process_time() - begun
     ceres = getattr(summary, "ceres_summary", summary)
-    print(f"{spent:.6f} {ceres.final_cost:.10g} {ceres.num_successful_steps + ceres.num_unsuccessful_steps}")
+    steps = ceres.num_successful_steps + ceres.num_unsuccessful_steps
+    how = ceres.linear_solver_type_used.name
+    print(f"{spent:.6f} {ceres.final_cost:.10g} {steps} {how} {before:.1f} {peak_mb():.1f}")
     return 0
 
 
