@@ -224,6 +224,26 @@ def test_corners_beside_the_markers_read_are_found_to_the_margin_of_a_wide_view(
     assert 0.75 < np.sqrt(((error / sigma) ** 2).mean()) < 1.3
 
 
+class Action(Wide):
+    """A view through the lens of an action camera."""
+
+    _focal = np.array([430.0, 429.0])
+    _lens = (-0.25, 0.075, -0.0003, 0.0003)
+
+
+@pytest.mark.parametrize("seed", [62, 64])
+def test_a_lattice_grows_through_the_many_saddles_of_sharpened_edges_behind_a_wide_lens(seed: int) -> None:
+    """Where the next corner is expected, edges have saddles that are nearer than the corner."""
+    design, printed = board("chess", 9, 7, 30.0), prints.chess(9, 7, 30.0)
+    turn, place = pose(seed, printed, nearer=1.5)
+    view = Action(printed, turn, place * [1, 1, 0.5], seed=seed, sharpening=1.5, noise=0.5, jpeg=90)
+    found = measured(Frame(view.picture(), 255.0, "action"), design)
+    sight = ((view.truth > 8) & (view.truth < [960 - 9, 720 - 9])).all(axis=1)
+    # The frame shows a part of the pattern, which fits shifted, too.
+    assert found.found == sight.sum()
+    assert np.abs(renamed(found, view.truth)).max() < 0.05
+
+
 @pytest.mark.parametrize(
     ("dictionary", "border", "shape", "size", "motion", "seed", "nearer"),
     [

@@ -62,6 +62,8 @@ _WELL = 5
 """Neighbours of a seed from which others are preferred for their strength alone, of 6."""
 _GATE = 0.22
 """Largest distance of a corner from its node, in steps of the lattice."""
+_CHOICE = 16
+"""Number of points near a node among which its corner is looked for: sharpened edges have many saddles."""
 _FROM = 1.1
 """Distance from a known node within which the next are searched, in steps."""
 _DIAGONAL = 0.3
@@ -274,10 +276,10 @@ def grown_through(
     Parameters
     ----------
     xy, mapping, extent, shape
-        The points; see :func:`grown`; height and width of the frame.
+        The points, the strongest first; see :func:`grown`; height and width of the frame.
     accepted : callable
-        Which of some nodes (n, 2) belong to the nearest points (n,), given the mapping and its slopes there
-        (n, 2, 2).
+        Which of some nodes (n, 2) belong to these points (n,), given the mapping and its slopes there
+        (n, 2, 2). The strongest point near a node that is accepted is its corner.
 
     Returns
     -------
@@ -296,9 +298,11 @@ def grown_through(
         pixels = np.maximum(np.linalg.norm(slopes, axis=1).min(axis=1), 1e-6)
         if led:
             predicted = predicted + _led(nodes, xy[rows] - images_of(mapping, nodes), beside)
-        gap, row = tree.query(predicted)
-        taken = (gap < _GATE * pixels) & accepted(mapping, beside, row, slopes)
-        order = np.argsort(gap / pixels + 1e6 * ~taken, kind="stable")
+        gap, at, which = _within(tree, predicted, _GATE * pixels)
+        good = accepted(mapping, beside[at], which, slopes[at]) if len(at) else np.zeros(0, dtype=bool)
+        gap, row = _strongest(len(beside), gap[good], at[good], which[good])
+        taken = np.isfinite(gap)
+        order = np.argsort(gap / pixels, kind="stable")
         _, once = np.unique(row[order], return_index=True)
         keep = np.sort(order[once])
         keep = keep[taken[keep]]
@@ -309,7 +313,7 @@ def grown_through(
         # A polynomial through few nodes does not predict the next ones through a wide lens; a fisheye is
         # followed by what the nodes beside them have in excess.
         led |= same and through_lens
-        through_lens = (same or led) and len(rows) >= LENS_FROM
+        through_lens |= same and len(rows) >= LENS_FROM
         if same and not through_lens:
             break
         free = through(nodes, xy[rows], shape)
@@ -318,6 +322,22 @@ def grown_through(
             lens = lens_through(nodes, xy[rows], np.full(len(rows), SADDLE_PX), shape, free)
         mapping = free if lens is None else lens.mapping
     return nodes, rows, mapping
+
+
+def _within(tree: KDTree, places: Array, gate: Array) -> tuple[Array, Rows, Rows]:
+    """Points within the distance `gate` of some places: their distances, and rows of places and of points."""
+    gap, row = tree.query(places, k=np.arange(1, min(_CHOICE, tree.n) + 1))
+    at, k = np.nonzero(gap < gate[:, None])
+    return gap[at, k], at, row[at, k]
+
+
+def _strongest(count: int, gap: Array, at: Rows, which: Rows) -> tuple[Array, Rows]:
+    """The first point at each of `count` places: its distance, infinite without one, and its row."""
+    distance, row = np.full(count, np.inf), np.zeros(count, dtype=np.intp)
+    order = np.lexsort((which, at))
+    first = order[np.unique(at[order], return_index=True)[1]]
+    distance[at[first]], row[at[first]] = gap[first], which[first]
+    return distance, row
 
 
 def _led(nodes: Array, excess: Array, beside: Array) -> Array:

@@ -374,6 +374,7 @@ class PlaneMarks(MarkWindows):
         strong = found.converged & (found.t > 8)
         ordinary = float(np.median(found.psf_px[strong])) if strong.any() else self.look.psf_px
         usual = float(np.median(found.noise[strong])) if strong.any() else np.inf
+        pixel = o.fill / np.sqrt(12)  # which alone blurs a sharpened image
         return [
             (
                 found.seen < self.least_seen,
@@ -385,7 +386,7 @@ class PlaneMarks(MarkWindows):
                 Reason(f"no {self.word} is distinct from its surroundings", Code.LOW_CONTRAST),
             ),
             (
-                found.psf_px > _BLURRED * ordinary,
+                np.hypot(found.psf_px, pixel) > _BLURRED * np.hypot(ordinary, pixel),
                 Reason(f"less sharp than the other {self.word}s", Code.BLURRED),
             ),
             *self._misshapen(found),
