@@ -18,11 +18,13 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 
 import cv2
 import numpy as np
+from parts import add_options, executor_of, main_of, outcomes, timed
 from scipy.stats import chi2
 from worlds.blurred import (
     ROWS,
@@ -279,26 +281,37 @@ def main() -> None:
         "--keep", type=Path, metavar="FOLDER", help="drawn photographs are kept and reused there"
     )
     parser.add_argument("--speed", action="store_true", help="time and exactness of one image only")
+    add_options(parser)
     chosen = parser.parse_args()
     if chosen.speed:
         speed()
         return
     rows: list[dict[str, object]] = []
     seconds = 0.0
-    for seed in range(chosen.first, chosen.first + chosen.count):
-        drawn = kept(seed, chosen.keep)
-        camera, planes = camera_of(drawn), plane_targets(drawn)
-        sigmas = [(BRIGHT - DARK) * 10 ** (-decibels / 20) for decibels in DECIBELS]
-        least = np.array([bounds(camera, plane, sigmas) for plane in planes])
-        for (level, decibels), draw in product(enumerate(DECIBELS), range(chosen.draws)):
-            noise = np.random.default_rng((seed, int(decibels), draw))
-            pixels = noisy(drawn.image, BRIGHT - DARK, decibels, noise)
-            start = time.process_time()
-            names = [str(k) for k in range(len(planes))]
-            found = measure_blurred(Frame(pixels, 255.0, f"world {seed}"), camera, names, planes)
-            seconds += time.process_time() - start
-            rows += _rows(seed, decibels, drawn, found, pixels, least[:, level])
+    seeds = range(chosen.first, chosen.first + chosen.count)
+    with executor_of(chosen) as executor:
+        for found, spent in outcomes(executor, partial(of_photograph, chosen.keep, chosen.draws), seeds):
+            rows += found
+            seconds += spent
     _report(rows, seconds)
+
+
+def of_photograph(keep: Path | None, draws: int, seed: int) -> tuple[list[dict[str, object]], float]:
+    """Rows of the targets of a photograph with each noise, and the processor time (s) to measure them."""
+    drawn = kept(seed, keep)
+    camera, planes = camera_of(drawn), plane_targets(drawn)
+    names = [str(k) for k in range(len(planes))]
+    sigmas = [(BRIGHT - DARK) * 10 ** (-decibels / 20) for decibels in DECIBELS]
+    least = np.array([bounds(camera, plane, sigmas) for plane in planes])
+    rows, seconds = list[dict[str, object]](), 0.0
+    for (level, decibels), draw in product(enumerate(DECIBELS), range(draws)):
+        noise = np.random.default_rng((seed, int(decibels), draw))
+        pixels = noisy(drawn.image, BRIGHT - DARK, decibels, noise)
+        frame = Frame(pixels, 255.0, f"world {seed}")
+        found, spent = timed(partial(measure_blurred, frame, camera, names, planes), "blurred")
+        seconds += spent
+        rows += _rows(seed, decibels, drawn, found, pixels, least[:, level])
+    return rows, seconds
 
 
 def speed() -> None:
@@ -444,4 +457,4 @@ def _line(name: str, rows: list[dict[str, object]]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main_of(__file__)

@@ -22,7 +22,6 @@ import argparse
 import gc
 import json
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -33,10 +32,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+from parts import add_options, executor_of, main_of, outcomes, timed
 from worlds.boards import OPENCV, bounds, picture, poses
 
 from reseau.core.data import Array, Frame, ImagePoints, Mask
 from reseau.core.failure import Failure
+from reseau.execution import Executor
 from reseau.io import parse_design
 from reseau.io.images import read_image
 from reseau.measure import ReseauOptions, measure_reseau, measure_testfield
@@ -96,12 +97,10 @@ def reaches(target: str, design: Any, xy: Array) -> Array:
 def measured(frame: Frame, measure: Measure, xy: Array, whole: Mask) -> Measured | str:
     """Errors of a picture, or why it was declined or what was raised."""
     gc.collect()
-    start = time.process_time()
     try:
-        found = measure(frame)
-    except Exception as error:  # whatever is raised is a finding
-        return f"RAISED {type(error).__name__}: {str(error).splitlines()[-1][:80]}"
-    seconds = time.process_time() - start
+        found, seconds = timed(partial(measure, frame), "boards")
+    except Exception as raised:  # whatever is raised is a finding
+        return f"RAISED {type(raised).__name__}: {str(raised).splitlines()[-1][:80]}"
     if isinstance(found, Failure):
         return f"declined: {found.reason} [{found.code}] ({seconds:.2f} s)"
     sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))[found.ok]
@@ -137,22 +136,32 @@ def line(name: str, done: list[Measured], rough: bool) -> bool:
     return good
 
 
-def table(folder: Path, target: str, design: Any, conditions: list[str], each: bool) -> bool:
-    """Measure the pictures of a target and print a row for each condition."""
+def in_picture(
+    folder: Path, target: str, design: Any, picture: tuple[str, str, Any]
+) -> list[tuple[str, Measured | str]]:
+    """What is measured in a picture, from the front, and where it is mirrored, from behind."""
+    name, condition, truth = picture
     front, behind = measurers(target, design)
+    frame, xy = read_image(folder / name), np.array(truth["xy"])
+    hidden = np.array(truth.get("hidden", truth.get("hid")) or np.zeros(len(xy))) > 0
+    size = np.array([frame.width, frame.height])
+    edge = reaches(target, design, xy) + MARGIN_PX
+    whole = ((xy > edge - 0.5) & (xy < size - 0.5 - edge)).all(axis=1) & ~hidden
+    ways = [(condition, front)] + [("mirrored", behind)] * (condition == "mirror")
+    return [(label, measured(frame, measure, xy, whole)) for label, measure in ways]
+
+
+def table(
+    executor: Executor, folder: Path, target: str, design: Any, conditions: list[str], each: bool
+) -> bool:
+    """Measure the pictures of a target and print a row for each condition."""
     parts: dict[str, list[Measured]] = {}
     good = True
     print(f"{target:26} {'measured':>14}  {'rms':6}  {'worst':8} {'sigma':>5}  wrong  error/sigma")
-    for name, condition, truth in pictures(folder, target):
-        if conditions and condition not in conditions:
-            continue
-        frame, xy = read_image(folder / name), np.array(truth["xy"])
-        hidden = np.array(truth.get("hidden", truth.get("hid")) or np.zeros(len(xy))) > 0
-        size = np.array([frame.width, frame.height])
-        edge = reaches(target, design, xy) + MARGIN_PX
-        whole = ((xy > edge - 0.5) & (xy < size - 0.5 - edge)).all(axis=1) & ~hidden
-        for label, measure in [(condition, front)] + [("mirrored", behind)] * (condition == "mirror"):
-            found = measured(frame, measure, xy, whole)
+    chosen = [one for one in pictures(folder, target) if not conditions or one[1] in conditions]
+    done = outcomes(executor, partial(in_picture, folder, target, design), chosen)
+    for (name, _, _), labelled in zip(chosen, done, strict=True):
+        for label, found in labelled:
             if isinstance(found, str):
                 right = label in DECLINED and found.startswith("declined")
                 good &= right
@@ -161,57 +170,62 @@ def table(folder: Path, target: str, design: Any, conditions: list[str], each: b
             parts.setdefault(label, []).append(found)
             if each:
                 line(name, [found], label in ROUGH)
-    for label, done in parts.items():
-        good &= line(label, done, label in ROUGH)
+    for label, several in parts.items():
+        good &= line(label, several, label in ROUGH)
     return good
 
 
-def squares(folder: Path, design: Any, conditions: list[str]) -> bool:
-    """Measure every square that lies in a picture with its four lines, cut out with a margin."""
+def in_squares(folder: Path, design: Any, picture: tuple[str, str, Any]) -> list[Measured | str]:
+    """What is measured in every square that lies in a picture with its four lines, cut out with a margin."""
+    name, _, truth = picture
     front, _ = measurers("tf", design)
-    good, of = True, np.array(design.targets.square)
-    print(f"{'one square with its lines':26} {'read':>10}")
-    for name, condition, truth in pictures(folder, "tf"):
-        if condition not in (conditions or ["clean"]):
+    of, found = np.array(design.targets.square), []
+    frame, xy = read_image(folder / name), np.array(truth["xy"])
+    to_image: Any = cv2.findHomography(design.xy, xy)[0]
+    for number in np.unique(of):
+        ends = design.centres[number - 1] + design.pitch / 2 * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
+        corners = cv2.perspectiveTransform(ends[None].astype(np.float64), to_image)[0]
+        low = np.floor(corners.min(axis=0)).astype(int) - SQUARE_MARGIN_PX
+        high = np.ceil(corners.max(axis=0)).astype(int) + SQUARE_MARGIN_PX + 1
+        if (low < 0).any() or (high > [frame.width, frame.height]).any():
             continue
-        frame, xy = read_image(folder / name), np.array(truth["xy"])
-        to_image: Any = cv2.findHomography(design.xy, xy)[0]
-        parts, read, misnumbered = [], 0, 0
-        count = 0
-        for number in np.unique(of):
-            ends = design.centres[number - 1] + design.pitch / 2 * np.array(
-                [[-1, -1], [-1, 1], [1, 1], [1, -1]]
-            )
-            corners = cv2.perspectiveTransform(ends[None].astype(np.float64), to_image)[0]
-            low = np.floor(corners.min(axis=0)).astype(int) - SQUARE_MARGIN_PX
-            high = np.ceil(corners.max(axis=0)).astype(int) + SQUARE_MARGIN_PX + 1
-            if (low < 0).any() or (high > [frame.width, frame.height]).any():
-                continue
-            count += 1
-            part = replace(frame, pixels=frame.pixels[low[1] : high[1], low[0] : high[0]])
-            found = measured(part, front, xy - low, of == number)
-            if isinstance(found, str):
-                good &= not found.startswith("RAISED")
-                continue
-            read, misnumbered = read + 1, misnumbered + int((np.hypot(*found.error.T) > 2).sum())
-            parts.append(found)
-        print(f"{name:26} {read:3} of {count:3}, {misnumbered} misnumbered")
+        part = replace(frame, pixels=frame.pixels[low[1] : high[1], low[0] : high[0]])
+        found.append(measured(part, front, xy - low, of == number))
+    return found
+
+
+def squares(executor: Executor, folder: Path, design: Any, conditions: list[str]) -> bool:
+    """Measure single squares of the testfield, and print a row for each picture."""
+    good = True
+    print(f"{'one square with its lines':26} {'read':>10}")
+    chosen = [one for one in pictures(folder, "tf") if one[1] in (conditions or ["clean"])]
+    done = outcomes(executor, partial(in_squares, folder, design), chosen)
+    for (name, _, _), found in zip(chosen, done, strict=True):
+        parts = [one for one in found if isinstance(one, Measured)]
+        misnumbered = sum(int((np.hypot(*one.error.T) > 2).sum()) for one in parts)
+        good &= not any(isinstance(one, str) and one.startswith("RAISED") for one in found)
+        print(f"{name:26} {len(parts):3} of {len(found):3}, {misnumbered} misnumbered")
         good &= line(name, parts, rough=False) and not misnumbered if parts else False
     return good
 
 
-def others(folder: Path, target: str, design: Any) -> bool:
-    """Measure the pictures of all other targets with this design; none may be accepted, none may raise."""
+def in_other(folder: Path, target: str, design: Any, name: str) -> Measured | str:
+    """What is measured in a picture of another target: nothing, if all is well."""
     front, _ = measurers(target, design)
+    none = np.zeros((len(design.xy), 2))
+    return measured(read_image(folder / name), front, none, np.zeros(len(none), dtype=bool))
+
+
+def others(executor: Executor, folder: Path, target: str, design: Any) -> bool:
+    """Measure the pictures of all other targets with this design; none may be accepted, none may raise."""
     wrong = 0
-    names = [
+    names = sorted(
         n
         for n, t in json.loads((folder / "truth.json").read_text()).items()
         if t.get("target", t.get("kind")) != target
-    ]
-    for name in sorted(names):
-        none = np.zeros((len(design.xy), 2))
-        found = measured(read_image(folder / name), front, none, np.zeros(len(none), dtype=bool))
+    )
+    done = outcomes(executor, partial(in_other, folder, target, design), names)
+    for name, found in zip(names, done, strict=True):
         if not isinstance(found, str) or found.startswith("RAISED"):
             wrong += 1
             print(f"{name:26} {found if isinstance(found, str) else f'{len(found.error)} points'}  MISSED")
@@ -219,34 +233,44 @@ def others(folder: Path, target: str, design: Any) -> bool:
     return wrong == 0
 
 
-def worlds(design_path: Path, count: int) -> bool:
+def in_world(design_path: Path, world: tuple[int, int, float, float]) -> tuple[Measured, Array] | str:
+    """What is measured in an own view, and the bounds of some of its targets."""
+    seed, k, k1, tilt = world
+    contents = json.loads(design_path.read_text())
+    measure, _ = measurers("tf", parse_design(design_path.read_text(), design_path))
+    camera = replace(OPENCV, k1=k1, k2=0.06 if k1 else 0.0)
+    pose = poses(4, 15 * seed + k, 500.0, (tilt - 1, tilt))[(seed + k) % 4]
+    pixels, xy = picture(contents, camera, pose, seed=seed)
+    whole = ((xy > 10) & (xy < [camera.width - 11, camera.height - 11])).all(axis=1)
+    found = measured(Frame(pixels.astype(np.uint8), 255.0), measure, xy, whole)
+    if isinstance(found, str):
+        return found
+    some = np.flatnonzero(found.ok & whole)[seed % BOUND_EACH :: BOUND_EACH]
+    ratios = np.stack([found.error[np.cumsum(found.ok)[some] - 1], bounds(contents, camera, pose, some)])
+    return found, ratios
+
+
+def worlds(executor: Executor, design_path: Path, count: int) -> bool:
     """Measure views of the testfield drawn by ``benchmarks/worlds/boards.py``, near and wide.
 
     The tilt is 29 to 65 degrees, and k1 is 0 to -0.3.
     """
-    contents = json.loads(design_path.read_text())
-    measure, _ = measurers("tf", parse_design(design_path.read_text(), design_path))
     parts, good, ratios = [], True, []
-    for seed in range(count):
-        for k, (k1, tilt) in enumerate(product((0.0, -0.15, -0.3), (30.0, 53.0, 57.0, 61.0, 65.0))):
-            camera = replace(OPENCV, k1=k1, k2=0.06 if k1 else 0.0)
-            pose = poses(4, 15 * seed + k, 500.0, (tilt - 1, tilt))[(seed + k) % 4]
-            pixels, xy = picture(contents, camera, pose, seed=seed)
-            whole = ((xy > 10) & (xy < [camera.width - 11, camera.height - 11])).all(axis=1)
-            found = measured(Frame(pixels.astype(np.uint8), 255.0), measure, xy, whole)
-            name = f"k1 {k1:g}, {tilt:g}°, seed {seed}"
-            if isinstance(found, str):
-                print(f"{name:26} {found}  MISSED", flush=True)
-                good = False
-                continue
-            line(name, [found], rough=False)
-            parts.append(found)
-            some = np.flatnonzero(found.ok & whole)[seed % BOUND_EACH :: BOUND_EACH]
-            least = bounds(contents, camera, pose, some)
-            ratios.append((found.error[np.cumsum(found.ok)[some] - 1], least))
+    drawn = list(product((0.0, -0.15, -0.3), (30.0, 53.0, 57.0, 61.0, 65.0)))
+    every = [(seed, k, *view) for seed in range(count) for k, view in enumerate(drawn)]
+    done = outcomes(executor, partial(in_world, design_path), every)
+    for (seed, _, k1, tilt), found in zip(every, done, strict=True):
+        name = f"k1 {k1:g}, {tilt:g}°, seed {seed}"
+        if isinstance(found, str):
+            print(f"{name:26} {found}  MISSED", flush=True)
+            good = False
+            continue
+        line(name, [found[0]], rough=False)
+        parts.append(found[0])
+        ratios.append(found[1])
     if not parts:
         return False
-    error, least = (np.concatenate(column) for column in zip(*ratios, strict=True))
+    error, least = np.concatenate(ratios, axis=1)
     rms, bound = (float(np.sqrt((values**2).mean())) for values in (error, least))
     print(
         f"{len(error)} of the targets: rms {rms:.4f} px, bound {bound:.4f} px, "
@@ -281,35 +305,63 @@ def normalised(measured: dict[str, ImagePoints], truth: dict[str, Array], ids: t
     return np.concatenate(parts)
 
 
-def calibrations(design_path: Path, seeds: range, keep: Path | None) -> bool:
-    """Calibrate the camera from own views, and print the errors of its parameters over their sigmas."""
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """A calibration from own views.
+
+    `scaled` and `white` are the errors of its parameters over their sigmas, and free of their correlations;
+    `points` (n, 2) the errors of image points over theirs.
+    """
+
+    scaled: Array
+    white: Array
+    points: Array
+    sigma0: float
+    seconds: float
+    declined: dict[str, str]
+
+
+def calibrated(design_path: Path, keep: Path | None, seed: int) -> Calibrated | str:
+    """Calibrate the camera from own views; or say why it was declined."""
     contents = json.loads(design_path.read_text())
     design = parse_design(design_path.read_text(), design_path)
     true = np.array([getattr(OPENCV, name) for name in PARAMETERS])
+    pictured = list(views(contents, seed, keep))
+    start = time.process_time()
+    done = calibrate_camera([frame for frame, _ in pictured], design, measurer_of(design))
+    seconds = time.process_time() - start
+    if isinstance(done, Failure):
+        return f"{done.reason} [{done.code}]"
+    camera = done.cameras["camera"]
+    at = [camera.parameters.index(name) for name in PARAMETERS]
+    error, cov = camera.values[at] - true, camera.covariance[np.ix_(at, at)]
+    return Calibrated(
+        error / np.sqrt(np.diag(cov)), np.linalg.solve(np.linalg.cholesky(cov), error),
+        normalised(done.measured, {frame.name: xy for frame, xy in pictured}, design.ids),
+        done.sigma0, seconds, {name: str(why) for name, why in done.declined.items()},
+    )  # fmt: skip
+
+
+def calibrations(executor: Executor, design_path: Path, seeds: range, keep: Path | None) -> bool:
+    """Calibrate the camera from own views, and print the errors of its parameters over their sigmas."""
     scaled, white, good = [], [], True
     print(
         f"calibration {'points':>7} {'error/sigma':>11} {'sigma0':>6}  "
         + " ".join(f"{p:>6}" for p in PARAMETERS)
     )
-    for seed in seeds:
-        pictured = list(views(contents, seed, keep))
-        start = time.process_time()
-        done = calibrate_camera([frame for frame, _ in pictured], design, measurer_of(design))
-        seconds = time.process_time() - start
-        if isinstance(done, Failure):
-            print(f"seed {seed:<6} {done.reason} [{done.code}]  MISSED", flush=True)
+    every = outcomes(executor, partial(calibrated, design_path, keep), seeds)
+    for seed, done in zip(seeds, every, strict=True):
+        if isinstance(done, str):
+            print(f"seed {seed:<6} {done}  MISSED", flush=True)
             good = False
             continue
-        camera = done.cameras["camera"]
-        at = [camera.parameters.index(name) for name in PARAMETERS]
-        error, cov = camera.values[at] - true, camera.covariance[np.ix_(at, at)]
-        scaled.append(error / np.sqrt(np.diag(cov)))
-        white.append(np.linalg.solve(np.linalg.cholesky(cov), error))
-        points = normalised(done.measured, {frame.name: xy for frame, xy in pictured}, design.ids)
+        scaled.append(done.scaled)
+        white.append(done.white)
+        points = done.points
         print(
             f"seed {seed:<6} {len(points):>7} {np.sqrt((points**2).mean()):>11.3f} {done.sigma0:>6.3f}  "
-            + " ".join(f"{value:>6.2f}" for value in scaled[-1])
-            + f"  {seconds:.1f} s"
+            + " ".join(f"{value:>6.2f}" for value in done.scaled)
+            + f"  {done.seconds:.1f} s"
             + "".join(f"  {name}: {why}" for name, why in done.declined.items()),
             flush=True,
         )
@@ -340,29 +392,36 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=20, help="number of calibrations")
     parser.add_argument("--first", type=int, default=0, help="seed of the first calibration")
     parser.add_argument("--keep", type=Path, help="folder of the pictures of calibrations")
+    add_options(parser)
     options = parser.parse_args()
     root = os.environ.get("RESEAU_DATA")
     folder = options.data or (Path(root) / "independent" / "boards" if root else None)
     if folder is None:
         print("RESEAU_DATA is not set, and --data not given: nothing to measure")
         return 1
-    good = True
+    with executor_of(options) as executor:
+        return 0 if chosen(executor, options, folder.resolve()) else 1
+
+
+def chosen(executor: Executor, options: argparse.Namespace, folder: Path) -> bool:
+    """Do what the options ask for; whether all is within its limits."""
+    field = folder / DESIGNS["tf"]
     if options.calibrate:
         seeds = range(options.first, options.first + options.seeds)
-        return 0 if calibrations(folder / DESIGNS["tf"], seeds, options.keep) else 1
+        return calibrations(executor, field, seeds, options.keep)
     if options.squares:
-        path = folder / DESIGNS["tf"]
-        return 0 if squares(folder, parse_design(path.read_text(), path), options.condition) else 1
+        return squares(executor, folder, parse_design(field.read_text(), field), options.condition)
+    good = True
     for target in DESIGNS if options.target is None else (options.target,):
         path = folder / DESIGNS[target]
         design = parse_design(path.read_text(), path)
-        good &= table(folder, target, design, options.condition, options.each)
+        good &= table(executor, folder, target, design, options.condition, options.each)
         if options.others:
-            good &= others(folder, target, design)
+            good &= others(executor, folder, target, design)
         if target == "tf" and options.worlds:
-            good &= worlds(path, options.worlds)
-    return 0 if good else 1
+            good &= worlds(executor, path, options.worlds)
+    return good
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main_of(__file__))

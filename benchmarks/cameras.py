@@ -14,16 +14,20 @@ import json
 import os
 import subprocess
 import time
+from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from parts import add_options, executor_of, main_of, outcomes
 from worlds import lenses
 
 from reseau.bundle import Camera, ModelChoice, Network, Result, adjust_network, choose_model
 from reseau.calibration.camera import by_rotation
+from reseau.execution import Executor
 from reseau.io.network import Network1
 from reseau.optics import PixelGrid, camera_models
 from reseau.optics.cameras import (
@@ -327,34 +331,41 @@ def truths() -> dict[str, lenses.Lens]:
     }
 
 
-def choices(seeds: int = 20) -> None:
+def choice(job: tuple[lenses.Lens, int]) -> tuple[str, float, int] | str:
+    """The model that is chosen, its error (px), and by how many parameters the best fitting one has more.
+
+    Or the reason why none is.
+    """
+    lens, seed = job
+    flat, true = lenses.board(8, 6, 1.0)
+    seen = lenses.views(lens, flat, true, 15, 0.2, seed)
+    f = 1.05 * float(lens.matrix[0, 0])
+    start = {"fx": f, "fy": f, "cx": (lens.width - 1) / 2, "cy": (lens.height - 1) / 2}
+    free = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"]
+    document = lenses.document(lens, flat, seen, start, free, 0.2, "opencv")
+    content = json.loads(json.dumps(document))
+    found = choose_model(Network.from_document(Network1.from_content(content, where="drawn")))
+    if not isinstance(found, ModelChoice):
+        return str(found.reason)
+    least = min((each for each in found.compared if each.cost > 0), key=lambda each: each.cost)
+    error = difference(lens, found.camera, np.concatenate([xy for _, xy in seen]))
+    more = len(least.candidate.free) - len(found.chosen.candidate.free)
+    return found.chosen.candidate.label, error, more
+
+
+def choices(executor: Executor, seeds: int = 20) -> None:
     """Which model is chosen, its parameters, and its greatest error over the observed part of the image."""
     for truth, lens in truths().items():
-        names: dict[str, int] = {}
-        error, loss = [], []
-        for seed in range(seeds):
-            flat, true = lenses.board(8, 6, 1.0)
-            seen = lenses.views(lens, flat, true, 15, 0.2, seed)
-            f = 1.05 * float(lens.matrix[0, 0])
-            start = {"fx": f, "fy": f, "cx": (lens.width - 1) / 2, "cy": (lens.height - 1) / 2}
-            free = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"]
-            document = lenses.document(lens, flat, seen, start, free, 0.2, "opencv")
-            content = json.loads(json.dumps(document))
-            found = choose_model(Network.from_document(Network1.from_content(content, where="drawn")))
-            if not isinstance(found, ModelChoice):
-                names[found.reason] = names.get(found.reason, 0) + 1
-                continue
-            label = found.chosen.candidate.label
-            names[label] = names.get(label, 0) + 1
-            least = min((each for each in found.compared if each.cost > 0), key=lambda each: each.cost)
-            error.append(difference(lens, found.camera, np.concatenate([xy for _, xy in seen])))
-            loss.append(len(least.candidate.free) - len(found.chosen.candidate.free))
-        said = ", ".join(f"{name} {count}" for name, count in sorted(names.items(), key=lambda e: -e[1]))
+        done = list(outcomes(executor, choice, ((lens, seed) for seed in range(seeds))))
+        names = Counter(each if isinstance(each, str) else each[0] for each in done)
+        said = ", ".join(f"{name} {count}" for name, count in names.most_common())
         print(f"  {truth}: {said}", flush=True)
+        chosen = [each for each in done if not isinstance(each, str)]
+        error, more = [each[1] for each in chosen], [each[2] for each in chosen]
         print(
             f"    rms error of the chosen camera where there are observations {np.median(error):.3f} px "
             f"(median), at most {np.max(error):.3f} px; "
-            f"the least residuals have {np.mean(loss):.1f} parameters more"
+            f"the least residuals have {np.mean(more):.1f} parameters more"
         )
 
 
@@ -377,14 +388,27 @@ def difference(lens: lenses.Lens, camera: Camera, seen: np.ndarray) -> float:
     return float(np.sqrt(((found.value - image) ** 2).sum(axis=1).mean()))
 
 
-PARTS = {"projections": projections, "calibrations": calibrations, "times": times, "choices": choices}
+PARTS = ("projections", "calibrations", "times", "choices")
 
-if __name__ == "__main__":
+
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--part", choices=PARTS)
     parser.add_argument("--seeds", type=int, default=20, help="networks of each lens, for the choices")
-    chosen, count = (given := parser.parse_args()).part, given.seeds
-    for name, part in PARTS.items():
-        if chosen in (None, name):
+    add_options(parser)
+    given = parser.parse_args()
+    with executor_of(given) as executor:
+        parts: dict[str, Callable[[], None]] = {
+            "projections": projections,
+            "calibrations": calibrations,
+            "times": times,
+            "choices": partial(choices, executor, given.seeds),
+        }
+        for name in PARTS if given.part is None else (given.part,):
             print(name)
-            choices(count) if part is choices else part()
+            parts[name]()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main_of(__file__))

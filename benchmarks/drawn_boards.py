@@ -14,13 +14,14 @@ have where that is wider.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
-from dataclasses import replace
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
+from parts import add_options, executor_of, main_of, outcomes, timed
 from scipy.stats import chi2
 from worlds import prints
 from worlds.pixels import Array
@@ -29,6 +30,7 @@ from worlds.sheets import CONDITIONS, Fisheye, View, Wide, pose, views
 from reseau.core.data import Frame, Rows
 from reseau.core.failure import Failure
 from reseau.designs import board
+from reseau.execution import Executor
 from reseau.io import BoardDesign
 from reseau.measure import measure_board
 from reseau.procedures.calibration import calibrate_camera, measurer_of
@@ -76,11 +78,11 @@ KINDS: dict[str, tuple[BoardDesign, prints.Print | prints.Deltille]] = {
 
 def by_others(design: BoardDesign, pixels: Any) -> tuple[Array, Rows, float]:
     """Points (n, 2) that OpenCV or ``aprilgrid`` finds, their rows in the design, and its processor time."""
+    if design.kind == "aprilgrid":
+        from aprilgrid import Detector
     start = time.process_time()
     xy, rows = np.zeros((0, 2)), np.arange(len(design.ids))
     if design.kind == "aprilgrid":
-        from aprilgrid import Detector
-
         assert design.dictionary is not None
         family = f"t{design.dictionary.split('_')[-1]}" + ("b1" if design.border_bits == 1 else "")
         tags = [tag for tag in Detector(family).detect(pixels) if tag.tag_id < design.columns * design.rows]
@@ -132,8 +134,10 @@ def misnamed(design: BoardDesign, ways: int, own: Rows, near: Rows) -> int:
     return int((np.abs(moved - design.nodes[near]).max(axis=1) > 0.1).sum()) if whole else len(own)
 
 
-def line(kind: str, label: str, view: View) -> bool:
-    """Measure a picture and print its row; whether it is within its limits."""
+def row(job: tuple[str, str, View]) -> tuple[str, bool]:
+    """Measure a picture: its row, and whether it is within its limits."""
+    cv2.setNumThreads(1)
+    kind, label, view = job
     design, printed = KINDS[kind]
     pixels, xy = view.picture(), view.truth
     h, w = pixels.shape
@@ -146,19 +150,15 @@ def line(kind: str, label: str, view: View) -> bool:
         others, their_names, their_gap = others[right], their_names[right], their_gap[right]
         theirs = float(np.sqrt((their_gap.min(axis=1) ** 2).mean() / 2)) if len(others) else np.nan
         their_wrong = misnamed(design, printed.symmetries, their_names, their_gap.argmin(axis=1))
-    start = time.process_time()
-    found = measure_board(Frame(pixels, 255.0, label), design)
-    seconds = time.process_time() - start
+    found, seconds = timed(partial(measure_board, Frame(pixels, 255.0, label), design), kind)
     if isinstance(found, Failure):
         good = len(others) == 0
-        print(f"{kind:12} {label:14} declined: {found.reason[:70]}; other {len(others)}  "
-              f"{'ok' if good else 'MISSED'}", flush=True)  # fmt: skip
-        return good
+        text = f"{kind:12} {label:14} declined: {found.reason[:70]}; other {len(others)}  "
+        return f"{text}{'ok' if good else 'MISSED'}", good
     own = np.flatnonzero(found.ok)
     if not len(own):
-        print(f"{kind:12} {label:14}    0 of {int(sight.sum()):4} {len(others):4}  "
-              f"{'MISSED' if len(others) else 'ok'}", flush=True)  # fmt: skip
-        return not len(others)
+        text = f"{kind:12} {label:14}    0 of {int(sight.sum()):4} {len(others):4}  "
+        return f"{text}{'MISSED' if len(others) else 'ok'}", not len(others)
     near = np.hypot(*(found.xy[own, None] - xy[None]).transpose(2, 0, 1)).argmin(axis=1)
     error = found.xy[own] - xy[near]
     sigma = np.sqrt(np.diagonal(found.cov[own], axis1=1, axis2=2))
@@ -171,18 +171,17 @@ def line(kind: str, label: str, view: View) -> bool:
     good = len(own) >= len(others) and not wrong and (not names or unclear)
     spread = np.sqrt(chi2.ppf([SPREAD, 1 - SPREAD], error.size) / error.size)
     good &= min(NORMALISED[0], spread[0]) <= ratio <= max(NORMALISED[1], spread[1])
-    print(
+    text = (
         f"{kind:12} {label:14} {len(own):4} of {int(sight.sum()):4} {len(others):4}  {rms:.4f} {theirs:7.4f} "
         f"{off.max():6.3f} {scaled.max():5.1f} {ratio:5.2f} {wrong:3} {names:3}{'?' if unclear else ' '} "
-        f"{their_wrong:4} {seconds:6.2f} {their_time:6.2f} {slow} {'ok' if good else 'MISSED'}",
-        flush=True,
+        f"{their_wrong:4} {seconds:6.2f} {their_time:6.2f} {slow} {'ok' if good else 'MISSED'}"
     )
-    return good
+    return text, bool(good)
 
 
 def held_out(kind: str, count: int) -> list[tuple[str, View]]:
     """Wide lenses, fisheyes, near 60°, small boards, partial views."""
-    printed, found = KINDS[kind][1], []
+    printed, found = KINDS[kind][1], list[tuple[str, View]]()
     for k in range(count):
         turn, place = pose(50 + k, printed, nearer=1.7)
         found.append((f"wide_{k}", Wide(printed, turn, place * [1, 1, 0.55], seed=900 + k)))
@@ -204,28 +203,35 @@ CALIBRATED, VIEWS = (0.75, 1.3), 10
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
-def calibrations(kind: str, seeds: int) -> bool:
-    """Calibrate from views that fill the frame, some beyond it; print errors over sigmas."""
+def calibrated(kind: str, seed: int) -> tuple[str, Array] | str:
+    """Calibrate from views that fill the frame, some beyond it: a row, and errors free of correlations."""
     design, printed = KINDS[kind]
-    white, good = [], True
     true = np.array([*View._focal, *View._centre, *View._lens])
-    for seed in range(seeds):
-        drawn = [
-            View(printed, *pose(100 * seed + k, printed, nearer=1.15), seed=7777 * seed + k)
-            for k in range(VIEWS)
-        ]
-        frames = [Frame(view.picture(), 255.0, str(k)) for k, view in enumerate(drawn)]
-        done = calibrate_camera(frames, design, measurer_of(design))
-        if isinstance(done, Failure):
-            print(f"{kind:12} seed {seed}: {done.reason}  MISSED")
+    drawn = [
+        View(printed, *pose(100 * seed + k, printed, nearer=1.15), seed=7777 * seed + k) for k in range(VIEWS)
+    ]
+    frames = [Frame(view.picture(), 255.0, str(k)) for k, view in enumerate(drawn)]
+    done = calibrate_camera(frames, design, measurer_of(design))
+    if isinstance(done, Failure):
+        return str(done.reason)
+    camera = done.cameras["camera"]
+    at = [camera.parameters.index(name) for name in PARAMETERS]
+    error, cov = camera.values[at] - true, camera.covariance[np.ix_(at, at)]
+    z = " ".join(f"{value:5.1f}" for value in error / np.sqrt(np.diag(cov)))
+    text = f"{kind:12} seed {seed:2}: sigma0 {done.sigma0:.2f}, errors over sigmas {z}"
+    return text, np.linalg.solve(np.linalg.cholesky(cov), error)
+
+
+def calibrations(executor: Executor, kind: str, seeds: int) -> bool:
+    """Calibrate for each seed; print errors over sigmas."""
+    white, good = [], True
+    for seed, done in enumerate(outcomes(executor, partial(calibrated, kind), range(seeds))):
+        if isinstance(done, str):
+            print(f"{kind:12} seed {seed}: {done}  MISSED")
             good = False
             continue
-        camera = done.cameras["camera"]
-        at = [camera.parameters.index(name) for name in PARAMETERS]
-        error, cov = camera.values[at] - true, camera.covariance[np.ix_(at, at)]
-        white.append(np.linalg.solve(np.linalg.cholesky(cov), error))
-        z = " ".join(f"{value:5.1f}" for value in error / np.sqrt(np.diag(cov)))
-        print(f"{kind:12} seed {seed:2}: sigma0 {done.sigma0:.2f}, errors over sigmas {z}", flush=True)
+        print(done[0], flush=True)
+        white.append(done[1])
     if not white:
         return False
     ratio = float(np.sqrt((np.array(white) ** 2).mean()))
@@ -234,35 +240,41 @@ def calibrations(kind: str, seeds: int) -> bool:
     return good
 
 
+def pictures(kinds: list[str], conditions: list[str], count: int) -> Iterator[tuple[str, str, View]]:
+    """Kind, label and view of each picture."""
+    for kind in kinds:
+        for condition in conditions:
+            if condition == "held":
+                for label, view in held_out(kind, count):
+                    yield kind, label, view
+                continue
+            for k, view in enumerate(views(condition, count, KINDS[kind][1])):
+                yield kind, f"{condition}_{k}", view
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--kind", nargs="+", default=list(KINDS), choices=list(KINDS))
     parser.add_argument("--condition", nargs="+", default=[*CONDITIONS, "held"])
     parser.add_argument("--count", type=int, default=2)
     parser.add_argument("--calibrate", type=int, default=0, help="number of calibrations, and nothing else")
+    add_options(parser)
     options = parser.parse_args()
-    cv2.setNumThreads(1)
-    if options.calibrate:
-        # Every kind is calibrated, whatever the others give.
-        done = [calibrations(kind, options.calibrate) for kind in options.kind]
-        return 0 if all(done) else 1
-    print(
-        "kind         picture      measured  other rms   theirs worst sigma ratio wrong names theirs s other"
-    )
-    good = True
-    for kind in options.kind:
-        printed = KINDS[kind][1]
-        warm = View(printed, *pose(1, printed))
-        measure_board(Frame(warm.picture(), 255.0), KINDS[kind][0])
-        for condition in options.condition:
-            if condition == "held":
-                for label, view in held_out(kind, options.count):
-                    good &= line(kind, label, view)
-                continue
-            for k, view in enumerate(views(condition, options.count, printed)):
-                good &= line(kind, f"{condition}_{k}", replace(view))
+    with executor_of(options) as executor:
+        if options.calibrate:
+            # Every kind is calibrated, whatever the others give.
+            done = [calibrations(executor, kind, options.calibrate) for kind in options.kind]
+            return 0 if all(done) else 1
+        print(
+            "kind         picture      measured  other rms   theirs worst sigma ratio wrong names theirs s "
+            "other"
+        )
+        good = True
+        for text, right in outcomes(executor, row, pictures(options.kind, options.condition, options.count)):
+            print(text, flush=True)
+            good &= right
     return 0 if good else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main_of(__file__))

@@ -10,8 +10,10 @@ lines.
 from __future__ import annotations
 
 import argparse
+from functools import partial
 
 import numpy as np
+from parts import add_options, executor_of, main_of, outcomes
 from shared import of_the_tests
 from tables import judged
 
@@ -27,41 +29,44 @@ TURNS = (0.02, -0.1, 0.05, 0.0)
 """Rotations of wires and echoes (rad)."""
 
 
+def of_frame(kind: str, seed: int) -> tuple[int, int, int, Array, Array]:
+    """Echoes of a frame that are to be found, found, and none; errors (n, 2) and their sigmas."""
+    drawn = of_the_tests("measure/echoes.py").draw(kind, seed=seed, turn=TURNS[seed % len(TURNS)])
+    points = find_pins(drawn.frame, hidden=drawn.hidden).points
+    off = points.xy[:, None] - drawn.truth
+    distance = np.hypot(off[..., 0], off[..., 1])
+    row = distance.argmin(axis=1)
+    near = distance.min(axis=1) < NEAR_PX
+    wanted, found = int((drawn.share < HIDDEN).sum()), int((near & (drawn.share[row] < HIDDEN)).sum())
+    return wanted, found, int((~near).sum()), off[np.arange(len(row)), row][near], points.sigma[near]
+
+
 def main() -> int:
     drawing = of_the_tests("measure/echoes.py")
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=4, help="frames of each kind")
     parser.add_argument("--first", type=int, default=0, help="seed of the first")
     parser.add_argument("--kind", nargs="+", default=list(drawing.KINDS), choices=list(drawing.KINDS))
+    add_options(parser)
     given = parser.parse_args()
     print(f"{'shape':<10} {'found':>12} {'none':>5} {'> 5 σ':>6} {'largest':>8}   ", end="")
     print("error/σ x  y           rms px x  y")
-    for kind in given.kind:
-        wanted = found = none = 0
-        errors: list[Array] = []
-        sigmas: list[Array] = []
-        for seed in range(given.first, given.first + given.frames):
-            drawn = drawing.draw(kind, seed=seed, turn=TURNS[seed % len(TURNS)])
-            points = find_pins(drawn.frame, hidden=drawn.hidden).points
-            off = points.xy[:, None] - drawn.truth
-            distance = np.hypot(off[..., 0], off[..., 1])
-            row = distance.argmin(axis=1)
-            near = distance.min(axis=1) < NEAR_PX
-            wanted += int((drawn.share < HIDDEN).sum())
-            found += int((near & (drawn.share[row] < HIDDEN)).sum())
-            none += int((~near).sum())
-            errors.append(off[np.arange(len(row)), row][near])
-            sigmas.append(points.sigma[near])
-        error, sigma = np.concatenate(errors), np.concatenate(sigmas)
-        normalised = error / sigma
-        x, y = np.sqrt((normalised**2).mean(axis=0)).tolist()
-        px = np.sqrt((error**2).mean(axis=0))
-        largest = np.abs(normalised).max(axis=1)
-        wrong = int((largest > WRONG_SIGMA).sum())
-        print(f"{kind:<10} {f'{found} of {wanted}':>12} {none:>5} {wrong:>6} {largest.max():8.1f}   ", end="")
-        print(f"{judged(x, 0.85, 1.15)} {judged(y, 0.85, 1.15)}   {px[0]:.3f} {px[1]:.3f}", flush=True)
+    with executor_of(given) as executor:
+        for kind in given.kind:
+            seeds = range(given.first, given.first + given.frames)
+            done = list(outcomes(executor, partial(of_frame, kind), seeds))
+            wanted, found, none = (sum(each[k] for each in done) for k in range(3))
+            error, sigma = (np.concatenate([each[k] for each in done]) for k in (3, 4))
+            normalised = error / sigma
+            x, y = np.sqrt((normalised**2).mean(axis=0)).tolist()
+            px = np.sqrt((error**2).mean(axis=0))
+            largest = np.abs(normalised).max(axis=1)
+            wrong = int((largest > WRONG_SIGMA).sum())
+            print(f"{kind:<10} {f'{found} of {wanted}':>12} {none:>5} {wrong:>6} ", end="")
+            print(f"{largest.max():8.1f}   {judged(x, 0.85, 1.15)} {judged(y, 0.85, 1.15)}   ", end="")
+            print(f"{px[0]:.3f} {px[1]:.3f}", flush=True)
     return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main_of(__file__))

@@ -1,7 +1,7 @@
 """The oscilloscope procedure on the simulated bench: correctness of the sigmas, effect of each factor.
 
 Run from the checkout: ``python benchmarks/oscilloscope.py [--frames 200] [--polynomial 100] [--draws 1000]
-[--jobs 1] [--echoes even] [--keep FOLDER]``, or with ``--part``:
+[--jobs N] [--echoes even] [--keep FOLDER]``, or with ``--part``:
 
 - ``independent``: the sets of another program in ``$RESEAU_DATA``, through ``reseau refine`` (see `refined`);
 - ``worlds``: the same with ``--count 200`` worlds of `worlds.oscilloscope`;
@@ -45,7 +45,7 @@ import numpy as np
 from chain import FALSE_PX, FAR_SIGMA, Errors, Found, Trial, trial
 from parts import add_options, executor_of, main_of, outcomes
 from photographs import ECHOES, Physics
-from refined import of_points, print_refined, refined
+from refined import Refined, of_points, print_refined, refined
 from tables import judged, mean_square, rms, rms_over_worlds
 from worlds.oscilloscope import World, write
 
@@ -183,30 +183,36 @@ def through_the_procedure(
     return found
 
 
-def _of_others(part: str, seeds: range, keep: Path | None) -> None:
+def _world(folder: Path, keep: bool, seed: int) -> Refined:
+    """Draw a world, unless it is there already, and run the command on it."""
+    name = f"world{seed:03d}"
+    if not (folder / f"{name}.truth.json").exists():
+        write(folder, name, World.drawn_from(seed))
+    found = refined(folder, name, folder)
+    if not keep:
+        for file in folder.glob(f"{name}.*"):
+            file.unlink()
+    return found
+
+
+def _of_others(executor: Executor, part: str, seeds: range, keep: Path | None) -> None:
     """The parts in worlds that share nothing with the project's formation of images."""
     if part == "points":
-        done = [of_points(seed) for seed in seeds]
-        print_refined("Worlds as coordinates with noise", done, 0.95, 1.05, 0.95, 1.05)
+        found = list(outcomes(executor, of_points, seeds))
+        print_refined("Worlds as coordinates with noise", found, 0.95, 1.05, 0.95, 1.05)
         return
     with TemporaryDirectory() as scratch:
-        place = Path(scratch) if keep is None else keep
+        place = Path(scratch) if keep is None else keep.resolve()
         if part == "independent":
             folder = Path(os.environ.get("RESEAU_DATA", "../shared/data")) / "independent" / "oscilloscope"
             names = sorted(file.name.split(".")[0] for file in folder.glob("*.truth.json"))
-            found = [refined(folder, name, place) for name in names]
+            found = list(outcomes(executor, partial(refined, folder.resolve(), keep=place), names))
             print_refined("Sets of another program", found, 0.85, 1.15, 0.8, 1.2)
             return
         found = []
-        for seed in seeds:
-            name = f"world{seed:03d}"
-            if not (place / f"{name}.truth.json").exists():
-                write(place, name, World.drawn_from(seed))
-            found.append(refined(place, name, place))
-            if keep is None:
-                for file in place.glob(f"{name}.*"):
-                    file.unlink()
-            print(f"{name}: {found[-1].message or found[-1].worst}", file=sys.stderr, flush=True)
+        for one in outcomes(executor, partial(_world, place, keep is not None), seeds):
+            found.append(one)
+            print(f"{one.name}: {one.message or one.worst}", file=sys.stderr, flush=True)
         print_refined("Worlds without the project's formation", found, 0.95, 1.05, 0.95, 1.05)
 
 
@@ -217,16 +223,20 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="seed of the first of these worlds")
     parser.add_argument("--echoes", choices=[*ECHOES], default="beam", help="their form")
     parser.add_argument("--draws", type=int, default=1000, help="tests of level, from points")
-    add_options(parser, jobs=1)
+    add_options(parser)
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep there what is measured in frames")
     parser.add_argument("--part", choices=["bench", "independent", "worlds", "points"], default="bench")
     parser.add_argument("--count", type=int, default=200, help="worlds of --part worlds and points")
+    parser.set_defaults(jobs=None)
     given = parser.parse_args()
+    # The wall time of the procedure is that of one process alone.
+    given.jobs = given.jobs or (1 if given.part == "bench" else 2)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)
     begun = time.perf_counter()
     if given.part != "bench":
-        _of_others(given.part, range(given.first, given.first + given.count), given.keep)
+        with executor_of(given) as executor:
+            _of_others(executor, given.part, range(given.first, given.first + given.count), given.keep)
         print(f"\n{time.perf_counter() - begun:.0f} s")
         return 0
     worlds: tuple[tuple[Physics, int], ...] = (("wong", given.frames), ("polynomial", given.polynomial))

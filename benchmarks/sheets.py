@@ -14,18 +14,22 @@ import argparse
 import json
 import resource
 import time
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from boards import reaches
+from parts import add_options, executor_of, main_of, outcomes, timed
 from worlds.boards import Field
 from worlds.sheets import CONDITIONS, Printed, View, coded, pose, views
 
 from reseau.core.data import Frame
 from reseau.core.failure import Failure
 from reseau.designs import coded_testfield
+from reseau.execution import Executor
 from reseau.io import ReseauDesign, TestfieldDesign, parse_design
 from reseau.measure import measure_reseau
 from reseau.measure.testfield.lattice_fit import LatticeFit, refit
@@ -38,13 +42,11 @@ _MARGIN_PX, _CLEAR_PX = 2.0, 12.0
 _WRONG_PX, _WRONG_SIGMA = 0.15, 5.0
 
 
-def measured(view: View, target: str) -> tuple[np.ndarray, np.ndarray, int, int, float] | Failure:
+def measured(target: str, view: View) -> tuple[np.ndarray, np.ndarray, int, int, float] | Failure:
     """Errors (n, 2) and the same in units of sigmas, numbers found and inside, and processor time."""
     design = parse_design(json.dumps(view.sheet.design()), Path(target))
     pixels = view.picture()
-    start = time.process_time()
-    found = measurer_of(design)(Frame(pixels, 255.0))
-    seconds = time.process_time() - start
+    found, seconds = timed(partial(measurer_of(design), Frame(pixels, 255.0)), target)
     if isinstance(found, Failure):
         return found
     size = np.array(pixels.shape[::-1])
@@ -57,32 +59,34 @@ def measured(view: View, target: str) -> tuple[np.ndarray, np.ndarray, int, int,
     return error, scaled, int((found.ok & inside).sum()), int(inside.sum()), seconds
 
 
-def sizes(field: Printed, count: int) -> None:
-    """Measure testfields of decreasing size, and read their squares where the lines are known."""
+def of_size(field: Printed, job: tuple[float, int]) -> str:
+    """Measure a testfield of some size, and read its squares where the lines are known; a row."""
+    nearer, seed = job
     design = parse_design(json.dumps(field.design()), Path("field"))
     assert isinstance(design, TestfieldDesign)
     lines = round(np.sqrt(len(design.centres)))
     at, numbers = design.xy / design.pitch + lines / 2, np.arange(lines + 1)
-    for nearer in (0.5, 0.45, 0.4, 0.36, 0.33, 0.3, 0.26, 0.22):
-        for seed in range(count):
-            view = View(field, *pose(seed, field, nearer=nearer), seed=10 * seed)
-            pixels, (wide, high) = view.picture(), np.ptp(view.truth, axis=0)
-            straight: Any = cv2.findHomography(at, view.truth)[0]
-            mapping = refit(started(straight, 3, pixels.shape), at, view.truth, 0.03)
-            fit = LatticeFit(mapping, numbers, numbers, 0.0, len(at))
-            read = read_clusters(pixels.astype(np.float32), fit, design, view.blur, PixelResponse())
-            legible = 0 if isinstance(read, Failure) else sum(map(bool, read.decoded))
-            found = measured(view, "field")
-            text = f"declined: {found.reason}" if isinstance(found, Failure) else ""
-            if not isinstance(found, Failure):
-                error, scaled, count_in, inside, _ = found
-                text = f"{count_in} of {inside} targets, rms {np.sqrt((error**2).mean()):.4f} px, "
-                text += f"error/sigma {np.sqrt((scaled**2).mean()):.2f}"
-            print(
-                f"{wide:.0f} x {high:.0f} px, {legible} of {lines**2} squares legible with known lines: "
-                f"{text}",
-                flush=True,
-            )
+    view = View(field, *pose(seed, field, nearer=nearer), seed=10 * seed)
+    pixels, (wide, high) = view.picture(), np.ptp(view.truth, axis=0)
+    straight: Any = cv2.findHomography(at, view.truth)[0]
+    mapping = refit(started(straight, 3, pixels.shape), at, view.truth, 0.03)
+    fit = LatticeFit(mapping, numbers, numbers, 0.0, len(at))
+    read = read_clusters(pixels.astype(np.float32), fit, design, view.blur, PixelResponse())
+    legible = 0 if isinstance(read, Failure) else sum(map(bool, read.decoded))
+    found = measured("field", view)
+    text = f"declined: {found.reason}" if isinstance(found, Failure) else ""
+    if not isinstance(found, Failure):
+        error, scaled, count_in, inside, _ = found
+        text = f"{count_in} of {inside} targets, rms {np.sqrt((error**2).mean()):.4f} px, "
+        text += f"error/sigma {np.sqrt((scaled**2).mean()):.2f}"
+    return f"{wide:.0f} x {high:.0f} px, {legible} of {lines**2} squares legible with known lines: {text}"
+
+
+def sizes(executor: Executor, field: Printed, count: int) -> None:
+    """Measure testfields of decreasing size."""
+    every = product((0.5, 0.45, 0.4, 0.36, 0.33, 0.3, 0.26, 0.22), range(count))
+    for text in outcomes(executor, partial(of_size, field), every):
+        print(text, flush=True)
 
 
 def large() -> None:
@@ -134,19 +138,25 @@ def main() -> None:
     parser.add_argument("--condition", nargs="*", default=list(CONDITIONS))
     parser.add_argument("--sizes", action="store_true", help="only testfields of decreasing size")
     parser.add_argument("--large", action="store_true", help="only time and memory for 20 megapixels")
+    add_options(parser)
     arguments = parser.parse_args()
-    sheet = coded() if arguments.target == "sheet" else Field(json.loads(coded_testfield().to_json()))
-    if arguments.sizes:
-        sizes(Field(json.loads(coded_testfield().to_json())), arguments.count)
-        return
     if arguments.large:
         large()
         return
+    with executor_of(arguments) as executor:
+        if arguments.sizes:
+            sizes(executor, Field(json.loads(coded_testfield().to_json())), arguments.count)
+        else:
+            conditions(executor, arguments.target, arguments.condition, arguments.count)
+
+
+def conditions(executor: Executor, target: str, names: list[str], count: int) -> None:
+    """Print a row for each condition."""
+    sheet = coded() if target == "sheet" else Field(json.loads(coded_testfield().to_json()))
     print(f"{'condition':12} {'measured':>14}  rms     worst px, sigma  wrong  error/sigma  processor time")
-    for condition in arguments.condition:
+    for condition in names:
         parts = []
-        for view in views(condition, arguments.count, sheet):
-            found = measured(view, arguments.target)
+        for found in outcomes(executor, partial(measured, target), views(condition, count, sheet)):
             if isinstance(found, Failure):
                 print(f"{condition:12} declined: {found.reason}")
             else:
@@ -156,9 +166,9 @@ def main() -> None:
         error, scaled = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
         off, sigmas = np.hypot(*error.T), np.hypot(*scaled.T)
         wrong = int(((off > _WRONG_PX) & (sigmas > _WRONG_SIGMA)).sum())
-        count, inside = (sum(part[k] for part in parts) for k in (2, 3))
+        known, inside = (sum(part[k] for part in parts) for k in (2, 3))
         print(
-            f"{condition:12} {count:5} of {inside:5}  {np.sqrt((error**2).mean()):.4f}  {off.max():.3f}  "
+            f"{condition:12} {known:5} of {inside:5}  {np.sqrt((error**2).mean()):.4f}  {off.max():.3f}  "
             f"{sigmas.max():5.1f}      {wrong:5}  {np.sqrt((scaled**2).mean()):11.2f}  "
             f"{np.mean([part[4] for part in parts]):.2f} s",
             flush=True,
@@ -166,4 +176,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main_of(__file__)

@@ -21,6 +21,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,7 @@ from blurred import (
     others,
     plane_targets,
 )
+from parts import add_options, executor_of, main_of, outcomes
 from scipy.optimize import least_squares
 
 from reseau.core.data import Frame
@@ -150,34 +152,49 @@ def fitted(drawn: World, lens: AberratedLens) -> AberratedLens:
     return model(found.x)
 
 
+Method = tuple[str, int, str, list[tuple[Array, Array, float]]]
+"""Its name, the number of targets, what became of them, and of each error, sigmas, error outwards."""
+
+
+def of_photograph(keep: Path | None, seed: int) -> list[Method]:
+    """Measure a photograph by each method."""
+    drawn = kept(seed, keep)
+    pixels = noisy(drawn.image, BRIGHT - DARK, DECIBELS, np.random.default_rng((seed, int(DECIBELS))))
+    xy = [others(pixels, drawn, k)["gravity"] for k in range(len(drawn.targets))]
+    done: list[Method] = []
+    for name, found in methods(drawn, Frame(pixels, 255.0, f"world {seed}"), xy):
+        errors = []
+        for k in np.flatnonzero(found.ok) if found is not None else ():
+            assert found is not None
+            outwards = (drawn.truth[k] - PRINCIPAL) / np.hypot(*(drawn.truth[k] - PRINCIPAL))
+            error, sigma = found.xy[k] - drawn.truth[k], np.sqrt(np.diagonal(found.cov[k]))
+            errors.append((error, sigma, float(error @ outwards)))
+        state = "none" if found is None else f"{found.found} measured, {len(found.notes)} notes"
+        done.append((name, len(drawn.targets), state, errors))
+    gravity = [(at - drawn.truth[k], np.full(2, np.nan), 0.0) for k, at in enumerate(xy)]
+    return [*done, ("gravity", len(xy), "", gravity)]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--count", type=int, default=12, help="photographs")
     parser.add_argument(
         "--keep", type=Path, metavar="FOLDER", help="drawn photographs are kept and reused there"
     )
+    add_options(parser)
     chosen = parser.parse_args()
     rows: dict[tuple[str, float], list[tuple[Array, Array, float]]] = {}
     counts: dict[tuple[str, float], int] = {}
     seeds = [seed for seed in range(10 * chosen.count) if seed % len(BLURS)][: chosen.count]
-    for seed in seeds:
-        drawn = kept(seed, chosen.keep)
-        pixels = noisy(drawn.image, BRIGHT - DARK, DECIBELS, np.random.default_rng((seed, int(DECIBELS))))
-        xy = [others(pixels, drawn, k)["gravity"] for k in range(len(drawn.targets))]
-        blur = BLURS[seed % len(BLURS)]
-        for name, found in methods(drawn, Frame(pixels, 255.0, f"world {seed}"), xy):
-            counts[name, blur] = counts.get((name, blur), 0) + len(drawn.targets)
-            for k in np.flatnonzero(found.ok) if found is not None else ():
-                assert found is not None
-                outwards = (drawn.truth[k] - PRINCIPAL) / np.hypot(*(drawn.truth[k] - PRINCIPAL))
-                error, sigma = found.xy[k] - drawn.truth[k], np.sqrt(np.diagonal(found.cov[k]))
-                rows.setdefault((name, blur), []).append((error, sigma, float(error @ outwards)))
-            state = "none" if found is None else f"{found.found} measured, {len(found.notes)} notes"
-            print(f"world {seed}, {name}: {state}", flush=True)
-        for k, at in enumerate(xy):
-            error = at - drawn.truth[k]
-            rows.setdefault(("gravity", blur), []).append((error, np.full(2, np.nan), 0.0))
-            counts["gravity", blur] = counts.get(("gravity", blur), 0) + 1
+    with executor_of(chosen) as executor:
+        done = outcomes(executor, partial(of_photograph, chosen.keep), seeds)
+        for seed, found in zip(seeds, done, strict=True):
+            for name, targets, state, errors in found:
+                key = name, BLURS[seed % len(BLURS)]
+                counts[key] = counts.get(key, 0) + targets
+                rows.setdefault(key, []).extend(errors)
+                if state:
+                    print(f"world {seed}, {name}: {state}", flush=True)
     print(
         f"{'':16s} {'blur px':>8s} {'n':>5s} {'measured':>8s} {'rms px':>8s} {'median':>8s} {'radial':>8s}"
         f" {'err/sig':>8s}"
@@ -199,4 +216,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main_of(__file__)
