@@ -38,6 +38,8 @@ __all__ = ["UNFIT", "PlaneMarks"]
 
 _HIGH_RESIDUALS = 1.25
 """Multiple of the usual residuals from which something is suspected in front of a mark."""
+_SPREADS = 4.0
+"""The same in robust standard deviations of the residuals of all marks, where these differ more."""
 _FOREIGN, _SHADE, _SHIFT_PX = 4.0, 0.03, 0.25
 """Tolerances of the prediction of a mark by its neighbours: noise, share of the light, and shift."""
 _NEIGHBOURS = 6
@@ -329,10 +331,17 @@ class PlaneMarks(MarkWindows):
 
     def _uneasy(self, found: Matches) -> Mask:
         """Marks with larger residuals than the others, or that did not converge."""
-        known = found.noise[found.converged]
-        ordinary = np.median(known) if len(known) else np.inf
-        spread = 1.4826 * np.median(np.abs(known / ordinary - 1)) if len(known) else 0.0
-        return ~found.converged | (found.noise > max(_HIGH_RESIDUALS, 1 + 4 * spread) * ordinary)
+        return ~found.converged | self._disturbed(found, found.converged, _HIGH_RESIDUALS)
+
+    def _disturbed(self, found: Matches, known: Mask, least: float) -> Mask:
+        """Marks whose residuals are larger, by a factor of at least `least`, than those known usually are.
+
+        Of photographs that cameras sharpened residuals differ from mark to mark.
+        """
+        noise = found.noise[known]
+        ordinary = float(np.median(noise)) if len(noise) else np.inf
+        spread = 1.4826 * float(np.median(np.abs(noise / ordinary - 1))) if len(noise) else 0.0
+        return np.asarray(found.noise > max(least, 1 + _SPREADS * spread) * ordinary)
 
     def _uncover(self, rows: Rows, found: Matches, uneasy: Mask, field: SmoothField) -> None:
         """Mask the pixels of windows that show neither paper nor ink, but something in front of them.
@@ -373,7 +382,6 @@ class PlaneMarks(MarkWindows):
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
         strong = found.converged & (found.t > 8)
         ordinary = float(np.median(found.psf_px[strong])) if strong.any() else self.look.psf_px
-        usual = float(np.median(found.noise[strong])) if strong.any() else np.inf
         pixel = o.fill / np.sqrt(12)  # which alone blurs a sharpened image
         return [
             (
@@ -396,7 +404,7 @@ class PlaneMarks(MarkWindows):
                 Reason(f"the image is not that of a {self.word}", Code.UNLIKE),
             ),
             (
-                (found.rejected > 0.25) | (found.noise > DISTURBED * usual),
+                (found.rejected > 0.25) | self._disturbed(found, strong, DISTURBED),
                 Reason("partly hidden or disturbed", Code.DISTURBED),
             ),
             (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
