@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -92,6 +94,9 @@ def test_a_model_that_does_not_fit_is_said_so_in_pixels() -> None:
     assert not found.fits
     assert found.misfit_px > 0.05
     assert "the model does not fit by" in found.lines[0]
+    assert found.lines[0].endswith("try --model auto")
+    # Where that was done it is no advice.
+    assert "auto" not in replace(found, compared=True).lines[0]
     assert any(remark.code is Code.UNMODELLED for remark in found.warnings)
 
 

@@ -85,6 +85,8 @@ class Assessment:
         Parts of the image with few points.
     next_photograph : NextPose, optional
         Photograph that would help most; none where no photograph lowers the error.
+    compared : bool
+        Whether the camera model is the best of several.
     warnings, tests : tuple of Remark
         Warnings that matter to the result, and remarks of the statistical tests whose effect is contained in
         the errors above.
@@ -107,6 +109,7 @@ class Assessment:
     covered: float
     uncovered: tuple[str, ...]
     next_photograph: NextPose | None
+    compared: bool
     warnings: tuple[Remark, ...]
     tests: tuple[Remark, ...]
 
@@ -125,7 +128,12 @@ class Assessment:
         elif self.fits:
             first += f"; the model fits (to {_rounded(self.misfit_px)})"
         else:
-            first += f"; the model does not fit by {_two(self.misfit_px)} px: try --model auto"
+            why = (
+                "see that focus and zoom stay and the target is stiff"
+                if self.compared
+                else "try --model auto"
+            )
+            first += f"; the model does not fit by {_two(self.misfit_px)} px: {why}"
         # Rounded down: points are in the whole image only where no part is left.
         second = f"points are in {int(100 * self.covered)} % of the image"
         if self.uncovered:
@@ -171,7 +179,7 @@ class Assessment:
         }
 
 
-def assess(result: Result, camera: int = 0) -> Assessment:
+def assess(result: Result, camera: int = 0, *, compared: bool = False) -> Assessment:
     """Assess a calibration.
 
     Parameters
@@ -180,6 +188,8 @@ def assess(result: Result, camera: int = 0) -> Assessment:
         The adjustment.
     camera : int
         Row of the camera.
+    compared : bool
+        Whether its model is the best of several.
 
     Raises
     ------
@@ -221,7 +231,7 @@ def assess(result: Result, camera: int = 0) -> Assessment:
     images = int((result.fit.usable.images & (result.network.camera_of == camera)).sum())
     return Assessment(
         use, centre, corners, focal, fits, misfit, images, _tilted(result, camera), float(seen.mean()),
-        uncovered, then, important, tests,
+        uncovered, then, compared, important, tests,
     )  # fmt: skip
 
 

@@ -296,7 +296,7 @@ class Calibrated(Display):
         network = self.result.network
         one = {c for c, entry in enumerate(network.cameras) if entry.has_plane_mapping}
         return {
-            entry.id: assess(self.result, c)
+            entry.id: assess(self.result, c, compared=self.choice is not None)
             for c, entry in enumerate(network.cameras)
             if c in one and (entry.additional is None or entry.additional.per == "camera")
         }
