@@ -76,13 +76,10 @@ def main() -> int:
     assert isinstance(design, BoardDesign), "the design is not that of a board"
     print(f"{'photograph':32} found other  rms/px other")
     every = np.array([line(path, design) for path in given.photographs])
-    photographs, points = (every[:, :2] > 0).sum(axis=0), every[:, :2].sum(axis=0)
-    for who, *row in zip(
-        ("reseau", "other"), photographs, points, np.nanmedian(every[:, 2:], axis=0), strict=True
-    ):
-        print(
-            f"{who:8} {row[0]} of {len(every)} photographs, {row[1]:.0f} points, rms {row[2]:.3f} px (median)"
-        )
+    for who, found, rms in zip(("reseau", "other"), every[:, :2].T, every[:, 2:].T, strict=True):
+        known = rms[np.isfinite(rms)]
+        text = f", rms {np.median(known):.3f} px (median)" if len(known) else ""
+        print(f"{who:8} {(found > 0).sum()} of {len(every)} photographs, {found.sum():.0f} points{text}")
     return 0 if (every[:, 0] >= every[:, 1]).all() else 1
 
 
