@@ -654,3 +654,20 @@ def test_corners_beside_a_reflection_of_another_program_are_measured() -> None:
     assert found.ok.sum() >= 90
     sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
     assert np.abs((found.xy - truth) / sigma)[found.ok].max() < 4.5
+
+
+def test_corners_towards_a_margin_where_all_are_less_sharp_are_measured() -> None:
+    """As field curvature does: the blur grows from 0.4 to 1.7 px over the picture."""
+    frame, truth = picture(CHESS, 10.0, 5.0, blur=0.4)
+    levels = np.linspace(0, 1.65, 12)
+    blurred = [frame.pixels if s == 0 else cv2.GaussianBlur(frame.pixels, (0, 0), s) for s in levels]
+    column = np.interp(np.arange(frame.width), [0.35 * frame.width, frame.width], [0, len(levels) - 1])
+    low = np.minimum(column.astype(int), len(levels) - 2)
+    share = (column - low)[None]
+    here = [np.stack(blurred)[low + k, :, np.arange(frame.width)].T for k in (0, 1)]
+    pixels = (
+        (1 - share) * here[0] + share * here[1] + np.random.default_rng(3).normal(0, 1, frame.pixels.shape)
+    )
+    found = measured(replace(frame, pixels=pixels), CHESS)
+    assert found.ok.all()
+    assert np.sqrt((renamed(found, truth) ** 2).mean()) < 0.02

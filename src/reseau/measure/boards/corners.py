@@ -267,8 +267,9 @@ class CornerMarks(PlaneMarks):
         size = np.ceil(np.ptp(np.nan_to_num(corners), axis=1)) + 2 * margin + 2
         seen = np.isfinite(corners).all(axis=(1, 2)) & (np.abs(corners) < _FAR_PX).all(axis=(1, 2))
         # Far from the corners found a polynomial may have any size.
-        seen &= (low + size > 0).all(axis=1) & (low < (w, h)).all(axis=1) & (size < 2 * max(h, w)).all(axis=1)
-        classes, of = np.unique(np.ceil(size / _FIGURES_PX), axis=0, return_inverse=True)
+        most = 2 * max(h, w)
+        seen &= (low + size > 0).all(axis=1) & (low < (w, h)).all(axis=1) & (size < most).all(axis=1)
+        classes, of = np.unique(np.ceil(np.minimum(size, most) / _FIGURES_PX), axis=0, return_inverse=True)
         for k, (wide, high) in enumerate((classes * _FIGURES_PX).astype(np.intp)):
             part = np.flatnonzero((of.ravel() == k) & seen)
             if not len(part):

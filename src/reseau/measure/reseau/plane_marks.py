@@ -376,13 +376,22 @@ class PlaneMarks(MarkWindows):
         foreign = cv2.dilate(foreign, np.ones((2 * margin + 1,) * 2, np.uint8))
         self.hidden |= (foreign > 0) & seen
 
+    def _blurred(self, rows: Rows, found: Matches, known: Mask) -> Mask:
+        """Marks that are less sharp than those known, and than those of them that are next to each."""
+        width = np.hypot(found.psf_px, self.options.fill / np.sqrt(12))  # the pixel alone blurs a sharp image
+        if known.sum() <= _NEIGHBOURS:
+            ordinary = np.median(width[known]) if known.any() else np.hypot(self.look.psf_px, 12**-0.5)
+            return np.asarray(width > _BLURRED * ordinary)
+        # Towards the margin of a lens all are less sharp. A mark is the nearest to itself.
+        near = KDTree(self.at[rows[known]]).query(self.at[rows], k=_NEIGHBOURS + 1)[1]
+        beside = np.median(width[known][near], axis=1)
+        return np.asarray(width > _BLURRED * np.maximum(beside, np.median(width[known])))
+
     def _objections(self, rows: Rows, found: Matches) -> list[tuple[Mask, Reason]]:
         """Objections to marks from their own images, the most serious first."""
         o = self.options
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
         strong = found.converged & (found.t > 8)
-        ordinary = float(np.median(found.psf_px[strong])) if strong.any() else self.look.psf_px
-        pixel = o.fill / np.sqrt(12)  # which alone blurs a sharpened image
         return [
             (
                 found.seen < self.least_seen,
@@ -394,7 +403,7 @@ class PlaneMarks(MarkWindows):
                 Reason(f"no {self.word} is distinct from its surroundings", Code.LOW_CONTRAST),
             ),
             (
-                np.hypot(found.psf_px, pixel) > _BLURRED * np.hypot(ordinary, pixel),
+                self._blurred(rows, found, strong),
                 Reason(f"less sharp than the other {self.word}s", Code.BLURRED),
             ),
             *self._misshapen(found),
