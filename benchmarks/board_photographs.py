@@ -7,7 +7,9 @@ each of them in turn. It contains by what the board is not plane.
 
 The public photographs of ``docs/benchmarks.md``: the AprilGrids of EuRoC and TUM VI have 6 × 6 tags of 88 mm
 and a spacing of 0.3; the chessboard of ``udacity/CarND-Camera-Calibration`` has 9 × 7 squares, those of
-``sourishg/stereo-calibration`` and ``sourishg/fisheye-stereo-calibration`` have 10 × 7.
+``sourishg/stereo-calibration`` and ``sourishg/fisheye-stereo-calibration`` have 10 × 7, the screen of
+``henrikmidtiby/camera-calibration-with-large-chessboards`` 60 × 34; the ChArUco board of
+``DominikBabiarczyk/camera-calibration`` has 13 × 18 squares, markers of 15/20 of them, DICT_4X4_250.
 """
 
 from __future__ import annotations

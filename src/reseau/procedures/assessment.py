@@ -148,7 +148,8 @@ class Assessment:
             which = "enough for measurement; the next photograph" if enough else "the photograph"
             second += f"; {which} that would help most: {then.words} (then {_two(then.worst_px)} px at most)"
         elif not self.uncovered:
-            second += "; no further photograph is needed"
+            enough = self.use is Use.MEASUREMENT
+            second += "; no further photograph " + ("is needed" if enough else "alone lowers these errors")
         return first, second
 
     def entries(self) -> dict[str, Any]:
