@@ -42,6 +42,8 @@ _SPREADS = 4.0
 """The same in robust standard deviations of the residuals of all marks, where these differ more."""
 _FOREIGN, _SHADE, _SHIFT_PX = 4.0, 0.03, 0.25
 """Tolerances of the prediction of a mark by its neighbours: noise, share of the light, and shift."""
+_UNSURE = 1.5
+"""The shift in standard deviations of the prediction."""
 _NEIGHBOURS = 6
 """Number of neighbours whose light is taken."""
 _BULGED = 0.3
@@ -346,15 +348,19 @@ class PlaneMarks(MarkWindows):
     def _uncover(self, rows: Rows, found: Matches, uneasy: Mask, field: SmoothField) -> None:
         """Mask the pixels of windows that show neither paper nor ink, but something in front of them.
 
-        The images of marks are predicted from their neighbours. The tolerance contains what a shift of a
-        quarter of a pixel makes of them.
+        The images of marks are predicted from the others. The tolerance contains what a shift makes of them:
+        of a quarter of a pixel, and of the uncertainty of the prediction, which is larger towards a margin.
         """
         good = ~uneasy & ~self.dazzled[rows]
         near = KDTree(self.at[rows[good]]).query(self.at[rows], k=min(_NEIGHBOURS, int(good.sum())))[1]
         level, depth = (np.median(values[good][near], axis=1) for values in (found.level, self.depth(found)))
         noise = float(np.median(found.noise[good]))
         some = rows[uneasy]
-        xy = field(self._straight(some))
+        xy, shift = field(self._straight(some)), np.full(len(some), _SHIFT_PX)
+        if self.displaced:
+            xy = self.mapping(self.at[some])
+            off = [((mapping(self.at[some]) - xy) ** 2).sum(axis=1) for mapping in self.displaced]
+            shift = shift + _UNSURE * np.sqrt(np.sum(off, axis=0))
         self.start[some] = xy
         images, reach = self._images(some)
         foreign: NDArray[Any] = np.zeros(self.screened.grey.shape, dtype=np.uint8)
@@ -368,7 +374,8 @@ class PlaneMarks(MarkWindows):
             here, ink = (values[uneasy][part, None, None] for values in (level, depth))
             off = self.screened.grey[y, x] - here - ink * share
             tolerance = _FOREIGN * noise + _SHADE * np.abs(here)
-            tolerance = tolerance + _SHIFT_PX * np.abs(ink) * np.hypot(slopes[:, 0], slopes[:, 1])
+            steep = np.hypot(slopes[:, 0], slopes[:, 1])
+            tolerance = tolerance + shift[part, None, None] * np.abs(ink) * steep
             np.maximum.at(foreign, (y, x), np.abs(off) > tolerance)
             seen[y, x] = True
         foreign = cv2.morphologyEx(foreign, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
