@@ -218,6 +218,7 @@ def test_after_a_stop_between_two_queries_the_second_part_of_a_movement_does_not
     table, _ = tables()[which]
     with table:
         table.home("tilt")
+        table.configure(speed=90.0)
         table.move("tilt", 90.0)
         table.configure(speed=20.0)
         ask, asked = table.state, list[str]()
