@@ -35,10 +35,10 @@ WIDE = [
 ]
 
 
-def network_of(lens: lenses.Lens, seed: int = 4, gross: int = 0) -> Network:
+def network_of(lens: lenses.Lens, seed: int = 4, gross: int = 0, noise: float = 0.2) -> Network:
     """Fifteen views of a board that is held, with a rough focal length."""
     flat, true = lenses.board(8, 6, 1.0)
-    seen = lenses.views(lens, flat, true, 15, 0.2, seed)
+    seen = lenses.views(lens, flat, true, 15, noise, seed)
     rng = np.random.default_rng(seed)
     for _ in range(gross):
         view = seen[rng.integers(len(seen))][1]
@@ -46,7 +46,7 @@ def network_of(lens: lenses.Lens, seed: int = 4, gross: int = 0) -> Network:
     f = 1.05 * float(lens.matrix[0, 0])
     start = {"fx": f, "fy": f, "cx": (lens.width - 1) / 2, "cy": (lens.height - 1) / 2}
     free = [*FRAME, "k1", "k2", "p1", "p2"]
-    document = lenses.document(lens, flat, seen, start, free, 0.2, "opencv")
+    document = lenses.document(lens, flat, seen, start, free, noise, "opencv")
     return Network.from_document(Network1.from_content(json.loads(json.dumps(document)), where="test"))
 
 
@@ -102,6 +102,21 @@ def test_a_wide_lens_gets_a_projection_of_wide_lenses() -> None:
     assert found.chosen.candidate.label == "fisheye: k1 k2"
     standard = next(each for each in found.compared if each.candidate.label == "opencv: k1 k2 p1 p2")
     assert standard.length > 1000
+
+
+def test_parameters_that_the_photographs_do_not_determine_in_the_corners_are_left_out() -> None:
+    """Rings of 0.02 px in the middle of a wide lens, outside of which there are no points."""
+    network = network_of(lenses.fisheye(60), noise=0.01)
+    middle = np.array([network.cameras[0].width, network.cameras[0].height]) / 2
+    off = (network.xy - middle) / (0.35 * np.hypot(*middle))
+    radius = np.hypot(*off.T)
+    rings = 0.02 * off / radius[:, None] * np.sin(2.8 * np.pi * radius)[:, None]
+    two, four = (Candidate("fisheye", (*FRAME, *more)) for more in (("k1", "k2"), ("k1", "k2", "k3", "k4")))
+    found = choose_model(replace(network, xy=network.xy + rings).select(radius < 1), [two, four])
+    assert isinstance(found, ModelChoice)
+    assert found.chosen.candidate == two
+    assert found.alternatives[0].length < -100
+    assert found.alternatives[0].reason.startswith("its projection is not determined")
 
 
 @pytest.mark.slow

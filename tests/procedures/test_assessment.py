@@ -130,3 +130,29 @@ def test_a_target_seen_nearly_straight_is_to_be_tilted() -> None:
     assert then is not None
     assert "40° towards the camera" in then.words
     assert then.worst_px < 0.5 * found.corners_px
+
+
+def test_the_verdict_on_a_circular_image_does_not_speak_of_its_dark_corners() -> None:
+    size, f = (900, 560), 190.0
+    rng, images = np.random.default_rng(5), []
+    xyz = np.column_stack([DESIGN.xy * [1, -1], np.zeros(len(DESIGN.xy))])
+    matrix = np.array([[f, 0, 452.0], [0, f, 278.0], [0, 0, 1]])
+    for k in range(16):
+        # The target is at 45° from the axis in all directions, and before the camera.
+        away = np.deg2rad(45.0 if k % 2 else 5.0)
+        turn = cv2.Rodrigues(0.5 * np.array([np.cos(1.3 * k), np.sin(1.3 * k), 0.3 * k]))[0]
+        ray = np.array([np.sin(away) * np.cos(0.8 * k), np.sin(away) * np.sin(0.8 * k), np.cos(away)])
+        place = 150.0 * ray - turn @ xyz.mean(axis=0)
+        seen = xyz @ turn.T + place
+        xy = cv2.fisheye.projectPoints(seen[:, None], np.zeros(3), np.zeros(3), matrix, np.zeros(4))[0][:, 0]
+        good = (seen[:, 2] > 20) & ((xy > 5) & (xy < np.array(size) - 6)).all(axis=1)
+        names = [name for name, inside in zip(DESIGN.ids, good, strict=True) if inside]
+        xy = xy + SIGMA * rng.normal(size=xy.shape)
+        images.append((f"{k}.png", ImagePoints.with_sigma(names, xy[good], SIGMA)))
+    model = CameraOptions("fisheye", ("fx", "fy", "cx", "cy", "k1", "k2"))
+    done = calibrate_camera(images, DESIGN, lambda frame: None, size, model).required()  # type: ignore[arg-type, return-value]
+    found = done.assessments["camera"]
+    assert 80 < found.circular_deg < 90
+    assert f"up to {found.circular_deg:.0f}° from the axis" in found.lines[0]
+    assert "corner" not in found.lines[0]
+    assert found.use is not Use.NOTHING

@@ -31,12 +31,15 @@ __all__ = [
     "options_of",
     "places",
     "projection_field",
+    "reach",
     "referred",
     "worst",
 ]
 
 _KEYS = ("model", "width", "height", "pitch_mm", "additional", "shutter")
 """Keys of the model in a file; the others are options of the camera model."""
+_CIRCULAR_DEG = 75.0
+"""Angle of rays to the axis from which corners without rays are dark; below, the model has no image there."""
 
 
 def options_of(model: Mapping[str, Any]) -> dict[str, Any]:
@@ -203,6 +206,8 @@ class ProjectionField:
         Places, pixels.
     cov : ndarray (rows, columns, 2, 2)
         Covariances (px²) of the image of the ray that is imaged there; NaN where there is no ray.
+    reach_deg : float
+        Largest angle between rays of these places and the axis; 0 for parallel rays.
 
     Examples
     --------
@@ -213,6 +218,27 @@ class ProjectionField:
 
     xy: Array
     cov: Array
+    reach_deg: float = 0.0
+
+    @property
+    def circular(self) -> bool:
+        """Whether no corner of the image has a ray, as of a fisheye whose image is a circle."""
+        corners = self.sigma[[0, 0, -1, -1], [0, -1, 0, -1]]
+        return self.reach_deg > _CIRCULAR_DEG and not np.isfinite(corners).any()
+
+    @property
+    def worst_px(self) -> float:
+        """Standard deviation in the worst corner, or place of a circular image, px; infinite without rays.
+
+        Examples
+        --------
+        >>> field = ProjectionField(np.zeros((1, 1, 2)), np.array([[[[0.04, 0.0], [0.0, 0.01]]]]))
+        >>> field.worst_px
+        0.2
+        """
+        sigma = self.sigma if self.circular else self.sigma[[0, 0, -1, -1], [0, -1, 0, -1]]
+        known = sigma[np.isfinite(sigma)]
+        return float(known.max()) if len(known) else float("inf")
 
     @property
     def sigma(self) -> Array:
@@ -268,7 +294,14 @@ def projection_field(lens: CameraMapping, across: int = 25, down: int | None = N
     )
     cov = np.full((len(xy), 2, 2), np.nan)
     cov[known] = slope @ lens.covariance @ np.swapaxes(slope, 1, 2)
-    return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2))
+    return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2), reach(uv[known], lens))
+
+
+def reach(uv: Array, lens: CameraMapping) -> float:
+    """Largest angle between rays (n, 2) and the axis of a camera, degrees; 0 for parallel rays."""
+    if lens.mapping.parallel or not len(uv):
+        return 0.0
+    return float(np.degrees(np.arctan(np.hypot(*uv.T).max())))
 
 
 def places(lens: CameraMapping, across: int, down: int | None) -> tuple[Array, tuple[int, int]]:

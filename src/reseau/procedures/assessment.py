@@ -42,8 +42,9 @@ _FOR = {
 }
 _FITS = 0.02
 """Common residuals (px) below which a model fits for all practical purposes."""
-_CELLS, _EMPTY = 12, 0.5
-"""Cells of a zone along each axis are a third of these; a zone with fewer of them covered is not covered."""
+_CELLS, _EMPTY, _LIT = 12, 0.5, 0.3
+"""Cells of a zone along each axis are a third of these; a zone with fewer of them covered is not covered;
+share of a zone that a circular image has, from which it is to be covered."""
 _ZONES = (
     ("upper left corner", "upper edge", "upper right corner"),
     ("left edge", "middle", "right edge"),
@@ -68,7 +69,10 @@ class Assessment:
     use : Use
         What it is accurate enough for.
     centre_px, corners_px : float
-        Standard error of the projection in the middle, and in the worst of the corners.
+        Standard error of the projection in the middle, and in the worst of the corners; of a circular image,
+        in the worst place.
+    circular_deg : float
+        Angle from the axis up to which a circular image has rays; 0 where the image fills the frame.
     focal_px : float
         Pixels in a radian at the centre; NaN for parallel rays.
     fits : bool
@@ -101,6 +105,7 @@ class Assessment:
     use: Use
     centre_px: float
     corners_px: float
+    circular_deg: float
     focal_px: float
     fits: bool
     misfit_px: float
@@ -118,7 +123,10 @@ class Assessment:
         """The verdict in two lines."""
         first = f"{_FOR[self.use]}: "
         if np.isfinite(self.corners_px):
-            first += f"{_two(self.centre_px)} px at the centre, {_two(self.corners_px)} px in the corners"
+            first += f"{_two(self.centre_px)} px at the centre, {_two(self.corners_px)} px "
+            first += (
+                f"up to {self.circular_deg:.0f}° from the axis" if self.circular_deg else "in the corners"
+            )
             far = 1e3 * self.corners_px / self.focal_px
             first += f" ({_two(far)} mm at 1 m)" if np.isfinite(far) else ""
         else:
@@ -206,10 +214,17 @@ def assess(result: Result, camera: int = 0, *, compared: bool = False) -> Assess
     lens = camera_mapping(result, camera)
     used = result.fit.usable.observations & ~result.rejected
     rows = np.flatnonzero(used & (result.network.camera_of[result.network.image_of] == camera))
-    seen, covered = _covered(result.network.xy[rows], lens)
-    share = covered.reshape(3, _CELLS // 3, 3, _CELLS // 3).mean(axis=(1, 3))
+    field, factor = projection_field(lens, _ACROSS), _enlarged(result, camera)
+    rows_down, columns = field.sigma.shape
+    centre, corners = factor * field.sigma[rows_down // 2, columns // 2], factor * field.worst_px
+    circular = field.reach_deg if field.circular else 0.0
+    seen, covered, lit = _covered(result.network.xy[rows], lens, field.circular)
+    count, with_points = (
+        cells.reshape(3, _CELLS // 3, 3, _CELLS // 3).sum(axis=(1, 3)) for cells in (lit, covered & lit)
+    )
+    # A zone of which a circular image has little need not be covered.
+    share = np.where(count < _LIT * (_CELLS // 3) ** 2, 1.0, with_points / np.maximum(count, 1))
     uncovered = tuple(_ZONES[r][c] for r in range(3) for c in range(3) if share[r, c] < _EMPTY)
-    centre, corners = _sigmas(lens, _enlarged(result, camera))
     misfit, at_centre, at_corners, chance = _misfits(result, camera, lens)
     centre, corners = float(np.hypot(centre, at_centre)), float(np.hypot(corners, at_corners))
     fits = misfit <= _FITS or chance > 0.01
@@ -230,8 +245,9 @@ def assess(result: Result, camera: int = 0, *, compared: bool = False) -> Assess
     slope = lens.mapping.derivatives(np.zeros((1, 2))).d_xy[0]
     focal = float("nan") if lens.mapping.parallel else float(np.sqrt(abs(np.linalg.det(slope))))
     images = int((result.fit.usable.images & (result.network.camera_of == camera)).sum())
+    tilt = _tilted(result, camera)
     return Assessment(
-        use, centre, corners, focal, fits, misfit, images, _tilted(result, camera), float(seen.mean()),
+        use, centre, corners, circular, focal, fits, misfit, images, tilt, float(seen[lit].mean()),
         uncovered, then, compared, important, tests,
     )  # fmt: skip
 
@@ -278,31 +294,24 @@ def sorted_remarks(
     return tuple(remark for remark in rest if remark.code is not Code.COVERAGE), tests
 
 
-def _covered(xy: Array, lens: CameraMapping) -> tuple[Mask, Mask]:
-    """Cells of the image that have points, and those that have points or a neighbour that has."""
+def _covered(xy: Array, lens: CameraMapping, circular: bool) -> tuple[Mask, Mask, Mask]:
+    """Cells of the image that have points; that have points or a neighbour that has; that have an image."""
     cell = np.clip((xy / np.array(lens.size) * _CELLS).astype(int), 0, _CELLS - 1)
     seen = np.zeros((_CELLS + 2, _CELLS + 2), dtype=np.bool_)
     seen[1 + cell[:, 1], 1 + cell[:, 0]] = True
     shifts = [(i, k) for i in range(3) for k in range(3) if 1 in (i, k)]
     near = [seen[i : i + _CELLS, k : k + _CELLS] for i, k in shifts]
-    return seen[1:-1, 1:-1], np.asarray(np.any(near, axis=0), dtype=np.bool_)
+    lit = np.ones((_CELLS, _CELLS), dtype=np.bool_)
+    if circular:
+        middles = (np.indices((_CELLS, _CELLS))[::-1].reshape(2, -1).T + 0.5) / _CELLS * lens.size
+        lit[:] = np.isfinite(lens.mapping.inverse(middles)).all(axis=1).reshape(lit.shape)
+    return seen[1:-1, 1:-1], np.asarray(np.any(near, axis=0), dtype=np.bool_), lit
 
 
 def _enlarged(result: Result, camera: int) -> float:
     """Factor by which the images scatter more than their standard deviations say; at least 1."""
     found = image_scatter(result, camera)
     return max(1.0, found) if np.isfinite(found) else 1.0
-
-
-def _sigmas(lens: CameraMapping, factor: float) -> tuple[float, float]:
-    """Standard deviations at the centre and in the worst corner; infinite where there is no ray."""
-    sigma = projection_field(lens, _ACROSS).sigma
-    rows, columns = sigma.shape
-    corners = sigma[[0, 0, -1, -1], [0, -1, 0, -1]]
-    if not np.isfinite(corners).any():
-        return float(factor * sigma[rows // 2, columns // 2]), float("inf")
-    # Corners that a circular image does not reach have no rays, and none are needed.
-    return float(factor * sigma[rows // 2, columns // 2]), float(factor * np.nanmax(corners))
 
 
 def _misfits(result: Result, camera: int, lens: CameraMapping) -> tuple[float, float, float, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...calibration.camera import CameraMapping, ProjectionField, by_rotation, places
+from ...calibration.camera import CameraMapping, ProjectionField, by_rotation, places, reach
 from ...core.data import Array, Rows
 from ...core.errors import UsageError
 from .checks import listed
@@ -145,7 +145,7 @@ def projection_field_at(
     )
     cov = np.full((len(xy), 2, 2), np.nan)
     cov[known] = slope @ covariance @ np.swapaxes(slope, 1, 2)
-    return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2))
+    return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2), reach(uv[known], camera))
 
 
 def _with_mean_pose(result: Result, c: int, columns: Rows) -> Array:

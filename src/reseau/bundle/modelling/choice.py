@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -39,10 +40,16 @@ __all__ = ["Candidate", "Compared", "ModelChoice", "camera_candidates", "choose_
 _EQUAL, _HOPELESS = 2.0, 30.0
 # Candidates that are cross-validated at most, and level of the test of their differences.
 _VALIDATED, _LEVEL = 6, 0.01
+# Places along the longer side at which the projection is looked at.
+_ACROSS = 9
 # Iterations of a candidate, which begins close to its solution, and decrease that makes a better start.
 _STEPS, _BETTER = 60, 0.02
 # Least number of images for which images can be left out, and of points by which one is predicted.
 _LEAST_IMAGES, _LEAST_POINTS = 4, 5
+# Standard deviation of a projection that is determined, and residuals that practically do not differ, pixels.
+_DETERMINED_PX, _PRACTICAL_PX = 2.0, 0.02
+# Ratio of standard deviations of two projections from which the larger is not determined.
+_TIMES = 10.0
 # Size of the reciprocal of a focal length, in standard deviations, above which there is perspective.
 _SIGNIFICANT = 2.6
 
@@ -311,7 +318,9 @@ def choose_model(
     Notes
     -----
     Chosen is the candidate with the fewest parameters of those whose description length is within 2 of the
-    least, and which predict images not significantly worse than another. Residuals alone never decide.
+    least, and which predict images not significantly worse than another. Residuals alone never decide. A
+    candidate whose projection has a standard deviation of more than 2 px in a corner of the image is left out
+    where another one, with residuals larger by less than 0.02 px, is determined ten times as well.
 
     Examples
     --------
@@ -575,9 +584,10 @@ def _chosen(
         count = 2 * int(fit.usable.observations.sum())
         number[k] = _determined(fit)
         length[k] = count * np.log(fit.cost / count) + number[k] * np.log(count)
-    length -= length.min()
     order = sorted(range(len(fits)), key=lambda k: (length[k], k))
-    close = [k for k in order if length[k] < _HOPELESS][:_VALIDATED]
+    vague = _undetermined({k: fit for k in order if isinstance(fit := fits[k], BundleFit)})
+    length -= min(length[k] for k in good if k not in vague)
+    close = [k for k in order if k not in vague and length[k] < _HOPELESS][:_VALIDATED]
     squares = _predicted([fits[k] for k in close], folds, seed, executor) if len(close) > 1 else None
     worse = _worse(squares)
     equal = [k for row, k in enumerate(close) if length[k] <= _EQUAL and row not in worse] or close[:1]
@@ -597,11 +607,37 @@ def _chosen(
             candidates[k], "", other.sigma0, other.cost, float(length[k]), predicted,
             _test(candidates[k], other, candidates[best], fit), **_difference(fit, other),
         )  # fmt: skip
-        found.append(replace(one, reason=_reason(one, k == best, row in worse, candidates[best], len(equal))))
+        reason = _reason(one, k == best, row in worse, candidates[best], len(equal))
+        if k in vague:
+            reason = f"its projection is not determined ({vague[k]:.2g} px in a corner), that of others is"
+        found.append(replace(one, reason=reason))
     camera = fit.problem.network.cameras[0]
     observed = np.array([name in camera.sigma for name in camera.names])
     camera = replace(camera, values=np.where(observed, camera.values, fit.values.cameras[0, : len(observed)]))
     return ModelChoice(replace(camera, id=network.cameras[0].id), tuple(found))
+
+
+def _undetermined(fits: Mapping[int, BundleFit]) -> dict[int, float]:
+    """Candidates that describe the images best, but are not determined beyond them, where others are.
+
+    The residuals of these others, which are determined ten times as well, are in practice the same. Returned
+    are standard deviations in the worst corner of candidates, which come by description length.
+    """
+    least = min(map(_rms, fits.values()))
+    alike = {k: fit for k, fit in fits.items() if _rms(fit) ** 2 - least**2 < _PRACTICAL_PX**2}
+    worst = dict[int, float]()
+    for k, fit in alike.items():
+        worst[k] = projection_field(_mapping(fit), _ACROSS).worst_px
+        if len(worst) == 1 and worst[k] <= _DETERMINED_PX:
+            return {}
+    limit = max(_DETERMINED_PX, _TIMES * min(worst.values()))
+    return dict(takewhile(lambda each: each[1] > limit, worst.items()))
+
+
+def _rms(fit: BundleFit) -> float:
+    """Root mean square of the residuals of the image points used, pixels."""
+    v = fit.residuals[: 2 * len(fit.problem.network.xy)].reshape(-1, 2)[fit.usable.observations]
+    return float(np.sqrt(np.nanmean(v**2)))
 
 
 def _determined(fit: BundleFit) -> float:
