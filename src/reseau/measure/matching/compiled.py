@@ -18,7 +18,20 @@ from numpy.typing import NDArray
 
 from ...optics.compiled import formed
 
-__all__ = ["ACTIVE", "DONE", "FAILED", "STALE", "adjusted", "advanced", "compared", "cut", "linearised"]
+__all__ = [
+    "ACTIVE",
+    "DONE",
+    "FAILED",
+    "STALE",
+    "adjusted",
+    "advanced",
+    "compared",
+    "cut",
+    "influenced",
+    "linearised",
+    "weighed",
+    "windows",
+]
 
 F = TypeVar("F", bound=Callable[..., Any])
 Floats = NDArray[Any]
@@ -66,15 +79,62 @@ def cut(
 
 
 @_compiled
+def windows(pixels: Floats, centre: Floats, half: tuple[int, int]) -> Floats:
+    """Values (k, r, c) of windows around pixels `centre` (k, 2); beyond the frame those of its border."""
+    (h, w), (right, down) = pixels.shape, half
+    found = np.empty((len(centre), 2 * down + 1, 2 * right + 1), pixels.dtype)
+    for k in range(len(centre)):
+        left, top = centre[k, 0] - right, centre[k, 1] - down
+        for i in range(found.shape[1]):
+            row = pixels[min(max(top + i, 0), h - 1)]
+            for j in range(found.shape[2]):
+                found[k, i, j] = row[min(max(left + j, 0), w - 1)]
+    return found
+
+
+@_compiled
+def weighed(
+    x: Floats,
+    share: Floats,
+    window: tuple[Floats, Floats, int],
+    dark: bool,
+    variance: tuple[float, float],
+    least: float,
+) -> Floats:
+    """Relative weights (k, n) of grey values as formed at `x` (k, u); see `noise.relative_weights`."""
+    n = share.shape[1]
+    plane, contrast, grey, found = np.empty(n), np.empty(n), np.empty(n), np.empty(share.shape)
+    for k in range(len(x)):
+        _formed(x[k], share[k], window[0], window[1], dark, plane, contrast, grey)
+        total = 0.0
+        for i in range(n):
+            grey[i] = variance[0] + variance[1] * grey[i]
+            total += grey[i]
+        inverse = 1.0 / max(total / n, 1e-12)
+        for i in range(n):
+            found[k, i] = 1.0 / max(grey[i] * inverse, least)
+    return found
+
+
+@_compiled
 def compared(
-    grey: Floats, plane: Floats, share: Floats, weights: Floats, used: Floats, near: Floats, dark: bool
+    grey: Floats,
+    x: Floats,
+    monomials: Floats,
+    share: Floats,
+    weights: Floats,
+    used: Floats,
+    near: Floats,
+    dark: bool,
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Windows compared with what was formed in them.
 
     Parameters
     ----------
-    grey, plane, share : ndarray (k, n)
-        Grey values, background, and share of the pixels covered by the mark.
+    grey, share : ndarray (k, n)
+        Grey values, and share of the pixels covered by the mark.
+    x, monomials : ndarray (k, u), (b, n)
+        Estimates, and monomials of the background.
     weights : ndarray (k, n)
         Ones where a pixel may be used.
     used, near : ndarray of bool (k, n)
@@ -87,8 +147,10 @@ def compared(
         used, and on those of them that were not.
     """
     count, seen, rejected = np.zeros(len(grey)), np.zeros(len(grey)), np.zeros(len(grey))
-    correlation = np.zeros(len(grey))
+    correlation, plane = np.zeros(len(grey)), np.empty(grey.shape[1])
     for k in range(len(grey)):
+        plane[:] = 0.0
+        _add_weighted(x[k], _LEVEL, monomials, plane)
         whole, a, b = 0.0, 0.0, 0.0
         for i in range(grey.shape[1]):
             covered = share[k, i]
@@ -97,17 +159,34 @@ def compared(
             rejected[k] += covered * (weights[k, i] - used[k, i])
             if used[k, i]:
                 count[k] += 1
-                a += grey[k, i] - plane[k, i]
-                b += -plane[k, i] * covered if dark else covered
+                a += grey[k, i] - plane[i]
+                b += -plane[i] * covered if dark else covered
         seen[k], rejected[k] = seen[k] / max(whole, 1e-12), rejected[k] / max(whole, 1e-12)
         a, b, ab, aa, bb = a / count[k], b / count[k], 0.0, 0.0, 0.0
         for i in range(grey.shape[1]):
             if used[k, i]:
-                u = grey[k, i] - plane[k, i] - a
-                v = (-plane[k, i] * share[k, i] if dark else np.float64(share[k, i])) - b
+                u = grey[k, i] - plane[i] - a
+                v = (-plane[i] * share[k, i] if dark else np.float64(share[k, i])) - b
                 ab, aa, bb = ab + u * v, aa + u * u, bb + v * v
         correlation[k] = ab / math.sqrt(aa * bb)
     return correlation, count, seen, rejected
+
+
+@_compiled
+def _add_weighted(factors: Floats, begin: int, rows: Floats, out: Floats) -> None:
+    """Add `rows` (m, n), times factors from `begin` on, to `out` (n,): three at a time, each of them once."""
+    m, n = 0, len(out)
+    while m + 3 <= len(rows):
+        a, b, c = factors[begin + m], factors[begin + m + 1], factors[begin + m + 2]
+        one, two, three = rows[m], rows[m + 1], rows[m + 2]
+        for i in range(n):
+            out[i] += a * one[i] + b * two[i] + c * three[i]
+        m += 3
+    while m < len(rows):
+        a, one = factors[begin + m], rows[m]
+        for i in range(n):
+            out[i] += a * one[i]
+        m += 1
 
 
 @_compiled
@@ -124,14 +203,8 @@ def _formed(
     """Background, contrast and grey values (n,) of a window of which `share` (n,) is covered."""
     n, ground = len(share), len(monomials)
     plane[:], contrast[:] = 0.0, x[_CONTRAST]
-    for m in range(ground):
-        factor, row = x[_LEVEL + m], monomials[m]
-        for i in range(n):
-            plane[i] += factor * row[i]
-    for m in range(len(across)):
-        factor, row = x[_LEVEL + ground + m], across[m]
-        for i in range(n):
-            contrast[i] += factor * row[i]
+    _add_weighted(x, _LEVEL, monomials, plane)
+    _add_weighted(x, _LEVEL + ground, across, contrast)
     if dark:
         for i in range(n):
             grey[i] = plane[i] * (1.0 - contrast[i] * share[i])
@@ -281,6 +354,125 @@ def _next(
 
 
 @_compiled
+def _roots(weights: Floats, root: Floats) -> int:
+    """Fill square roots of the weights (n,); the number of pixels used."""
+    used = 0
+    for i in range(len(root)):
+        root[i] = math.sqrt(weights[i])
+        used += weights[i] > 0
+    return used
+
+
+@_compiled
+def _factors(
+    plane: Floats,
+    contrast: Floats,
+    share: Floats,
+    root: Floats,
+    dark: bool,
+    by_share: Floats,
+    by_contrast: Floats,
+    rest: Floats,
+) -> None:
+    """Derivatives (n,) of grey values by share, contrast and background, times the roots of their weights."""
+    n = len(share)
+    if dark:
+        for i in range(n):
+            by_share[i] = -plane[i] * contrast[i] * root[i]
+        for i in range(n):
+            by_contrast[i] = -plane[i] * share[i] * root[i]
+        for i in range(n):
+            rest[i] = (1.0 - contrast[i] * share[i]) * root[i]
+    else:
+        for i in range(n):
+            by_share[i] = contrast[i] * root[i]
+        _multiply(share, root, by_contrast)
+        rest[:] = root
+
+
+@_compiled
+def _widening(log_width: float, psf: float) -> float:
+    """Derivative of the width of the point-spread function by its logarithm above the lower bound."""
+    wide = math.exp(log_width)
+    return wide * wide / math.hypot(psf, wide)
+
+
+@_compiled
+def _fill_jacobian(
+    slopes: Floats,
+    factors: Floats,
+    window: tuple[Floats, Floats, int],
+    widening: float,
+    jacobian: Floats,
+) -> None:
+    """Fill derivatives (u, n) of grey values times the roots of their weights; `factors` (3, n)."""
+    monomials, across, _ = window
+    by_share, by_contrast, rest = factors[0], factors[1], factors[2]
+    ground, u = len(monomials), len(jacobian)
+    _multiply(by_share, slopes[0], jacobian[0])
+    _multiply(by_share, slopes[1], jacobian[1])
+    _multiply(by_share, slopes[2], jacobian[_WIDTH])
+    jacobian[_WIDTH] *= f32(widening)
+    jacobian[_CONTRAST] = by_contrast
+    for m in range(ground):
+        _multiply(rest, monomials[m], jacobian[_LEVEL + m])
+    at = _LEVEL + ground
+    for m in range(len(across)):
+        _multiply(by_contrast, across[m], jacobian[at + m])
+    at += len(across)
+    for m in range(u - at):
+        _multiply(by_share, slopes[3 + m], jacobian[at + m])
+
+
+@_compiled
+def _fill_gradient(
+    slopes: Floats,
+    factors: Floats,
+    window: tuple[Floats, Floats, int],
+    widening: float,
+    off: Floats,
+    part: Floats,
+    gradient: Floats,
+) -> None:
+    """Fill the negative product (u,) of the derivatives and weighted residuals `off` (n,).
+
+    The derivatives themselves would take a cache; `part` (n,) is memory of their kind.
+    """
+    monomials, across, _ = window
+    ground, forms, n = len(monomials), len(slopes) - 3, len(off)
+    _multiply(factors[0], off, part)
+    for m in range(len(slopes)):
+        at = m if m <= _WIDTH else len(gradient) - forms + m - 3
+        gradient[at] = -_product(slopes[m], part, 0, n)
+    gradient[_WIDTH] *= widening
+    _multiply(factors[1], off, part)
+    total = 0.0
+    for i in range(n):
+        total += part[i]
+    gradient[_CONTRAST] = -total
+    for m in range(len(across)):
+        gradient[_LEVEL + ground + m] = -_product(across[m], part, 0, n)
+    _multiply(factors[2], off, part)
+    for m in range(ground):
+        gradient[_LEVEL + m] = -_product(monomials[m], part, 0, n)
+
+
+@_compiled
+def _fill_influence(
+    jacobian: Floats, cofactor: Floats, root: Floats, gains: Floats, on_position: Floats, leverage: Floats
+) -> None:
+    """Fill influences (2, n) and leverages (n,) of a window; see :func:`linearised`."""
+    np.dot(cofactor.astype(f32), jacobian, gains)
+    _multiply(gains[0], root, on_position[0])
+    _multiply(gains[1], root, on_position[1])
+    leverage[:] = f32(0)
+    for m in range(len(jacobian)):
+        row, gain = jacobian[m], gains[m]
+        for i in range(len(leverage)):
+            leverage[i] += gain[i] * row[i]
+
+
+@_compiled
 def linearised(
     rows: Floats,
     share: Floats,
@@ -294,7 +486,7 @@ def linearised(
     prior: Floats,
     share_of_sigma: float,
     x: Floats,
-    work: tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats],
+    work: tuple[Floats, Floats, Floats, Floats, Floats, Floats],
     trial: Floats,
     iteration: Floats,
     state: Floats,
@@ -322,79 +514,54 @@ def linearised(
     x : ndarray (k, u)
         Approximate values, replaced by the estimates where the state becomes DONE.
     work : tuple
-        Filled: residuals (k, n), Jacobians times weights (k, u, n) float32, normal equations (k, u, u),
-        gradients (k, u), cofactors (k, u, u), slope and weighted slope (k, n) of the common errors of rows,
-        float32, (0, n) if rows have none.
+        Filled: residuals (k, n), normal equations (k, u, u), gradients (k, u), cofactors (k, u, u), slope and
+        weighted slope (k, n) of the common errors of rows, float32, both times the roots of the weights,
+        (0, n) if rows have none.
     trial, iteration, state : ndarray (k, u), (k, 6), (k,)
         Filled: next values to evaluate; columns of the iteration, of which the damping and its factor are
         given; ACTIVE, DONE or FAILED.
     influence : tuple
-        Filled: influence of each pixel on the position (k, 2, n) and its leverage (k, n), float32; (0, …) if
-        they are not wanted. With derivatives A, weights W and cofactor Q they are the first rows of Q Aᵀ W,
-        and the diagonal of A Q Aᵀ W.
+        Filled where the state becomes DONE: influence of each pixel on the position (k, 2, n) and its
+        leverage (k, n), float32; (0, …) if they are not wanted. With derivatives A, weights W and cofactor Q
+        they are the first rows of Q Aᵀ W, and the diagonal of A Q Aᵀ W.
     """
     monomials, across, columns = window
     dark, variance, jitter = light
-    residuals, kept, normals, gradients, cofactors, slope, weighted = work
+    residuals, normals, gradients, cofactors, slope, weighted = work
     on_position, leverage = influence
-    n, u, ground, forms = observed.shape[1], x.shape[1], len(monomials), slopes.shape[1] - 3
+    n, u, forms = observed.shape[1], x.shape[1], slopes.shape[1] - 3
     plane, contrast, grey = np.empty(n), np.empty(n), np.empty(n)
-    by_share, rest, jacobian = np.empty(n, f32), np.empty(n, f32), np.empty((u, n), f32)
+    root, part, factors = np.empty(n, f32), np.empty(n, f32), np.empty((3, n), f32)
+    jacobian, gains = np.empty((u, n), f32), np.empty((u, n if len(leverage) else 0), f32)
     scale, lower, left = np.empty(u), np.empty((u, u)), np.empty(n, f32)
     for j in range(len(rows)):
         k = rows[j]
-        w, covered = weights[k], share[j]
+        covered, seen = share[j], observed[k]
         _formed(x[k], covered, monomials, across, dark, plane, contrast, grey)
-        if dark:
-            for i in range(n):
-                by_share[i], rest[i] = -plane[i] * contrast[i], 1.0 - contrast[i] * covered[i]
-            for i in range(n):
-                jacobian[_CONTRAST, i] = -plane[i] * covered[i]
-        else:
-            by_share[:], rest[:] = contrast, f32(1)
-            jacobian[_CONTRAST] = covered
-        wide = math.exp(x[k, _WIDTH])
-        _multiply(by_share, slopes[j, 0], jacobian[0])
-        _multiply(by_share, slopes[j, 1], jacobian[1])
-        _multiply(by_share, slopes[j, 2], jacobian[_WIDTH])
-        jacobian[_WIDTH] *= f32(wide * wide / math.hypot(psf[k], wide))
-        for m in range(ground):
-            _multiply(rest, monomials[m], jacobian[_LEVEL + m])
-        at = _LEVEL + ground
-        for m in range(len(across)):
-            _multiply(jacobian[_CONTRAST], across[m], jacobian[at + m])
-        at += len(across)
-        for m in range(u - at):
-            _multiply(by_share, slopes[j, 3 + m], jacobian[at + m])
-        used = 0
-        for i in range(n):
-            used += w[i] > 0
+        used, widening = _roots(weights[k], root), _widening(x[k, _WIDTH], psf[k])
+        _factors(plane, contrast, covered, root, dark, factors[0], factors[1], factors[2])
+        _fill_jacobian(slopes[j], factors, window, widening, jacobian)
         for i in range(n):
             # Pixels that are not used may carry any value.
-            residuals[k, i] = grey[i] - observed[k, i] if w[i] > 0 else 0.0
+            residuals[k, i] = grey[i] - seen[i] if root[i] > 0 else 0.0
+        _multiply(residuals[k], root, left)
         if len(slope):
             along, heavy = slope[k], weighted[k]
-            for i in range(n):
-                along[i] = jacobian[0, i] if w[i] > 0 else f32(0)
-            for i in range(n):
-                heavy[i] = along[i] * w[i] * variance
+            along[:] = jacobian[0]
             for first in range(0, n, columns):
-                length2 = _product(along, heavy, first, first + columns)
-                factor = f32((1.0 - 1.0 / math.sqrt(1.0 + jitter * length2)) / max(length2, 1e-30))
+                length2 = variance * _product(along, along, first, first + columns)
+                factor = f32(variance * (1.0 - 1.0 / math.sqrt(1.0 + jitter * length2)) / max(length2, 1e-30))
                 for i in range(first, first + columns):
-                    heavy[i] *= factor
-            _without_common(residuals[k], along, heavy, columns, contrast)
+                    heavy[i] = along[i] * factor
+            _without_common(left, along, heavy, columns, part)
             for m in range(u):
-                _without_common(jacobian[m], along, heavy, columns, by_share)
-        _multiply(w, residuals[k], left)
-        cost = _product(left, residuals[k], 0, n)
+                _without_common(jacobian[m], along, heavy, columns, part)
+            _unweighted(left, root, residuals[k])
+        cost = _product(left, left, 0, n)
         for m in range(u):
             cost += prior[m] * (mean[k, m] - x[k, m]) ** 2
-        for m in range(u):
-            _multiply(jacobian[m], w, kept[k, m])
-        left[:] = residuals[k]
-        normals[k] = np.dot(kept[k], jacobian.T)
-        gradients[k] = -np.dot(kept[k], left)
+        normals[k] = np.dot(jacobian, jacobian.T)
+        gradients[k] = -np.dot(jacobian, left)
         for m in range(u):
             normals[k, m, m] += prior[m]
             gradients[k, m] += prior[m] * (mean[k, m] - x[k, m])
@@ -409,18 +576,11 @@ def linearised(
             _solve(lower, cofactors[k, m])
             for i in range(u):
                 cofactors[k, m, i] *= scale[i] * scale[m]
-        if len(leverage):
-            gains = np.dot(cofactors[k].astype(f32), kept[k])
-            on_position[k] = gains[:2]
-            leverage[k] = f32(0)
-            for m in range(u):
-                row, gain = jacobian[m], gains[m]
-                for i in range(n):
-                    leverage[k, i] += gain[i] * row[i]
         limit = share_of_sigma**2 * cost / max(freedom, 1)
         state[k] = ACTIVE
         _next(k, normals[k], gradients[k], limit, x, trial, iteration, state)
         # What the first correction leaves is smaller than itself by half the relative change of the mark.
+        wide = math.exp(x[k, _WIDTH])
         total = math.hypot(psf[k], wide)
         change = max(abs(trial[k, 0] - x[k, 0]), abs(trial[k, 1] - x[k, 1])) / total
         change = max(change, abs(trial[k, _WIDTH] - x[k, _WIDTH]) * (wide / total) ** 2)
@@ -429,8 +589,56 @@ def linearised(
             change = max(change, abs(trial[k, m] - x[k, m]))
         left_over = iteration[k, _PREDICTED]
         if state[k] == ACTIVE and left_over * (change / 4) ** 2 <= limit * (1 - left_over / cost):
-            _extrapolated(x[k], trial[k], jacobian, slopes[j], wide * wide / total, covered, residuals[k])
+            _extrapolated(x[k], trial[k], jacobian, slopes[j], widening, covered, root, left, residuals[k])
             iteration[k, _COST], state[k] = cost - left_over, DONE
+        if len(leverage) and state[k] == DONE:
+            _fill_influence(jacobian, cofactors[k], root, gains, on_position[k], leverage[k])
+
+
+@_compiled
+def _unweighted(off: Floats, root: Floats, residuals: Floats) -> None:
+    """Fill residuals (n,) from weighted ones; 0 where a pixel is not used."""
+    for i in range(len(off)):
+        residuals[i] = off[i] / root[i] if root[i] > 0 else 0.0
+
+
+@_compiled
+def influenced(
+    rows: Floats,
+    places: Floats,
+    first: tuple[Floats, Floats, Floats],
+    weights: Floats,
+    window: tuple[Floats, Floats, int],
+    dark: bool,
+    psf: Floats,
+    cofactors: Floats,
+    influence: tuple[Floats, Floats],
+) -> None:
+    """Fill influences of windows `rows` (m,) that have converged after they were linearised.
+
+    Parameters
+    ----------
+    places : ndarray (m,)
+        Their rows of `first`.
+    first : tuple
+        Values (r, u), images (r, n) and derivatives (r, 3 + p, n) at which they were linearised last.
+    weights, window, dark, psf, cofactors, influence
+        As in :func:`linearised`.
+    """
+    at, share, slopes = first
+    monomials, across, _ = window
+    on_position, leverage = influence
+    n, u = weights.shape[1], at.shape[1]
+    plane, contrast, grey = np.empty(n), np.empty(n), np.empty(n)
+    root, factors = np.empty(n, f32), np.empty((3, n), f32)
+    jacobian, gains = np.empty((u, n), f32), np.empty((u, n), f32)
+    for j in range(len(rows)):
+        k, p = rows[j], places[j]
+        _formed(at[p], share[p], monomials, across, dark, plane, contrast, grey)
+        _roots(weights[k], root)
+        _factors(plane, contrast, share[p], root, dark, factors[0], factors[1], factors[2])
+        _fill_jacobian(slopes[p], factors, window, _widening(at[p, _WIDTH], psf[k]), jacobian)
+        _fill_influence(jacobian, cofactors[k], root, gains, on_position[k], leverage[k])
 
 
 @_compiled
@@ -441,67 +649,80 @@ def _extrapolated(
     slopes: Floats,
     widened: float,
     share: Floats,
+    root: Floats,
+    off: Floats,
     residuals: Floats,
 ) -> None:
-    """Change `x` to `trial`, and share and residuals (n,) of a window by their derivatives."""
-    n, u = len(share), len(x)
+    """Change `x` to `trial`, and share and residuals (n,) of a window by their derivatives.
+
+    `off` (n,) are residuals times the roots of the weights.
+    """
+    u, forms = len(x), len(slopes) - 3
+    steps = np.empty(u + len(slopes), f32)
     for m in range(u):
-        factor, row = f32(trial[m] - x[m]), jacobian[m]
-        for i in range(n):
-            residuals[i] += factor * row[i]
+        steps[m] = trial[m] - x[m]
     for m in range(len(slopes)):
-        at = m if m <= _WIDTH else u - len(slopes) + m
-        factor, row = f32((trial[at] - x[at]) * (widened if m == _WIDTH else 1.0)), slopes[m]
-        for i in range(n):
-            share[i] += factor * row[i]
+        steps[u + m] = steps[m if m <= _WIDTH else u - forms + m - 3] * f32(widened if m == _WIDTH else 1.0)
+    _add_weighted(steps, 0, jacobian, off)
+    _unweighted(off, root, residuals)
+    _add_weighted(steps, u, slopes, share)
     x[:] = trial
 
 
 @_compiled
 def advanced(
     rows: Floats,
+    places: Floats,
+    first: tuple[Floats, Floats, Floats],
     share: Floats,
     observed: Floats,
     weights: Floats,
     window: tuple[Floats, Floats, int],
     dark: bool,
+    psf: Floats,
     mean: Floats,
     prior: Floats,
     share_of_sigma: float,
     x: Floats,
-    work: tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats],
+    work: tuple[Floats, Floats, Floats, Floats, Floats, Floats],
     trial: Floats,
     iteration: Floats,
     state: Floats,
 ) -> None:
     """Accept or refuse the trials of windows `rows` (m,), in which `share` (m, n) was formed; place the next.
 
-    Parameters as in :func:`linearised`.
+    Parameters as in :func:`linearised`, and `places`, `first` as in :func:`influenced`.
     """
     monomials, across, columns = window
-    residuals, kept, normals, gradients, _, slope, weighted = work
+    residuals, normals, gradients, _, slope, weighted = work
+    at, begun, slopes = first
     n, u = observed.shape[1], x.shape[1]
     plane, contrast, grey, left = np.empty(n), np.empty(n), np.empty(n), np.empty(n, f32)
+    root, part, factors = np.empty(n, f32), np.empty(n, f32), np.empty((3, n), f32)
     for j in range(len(rows)):
-        k = rows[j]
+        k, p, seen = rows[j], places[j], observed[rows[j]]
         _formed(trial[k], share[j], monomials, across, dark, plane, contrast, grey)
-        used = 0
+        used = _roots(weights[k], root)
         for i in range(n):
-            used += weights[k, i] > 0
-        for i in range(n):
-            grey[i] = grey[i] - observed[k, i] if weights[k, i] > 0 else 0.0
+            grey[i] = grey[i] - seen[i] if root[i] > 0 else 0.0
+        _multiply(grey, root, left)
         if len(slope):
-            _without_common(grey, slope[k], weighted[k], columns, contrast)
-        _multiply(weights[k], grey, left)
-        cost = _product(left, grey, 0, n)
-        left[:] = grey
+            _without_common(left, slope[k], weighted[k], columns, part)
+            _unweighted(left, root, grey)
+        cost = _product(left, left, 0, n)
         for m in range(u):
             cost += prior[m] * (trial[k, m] - mean[k, m]) ** 2
         gain = (iteration[k, _COST] - cost) / max(iteration[k, _PREDICTED], _TINY)
         limit = share_of_sigma**2 * cost / max(used + np.count_nonzero(prior) - u, 1)
         if gain > _SERVES:
             x[k], residuals[k] = trial[k], grey
-            gradients[k] = -np.dot(kept[k], left)
+            if len(slope):
+                # The transposed of what made the derivatives independent.
+                _without_common(left, weighted[k], slope[k], columns, part)
+            _formed(at[p], begun[p], monomials, across, dark, plane, contrast, grey)
+            _factors(plane, contrast, begun[p], root, dark, factors[0], factors[1], factors[2])
+            widening = _widening(at[p, _WIDTH], psf[k])
+            _fill_gradient(slopes[p], factors, window, widening, left, part, gradients[k])
             for m in range(u):
                 gradients[k, m] += prior[m] * (mean[k, m] - x[k, m])
             iteration[k, _COST], iteration[k, _FRESH], iteration[k, _GROWTH] = cost, 0.0, 2.0
@@ -574,7 +795,7 @@ def adjusted(
     nodes, tangents, generators, at = outlines
     (count, high, wide), n, u = shares.shape, observed.shape[1], x.shape[1]
     forms, together = len(generators), max(1, min(_AT_ONCE // observed.shape[1], len(observed)))
-    kept, normals = np.empty((together, u, n), f32), np.zeros((together, u, u))
+    normals, begun = np.zeros((together, u, u)), np.empty((together, n), f32)
     common = np.zeros((2, together if light[2] > 0 else 0, n), f32)
     trial, first, gradients = (
         np.empty((together, u)),
@@ -588,10 +809,10 @@ def adjusted(
     for begin in range(0, count, together):
         part = slice(begin, min(begin + together, count))
         some = part.stop - begin
-        first[:some], trial[:some] = x[part], x[part]
+        first[:some], trial[:some], begun[:some] = x[part], x[part], flat[part]
+        linear = first[:some], begun[:some], slopes[part]
         work = (
             residuals[part],
-            kept[:some],
             normals[:some],
             gradients[:some],
             cofactors[part],
@@ -655,11 +876,14 @@ def adjusted(
                 flat[begin + rows[j]] = tried[j]
             advanced(
                 rows[:active],
+                rows[:active],
+                linear,
                 tried,
                 observed[part],
                 weights[part],
                 window,
                 light[0],
+                psf[part],
                 first[:some],
                 prior,
                 share_of_sigma,
@@ -668,4 +892,21 @@ def adjusted(
                 trial[:some],
                 iteration[part],
                 state[part],
+            )
+        if wanted:
+            active = 0
+            for j in range(some):
+                if state[begin + j] == DONE and rounds[begin + j] > 0:
+                    rows[active] = j
+                    active += 1
+            influenced(
+                rows[:active],
+                rows[:active],
+                linear,
+                weights[part],
+                window,
+                light[0],
+                psf[part],
+                cofactors[part],
+                (on_position[part], leverage[part]),
             )

@@ -248,7 +248,7 @@ def _continued(
         formed[rows] = patch.shares[rows]
         patch.shares = formed
     used = patch.weights > 0
-    worst = np.where(used, np.abs(found.residuals), 0.0).max(axis=1)
+    worst = np.maximum(found.residuals.max(axis=1), -found.residuals.min(axis=1))  # 0 where none is used
     rms = found.sigma0 * noise
     amiss = ~found.converged | ~(rms < 2 * noise)
     large = ~amiss & ~(worst < _PLAIN * patch.options.rejection * np.maximum(rms, noise))
@@ -331,7 +331,7 @@ class _Iteration:
     def __init__(self, patch: Patches, start: Array, options: BatchOptions, noise: float | None) -> None:
         k, u, n = *start.shape, patch.grey.shape[1]
         jitter = 0.0 if noise is None else patch.options.row_jitter_px / noise
-        self.window = patch.monomials.T.copy(), patch.across.reshape(len(patch.across), n), patch.shape[2]
+        self.window = patch.terms
         self.light = patch.options.polarity == "dark", 1.0 if noise is None else noise**2, jitter**2
         self.x, self.residuals, self.cofactor = start.copy(), np.empty((k, n)), np.full((k, u, u), np.nan)
         self.iteration, (self.state, self.rounds) = np.zeros((k, 6)), np.zeros((2, k), np.int64)
@@ -396,7 +396,7 @@ def _iterated(
     noise : float, optional
         Standard deviation of grey values, if shifts of rows are among the errors.
     """
-    from .compiled import ACTIVE, DONE, STALE, advanced, linearised  # takes half a second to import
+    from .compiled import ACTIVE, DONE, STALE, advanced, influenced, linearised  # half a second to import
 
     work, (m, u), n = _Iteration(patch, start, options, noise), start.shape, patch.grey.shape[1]
     every = len(rows) == len(patch.xy)
@@ -404,12 +404,12 @@ def _iterated(
     prior, x, trial = 1 / free**2, work.x, start.copy()
     common = np.zeros((2, m if work.light[2] > 0 else 0, n), np.float32)
     space = (
-        *(work.residuals, np.empty((m, u, n), np.float32), np.zeros((m, u, u)), np.zeros((m, u))),
+        *(work.residuals, np.zeros((m, u, u)), np.zeros((m, u))),
         *(work.cofactor, common[0], common[1]),
     )
     steps: Any = x, space, trial, work.iteration, work.state
     state, some, left, begun = work.state, np.arange(m), options.max_iterations, start.copy()
-    formed_at, last = start, _LAST
+    formed_at, last, place = start, _LAST, np.arange(m)
     if every:
         patch.shares = np.empty(patch.shape, np.float32)
     while len(some):
@@ -420,8 +420,9 @@ def _iterated(
                 *(some, share, slopes, observed, weights, work.window, work.light, psf, mean, prior),
                 *(options.share, *steps, work.influence),
             )
-        begun[some] = formed_at
+        begun[some], place[some] = formed_at, np.arange(len(some))
         patch.shares[rows[some]] = share.reshape(-1, *patch.shape[1:])
+        first, further = (formed_at, share, slopes), np.flatnonzero(state == ACTIVE)
         while left > 0 and len(some := np.flatnonzero(state == ACTIVE)):
             left -= 1
             tried = np.ascontiguousarray(patch.image(trial[some], rows[some]))
@@ -429,13 +430,20 @@ def _iterated(
             work.rounds[some] += 1
             with one_thread():
                 advanced(
-                    *(some, tried.reshape(len(some), n), observed, weights, work.window, work.light[0]),
-                    *(mean, prior, options.share, *steps),
+                    *(some, place[some], first, tried.reshape(len(some), n), observed, weights, work.window),
+                    *(work.light[0], psf, mean, prior, options.share, *steps),
                 )
             taken = work.iteration[some, 0] < before
             patch.shares[rows[some[taken]]] = tried[taken]
         # With derivatives of another image the gradient of the noise vanishes at another place.
         changed = (state == DONE) & (patch.change(begun, x, rows) > options.share)
+        if len(work.influence[1]) and len(further):
+            done = further[(state[further] == DONE) & ~(changed[further] & (left > 0))]
+            with one_thread():
+                influenced(
+                    *(done, place[done], first, weights, work.window, work.light[0], psf, work.cofactor),
+                    work.influence,
+                )
         if changed.any() and left < last:
             left, last = last, 0
         some = np.flatnonzero(changed | (state == STALE))

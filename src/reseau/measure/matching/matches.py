@@ -125,11 +125,11 @@ def matches_of(
     """Columns of results from the adjusted batch; `share` as formed last, and influences, if known."""
     x, k = found.estimates, len(patch.xy)
     flat = (patch.share(x) if share is None else share).reshape(k, -1)
-    plane, dark = patch.background(x).reshape(k, -1), patch.options.polarity == "dark"
+    monomials, dark = np.ascontiguousarray(patch.monomials.T), patch.options.polarity == "dark"
     from .compiled import compared  # takes half a second to import; not every command needs it
 
     correlation, count, seen, rejected = compared(
-        patch.grey, plane, flat, patch.weights, used, patch.near, dark
+        patch.grey, x, monomials, flat, patch.weights, used, patch.near, dark
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         cov = found.covariance

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask
 
-__all__ = ["grey_variance", "medians", "relative_weights"]
+__all__ = ["LEAST", "grey_variance", "medians", "relative_weights"]
 
 _SIGNIFICANT = 5.0
 """The slope of the variance must exceed this many of its standard deviations to be used."""
-_LEAST = 0.05
+LEAST = 0.05
 """Smallest variance of a pixel relative to the mean of its patch."""
 
 
@@ -66,7 +66,7 @@ def grey_variance(pixels: NDArray[Any], start: Array, residuals: Array) -> tuple
         weighted = design / (2 * variance**2)
         normal = weighted @ design.T
         a, b = np.linalg.lstsq(normal, weighted @ square, rcond=None)[0]
-        variance = np.maximum(a + b * grey, _LEAST * mean)
+        variance = np.maximum(a + b * grey, LEAST * mean)
     sigma = np.sqrt(np.linalg.pinv(normal)[1, 1])
     return (float(a), float(b)) if b > _SIGNIFICANT * sigma else None
 
@@ -75,7 +75,7 @@ def relative_weights(grey: Array, variance: tuple[float, float]) -> Array:
     """Relative weights (k, n) of grey values, about 1 on average in each patch."""
     expected = variance[0] + variance[1] * grey
     mean = np.maximum(expected.mean(axis=1, keepdims=True), 1e-12)
-    weights: Array = 1 / np.maximum(expected / mean, _LEAST)
+    weights: Array = 1 / np.maximum(expected / mean, LEAST)
     return weights
 
 

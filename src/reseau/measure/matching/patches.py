@@ -7,6 +7,7 @@ function, contrast, coefficients of the background, slopes of the contrast (opti
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
 from ...optics.formation import PixelResponse
-from .noise import medians, relative_weights
+from .noise import LEAST, medians, relative_weights
 from .shapes import Shape, Window
 
 __all__ = ["CONTRAST", "LEVEL", "SHARPEST", "WIDTH", "MatchOptions", "Patches", "X", "Y"]
@@ -186,9 +187,17 @@ class Patches:
         else:
             x[:, CONTRAST], x[:, self.ground] = light
         if self.options.variance is not None:
-            grey = self._grey(x, self.first[0])
-            self.relative_weights = relative_weights(grey.reshape(len(x), -1), self.options.variance)
+            from .compiled import weighed  # takes half a second to import; not every command needs it
+
+            share, dark = self.first[0].reshape(len(x), -1), self.options.polarity == "dark"
+            self.relative_weights = weighed(x, share, self.terms, dark, self.options.variance, LEAST)
         return x
+
+    @cached_property
+    def terms(self) -> tuple[Array, Array, int]:
+        """Monomials (b, n) of the background, those (0 or 2, n) of the contrast, and number of columns."""
+        across = self.across.reshape(len(self.across), len(self.monomials))
+        return self.monomials.T.astype(np.float32, order="C"), across.astype(np.float32), self.shape[2]
 
     def _levels(self, share: Array) -> tuple[Array, Array]:
         """Grey values (k,) of the background, and what a mark adds, by regression on its share (k, n)."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -189,6 +189,7 @@ class MarkWindows(ABC):
         self.searching = _HIDING if self.precise_start else np.inf  # see :func:`match`
         self.own_px = np.zeros(len(self.at))  # pixels of the windows that belong to marks, matched last
         self.rough = 0.0  # residuals of the marks that were learnt from
+        self._cleared: tuple[Array, Mask] | None = None  # see `_clear`
 
     @abstractmethod
     def _images(self, rows: Rows) -> tuple[Shape, Array]:
@@ -217,11 +218,11 @@ class MarkWindows(ABC):
         # In a large frame every copy takes time.
         valid = self.screened.valid & ~self.hidden if self.hidden.any() else self.screened.valid
         if beside is not None:
-            valid = valid & (beside < _BESIDE) & (beside > -_BESIDE)
+            valid = valid & self._clear(beside)
         parts, found = [], []
         for part, half in self._windows(reach):
             region = self._region(rows[part], half)
-            here = None if beside is None else beside[self.pixels(rows[part], half)[::-1]]
+            here = None if beside is None else self._cut(beside, rows[part], half)
             self.own_px[rows[part]] = float((2 * np.array(half) + 1).prod())
             if region is not None:
                 # What is printed there is known, and the same around every mark.
@@ -260,6 +261,18 @@ class MarkWindows(ABC):
             )
             parts.append(part)
         return merged(parts, found)
+
+    def _clear(self, beside: Array) -> Mask:
+        """Pixels (h, w) of which other ink takes nearly nothing."""
+        if self._cleared is None or self._cleared[0] is not beside:
+            self._cleared = beside, (beside < _BESIDE) & (beside > -_BESIDE)
+        return self._cleared[1]
+
+    def _cut(self, values: NDArray[Any], rows: Rows, half: tuple[int, int]) -> NDArray[Any]:
+        """Values (k, r, c) of a frame in the windows of marks."""
+        from ..matching.compiled import windows  # takes half a second to import; not every command needs it
+
+        return np.asarray(windows(values, np.rint(self.start[rows]).astype(np.intp), half))
 
     def _form_sigma(self) -> Array:
         """Standard deviations of the parameters of the form."""
