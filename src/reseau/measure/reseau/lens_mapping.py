@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache
 
 import numpy as np
 
@@ -50,27 +50,21 @@ class FoundMapping:
     ----------
     mapping : Chain
         The mapping.
-    displacing : callable
-        Makes `displaced`, which not every use of a mapping needs.
+    changes : callable
+        Changes (m, n, 2) of the images of lattice coordinates (n, 2) by one standard deviation of the mapping
+        in each of m independent directions. The covariance of anything that follows from the mapping is the
+        sum of the squares of what changes with them.
 
     Examples
     --------
     >>> from reseau.measure.testfield.lattice_mapping import started
-    >>> FoundMapping(started(np.eye(3), 1, (480, 640)), tuple).displaced
-    ()
+    >>> exact = FoundMapping(started(np.eye(3), 1, (480, 640)), lambda at: np.zeros((0, *at.shape)))
+    >>> exact.changes(np.zeros((5, 2))).shape
+    (0, 5, 2)
     """
 
     mapping: Chain
-    displacing: Callable[[], tuple[Chain, ...]]
-
-    @cached_property
-    def displaced(self) -> tuple[Chain, ...]:
-        """Mappings that are off by one standard deviation in independent directions.
-
-        The covariance of anything that follows from the mapping is the sum of the squares of what changes
-        with them.
-        """
-        return self.displacing()
+    changes: Callable[[Array], Array]
 
 
 def mapping_through(at: Array, xy: Array, sigma: Array, shape: tuple[int, int]) -> FoundMapping:
@@ -101,7 +95,7 @@ def mapping_through(at: Array, xy: Array, sigma: Array, shape: tuple[int, int]) 
         least = criterion(best, len(best.second.values))
         if criterion(lens.mapping, 8 + len(_LENS_SIGMA)) <= least:
             return lens
-    return FoundMapping(best, partial(_displaced, best, at, xy, weight))
+    return FoundMapping(best, _changes(best, at, xy, weight))
 
 
 def free_through(mapping: Chain, at: Array, xy: Array, sigma: Array) -> Chain:
@@ -122,20 +116,20 @@ def free_through(mapping: Chain, at: Array, xy: Array, sigma: Array) -> Chain:
     return with_coefficients(free, np.asarray(values.T, dtype=np.float64))
 
 
-def _displaced(free: Chain, at: Array, xy: Array, weight: Array) -> tuple[Chain, ...]:
-    """See :attr:`FoundMapping.displaced`; the coefficients of a polynomial are those of a linear problem."""
-    monomials, _ = monomials_of(free, at)
-    _, value, right = np.linalg.svd(monomials * weight[:, None], full_matrices=False)
-    known = value > 1e-10 * value[0]
-    redundancy = len(at) - int(known.sum())
-    square = (((free(at) - xy) * weight[:, None]) ** 2).mean() * len(at) / max(redundancy, 1)
-    scale = np.sqrt(square) if 2 * redundancy >= _SHOWN else 1.0
-    none = np.zeros(monomials.shape[1])
-    return tuple(
-        with_coefficients(free, scale * np.stack([step, none] if k == 0 else [none, step]))
-        for step in right[known] / value[known, None]
-        for k in range(2)
-    )
+def _changes(free: Chain, at: Array, xy: Array, weight: Array) -> Callable[[Array], Array]:
+    """See :class:`FoundMapping`; the coefficients of a polynomial are those of a linear problem."""
+
+    def changed(there: Array) -> Array:
+        monomials, _ = monomials_of(free, at)
+        _, value, right = np.linalg.svd(monomials * weight[:, None], full_matrices=False)
+        known = value > 1e-10 * value[0]
+        redundancy = len(at) - int(known.sum())
+        square = (((free(at) - xy) * weight[:, None]) ** 2).mean() * len(at) / max(redundancy, 1)
+        scale = np.sqrt(square) if 2 * redundancy >= _SHOWN else 1.0
+        along = scale * (right[known] / value[known, None]) @ monomials_of(free, there)[0].T
+        return np.asarray((along[:, None, :, None] * np.eye(2)[None, :, None]).reshape(-1, len(there), 2))
+
+    return changed
 
 
 def _distortion(u: Array, x: Array) -> tuple[Array, Array, Array]:
@@ -162,6 +156,17 @@ def _distortion(u: Array, x: Array) -> tuple[Array, Array, Array]:
     return q / stretch, by_u, by_x
 
 
+def _seen(source: Array, x: Array) -> tuple[Array, Array]:
+    """Images (n, 2) of points (n, 3) in homogeneous coordinates, and derivatives (n, 2, 16) by parameters."""
+    p = source @ np.append(x[:8], 1.0).reshape(3, 3).T
+    u = p[:, :2] / p[:, 2:]
+    bent, by_u, by_x = _distortion(u, x[8:])
+    by_h = np.zeros((len(source), 2, 8))
+    by_h[:, 0, :3] = by_h[:, 1, 3:6] = source / p[:, 2:]
+    by_h[:, :, 6:] = -u[:, :, None] * (source[:, None, :2] / p[:, 2:, None])
+    return u + bent, np.concatenate([(by_u + np.eye(2)) @ by_h, by_x], axis=2)
+
+
 def lens_through(
     at: Array, xy: Array, sigma: Array, shape: tuple[int, int], start: Chain
 ) -> FoundMapping | None:
@@ -180,21 +185,19 @@ def lens_through(
     back = np.array([[1 / size, 0, -centre[0] / size], [0, 1 / size, -centre[1] / size], [0, 0, 1]])
     to_unit = np.array([[1 / half, 0, -middle[0] / half], [0, 1 / half, -middle[1] / half], [0, 0, 1]])
     first = to_unit @ np.append(start.first.values, 1.0).reshape(3, 3) @ np.linalg.inv(back)
-    source = np.column_stack([(at - centre) / size, np.ones(len(at))])
+
+    def source(at: Array) -> Array:
+        return np.column_stack([(at - centre) / size, np.ones(len(at))])
+
+    here = source(at)
     seen, weight = (xy - middle) / half, np.repeat(half / np.hypot(sigma, _ROUGH_PX), 2)
     x = np.append((first / first[2, 2]).ravel()[:8], np.zeros(len(_LENS_SIGMA)))
     prior = np.append(np.zeros(8), 1 / _LENS_SIGMA)
     last = np.inf
     for _ in range(_STEPS):
-        p = source @ np.append(x[:8], 1.0).reshape(3, 3).T
-        u = p[:, :2] / p[:, 2:]
-        bent, by_u, by_x = _distortion(u, x[8:])
-        by_h = np.zeros((len(at), 2, 8))
-        by_h[:, 0, :3] = by_h[:, 1, 3:6] = source / p[:, 2:]
-        by_h[:, :, 6:] = -u[:, :, None] * (source[:, None, :2] / p[:, 2:, None])
-        jacobian = np.concatenate([(by_u + np.eye(2)) @ by_h, by_x], axis=2)
-        jacobian = jacobian.reshape(-1, len(x)) * weight[:, None]
-        off = (seen - u - bent).ravel() * weight
+        image, slopes = _seen(here, x)
+        jacobian = slopes.reshape(-1, len(x)) * weight[:, None]
+        off = (seen - image).ravel() * weight
         data = jacobian.T @ jacobian
         normal = data + np.diag(prior**2)
         try:
@@ -222,7 +225,9 @@ def lens_through(
         return None
     redundancy = 2 * len(at) - float(np.trace(np.linalg.solve(normal, data)))
     scale = np.sqrt(float(off @ off) / redundancy) if redundancy >= _SHOWN else 1.0
-    return FoundMapping(written(x), lambda: tuple(written(x + scale * step) for step in root.T))
+    return FoundMapping(
+        written(x), lambda at: np.moveaxis(_seen(source(at), x)[1] @ (half * scale * root), 2, 0)
+    )
 
 
 def _expanded(x: Array) -> Array:

@@ -6,6 +6,7 @@ The image of every mark is formed with the mapping through all marks, to second 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -27,7 +28,7 @@ from ..matching import (
 )
 from ..points import Reason
 from ..screening import Screened
-from ..testfield.lattice_mapping import slope_of
+from ..testfield.lattice_mapping import images_of, slope_of
 from ..testfield.targets import replaced
 from .learning import learn, weigh
 from .lens_mapping import free_through, mapping_through
@@ -99,7 +100,7 @@ class PlaneMarks(MarkWindows):
         self.dazzled = np.zeros(len(self.at), dtype=bool)  # by reflected light
         self.lit = np.zeros_like(self.dazzled)  # by so little that no pixels are lost
         self.notes: tuple[Remark, ...] = ()
-        self.displaced: tuple[Chain, ...] = ()
+        self.changes: Callable[[Array], Array] | None = None  # of the mapping, see :class:`FoundMapping`
         self.misfit = 1.0  # of the mapping through all marks, in sigmas
         self.other: Chain | None = None  # another mapping, where that one does not fit
 
@@ -180,15 +181,15 @@ class PlaneMarks(MarkWindows):
         """
         (h, w), sigma = self.screened.grey.shape, np.sqrt(found.variance)
         xy, last = found.xy, np.inf
-        middle = xy + self._off_centre(self.mapping, rows)
+        middle = xy + self._off_centre(rows)
         while True:
             known = self.at[rows[sure]], xy[sure], sigma[sure]
             through_all = mapping_through(*known, (h, w))
-            self.mapping, self.displaced = through_all.mapping, through_all.displaced
+            self.mapping, self.changes = through_all.mapping, through_all.changes
             off = (self.mapping(known[0]) - xy[sure]) / sigma[sure, None]
             self.misfit = float(np.sqrt((off**2).mean()))
             self.other = free_through(self.mapping, *known) if self.misfit > UNFIT else None
-            moved = middle - self._off_centre(self.mapping, rows)
+            moved = middle - self._off_centre(rows)
             change, total = (
                 float((np.abs(moved - before)[sure].max(axis=1) / sigma[sure]).max())
                 for before in (xy, found.xy)
@@ -199,20 +200,25 @@ class PlaneMarks(MarkWindows):
             if change < _SAME:
                 return replace(found, xy=xy), True
 
-    def _off_centre(self, mapping: Chain, rows: Rows) -> Array:
-        """How far (k, 2) the middles of the images of marks are from the images of their points."""
+    def _off_centre(self, rows: Rows, images: Callable[[Array], Array] | None = None) -> Array:
+        """How far (k, 2) the middles of the images of marks are from the images of their points.
+
+        `images` are those (m, n, 2) of lattice coordinates (n, 2) with m other mappings: then (m, k, 2).
+        """
         return np.zeros((len(rows), 2))
 
     def _misformed(self, rows: Rows) -> Array:
         """Covariances (k, 2, 2) of what formed images lack, and of the mapping that forms them."""
         cov = np.tile(self.formed_px**2 * np.eye(2), (len(rows), 1, 1))
-        middle = self._off_centre(self.mapping, rows)
-        for mapping in self.displaced:
-            off = self._off_centre(mapping, rows) - middle
-            cov += off[:, :, None] * off[:, None]
-        if self.other is not None:
+        if not self.eccentric:
+            return cov
+        middle, changes, other = self._off_centre(rows), self.changes, self.other
+        if changes is not None:
+            off = self._off_centre(rows, lambda at: images_of(self.mapping, at) + changes(at)) - middle
+            cov += np.einsum("mki,mkj->kij", off, off)
+        if other is not None:
             # The change shows the size of the error, not its direction.
-            off = self._off_centre(self.other, rows) - middle
+            off = self._off_centre(rows, lambda at: images_of(other, at)[None])[0] - middle
             cov += off[:, :, None] * off[:, None] + 0.5 * (off**2).sum(axis=1)[:, None, None] * np.eye(2)
         return cov
 
@@ -357,10 +363,9 @@ class PlaneMarks(MarkWindows):
         noise = float(np.median(found.noise[good]))
         some = rows[uneasy]
         xy, shift = field(self._straight(some)), np.full(len(some), _SHIFT_PX)
-        if self.displaced:
+        if self.changes is not None:
             xy = self.mapping(self.at[some])
-            off = [((mapping(self.at[some]) - xy) ** 2).sum(axis=1) for mapping in self.displaced]
-            shift = shift + _UNSURE * np.sqrt(np.sum(off, axis=0))
+            shift = shift + _UNSURE * np.sqrt((self.changes(self.at[some]) ** 2).sum(axis=(0, 2)))
         self.start[some] = xy
         images, reach = self._images(some)
         foreign: NDArray[Any] = np.zeros(self.screened.grey.shape, dtype=np.uint8)
@@ -376,7 +381,8 @@ class PlaneMarks(MarkWindows):
             tolerance = _FOREIGN * noise + _SHADE * np.abs(here)
             steep = np.hypot(slopes[:, 0], slopes[:, 1])
             tolerance = tolerance + shift[part, None, None] * np.abs(ink) * steep
-            np.maximum.at(foreign, (y, x), np.abs(off) > tolerance)
+            beyond, (row, column) = np.abs(off) > tolerance, np.broadcast_arrays(y, x)
+            foreign[row[beyond], column[beyond]] = 1
             seen[y, x] = True
         foreign = cv2.morphologyEx(foreign, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
         margin = int(np.ceil(2 * self.look.psf_px)) + 1

@@ -4,6 +4,7 @@ The image of every disk is formed with the mapping through all disks, to second 
 estimate is therefore the image of its centre, not the centre of its ellipse.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -158,15 +159,17 @@ class DiskMarks(PlaneMarks):
         slope = second_order(self.mapping, self.at[rows])[1] @ self.frame
         return np.asarray(self.look.size / 2 * np.sqrt(np.abs(np.linalg.det(slope))))
 
-    def _off_centre(self, mapping: Chain, rows: Rows) -> Array:
+    def _off_centre(self, rows: Rows, images: Callable[[Array], Array] | None = None) -> Array:
         """See :class:`PlaneMarks`: the centroids of the images of disks."""
         circle = Outline.circle(self.look.size / 2, np.pi * self.look.size / _SIDES).xy @ self.frame.T
-        at = self.at[rows]
-        node = images_of(mapping, (at[:, None] + circle).reshape(-1, 2)).reshape(len(at), -1, 2)
-        a = node - images_of(mapping, at)[:, None]
-        b = np.roll(a, -1, axis=1)
+        around = np.concatenate([np.zeros((1, 2)), circle])
+        at = (self.at[rows][:, None] + around).reshape(-1, 2)
+        nodes = images_of(self.mapping, at) if images is None else images(at)
+        nodes = nodes.reshape(*nodes.shape[:-2], len(rows), -1, 2)
+        a = nodes[..., 1:, :] - nodes[..., :1, :]
+        b = np.roll(a, -1, axis=-2)
         twice = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-        return np.asarray(((a + b) * twice[..., None]).sum(axis=1) / (3 * twice.sum(axis=1)[:, None]))
+        return np.asarray(((a + b) * twice[..., None]).sum(axis=-2) / (3 * twice.sum(axis=-1)[..., None]))
 
     def _misshapen(self, found: Matches) -> list[tuple[Mask, Reason]]:
         """See :class:`PlaneMarks`."""
