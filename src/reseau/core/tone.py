@@ -48,6 +48,23 @@ class ToneCurve:
             light = np.where(part > 0.04045, ((part + 0.055) / 1.055) ** 2.4, part / 12.92)
         return np.asarray(light * full_scale, dtype=grey.dtype)
 
+    def grey(self, light: NDArray[Any]) -> NDArray[Any]:
+        """Grey values of light, both relative to their largest values, of which none is exceeded.
+
+        Examples
+        --------
+        >>> ToneCurve(2.0).grey(np.array([0.0, 0.25, 1.1])).tolist()
+        [0.0, 0.5, 1.0]
+        """
+        part, grey = np.clip(light, 0.0, 1.0), np.asarray(light)
+        if self.table:
+            grey = np.interp(part, self.table, np.linspace(0.0, 1.0, len(self.table)))
+        elif self.exponent is not None:
+            grey = part if self.exponent == 1 else part ** (1 / self.exponent)
+        else:
+            grey = np.where(part > 0.04045 / 12.92, 1.055 * part ** (1 / 2.4) - 0.055, part * 12.92)
+        return np.asarray(grey)
+
     @property
     def linear(self) -> bool:
         """Whether grey values are proportional to the light, to a hundredth of full scale."""

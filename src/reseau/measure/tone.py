@@ -43,8 +43,6 @@ _LIKE_SRGB = 0.5
 _DOUBTFUL = 1.03
 """Ratio of the residuals with the curve that the file states to those with a straight line up to which marks
 do not contradict the file; in strongly compressed pictures they do not tell."""
-_LEVELS = 4097
-"""Number of grey values at which a curve is inverted."""
 _STRAIGHT = ToneCurve(1.0)
 
 Matched = Callable[[ToneCurve], "tuple[Samples, Array] | None"]
@@ -199,9 +197,7 @@ def find_curve(
 def _misfit(curve: ToneCurve, at: tuple[Samples, Array], full_scale: float) -> float:
     """Usual residuals of marks in grey values as they are in the file, as a share of full scale."""
     samples, formed = at
-    levels = np.linspace(0.0, 1.0, _LEVELS)
-    light = curve.light(levels, 1.0)
-    both = (np.interp(values / full_scale, light, levels) for values in (formed, samples.grey))
+    both = (curve.grey(values / full_scale) for values in (formed, samples.grey))
     off = np.where(samples.used, np.subtract(*both), 0.0)
     square = (off**2).sum(axis=(1, 2)) / np.maximum(samples.used.sum(axis=(1, 2)), 1)
     return float(np.median(np.sqrt(square)))

@@ -470,7 +470,15 @@ def lay_marked(
     if design.kind == "aprilgrid":
         assert design.size is not None
         apart = min(design.size, design.pitch - design.size) / design.pitch
-    through_lens = False
+    through_lens, last = False, (plane[use], image[use], mapping)
+
+    def again_through(at: Array, xy: Array) -> Chain:
+        """Mapping through points; through the same as before it is the same."""
+        nonlocal last
+        if not (np.array_equal(at, last[0]) and np.array_equal(xy, last[1])):
+            last = at, xy, through(at, xy, shape)
+        return last[2]
+
     for _ in range(_GROWN):
         again, row = _nearest(saddles, mapping, nodes, dark, plane[use], known, apart)
         if design.kind == "charuco":
@@ -485,7 +493,7 @@ def lay_marked(
         there = np.concatenate([start[known], start[known], image[use]])
         if known.sum() >= _FEWEST and known.sum() > 0.5 * len(rows):
             both, there = nodes[known], start[known]
-        mapping = through(both, there, shape)
+        mapping = again_through(both, there)
         if through_lens:
             at, seen = np.concatenate([nodes[known], plane[use]]), np.concatenate([start[known], image[use]])
             sigma = np.repeat([SADDLE_PX, _MARKER_PX], [known.sum(), use.sum()])
@@ -493,7 +501,7 @@ def lay_marked(
             mapping = mapping if lens is None else lens.mapping
     if known.sum() < 4:
         return failed(int(known.sum()), "corners beside the markers read")
-    mapping = through(nodes[known], start[known], shape) if known.sum() >= _FEWEST else mapping
+    mapping = again_through(nodes[known], start[known]) if known.sum() >= _FEWEST else mapping
     return Placed(Located(design.ids, design.xy, "dark", mapping, frame, origin, known, start))
 
 

@@ -33,8 +33,8 @@ _CANCELLED = 0.3
 """Least share of the variance of independent errors that remains where they cancel each other."""
 _SHOWN = 40
 """Most marks from which correlations are learnt."""
-_SEEN = 60
-"""Most marks that show whether there are any."""
+_FEW, _SEEN = 24, 60
+"""Numbers of marks that show whether there are any, and of those that show what they are."""
 _FEWEST = 20
 """Marks that are needed to learn correlations."""
 _SPREAD = 5
@@ -84,16 +84,17 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     sure &= np.isfinite(found.influence).all(axis=(1, 2, 3))
     if sure.sum() < _FEWEST:
         return found
-    # A part of many marks shows what they have in common.
-    rows = np.flatnonzero(sure)
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, _SEEN).astype(np.intp))]
-    unit, shown, activity = _prepared(found.select(rows), None if centres is None else centres[rows])
-    free = 1 - found.leverage[rows]
-    # Beside a mark, where its image is even, residuals show the errors of pixels alone; on it, also what the
-    # formed image lacks, which is alike in all marks and symmetric.
-    beside = shown & (activity <= np.median(activity[shown]))
-    if not _neighbours(unit, beside, free, both_ways=centres is not None):
-        return found
+    for most in (_FEW, _SEEN):
+        # A part of many marks shows what they have in common.
+        rows = np.flatnonzero(sure)
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(np.intp))]
+        unit, shown, activity = _prepared(found.select(rows), None if centres is None else centres[rows])
+        free = 1 - found.leverage[rows]
+        # Beside a mark, where its image is even, residuals show the errors of pixels alone; on it, also what
+        # the formed image lacks, which is alike in all marks and symmetric.
+        beside = shown & (activity <= np.median(activity[shown]))
+        if not _neighbours(unit, beside, free, both_ways=centres is not None):
+            return found
     limits = np.quantile(activity[shown], np.arange(1, _CLASSES) / _CLASSES)
     kind = _kinds(activity, limits)
     variance = np.ones(_CLASSES)

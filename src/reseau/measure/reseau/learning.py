@@ -33,6 +33,9 @@ _EXPLAINED = 0.7
 """Ratio of residuals below which a curve explains what looked like motion or sharpening."""
 _SPREAD = 16
 """Least number of marks that show the mapping through a lens before all are matched."""
+_ALIKE_PX = 0.3
+"""Deviation of a mark, as it was found, from the mapping through precise ones, up to which it is expected
+where this has it."""
 _NEAR_WIDTH, _NEAR_FORM = 0.15, 0.01
 """Relative error of the sharpness, and change of the form, beyond which marks are matched again before the
 camera's response is learnt."""
@@ -103,9 +106,15 @@ def _learn(marks: MarkWindows, first: Matches, rows: Rows) -> Matches:
     known = marks.found if marks.precise_start else np.isin(np.arange(len(marks.at)), rows)
     h, w = marks.screened.grey.shape
     marks.mapping = through(marks.at[known], marks.start[known], (h, w))
-    if marks.eccentric and len(rows) >= _SPREAD:
+    if marks.precise_start and len(rows) >= _SPREAD:
         sigma = np.sqrt(first.variance)
-        marks.mapping = mapping_through(marks.at[rows], first.xy, sigma, (h, w)).mapping
+        precise = mapping_through(marks.at[rows], first.xy, sigma, (h, w)).mapping
+        marks.mapping = precise if marks.eccentric else marks.mapping
+        # Marks that it predicts as they were found are nearer to it than they were found.
+        predicted = precise(marks.at)
+        near = marks.found & (np.abs(predicted - marks.start) < _ALIKE_PX).all(axis=1)
+        near &= ~np.isin(np.arange(len(near)), rows)
+        marks.start[near] = predicted[near]
     weigh(marks, first, rows)
     first = marks.settle(first)
     marks.look = replace(
