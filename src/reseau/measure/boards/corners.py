@@ -228,21 +228,13 @@ class CornerMarks(PlaneMarks):
 
     def _region(self, rows: Rows, half: tuple[int, int]) -> Mask | None:
         """See :class:`PlaneMarks`: the half squares around a corner, and what lies along its edges."""
-        slope, _, _ = self._steps(rows)
-        centre = np.rint(self.start[rows])
-        x = centre[:, :1] + np.arange(-half[0], half[0] + 1) - self.start[rows, :1]
-        y = centre[:, 1:] + np.arange(-half[1], half[1] + 1) - self.start[rows, 1:]
-        back = np.linalg.inv(slope)[..., None, None]
-        one, two = (back[:, k, 0] * x[:, None, :] + back[:, k, 1] * y[:, :, None] for k in (0, 1))
-        normal = self.sectors.normal[rows][..., None, None]
-        # Distances from the edges on the plane of the board.
-        away = [normal[:, e, 0] * one + normal[:, e, 1] * two for e in range(normal.shape[1])]
-        near = [np.abs(distance) < self.sectors.reach for distance in away]
-        inside: Mask = np.logical_and.reduce(near)
-        if self.sectors.along > self.sectors.reach:
-            for beside, side in ((near[0], away[1]), (near[1], away[0])):
-                inside |= beside & (side > 0) & (side < self.sectors.along)
-        return inside
+        from .compiled_corners import pixels_around  # takes half a second to import
+
+        back = np.linalg.inv(self._steps(rows)[0])
+        across = np.einsum("kei,kij->kej", self.sectors.normal[rows], back)
+        return np.asarray(
+            pixels_around(self.start[rows], across, half, self.sectors.reach, self.sectors.along)
+        )
 
     def beside(self) -> Array | None:
         """See :class:`PlaneMarks`: the markers in bright squares, as solid figures; bright cells of tags."""
