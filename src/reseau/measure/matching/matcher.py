@@ -414,7 +414,9 @@ def _iterated(
         patch.shares = np.empty(patch.shape, np.float32)
     while len(some):
         share, slopes = formed
-        share, slopes = np.ascontiguousarray(share).reshape(len(some), n), slopes.reshape(len(some), -1, n)
+        # In the layout of the batch with one outline each: another one is compiled, and loaded, by itself.
+        share = np.ascontiguousarray(share).reshape(len(some), n)
+        slopes = np.ascontiguousarray(slopes).reshape(len(some), -1, n)
         with one_thread():
             linearised(
                 *(some, share, slopes, observed, weights, work.window, work.light, psf, mean, prior),
