@@ -1,11 +1,12 @@
-"""Bundle adjustment compared with Ceres and COLMAP: time, statistics, growth, coverage of covariances.
+"""Bundle adjustment compared with Ceres, COLMAP and SciPy: time, statistics, growth, coverage of covariances.
 
 Run from the checkout: ``python benchmarks/bundle.py [--part peers|statistics|growth|cover]``. Networks are
 read from $RESEAU_DATA/networks. Ceres needs g++ and libceres-dev (Debian), COLMAP needs pycolmap (PyPI);
 without them only our times are printed. All use two threads and stop when the relative change of the sum of
 squares is below 1e-6 (ours: corrections below 1e-6 standard deviations). Times are those of all processors
 together, medians of rounds in which the programs take turns: what else runs hardly changes them. Import,
-compilation and reading of files are not included.
+compilation and reading of files are not included. SciPy adjusts ladybug-49 once, with at most 200
+evaluations.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.sparse import coo_array
 from shared import of_the_tests
 from worlds import lenses
 
@@ -81,6 +84,36 @@ def colmap(kind: str, network: Path) -> tuple[float, float, float, int] | None:
         return None
     words = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
     return float("nan"), float(words[0]), float(words[1]), int(words[2])
+
+
+def by_scipy(network: Path) -> tuple[float, float, float, int]:
+    """Adjust a BAL file by `scipy.optimize.least_squares`, as its cookbook does: only the total is known.
+
+    Derivatives are differences, of groups of parameters that share no observation; steps are those of LSMR.
+    """
+    words = np.fromfile(network, sep=" ")
+    m, p, n = (int(v) for v in words[:3])
+    seen, start = words[3 : 3 + 4 * n].reshape(n, 4), words[3 + 4 * n :]
+    image, point, xy = seen[:, 0].astype(int), seen[:, 1].astype(int), seen[:, 2:]
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        cameras, xyz = x[: 9 * m].reshape(m, 9)[image], x[9 * m :].reshape(p, 3)[point]
+        turned = np.einsum("nij,nj->ni", rotation_matrix(cameras[:, :3]), xyz) + cameras[:, 3:6]
+        uv = -turned[:, :2] / turned[:, 2:]
+        r2 = (uv**2).sum(axis=1)
+        scale = cameras[:, 6] * (1 + r2 * (cameras[:, 7] + r2 * cameras[:, 8]))
+        return np.asarray(scale[:, None] * uv - xy).ravel()
+
+    columns = np.hstack([9 * image[:, None] + np.arange(9), 9 * m + 3 * point[:, None] + np.arange(3)])
+    rows = np.repeat(np.arange(2 * n), columns.shape[1])
+    pattern = coo_array(
+        (np.ones(len(rows)), (rows, np.repeat(columns, 2, axis=0).ravel())), (2 * n, len(start))
+    )
+    begun = time.process_time()
+    found = least_squares(
+        residuals, start, jac_sparsity=pattern.tocsr(), x_scale="jac", ftol=1e-6, method="trf", max_nfev=200
+    )
+    return float("nan"), time.process_time() - begun, float(found.cost), int(found.nfev)
 
 
 def ours(problem: BundleProblem, target: float) -> tuple[float, float, float, int]:
@@ -235,6 +268,8 @@ def peers() -> None:
             said("reseau", mine)
             if theirs:
                 said("Ceres", theirs, [a[0] / b[0] for a, b in zip(mine, theirs, strict=True)])
+            if title == "ladybug-49":
+                said("SciPy", [by_scipy(file)])
             if others:
                 said("COLMAP", others, [a[1] / b[1] for a, b in zip(mine, others, strict=True)])
 
