@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -249,6 +248,8 @@ class CornerMarks(PlaneMarks):
             with np.errstate(invalid="ignore"):
                 if alike and np.nanmax(np.abs(corners - before)) < _ALIKE_PX:
                     return share
+        from ..compiled_filter import filtered  # takes half a second to import; not every command needs it
+
         at = corners
         h, w = self.screened.grey.shape
         share = np.zeros((h, w), dtype=np.float32)
@@ -276,7 +277,8 @@ class CornerMarks(PlaneMarks):
                 Window(x, y, PixelResponse(self.options.fill)),
             )
             if look.kernel is not None:
-                taken = np.stack([cv2.filter2D(image, -1, look.kernel) for image in taken])
+                wider = np.pad(taken, ((0, 0), (reach, reach), (reach, reach)))
+                taken = filtered(wider, look.kernel.astype(np.float32))
             taken = taken * self.sectors.ink[part, None, None].astype(np.float32)
             for image, (left, top) in zip(taken, low[part].astype(np.intp), strict=True):
                 a, b = max(left, 0), max(top, 0)
