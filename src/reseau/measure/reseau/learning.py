@@ -36,6 +36,9 @@ _SPREAD = 16
 _ALIKE_PX = 0.3
 """Deviation of a mark, as it was found, from the mapping through precise ones, up to which it is expected
 where this has it."""
+_FITS, _ROUGH_PX = 4.0, 0.01
+"""Deviation of precise marks from that mapping, in their sigmas and a part that does not count, up to which
+it predicts others."""
 _NEAR_WIDTH, _NEAR_FORM = 0.15, 0.01
 """Relative error of the sharpness, and change of the form, beyond which marks are matched again before the
 camera's response is learnt."""
@@ -110,11 +113,12 @@ def _learn(marks: MarkWindows, first: Matches, rows: Rows) -> Matches:
         sigma = np.sqrt(first.variance)
         precise = mapping_through(marks.at[rows], first.xy, sigma, (h, w)).mapping
         marks.mapping = precise if marks.eccentric else marks.mapping
-        # Marks that it predicts as they were found are nearer to it than they were found.
-        predicted = precise(marks.at)
-        near = marks.found & (np.abs(predicted - marks.start) < _ALIKE_PX).all(axis=1)
-        near &= ~np.isin(np.arange(len(near)), rows)
-        marks.start[near] = predicted[near]
+        predicted, limit = precise(marks.at), _FITS * np.hypot(sigma, _ROUGH_PX)[:, None]
+        if (np.abs(predicted[rows] - first.xy) < limit).all():
+            # Other marks that it predicts as they were found are nearer to it than they were found.
+            near = marks.found & (np.abs(predicted - marks.start) < _ALIKE_PX).all(axis=1)
+            near &= ~np.isin(np.arange(len(near)), rows)
+            marks.start[near] = predicted[near]
     weigh(marks, first, rows)
     first = marks.settle(first)
     marks.look = replace(
