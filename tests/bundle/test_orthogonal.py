@@ -50,6 +50,8 @@ def test_cofactors_from_rows_are_those_of_the_normal_equations(
         across = np.outer(size[len(found.band) :], size)
         np.testing.assert_allclose((found.border - reduced.border) / across, 0.0, rtol=0, atol=1e-7)
     np.testing.assert_allclose(found.seen, fit.cofactors.seen, rtol=0, atol=1e-7)
+    trace = np.trace(found.seen, axis1=1, axis2=2).sum()
+    np.testing.assert_allclose(trace, fit.counts[1] - fit.counts[2], rtol=0, atol=1e-9)
     sides = np.random.default_rng(0).normal(size=(len(held), 2))
     sides[held] = 0.0
     solved = found.arrow.solve(sides)

@@ -32,12 +32,12 @@ from .compiled import compiled
 from .linear import Linear
 from .normal import SEGMENTS, Pattern
 
-__all__ = ["FromRows", "cofactors_from_rows"]
+__all__ = ["ROUNDING", "FromRows", "cofactors_from_rows"]
 
 # Columns that are completed at once, and rows that are added to a triangle at once.
 _BLOCK, _ROWS = 64, 600
-# Part of a column of F that no combination of the others explains, relative to its length, which is rounding.
-_ZERO = 1e-12
+# Standard deviation of an unknown, relative to that with all others known, from which on it is rounding.
+ROUNDING = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class _Part:
     by_ray: Mask
 
 
-def cofactors_from_rows(linear: Linear, held: Mask) -> FromRows:
+def cofactors_from_rows(linear: Linear, held: Mask, most: float = ROUNDING) -> FromRows:
     """Compute cofactors from the rows of the observations.
 
     Parameters
@@ -106,18 +106,19 @@ def cofactors_from_rows(linear: Linear, held: Mask) -> FromRows:
         The linear problem at the estimates; without a stage or a rig.
     held : ndarray of bool (u,)
         Held reduced unknowns.
+    most : float
+        Largest standard deviation of an unknown relative to that with all others known.
 
     Raises
     ------
     Singular
-        When the rows do not determine the other unknowns.
+        When the rows do not determine the other unknowns, or one of them less precisely than this.
     """
     rows, blocks = _Rows(linear, held), _blocks(linear, held)
     found = _inverted(rows, blocks, _triangles(rows, blocks))
     b = len(found.band)
     diagonal = np.concatenate([found.band[:, 0], np.diagonal(found.border[:, b:])])
-    # 1 / Z is the square of that part of a column.
-    if not (diagonal * rows.squares < 1.0 / _ZERO**2).all():
+    if not (diagonal * rows.squares < most**2).all():
         raise Singular
     return found
 

@@ -22,8 +22,8 @@ from .datum import Freedom, held_for
 from .direct import Normal
 from .implicit import normal_of
 from .linear import Linear
-from .normal import SEGMENTS, posterior
-from .orthogonal import cofactors_from_rows
+from .normal import posterior
+from .orthogonal import ROUNDING, cofactors_from_rows
 from .rank import PARALLEL
 from .reduced import Reduced, Referral
 
@@ -37,11 +37,12 @@ _EXACT, _INEXACT = 1e-7, 1e-4
 _STAGED = 1e-3
 # Accuracy of the solution for a random right-hand side: it is only asked whether there is one.
 _ROUGHLY = 1e-3
-# Largest number of entries of F for which its decomposition takes about a second, and of products inside a
-# band for which it takes some minutes.
+# Standard deviation of an unknown of a small network, relative to that with all others known, of which first
+# derivatives say nothing any more.
+_INFLATED = 1e6
+# Largest number of entries of F for which its decomposition takes about a second, and of products for which
+# it takes some minutes.
 _ENTRIES, _PRODUCTS = 20_000_000, 5e12
-# Singular values below this part of the largest count as zero, as in :mod:`reseau.adjust`.
-_ZERO = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,14 +269,11 @@ def _marginal(
     if normal.least < PARALLEL:
         raise Singular
     enough = _INEXACT * max(1.0, system.unknowns.size / 1000.0)
-    if _is_small(linear):
-        z = Reduced.of_matrix(_inverse_from_rows(normal, held), held)
-        found = _with_inverse(linear, normal, z, held, taking_part)
-        missing = abs(_total(found) - free)
-    elif not missing < enough and _is_narrow(linear):
+    small = _is_small(linear)
+    if small or (not missing < enough and _is_affordable(linear)):
         # The ends of a long chain are determined weakly, although neighbours are determined well.
-        own = cofactors_from_rows(linear, held)
-        z = Reduced(held, own.band, own.border, own.arrow, normal.turn)
+        own = cofactors_from_rows(linear, held, _INFLATED if small else ROUNDING)
+        z = Reduced(held, own.band, own.border, own.arrow if len(own.band) else None, normal.turn)
         found = _complete(linear, z, own.points, own.seen, taking_part)
         missing = abs(_total(found) - free)
     if not missing < enough:
@@ -449,68 +447,8 @@ def _is_small(linear: Linear) -> bool:
     return 2 * len(linear.misfits) * linear.system.unknowns.size <= _ENTRIES
 
 
-def _inverse_from_rows(normal: Normal, held: Mask) -> Array:
-    """Compute S⁻¹ (u, u) from the rows of the observations, without S; zero for held unknowns.
-
-    The rows F = A − B V⁻¹ Wᵀ of all observations, with points eliminated, satisfy FᵀF = S. The condition
-    number of F is the square root of that of S: its QR factors keep digits that S loses (Golub & Van Loan,
-    *Matrix Computations*, ch. 5).
-
-    Parameters
-    ----------
-    normal : Normal
-        Undamped normal equations; their V⁻¹ are used.
-    held : ndarray of bool (u,)
-        Held reduced unknowns.
-
-    Raises
-    ------
-    Singular
-        When the rows do not determine the other unknowns.
-    """
-    rows = _reduced_rows(normal)[:, ~held]
-    length = np.sqrt((rows**2).sum(axis=0))
-    if not (length > 0).all():
-        raise Singular
-    triangle = np.linalg.qr(rows / length, mode="r")
-    _, singular, vt = np.linalg.svd(triangle)
-    if len(singular) < len(length) or singular[-1] <= _ZERO * singular[0]:
-        raise Singular
-    factor = (vt.T / singular) / length[:, None]
-    inverse = np.zeros((len(held), len(held)))
-    inverse[np.ix_(~held, ~held)] = factor @ factor.T
-    return inverse
-
-
-def _reduced_rows(normal: Normal) -> Array:
-    """F (N, u): derivatives of all observations by the reduced unknowns, points eliminated."""
-    linear, system = normal.linear, normal.linear.system
-    pattern, last, u = system.pattern, linear.rows.shape[2] - 3, system.unknowns.size
-    point = system.seen.point
-    a = np.zeros((len(point), 2, u))
-    for s in range(SEGMENTS):
-        wide = int(pattern.width[:, s].max(initial=0))
-        for i in range(wide):
-            at = np.flatnonzero(pattern.width[:, s] > i)
-            a[at, :, pattern.start[at, s] + i] = linear.rows[at, :, pattern.column[at, s] + i]
-    b = linear.rows[:, :, last:]
-    cross = np.zeros((len(linear.prior), 3, u))
-    np.add.at(cross, point, np.swapaxes(b, 1, 2) @ a)
-    through = normal.inverse @ cross
-    through[pattern.eliminated == 0] = 0.0
-    image = (a - b @ through[point]).reshape(-1, u)
-    j, axis = system.others.coordinate.T
-    _, coordinates, _ = system.others.slices
-    root = system.sigma_root
-    # An observed coordinate is a row of B only, or a separate column where its point is kept.
-    observed = -root[coordinates][:, None] * through[j, axis]
-    own = linear.other_rows.toarray()
-    own[coordinates] += observed
-    return np.concatenate([image, own])
-
-
-def _is_narrow(linear: Linear) -> bool:
-    """Whether a triangle inside the band, and its full rows, take less than some minutes."""
+def _is_affordable(linear: Linear) -> bool:
+    """Whether triangles of these rows, inside a band if there is one, take less than some minutes."""
     unknowns = linear.system.unknowns
     width = unknowns.bandwidth + unknowns.size - unknowns.bands
-    return unknowns.bands > 0 and 2 * len(linear.misfits) * width**2 <= _PRODUCTS
+    return 2 * len(linear.misfits) * width**2 <= _PRODUCTS

@@ -27,6 +27,7 @@ from .datum import Freedom, freedom_of, held_minimally, scaled_by_windows, simil
 from .implicit import normal_of
 from .iteration import Iterated, iterate
 from .linear import Linear, linearised
+from .noise import determined_by_noise
 from .observations import OtherObservations
 from .posterior import BlockSolution, Cofactors, cofactors_of
 from .rank import (
@@ -487,11 +488,19 @@ class _Run:
                 return AdjustmentFailure(_WEAK, Code.SINGULAR, iterations=found.iterations, costs=found.costs)
             return undetermined(linear, freedom, tuple(found.costs))
         sigma0 = float(np.sqrt(linear.cost / redundancy)) if redundancy > 0 else 1.0
-        if self._scale_is_loose((start, values), sigma0, chosen if inner else None):
+        datum = chosen if inner else None
+        noisy = determined_by_noise(linear, cofactors, self.usable.points, sigma0)
+        if noisy:
+            return AdjustmentFailure(
+                f"the observations do not determine {' with '.join(noisy)}: what they seem to tell is noise; "
+                "take images from more directions, or points at more depths, or hold one of them",
+                Code.RANK_DEFECT, iterations=found.iterations, costs=found.costs,
+            )  # fmt: skip
+        if self._scale_is_loose((start, values), sigma0, datum):
             return AdjustmentFailure(
                 SCALE_OF_WINDOWS, Code.NOT_IDENTIFIED, iterations=found.iterations, costs=found.costs
             )
-        return self._fit(linear, freedom, cofactors, counts, found, chosen if inner else None)
+        return self._fit(linear, freedom, cofactors, counts, found, datum)
 
     def _idle(self, linear: Linear, costs: tuple[float, ...]) -> Failure | None:
         """A failure where no ray depends on a free parameter of windows or media."""
