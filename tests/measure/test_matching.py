@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import uniform_filter
 
 from reseau.measure import MatchOptions, match
-from reseau.measure.matching import matcher
+from reseau.measure.matching import compiled, matcher
 from reseau.measure.matching.correlation import with_alike_errors
 from reseau.measure.matching.matcher import SIZE
 from reseau.measure.matching.matches import Matches
@@ -266,6 +266,37 @@ def test_compiled_matches_from_known_light_are_those_of_the_general_adjustment(o
     np.testing.assert_allclose(compiled.form_sigma, general.form_sigma, rtol=1e-3, atol=0)
     for name in ("psf_px", "contrast", "level", "noise", "correlation", "t"):
         np.testing.assert_allclose(getattr(compiled, name), getattr(general, name), rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("trials", [2, 3, 4, 6])
+def test_marks_that_have_no_trials_left_are_never_corrected_with_derivatives_of_others(trials, monkeypatch):
+    """Of some the image changes, so that they are linearised again, when others are still far away."""
+    xy = places()
+    pixels = formed("square", xy) + noise(8)
+    off = np.where(np.arange(len(xy))[:, None] % 3 == 0, 2.5, 0.3)
+    corrected = compiled.advanced
+    batches = []
+
+    def advanced(rows, place, first, *rest):
+        assert place.max() < len(first[1]) == len(first[2])
+        batches.append((len(rows), len(first[1])))
+        corrected(rows, place, first, *rest)
+
+    monkeypatch.setattr(compiled, "advanced", advanced)
+    monkeypatch.setattr(matcher, "outlines_of", lambda *_: None)
+    monkeypatch.setattr(matcher, "_FIRST", trials)
+    level = np.zeros((len(xy), 3))
+    level[:, 0] = LEVEL
+    shape = GrownOutline(outlines("square", len(xy)).single(), SIZE)
+    settings = MatchOptions(half_px=9, psf_px=1.4, settled=0.02, influence=True)
+    known = {"noise": NOISE, "form_sigma": np.array([0.1]), "searching": 0.0}
+    found = match(
+        pixels, pixels > -np.inf, shape, xy + off, settings, light=(np.full(len(xy), 0.68), level), **known
+    )
+    assert len(batches) > 1
+    good = found.converged
+    assert good.any()
+    assert np.abs(found.xy - xy)[good].max() < 0.2
 
 
 @pytest.mark.parametrize("polarity", ["dark", "bright"])

@@ -448,7 +448,8 @@ def _iterated(
                 )
         if changed.any() and left < last:
             left, last = last, 0
-        some = np.flatnonzero(changed | (state == STALE))
+        # What is still active has no trials left, and a Jacobian of a batch that is no more.
+        some = np.flatnonzero(changed | (state == STALE) | (state == ACTIVE))
         if left <= 0 or not len(some):
             break
         # Trials are counted, as in the general adjustment; only what has converged may go on without any.
