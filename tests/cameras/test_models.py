@@ -222,6 +222,20 @@ def test_the_model_is_converted_to_every_other_model(case: Case) -> None:
         assert np.hypot(*off.T).max() <= 1.5 * other.greatest_px + 1e-9
 
 
+def test_a_converted_camera_has_no_pole_between_the_points_that_were_compared() -> None:
+    """A shear, that OpenCV's camera lacks, is not made up for by a denominator that vanishes in the image."""
+    grid = PixelGrid(1600, 1200, (0.005, 0.005))
+    values = {"c": 8.1, "x0": 0.05, "y0": -0.03, "K1": -2e-4, "K2": 2e-6, "P1": 3e-5, "P2": -2e-5, "B1": 1e-4}
+    camera = camera_model("openptv").mapping(np.zeros(10), grid).with_values({**values, "she": 2e-4})
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+    found = convert(camera, grid, "opencv_full", free=names)
+    columns, rows = np.meshgrid(np.linspace(0, 1599, 401), np.linspace(0, 1199, 301))
+    pixels = np.column_stack([columns.ravel(), rows.ravel()])
+    uv = camera.inverse(pixels)
+    assert found.mapping.one_to_one(uv).all()
+    assert np.hypot(*(found.mapping(uv) - pixels).T).max() < 1.1 * found.greatest_px
+
+
 def test_the_covariance_goes_along_with_a_conversion() -> None:
     """Against conversions of cameras with other values; to the same model it stays what it was."""
     camera = Case(camera_model("brown"), {"side": "object", "balance_radius_mm": 0.0}).mapping()

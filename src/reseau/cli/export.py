@@ -12,6 +12,9 @@ from .common import Out, say, suffix_of, writable
 
 __all__ = ["export"]
 
+_SAME, _FAR = 1e-5, 0.3
+"""Differences (px) that are rounding errors, and above which another format is proposed."""
+
 
 def export(
     files: Annotated[
@@ -70,7 +73,9 @@ def export(
 def _calibration(files: list[Path], to: str | None, out: Path | None) -> None:
     """Write a calibration, or those of a rig, in a format."""
     from ..calibration import Calibration
+    from ..core.numbers import plain
     from ..exchange import export_calibration, export_rig, import_calibration
+    from ..exchange.calibrations import calibration_formats, formats_holding
     from ..io import read_text
 
     if to is None or out is None:
@@ -92,7 +97,13 @@ def _calibration(files: list[Path], to: str | None, out: Path | None) -> None:
     for done in written:
         name = f" {done.camera.name}" if len(written) > 1 else ""
         say(f"{out}:{name} {done.camera.model}\n")
-        if done.greatest_px > 0:
-            say(f"  differs from the calibration by {done.rms_px:.2g} px rms, {done.greatest_px:.2g} at most")
+        if done.greatest_px > _SAME:
+            rms, most = plain(done.rms_px, 2), plain(done.greatest_px, 2)
+            say(f"  differs from the calibration by {rms} px rms, {most} at most")
             rest = "" if done.share == 1 else f"; not compared in {100 * (1 - done.share):.2g} % of the image"
             say(f"{rest}\n")
+    if max(done.greatest_px for done in written) > _FAR:
+        whole = set.intersection(*(set(formats_holding(each)) for each in calibrations))
+        known = ", ".join(name for name in calibration_formats() if name in whole)
+        do = f"these formats have its own model: {known}" if known else "no other format has it either"
+        say(f"  {to} has no model that describes this camera well; {do}\n")

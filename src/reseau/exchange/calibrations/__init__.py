@@ -11,6 +11,7 @@ from .formats import (
     export_calibration,
     export_rig,
     exported_lens,
+    formats_holding,
     import_calibration,
 )
 from .plain import Mounted, PlainCamera
@@ -24,5 +25,6 @@ __all__ = [
     "export_calibration",
     "export_rig",
     "exported_lens",
+    "formats_holding",
     "import_calibration",
 ]

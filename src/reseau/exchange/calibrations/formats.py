@@ -27,6 +27,7 @@ __all__ = [
     "export_calibration",
     "export_rig",
     "exported_lens",
+    "formats_holding",
     "import_calibration",
 ]
 
@@ -272,6 +273,15 @@ def export_rig(calibrations: Sequence[Calibration], to: str, path: Path | str) -
 
 def _in_a_model_of(form: CalibrationFormat, calibration: Calibration, lens: CameraMapping) -> Exported:
     """The camera in one of the models of a format."""
+    pitch = float(cast(dict[str, Any], calibration.model)["pitch_mm"][0])
+    camera = _as_it_is(form, calibration, lens)
+    if camera is None:
+        return exported_lens(form, calibration.name, lens, pitch)
+    return Exported(camera, 0.0, 0.0, 1.0)
+
+
+def _as_it_is(form: CalibrationFormat, calibration: Calibration, lens: CameraMapping) -> PlainCamera | None:
+    """The camera without conversion; None where the format lacks its model or one of its parameters."""
     name, (width, height) = calibration.name, lens.size
     stored: dict[str, Any] = dict(calibration.model)
     model, given = str(stored.get("model")), tuple(float(v) for v in stored["pitch_mm"])
@@ -284,11 +294,26 @@ def _in_a_model_of(form: CalibrationFormat, calibration: Calibration, lens: Came
     for wanted, names in form.models:
         same = wanted.partition("_full")[0] == model.partition("_full")[0] and set(own) <= set(names)
         if plain and same and options == _options(wanted):
-            pitch = (given[0], given[1])
-            return Exported(PlainCamera(name, width, height, wanted, own, pitch, options), 0.0, 0.0, 1.0)
+            return PlainCamera(name, width, height, wanted, own, (given[0], given[1]), options)
     if form.name == "mrcal" and isinstance(lens.mapping, SplinedStereographic):
-        return Exported(PlainCamera(name, width, height, model, own), 0.0, 0.0, 1.0)
-    return exported_lens(form, name, lens, given[0])
+        return PlainCamera(name, width, height, model, own)
+    return None
+
+
+def formats_holding(calibration: Calibration) -> tuple[str, ...]:
+    """Names of the formats that hold the calibration of a camera without conversion.
+
+    Examples
+    --------
+    >>> camera = PlainCamera("front", 640, 480, "fisheye", {"fx": 300.0, "fy": 300.0, "k1": 0.1})
+    >>> formats_holding(_calibration(camera, {}))
+    ('opencv', 'ros', 'kalibr', 'colmap')
+    """
+    lens = calibration.mapping()
+    if not isinstance(lens, CameraMapping):
+        return ()
+    forms = calibration_formats()
+    return tuple(name for name, form in forms.items() if _as_it_is(form, calibration, lens) is not None)
 
 
 def exported_lens(form: CalibrationFormat, name: str, lens: CameraMapping, pitch_mm: float = 1.0) -> Exported:

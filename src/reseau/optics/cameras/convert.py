@@ -121,6 +121,9 @@ def convert(
 ) -> Converted:
     """Convert a camera to another registered model, by least squares over the image.
 
+    The new camera is one-to-one over the image: parameters with which it has a pole or folds there are not
+    taken, however well they fit at the points.
+
     Parameters
     ----------
     camera : PlaneMapping
@@ -214,7 +217,8 @@ def _fitted(mapping: PlaneMapping, uv: Array, target: Array, at: Array) -> Plane
             full[at] = right.T @ (along * values / (values**2 + damping)) / size
             trial = mapping.with_values(mapping.values + full)
             after = _cost(trial, uv, target)
-            if after < cost:
+            # A pole or fold between the points costs nothing at them, but ruins the image there.
+            if after < cost and trial.one_to_one(uv).all():
                 mapping, cost, damping = trial, after, max(damping / 10, 1e-24)
                 break
             damping *= 10
