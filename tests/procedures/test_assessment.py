@@ -8,9 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from reseau.bundle import camera_mapping
+from reseau.calibration import CameraMapping, calibration_difference
 from reseau.core.data import ImagePoints
 from reseau.core.failure import Code
 from reseau.designs import coded_sheet
+from reseau.optics import OpenCV
 from reseau.procedures.assessment import Use
 from reseau.procedures.calibration import Calibrated, CameraOptions, calibrate_camera
 
@@ -21,9 +24,19 @@ MATRIX = np.array([[700.0, 0, 402.0], [0, 700.0, 297.0], [0, 0, 1]])
 
 
 def measured(
-    count: int = 10, *, side: float = 0.0, k2: float = 0.05, noise: float = SIGMA, tilt: float = 30.0
+    count: int = 10,
+    *,
+    side: float = 0.0,
+    k2: float = 0.05,
+    k3: float = 0.0,
+    noise: float = SIGMA,
+    tilt: float = 30.0,
+    zoom: float = 1.0,
 ) -> list[tuple[str, ImagePoints]]:
-    """Coordinates by OpenCV's projection; with `side` the target is in the left part of all images."""
+    """Coordinates by OpenCV's projection; with `side` the target is in the left part of all images.
+
+    From the middle on, images are taken with another `zoom`.
+    """
     rng, found = np.random.default_rng(4), []
     xyz = np.column_stack([DESIGN.xy * [1, -1], np.zeros(len(DESIGN.xy))])
     for k in range(count):
@@ -31,7 +44,8 @@ def measured(
         axis = np.deg2rad(tilt) * np.array([np.cos(1.3 * k), np.sin(1.3 * k), 0])
         turn = cv2.Rodrigues(cv2.Rodrigues(axis)[0] @ roll)[0]
         place = np.array([rng.uniform(-40, 40) - side, rng.uniform(-30, 30), 170.0 + side + 10 * (k % 3)])
-        xy = cv2.projectPoints(xyz, turn, place, MATRIX, np.array([-0.2, k2, 0, 0]))[0][:, 0]
+        matrix = MATRIX if k < count / 2 else np.diag([zoom, zoom, 1.0]) @ MATRIX
+        xy = cv2.projectPoints(xyz, turn, place, matrix, np.array([-0.2, k2, 0, 0, k3]))[0][:, 0]
         inside = ((xy > 5) & (xy < np.array(SIZE) - 6)).all(axis=1)
         xy = xy + noise * rng.normal(size=xy.shape)
         names = [name for name, good in zip(DESIGN.ids, inside, strict=True) if good]
@@ -56,6 +70,34 @@ def test_a_covered_and_accurate_calibration_is_usable_for_measurement() -> None:
     assert found.covered > 0.8
     assert found.lines[1].startswith(f"points are in {int(100 * found.covered)} % of the image; ")
     assert "enough for measurement" in found.lines[1] or "no further" in found.lines[1]
+
+
+@pytest.mark.parametrize("k3", [0.0, 0.02])
+def test_the_error_that_is_stated_holds_for_a_lens_with_more_terms(k3: float) -> None:
+    """What k1 and k2 make of k3 is right where points are, and wrong by ten sigmas in the corners."""
+    result = calibrated(measured(k3=k3))
+    found = result.assessments["camera"]
+    true = dict(zip(("fx", "fy", "cx", "cy"), MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True))
+    lens = OpenCV.from_parameters(true | {"k1": -0.2, "k2": 0.05, "k3": k3})
+    other = CameraMapping(lens, *SIZE, np.array([0]), np.zeros((1, 1)))
+    off = calibration_difference(camera_mapping(result.result, 0), other).difference
+    corners = np.hypot(*off[[0, 0, -1, -1], [0, -1, 0, -1]].T).max()
+    assert found.lacks == ("k3" if k3 else "")
+    assert corners < 2.5 * found.corners_px
+    assert found.corners_px < max(2.5 * corners, 0.05)
+    if k3:
+        assert corners > 0.1
+        assert "; the model lacks k3 (0." in found.lines[0]
+        assert found.entries()["lacks"] == "k3"
+
+
+def test_photographs_that_contradict_each_other_are_not_made_up_for_by_another_one() -> None:
+    found = calibrated(measured(zoom=1.1)).assessments["camera"]
+    assert found.contradicts
+    assert found.next_photograph is None
+    assert "; the photographs contradict each other, by " in found.lines[0]
+    assert "; take them anew: focus, zoom, stabilisation or the target changed" in found.lines[1]
+    assert not calibrated(measured()).assessments["camera"].contradicts
 
 
 def test_the_part_without_points_is_named_and_the_next_photograph_shows_the_target_there() -> None:

@@ -1,8 +1,9 @@
 """What a calibration is good for: its accuracy in pixels, what the photographs do not cover, what to do next.
 
 The accuracy at a place of the image is the root of the squares of the standard deviation of the projection,
-enlarged where the images scatter more than it says, and of what the residuals have in common there beyond
-noise. It is a size in pixels, not a test: with many points, a test finds errors that are too small to matter.
+enlarged where the images scatter more than it says, of what the residuals have in common there beyond noise,
+and of what the next radial coefficient would change, where it is significant. It is a size in pixels, not a
+test: with many points, a test finds errors that are too small to matter.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..bundle import Result, by_place, camera_mapping, common_pattern, image_scatter
+from ..bundle import Result, by_place, camera_mapping, common_pattern, image_scatter, lacking
 from ..calibration import CameraMapping, projection_field
 from ..core.data import Array, Mask
 from ..core.errors import UsageError
@@ -51,6 +52,8 @@ _ZONES = (
     ("lower left corner", "lower edge", "lower right corner"),
 )
 _ACROSS = 13
+_CONTRADICT = 3.0
+"""Factor by which images scatter more than their points say, from which they are of different cameras."""
 _ENOUGH = 6
 """Fewer images do not show whether the camera is stable and the model fits."""
 _STRAIGHT, _PLANE = 15.0, 0.05
@@ -79,6 +82,12 @@ class Assessment:
         Whether the camera model describes the residuals but for practically nothing.
     misfit_px : float
         What the residuals have in common beyond noise, root mean square.
+    lacks : str
+        Radial coefficient that the camera lacks and the residuals need; empty where there is none.
+    lacks_px : float
+        What it changes in the corners.
+    scatter : float
+        Factor by which the images scatter more than the standard deviations say; at least 1.
     images : int
         Number of photographs.
     tilt_deg : float
@@ -88,7 +97,8 @@ class Assessment:
     uncovered : tuple of str
         Parts of the image with few points.
     next_photograph : NextPose, optional
-        Photograph that would help most; none where no photograph lowers the error.
+        Photograph that would help most; none where no photograph lowers the error, or the photographs
+        contradict each other.
     compared : bool
         Whether the camera model is the best of several.
     warnings, tests : tuple of Remark
@@ -109,6 +119,9 @@ class Assessment:
     focal_px: float
     fits: bool
     misfit_px: float
+    lacks: str
+    lacks_px: float
+    scatter: float
     images: int
     tilt_deg: float
     covered: float
@@ -117,6 +130,11 @@ class Assessment:
     compared: bool
     warnings: tuple[Remark, ...]
     tests: tuple[Remark, ...]
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the photographs are not of one camera and one target, so that more of them do not help."""
+        return self.scatter >= _CONTRADICT
 
     @property
     def lines(self) -> tuple[str, str]:
@@ -131,17 +149,23 @@ class Assessment:
             first += f" ({_two(far)} mm at 1 m)" if np.isfinite(far) else ""
         else:
             first += "the projection is not determined in the corners"
-        if self.use is Use.NOTHING and self.fits:
+        if self.contradicts:
+            first += f"; the photographs contradict each other, by {_two(self.scatter)} times their sigmas"
+        elif not self.fits:
+            more = f" and lacks {self.lacks}" if self.lacks else ""
+            if self.compared:
+                why = "see that focus and zoom stay and the target is stiff"
+            else:
+                why = "try --model auto"
+            first += f"; the model does not fit by {_two(self.misfit_px)} px{more}: {why}"
+        elif self.lacks_px > _FITS:
+            do = "estimate it too" if self.compared else "try --model auto"
+            where = "at the margin" if self.circular_deg else "in the corners"
+            first += f"; the model lacks {self.lacks} ({_two(self.lacks_px)} px {where}): {do}"
+        elif self.use is Use.NOTHING:
             first += "; the photographs do not determine the camera"
-        elif self.fits:
-            first += f"; the model fits (to {_rounded(self.misfit_px)})"
         else:
-            why = (
-                "see that focus and zoom stay and the target is stiff"
-                if self.compared
-                else "try --model auto"
-            )
-            first += f"; the model does not fit by {_two(self.misfit_px)} px: {why}"
+            first += f"; the model fits (to {_rounded(self.misfit_px)})"
         # Rounded down: points are in the whole image only where no part is left.
         second = f"points are in {int(100 * self.covered)} % of the image"
         if self.uncovered:
@@ -150,7 +174,9 @@ class Assessment:
             second += f"; {self.images} photographs are few, take 10 or more"
         if self.tilt_deg < _STRAIGHT:
             second += f"; the target is seen nearly straight, tilted by {self.tilt_deg:.0f}° at most: tilt it"
-        if self.next_photograph is not None:
+        if self.contradicts:
+            second += "; take them anew: focus, zoom, stabilisation or the target changed between them"
+        elif self.next_photograph is not None:
             then = self.next_photograph
             enough = self.use is Use.MEASUREMENT and not self.uncovered and self.images >= _ENOUGH
             which = "enough for measurement; the next photograph" if enough else "the photograph"
@@ -177,6 +203,9 @@ class Assessment:
             "corners_px": self.corners_px if np.isfinite(self.corners_px) else None,
             "fits": self.fits,
             "misfit_px": self.misfit_px,
+            "lacks": self.lacks or None,
+            "lacks_px": self.lacks_px,
+            "scatter": self.scatter,
             "uncovered": list(self.uncovered),
             "next_photograph": None
             if then is None
@@ -226,11 +255,16 @@ def assess(result: Result, camera: int = 0, *, compared: bool = False) -> Assess
     share = np.where(count < _LIT * (_CELLS // 3) ** 2, 1.0, with_points / np.maximum(count, 1))
     uncovered = tuple(_ZONES[r][c] for r in range(3) for c in range(3) if share[r, c] < _EMPTY)
     misfit, at_centre, at_corners, chance = _misfits(result, camera, lens)
-    centre, corners = float(np.hypot(centre, at_centre)), float(np.hypot(corners, at_corners))
+    more = lacking(result, camera)
+    lacks, lacks_centre, lacks_px = "", 0.0, 0.0
+    if more is not None and more.significant and np.isfinite(corners):
+        lacks, lacks_centre, lacks_px = more.name, more.centre_px, more.corners_px
+    centre = float(np.linalg.norm([centre, at_centre, lacks_centre]))
+    corners = float(np.linalg.norm([corners, at_corners, lacks_px]))
     fits = misfit <= _FITS or chance > 0.01
     use = next((use for limit, use in _LIMITS if corners <= limit), Use.NOTHING)
     empty = np.repeat(np.repeat(share < _EMPTY, _CELLS // 3, axis=0), _CELLS // 3, axis=1) & ~covered
-    then = next_photograph(result, empty) if camera == 0 else None
+    then = next_photograph(result, empty) if camera == 0 and factor < _CONTRADICT else None
     few = _few_gross_errors(result, len(rows))
     tests = tuple(
         remark
@@ -247,8 +281,8 @@ def assess(result: Result, camera: int = 0, *, compared: bool = False) -> Assess
     images = int((result.fit.usable.images & (result.network.camera_of == camera)).sum())
     tilt = _tilted(result, camera)
     return Assessment(
-        use, centre, corners, circular, focal, fits, misfit, images, tilt, float(seen[lit].mean()),
-        uncovered, then, compared, important, tests,
+        use, centre, corners, circular, focal, fits, misfit, lacks, lacks_px, factor, images, tilt,
+        float(seen[lit].mean()), uncovered, then, compared, important, tests,
     )  # fmt: skip
 
 

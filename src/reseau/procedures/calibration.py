@@ -475,8 +475,9 @@ def calibrate_camera(
         if of.count(c) < _LEAST_IMAGES:
             which = f" of camera {name}" if taken else ""
             why = "".join(f"; {image}: {reason}" for image, reason in declined.items())
+            show = f"image{which} shows" if of.count(c) == 1 else f"images{which} show"
             return Failure(
-                f"{of.count(c)} images{which} show the target, {_LEAST_IMAGES} are needed{why}",
+                f"{of.count(c)} {show} the target, {_LEAST_IMAGES} are needed, 10 are good{why}",
                 Code.TOO_FEW_IMAGES,
             )
     if not all(name in sizes for name in cameras):
@@ -620,6 +621,8 @@ def _measured(
         if seen[name] != (width, height):
             del measured[name]
             declined[name] = f"is {seen[name][0]}×{seen[name][1]} pixels, not {width}×{height}"
+            if seen[name] == (height, width):
+                declined[name] += ": turned by a program, take the file as the camera wrote it"
     return measured, declined, sizes
 
 

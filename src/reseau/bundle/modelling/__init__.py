@@ -4,6 +4,7 @@ from .adjustment import Options, adjust_network, problem_of
 from .board import BoardChoice, BoardModel, choose_board, held_as_designed
 from .calibration import calibration_of, with_estimates
 from .choice import Candidate, Compared, ModelChoice, camera_candidates, choose_model
+from .lacking import Lacking, lacking
 from .search import (
     Kind,
     Selection,
@@ -20,6 +21,7 @@ __all__ = [
     "Candidate",
     "Compared",
     "Kind",
+    "Lacking",
     "ModelChoice",
     "Options",
     "Selection",
@@ -32,6 +34,7 @@ __all__ = [
     "eliminate_parameters",
     "estimate_components",
     "held_as_designed",
+    "lacking",
     "problem_of",
     "reweighted",
     "search_model",
