@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from reseau.core.data import Array
-from reseau.measure.reseau.lens_mapping import lens_through
+from reseau.measure.reseau.lens_mapping import lens_through, mapping_through
 from reseau.measure.reseau.sheet_placement import through
+from reseau.measure.testfield.lattice_mapping import second_order, slope_of
 
 SHAPE, FOCAL, NOISE_PX = (1024, 1024), 380.0, 0.3
 
@@ -33,3 +34,24 @@ def test_tags_in_the_corner_of_a_fisheye_picture_lie_in_one_plane(seed: int) -> 
     found = lens_through(at, xy, np.full(len(at), NOISE_PX), SHAPE, through(at, xy, SHAPE))
     assert found is not None
     assert np.hypot(*(found.mapping(at) - xy).T).max() < 6 * NOISE_PX
+
+
+def test_a_board_from_the_axis_of_a_fisheye_to_the_horizon_has_a_mapping() -> None:
+    """Far from the axis a projectivity alone leads out of the frame; OpenCV's fisheye camera with k1, k2."""
+    at = np.stack(np.unravel_index(np.arange(88), (8, 11)), axis=1).astype(float)
+    matrix = np.array([[400.0, 0, 470.0], [0, 402.0, 330.0], [0, 0, 1]])
+    turn, place = np.array([[0.5, 0.2, 0.3]]), np.array([[-2.0, -5.0, 3.2]])
+    xyz = np.column_stack([at, np.zeros(len(at))])[:, None]
+    xy = cv2.fisheye.projectPoints(xyz, turn, place, matrix, np.array([0.02, -0.01, 0.0, 0.0]))[0][:, 0]
+    deep = (xyz[:, 0] @ np.asarray(cv2.Rodrigues(turn)[0]).T + place)[:, 2] > 0.3
+    at, xy = at[deep], xy[deep]
+    off_axis = np.hypot(*(xy - matrix[:2, 2]).T) / 400
+    assert len(at) > 60
+    assert off_axis.max() > np.deg2rad(65)
+    found = mapping_through(at, xy, np.full(len(at), 0.005), (720, 960)).mapping
+    assert np.hypot(*(found(at) - xy).T).max() < 0.05
+    step, (_, slope, bend) = 1e-4, second_order(found, at)
+    for k, d in enumerate(step * np.eye(2)):
+        np.testing.assert_allclose((found(at + d) - found(at - d)) / (2 * step), slope[:, :, k], atol=1e-4)
+        numeric = (slope_of(found, at + d) - slope_of(found, at - d)) / (2 * step)
+        np.testing.assert_allclose(numeric, bend[..., k], atol=1e-2)

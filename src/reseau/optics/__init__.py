@@ -16,6 +16,7 @@ from .cameras import (
 )
 from .composition import Chain, Identity, Inverted, Similarity
 from .displays import DecenteredDisplay, wong_display
+from .equidistant import Equidistant
 from .mapping import Derivatives, Mapping, PlaneMapping
 from .polynomials import RationalPolynomial
 from .poses import (
@@ -40,6 +41,7 @@ __all__ = [
     "DecenteredDisplay",
     "Derivatives",
     "EbnerCorrection",
+    "Equidistant",
     "Identity",
     "Inverted",
     "Mapping",

@@ -25,8 +25,8 @@ from ...optics import Chain
 from ..reseau.disks import Disks
 from ..reseau.lens_mapping import lens_through
 from ..reseau.mark_windows import Located
-from ..reseau.sheet_placement import MOST_DISKS, disk_seeds, grown_disks, through
-from ..testfield.lattice_mapping import images_of, slope_of
+from ..reseau.sheet_placement import MOST_DISKS, STRENGTHS, disk_seeds, grown_disks, through
+from ..testfield.lattice_mapping import images_of, slope_of, started
 from .bits import Bits, Integers, read_bits
 from .candidates import (
     LENS_FROM,
@@ -388,8 +388,7 @@ def _plane_of_markers(
         return np.asarray(matrix), np.ones(4, dtype=bool)
     # Good to two pixels: distortion bends the board.
     limit = max(3.0, 0.006 * max(shape))
-    found, inlier = cv2.findHomography(plane, image, cv2.RANSAC, limit)
-    good = np.zeros(len(plane), dtype=bool) if inlier is None else np.asarray(inlier.ravel() > 0)
+    found, good = _agreeing(plane, image, shape, limit, 0.0)
     while _LENS_FROM <= good.sum() < len(good):
         start = through(plane[good], image[good], shape)
         lens = lens_through(plane[good], image[good], np.full(good.sum(), _MARKER_PX), shape, start)
@@ -399,7 +398,29 @@ def _plane_of_markers(
         if agree.sum() <= good.sum():
             break
         good = agree
-    return None if found is None else np.asarray(found, dtype=np.float64), good
+    if not good.all():
+        bent = [_agreeing(plane, image, shape, limit, strength) for strength in STRENGTHS[1:]]
+        found, good = max([(found, good), *bent], key=lambda one: int(one[1].sum()))
+    return found, good
+
+
+def _agreeing(
+    plane: Array, image: Array, shape: tuple[int, int], limit: float, strength: float
+) -> tuple[Array | None, NDArray[np.bool_]]:
+    """Projectivity behind a fisheye, and which points agree with it to `limit` pixels."""
+    good = np.zeros(len(plane), dtype=bool)
+    ideal = started(np.eye(3), 1, shape, strength).first.inverse(image) if strength > 0 else image
+    there = np.isfinite(ideal).all(axis=1)
+    if there.sum() < 4:
+        return None, good
+    found, inlier = cv2.findHomography(plane[there], ideal[there], cv2.RANSAC, limit)
+    if found is None:
+        return None, good
+    good[there] = inlier.ravel() > 0
+    if strength > 0:
+        off = images_of(started(np.asarray(found), 1, shape, strength), plane) - image
+        good = np.hypot(*off.T) < limit
+    return np.asarray(found, dtype=np.float64), good
 
 
 def lay_marked(

@@ -29,6 +29,9 @@ _KERNELS = 2
 """Number of times a kernel is estimated."""
 _FILTERED = 0.85
 """Ratio of mean square residuals below which a kernel is used."""
+_CONFIRMED = 0.7
+"""The same with all marks that show it: what few marks have in common is also compression, or errors of
+figures beside them, which leave 0.8; sharpening and motion leave 0.4."""
 _EXPLAINED = 0.7
 """Ratio of residuals below which a curve explains what looked like motion or sharpening."""
 _SPREAD = 16
@@ -154,16 +157,22 @@ def _respond(marks: MarkWindows, first: Matches, rows: Rows, begun_px: float) ->
         if bent:
             kernel, sharper, gain = estimate_kernel(marks.samples(first.select(few), rows[few])[0])
     if gain < _FILTERED:
+        plain = marks.look
         for again in range(_KERNELS):
             if again:
                 # Position and form were those of images without the kernel.
                 marks.look = replace(marks.look, kernel=None)
-                kernel, sharper, _ = estimate_kernel(marks.samples(first, rows)[0], (1.0,))
-            marks.look = replace(marks.look, kernel=kernel, psf_px=sharper * marks.look.psf_px)
+                kernel, sharper, gain = estimate_kernel(marks.samples(first, rows)[0], (1.0,))
+            confirmed = not again or gain < _CONFIRMED
+            if not confirmed:
+                marks.look = plain
+            else:
+                marks.look = replace(marks.look, kernel=kernel, psf_px=sharper * marks.look.psf_px)
             first = marks.settle(marks.match(rows))
             weigh(marks, first, rows)
-        text = "the images are smeared by motion or sharpened: this was estimated and is modelled"
-        notes = (*notes, Remark(text, Code.FILTERED))
+        if confirmed:
+            text = "the images are smeared by motion or sharpened: this was estimated and is modelled"
+            notes = (*notes, Remark(text, Code.FILTERED))
     if not bent:
         notes = (*notes, *_straighten(marks, first, rows)[2])
     return notes

@@ -9,7 +9,8 @@ centre c, and the ratio a of the scales along both axes less 1,
 
 with r = |d| (Brown 1971, Photogrammetric Engineering 37, eq. 10): sixteen parameters, of which usual sizes
 are known, contain the second derivatives that a free polynomial has only from its third degree on, with
-twenty. Written out it is a polynomial of the seventh degree.
+twenty. Written out it is a polynomial of the seventh degree. Behind a fisheye u is that by an equidistant
+one about the middle of the frame (:class:`reseau.optics.Equidistant`).
 """
 
 from __future__ import annotations
@@ -21,15 +22,27 @@ from functools import lru_cache
 import numpy as np
 
 from ...core.data import Array
-from ...optics import Chain
+from ...optics import Chain, Equidistant
 from ..testfield.lattice_fit import monomials_of
-from ..testfield.lattice_mapping import of_degree, started, with_coefficients
-from .sheet_placement import through
+from ..testfield.lattice_mapping import (
+    degree_of,
+    matrix_of,
+    of_degree,
+    started,
+    strength_of,
+    with_coefficients,
+)
+from .sheet_placement import fisheye_of, through
 
-__all__ = ["FoundMapping", "free_through", "lens_through", "mapping_through"]
+__all__ = ["UNFIT", "FoundMapping", "free_through", "lens_through", "mapping_through"]
+
+UNFIT = 2.0
+"""Misfit of the mapping through all marks, in their sigmas, from which it does not tell its derivatives."""
 
 _LENS_SIGMA = np.array([0.3, 0.3, 0.1, 0.1, 0.1, 0.005, 0.003, 0.003])
 """Usual sizes of k1, k2, k3, c, a, p1 and p2; half the width of a frame has r = 1."""
+_FISHEYE = 0.25
+"""Share of the weighted squares and parameters without a fisheye below which there is one."""
 _DEGREE, _USUAL = 7, 5
 """Degree of the polynomial; and of a free one that is tried with any number of points."""
 _ROUGH_PX = 0.005
@@ -87,19 +100,30 @@ def mapping_through(at: Array, xy: Array, sigma: Array, shape: tuple[int, int]) 
         return float((((mapping(at) - xy) * weight[:, None]) ** 2).sum()) + 2 * parameters
 
     known = [d for d in range(1, _DEGREE + 1) if d == 1 or _PER_TERM * (d + 1) * (d + 2) <= 2 * len(at)]
-    # A fisheye is described by no lens of the above kind: as high a degree as there are points for.
-    free = [through(at, xy, shape, d) for d in {min(known[-1], _USUAL), known[-1]}]
-    best = min(free, key=lambda mapping: criterion(mapping, len(mapping.second.values)))
-    lens = lens_through(at, xy, sigma, shape, free[0])
-    if lens is not None:
+
+    def best_of(strength: float) -> tuple[float, FoundMapping]:
+        # Where no lens of the above kind describes the points: as high a degree as there are points for.
+        free = [through(at, xy, shape, d, strength) for d in sorted({min(known[-1], _USUAL), known[-1]})]
+        if strength > 0:
+            # What little is left towards the margin counts for a robust fit as errors of the points.
+            free = [free_through(mapping, at, xy, sigma, degree_of(mapping)) for mapping in free]
+        best = min(free, key=lambda mapping: criterion(mapping, len(mapping.second.values)))
         least = criterion(best, len(best.second.values))
-        if criterion(lens.mapping, 8 + len(_LENS_SIGMA)) <= least:
-            return lens
-    return FoundMapping(best, _changes(best, at, xy, weight))
+        lens = lens_through(at, xy, sigma, shape, free[0])
+        if lens is not None and (own := criterion(lens.mapping, 8 + len(_LENS_SIGMA))) <= least:
+            return own, lens
+        return least, FoundMapping(best, _changes(best, at, xy, weight))
+
+    least, found = best_of(0.0)
+    if least > UNFIT**2 * 2 * len(at) and (strength := fisheye_of(at, xy, shape)) > 0:
+        # A board that is not plane is described a little better, too.
+        other, behind = best_of(strength)
+        found = behind if other < _FISHEYE * least else found
+    return found
 
 
-def free_through(mapping: Chain, at: Array, xy: Array, sigma: Array) -> Chain:
-    """The projectivity of a mapping with a polynomial of the seventh degree through points, by least squares.
+def free_through(mapping: Chain, at: Array, xy: Array, sigma: Array, degree: int = _DEGREE) -> Chain:
+    """The projectivity of a mapping with a polynomial of some degree through points, by least squares.
 
     Where no lens describes the points (a fisheye), the difference from `mapping` shows what is unknown.
 
@@ -109,8 +133,10 @@ def free_through(mapping: Chain, at: Array, xy: Array, sigma: Array) -> Chain:
         The mapping.
     at, xy, sigma
         See :func:`mapping_through`.
+    degree : int
+        Of the polynomial.
     """
-    free, weight = of_degree(mapping, _DEGREE), 1 / np.hypot(sigma, _ROUGH_PX)[:, None]
+    free, weight = of_degree(mapping, degree), 1 / np.hypot(sigma, _ROUGH_PX)[:, None]
     monomials, straight = monomials_of(free, at)
     values = np.linalg.lstsq(monomials * weight, (xy - straight) * weight, rcond=1e-10)[0]
     return with_coefficients(free, np.asarray(values.T, dtype=np.float64))
@@ -156,14 +182,17 @@ def _distortion(u: Array, x: Array) -> tuple[Array, Array, Array]:
     return q / stretch, by_u, by_x
 
 
-def _seen(source: Array, x: Array) -> tuple[Array, Array]:
+def _seen(source: Array, x: Array, strength: float) -> tuple[Array, Array]:
     """Images (n, 2) of points (n, 3) in homogeneous coordinates, and derivatives (n, 2, 16) by parameters."""
     p = source @ np.append(x[:8], 1.0).reshape(3, 3).T
     u = p[:, :2] / p[:, 2:]
-    bent, by_u, by_x = _distortion(u, x[8:])
     by_h = np.zeros((len(source), 2, 8))
     by_h[:, 0, :3] = by_h[:, 1, 3:6] = source / p[:, 2:]
     by_h[:, :, 6:] = -u[:, :, None] * (source[:, None, :2] / p[:, 2:, None])
+    if strength > 0:
+        u, slope = Equidistant(np.array([strength])).derivatives(u)[:2]
+        by_h = slope @ by_h
+    bent, by_u, by_x = _distortion(u, x[8:])
     return u + bent, np.concatenate([(by_u + np.eye(2)) @ by_h, by_x], axis=2)
 
 
@@ -177,14 +206,15 @@ def lens_through(
     at, xy, sigma, shape
         See :func:`mapping_through`.
     start : Chain
-        Whose projectivity the iteration starts from.
+        Whose projectivity the iteration starts from; its fisheye is kept.
     """
     h, w = shape
     middle, half = np.array([w - 1, h - 1]) / 2, max(h, w) / 2
     centre, size = at.mean(axis=0), max(float(np.ptp(at, axis=0).max()) / 2, 1e-9)
     back = np.array([[1 / size, 0, -centre[0] / size], [0, 1 / size, -centre[1] / size], [0, 0, 1]])
     to_unit = np.array([[1 / half, 0, -middle[0] / half], [0, 1 / half, -middle[1] / half], [0, 0, 1]])
-    first = to_unit @ np.append(start.first.values, 1.0).reshape(3, 3) @ np.linalg.inv(back)
+    first = to_unit @ matrix_of(start) @ np.linalg.inv(back)
+    strength = strength_of(start)
 
     def source(at: Array) -> Array:
         return np.column_stack([(at - centre) / size, np.ones(len(at))])
@@ -195,7 +225,7 @@ def lens_through(
     prior = np.append(np.zeros(8), 1 / _LENS_SIGMA)
     last = np.inf
     for _ in range(_STEPS):
-        image, slopes = _seen(here, x)
+        image, slopes = _seen(here, x, strength)
         jacobian = slopes.reshape(-1, len(x)) * weight[:, None]
         off = (seen - image).ravel() * weight
         data = jacobian.T @ jacobian
@@ -216,7 +246,7 @@ def lens_through(
 
     def written(values: Array) -> Chain:
         matrix = np.linalg.inv(to_unit) @ np.append(values[:8], 1.0).reshape(3, 3) @ back
-        mapping = of_degree(started(matrix, 1, shape), _DEGREE)
+        mapping = of_degree(started(matrix, 1, shape, strength), _DEGREE)
         return with_coefficients(mapping, half * _expanded(values[8:]).T)
 
     try:
@@ -226,7 +256,7 @@ def lens_through(
     redundancy = 2 * len(at) - float(np.trace(np.linalg.solve(normal, data)))
     scale = np.sqrt(float(off @ off) / redundancy) if redundancy >= _SHOWN else 1.0
     return FoundMapping(
-        written(x), lambda at: np.moveaxis(_seen(source(at), x)[1] @ (half * scale * root), 2, 0)
+        written(x), lambda at: np.moveaxis(_seen(source(at), x, strength)[1] @ (half * scale * root), 2, 0)
     )
 
 

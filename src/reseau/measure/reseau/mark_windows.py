@@ -31,7 +31,7 @@ from ..screening import Screened
 from ..testfield.targets import merged
 from .marks import ReseauOptions
 
-__all__ = ["DISTURBED", "ENOUGH", "SEEN", "Appearance", "Located", "MarkWindows"]
+__all__ = ["BESIDE", "DISTURBED", "ENOUGH", "SEEN", "Appearance", "Located", "MarkWindows"]
 
 _CLASS_PX = 4
 """Step of the window sizes."""
@@ -58,7 +58,7 @@ _LIKELY = 0.7
 """Correlation with the formed image from which a mark that was not found at first is looked for."""
 ENOUGH = 6
 """Least number of reliable marks from which something is learnt."""
-_BESIDE = 0.05
+BESIDE = 0.05
 """Share of a pixel from which other ink hides it from the matching; the light of fainter tails is
 subtracted."""
 
@@ -226,7 +226,7 @@ class MarkWindows(ABC):
             self.own_px[rows[part]] = float((2 * np.array(half) + 1).prod())
             if region is not None:
                 # What is printed there is known, and the same around every mark.
-                own = region if here is None else region & (np.abs(here) < _BESIDE)
+                own = region if here is None else region & (np.abs(here) < BESIDE)
                 self.own_px[rows[part]] = own.sum(axis=(1, 2))
             options = MatchOptions(
                 half_px=half,
@@ -265,7 +265,7 @@ class MarkWindows(ABC):
     def _clear(self, beside: Array) -> Mask:
         """Pixels (h, w) of which other ink takes nearly nothing."""
         if self._cleared is None or self._cleared[0] is not beside:
-            self._cleared = beside, (beside < _BESIDE) & (beside > -_BESIDE)
+            self._cleared = beside, (beside < BESIDE) & (beside > -BESIDE)
         return self._cleared[1]
 
     def _cut(self, values: NDArray[Any], rows: Rows, half: tuple[int, int]) -> NDArray[Any]:

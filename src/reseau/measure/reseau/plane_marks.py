@@ -31,11 +31,11 @@ from ..screening import Screened
 from ..testfield.lattice_mapping import images_of, slope_of
 from ..testfield.targets import replaced
 from .learning import learn, weigh
-from .lens_mapping import free_through, mapping_through
-from .mark_windows import DISTURBED, ENOUGH, SEEN, Located, MarkWindows
+from .lens_mapping import UNFIT, free_through, mapping_through
+from .mark_windows import BESIDE, DISTURBED, ENOUGH, SEEN, Located, MarkWindows
 from .marks import ReseauOptions
 
-__all__ = ["UNFIT", "PlaneMarks"]
+__all__ = ["PlaneMarks"]
 
 _HIGH_RESIDUALS = 1.25
 """Multiple of the usual residuals from which something is suspected in front of a mark."""
@@ -57,8 +57,6 @@ _UNKNOWN_PX = 1.0
 """Error of a position that nothing bounds; it is more than is accepted."""
 _WHOLE = 0.97
 """Share of the pixels of a mark below which it is seen in part."""
-UNFIT = 2.0
-"""Misfit of the mapping through all marks, in their sigmas, from which it does not tell its derivatives."""
 _BENT_PX = 0.15
 """Distance of one mark in ten from the mapping through all, from which that is adjusted again."""
 _ROUNDS, _SAME, _NEAR = 6, 0.5, 2.0
@@ -132,7 +130,7 @@ class PlaneMarks(MarkWindows):
         found = self._tempered(rows, found, alike) if self.even else alike
         if self.precise_start:
             found = self._with_doubtful_light(rows, found)
-        found = replace(found, cov=found.cov + self._misformed(rows))
+        found = replace(found, cov=found.cov + self._misformed(rows, found))
         why, field = self._judged(rows, found, field)
         return self._spread(rows, found, why, field, with_field)
 
@@ -207,7 +205,7 @@ class PlaneMarks(MarkWindows):
         """
         return np.zeros((len(rows), 2))
 
-    def _misformed(self, rows: Rows) -> Array:
+    def _misformed(self, rows: Rows, found: Matches) -> Array:
         """Covariances (k, 2, 2) of what formed images lack, and of the mapping that forms them."""
         cov = np.tile(self.formed_px**2 * np.eye(2), (len(rows), 1, 1))
         if not self.eccentric:
@@ -243,7 +241,7 @@ class PlaneMarks(MarkWindows):
         return bool(len(off) >= ENOUGH and np.quantile(off, 0.9) > _BENT_PX)
 
     def _straight(self, rows: Rows) -> Array:
-        """Images by the projectivity alone, the source coordinates of smooth fields."""
+        """Images without the polynomial, the source coordinates of smooth fields."""
         return self.mapping.first(self.at[rows])
 
     def _in_sight(self) -> Rows:
@@ -285,21 +283,17 @@ class PlaneMarks(MarkWindows):
         Correlations of residuals are those of the whole frame; what they make of a position is a bound.
         Positions also scatter about a smooth mapping: with the covariances C + f E, of independent
         errors and of what they have in common, the weighted square sum of the deviations is the redundancy.
+        Where they scatter less than C, residuals are larger than noise: blur, smear and levels that are not
+        quite those of the model leave residuals that are even about a mark, and do not displace it. The
+        covariance is then at least that of the odd residuals.
         """
         extra = alike.cov - plain.cov
         good = plain.converged & (plain.t > 8) & (plain.rejected < 0.1) & (plain.seen > SEEN)
-        good &= np.trace(extra, axis1=1, axis2=2) != 0
-        count = int(good.sum())
-        degree = next((d for d in (5, 4, 3) if _PER_SMOOTH * (d + 1) * (d + 2) <= 2 * count), None)
-        if degree is None:
+        terms = self._smooth_terms(rows[good])
+        if terms is None:
             return alike
-        at = self._straight(rows[good])
-        at = (at - at.mean(axis=0)) / np.maximum(np.ptp(at, axis=0) / 2, 1e-9)
-        terms = np.stack(
-            [at[:, 0] ** i * at[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1
-        )
         c, e = (np.diagonal(cov[good], axis1=1, axis2=2) for cov in (plain.cov, extra))
-        redundancy = 2 * (count - terms.shape[1])
+        redundancy = 2 * (len(terms) - terms.shape[1])
 
         def excess(share: float) -> float:
             total = 0.0
@@ -311,11 +305,31 @@ class PlaneMarks(MarkWindows):
             return float(total - redundancy)
 
         none, whole = excess(0.0), excess(1.0)
+        if none < 0:
+            odd = self._odd_share(plain.residuals[good])
+            return replace(alike, cov=plain.cov * np.clip(1 + none / redundancy, odd, 1.0))
         if none * whole < 0:
             share = float(brentq(excess, 0.0, 1.0, xtol=0.01))
         else:
             share = 0.0 if abs(none) < abs(whole) else 1.0
         return replace(alike, cov=plain.cov + share * extra)
+
+    @staticmethod
+    def _odd_share(residuals: Array) -> float:
+        """Mean square of the part of residuals (k, r, c) that is odd about the middle, over that of all."""
+        turned = residuals[:, ::-1, ::-1]
+        whole = float(np.nanmean(np.where(np.isfinite(turned), residuals**2, np.nan)))
+        return min(float(np.nanmean((residuals - turned) ** 2)) / 2 / max(whole, 1e-300), 1.0)
+
+    def _smooth_terms(self, rows: Rows) -> Array | None:
+        """Terms (k, u) of the polynomial about which positions of marks scatter; None for too few of them."""
+        degree = next((d for d in (5, 4, 3) if _PER_SMOOTH * (d + 1) * (d + 2) <= 2 * len(rows)), None)
+        if degree is None:
+            return None
+        at = self._straight(rows)
+        at = (at - at.mean(axis=0)) / np.maximum(np.ptp(at, axis=0) / 2, 1e-9)
+        terms = [at[:, 0] ** i * at[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)]
+        return np.stack(terms, axis=1)
 
     def _match_all(self, rows: Rows) -> Matches:
         """Match disks; on even paper where paper is saturated all around."""
@@ -368,6 +382,7 @@ class PlaneMarks(MarkWindows):
             shift = shift + _UNSURE * np.sqrt((self.changes(self.at[some]) ** 2).sum(axis=(0, 2)))
         self.start[some] = xy
         images, reach = self._images(some)
+        beside = self.beside()
         foreign: NDArray[Any] = np.zeros(self.screened.grey.shape, dtype=np.uint8)
         seen = np.zeros(foreign.shape, dtype=bool)
         for part, half in self._windows(reach):
@@ -381,7 +396,12 @@ class PlaneMarks(MarkWindows):
             tolerance = _FOREIGN * noise + _SHADE * np.abs(here)
             steep = np.hypot(slopes[:, 0], slopes[:, 1])
             tolerance = tolerance + shift[part, None, None] * np.abs(ink) * steep
-            beyond, (row, column) = np.abs(off) > tolerance, np.broadcast_arrays(y, x)
+            beyond = np.abs(off) > tolerance
+            if beside is not None:
+                # What is printed beside a mark is not in front of it.
+                region = self._region(some[part], half)
+                beyond &= (np.abs(beside[y, x]) < BESIDE) & (True if region is None else region)
+            row, column = np.broadcast_arrays(y, x)
             foreign[row[beyond], column[beyond]] = 1
             seen[y, x] = True
         foreign = cv2.morphologyEx(foreign, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))

@@ -1,8 +1,8 @@
 """The mapping of a lattice and the profiles of its lines, compiled.
 
 A mapping is given as `(matrix, coefficients, normal)`: the projectivity (3, 3); the polynomials of x and y
-(2, m) of the monomials 1, u, v, u², u v, v², … up to a degree; and the offset and scale (3,) that give u and
-v. See :mod:`reseau.measure.testfield.lattice_mapping`.
+(2, m) of the monomials 1, u, v, u², u v, v², … up to a degree; and the offset and scale that give u and v,
+with the strength of a fisheye between both (4,). See :mod:`reseau.measure.testfield.lattice_mapping`.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ _MOST_PX = 0.7
 """How far a line may be off its approximate place."""
 _FAR, _PER_SIGMA = 8.0, 64
 """End of the table of the normal distribution, and entries per standard deviation; accurate to 1e-10."""
+_FLAT = 1e-3
+"""Argument of the fisheye up to which its series is used."""
 _AT = np.arange(-_FAR * _PER_SIGMA, _FAR * _PER_SIGMA + 1) / _PER_SIGMA
 _STEP, _BELL = ndtr(_AT), np.exp(-0.5 * _AT * _AT) / np.sqrt(2 * np.pi)
 
@@ -59,6 +61,45 @@ def _powers(u: float, degree: int, table: Floats) -> None:
 
 
 @_compiled
+def _equidistant(square: float, strength: float) -> tuple[float, float, float]:
+    """The factor atan(√(w s)) / √(w s) of points at the squared distance s, and its derivatives by s."""
+    z = strength * square
+    if z < _FLAT:
+        return (
+            1 - z * (1 / 3 - z * (1 / 5 - z / 7)),
+            strength * (-1 / 3 + z * (2 / 5 - z * 3 / 7)),
+            strength * strength * (2 / 5 - z * 6 / 7),
+        )
+    root, share = math.sqrt(z), 1 / (1 + z)
+    factor = math.atan(root) / root
+    first = (share - factor) / (2 * z)
+    return factor, strength * first, strength * strength * (-share * share - 3 * first) / (2 * z)
+
+
+@_compiled
+def _through_fisheye(seen: Floats, first: Floats, inner: Floats, strength: float, before: Floats) -> None:
+    """Replace a point (2,) and its derivatives (2, 2), (2, 2, 2) by those of its image; `before` is space."""
+    p, q = seen
+    factor, by_s, by_ss = _equidistant(p * p + q * q, strength)
+    before[:] = first
+    for i in range(2):
+        for j in range(2):
+            # Of s = p² + q², by the lattice coordinates.
+            one, two = p * before[0, i] + q * before[1, i], p * before[0, j] + q * before[1, j]
+            s_ij = 2 * (before[0, i] * before[0, j] + before[1, i] * before[1, j])
+            s_ij += 2 * (p * inner[0, i, j] + q * inner[1, i, j])
+            for d in range(2):
+                at = seen[d]
+                inner[d, i, j] = factor * inner[d, i, j] + at * (by_s * s_ij + 4 * by_ss * one * two)
+                inner[d, i, j] += 2 * by_s * (one * before[d, j] + two * before[d, i])
+    for i in range(2):
+        s_i = 2 * (p * before[0, i] + q * before[1, i])
+        for d in range(2):
+            first[d, i] = factor * before[d, i] + by_s * s_i * seen[d]
+    seen[0], seen[1] = factor * p, factor * q
+
+
+@_compiled
 def images(mapping: Mapped, at: Floats, value: Floats, slope: Floats, bend: Floats) -> None:
     """Images of lattice coordinates `at` (n, 2), and derivatives.
 
@@ -76,6 +117,7 @@ def images(mapping: Mapped, at: Floats, value: Floats, slope: Floats, bend: Floa
         np.empty(4),
     )
     by_u, by_uu, terms = np.empty(2), np.empty(3), coefficients.shape[1]
+    inner, seen, before, strength = np.empty((2, 2, 2)), np.empty(2), np.empty((2, 2)), normal[3]
     for k in range(len(at)):
         a, b = at[k, 0], at[k, 1]
         depth = 1.0 / (matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2])
@@ -84,6 +126,9 @@ def images(mapping: Mapped, at: Floats, value: Floats, slope: Floats, bend: Floa
         if not order:
             # Powers of u and v in place, then their products, as they are needed most often.
             p, q = (u - normal[0]) / normal[2], (v - normal[1]) / normal[2]
+            if strength > 0:
+                factor = _equidistant(p * p + q * q, strength)[0]
+                p, q = factor * p, factor * q
             x[0, 0], y[0, 0] = 1.0, 1.0
             for i in range(1, degree + 1):
                 x[0, i], y[0, i] = p * x[0, i - 1], q * y[0, i - 1]
@@ -100,8 +145,18 @@ def images(mapping: Mapped, at: Floats, value: Floats, slope: Floats, bend: Floa
         for i in range(2):
             first[0, i] = (matrix[0, i] - u * matrix[2, i]) * depth / normal[2]
             first[1, i] = (matrix[1, i] - v * matrix[2, i]) * depth / normal[2]
-        _powers((u - normal[0]) / normal[2], degree, x)
-        _powers((v - normal[1]) / normal[2], degree, y)
+        if order > 1:
+            # The second derivative of a quotient of linear functions.
+            for d in range(2):
+                for i in range(2):
+                    for j in range(2):
+                        both = first[d, i] * matrix[2, j] + first[d, j] * matrix[2, i]
+                        inner[d, i, j] = -both * depth
+        seen[0], seen[1] = (u - normal[0]) / normal[2], (v - normal[1]) / normal[2]
+        if strength > 0:
+            _through_fisheye(seen, first, inner, strength, before)
+        _powers(seen[0], degree, x)
+        _powers(seen[1], degree, y)
         for c in range(2):
             total, m = 0.0, 0
             by_u[:], by_uu[:] = 0.0, 0.0
@@ -125,11 +180,7 @@ def images(mapping: Mapped, at: Floats, value: Floats, slope: Floats, bend: Floa
                         second[0] = by_uu[0] * first[0, i] * first[0, j]
                         second[1] = by_uu[1] * (first[0, i] * first[1, j] + first[0, j] * first[1, i])
                         second[2] = by_uu[2] * first[1, i] * first[1, j]
-                        # The second derivative of a quotient of linear functions.
-                        second[3] = 0.0
-                        for d in range(2):
-                            bent = first[d, i] * matrix[2, j] + first[d, j] * matrix[2, i]
-                            second[3] -= by_u[d] * bent * depth
+                        second[3] = by_u[0] * inner[0, i, j] + by_u[1] * inner[1, i, j]
                         bend[k, c, i, j] = second[0] + second[1] + second[2] + second[3]
 
 
@@ -183,7 +234,7 @@ def lattice_coordinates(mapping: Mapped, back: Floats, curved: bool, xy: Floats,
 
 @_compiled
 def monomials(mapping: Mapped, at: Floats, degree: int) -> tuple[Floats, Floats]:
-    """Monomials (n, m) of the polynomial, and images (n, 2) of the projectivity alone."""
+    """Monomials (n, m) of the polynomial, and images (n, 2) without it."""
     matrix, _, normal = mapping
     found, straight = np.empty((len(at), (degree + 1) * (degree + 2) // 2)), np.empty(at.shape)
     x, y = np.empty((3, degree + 1)), np.empty((3, degree + 1))
@@ -192,8 +243,13 @@ def monomials(mapping: Mapped, at: Floats, degree: int) -> tuple[Floats, Floats]
         depth = matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2]
         straight[k, 0] = (matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2]) / depth
         straight[k, 1] = (matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2]) / depth
-        _powers((straight[k, 0] - normal[0]) / normal[2], degree, x)
-        _powers((straight[k, 1] - normal[1]) / normal[2], degree, y)
+        p, q = (straight[k, 0] - normal[0]) / normal[2], (straight[k, 1] - normal[1]) / normal[2]
+        if normal[3] > 0:
+            factor = _equidistant(p * p + q * q, normal[3])[0]
+            p, q = factor * p, factor * q
+            straight[k, 0], straight[k, 1] = normal[0] + normal[2] * p, normal[1] + normal[2] * q
+        _powers(p, degree, x)
+        _powers(q, degree, y)
         m = 0
         for n in range(degree + 1):
             for j in range(n + 1):

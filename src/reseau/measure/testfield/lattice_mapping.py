@@ -1,7 +1,8 @@
 """The mapping of a lattice to an image, a projectivity followed by a polynomial; derivatives and inverse.
 
 Both are :class:`reseau.optics.RationalPolynomial`; here they are evaluated by compiled code, for the many
-small sets of points of a search.
+small sets of points of a search. No polynomial in the image by a projectivity describes a frame behind a
+fisheye: at 70° from the axis that is far outside of it, at 90° nowhere. A fisheye can lie between both.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ from math import isqrt
 import numpy as np
 
 from ...core.data import Array
-from ...optics import Chain, RationalPolynomial
+from ...optics import Chain, Equidistant, PlaneMapping, RationalPolynomial
 
 __all__ = [
     "degree_of",
     "images_of",
     "lattice_coordinates",
+    "matrix_of",
     "numbers_of",
     "of_degree",
     "reduced",
@@ -26,6 +28,7 @@ __all__ = [
     "slope_of",
     "started",
     "straightened",
+    "strength_of",
     "stretches",
     "with_coefficients",
 ]
@@ -46,11 +49,28 @@ def _projectivity() -> RationalPolynomial:
     return RationalPolynomial.projective()
 
 
-def started(matrix: Array, degree: int, shape: tuple[int, ...]) -> Chain:
-    """A projectivity (3, 3) to a frame of this height and width, followed by a polynomial that is zero."""
+def started(matrix: Array, degree: int, shape: tuple[int, ...], strength: float = 0.0) -> Chain:
+    """A projectivity (3, 3) to a frame of this height and width, followed by a polynomial that is zero.
+
+    With a `strength` there is a fisheye between both (:class:`reseau.optics.Equidistant`) about the middle of
+    the frame, half whose longer side is the unit.
+    """
     h, w = shape
     curved = _polynomial(degree, ((w - 1) / 2, (h - 1) / 2), max(h, w) / 2)
-    return Chain(_projectivity().with_values((matrix / matrix[2, 2]).ravel()[:8]), curved)
+    first: PlaneMapping = _projectivity().with_values((matrix / matrix[2, 2]).ravel()[:8])
+    if strength > 0:
+        first = Chain(first, Equidistant(np.array([strength]), curved.offset, curved.scale))
+    return Chain(first, curved)
+
+
+def strength_of(mapping: Chain) -> float:
+    """Strength of the fisheye of a mapping; 0 without one."""
+    return float(mapping.first.values[8]) if len(mapping.first.values) > 8 else 0.0
+
+
+def matrix_of(mapping: Chain) -> Array:
+    """Projectivity (3, 3) of a mapping."""
+    return np.append(mapping.first.values[:8], 1.0).reshape(3, 3)
 
 
 def of_degree(mapping: Chain, degree: int) -> Chain:
@@ -66,16 +86,15 @@ def with_coefficients(mapping: Chain, added: Array) -> Chain:
 
 @lru_cache(maxsize=16)
 def numbers_of(mapping: Chain) -> tuple[Array, Array, Array]:
-    """Projectivity (3, 3), coefficients (2, m) of the polynomial, and offset and scale (3,) of its arguments.
+    """Projectivity (3, 3), coefficients (2, m) of the polynomial, offset, scale and fisheye before it (4,).
 
     The monomials are 1, u, v, u², u v, v², … as :meth:`reseau.optics.RationalPolynomial.polynomial` orders
     them. The arrays are kept for the next call: copy them to change them.
     """
     curved = mapping.second
     assert isinstance(curved, RationalPolynomial)
-    matrix, normal = np.ones((3, 3)), np.array([*curved.offset, curved.scale])
-    matrix.reshape(-1)[:8] = mapping.first.values
-    return matrix, curved.values.reshape(2, -1), normal
+    normal = np.array([*curved.offset, curved.scale, strength_of(mapping)])
+    return matrix_of(mapping), curved.values.reshape(2, -1), normal
 
 
 def degree_of(mapping: Chain) -> int:
@@ -124,8 +143,7 @@ def second_order(mapping: Chain, at: Array) -> tuple[Array, Array, Array]:
 
 def straightened(mapping: Chain, xy: Array) -> Array:
     """Lattice coordinates (n, 2) of image points by the projectivity alone."""
-    h = np.append(mapping.first.values, 1.0).reshape(3, 3)
-    back = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(h).T
+    back = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(matrix_of(mapping)).T
     at: Array = back[:, :2] / back[:, 2:]
     return at
 
