@@ -261,7 +261,7 @@ def grown(
         taken = (bright == expected) & along(saddles.edges[row], slopes)
         return np.asarray(taken & crossed(sector_levels(grey, mapping, beside), bright))
 
-    return grown_through(saddles.xy, mapping, extent, shape, accepted)
+    return grown_through(saddles.xy, mapping, extent, shape, accepted, strongest=True)
 
 
 def grown_through(
@@ -270,6 +270,8 @@ def grown_through(
     extent: int,
     shape: tuple[int, int],
     accepted: Callable[[Chain, Array, Rows, Array], Mask],
+    *,
+    strongest: bool = False,
 ) -> tuple[Array, Rows, Chain]:
     """Grow a lattice through points (m, 2) of a frame.
 
@@ -279,7 +281,9 @@ def grown_through(
         The points, the strongest first; see :func:`grown`; height and width of the frame.
     accepted : callable
         Which of some nodes (n, 2) belong to these points (n,), given the mapping and its slopes there
-        (n, 2, 2). The strongest point near a node that is accepted is its corner.
+        (n, 2, 2).
+    strongest : bool
+        Whether the strongest of the points that are accepted is the corner of a node, by default the nearest.
 
     Returns
     -------
@@ -300,7 +304,7 @@ def grown_through(
             predicted = predicted + _led(nodes, xy[rows] - images_of(mapping, nodes), beside)
         gap, at, which = _within(tree, predicted, _GATE * pixels)
         good = accepted(mapping, beside[at], which, slopes[at]) if len(at) else np.zeros(0, dtype=bool)
-        gap, row = _strongest(len(beside), gap[good], at[good], which[good])
+        gap, row = _first(len(beside), gap[good], at[good], which[good], strongest=strongest)
         taken = np.isfinite(gap)
         order = np.argsort(gap / pixels, kind="stable")
         _, once = np.unique(row[order], return_index=True)
@@ -331,10 +335,10 @@ def _within(tree: KDTree, places: Array, gate: Array) -> tuple[Array, Rows, Rows
     return gap[at, k], at, row[at, k]
 
 
-def _strongest(count: int, gap: Array, at: Rows, which: Rows) -> tuple[Array, Rows]:
-    """The first point at each of `count` places: its distance, infinite without one, and its row."""
+def _first(count: int, gap: Array, at: Rows, which: Rows, *, strongest: bool) -> tuple[Array, Rows]:
+    """The strongest or nearest point at each of `count` places: its distance (infinite without one) and row."""
     distance, row = np.full(count, np.inf), np.zeros(count, dtype=np.intp)
-    order = np.lexsort((which, at))
+    order = np.lexsort((which if strongest else gap, at))
     first = order[np.unique(at[order], return_index=True)[1]]
     distance[at[first]], row[at[first]] = gap[first], which[first]
     return distance, row
