@@ -336,7 +336,7 @@ def _within(tree: KDTree, places: Array, gate: Array) -> tuple[Array, Rows, Rows
 
 
 def _first(count: int, gap: Array, at: Rows, which: Rows, *, strongest: bool) -> tuple[Array, Rows]:
-    """The strongest or nearest point at each of `count` places: its distance (infinite without one) and row."""
+    """The strongest or nearest point at each of `count` places: distance (infinite without one) and row."""
     distance, row = np.full(count, np.inf), np.zeros(count, dtype=np.intp)
     order = np.lexsort((which if strongest else gap, at))
     first = order[np.unique(at[order], return_index=True)[1]]
