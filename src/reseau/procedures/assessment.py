@@ -52,8 +52,9 @@ _ZONES = (
     ("lower left corner", "lower edge", "lower right corner"),
 )
 _ACROSS = 13
-_CONTRADICT = 3.0
-"""Factor by which images scatter more than their points say, from which they are of different cameras."""
+_CONTRADICT, _CONTRADICT_PX = 3.0, 0.3
+"""Factor by which images scatter more than their points say, and error of the projection in the middle, from
+which they are of different cameras. A precise measurement shows scatter that does not matter."""
 _ENOUGH = 6
 """Fewer images do not show whether the camera is stable and the model fits."""
 _STRAIGHT, _PLANE = 15.0, 0.05
@@ -134,7 +135,7 @@ class Assessment:
     @property
     def contradicts(self) -> bool:
         """Whether the photographs are not of one camera and one target, so that more of them do not help."""
-        return self.scatter >= _CONTRADICT
+        return self.scatter >= _CONTRADICT and self.centre_px > _CONTRADICT_PX
 
     @property
     def lines(self) -> tuple[str, str]:
@@ -264,7 +265,8 @@ def assess(result: Result, camera: int = 0, *, compared: bool = False) -> Assess
     fits = misfit <= _FITS or chance > 0.01
     use = next((use for limit, use in _LIMITS if corners <= limit), Use.NOTHING)
     empty = np.repeat(np.repeat(share < _EMPTY, _CELLS // 3, axis=0), _CELLS // 3, axis=1) & ~covered
-    then = next_photograph(result, empty) if camera == 0 and factor < _CONTRADICT else None
+    contradict = factor >= _CONTRADICT and centre > _CONTRADICT_PX
+    then = next_photograph(result, empty) if camera == 0 and not contradict else None
     few = _few_gross_errors(result, len(rows))
     tests = tuple(
         remark
