@@ -609,7 +609,9 @@ def _chosen(
         )  # fmt: skip
         reason = _reason(one, k == best, row in worse, candidates[best], len(equal))
         if k in vague:
-            reason = f"its projection is not determined ({vague[k]:.2g} px in a corner), that of others is"
+            size = f"not determined ({vague[k]:.2g} px in a corner)"
+            reason = f"its projection is {size if np.isfinite(vague[k]) else 'folded before a corner'}"
+            reason += ", that of others is not" if not np.isfinite(vague[k]) else ", that of others is"
         found.append(replace(one, reason=reason))
     camera = fit.problem.network.cameras[0]
     observed = np.array([name in camera.sigma for name in camera.names])
@@ -620,18 +622,24 @@ def _chosen(
 def _undetermined(fits: Mapping[int, BundleFit]) -> dict[int, float]:
     """Candidates that describe the images best, but are not determined beyond them, where others are.
 
-    The residuals of these others, which are determined ten times as well, are in practice the same. Returned
-    are standard deviations in the worst corner of candidates, which come by description length.
+    These others are determined ten times as well, and their residuals are in practice the same; or twice as
+    large, where an image folds before a corner of the frame. Returned are standard deviations in the worst
+    corner of candidates, which come by description length.
     """
-    least = min(map(_rms, fits.values()))
-    alike = {k: fit for k, fit in fits.items() if _rms(fit) ** 2 - least**2 < _PRACTICAL_PX**2}
-    worst = dict[int, float]()
-    for k, fit in alike.items():
-        worst[k] = projection_field(_mapping(fit), _ACROSS).worst_px
-        if len(worst) == 1 and worst[k] <= _DETERMINED_PX:
-            return {}
-    limit = max(_DETERMINED_PX, _TIMES * min(worst.values()))
-    return dict(takewhile(lambda each: each[1] > limit, worst.items()))
+    every = list(fits)
+    rms = {k: _rms(fit) for k, fit in fits.items()}
+    worst = {every[0]: projection_field(_mapping(fits[every[0]]), _ACROSS).worst_px}
+    if worst[every[0]] <= _DETERMINED_PX:
+        return {}
+    near = [k for k in every if rms[k] < 2 * min(rms.values())]
+    worst |= {k: projection_field(_mapping(fits[k]), _ACROSS).worst_px for k in near if k not in worst}
+    found = dict(takewhile(lambda each: not np.isfinite(each[1]), ((k, worst[k]) for k in near)))
+    rest = near[len(found) :]
+    if not rest:
+        return {}
+    alike = [k for k in rest if rms[k] ** 2 - rms[rest[0]] ** 2 < _PRACTICAL_PX**2]
+    limit = max(_DETERMINED_PX, _TIMES * min(worst[k] for k in alike))
+    return found | dict(takewhile(lambda each: each[1] > limit, ((k, worst[k]) for k in alike)))
 
 
 def _rms(fit: BundleFit) -> float:
