@@ -9,9 +9,9 @@ coordinates.
 
 With A the derivatives at the true values and E what noise adds to them, the expectation of ‖(A + E) v‖² is
 ‖A v‖² + ⟨‖E v‖²⟩. As much noise again adds ⟨‖E v‖²⟩ once more. At estimates that are moved by it to both
-sides, what is linear in the noise cancels: the increase of 1 / q, the inverse of a cofactor, relative to 1 / q at
-the estimates, is the part of it that is due to noise. Cameras are moved along the combinations of their
-parameters that are determined well.
+sides, what is linear in the noise cancels: the increase of 1 / q, the inverse of a cofactor, relative to
+1 / q at the estimates, is the part of it that is due to noise. Cameras are moved along the combinations of
+their parameters that are determined well.
 """
 
 from __future__ import annotations
