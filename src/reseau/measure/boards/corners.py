@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.stats import chi2
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code
@@ -55,8 +54,6 @@ _LEAST_EDGE = 0.1
 """Share of the pixels of an edge below which it is not seen."""
 _BORDER = 2.0
 """Least distance of a corner from the outermost pixels, in widths of the point-spread function."""
-_CHANCE = 1e-4
-"""Probability by which independent errors have as much in common as makes a systematic error of corners."""
 _FLAT = 0.35
 """Least sine of the angle between the edges of a corner."""
 _FAR_PX, _FIGURES_PX = 1e5, 8
@@ -289,39 +286,6 @@ class CornerMarks(PlaneMarks):
                 place += image[b - top : b - top + len(place), a - left : a - left + place.shape[1]]
         self.figures = share, at, width, look.kernel
         return share
-
-    def _misformed(self, rows: Rows, found: Matches) -> Array:
-        """See :class:`PlaneMarks`: and what corners with their dark sectors at the same sides have in common.
-
-        No lens and no bend of the board displaces the four corners of each tag outwards, say: figures that
-        lie within the blur of a corner do, if their blur is not quite known.
-        """
-        cov = super()._misformed(rows, found)
-        good = np.flatnonzero(found.converged & (found.t > 8) & (found.rejected < 0.1))
-        terms = self._smooth_terms(rows[good])
-        signs = np.sign(np.rint(4 * self.sectors.normal[rows].reshape(len(rows), -1)))
-        kinds, of = np.unique(signs, axis=0, return_inverse=True)
-        if terms is None or len(kinds) < 2 or np.bincount(of.ravel()[good], minlength=len(kinds)).min() < 4:
-            return cov
-        kind = np.eye(len(kinds))[of.ravel()]
-        # The smaller the image, the more of its figures lie within the blur.
-        small = 1 / np.abs(np.linalg.det(self._steps(rows)[0]))
-        alike = np.concatenate([kind[:, 1:] - kind[:, :1]] * 2, axis=1)
-        alike[:, len(kinds) - 1 :] *= (small / np.median(small) - 1)[:, None]
-        design = np.concatenate([terms, alike[good]], axis=1)
-        own, off, total = slice(terms.shape[1], None), np.zeros((alike.shape[1], 2)), 0.0
-        for k in range(2):
-            root = np.sqrt(found.cov[good, k, k] + cov[good, k, k])[:, None]
-            q, r = np.linalg.qr(design / root)
-            seen = found.xy[good, k] / root[:, 0]
-            x, back = np.linalg.solve(r, q.T @ seen), np.linalg.inv(r)[own]
-            scatter = ((seen - q @ (q.T @ seen)) ** 2).sum() / max(len(good) - design.shape[1], 1)
-            total += float(x[own] @ np.linalg.solve(back @ back.T, x[own])) / max(scatter, 1.0)
-            off[:, k] = x[own]
-        if total < chi2.isf(_CHANCE, off.size):
-            return cov
-        shift = alike @ off
-        return np.asarray(cov + shift[:, :, None] * shift[:, None])
 
     def _width(self, at: Array) -> Array:
         """Widths (m,) of the point-spread function at places of the lattice; if it varies, those near."""
