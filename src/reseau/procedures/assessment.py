@@ -135,7 +135,7 @@ class Assessment:
     @property
     def contradicts(self) -> bool:
         """Whether the photographs are not of one camera and one target, so that more of them do not help."""
-        return self.scatter >= _CONTRADICT and self.centre_px > _CONTRADICT_PX
+        return _contradict(self.scatter, self.centre_px)
 
     @property
     def lines(self) -> tuple[str, str]:
@@ -265,8 +265,7 @@ def assess(result: Result, camera: int = 0, *, compared: bool = False) -> Assess
     fits = misfit <= _FITS or chance > 0.01
     use = next((use for limit, use in _LIMITS if corners <= limit), Use.NOTHING)
     empty = np.repeat(np.repeat(share < _EMPTY, _CELLS // 3, axis=0), _CELLS // 3, axis=1) & ~covered
-    contradict = factor >= _CONTRADICT and centre > _CONTRADICT_PX
-    then = next_photograph(result, empty) if camera == 0 and not contradict else None
+    then = next_photograph(result, empty) if camera == 0 and not _contradict(factor, centre) else None
     few = _few_gross_errors(result, len(rows))
     tests = tuple(
         remark
@@ -286,6 +285,11 @@ def assess(result: Result, camera: int = 0, *, compared: bool = False) -> Assess
         use, centre, corners, circular, focal, fits, misfit, lacks, lacks_px, factor, images, tilt,
         float(seen[lit].mean()), uncovered, then, compared, important, tests,
     )  # fmt: skip
+
+
+def _contradict(scatter: float, centre_px: float) -> bool:
+    """Whether photographs are not of one camera and one target; see :class:`Assessment`."""
+    return scatter >= _CONTRADICT and centre_px > _CONTRADICT_PX
 
 
 def _tilted(result: Result, camera: int) -> float:

@@ -609,9 +609,12 @@ def _chosen(
         )  # fmt: skip
         reason = _reason(one, k == best, row in worse, candidates[best], len(equal))
         if k in vague:
-            size = f"not determined ({vague[k]:.2g} px in a corner)"
-            reason = f"its projection is {size if np.isfinite(vague[k]) else 'folded before a corner'}"
-            reason += ", that of others is not" if not np.isfinite(vague[k]) else ", that of others is"
+            if np.isfinite(vague[k]):
+                reason = (
+                    f"its projection is not determined ({vague[k]:.2g} px in a corner), that of others is"
+                )
+            else:
+                reason = "its projection is folded before a corner, that of others is not"
         found.append(replace(one, reason=reason))
     camera = fit.problem.network.cameras[0]
     observed = np.array([name in camera.sigma for name in camera.names])
