@@ -28,6 +28,7 @@ __all__ = [
     "CameraMapping",
     "ProjectionField",
     "by_rotation",
+    "corners_of",
     "options_of",
     "places",
     "projection_field",
@@ -223,8 +224,7 @@ class ProjectionField:
     @property
     def circular(self) -> bool:
         """Whether no corner of the image has a ray, as of a fisheye whose image is a circle."""
-        corners = self.sigma[[0, 0, -1, -1], [0, -1, 0, -1]]
-        return self.reach_deg > _CIRCULAR_DEG and not np.isfinite(corners).any()
+        return self.reach_deg > _CIRCULAR_DEG and not np.isfinite(corners_of(self.sigma)).any()
 
     @property
     def worst_px(self) -> float:
@@ -236,7 +236,7 @@ class ProjectionField:
         >>> field.worst_px
         0.2
         """
-        sigma = self.sigma if self.circular else self.sigma[[0, 0, -1, -1], [0, -1, 0, -1]]
+        sigma = self.sigma if self.circular else corners_of(self.sigma)
         known = sigma[np.isfinite(sigma)]
         return float(known.max()) if len(known) else float("inf")
 
@@ -295,6 +295,11 @@ def projection_field(lens: CameraMapping, across: int = 25, down: int | None = N
     cov = np.full((len(xy), 2, 2), np.nan)
     cov[known] = slope @ lens.covariance @ np.swapaxes(slope, 1, 2)
     return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2), reach(uv[known], lens))
+
+
+def corners_of(values: Array) -> Array:
+    """The four values (4,) in the corners of a field (rows, columns)."""
+    return np.asarray(values[[0, 0, -1, -1], [0, -1, 0, -1]])
 
 
 def reach(uv: Array, lens: CameraMapping) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.special
 
 from ...calibration import CameraMapping, calibration_difference
+from ...calibration.camera import corners_of
 from ...core.errors import UsageError
 from ..diagnostics import Result, camera_mapping
 from ..solver import BundleFit
@@ -113,7 +114,7 @@ def lacking(result: Result, camera: int = 0) -> Lacking | None:
         return None
     far = np.hypot(change[..., 0], change[..., 1])
     rows, columns = far.shape
-    corners = far[[0, 0, -1, -1], [0, -1, 0, -1]]
+    corners = corners_of(far)
     if not np.isfinite(corners).any():
         corners = far
     return Lacking(following, p, float(far[rows // 2, columns // 2]), float(np.nanmax(corners)))
