@@ -76,10 +76,11 @@ def formed(
     columns: Floats,
     rows: Floats,
     fill: float,
+    needed: Floats,
     images: Floats,
 ) -> None:
     """Fill images (k, 1, 6 or 8, r, c) of corners; see :func:`reseau.optics.corners.corner_images`."""
-    derived, curved = images.shape[1] > 1, form.shape[1] > 2
+    derived, curved, every = images.shape[1] > 1, form.shape[1] > 2, len(needed) == 0
     box, fourth = fill**2 / 12, -(fill**4) / 120 / 24
     at, inverse, weight = np.empty(10), np.empty(10), np.empty(10)
     for k in range(len(normal)):
@@ -102,6 +103,10 @@ def formed(
         for i in range(images.shape[2]):
             y = rows[k, i] - xy[k, 1]
             for j in range(images.shape[3]):
+                if not (every or needed[k, i, j]):
+                    for p in range(images.shape[1]):
+                        images[k, p, i, j] = 0.0
+                    continue
                 x = columns[k, j] - xy[k, 0]
                 along1, along2 = t1x * x + t1y * y, t2x * x + t2y * y
                 a = (n1x * x + n1y * y - 0.5 * bend1 * along1 * along1) / s
@@ -162,13 +167,18 @@ def six_formed(
     columns: Floats,
     rows: Floats,
     fill: float,
+    needed: Floats,
     images: Floats,
 ) -> None:
     """Fill images (k, 7 or 10, r, c) of corners of three edges; see :mod:`reseau.optics.corners`."""
-    derived, curved = images.shape[1] > 1, form.shape[1] > 3
+    derived, curved, every = images.shape[1] > 1, form.shape[1] > 3, len(needed) == 0
     box, fourth = fill**2 / 12, -(fill**4) / 120 / 24
-    images[:], images[:, 0] = 0.0, -1.0
+    images[:] = 0.0
     for k in range(len(normal)):
+        for i in range(images.shape[2]):
+            for j in range(images.shape[3]):
+                if every or needed[k, i, j]:
+                    images[k, 0, i, j] = -1.0
         width = max(sigma[k], _SHARPEST)
         s = sqrt(width * width + box)
         for e in range(3):
@@ -180,6 +190,8 @@ def six_formed(
             for i in range(images.shape[2]):
                 y = rows[k, i] - xy[k, 1]
                 for j in range(images.shape[3]):
+                    if not (every or needed[k, i, j]):
+                        continue
                     x = columns[k, j] - xy[k, 0]
                     along = tx * x + ty * y
                     a = (nx * x + ny * y - 0.5 * bent * along * along) / s

@@ -81,6 +81,7 @@ def corner_images(
     *,
     fill: float = 1.0,
     derivatives: bool = True,
+    needed: Mask | None = None,
 ) -> Array:
     """Form images of corners, and their derivatives.
 
@@ -101,6 +102,8 @@ def corner_images(
         Light-sensitive share of the pitch.
     derivatives : bool
         Whether to form the derivatives, too.
+    needed : ndarray of bool (k, r, c), optional
+        Pixels that are formed; the others become 0. By default all.
 
     Returns
     -------
@@ -131,7 +134,8 @@ def corner_images(
 
     parts = 4 + form.shape[1] if derivatives else 1
     images = np.empty((len(corners), parts, rows.shape[1], columns.shape[1]), np.float32)
-    pixels = np.ascontiguousarray(columns), np.ascontiguousarray(rows), fill, images
+    wanted = np.zeros((0, 1, 1), dtype=bool) if needed is None else np.ascontiguousarray(needed)
+    pixels = np.ascontiguousarray(columns), np.ascontiguousarray(rows), fill, wanted, images
     with one_thread():
         if corners.normal.shape[1] == 3:
             six_formed(corners.normal, corners.bend, xy, sigma, form, *pixels)

@@ -88,14 +88,15 @@ class CornerShape:
     def image(self, xy: Array, width: Array, form: Array, at: Rows, window: Window) -> Array:
         """See :class:`reseau.measure.matching.Shape`."""
         place = self.corners.select(at), xy, width, form, window.columns, window.rows
-        return corner_images(*place, fill=window.response.fill, derivatives=False)[:, 0]
+        needed, fill = window.needed, window.response.fill
+        return corner_images(*place, fill=fill, derivatives=False, needed=needed)[:, 0]
 
     def derivatives(
         self, xy: Array, width: Array, form: Array, at: Rows, window: Window
     ) -> tuple[Array, Array]:
         """See :class:`reseau.measure.matching.Shape`."""
         place = self.corners.select(at), xy, width, form, window.columns, window.rows
-        parts = corner_images(*place, fill=window.response.fill)
+        parts = corner_images(*place, fill=window.response.fill, needed=window.needed)
         return parts[:, 0], parts[:, 1:]
 
 

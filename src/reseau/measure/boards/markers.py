@@ -41,20 +41,40 @@ def find_markers(frame: Frame, design: BoardDesign, *, whole: bool = False) -> t
     if pixels.dtype != np.uint8:
         scale = 255.0 / max(float(pixels.max()), 1e-12)
         pixels = np.clip(pixels.astype(np.float64) * scale, 0, 255).astype(np.uint8)
-    windows = parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax
-    # The middle of OpenCV's windows finds almost as much as all three. Corners between squares are found by a
-    # part of the markers.
-    enough = design.kind == "charuco" and not whole
-    for least, most in ((_WINDOW_PX, _WINDOW_PX), windows)[0 if enough else 1 :]:
-        parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = least, most
-        detector = cv2.aruco.ArucoDetector(marker_dictionary(design.dictionary), parameters)
-        corners, numbers, _ = detector.detectMarkers(np.ascontiguousarray(pixels))
-        if numbers is not None and len(numbers) >= max(_FEW, _SHARE * len(design.markers[0])):
-            break
+    # OpenCV compares each candidate with every word, which takes most of its time; a part of the markers of a
+    # ChArUco board is enough to find the corners between its squares.
+    pixels = np.ascontiguousarray(pixels)
+    if design.kind == "charuco" and not whole:
+        read = _read_quickly(pixels, design, parameters)
+        if len(read[1]) >= max(_FEW, _SHARE * len(design.markers[0])):
+            return read
+    detector = cv2.aruco.ArucoDetector(marker_dictionary(design.dictionary), parameters)
+    corners, numbers, _ = detector.detectMarkers(pixels)
     if numbers is None or not len(numbers):
         return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.intp)
     found = np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2)
     return found, np.asarray(numbers).reshape(-1).astype(np.intp)
+
+
+def _read_quickly(
+    pixels: NDArray[np.uint8], design: BoardDesign, parameters: cv2.aruco.DetectorParameters
+) -> tuple[Array, NDArray[np.intp]]:
+    """Markers as :func:`find_markers` finds them, of those that one of OpenCV's windows separates from paper.
+
+    OpenCV finds the candidates; they are read here, with as many wrong bits as OpenCV allows.
+    """
+    assert design.dictionary is not None
+    dictionary = marker_dictionary(design.dictionary)
+    most_wrong = int(dictionary.maxCorrectionBits * parameters.errorCorrectionRate)
+    nothing = cv2.aruco.Dictionary(dictionary.bytesList[:1], dictionary.markerSize, 0)
+    windows = parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax
+    parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = _WINDOW_PX
+    read, _, others = cv2.aruco.ArucoDetector(nothing, parameters).detectMarkers(pixels)
+    parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = windows
+    corners = np.asarray([*read, *others], dtype=np.float64).reshape(-1, 4, 2)
+    words = marker_cells(design)[1]
+    index, corners = read_tags(pixels.astype(np.float32), corners, words, design.border_bits, most_wrong)
+    return corners[index >= 0], design.markers[0][index[index >= 0]]
 
 
 def find_tags(

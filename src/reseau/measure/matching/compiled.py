@@ -49,6 +49,8 @@ _GAINS, _HELD = 1e-4, 1e-2
 _AT_ONCE = 40_000
 """Number of pixels in the windows that are adjusted together."""
 _TINY = 1e-300
+_TOGETHER = 1024
+"""Number of pixels whose derivatives are multiplied together: they fit into a cache."""
 f32 = np.float32
 
 
@@ -56,6 +58,12 @@ def _compiled(function: F) -> F:
     """Compile with Numba, cached on disk, releasing the GIL."""
     options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
     return cast(F, numba.njit(**options)(function))
+
+
+def _vectorised(function: F) -> F:
+    """As :func:`_compiled`; sums may be formed in any order, as several at once."""
+    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+    return cast(F, numba.njit(**options, fastmath={"reassoc", "nsz", "contract"})(function))
 
 
 @_compiled
@@ -96,21 +104,27 @@ def windows(pixels: Floats, centre: Floats, half: tuple[int, int]) -> Floats:
 def weighed(
     x: Floats,
     share: Floats,
+    weights: Floats,
     window: tuple[Floats, Floats, int],
     dark: bool,
     variance: tuple[float, float],
     least: float,
 ) -> Floats:
-    """Relative weights (k, n) of grey values as formed at `x` (k, u); see `noise.relative_weights`."""
+    """Relative weights (k, n) of grey values as formed at `x` (k, u); see `noise.relative_weights`.
+
+    They are about 1 on average where `weights` (k, n) are not 0.
+    """
     n = share.shape[1]
     plane, contrast, grey, found = np.empty(n), np.empty(n), np.empty(n), np.empty(share.shape)
     for k in range(len(x)):
         _formed(x[k], share[k], window[0], window[1], dark, plane, contrast, grey)
-        total = 0.0
+        total, count = 0.0, 0
         for i in range(n):
             grey[i] = variance[0] + variance[1] * grey[i]
-            total += grey[i]
-        inverse = 1.0 / max(total / n, 1e-12)
+            if weights[k, i] > 0:
+                total += grey[i]
+                count += 1
+        inverse = 1.0 / max(total / max(count, 1), 1e-12)
         for i in range(n):
             found[k, i] = 1.0 / max(grey[i] * inverse, least)
     return found
@@ -457,19 +471,120 @@ def _fill_gradient(
         gradient[_LEVEL + m] = -_product(monomials[m], part, 0, n)
 
 
+@_vectorised
+def _with_four(a: Floats, one: Floats, two: Floats, three: Floats, four: Floats) -> tuple[Any, Any, Any, Any]:
+    """Scalar products of a row with four others, which load it once."""
+    w = x = y = z = f32(0)
+    for i in range(len(a)):
+        w += a[i] * one[i]
+        x += a[i] * two[i]
+        y += a[i] * three[i]
+        z += a[i] * four[i]
+    return w, x, y, z
+
+
+@_vectorised
+def _with_one(a: Floats, b: Floats) -> Any:
+    """Scalar product."""
+    total = f32(0)
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
+
+
+@_compiled
+def _fill_normal(jacobian: Floats, normal: Floats) -> None:
+    """Fill the products (u, u) of the rows of a Jacobian (u, n).
+
+    A library for matrices takes three times as long for so few rows. Sums of parts are in double precision.
+    """
+    u, n = jacobian.shape
+    normal[:] = 0.0
+    for begin in range(0, n, _TOGETHER):
+        end = min(begin + _TOGETHER, n)
+        for i in range(u):
+            a, m = jacobian[i, begin:end], 0
+            while m + 4 <= i + 1:
+                w, x, y, z = _with_four(
+                    a,
+                    jacobian[m, begin:end],
+                    jacobian[m + 1, begin:end],
+                    jacobian[m + 2, begin:end],
+                    jacobian[m + 3, begin:end],
+                )
+                normal[i, m] += w
+                normal[i, m + 1] += x
+                normal[i, m + 2] += y
+                normal[i, m + 3] += z
+                m += 4
+            while m <= i:
+                normal[i, m] += _with_one(a, jacobian[m, begin:end])
+                m += 1
+    for i in range(u):
+        for m in range(i):
+            normal[m, i] = normal[i, m]
+
+
+@_vectorised
+def _add_three(a: float, b: float, c: float, one: Floats, two: Floats, three: Floats, out: Floats) -> None:
+    for i in range(len(out)):
+        out[i] += a * one[i] + b * two[i] + c * three[i]
+
+
+@_vectorised
+def _add_one(a: float, one: Floats, out: Floats) -> None:
+    for i in range(len(out)):
+        out[i] += a * one[i]
+
+
+@_compiled
+def _fill_weighted(factors: Floats, first: int, rows: Floats, begin: int, out: Floats) -> None:
+    """Fill `out` (k,) with columns of `rows` (m, n) from `begin` on, times factors (m,) from `first` on."""
+    out[:] = f32(0)
+    m, end = first, begin + len(out)
+    while m + 3 <= len(rows):
+        parts = rows[m, begin:end], rows[m + 1, begin:end], rows[m + 2, begin:end]
+        _add_three(factors[m], factors[m + 1], factors[m + 2], *parts, out)
+        m += 3
+    while m < len(rows):
+        _add_one(factors[m], rows[m, begin:end], out)
+        m += 1
+
+
+@_compiled
+def _add_squares(part: Floats, out: Floats) -> None:
+    for i in range(len(out)):
+        out[i] += part[i] * part[i]
+
+
 @_compiled
 def _fill_influence(
-    jacobian: Floats, cofactor: Floats, root: Floats, gains: Floats, on_position: Floats, leverage: Floats
+    jacobian: Floats, cofactor: Floats, root: Floats, part: Floats, on_position: Floats, leverage: Floats
 ) -> None:
-    """Fill influences (2, n) and leverages (n,) of a window; see :func:`linearised`."""
-    np.dot(cofactor.astype(f32), jacobian, gains)
-    _multiply(gains[0], root, on_position[0])
-    _multiply(gains[1], root, on_position[1])
+    """Fill influences (2, n) and leverages (n,) of a window; see :func:`linearised`.
+
+    With the factor C of a cofactor Q = C Cᵀ the leverages are the squared lengths of the columns of Cᵀ Aᵀ.
+    `part` is memory of some pixels.
+    """
+    u, n = jacobian.shape
+    scale, factor = np.empty(u), np.empty((u, u))
+    positive = _factorised(cofactor, 0.0, scale, factor)
+    first, columns = cofactor[:2].astype(f32), np.zeros((u, u), f32)
+    for m in range(u):
+        for i in range(m, u):
+            columns[m, i] = factor[i, m] / scale[i]
     leverage[:] = f32(0)
-    for m in range(len(jacobian)):
-        row, gain = jacobian[m], gains[m]
-        for i in range(len(leverage)):
-            leverage[i] += gain[i] * row[i]
+    for begin in range(0, n, len(part)):
+        end = min(begin + len(part), n)
+        some = part[: end - begin]
+        for m in range(2):
+            _fill_weighted(first[m], 0, jacobian, begin, some)
+            _multiply(some, root[begin:end], on_position[m, begin:end])
+        if not positive:
+            continue
+        for m in range(u):
+            _fill_weighted(columns[m], m, jacobian, begin, some)
+            _add_squares(some, leverage[begin:end])
 
 
 @_compiled
@@ -532,7 +647,7 @@ def linearised(
     n, u, forms = observed.shape[1], x.shape[1], slopes.shape[1] - 3
     plane, contrast, grey = np.empty(n), np.empty(n), np.empty(n)
     root, part, factors = np.empty(n, f32), np.empty(n, f32), np.empty((3, n), f32)
-    jacobian, gains = np.empty((u, n), f32), np.empty((u, n if len(leverage) else 0), f32)
+    jacobian, some = np.empty((u, n), f32), np.empty(_TOGETHER, f32)
     scale, lower, left = np.empty(u), np.empty((u, u)), np.empty(n, f32)
     for j in range(len(rows)):
         k = rows[j]
@@ -560,7 +675,7 @@ def linearised(
         cost = _product(left, left, 0, n)
         for m in range(u):
             cost += prior[m] * (mean[k, m] - x[k, m]) ** 2
-        normals[k] = np.dot(jacobian, jacobian.T)
+        _fill_normal(jacobian, normals[k])
         gradients[k] = -np.dot(jacobian, left)
         for m in range(u):
             normals[k, m, m] += prior[m]
@@ -592,7 +707,7 @@ def linearised(
             _extrapolated(x[k], trial[k], jacobian, slopes[j], widening, covered, root, left, residuals[k])
             iteration[k, _COST], state[k] = cost - left_over, DONE
         if len(leverage) and state[k] == DONE:
-            _fill_influence(jacobian, cofactors[k], root, gains, on_position[k], leverage[k])
+            _fill_influence(jacobian, cofactors[k], root, some, on_position[k], leverage[k])
 
 
 @_compiled
@@ -631,14 +746,14 @@ def influenced(
     n, u = weights.shape[1], at.shape[1]
     plane, contrast, grey = np.empty(n), np.empty(n), np.empty(n)
     root, factors = np.empty(n, f32), np.empty((3, n), f32)
-    jacobian, gains = np.empty((u, n), f32), np.empty((u, n), f32)
+    jacobian, some = np.empty((u, n), f32), np.empty(_TOGETHER, f32)
     for j in range(len(rows)):
         k, p = rows[j], places[j]
         _formed(at[p], share[p], monomials, across, dark, plane, contrast, grey)
         _roots(weights[k], root)
         _factors(plane, contrast, share[p], root, dark, factors[0], factors[1], factors[2])
         _fill_jacobian(slopes[p], factors, window, _widening(at[p, _WIDTH], psf[k]), jacobian)
-        _fill_influence(jacobian, cofactors[k], root, gains, on_position[k], leverage[k])
+        _fill_influence(jacobian, cofactors[k], root, some, on_position[k], leverage[k])
 
 
 @_compiled

@@ -137,7 +137,7 @@ class Patches:
         self.form_at = self.ground.stop + len(self.across)
         self.centre = np.rint(xy).astype(np.intp)
         columns, rows = self.centre[:, :1] + right, self.centre[:, 1:] + down
-        self.window = Window(columns.astype(float), rows.astype(float), options.response)
+        self.window = Window(columns.astype(float), rows.astype(float), options.response, region)
         k = len(xy)
         self.shape = (k, len(down), len(right))
         self.grey, self.weights = np.empty((2, k, len(down) * len(right)))
@@ -190,7 +190,9 @@ class Patches:
             from .compiled import weighed  # takes half a second to import; not every command needs it
 
             share, dark = self.first[0].reshape(len(x), -1), self.options.polarity == "dark"
-            self.relative_weights = weighed(x, share, self.terms, dark, self.options.variance, LEAST)
+            self.relative_weights = weighed(
+                *(x, share, self.weights, self.terms, dark, self.options.variance, LEAST)
+            )
         return x
 
     @cached_property

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...core.data import Array, Rows
+from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
 from ...optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
 
@@ -28,6 +28,8 @@ class Window:
         Coordinates of the columns and rows, pixels.
     response : PixelResponse
         Response of a pixel.
+    needed : ndarray of bool (k, r, c), optional
+        Pixels whose values are needed; the others may have any. By default all.
 
     Examples
     --------
@@ -39,10 +41,12 @@ class Window:
     columns: Array
     rows: Array
     response: PixelResponse
+    needed: Mask | None = None
 
     def select(self, at: Rows) -> Window:
         """Windows of the marks `at`."""
-        return Window(self.columns[at], self.rows[at], self.response)
+        needed = None if self.needed is None else self.needed[at]
+        return Window(self.columns[at], self.rows[at], self.response, needed)
 
 
 class Shape(Protocol):

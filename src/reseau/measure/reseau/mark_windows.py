@@ -226,8 +226,8 @@ class MarkWindows(ABC):
             self.own_px[rows[part]] = float((2 * np.array(half) + 1).prod())
             if region is not None:
                 # What is printed there is known, and the same around every mark.
-                own = region if here is None else region & (np.abs(here) < BESIDE)
-                self.own_px[rows[part]] = own.sum(axis=(1, 2))
+                region = region if here is None else region & (np.abs(here) < BESIDE)
+                self.own_px[rows[part]] = region.sum(axis=(1, 2))
             options = MatchOptions(
                 half_px=half,
                 psf_px=self.look.psf_px,
