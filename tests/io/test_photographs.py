@@ -61,6 +61,64 @@ def test_heic_is_read_as_the_sensor_has_it(tmp_path: Path, orientation: int) -> 
         read_image(tmp_path / "broken.heic")
 
 
+def made(path: Path, *pictures: np.ndarray) -> None:  # type: ignore[type-arg]
+    """Write an image with Pillow, without loss where the format can; several pictures as an animation."""
+    first, *more = (Image.fromarray(each) for each in pictures)
+    how: dict[str, object] = {"save_all": True, "append_images": more} if more else {}
+    if path.suffix == ".webp":
+        how["lossless"] = True
+    elif path.suffix == ".avif":
+        how |= {"quality": 100, "subsampling": "4:4:4", "exif": exif(6)}
+    first.save(path, **how)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "loss"), [(".webp", 0), (".gif", 0), (".avif", 3), (".jp2", 0), (".pgm", 0), (".ppm", 0)]
+)
+def test_formats_of_web_pages_and_archives_are_read(tmp_path: Path, suffix: str, loss: int) -> None:
+    path = tmp_path / f"a{suffix}"
+    pixels = gradient()
+    made(path, pixels[:, :, 0] if suffix in (".gif", ".pgm") else pixels)
+    found = read_image(path, "red")
+    assert (found.width, found.height, found.full_scale) == (64, 48, 255.0)  # AVIF: a viewer would turn it
+    assert np.abs(found.pixels.astype(int) - pixels[:, :, 0]).max() <= loss
+    if suffix not in (".pgm", ".ppm"):
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    else:
+        path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(ImageError, match="is a damaged"):
+        read_image(path)
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".gif"])
+def test_the_first_picture_of_an_animation_is_read_with_a_note(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    made(path, np.full((20, 30), 10, np.uint8), np.full((20, 30), 200, np.uint8))
+    found = read_image(path)
+    assert abs(int(found.pixels.max()) - 10) <= 2
+    assert found.notes == ("has several pictures, of which the first is used",)
+
+
+def test_values_of_ten_bit_fill_the_scale_of_sixteen(tmp_path: Path) -> None:
+    values = (np.arange(48 * 64).reshape(48, 64) % 1024).astype(np.uint16)
+    (tmp_path / "a.pgm").write_bytes(b"P5 # a camera\n64 48\n1023\n" + values.astype(">u2").tobytes())
+    found = read_image(tmp_path / "a.pgm")
+    assert found.full_scale == 65535.0
+    assert np.abs(found.pixels - values * (65535 / 1023)).max() <= 1
+
+
+def test_an_image_that_is_too_large_is_declined_by_its_header(tmp_path: Path) -> None:
+    for suffix in (".gif", ".pgm"):
+        made(tmp_path / f"a{suffix}", gradient()[:, :, 0])
+    gif = bytearray((tmp_path / "a.gif").read_bytes())
+    gif[6:10] = b"\xff\xff\xff\xff"
+    (tmp_path / "a.gif").write_bytes(gif)
+    (tmp_path / "a.pgm").write_bytes(b"P5 40000 40000 255\n")
+    for suffix in (".gif", ".pgm"):
+        with pytest.raises(ImageError, match=r"more (pixels )?than"):
+            read_image(tmp_path / f"a{suffix}")
+
+
 def dng(path: Path, mosaic: np.ndarray) -> None:  # type: ignore[type-arg]
     """A raw file by the specification of DNG 1.4, of one green-dominated Bayer pattern."""
     unit = (1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1)

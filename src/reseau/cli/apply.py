@@ -17,6 +17,7 @@ from .common import (
     points_document,
     progress,
     say,
+    say_files_left_out,
     suffix_of,
     writable,
 )
@@ -370,6 +371,7 @@ def _folder(
     if out.resolve() == source.resolve():
         raise UsageError("is the folder of the images", where=out, do="choose another one")
     images = photographs_in(source)
+    say_files_left_out([source])
     try:
         out.mkdir(exist_ok=True)
     except OSError as error:

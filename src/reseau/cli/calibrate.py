@@ -46,6 +46,7 @@ from .common import (
     remark_lines,
     required,
     say,
+    say_files_left_out,
     sensor_correction,
 )
 
@@ -298,6 +299,7 @@ def _photographs(images: list[Path], cameras: list[str]) -> tuple[dict[str, Path
             raise UsageError(
                 "are missing", where="photographs", do="name IMAGES, or --camera for each camera"
             )
+        say_files_left_out(images)
         images = photographs_named(images)
         named = {path.name: path for path in images}
         if len(named) < len(images):
@@ -313,6 +315,7 @@ def _photographs(images: list[Path], cameras: list[str]) -> tuple[dict[str, Path
         if not equals or not name or not pattern or name in files:
             raise UsageError(f"is {text!r}", where="--camera", do="write name=files, each name once")
         files[name] = files_of(pattern)
+        say_files_left_out([Path(pattern)])
     found = exposures_of_files(files)
     return {name: path for name, (path, _) in found.items()}, {name: at for name, (_, at) in found.items()}
 

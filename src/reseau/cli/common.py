@@ -278,6 +278,16 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
+def say_files_left_out(paths: Iterable[Path]) -> None:
+    """Say which files of folders are no photographs."""
+    from ..procedures.exposures import files_left_out
+
+    for path in paths:
+        line = files_left_out(path) if path.is_dir() else ""
+        if line:
+            typer.echo(f"note: {line}", err=True)
+
+
 @contextmanager
 def progress(title: str, steps: int) -> Iterator[Any]:
     """Show a progress bar on standard error if it is a terminal; yield a function to call after each step."""

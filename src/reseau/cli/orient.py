@@ -12,7 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..core.errors import InputError, ReseauError, UsageError
-from .common import AsJson, ClusterAddress, Jobs, Store, overlay_files, progress, required, say
+from .common import (
+    AsJson,
+    ClusterAddress,
+    Jobs,
+    Store,
+    overlay_files,
+    progress,
+    required,
+    say,
+    say_files_left_out,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -106,6 +116,7 @@ def orient(
     from ..procedures.exposures import photographs_named
     from ..report.frames import roll_page
 
+    say_files_left_out(images)
     images = photographs_named(images)
     if corners is not None:
         FrameCorners.read(corners)  # an invalid file is reported before the computation

@@ -1,11 +1,11 @@
 """Image files: one reader for whole frames and for windows of scans, and a writer.
 
-Accepted files: PNG, JPEG and BMP as OpenCV decodes them, and a page of a TIFF (``scan.tif#2`` is the second,
-``scan.tif`` the first) with grey or RGB samples of 1, 8 or 16 bit, signed 16 bit, or floating point,
-uncompressed or in a compression that tifffile decodes; and a frame of a DICOM file, see
-:mod:`reseau.io.dicom`. Other grey values are never rescaled; an
-alpha channel is ignored, and so is an orientation tag: pixel coordinates are those of the sensor. A colour
-profile does not change grey values: its curve is given beside them.
+Accepted files: PNG, JPEG and BMP as OpenCV decodes them, those of :mod:`reseau.io.coded`, and a page of a
+TIFF (``scan.tif#2`` is the second, ``scan.tif`` the first) with grey or RGB samples of 1, 8 or 16 bit, signed
+16 bit, or floating point, uncompressed or in a compression that tifffile decodes; and a frame of a DICOM
+file, see :mod:`reseau.io.dicom`. Other grey values are never rescaled; an alpha channel is ignored, and so is
+an orientation tag: pixel coordinates are those of the sensor. A colour profile does not change grey values:
+its curve is given beside them.
 
 An uncompressed TIFF is mapped into memory; of a compressed one only the strips or tiles that a window touches
 are decoded.
@@ -28,6 +28,7 @@ from ..core.files import split_frame
 from ..core.provenance import sha256_of
 from ..core.tone import ToneCurve
 from . import write_whole
+from .coded import coded_kind, decoded_coded
 from .dicom import is_dicom, open_dicom
 from .photographs import decoded_heic, decoded_raw, is_heic, is_raw
 from .profiles import curve_of_file, curve_of_profile
@@ -65,9 +66,9 @@ def read_image(path: Path | str, channel: Channel = "luma", digest: str | None =
     Parameters
     ----------
     path : path
-        PNG, JPEG, BMP, TIFF, HEIC, a raw file or DICOM; see :mod:`reseau.io.images` for the kinds of
-        TIFF. ``loop.dcm#3`` is the third frame of a DICOM file; without a number the first is read, with
-        a note.
+        PNG, JPEG, BMP, TIFF, HEIC, WebP, AVIF, GIF, JPEG 2000, PGM, a raw file or DICOM; see
+        :mod:`reseau.io.images` for the kinds of TIFF. ``loop.dcm#3`` is the third frame of a DICOM file;
+        without a number the first is read, with a note.
     channel : {"luma", "red", "green", "blue"}
         Channel of a colour image that is used. A lens images colours at slightly different scales; a single
         channel avoids the shifts that this causes. The pixels of a grey image are the same for every channel.
@@ -179,6 +180,9 @@ def open_scan(path: Path | str) -> Scan:
     if number is not None:
         what = "is no TIFF or DICOM file, which could have several images"
         raise ImageError(what, where=path, do=f"give {whole.name}")
+    if kind := coded_kind(magic):
+        decoded, notes = decoded_coded(path, kind, MAX_PIXELS)
+        return replace(scan_of(decoded, path.name), notes=notes)
     pixels = _decoded(path, magic)
     _check_least(path, pixels.shape[1], pixels.shape[0])
     if pixels.ndim == 3:

@@ -23,7 +23,10 @@ RAW = (
     ".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".3fr", ".iiq",
 )  # fmt: skip
 """Suffixes of raw files."""
-PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".dcm", ".heic", ".heif", *RAW)
+PHOTOGRAPHS = (
+    ".png", ".jpg", ".jpeg", ".jfif", ".tif", ".tiff", ".bmp", ".dcm", ".heic", ".heif",
+    ".webp", ".gif", ".avif", ".jp2", ".j2k", ".pgm", ".ppm", *RAW,
+)  # fmt: skip
 """Suffixes of photographs in a folder."""
 _BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _ORIENTATION, _EXIF = 0x0112, 0x8769
@@ -67,7 +70,7 @@ class Exif:
 
 def is_heic(magic: bytes) -> bool:
     """Whether a file begins like a HEIC image."""
-    return magic[4:8] == b"ftyp" and magic[8:12] in _BRANDS
+    return magic[4:8] == b"ftyp" and magic[8:12] in _BRANDS and b"avif" not in magic[12:32]
 
 
 def is_raw(path: Path) -> bool:

@@ -25,6 +25,7 @@ from .target_measurement import Photograph, Unread
 __all__ = [
     "Taken",
     "exposures_of_files",
+    "files_left_out",
     "files_of",
     "of_another_lens",
     "photograph_reader",
@@ -88,6 +89,34 @@ def photographs_in(folder: Path) -> list[Path]:
         if found:
             return found
     raise InputError("has no photograph", where=folder, do="put some in: .jpg, .png, .tif, .heic")
+
+
+def files_left_out(folder: Path) -> str:
+    """Name the files of a folder that :func:`photographs_in` leaves out, in one line; empty without any.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     for name in ("a.png", "film.mp4", "notes.txt"):
+    ...         (Path(folder) / name).touch()
+    ...     files_left_out(Path(folder)).removeprefix(folder)
+    ': film.mp4 and notes.txt are left out: no photographs by their suffixes'
+    """
+    used = set(photographs_in(folder))
+    names = sorted(
+        path.name
+        for path in folder.iterdir()
+        if path.is_file() and not path.name.startswith(".") and path not in used
+    )
+    if not names:
+        return ""
+    if len(names) == 1:
+        return f"{folder}: {names[0]} is left out: no photograph by its suffix"
+    if len(names) > 4:
+        names = [*names[:3], f"{len(names) - 3} more files"]
+    named = f"{', '.join(names[:-1])} and {names[-1]}"
+    return f"{folder}: {named} are left out: no photographs by their suffixes"
 
 
 def photographs_named(paths: Iterable[Path]) -> list[Path]:

@@ -61,7 +61,7 @@ class LivePage:
     def __init__(self, title: str, port: int = 0) -> None:
         self._lock = threading.Lock()
         self._picture, self._sharpest = b"", float("inf")
-        self._state: dict[str, Any] = {"title": title, "number": 0, "words": "waiting for the camera"}
+        self._state: dict[str, Any] = {"title": title, "number": 0, "words": "waiting for the first picture"}
         try:
             self._server = ThreadingHTTPServer((_ADDRESS, port), _handler(self))
         except OSError as error:
