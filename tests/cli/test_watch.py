@@ -16,6 +16,7 @@ from scipy.special import ndtr
 
 from reseau.cli import run
 from reseau.core.data import Frame, ImagePoints
+from reseau.core.errors import ConnectionLost
 from reseau.core.failure import Code, Failure
 from reseau.designs import board
 from reseau.optics import OpenCV, Pose, project
@@ -136,7 +137,34 @@ def test_watching_the_simulated_bench_leaves_frames_for_a_calibration(
     assert "3 frames in photos; next: reseau calibrate photos --design field.json" in printed.out
     assert sorted(file.name for file in Path("photos").iterdir()) == ["001.png", "002.png", "003.png"]
     assert run(["watch", "--design", "field.json", "-o", "photos"]) == 2
-    assert "photos: is not empty" in capsys.readouterr().err
+    assert "photos: is not empty; give a new folder, or --resume" in capsys.readouterr().err
+
+    def lost(number: int) -> None:  # the camera goes away after the fourth frame
+        if len(list(Path("photos").iterdir())) == 4:
+            raise ConnectionLost("is away", where="camera")
+        rig.table.stands.update(tilt=20.0, roll=45.0)
+
+    rig.camera.during = lost
+    more = (*how[:-3], "5", "--seconds", "200", "--resume")
+    assert run(["watch", "--design", "field.json", "--camera", "camera", "-o", "photos", *more]) == 1
+    printed = capsys.readouterr()
+    assert "photos/004.png: " in printed.out
+    assert "4 frames in photos; next: reseau calibrate photos" in printed.out
+    assert "camera: is away" in printed.err
+
+
+def test_frames_of_an_earlier_session_are_taken_as_they_are() -> None:
+    answers: list[Any] = []
+    watching = Watching(DESIGN, lambda frame: answers[-1], CameraOptions(free=("fx", "fy", "cx", "cy")))
+    frame = Frame(np.zeros((SIZE[1], SIZE[0]), np.uint8), 255.0)
+    for k, answer in enumerate([seen_from(0.4, 0.0, 0.0), Failure("no board", Code.NOT_FOUND)]):
+        answers.append(answer)
+        declined = watching.resume(frame, f"{k}.png")
+        assert (declined is None) == (k == 0)
+    assert watching.frames == 1
+    answers.append(seen_from(0.4, 0.0, 0.0))
+    watching.on_frame(frame, "2.png")
+    assert watching.on_frame(frame, "3.png").words.startswith("seen before")
 
 
 class _Moved:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -46,6 +45,7 @@ def watch(
             "--auto", help="First set exposure and gain: 99.5 % of the pixels below 80 % of full scale."
         ),
     ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue with the frames of --out.")] = False,
     window: Annotated[bool, typer.Option(help="Open the page in a window, where there is a display.")] = True,
 ) -> None:
     """Show the live picture of a camera on a page, and take a frame when it is sharp and new."""
@@ -53,10 +53,12 @@ def watch(
     import webbrowser
 
     from ..capture import steer
+    from ..core.errors import InputError, InstrumentError
     from ..instruments import Camera
     from ..io import parse_design, read_text
-    from ..io.images import write_image
+    from ..io.images import read_image, write_image
     from ..procedures.calibration import CameraOptions, measurer_of
+    from ..procedures.exposures import photographs_in
     from ..procedures.watching import Watching
     from ..service.live import LivePage
 
@@ -65,13 +67,20 @@ def watch(
     options = CameraOptions(model, names, None if pitch is None else (pitch, pitch))
     if options.automatic:
         raise UsageError("is chosen from all photographs", where="--model auto", do="give it to calibrate")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError("is not empty", where=out, do="give a new folder")
+    before = photographs_in(out) if resume and out.is_dir() and any(out.iterdir()) else []
+    if out.exists() and not before and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError("is not empty", where=out, do="give a new folder, or --resume")
     instruments = _bench(bench, camera)
     chosen = None if camera is None or camera.startswith("/dev/") else camera
     source = instruments.one(Camera, chosen)
     # The axes of the bench are free to be moved from elsewhere meanwhile.
     instruments, watching = instruments.part([source.name]), Watching(target, measurer_of(target), options)
+    for path in before:
+        declined = watching.resume(read_image(path), path.name)
+        if declined is not None:
+            typer.echo(f"left out: {path.name}: {declined.reason}", err=True)
+    kept, failed = watching.frames, None
+    number = max((int(path.stem) for path in before if path.stem.isdecimal()), default=0)
     with (
         instruments.lock("reseau watch"),
         instruments,
@@ -86,21 +95,27 @@ def watch(
             say(f"{source.name}: exposure_us {steered.exposure_us:g}, gain {steered.gain:g}\n")
             if not steered:
                 typer.echo(f"warning: {steered.why}", err=True)
-        end, taken = time.monotonic() + (seconds or float("inf")), 0
-        with suppress(KeyboardInterrupt):
-            while taken < count and time.monotonic() < end:
+        end = time.monotonic() + (seconds or float("inf"))
+        try:
+            while kept < count and time.monotonic() < end:
                 frame = source.expose().frame
-                name = f"{taken + 1:03d}.png"
+                name = f"{number + 1:03d}.png"
                 seen = watching.on_frame(frame, name)
                 if seen.taken:
                     write_image(out / name, frame.pixels)
-                    taken += 1
+                    number, kept = number + 1, kept + 1
                     reached = "".join(f"  {key} {value:.2g}" for key, value in seen.sigmas.items())
                     say(f"{out / name}: {len(seen.xy)} points{reached}\n")
                 page.show(frame, seen, count)
-    for line in () if not taken else seen.verdict:
+        except KeyboardInterrupt:
+            pass
+        except (InstrumentError, InputError) as error:  # what was taken is told before it
+            failed = error
+    for line in watching.verdict:
         say(f"{line}\n")
-    say(f"{taken} frames in {out}; next: reseau calibrate {out} --design {design}\n")
+    say(f"{kept} frames in {out}; next: reseau calibrate {out} --design {design}\n")
+    if failed is not None:
+        raise failed
 
 
 def _has_display() -> bool:

@@ -148,13 +148,26 @@ class Watching:
         assert self._current is not None
         return self._current
 
+    @property
+    def frames(self) -> int:
+        """Number of frames taken."""
+        return len(self._taken)
+
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """What the calibration so far is good for; empty before the third frame."""
+        return self._verdict
+
+    def resume(self, frame: Frame, name: str) -> Failure | None:
+        """Take a frame of an earlier session as it is; why it cannot be measured otherwise."""
+        points = self._measured(frame)
+        if points is not None:
+            self._take(frame, points, name)
+        return self._current if isinstance(self._current, Failure) else None
+
     def on_frame(self, frame: Frame, name: str) -> Seen:
         """Measure a frame, and take it under this name if it is sharp, still and new."""
-        try:
-            self._current = self._measure(frame)
-        except ImageError as error:  # too dark, or overexposed: the next frame may be good
-            self._current = Failure(error.what, Code.DECLINED)
-        points = None if isinstance(self._current, Failure) else self._current.points
+        points = self._measured(frame)
         words = self._objection(points, frame.width)
         self._before = points
         taken = not words and points is not None
@@ -163,6 +176,14 @@ class Watching:
             words = f"taken: {len(self._taken)} frames; move the target or the camera"
         xy = np.zeros((0, 2)) if points is None else points.xy
         return Seen(taken, words, xy, self._covered.copy(), len(self._taken), self._sigmas, self._verdict)
+
+    def _measured(self, frame: Frame) -> ImagePoints | None:
+        """The points of a frame, which becomes the current one."""
+        try:
+            self._current = self._measure(frame)
+        except ImageError as error:  # too dark, or overexposed: the next frame may be good
+            self._current = Failure(error.what, Code.DECLINED)
+        return None if isinstance(self._current, Failure) else self._current.points
 
     def _objection(self, points: ImagePoints | None, width: int) -> str:
         """Why the frame is not taken, and what helps; empty where nothing does."""
