@@ -206,7 +206,8 @@ def _misfit(curve: ToneCurve, at: tuple[Samples, Array], full_scale: float) -> f
 def _estimated(
     matched: Matched, first: Exponent | None, at: tuple[Samples, Array], full_scale: float
 ) -> tuple[float, float, tuple[Samples, Array]] | None:
-    """Exponent with its standard deviation, and the marks matched with it; None if cameras have no such.
+    """Exponent with its standard deviation, and the marks matched with it; None if cameras have no such, or
+    it does not settle.
 
     `first` is the exponent estimated `at` marks matched in grey values as they are.
     """
@@ -220,6 +221,9 @@ def _estimated(
         if again is None:
             return None
         at = again
+    else:
+        # The exponent of a camera settles; that of correlated residuals, as of compression, drifts.
+        return None
     usable = _LEAST < gamma < _MOST and abs(gamma - 1) > _LINEAR
     return (gamma, found.sigma, at) if usable else None
 

@@ -56,7 +56,7 @@ _BORDER = 2.0
 """Least distance of a corner from the outermost pixels, in widths of the point-spread function."""
 _FLAT = 0.35
 """Least sine of the angle between the edges of a corner."""
-_FAR_PX, _FIGURES_PX = 1e5, 8
+_FAR_PX, _FIGURES_PX = 1e5, 24
 """Coordinates from which a mapping is not used; step of the window sizes of figures."""
 _NODES_PX = 1.1
 """Distance of nodes on an outline, in widths of the point-spread function."""
