@@ -37,7 +37,9 @@ def _disks(gamma: float) -> Callable[[ToneCurve], tuple[Samples, np.ndarray]]:
 
 def test_the_exponent_of_a_camera_is_found_within_three_sigmas() -> None:
     found = find_curve(_disks(2.0), 255.0, None)
-    assert found.curve is not None and found.curve.exponent is not None and found.sigma is not None
+    assert found.curve is not None
+    assert found.curve.exponent is not None
+    assert found.sigma is not None
     assert abs(found.curve.exponent - 2.0) < 3 * found.sigma < 0.03
 
 
