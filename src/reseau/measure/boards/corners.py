@@ -250,6 +250,7 @@ class CornerMarks(PlaneMarks):
                 if alike and np.nanmax(np.abs(corners - before)) < _ALIKE_PX:
                     return share
         from ..compiled_filter import filtered  # takes half a second to import; not every command needs it
+        from .compiled_corners import add_images
 
         at = corners
         h, w = self.screened.grey.shape
@@ -280,11 +281,7 @@ class CornerMarks(PlaneMarks):
             if look.kernel is not None:
                 wider = np.pad(taken, ((0, 0), (reach, reach), (reach, reach)))
                 taken = filtered(wider, look.kernel.astype(np.float32))
-            taken = taken * self.sectors.ink[part, None, None].astype(np.float32)
-            for image, (left, top) in zip(taken, low[part].astype(np.intp), strict=True):
-                a, b = max(left, 0), max(top, 0)
-                place = share[b : top + high, a : left + wide]
-                place += image[b - top : b - top + len(place), a - left : a - left + place.shape[1]]
+            add_images(share, taken, self.sectors.ink[part], low[part].astype(np.intp))
         self.figures = share, at, width, look.kernel
         return share
 
