@@ -53,6 +53,14 @@ def _normal(z: float) -> tuple[float, float]:
 
 
 @_compiled
+def _near_edge(z: float) -> tuple[float, float]:
+    """Normal distribution and density; exactly 0 or 1, and 0, far from an edge, where most pixels are."""
+    if abs(z) < _FAR:
+        return _normal(z)
+    return (1.0, 0.0) if z > 0 else (0.0, 0.0)
+
+
+@_compiled
 def _rule(rho: float, at: Floats, inverse: Floats, weight: Floats) -> int:
     """Fill nodes of the integral of the density of two normal variables over their correlation."""
     kind = 0
@@ -119,8 +127,8 @@ def formed(
                         for p in range(1, images.shape[1]):
                             images[k, p, i, j] = 0.0
                     continue
-                pa, bell_a = _normal(a)
-                pb, bell_b = _normal(b)
+                pa, bell_a = _near_edge(a)
+                pb, bell_b = _near_edge(b)
                 share = pa * pb + (1 - pa) * (1 - pb) if two else pa * pb
                 by_rho = 0.0
                 if near1 and near2 and a * a + b * b < nothing:
@@ -133,12 +141,12 @@ def formed(
                         by_rho *= 2
                 by_a, by_b = 0.0, 0.0
                 if near1:
-                    side, bell = _normal((b - rho * a) * free)[0], bell_a
+                    side, bell = _near_edge((b - rho * a) * free)[0], bell_a
                     beside = 2 * side - 1 if two else side
                     by_a = bell * beside
                     share += sharp1 * (3 * a - a * a * a) * bell * beside
                 if near2:
-                    side, bell = _normal((a - rho * b) * free)[0], bell_b
+                    side, bell = _near_edge((a - rho * b) * free)[0], bell_b
                     beside = 2 * side - 1 if two else side
                     by_b = bell * beside
                     share += sharp2 * (3 * b - b * b * b) * bell * beside
