@@ -236,6 +236,11 @@ class CornerMarks(PlaneMarks):
             pixels_around(self.start[rows], across, half, self.sectors.reach, self.sectors.along)
         )
 
+    @property
+    def surrounded(self) -> bool:
+        """See :class:`MarkWindows`."""
+        return len(self.sectors.outlines) > 0
+
     def beside(self) -> Array | None:
         """See :class:`PlaneMarks`: the markers in bright squares, as solid figures; bright cells of tags."""
         outlines, look = self.sectors.outlines, self.look

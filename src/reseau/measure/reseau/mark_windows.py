@@ -188,6 +188,7 @@ class MarkWindows(ABC):
         self.quick = self.precise_start  # whether marks are matched without a search for blunders
         self.searching = _HIDING if self.precise_start else np.inf  # see :func:`match`
         self.own_px = np.zeros(len(self.at))  # pixels of the windows that belong to marks, matched last
+        self.matched_beside: Array | None = None  # see `beside`, when marks were matched last
         self.rough = 0.0  # residuals of the marks that were learnt from
         self._cleared: tuple[Array, Mask] | None = None  # see `_clear`
 
@@ -203,6 +204,11 @@ class MarkWindows(ABC):
     def radius(self, rows: Rows) -> Array:
         """Half the mean extent (k,) of marks in the image."""
 
+    @property
+    def surrounded(self) -> bool:
+        """Whether there is other ink of the target beside marks."""
+        return False
+
     def beside(self) -> Array | None:
         """Share (h, w) of each pixel that other ink of the target takes."""
         return None
@@ -214,7 +220,7 @@ class MarkWindows(ABC):
     def match(self, rows: Rows, background: int = 2, influence: bool = False) -> Matches:
         """Match disks, grouped by window size."""
         images, reach = self._images(rows)
-        beside = self.beside()
+        beside = self.matched_beside = self.beside()
         # In a large frame every copy takes time.
         valid = self.screened.valid & ~self.hidden if self.hidden.any() else self.screened.valid
         if beside is not None:
@@ -335,7 +341,8 @@ class MarkWindows(ABC):
         centre = slice(high - half[1], high + half[1] + 1), slice(wide - half[0], wide + half[0] + 1)
         residuals = first.residuals[:, *centre]
         grey = self.screened.grey[y, x].astype(np.float64)
-        beside = self.beside()
+        # What was subtracted when they were matched.
+        beside = self.matched_beside
         if beside is not None and (others := self._light_of(beside[y, x], rows)) is not None:
             grey -= others
         window = Window(x[:, 0].astype(float), y[:, :, 0].astype(float), PixelResponse(self.options.fill))

@@ -209,6 +209,11 @@ class _Sheet(DiskMarks):
         self.design = design
         self.ring: tuple[Array, Chain, float, Array | None] | None = None
 
+    @property
+    def surrounded(self) -> bool:
+        """See :class:`MarkWindows`."""
+        return self.design.rings is not None
+
     def beside(self) -> Array | None:
         """Share (h, w) of each pixel that the coded rings take; formed anew when they have changed."""
         look, rings = self.look, self.design.rings
