@@ -33,7 +33,7 @@ from .marks import ReseauOptions
 
 __all__ = ["BESIDE", "DISTURBED", "ENOUGH", "SEEN", "Appearance", "Located", "MarkWindows"]
 
-_CLASS_PX = 2
+_CLASS_PX = 4
 """Step of the window sizes."""
 _GROUND_PX, _GROUND_WIDTHS = 5, 3.0
 """Background shown by a window around its mark: pixels, and widths of the point-spread function."""
