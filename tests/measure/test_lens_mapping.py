@@ -6,7 +6,7 @@ import pytest
 
 from reseau.core.data import Array
 from reseau.measure.reseau.lens_mapping import lens_through, mapping_through
-from reseau.measure.reseau.sheet_placement import through
+from reseau.measure.reseau.plane_mapping import plane_through
 from reseau.measure.testfield.lattice_mapping import second_order, slope_of
 
 SHAPE, FOCAL, NOISE_PX = (1024, 1024), 380.0, 0.3
@@ -31,7 +31,7 @@ def seen_through_a_fisheye(seed: int) -> tuple[Array, Array]:
 @pytest.mark.parametrize("seed", range(20))
 def test_tags_in_the_corner_of_a_fisheye_picture_lie_in_one_plane(seed: int) -> None:
     at, xy = seen_through_a_fisheye(seed)
-    found = lens_through(at, xy, np.full(len(at), NOISE_PX), SHAPE, through(at, xy, SHAPE))
+    found = lens_through(at, xy, np.full(len(at), NOISE_PX), SHAPE, plane_through(at, xy, SHAPE))
     assert found is not None
     assert np.hypot(*(found.mapping(at) - xy).T).max() < 6 * NOISE_PX
 

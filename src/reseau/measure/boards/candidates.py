@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 from ...core.data import Array, Mask, Rows
 from ...optics import Chain
 from ..reseau.lens_mapping import lens_through
-from ..reseau.sheet_placement import through
+from ..reseau.plane_mapping import plane_through
 from ..testfield.lattice_mapping import images_of, started
 
 __all__ = [
@@ -320,7 +320,7 @@ def grown_through(
         through_lens |= same and len(rows) >= LENS_FROM
         if same and not through_lens:
             break
-        free = through(nodes, xy[rows], shape)
+        free = plane_through(nodes, xy[rows], shape)
         lens = None
         if through_lens:
             lens = lens_through(nodes, xy[rows], np.full(len(rows), SADDLE_PX), shape, free)

@@ -25,8 +25,9 @@ from ...optics import Chain
 from ..reseau.disks import Disks
 from ..reseau.lens_mapping import lens_through
 from ..reseau.mark_windows import Located
-from ..reseau.sheet_placement import MOST_DISKS, STRENGTHS, disk_seeds, grown_disks, through
-from ..testfield.lattice_mapping import images_of, slope_of, started
+from ..reseau.plane_mapping import STRENGTHS, plane_through, projectivity_behind
+from ..reseau.sheet_placement import MOST_DISKS, disk_seeds, grown_disks
+from ..testfield.lattice_mapping import images_of, slope_of
 from .bits import Bits, Integers, read_bits
 from .candidates import (
     LENS_FROM,
@@ -388,9 +389,9 @@ def _plane_of_markers(
         return np.asarray(matrix), np.ones(4, dtype=bool)
     # Good to two pixels: distortion bends the board.
     limit = max(3.0, 0.006 * max(shape))
-    found, good = _agreeing(plane, image, shape, limit, 0.0)
+    found, good = projectivity_behind(plane, image, shape, 0.0, limit)
     while _LENS_FROM <= good.sum() < len(good):
-        start = through(plane[good], image[good], shape)
+        start = plane_through(plane[good], image[good], shape)
         lens = lens_through(plane[good], image[good], np.full(good.sum(), _MARKER_PX), shape, start)
         if lens is None:
             break
@@ -399,28 +400,9 @@ def _plane_of_markers(
             break
         good = agree
     if not good.all():
-        bent = [_agreeing(plane, image, shape, limit, strength) for strength in STRENGTHS[1:]]
+        bent = [projectivity_behind(plane, image, shape, strength, limit) for strength in STRENGTHS[1:]]
         found, good = max([(found, good), *bent], key=lambda one: int(one[1].sum()))
     return found, good
-
-
-def _agreeing(
-    plane: Array, image: Array, shape: tuple[int, int], limit: float, strength: float
-) -> tuple[Array | None, NDArray[np.bool_]]:
-    """Projectivity behind a fisheye, and which points agree with it to `limit` pixels."""
-    good = np.zeros(len(plane), dtype=bool)
-    ideal = started(np.eye(3), 1, shape, strength).first.inverse(image) if strength > 0 else image
-    there = np.isfinite(ideal).all(axis=1)
-    if there.sum() < 4:
-        return None, good
-    found, inlier = cv2.findHomography(plane[there], ideal[there], cv2.RANSAC, limit)
-    if found is None:
-        return None, good
-    good[there] = inlier.ravel() > 0
-    if strength > 0:
-        off = images_of(started(np.asarray(found), 1, shape, strength), plane) - image
-        good = np.hypot(*off.T) < limit
-    return np.asarray(found, dtype=np.float64), good
 
 
 def lay_marked(
@@ -477,7 +459,7 @@ def lay_marked(
     use = np.repeat(whole, 4) if whole.any() else good
     if np.linalg.det(matrix[:2, :2] - np.outer(matrix[:2, 2], matrix[2, :2]) / matrix[2, 2]) > 0:
         return Failure("the board is seen mirrored", Code.MIRRORED)
-    mapping = through(plane[use], image[use], shape)
+    mapping = plane_through(plane[use], image[use], shape)
     nodes = design.xy / design.pitch
     frame, origin = np.eye(2) / design.pitch, np.zeros(2)
     if design.kind == "markers":
@@ -497,7 +479,7 @@ def lay_marked(
         """Mapping through points; through the same as before it is the same."""
         nonlocal last
         if not (np.array_equal(at, last[0]) and np.array_equal(xy, last[1])):
-            last = at, xy, through(at, xy, shape)
+            last = at, xy, plane_through(at, xy, shape)
         return last[2]
 
     for _ in range(_GROWN):

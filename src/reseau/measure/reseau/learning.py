@@ -19,7 +19,7 @@ from ..response import Samples, estimate_kernel
 from ..tone import find_curve
 from .lens_mapping import mapping_through
 from .mark_windows import DISTURBED, ENOUGH, Appearance, MarkWindows
-from .sheet_placement import through
+from .plane_mapping import plane_through
 
 __all__ = ["learn", "weigh"]
 
@@ -111,7 +111,7 @@ def _learn(marks: MarkWindows, first: Matches, rows: Rows) -> Matches:
     marks.start[rows] = first.xy
     known = marks.found if marks.precise_start else np.isin(np.arange(len(marks.at)), rows)
     h, w = marks.screened.grey.shape
-    marks.mapping = through(marks.at[known], marks.start[known], (h, w))
+    marks.mapping = plane_through(marks.at[known], marks.start[known], (h, w))
     if marks.precise_start and len(rows) >= _SPREAD:
         sigma = np.sqrt(first.variance)
         precise = mapping_through(marks.at[rows], first.xy, sigma, (h, w)).mapping

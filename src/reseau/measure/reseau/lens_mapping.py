@@ -32,7 +32,7 @@ from ..testfield.lattice_mapping import (
     strength_of,
     with_coefficients,
 )
-from .sheet_placement import fisheye_of, through
+from .plane_mapping import fisheye_of, polynomial_through
 
 __all__ = ["UNFIT", "FoundMapping", "free_through", "lens_through", "mapping_through"]
 
@@ -103,7 +103,10 @@ def mapping_through(at: Array, xy: Array, sigma: Array, shape: tuple[int, int]) 
 
     def best_of(strength: float) -> tuple[float, FoundMapping]:
         # Where no lens of the above kind describes the points: as high a degree as there are points for.
-        free = [through(at, xy, shape, d, strength) for d in sorted({min(known[-1], _USUAL), known[-1]})]
+        free = [
+            polynomial_through(at, xy, shape, d, strength)
+            for d in sorted({min(known[-1], _USUAL), known[-1]})
+        ]
         if strength > 0:
             # What little is left towards the margin counts for a robust fit as errors of the points.
             free = [free_through(mapping, at, xy, sigma, degree_of(mapping)) for mapping in free]

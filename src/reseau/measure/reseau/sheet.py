@@ -25,8 +25,9 @@ from ..testfield.lattice_mapping import images_of, second_order, slope_of
 from .disks import Disks, find_disks
 from .mark_windows import Located
 from .marks import ReseauOptions
+from .plane_mapping import plane_through
 from .plane_marks import PlaneMarks
-from .sheet_placement import MOST_DISKS, SheetPlacement, lay_sheet, through
+from .sheet_placement import MOST_DISKS, SheetPlacement, lay_sheet
 
 __all__ = ["DiskMarks", "measure_sheet"]
 
@@ -108,7 +109,7 @@ def _placed(
             # Pixel 0 at half the size covers pixels 0 and 1.
             disks = Disks(2 * disks.xy + 0.5, 2 * disks.form, disks.t)
             at, found = design.xy @ placed.frame.T + placed.origin, placed.disk >= 0
-            mapping = through(at[found], disks.xy[placed.disk[found]], (h, w))
+            mapping = plane_through(at[found], disks.xy[placed.disk[found]], (h, w))
             return replace(placed, mapping=mapping), disks
     disks = find_disks(grey, screened.valid, screened.noise)
     return lay_sheet(grey, disks, design, mirrored), disks

@@ -10,13 +10,10 @@ the darkness of the rings around them is compared with their codes.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
-from scipy.optimize import minimize_scalar
 from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask, Rows
@@ -24,21 +21,17 @@ from ...core.errors import UsageError
 from ...core.failure import Code, Failure
 from ...io import ReseauDesign
 from ...optics import Chain
-from ..testfield.lattice_fit import refit
-from ..testfield.lattice_mapping import images_of, second_order, started
+from ..testfield.lattice_mapping import second_order, started
 from .assignment import spacing
 from .disks import Disks
+from .plane_mapping import plane_through
 
 __all__ = [
     "MOST_DISKS",
-    "STRENGTHS",
     "SheetPlacement",
     "disk_seeds",
-    "fisheye_of",
     "grown_disks",
     "lay_sheet",
-    "projectivity_behind",
-    "through",
 ]
 
 MOST_DISKS = 4
@@ -56,15 +49,6 @@ _LEGIBLE = 0.5
 """Minimum agreement of a ring with the design, from -1 (opposite) to 1."""
 _AHEAD = 2.0
 """Minimum lead of the best numbering over the second best, in disks."""
-_POINT_PX = 0.1
-_LEFT_PX, _BETTER, _FEWEST_FISHEYE = 0.5, 0.5, 8
-"""Residuals of a mapping from which a fisheye is tried, share of them that it may leave, and the least number
-of points."""
-STRENGTHS = (0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0)
-"""Of fisheyes that are tried: one that shows 180° along the longer side of the frame has 2.5."""
-_MIDDLE = 0.5
-_ENOUGH = 30
-"""Number of disks in the centre of the frame from which the projectivity is estimated from these alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,84 +69,6 @@ class SheetPlacement:
     frame: Array
     origin: Array
     disk: Rows
-
-
-def through(
-    at: Array, xy: Array, shape: tuple[int, int], degree: int = 1, strength: float | None = None
-) -> Chain:
-    """Mapping through points: a projectivity and a polynomial whose degree grows with the number of points.
-
-    Parameters
-    ----------
-    at, xy : ndarray (n, 2)
-        Lattice coordinates and images.
-    shape : tuple
-        Height and width of the frame.
-    degree : int
-        Least degree of the polynomial, for points that were measured precisely.
-    strength : float, optional
-        Of a fisheye between both. By default there is one if it leaves much less than the polynomial alone.
-    """
-    if strength is not None and strength > 0:
-        straight = projectivity_behind(at, xy, shape, strength)
-        if straight is not None:
-            return refit(started(straight, degree, shape, strength), at, xy, _POINT_PX)
-    plain = _without_fisheye(at, xy, shape, degree)
-    if strength is not None or len(at) < _FEWEST_FISHEYE:
-        return plain
-    left = float(np.sqrt(((images_of(plain, at) - xy) ** 2).mean()))
-    if left < _LEFT_PX:
-        return plain
-    strength = fisheye_of(at, xy, shape)
-    if not strength > 0:
-        return plain
-    bent = through(at, xy, shape, degree, strength)
-    better = float(np.sqrt(((images_of(bent, at) - xy) ** 2).mean())) < _BETTER * left
-    return bent if better else plain
-
-
-def fisheye_of(at: Array, xy: Array, shape: tuple[int, int]) -> float:
-    """Strength of the fisheye that leaves least with a projectivity alone; 0 if none leaves less than none.
-
-    Parameters
-    ----------
-    at, xy, shape
-        See :func:`through`.
-    """
-
-    def left(strength: float) -> float:
-        straight = projectivity_behind(at, xy, shape, strength)
-        if straight is None:
-            return np.inf
-        return float(((images_of(started(straight, 1, shape, strength), at) - xy) ** 2).sum())
-
-    squares = [left(strength) for strength in STRENGTHS]
-    k = int(np.argmin(squares))
-    if k == 0:
-        return 0.0
-    low, high = STRENGTHS[k - 1], STRENGTHS[min(k + 1, len(STRENGTHS) - 1)]
-    found = minimize_scalar(left, bounds=(low, high), method="bounded", options={"xatol": 0.02})
-    return float(found.x if found.fun < squares[k] else STRENGTHS[k])
-
-
-def projectivity_behind(at: Array, xy: Array, shape: tuple[int, int], strength: float) -> Array | None:
-    """Projectivity (3, 3) through points behind a fisheye; None if some are outside of what it shows."""
-    lens = started(np.eye(3), 1, shape, strength).first
-    ideal = lens.inverse(xy) if strength > 0 else xy
-    if not np.isfinite(ideal).all():
-        return None
-    found: Any = cv2.findHomography(at, ideal)[0]
-    return None if found is None else np.asarray(found, dtype=np.float64)
-
-
-def _without_fisheye(at: Array, xy: Array, shape: tuple[int, int], degree: int) -> Chain:
-    h, w = shape
-    middle, half = np.array([w - 1, h - 1]) / 2, max(h, w) / 2
-    near = np.hypot(*(xy - middle).T) < _MIDDLE * half
-    # Distortion of the lens is smallest there; the polynomial then models the distortion alone.
-    some = near if near.sum() >= _ENOUGH and np.ptp(at[near], axis=0).min() > 1 else np.ones_like(near)
-    found: Any = cv2.findHomography(at[some], xy[some])[0]
-    return refit(started(np.eye(3) if found is None else found, degree, shape), at, xy, _POINT_PX)
 
 
 def lay_sheet(
@@ -282,7 +188,7 @@ def grown_disks(
         nodes, rows = beside[keep], row[keep]
         if same or len(rows) < 5 or np.ptp(nodes, axis=0).min() < 1:
             break
-        mapping = through(nodes, disks.xy[rows], shape)
+        mapping = plane_through(nodes, disks.xy[rows], shape)
     return nodes, rows, mapping
 
 
