@@ -292,7 +292,8 @@ def grown_through(
     """
     grid = np.array(list(product(range(-extent, extent + 1), repeat=2)), dtype=np.float64)
     tree, step = KDTree(xy), 1e-3
-    nodes, rows, through_lens, led = np.zeros((1, 2)), np.zeros(1, dtype=np.intp), False, False
+    nodes, rows, free = np.zeros((1, 2)), np.zeros(1, dtype=np.intp), mapping
+    through_lens = led = False
     for _ in range(3 * extent):
         beside = grid[KDTree(nodes).query(grid)[0] < _FROM + 0.5 * (len(nodes) < 4)]
         predicted = images_of(mapping, beside)
@@ -310,17 +311,19 @@ def grown_through(
         _, once = np.unique(row[order], return_index=True)
         keep = np.sort(order[once])
         keep = keep[taken[keep]]
-        same = len(keep) == len(rows) and np.array_equal(row[keep], rows)
+        same = np.array_equal(row[keep], rows) and np.array_equal(beside[keep], nodes)
         nodes, rows = beside[keep], row[keep]
         if len(rows) < 4 or np.ptp(nodes, axis=0).min() < 1 or (same and led):
             break
-        # A polynomial through few nodes does not predict the next ones through a wide lens; a fisheye is
-        # followed by what the nodes beside them have in excess.
-        led |= same and through_lens
-        through_lens |= same and len(rows) >= LENS_FROM
-        if same and not through_lens:
+        if same and through_lens:
+            # Behind a fisheye what nodes have in excess of the mapping is continued to those beside them.
+            led = True
+            continue
+        if same and len(rows) < LENS_FROM:
             break
-        free = plane_through(nodes, xy[rows], shape)
+        # A polynomial through few nodes does not predict the next ones through a wide lens.
+        through_lens |= same
+        free = free if same else plane_through(nodes, xy[rows], shape)
         lens = None
         if through_lens:
             lens = lens_through(nodes, xy[rows], np.full(len(rows), SADDLE_PX), shape, free)
