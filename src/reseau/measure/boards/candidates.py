@@ -22,7 +22,7 @@ from ...core.data import Array, Mask, Rows
 from ...optics import Chain
 from ..reseau.lens_mapping import lens_through
 from ..reseau.plane_mapping import plane_through
-from ..testfield.lattice_mapping import images_of, started
+from ..testfield.lattice_mapping import images_of, second_order, started
 
 __all__ = [
     "LENS_FROM",
@@ -291,15 +291,12 @@ def grown_through(
         As :func:`grown`.
     """
     grid = np.array(list(product(range(-extent, extent + 1), repeat=2)), dtype=np.float64)
-    tree, step = KDTree(xy), 1e-3
+    tree = KDTree(xy)
     nodes, rows, free = np.zeros((1, 2)), np.zeros(1, dtype=np.intp), mapping
     through_lens = led = False
     for _ in range(3 * extent):
         beside = grid[KDTree(nodes).query(grid)[0] < _FROM + 0.5 * (len(nodes) < 4)]
-        predicted = images_of(mapping, beside)
-        slopes = np.stack(
-            [(images_of(mapping, beside + d) - predicted) / step for d in step * np.eye(2)], axis=2
-        )
+        predicted, slopes, _ = second_order(mapping, beside)
         pixels = np.maximum(np.linalg.norm(slopes, axis=1).min(axis=1), 1e-6)
         if led:
             predicted = predicted + _led(nodes, xy[rows] - images_of(mapping, nodes), beside)
