@@ -10,10 +10,14 @@ import pytest
 
 from reseau.bundle import Options, Result, adjust_network, example_network
 from reseau.bundle.network import network_document
+from reseau.calibration import CameraMapping
 from reseau.cli import run
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.exchange import read_network, write_network
+from reseau.exchange.calibrations import calibration_formats, exported_lens
+from reseau.optics import PixelGrid
+from reseau.optics.cameras import camera_model
 
 from .scene import residuals
 
@@ -44,6 +48,35 @@ def test_the_residuals_are_computed_minus_observed(result: Result) -> None:
     from reseau.bundle import with_estimates
 
     assert np.abs(residuals(with_estimates(result)) - result.residuals).max() < 1e-6
+
+
+def test_a_camera_that_colmap_has_is_written_as_it_is_although_it_folds_beyond_the_points() -> None:
+    model = camera_model("opencv")
+    given = {"fx": 900.0, "fy": 905.0, "cx": 320.0, "cy": 240.0, "k1": -0.05, "k2": -8.0}
+    grid = PixelGrid(1280, 960, (1.0, 1.0))
+    mapping = model.mapping([given.get(name, 0.0) for name in model.names], grid)
+    lens = CameraMapping(mapping, 1280, 960, np.zeros(0, np.intp), np.zeros((0, 0)))
+    assert np.isnan(lens.mapping.inverse(np.array([[1279.0, 959.0]]))).any()
+    form, stored = calibration_formats()["colmap"], {"model": "opencv", "pitch_mm": (1.0, 1.0)}
+    written = exported_lens(form, "camera", lens, stored)
+    assert written.greatest_px == 0.0
+    assert {name: value for name, value in written.camera.values.items() if value} == given
+
+
+@pytest.mark.parametrize("kind", ["SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"])
+@pytest.mark.parametrize("binary", [False, True])
+def test_fisheyes_of_colmap_with_one_focal_length_are_read(kind: str, binary: bool, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap (extra `peers`)")
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=3)
+    options.num_points3D, options.camera_model_id = 30, getattr(pycolmap.CameraModelId, kind)
+    options.camera_width, options.camera_height = 640, 480
+    options.camera_params = [400.0, 320.0, 240.0, 0.02, -0.01][: 4 + (kind == "RADIAL_FISHEYE")]
+    scene = pycolmap.synthesize_dataset(options)
+    (scene.write_binary if binary else scene.write_text)(str(tmp_path))
+    network = read_network(tmp_path)
+    assert network.cameras[0].model == "fisheye"
+    assert np.abs(residuals(network)).max() < EXACT_PX
 
 
 def test_colmap_projects_the_same_points(result: Result, tmp_path: Path) -> None:

@@ -34,9 +34,11 @@ _MODELS = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
 }
-# Their numbers in binary files.
-_NUMBERS = dict(enumerate(_MODELS))
+# Their numbers in binary files; 7 has another projection (FOV).
+_NUMBERS = dict(zip((*range(7), 8, 9), _MODELS, strict=True))
 
 
 def read_colmap(folder: Path | str) -> Network:
@@ -143,7 +145,9 @@ def write_colmap(result: Result, folder: Path | str) -> dict[str, Exported]:
         raise UsageError("cannot be written: COLMAP has no windows", where="network with windows")
     form, written, cameras = calibration_formats()["colmap"], dict[str, Exported](), list[str]()
     for c, camera in enumerate(network.cameras):
-        written[camera.id] = exported_lens(form, camera.id, camera_mapping(result, c))
+        stored = {"model": camera.model, "pitch_mm": camera.pitch_mm, "additional": camera.additional}
+        lens = camera_mapping(result, c)
+        written[camera.id] = exported_lens(form, camera.id, lens, {**camera.options, **stored})
         line = form.write(written[camera.id].camera).splitlines()[-1]
         cameras.append(f"{c + 1} {line.split(maxsplit=1)[1]}")
     turns = fit.values.rotation
@@ -308,7 +312,10 @@ def _camera(name: str, model: str, size: tuple[int, int], values: Sequence[float
     given = dict(zip(names, values, strict=True))
     for key in ("cx", "cy"):
         given[key] -= 0.5
-    if "f" in given:
+    wide = model.endswith("FISHEYE")
+    if wide and "f" in given:
+        given["fx"] = given["fy"] = given["f"]
+    elif "f" in given:
         f = given["f"]
         # One principal distance for both axes: Brown's model with a pitch of one.
         brown = [f, given["cx"] - (width - 1) / 2, (height - 1) / 2 - given["cy"]]
@@ -316,7 +323,7 @@ def _camera(name: str, model: str, size: tuple[int, int], values: Sequence[float
         free = ("c", *(f"K{k}" for k in (1, 2) if f"k{k}" in given))
         all_values = np.array([*brown, *radial, *5 * [0.0]])
         return Camera(name, *size, (1.0, 1.0), "brown", all_values, free)
-    kind = "fisheye" if model.endswith("FISHEYE") else "opencv"
+    kind = "fisheye" if wide else "opencv"
     full = camera_model(kind)
     parameters = np.array([given.get(key, 0.0) for key in full.names])
     free = tuple(key for key in full.of_role("scale", "distortion") if key in given)

@@ -20,6 +20,8 @@ _MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV": (*_CENTRE, *RADIAL_TANGENTIAL),
     "FULL_OPENCV": (*_CENTRE, *RATIONAL),
     "OPENCV_FISHEYE": (*_CENTRE, *_FISHEYE),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
 }
 
 
@@ -62,7 +64,7 @@ def read(text: str, path: Path) -> PlainCamera:
     except ValueError:
         raise FormatError(f"has not {len(names)} numbers for {model}", where=path) from None
     focal = values.get("fx", values.get("f", 0.0)), values.get("fy", values.get("f", 0.0))
-    fisheye = model == "OPENCV_FISHEYE"
+    fisheye = model.endswith("FISHEYE")
     found = [values.get(name, 0.0) for name in (_FISHEYE if fisheye else RATIONAL)]
     centre = values["cx"] - 0.5, values["cy"] - 0.5
     return opencv_camera(number, size, focal, centre, found, path, fisheye=fisheye)

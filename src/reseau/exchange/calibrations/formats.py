@@ -273,20 +273,20 @@ def export_rig(calibrations: Sequence[Calibration], to: str, path: Path | str) -
 
 def _in_a_model_of(form: CalibrationFormat, calibration: Calibration, lens: CameraMapping) -> Exported:
     """The camera in one of the models of a format."""
-    pitch = float(cast(dict[str, Any], calibration.model)["pitch_mm"][0])
-    camera = _as_it_is(form, calibration, lens)
-    if camera is None:
-        return exported_lens(form, calibration.name, lens, pitch)
-    return Exported(camera, 0.0, 0.0, 1.0)
+    return exported_lens(form, calibration.name, lens, cast(dict[str, Any], calibration.model))
 
 
-def _as_it_is(form: CalibrationFormat, calibration: Calibration, lens: CameraMapping) -> PlainCamera | None:
+def _as_it_is(
+    form: CalibrationFormat, name: str, lens: CameraMapping, stored: Mapping[str, Any]
+) -> PlainCamera | None:
     """The camera without conversion; None where the format lacks its model or one of its parameters."""
-    name, (width, height) = calibration.name, lens.size
-    stored: dict[str, Any] = dict(calibration.model)
-    model, given = str(stored.get("model")), tuple(float(v) for v in stored["pitch_mm"])
+    width, height = lens.size
+    model, given = str(stored["model"]), tuple(float(v) for v in stored["pitch_mm"])
+    if model == "mapping":
+        return None
     registered = camera_model(model)
-    own = {key: value for key, value in calibration.values().items() if value or key in _CENTRE}
+    values = dict(zip(lens.mapping.names, lens.mapping.values.tolist(), strict=True))
+    own = {key: value for key, value in values.items() if value or key in _CENTRE}
     options = registered.checked_options(
         {o.name: stored[o.name] for o in registered.options if o.name in stored}
     )
@@ -312,12 +312,16 @@ def formats_holding(calibration: Calibration) -> tuple[str, ...]:
     lens = calibration.mapping()
     if not isinstance(lens, CameraMapping):
         return ()
-    forms = calibration_formats()
-    return tuple(name for name, form in forms.items() if _as_it_is(form, calibration, lens) is not None)
+    forms, stored = calibration_formats(), cast(dict[str, Any], calibration.model)
+    return tuple(
+        name for name, form in forms.items() if _as_it_is(form, calibration.name, lens, stored) is not None
+    )
 
 
-def exported_lens(form: CalibrationFormat, name: str, lens: CameraMapping, pitch_mm: float = 1.0) -> Exported:
-    """The camera, converted to the model of a format that describes it best.
+def exported_lens(
+    form: CalibrationFormat, name: str, lens: CameraMapping, stored: Mapping[str, Any]
+) -> Exported:
+    """The camera as it is, or converted to the model of a format that describes it best.
 
     Parameters
     ----------
@@ -327,8 +331,9 @@ def exported_lens(form: CalibrationFormat, name: str, lens: CameraMapping, pitch
         Name of the camera.
     lens : CameraMapping
         Its mapping.
-    pitch_mm : float
-        Pixel size, for models in mm; 1 where it is not known.
+    stored : mapping
+        Its ``model``, ``pitch_mm`` (1 where it is not known), options of the model, and ``additional`` if it
+        has such parameters, as in a :class:`~reseau.calibration.Calibration`.
 
     Raises
     ------
@@ -339,10 +344,15 @@ def exported_lens(form: CalibrationFormat, name: str, lens: CameraMapping, pitch
     --------
     >>> from reseau.bundle import adjust_network, camera_mapping, example_network
     >>> lens = camera_mapping(adjust_network(example_network()), 0)
-    >>> exported_lens(calibration_formats()["colmap"], "camera", lens).camera.model
+    >>> brown = {"model": "brown", "pitch_mm": (0.01, 0.01)}
+    >>> exported_lens(calibration_formats()["colmap"], "camera", lens, brown).camera.model
     'opencv'
     """
+    own = _as_it_is(form, name, lens, stored)
+    if own is not None:
+        return Exported(own, 0.0, 0.0, 1.0)
     width, height = lens.size
+    pitch_mm = float(stored["pitch_mm"][0])
     best: Exported | None = None
     why = "no model of the format describes it"
     for wanted, names in form.models:
