@@ -70,6 +70,8 @@ _DIAGONAL = 0.3
 """Where the sectors around a node are looked at, in steps along both axes."""
 _CROSSED = 0.3
 """Least difference between the darker of two bright sectors and the brighter of two dark ones."""
+_AROUND, _ACROSS, _ALONG = np.arange(-1, 2), np.array([-1.0, 0.0, 1.0]) / 2, np.array([1.0, 2.0, 1.0]) / 4
+"""Pixels around a saddle, and Sobel's derivative by their columns and mean over their rows."""
 LENS_FROM, SADDLE_PX = 8, 0.5
 """Least number of nodes from which the distortion of a lens is used; their standard deviation."""
 _LARGE_PX = 2_500_000
@@ -124,13 +126,13 @@ def find_saddles(grey: NDArray[np.float32], noise: float) -> Saddles:
         # Pixel 0 at half the size covers pixels 0 and 1.
         return Saddles(2 * found.xy + 0.5, found.edges, found.strength)
     smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTH_PX)
-    x, y, xx, yy, xy = (
-        cv2.Sobel(smooth, cv2.CV_32F, i, j, ksize=3, scale=scale)
-        for i, j, scale in ((1, 0, 1 / 8), (0, 1, 1 / 8), (2, 0, 1 / 4), (0, 2, 1 / 4), (1, 1, 1 / 4))
+    xx, yy, xy = (
+        cv2.Sobel(smooth, cv2.CV_32F, i, j, ksize=3, scale=1 / 4) for i, j in ((2, 0), (0, 2), (1, 1))
     )
-    power = xy * xy - xx * yy
+    power = cv2.multiply(xy, xy)
+    power -= cv2.multiply(xx, yy)
     beside = np.ones((_BESIDE, _BESIDE), np.uint8)
-    peak = (power >= cv2.dilate(power, beside)) & (power > 0)
+    peak = power >= cv2.dilate(power, beside)
     # White noise after a Gaussian of width s has second derivatives of sqrt(3/16/pi) / s³ times its own.
     floor = _LEAST_T * noise * np.sqrt(3 / (16 * np.pi)) / _SMOOTH_PX**3
     peak &= power > floor**2
@@ -143,7 +145,9 @@ def find_saddles(grey: NDArray[np.float32], noise: float) -> Saddles:
     order = np.argsort(-strength, kind="stable")
     order = order[strength[order] > _WEAK**2 * strong][:_MOST]
     v, u = v[order], u[order]
-    a, b, c, gx, gy = (field[v, u].astype(np.float64) for field in (xx, xy, yy, x, y))
+    a, b, c = (field[v, u].astype(np.float64) for field in (xx, xy, yy))
+    near = smooth[v[:, None, None] + _AROUND[:, None], u[:, None, None] + _AROUND].astype(np.float64)
+    gx, gy = ((near @ one) @ other for one, other in ((_ACROSS, _ALONG), (_ALONG, _ACROSS)))
     det = b * b - a * c
     # The saddle point of the parabola: H d = −g.
     dx, dy = (c * gx - b * gy) / det, (a * gy - b * gx) / det
