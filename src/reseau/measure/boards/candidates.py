@@ -129,8 +129,7 @@ def find_saddles(grey: NDArray[np.float32], noise: float) -> Saddles:
     xx, yy, xy = (
         cv2.Sobel(smooth, cv2.CV_32F, i, j, ksize=3, scale=1 / 4) for i, j in ((2, 0), (0, 2), (1, 1))
     )
-    power = cv2.multiply(xy, xy)
-    power -= cv2.multiply(xx, yy)
+    power = cv2.subtract(cv2.multiply(xy, xy), cv2.multiply(xx, yy))
     beside = np.ones((_BESIDE, _BESIDE), np.uint8)
     peak = power >= cv2.dilate(power, beside)
     # White noise after a Gaussian of width s has second derivatives of sqrt(3/16/pi) / s³ times its own.

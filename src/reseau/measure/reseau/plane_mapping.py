@@ -97,7 +97,12 @@ def fisheye_of(at: Array, xy: Array, shape: tuple[int, int]) -> float:
             return np.inf
         return float(((images_of(started(straight, 1, shape, strength), at) - xy) ** 2).sum())
 
-    squares = [left(strength) for strength in STRENGTHS]
+    squares: list[float] = []
+    for strength in STRENGTHS:
+        squares.append(left(strength))
+        # What is left has one minimum; a weak fisheye may show less than the frame does.
+        if len(squares) > 2 and np.isfinite(squares[-3:]).all() and squares[-1] > squares[-2] > squares[-3]:
+            break
     k = int(np.argmin(squares))
     if k == 0:
         return 0.0
