@@ -89,6 +89,8 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
         rows = np.flatnonzero(sure)
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(np.intp))]
         unit, shown, activity = _prepared(found.select(rows), None if centres is None else centres[rows])
+        if not shown.any():
+            return found
         free = 1 - found.leverage[rows]
         # Beside a mark, where its image is even, residuals show the errors of pixels alone; on it, also what
         # the formed image lacks, which is alike in all marks and symmetric.
