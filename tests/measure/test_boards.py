@@ -293,6 +293,32 @@ def test_a_corner_from_which_sharpening_reaches_beyond_the_frame_is_declined() -
     assert np.abs(error / sigma).max() < 4.5
 
 
+@pytest.mark.parametrize(
+    ("design", "printed", "seed"),
+    [
+        # Circles at 4 and 11 px from the border were off by 5 and 9 sigma.
+        (board("circles", 9, 7, 25.0, size=12.0), prints.circles(9, 7, 25.0, 12.0), 1),
+        (
+            board("aprilgrid", 6, 6, 28.6, size=22.0, border_bits=2),
+            prints.aprilgrid(6, 6, 22.0, 0.3, "DICT_APRILTAG_36h11", 2),
+            0,
+        ),
+    ],
+    ids=["circles", "aprilgrid"],
+)
+def test_sharpened_pictures_have_the_sigmas_of_their_errors(
+    design: BoardDesign, printed: prints.Print, seed: int
+) -> None:
+    """Noise that sharpening has made opposite in neighbouring pixels cancels."""
+    view = View(printed, *pose(seed, printed), seed=10 * seed, sharpening=1.2)
+    found = measured(Frame(view.picture(), 255.0, "sharpened"), design)
+    error = renamed(found, view.truth)
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert found.found >= 40
+    assert np.abs(error / sigma).max() < 4.5
+    assert 0.83 < np.sqrt(((error / sigma) ** 2).mean()) < 1.2
+
+
 def test_corners_on_paper_that_is_saturated_everywhere_are_measured_to_their_sigmas() -> None:
     """The middle of every edge is not, and tells where it is: as many corners as ``aprilgrid`` finds, 132."""
     printed = prints.aprilgrid(6, 6, 22.0, 0.3, "DICT_APRILTAG_36h11", 2)

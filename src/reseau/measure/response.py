@@ -16,7 +16,7 @@ import numpy as np
 from ..core.data import Array, Mask, Rows
 from .matching import Shape, Window
 
-__all__ = ["FilteredShape", "Samples", "estimate_kernel", "unexplained"]
+__all__ = ["FilteredShape", "Samples", "estimate_kernel", "sharpened_from_px", "unexplained"]
 
 _REACH = 5
 """Half the side of a kernel, pixels."""
@@ -30,6 +30,8 @@ _SINGULAR = 1e-12
 """Added to the diagonal of correlations, where parts of a basis may be alike."""
 _SMALL = 1e-3
 """Values of a kernel below this are set to zero."""
+_SHARPENS = -0.01
+"""Values of a kernel below which it subtracts light, as sharpening does and motion cannot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +87,28 @@ class FilteredShape:
         every = np.ascontiguousarray(images, dtype=np.float32).reshape(-1, *images.shape[-2:])
         found = filtered(every, self.kernel.astype(np.float32))
         return np.asarray(found.reshape(*images.shape[:-2], *found.shape[1:]), dtype=images.dtype)
+
+
+def sharpened_from_px(kernel: Array) -> int:
+    """Distance up to which sharpening takes light from around a pixel; 0 for motion.
+
+    Sharpening has worked on the grey values of the frame: nearer to its border than this, it has invented
+    those beyond.
+
+    Parameters
+    ----------
+    kernel : ndarray (2 m + 1, 2 m + 1)
+        See :func:`estimate_kernel`.
+
+    Examples
+    --------
+    >>> sharpened_from_px(np.array([[0.0, -0.1, 0.0], [-0.1, 1.4, -0.1], [0.0, -0.1, 0.0]]))
+    1
+    >>> sharpened_from_px(np.array([[0.0, 0.0, 0.0], [0.3, 0.4, 0.3], [0.0, 0.0, 0.0]]))
+    0
+    """
+    at = np.argwhere(kernel < _SHARPENS) - len(kernel) // 2
+    return int(np.abs(at).max(initial=0))
 
 
 def _widened(window: Window, reach: int) -> Window:

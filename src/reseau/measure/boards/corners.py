@@ -24,6 +24,7 @@ from ..reseau.lens_mapping import UNFIT, mapping_through
 from ..reseau.mark_windows import ENOUGH, Located
 from ..reseau.marks import ReseauOptions
 from ..reseau.plane_marks import PlaneMarks
+from ..response import sharpened_from_px
 from ..screening import Screened
 from ..testfield.lattice_mapping import images_of, second_order
 
@@ -209,6 +210,7 @@ class CornerMarks(PlaneMarks):
         h, w = self.screened.grey.shape
         sigma = np.sqrt(found.variance)
         other = mapping_through(self.at[rows], found.xy, sigma, (h, w)).mapping
+        self.precise = other, rows
         reach = self._images(rows)[1].max(axis=1, keepdims=True) + self._ground
         change = np.abs(self._curvature(other, rows) - self._curvature(self.mapping, rows)) * reach**2 / 6
         unlike = np.quantile(np.abs(np.log(found.psf_px / self.look.psf_px)), 0.9) > _UNLIKE_WIDTH
@@ -316,7 +318,7 @@ class CornerMarks(PlaneMarks):
         h, w = self.screened.grey.shape
         gap = np.minimum(found.xy, np.array([w - 1, h - 1]) - found.xy).min(axis=1)
         # What the kernel takes from beyond the frame is unknown.
-        beyond = 0 if self.look.kernel is None else len(self.look.kernel) // 2
+        beyond = 0 if self.look.kernel is None else sharpened_from_px(self.look.kernel)
         near = gap < max(_BORDER * self.look.blur_px, beyond)
         border = near, Reason("on the border of the frame", Code.OUTSIDE)
         # Without its pixels an edge is where faint tails of its blur have it.

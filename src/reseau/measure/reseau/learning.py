@@ -15,7 +15,7 @@ from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Remark
 from ...core.tone import ToneCurve
 from ..matching import Matches, grey_variance
-from ..response import Samples, estimate_kernel
+from ..response import Samples, estimate_kernel, sharpened_from_px
 from ..tone import find_curve
 from .lens_mapping import mapping_through
 from .mark_windows import DISTURBED, ENOUGH, Appearance, MarkWindows
@@ -171,11 +171,21 @@ def _respond(marks: MarkWindows, first: Matches, rows: Rows, begun_px: float) ->
             first = marks.settle(marks.match(rows))
             weigh(marks, first, rows)
         if confirmed:
+            _without_border(marks, sharpened_from_px(kernel))
             text = "the images are smeared by motion or sharpened: this was estimated and is modelled"
             notes = (*notes, Remark(text, Code.FILTERED))
     if not bent:
         notes = (*notes, *_straighten(marks, first, rows)[2])
     return notes
+
+
+def _without_border(marks: MarkWindows, width: int) -> None:
+    """Use no pixels within some from the border of the frame."""
+    if width:
+        valid = np.zeros_like(marks.screened.valid)
+        inner = slice(width, -width), slice(width, -width)
+        valid[inner] = marks.screened.valid[inner]
+        marks.screened = replace(marks.screened, valid=valid)
 
 
 def _straighten(

@@ -306,10 +306,18 @@ class MarkWindows(ABC):
 
     def pixels(self, rows: Rows, half: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Columns (k, 1, c) and rows (k, r, 1) of the windows of marks, within the frame."""
-        h, w = self.screened.grey.shape
-        centre = np.rint(self.start[rows]).astype(np.intp)
-        x, y = (centre[:, k, None] + np.arange(-half[k], half[k] + 1) for k in (0, 1))
-        return np.clip(x, 0, w - 1)[:, None, :], np.clip(y, 0, h - 1)[:, :, None]
+        window, (h, w) = self.window(rows, half), self.screened.grey.shape
+        x, y = (
+            np.clip(axis, 0, last).astype(np.intp)
+            for axis, last in ((window.columns, w - 1), (window.rows, h - 1))
+        )
+        return x[:, None, :], y[:, :, None]
+
+    def window(self, rows: Rows, half: tuple[int, int]) -> Window:
+        """Windows of marks; they may extend beyond the frame."""
+        centre: Array = np.rint(self.start[rows])
+        columns, lines = (centre[:, k, None] + np.arange(-half[k], half[k] + 1.0) for k in (0, 1))
+        return Window(columns, lines, PixelResponse(self.options.fill))
 
     def _known_light(self, rows: Rows, background: int) -> tuple[Array, Array] | None:
         """Contrast and background from which the match of marks continues."""
@@ -345,7 +353,6 @@ class MarkWindows(ABC):
         beside = self.matched_beside
         if beside is not None and (others := self._light_of(beside[y, x], rows)) is not None:
             grey -= others
-        window = Window(x[:, 0].astype(float), y[:, :, 0].astype(float), PixelResponse(self.options.fill))
         every = np.arange(len(rows))
         samples = Samples(
             self._shape(images, every),
@@ -353,7 +360,7 @@ class MarkWindows(ABC):
             first.psf_px,
             first.form,
             self.depth(first),
-            window,
+            self.window(rows, half),
             grey,
             np.isfinite(residuals),
         )

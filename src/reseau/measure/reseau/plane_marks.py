@@ -20,10 +20,8 @@ from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Remark
 from ...optics import Chain
 from ...optics.field import SmoothField
-from ...optics.formation import PixelResponse
 from ..matching import (
     Matches,
-    Window,
     with_alike_errors,
 )
 from ..points import Reason
@@ -100,6 +98,7 @@ class PlaneMarks(MarkWindows):
         self.notes: tuple[Remark, ...] = ()
         self.changes: Callable[[Array], Array] | None = None  # of the mapping, see :class:`FoundMapping`
         self.misfit = 1.0  # of the mapping through all marks, in sigmas
+        self.precise: tuple[Chain, Rows] | None = None  # mapping through precise marks, and which these are
         self.other: Chain | None = None  # another mapping, where that one does not fit
 
     @abstractmethod
@@ -184,6 +183,7 @@ class PlaneMarks(MarkWindows):
             known = self.at[rows[sure]], xy[sure], sigma[sure]
             through_all = mapping_through(*known, (h, w))
             self.mapping, self.changes = through_all.mapping, through_all.changes
+            self.precise = self.mapping, rows[sure]
             off = (self.mapping(known[0]) - xy[sure]) / sigma[sure, None]
             self.misfit = float(np.sqrt((off**2).mean()))
             self.other = free_through(self.mapping, *known) if self.misfit > UNFIT else None
@@ -283,15 +283,20 @@ class PlaneMarks(MarkWindows):
         Correlations of residuals are those of the whole frame; what they make of a position is a bound.
         Positions also scatter about a smooth mapping: with the covariances C + f E, of independent
         errors and of what they have in common, the weighted square sum of the deviations is the redundancy.
-        Where they scatter less than C, residuals are larger than noise: blur, smear and levels that are not
-        quite those of the model leave residuals that are even about a mark, and do not displace it. The
-        covariance is then at least that of the odd residuals.
+        Where they scatter less than C, errors of pixels cancel each other, as after sharpening, or residuals
+        are larger than noise: blur, smear and levels that are not quite those of the model leave residuals
+        that are even about a mark, and do not displace it. The covariance is then C + f E, or at least that
+        of the odd residuals, whichever agrees better with the scatter.
         """
         extra = alike.cov - plain.cov
         good = plain.converged & (plain.t > 8) & (plain.rejected < 0.1) & (plain.seen > SEEN)
+        # A polynomial through few marks has too few terms for a lens.
+        mapping, known = self.precise or (self.mapping, rows)
+        good &= np.isin(rows, known)
         terms = self._smooth_terms(rows[good])
         if terms is None:
             return alike
+        bent = plain.xy[good] - mapping(self.at[rows[good]])
         c, e = (np.diagonal(cov[good], axis1=1, axis2=2) for cov in (plain.cov, extra))
         redundancy = 2 * (len(terms) - terms.shape[1])
 
@@ -300,19 +305,18 @@ class PlaneMarks(MarkWindows):
             for k in range(2):
                 root = np.sqrt(c[:, k] + share * e[:, k])
                 weighted = terms / root[:, None]
-                off = plain.xy[good, k] / root
+                off = bent[:, k] / root
                 total += float(((off - weighted @ np.linalg.lstsq(weighted, off, rcond=None)[0]) ** 2).sum())
             return float(total - redundancy)
 
         none, whole = excess(0.0), excess(1.0)
-        if none < 0:
-            odd = self._odd_share(plain.residuals[good])
-            return replace(alike, cov=plain.cov * np.clip(1 + none / redundancy, odd, 1.0))
+        share, left = (0.0, none) if abs(none) < abs(whole) else (1.0, whole)
         if none * whole < 0:
-            share = float(brentq(excess, 0.0, 1.0, xtol=0.01))
-        else:
-            share = 0.0 if abs(none) < abs(whole) else 1.0
-        return replace(alike, cov=plain.cov + share * extra)
+            share, left = float(brentq(excess, 0.0, 1.0, xtol=0.01)), 0.0
+        even = max(1 + none / redundancy, self._odd_share(plain.residuals[good])) if none < 0 else 1.0
+        if abs(left) < abs((none + redundancy) / even - redundancy):
+            return replace(alike, cov=plain.cov + share * extra)
+        return replace(alike, cov=even * plain.cov)
 
     @staticmethod
     def _odd_share(residuals: Array) -> float:
@@ -386,8 +390,7 @@ class PlaneMarks(MarkWindows):
         foreign: NDArray[Any] = np.zeros(self.screened.grey.shape, dtype=np.uint8)
         seen = np.zeros(foreign.shape, dtype=bool)
         for part, half in self._windows(reach):
-            x, y = self.pixels(some[part], half)
-            window = Window(x[:, 0].astype(float), y[:, :, 0].astype(float), PixelResponse(self.options.fill))
+            window, (x, y) = self.window(some[part], half), self.pixels(some[part], half)
             formed = self._shape(images, part)
             width, form = np.full(len(part), self.look.psf_px), np.zeros((len(part), formed.parameters))
             share, slopes = formed.derivatives(xy[part], width, form, np.arange(len(part)), window)
@@ -397,6 +400,7 @@ class PlaneMarks(MarkWindows):
             steep = np.hypot(slopes[:, 0], slopes[:, 1])
             tolerance = tolerance + shift[part, None, None] * np.abs(ink) * steep
             beyond = np.abs(off) > tolerance
+            beyond &= (x == window.columns[:, None, :]) & (y == window.rows[:, :, None])
             if beside is not None:
                 # What is printed beside a mark is not in front of it.
                 region = self._region(some[part], half)
