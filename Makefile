@@ -33,10 +33,12 @@ docs: $(VENV)/.docs
 rig: $(VENV)/.test
 	$(BIN)/python -m tests.rig.machine
 
-# All comparisons with peers that are installed; an interrupted run continues where it ended.
+# All comparisons with peers that are installed; an interrupted run continues where it ended. The tables and
+# pictures of docs/benchmarks.md are written. AquaCal asks for an OpenCV before 5, and works with that, too.
 bench: $(VENV)/.test
 	@$(PIP) -e '.[peers]' || echo "without peers of PyPI"
-	$(BIN)/python benchmarks/all.py
+	@$(PIP) natsort pandas pyyaml requests tqdm && $(PIP) --no-deps aquacal || echo "without AquaCal"
+	$(BIN)/python benchmarks/all.py --write
 
 # Time, memory and accuracy of the main jobs against what was recorded; see benchmarks/history.py.
 bench-compare: $(VENV)/.test

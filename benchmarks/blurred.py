@@ -24,6 +24,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from figures import BOUND, ORIGIN, record
 from parts import add_options, executor_of, main_of, outcomes, timed
 from scipy.stats import chi2
 from worlds.blurred import (
@@ -404,6 +405,18 @@ def _report(rows: list[dict[str, object]], seconds: float) -> None:
             those = [row for row in rows if row["blur"] == value and row["decibels"] == decibels]
             _line(f"blur {value:g}, {decibels:g} dB", those)
     _line("all", rows)
+    good = [row for row in rows if row["ok"]]
+    record("blurred targets", "independent, found", len(good), of=len(rows), table=ORIGIN)
+    if good:
+        error, least, sigma = (np.array([row[key] for row in good]) for key in ("error", "bound", "sigma"))
+        for who, values in (("reseau", error), ("bound", least)):
+            record("blurred target", who, np.sqrt((values**2).mean()), table=BOUND)
+        for method, name in (("gravity", "centre of gravity"), ("ellipse", "ellipse"),
+                             ("matching", "ordinary matching")):  # fmt: skip
+            record("blurred target", name, np.sqrt((_errors_of(good, method) ** 2).mean()), table=BOUND)
+        levels = [np.array([row["decibels"] == each for row in good]) for each in DECIBELS]
+        ratios = [np.sqrt(((error[of] / sigma[of]) ** 2).mean()) for of in levels]
+        record("blurred targets", "independent, errors ÷ sigmas", ratios, table=ORIGIN)
     _cells(rows)
     print(f"{1e3 * seconds / max(len(rows), 1):.1f} ms of processor time per target")
 
@@ -445,15 +458,25 @@ def _line(name: str, rows: list[dict[str, object]]) -> None:
         return
     error, sigma, least = (np.array([row[key] for row in good]) for key in ("error", "sigma", "bound"))
     rms = float(np.sqrt((error**2).mean()))
+    record(name, "measured", len(good), of=len(rows))
+    record(name, "rms", rms, "px")
+    record(name, "rms ÷ bound", np.sqrt(((error / least) ** 2).mean()))
+    record(name, "errors ÷ sigmas", np.sqrt(((error / sigma) ** 2).mean()))
     line = (
         f"{name:24s} {len(rows):5d} {len(rows) - len(good):8d} {rms:8.4f} "
         f"{np.sqrt(((error / least) ** 2).mean()):8.2f} {np.mean([row['radial'] for row in good]):8.4f} "
         f"{np.sqrt(((error / sigma) ** 2).mean()):8.2f}"
     )
     for method in ("gravity", "ellipse", "matching"):
-        deviations = [row["others"][method] for row in good if method in row["others"]]  # type: ignore[index, operator]
-        line += f" {np.sqrt((np.array(deviations) ** 2).mean()):8.3f}"
+        off = np.sqrt((_errors_of(good, method) ** 2).mean())
+        record(name, f"{method}, rms", off, "px")
+        line += f" {off:8.3f}"
     print(line)
+
+
+def _errors_of(good: list[dict[str, object]], method: str) -> Array:
+    """Errors (n, 2) of another method."""
+    return np.array([row["others"][method] for row in good if method in row["others"]])  # type: ignore[index, operator]
 
 
 if __name__ == "__main__":

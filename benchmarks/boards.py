@@ -32,6 +32,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from figures import ORIGIN, record
 from parts import add_options, executor_of, main_of, outcomes, timed
 from worlds.boards import OPENCV, bounds, picture, poses
 
@@ -115,8 +116,8 @@ def pictures(folder: Path, target: str) -> Iterator[tuple[str, str, Any]]:
             yield name, truth.get("condition") or LABELS.get(name[:2], name[:2]), truth
 
 
-def line(name: str, done: list[Measured], rough: bool) -> bool:
-    """Print a row of the table; whether it is within its limits."""
+def line(name: str, done: list[Measured], rough: bool, title: str = "") -> bool:
+    """Print a row of the table `title`; whether it is within its limits."""
     error, sigma = (np.concatenate([getattr(part, k) for part in done]) for k in ("error", "sigma"))
     inside, found = sum(part.inside for part in done), sum(part.found for part in done)
     seconds = sum(part.seconds for part in done) / len(done)
@@ -128,6 +129,11 @@ def line(name: str, done: list[Measured], rough: bool) -> bool:
     ratio = float(np.sqrt(((error / sigma) ** 2).mean()))
     low, high = NORMALISED_ROUGH if rough else NORMALISED
     good = found >= LEAST_FOUND * inside and not wrong and low <= ratio <= high
+    record(name, "found", found, of=inside, table=title)
+    record(name, "rms", np.sqrt((error**2).mean()), "px", table=title)
+    record(name, "errors ÷ sigmas", ratio, table=title)
+    record(name, "wrong", wrong, table=title)
+    record(name, "processor time", [part.seconds for part in done], "s", table=title)
     print(
         f"{name:26} {found:5} of {inside:5}  {np.sqrt((error**2).mean()):.4f}  {off.max():.3f} px "
         f"{scaled.max():5.1f}  {wrong:5}  {ratio:11.3f}  {seconds:6.2f} s  {'ok' if good else 'MISSED'}",
@@ -171,7 +177,16 @@ def table(
             if each:
                 line(name, [found], label in ROUGH)
     for label, several in parts.items():
-        good &= line(label, several, label in ROUGH)
+        good &= line(label, several, label in ROUGH, target)
+    every = [part for several in parts.values() for part in several]
+    what = {"tf": "coded testfield", "sheet": "sheet of disks"}[target]
+    found, inside = sum(part.found for part in every), sum(part.inside for part in every)
+    record(what, "independent, found", found, of=inside, table=ORIGIN)
+    ratios = [
+        np.sqrt(np.mean(np.concatenate([(part.error / part.sigma).ravel() for part in several]) ** 2))
+        for several in parts.values()
+    ]
+    record(what, "independent, errors ÷ sigmas", ratios, table=ORIGIN)
     return good
 
 

@@ -23,6 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from figures import record
 from scipy.optimize import least_squares
 from scipy.sparse import coo_array
 from shared import of_the_tests
@@ -265,16 +266,22 @@ def peers() -> None:
                 if found is not None:
                     others.append(found)
             print(f"{title}: to ½Σr² ≤ {target:.8g}")
-            said("reseau", mine)
+            said(title, "reseau", mine)
             if theirs:
-                said("Ceres", theirs, [a[0] / b[0] for a, b in zip(mine, theirs, strict=True)])
+                said(title, "Ceres", theirs, [a[0] / b[0] for a, b in zip(mine, theirs, strict=True)])
             if title == "ladybug-49":
-                said("SciPy", [by_scipy(file)])
+                said(title, "SciPy", [by_scipy(file)])
             if others:
-                said("COLMAP", others, [a[1] / b[1] for a, b in zip(mine, others, strict=True)])
+                said(title, "COLMAP", others, [a[1] / b[1] for a, b in zip(mine, others, strict=True)])
 
 
-def said(who: str, runs: list[tuple[float, float, float, int]], ratios: list[float] | None = None) -> None:
+def said(
+    title: str, who: str, runs: list[tuple[float, float, float, int]], ratios: list[float] | None = None
+) -> None:
+    """Print and record the times of a program."""
+    for what, column in (("to the same sum of squares", 0), ("in total", 1)):
+        record(f"{title}, {what}", who, [run[column] for run in runs], "s")
+    record(f"{title}, ½Σr² at the end", who, [run[2] for run in runs])
     reached, whole, cost, steps = np.median(np.array(runs), axis=0)
     to_it = "        –" if np.isnan(reached) else f"{reached:7.3f} s"
     ratio = "" if ratios is None else f"; reseau takes {np.median(ratios):.2f} of it"

@@ -22,6 +22,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from figures import record
 from parts import add_options, executor_of, main_of, outcomes
 from worlds import lenses
 
@@ -80,6 +81,7 @@ def projections() -> None:
 
     def said(who: str, name: str, ours: Any, x: np.ndarray, theirs: np.ndarray) -> None:
         off = np.abs(ours(x[:, :2] / x[:, 2:]) - theirs)
+        record(f"{who}, {name}", "largest difference from reseau", off.max(), "px")
         print(f"  {who:7} {name:27} {len(x)} rays  {off.max():.1e} px{'' if off.max() < 1e-9 else '  !'}")
 
     x, wide = points(50.0), points(88.0)
@@ -218,6 +220,7 @@ def compare(
     for who, values in theirs.items():
         off = np.abs(ours.values - values) / ours.sigma
         most, mark = int(off.argmax()), "" if off.max() < 0.1 else "  !"
+        record(title, f"{who}, largest difference of a parameter", off.max(), "sigma")
         print(f"  {who:7} fx {values[0]:.3f}; differs by at most {off.max():.3f} sigma ({free[most]}){mark}")
 
 

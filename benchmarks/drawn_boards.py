@@ -1,4 +1,4 @@
-"""Boards of other programs in pictures drawn by ``worlds.prints``, beside OpenCV and ``aprilgrid``.
+"""Boards of other programs in pictures drawn by ``worlds.prints``, beside the programs that find them.
 
 Run from the checkout: ``python benchmarks/drawn_boards.py [--kind K …] [--condition C …] [--count 2]
 [--calibrate SEEDS]``. With ``--calibrate`` the camera is calibrated from ten views for each seed, and the
@@ -8,19 +8,31 @@ other's; errors over sigmas; points wrong by more than 0.15 px and 5 sigma; name
 of the board (? where a note says that they are ambiguous), and those of the other program; processor time
 of both. A row is missed with fewer points than the other program has, with a point or a name that is wrong,
 and with errors over sigmas outside 0.85 to 1.2, or outside of what 99.8 % of as many independent errors
-have where that is wider.
+have where that is wider. Of several other programs a row shows the one with the most points.
+
+The others are OpenCV; for AprilGrids ``aprilgrid``, and with borders of one bit the detector of the AprilTag
+library (``pupil-apriltags``); for a board of as many rows as columns mrgingham (Debian), which finds no
+other. Those that are not installed are left out.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
+import resource
+import shutil
+import subprocess
+import tempfile
 import time
 from collections.abc import Iterator
-from functools import partial
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from figures import BOUND, ORIGIN, record
 from parts import add_options, executor_of, main_of, outcomes, timed
 from scipy.stats import chi2
 from worlds import prints
@@ -37,6 +49,8 @@ from reseau.procedures.calibration import calibrate_camera, measurer_of
 
 WRONG_PX, WRONG_SIGMA, NORMALISED, SPREAD = 0.15, 5.0, (0.85, 1.2), 0.001
 APRIL, ARUCO = "DICT_APRILTAG_36h11", "DICT_4X4_100"
+APRIL_CORNERS = {"aprilgrid": np.array([0, 1, 2, 3]), "markers": np.array([1, 0, 3, 2])}
+"""Corners of a tag of a design, in the order of the AprilTag library."""
 KINDS: dict[str, tuple[BoardDesign, prints.Print | prints.Deltille]] = {
     "aprilgrid2": (
         board("aprilgrid", 6, 6, 28.6, size=22.0, border_bits=2),
@@ -58,6 +72,10 @@ KINDS: dict[str, tuple[BoardDesign, prints.Print | prints.Deltille]] = {
         board("markers", 6, 5, 40.0, size=30.0, dictionary=ARUCO),
         prints.markers(6, 5, 30.0, 10.0, ARUCO),
     ),
+    "april_markers": (
+        board("markers", 6, 5, 40.0, size=30.0, dictionary=APRIL),
+        prints.markers(6, 5, 30.0, 10.0, APRIL),
+    ),
     "charuco": (
         board("charuco", 9, 6, 30.0, size=22.0, dictionary=ARUCO),
         prints.charuco(9, 6, 30.0, 22.0, ARUCO),
@@ -67,6 +85,7 @@ KINDS: dict[str, tuple[BoardDesign, prints.Print | prints.Deltille]] = {
         prints.charuco(9, 6, 30.0, 22.0, ARUCO, True),
     ),
     "chess": (board("chess", 10, 7, 25.0), prints.chess(10, 7, 25.0)),
+    "chess_square": (board("chess", 8, 8, 25.0), prints.chess(8, 8, 25.0)),
     "deltille": (board("deltille", 9, 8, 25.0), prints.Deltille(9, 8, 25.0)),
     "circles": (board("circles", 9, 7, 25.0, size=12.0), prints.circles(9, 7, 25.0, 12.0)),
     "asymmetric": (
@@ -76,19 +95,91 @@ KINDS: dict[str, tuple[BoardDesign, prints.Print | prints.Deltille]] = {
 }
 
 
-def by_others(design: BoardDesign, pixels: Any) -> tuple[Array, Rows, float]:
-    """Points (n, 2) that OpenCV or ``aprilgrid`` finds, their rows in the design, and its processor time."""
+@dataclass(frozen=True, eq=False)
+class Other:
+    """What another program finds: points (n, 2), their rows in the design, and its processor time (s)."""
+
+    program: str
+    xy: Array
+    rows: Rows
+    seconds: float
+
+
+def by_others(design: BoardDesign, pixels: Any) -> list[Other]:
+    """What the other programs find that are installed and know the board; OpenCV knows no deltilles."""
+    programs: dict[str, Any] = {}
     if design.kind == "aprilgrid":
-        from aprilgrid import Detector
-    start = time.process_time()
+        if importlib.util.find_spec("aprilgrid") is not None:
+            programs["aprilgrid"] = by_aprilgrid
+        if design.border_bits == 1 and importlib.util.find_spec("pupil_apriltags") is not None:
+            programs["AprilTag"] = by_apriltag
+    elif design.kind != "deltille":
+        programs["OpenCV"] = by_opencv
+        if "APRILTAG" in str(design.dictionary) and importlib.util.find_spec("pupil_apriltags") is not None:
+            programs["AprilTag"] = by_apriltag
+        if design.kind == "chess" and design.columns == design.rows and shutil.which("mrgingham"):
+            programs["mrgingham"] = by_mrgingham
+    done = []
+    for program, find in programs.items():
+        if program == "AprilTag":
+            april_detector(design)  # is set up once; not part of the time
+        start = used_s()
+        xy, rows = find(design, pixels)
+        xy = np.asarray(xy, float).reshape(-1, 2)
+        done.append(Other(program, xy, np.asarray(rows).ravel()[: len(xy)], used_s() - start))
+    return done
+
+
+def used_s() -> float:
+    """Processor time (s) of this process and of those that it has started and seen end."""
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + ended.ru_utime + ended.ru_stime
+
+
+def by_aprilgrid(design: BoardDesign, pixels: Any) -> tuple[Array, Rows]:
+    from aprilgrid import Detector
+
+    family = f"t{str(design.dictionary).split('_')[-1]}" + ("b1" if design.border_bits == 1 else "")
+    tags = [tag for tag in Detector(family).detect(pixels) if tag.tag_id < design.columns * design.rows]
+    return np.array([tag.corners for tag in tags], float), np.array(
+        [4 * tag.tag_id + np.arange(4) for tag in tags], int
+    )
+
+
+@cache
+def april_detector(design: BoardDesign) -> Any:
+    """The detector of the AprilTag library; one thread, all pixels."""
+    from pupil_apriltags import Detector
+
+    family = f"tag{str(design.dictionary).split('_')[-1]}"
+    return Detector(families=family, nthreads=1, quad_decimate=1.0, refine_edges=1)
+
+
+def by_apriltag(design: BoardDesign, pixels: Any) -> tuple[Array, Rows]:
+    tags = [
+        tag
+        for tag in april_detector(design).detect(pixels)
+        if tag.tag_id < design.columns * design.rows and tag.hamming == 0
+    ]
+    rows = np.array([4 * tag.tag_id + APRIL_CORNERS[design.kind] for tag in tags], int)
+    # Its coordinates have their origin in the corner of the first pixel.
+    return np.array([tag.corners for tag in tags], float) - 0.5, rows
+
+
+def by_mrgingham(design: BoardDesign, pixels: Any) -> tuple[Array, Rows]:
+    with tempfile.TemporaryDirectory() as name:
+        file = Path(name) / "board.png"
+        cv2.imwrite(str(file), pixels)
+        command = ["mrgingham", "--jobs", "1", "--gridn", str(design.rows - 1), str(file)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    rows = [line.split()[1:3] for line in done.stdout.splitlines() if not line.startswith("#")]
+    xy = np.array([(float(x), float(y)) for x, y in rows if x != "-"])
+    return xy, np.arange(len(xy))
+
+
+def by_opencv(design: BoardDesign, pixels: Any) -> tuple[Array, Rows]:
     xy, rows = np.zeros((0, 2)), np.arange(len(design.ids))
-    if design.kind == "aprilgrid":
-        assert design.dictionary is not None
-        family = f"t{design.dictionary.split('_')[-1]}" + ("b1" if design.border_bits == 1 else "")
-        tags = [tag for tag in Detector(family).detect(pixels) if tag.tag_id < design.columns * design.rows]
-        xy = np.array([tag.corners for tag in tags], float)
-        rows = np.array([4 * tag.tag_id + np.arange(4) for tag in tags], int)
-    elif design.kind in ("markers", "charuco"):
+    if design.kind in ("markers", "charuco"):
         words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, str(design.dictionary)))
         if design.kind == "markers":
             parameters = cv2.aruco.DetectorParameters()
@@ -114,9 +205,7 @@ def by_others(design: BoardDesign, pixels: Any) -> tuple[Array, Rows, float]:
         flags = cv2.CALIB_CB_ASYMMETRIC_GRID if design.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
         good, corners = cv2.findCirclesGrid(pixels, (design.columns, design.rows), flags=flags)
         xy = corners if good else xy
-    # OpenCV knows no deltilles.
-    xy = np.asarray(xy, float).reshape(-1, 2)
-    return xy, np.asarray(rows).ravel()[: len(xy)], time.process_time() - start
+    return xy, rows
 
 
 def misnamed(design: BoardDesign, ways: int, own: Rows, near: Rows) -> int:
@@ -134,31 +223,58 @@ def misnamed(design: BoardDesign, ways: int, own: Rows, near: Rows) -> int:
     return int((np.abs(moved - design.nodes[near]).max(axis=1) > 0.1).sum()) if whole else len(own)
 
 
-def row(job: tuple[str, str, View]) -> tuple[str, bool]:
-    """Measure a picture: its row, and whether it is within its limits."""
+@dataclass(frozen=True)
+class Row:
+    """A picture: its row, whether it is within its limits, and what is pooled.
+
+    Points `found` of those in `sight`, rms error (px), errors over sigmas, points and names that are wrong,
+    processor time (s); and for each other program its points that are right, their rms error, and its time.
+    """
+
+    kind: str
+    label: str
+    text: str
+    good: bool
+    sight: int
+    others: dict[str, tuple[int, float, float]]
+    found: int = 0
+    rms: float = np.nan
+    ratio: float = np.nan
+    wrong: int = 0
+    seconds: float = np.nan
+
+
+def row(job: tuple[str, str, View]) -> Row:
+    """Measure a picture."""
     cv2.setNumThreads(1)
     kind, label, view = job
     design, printed = KINDS[kind]
     pixels, xy = view.picture(), view.truth
     h, w = pixels.shape
     sight = ((xy > 6) & (xy < [w - 7, h - 7])).all(axis=1) & (view.hidden > 6)
-    others, their_names, their_time = by_others(design, pixels)
-    theirs, their_wrong = np.nan, 0
-    if len(others):
-        their_gap = np.hypot(*(others[:, None] - xy[None]).transpose(2, 0, 1))
-        right = their_gap.min(axis=1) < 1.0
-        others, their_names, their_gap = others[right], their_names[right], their_gap[right]
-        theirs = float(np.sqrt((their_gap.min(axis=1) ** 2).mean() / 2)) if len(others) else np.nan
-        their_wrong = misnamed(design, printed.symmetries, their_names, their_gap.argmin(axis=1))
+    several: dict[str, tuple[int, float, float]] = {}
+    others, theirs, their_wrong, their_time = 0, np.nan, 0, 0.0
+    for other in by_others(design, pixels):
+        count, error_px, misread = 0, np.nan, 0
+        if len(other.xy):
+            gap = np.hypot(*(other.xy[:, None] - xy[None]).transpose(2, 0, 1))
+            right = gap.min(axis=1) < 1.0
+            count, gap = int(right.sum()), gap[right]
+            error_px = float(np.sqrt((gap.min(axis=1) ** 2).mean() / 2)) if count else np.nan
+            misread = misnamed(design, printed.symmetries, other.rows[right], gap.argmin(axis=1))
+        several[other.program] = count, error_px, other.seconds
+        if count > others or len(several) == 1:
+            others, theirs, their_wrong, their_time = count, error_px, misread, other.seconds
+    pooled = {"kind": kind, "label": label, "sight": int(sight.sum()), "others": several}
     found, seconds = timed(partial(measure_board, Frame(pixels, 255.0, label), design), kind)
     if isinstance(found, Failure):
-        good = len(others) == 0
-        text = f"{kind:12} {label:14} declined: {found.reason[:70]}; other {len(others)}  "
-        return f"{text}{'ok' if good else 'MISSED'}", good
+        good = others == 0
+        text = f"{kind:12} {label:14} declined: {found.reason[:70]}; other {others}  "
+        return Row(text=f"{text}{'ok' if good else 'MISSED'}", good=good, **pooled)
     own = np.flatnonzero(found.ok)
     if not len(own):
-        text = f"{kind:12} {label:14}    0 of {int(sight.sum()):4} {len(others):4}  "
-        return f"{text}{'MISSED' if len(others) else 'ok'}", not len(others)
+        text = f"{kind:12} {label:14}    0 of {int(sight.sum()):4} {others:4}  "
+        return Row(text=f"{text}{'MISSED' if others else 'ok'}", good=not others, **pooled)
     near = np.hypot(*(found.xy[own, None] - xy[None]).transpose(2, 0, 1)).argmin(axis=1)
     error = found.xy[own] - xy[near]
     sigma = np.sqrt(np.diagonal(found.cov[own], axis1=1, axis2=2))
@@ -168,15 +284,65 @@ def row(job: tuple[str, str, View]) -> tuple[str, bool]:
     unclear = any(note.code.value == "ambiguous" for note in found.notes)
     ratio, rms = float(np.sqrt(((error / sigma) ** 2).mean())), float(np.sqrt((error**2).mean()))
     slow = "slow" if seconds > 3 * their_time else "    "
-    good = len(own) >= len(others) and not wrong and (not names or unclear)
+    good = len(own) >= others and not wrong and (not names or unclear)
     spread = np.sqrt(chi2.ppf([SPREAD, 1 - SPREAD], error.size) / error.size)
     good &= min(NORMALISED[0], spread[0]) <= ratio <= max(NORMALISED[1], spread[1])
     text = (
-        f"{kind:12} {label:14} {len(own):4} of {int(sight.sum()):4} {len(others):4}  {rms:.4f} {theirs:7.4f} "
+        f"{kind:12} {label:14} {len(own):4} of {int(sight.sum()):4} {others:4}  {rms:.4f} {theirs:7.4f} "
         f"{off.max():6.3f} {scaled.max():5.1f} {ratio:5.2f} {wrong:3} {names:3}{'?' if unclear else ' '} "
         f"{their_wrong:4} {seconds:6.2f} {their_time:6.2f} {slow} {'ok' if good else 'MISSED'}"
     )
-    return text, bool(good)
+    wrong += 0 if unclear else names
+    figures = {"found": len(own), "rms": rms, "ratio": ratio, "wrong": wrong, "seconds": seconds}
+    return Row(text=text, good=bool(good), **pooled, **figures)
+
+
+def keep(kind: str, rows: list[Row]) -> None:
+    """Record the figures of the pictures of a kind: of each program one row."""
+    title, sight, measured = TITLES[kind], sum(r.sight for r in rows), [r for r in rows if r.found]
+    found = sum(r.found for r in rows)
+    record(f"{title}, reseau", "found", found, of=sight)
+    record(f"{title}, reseau", "rms of a picture", [r.rms for r in measured], "px")
+    record(f"{title}, reseau", "errors ÷ sigmas", [r.ratio for r in measured])
+    record(f"{title}, reseau", "wrong", sum(r.wrong for r in rows))
+    record(f"{title}, reseau", "processor time", [r.seconds for r in measured], "s")
+    for program in dict.fromkeys(program for r in rows for program in r.others):
+        theirs = [r.others[program] for r in rows]
+        record(f"{title}, {program}", "found", sum(count for count, _, _ in theirs), of=sight)
+        record(f"{title}, {program}", "rms of a picture", [error for _, error, _ in theirs], "px")
+        record(f"{title}, {program}", "processor time", [seconds for _, _, seconds in theirs], "s")
+    what = f"{title}, drawn"
+    record(what, "independent, found", found, of=sight, table=ORIGIN)
+    record(what, "independent, errors ÷ sigmas", [r.ratio for r in measured], table=ORIGIN)
+    for r in rows:
+        if r.label == CLEAN.get(kind):
+            record(title, "reseau", r.rms, table=BOUND)
+            for program, (_, error, _) in r.others.items():
+                record(title, program, error, table=BOUND)
+
+
+TITLES = {
+    "aprilgrid2": "AprilGrid 36h11, borders of two bits",
+    "aprilgrid1": "AprilGrid 36h11",
+    "april16h5": "AprilGrid 16h5",
+    "april25h9": "AprilGrid 25h9",
+    "markers": "separate markers",
+    "april_markers": "separate tags 36h11",
+    "charuco": "ChArUco board",
+    "charuco_old": "ChArUco board of older versions",
+    "chess": "chessboard",
+    "chess_square": "square chessboard",
+    "deltille": "deltille",
+    "circles": "grid of circles",
+    "asymmetric": "asymmetric grid of circles",
+}
+CLEAN = {
+    "aprilgrid2": "clean_0",
+    "aprilgrid1": "clean_0",
+    "april_markers": "clean_0",
+    "chess_square": "small_0",
+}
+"""Kinds of which a clean picture is shown beside the bounds of other targets, and that picture."""
 
 
 def held_out(kind: str, count: int) -> list[tuple[str, View]]:
@@ -269,11 +435,13 @@ def main() -> int:
             "kind         picture      measured  other rms   theirs worst sigma ratio wrong names theirs s "
             "other"
         )
-        good = True
-        for text, right in outcomes(executor, row, pictures(options.kind, options.condition, options.count)):
-            print(text, flush=True)
-            good &= right
-    return 0 if good else 1
+        rows = list[Row]()
+        for found in outcomes(executor, row, pictures(options.kind, options.condition, options.count)):
+            print(found.text, flush=True)
+            rows.append(found)
+        for kind in options.kind:
+            keep(kind, [each for each in rows if each.kind == kind])
+    return 0 if all(each.good for each in rows) else 1
 
 
 if __name__ == "__main__":

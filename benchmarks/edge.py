@@ -12,6 +12,7 @@ import time
 from typing import NamedTuple
 
 import numpy as np
+from figures import record
 from parts import add_options, executor_of, main_of, outcomes
 from shared import of_the_tests
 
@@ -63,9 +64,13 @@ def row(kind: str, decibels: float, count: int, executor: Executor) -> tuple[str
         np.array([getattr(each, name) for each in done]) for name in ("free", "plain", "gaussian", "sigma")
     )
     over, rejected = free / sigma, sum(each.rejected for each in done)
+    label = f"{kind}, {decibels:.0f} dB"
+    for who, curves in (("reseau, free curve", free), ("ISO 12233", plain), ("Gaussian", gaussian)):
+        record(label, f"{who}, rms error of an edge", [rms(each) for each in curves])
+    record(label, "errors ÷ sigmas", rms(over))
     bias = np.abs(over.mean(axis=0)).max()
-    curves = " ".join(f"{rms(each):9.4f}" for each in (free, plain, gaussian))
-    line = f"{kind:<9} {decibels:3.0f} dB {curves} {rms(over):10.2f} {bias:10.2f} {rejected:5d}/{count}"
+    columns = " ".join(f"{rms(each):9.4f}" for each in (free, plain, gaussian))
+    line = f"{kind:<9} {decibels:3.0f} dB {columns} {rms(over):10.2f} {bias:10.2f} {rejected:5d}/{count}"
     return line, sum(each.seconds for each in done)
 
 

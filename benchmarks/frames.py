@@ -24,6 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from cruz import cruz_corners
+from figures import ORIGIN, record
 from parts import add_options, executor_of, main_of, outcomes
 from real_frames import print_real
 
@@ -70,6 +71,14 @@ CASES = {
     "1200 dpi, soft, film": FilmFrame(dpi=1200, blur_px=2.5, beside=Beside(**_FILM, dust=40, scratches=3)),
     "1200 dpi, soft, 7A": FilmFrame(dpi=1200, blur_px=2.5, beside=Beside(rods=1)),
 }
+
+SIDE_BY_SIDE = {
+    "sharp, clean": "film, sharp and clean",
+    "sharp, 9°, bowed": "film, tilted",
+    "perforations, print": "film, perforated",
+    "out of focus": "film, out of focus",
+}
+"""Difficulties that `film_independent.py` has, too, by their rows there."""
 
 PAPER = {"Ricoh, 600 dpi": (0.008, 0.014, 0.015, 0.010), "Hasselblad, 1200 dpi": (0.014, 0.018, 0.026, 0.028)}
 """Table 1, examples 1 and 2: affine σX, σY, conformal σX, σY in mm."""
@@ -139,6 +148,15 @@ def print_cases(executor: Executor, count: int, only: list[str], stated: bool) -
             print(f"  {name:22s}    0.0", flush=True)
             continue
         e, s = error[good], sigma[good]
+        ratios = np.sqrt(np.mean((e / s) ** 2, axis=(1, 2)))
+        record(name, "oriented", int(good.sum()), of=len(good))
+        record(name, "rms of a frame", np.sqrt(np.mean(e**2, axis=(1, 2))), "px")
+        record(name, "errors ÷ sigmas", np.sqrt(np.mean((e / s) ** 2)))
+        record(name, "Hough method, rms of a frame", np.sqrt(np.mean(theirs**2, axis=(1, 2))), "px")
+        if name in SIDE_BY_SIDE:
+            row = SIDE_BY_SIDE[name]
+            record(row, "simulator, found", int(good.sum()), of=len(good), table=ORIGIN)
+            record(row, "simulator, errors ÷ sigmas", ratios, table=ORIGIN)
         far = np.abs(e).max(axis=(1, 2))
         away = np.nanmax(np.abs(np.nan_to_num(theirs, nan=99.0)), axis=(1, 2))
         known = np.isfinite(theirs).all(axis=(1, 2))

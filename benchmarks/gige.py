@@ -29,6 +29,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 import psutil
+from figures import record
 
 from reseau_drivers.camera import CameraDriver, aravis
 from reseau_sims.serving import GigeCamera, GigeVisionCamera, SimulatedCamera, View, loopback_addresses
@@ -162,7 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     settings = {"width": SIZE, "height": SIZE, "rate": RATE, "packet_size": PACKET, "buffers": 10}
     with ExitStack() as stack, ThreadPoolExecutor(options.cameras) as pool:
         wanted = loopback_addresses(options.cameras) if options.cameras > 1 else ("",)
-        addresses = [stack.enter_context(simulated_camera(each)) for each in wanted]
+        addresses, rounds = [stack.enter_context(simulated_camera(each)) for each in wanted], []
         address, ratios = addresses[0], []
         for number in range(options.rounds):
             theirs = together(list(pool.map(peer, addresses)))
@@ -173,6 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 ]
                 own = together(list(pool.map(ours, cameras)))
             ratios.append(own.rate / theirs.rate)
+            rounds.append({"reseau": own, "Aravis": theirs})
             print(
                 f"round {number + 1}: Aravis {theirs.rate:6.1f} 1/s ({theirs.lost} failed), "
                 f"ours {own.rate:6.1f} 1/s ({own.lost} lost), ratio {ratios[-1]:.2f}; "
@@ -180,6 +182,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             )
         with aravis("camera", address, settings=settings, seconds=20.0) as camera:
             cpu, memory, dropped = long_series(camera, sight, options.frames)
+    for who in ("reseau", "Aravis"):
+        received = [each[who] for each in rounds]
+        record("frames a second", who, [each.rate for each in received])
+        record("processor time of a frame", who, [each.cpu_ms for each in received], "ms")
+        record("frames lost", who, sum(each.lost for each in received))
     print(f"{options.frames} frames, {dropped} lost, none damaged")
     print("CPU, ms a frame: " + " ".join(f"{value:.1f}" for value in cpu))
     print("memory, MB:      " + " ".join(f"{value:.0f}" for value in memory))

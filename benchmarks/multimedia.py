@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.stats
+from figures import record
 from parts import add_options, executor_of, main_of, outcomes
 from shared import of_the_tests
 from worlds.water import Array, Scene, Surface, around
@@ -225,6 +226,8 @@ def cavity() -> None:
     stored = [float(np.sqrt((off[network.image_of == k] ** 2).mean())) for k in range(4)]
     counts = np.bincount(network.image_of)
     print(f"detections {counts.tolist()}; stored calibration, rms px: {_list(stored)}")
+    for k, value in enumerate(stored):
+        record("rms with OpenPTV's stored calibration", f"camera {k + 1}", value, "px")
     for text, free in (
         ("exterior orientation", ()),
         ("and c, x0, y0", tests.INTERIOR),
@@ -238,6 +241,9 @@ def cavity() -> None:
                          - single[k].residuals).max())
             for k in range(4)
         )  # fmt: skip
+        for k, fit in enumerate(single):
+            record(f"sigma0 with {text.removeprefix('and ')} free", f"camera {k + 1}", fit.sigma0, "px")
+        record(f"sigma0 with {text.removeprefix('and ')} free", "jointly", joint.sigma0, "px")
         print(
             f"{text:<26} sigma0 {_list([fit.sigma0 for fit in single])}; joint {joint.sigma0:.4f} in "
             f"{joint.iterations} iterations, residuals equal to {apart:.1e} px"

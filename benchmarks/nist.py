@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from figures import record
 from shared import of_the_tests
 
 from reseau.adjust import adjust
@@ -51,6 +52,8 @@ def main() -> int:
             best.append(digits)
     for label, figures in (("in double precision", double), ("with decimal arithmetic where needed", best)):
         mean, least = np.mean(figures, axis=0), np.min(figures, axis=0)
+        for k, what in enumerate(("parameters", "sigmas")):
+            record(label, f"correct digits of {what}", [each[k] for each in figures])
         print(
             f"{label}: parameters {mean[0]:.2f} digits in the mean, {least[0]:.1f} at least; "
             f"sigmas {mean[1]:.2f} and {least[1]:.1f}"

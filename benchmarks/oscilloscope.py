@@ -43,6 +43,7 @@ import group_a
 import group_b
 import numpy as np
 from chain import FALSE_PX, FAR_SIGMA, Errors, Found, Trial, trial
+from figures import ORIGIN, record
 from parts import add_options, executor_of, main_of, outcomes
 from photographs import ECHOES, Physics
 from refined import Refined, of_points, print_refined, refined
@@ -165,9 +166,33 @@ def print_physics(physics: Physics, found: Sequence[Trial | str], jobs: int) -> 
         print(f"  group B, {label}, coefficients, normalised:")
         print_group_b(errors)
         print_true_coordinates(errors)
+    keep(done)
     print_factors(done)
     print_verdicts(done)
     print_time(done, jobs)
+
+
+def keep(done: Sequence[Trial]) -> None:
+    """Record what is recorded of the sets of another program, too; each value is that of one world."""
+    known, found = sum(t.body.known for t in done), sum(len(t.body.errors) for t in done)
+    record("points of PHOTO III", "found", found, of=known)
+    ratios = {
+        "points of PHOTO III": [float(rms(t.tolerance.truth)) for t in done],
+        "points of PHOTO III, rods free of error": [float(rms(t.exact.truth)) for t in done],
+        "coefficients of group A": [float(rms(t.group_a)) for t in done],
+        "coefficients of group B": [float(rms(t.tolerance.coefficients)) for t in done],
+    }
+    for row, values in ratios.items():
+        record(row, "errors ÷ sigmas", values)
+    record("the procedure", "processor time", [t.measured.cpu for t in done], "s")
+    what = "oscilloscope, points of PHOTO III"
+    record(what, "simulator, found", found, of=known, table=ORIGIN)
+    record(what, "simulator, errors ÷ sigmas", ratios["points of PHOTO III"], table=ORIGIN)
+    for group in "AB":
+        values = ratios[f"coefficients of group {group}"]
+        record(
+            f"oscilloscope, coefficients of group {group}", "simulator, errors ÷ sigmas", values, table=ORIGIN
+        )
 
 
 def through_the_procedure(

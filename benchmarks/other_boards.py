@@ -1,13 +1,13 @@
 """Chessboards, ChArUco boards and circle grids in pictures of another program, beside OpenCV.
 
 Run from the checkout: ``RESEAU_DATA=… python benchmarks/other_boards.py [--target charuco|chess|circ]
-[--condition C …]``. For every picture: points measured of those in sight, and OpenCV's; the rms error beside
-the Cramér–Rao bound (of twelve points: levels, slopes, blur and directions of edges unknown, noise as in the
-picture, window of half a square; not for ChArUco) and OpenCV's rms; errors over sigmas; points wrong by more
-than 0.15 px and 5 sigma; names wrong beyond the symmetry of the board; processor time beside OpenCV's.
-``CharucoDetector``, ``findChessboardCornersSB`` and ``findCirclesGrid`` run in the same process; times are
-the least of several rounds in which both take turns. The last row of a target has the mean times over its
-pictures and their ratio.
+[--condition C …] [--jobs N]``. For every picture: points measured of those in sight, and OpenCV's; the rms
+error beside the Cramér–Rao bound (of twelve points: levels, slopes, blur and directions of edges unknown,
+noise as in the picture, window of half a square; not for ChArUco) and OpenCV's rms; errors over sigmas;
+points wrong by more than 0.15 px and 5 sigma; names wrong beyond the symmetry of the board; processor time
+beside OpenCV's. ``CharucoDetector``, ``findChessboardCornersSB`` and ``findCirclesGrid`` run in the same
+process; times are those of the process that measures a picture, the least of several rounds in which both
+take turns. The last row of a target has the mean times over its pictures and their ratio.
 """
 
 from __future__ import annotations
@@ -15,13 +15,17 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 import time
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from figures import BOUND as BESIDE
+from figures import ORIGIN, record
+from parts import add_options, executor_of, main_of, outcomes
 from worlds.pixels import Array, edge, form_at
 
 from reseau.core.failure import Failure
@@ -39,6 +43,8 @@ WRONG_PX, WRONG_SIGMA, NORMALISED = 0.15, 5.0, (0.85, 1.2)
 BOUND, LEAST_PX, SLOWER = 1.15, 0.003, 3.0
 SAMPLE = 12
 BLUR = {"defoc1.5": 1.5, "defoc2.2": 2.2, "defoc3": 3.0}
+MIRRORED = ("charuco", "mirror")
+"""Target and condition that must be declined from the front; it is measured from behind, too."""
 
 
 def by_opencv(target: str, pixels: Any) -> tuple[Array, float]:
@@ -152,10 +158,28 @@ def misnamed(design: BoardDesign, own: Array, near: Array) -> int:
     return int((np.abs(a @ whole - b).max(axis=1) > 0.1).sum())
 
 
-def line(
-    name: str, target: str, truth: Any, folder: Path, mirrored: bool, rounds: int, times: list[list[float]]
-) -> bool:
-    """Measure a picture and print its row; whether it is within its limits. Times are added to `times`."""
+@dataclass(frozen=True)
+class Row:
+    """A picture: its row, whether it is within its limits, and what is pooled where it was measured.
+
+    Points `found` of those in `sight`, and those of OpenCV, rms errors, their bound and that of OpenCV (px),
+    errors over sigmas, and processor times (s) of both.
+    """
+
+    text: str
+    good: bool
+    found: int = 0
+    sight: int = 0
+    theirs: int = 0
+    rms: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+    ratio: float = np.nan
+    seconds: tuple[float, float] | None = None
+
+
+def measured(folder: Path, target: str, rounds: int, picture: tuple[str, Any, bool]) -> Row:
+    """Measure a picture of which name, truth, and whether it is seen from behind are given."""
+    cv2.setNumThreads(1)
+    name, truth, mirrored = picture
     design, condition = DESIGNS[target], truth["condition"]
     frame, xy = read_image(folder / name), np.array(truth["xy"])
     hidden = np.array(truth.get("hidden") or np.zeros(len(xy))) > 0
@@ -170,9 +194,9 @@ def line(
         seconds = min(seconds, time.process_time() - start)
         their_time = min(their_time, theirs_now)
     if isinstance(found, Failure):
-        right = target == "charuco" and condition == "mirror" and not mirrored
-        print(f"{name:24} declined: {found.reason} [{found.code}]  {'ok' if right else 'MISSED'}", flush=True)
-        return right
+        right = (target, condition) == MIRRORED and not mirrored
+        text = f"{name:24} declined: {found.reason} [{found.code}]  {'ok' if right else 'MISSED'}"
+        return Row(text, right)
     own = np.flatnonzero(found.ok)
     near = np.hypot(*(found.xy[own, None] - xy[None]).transpose(2, 0, 1)).argmin(axis=1)
     error = found.xy[own] - xy[near]
@@ -196,20 +220,49 @@ def line(
         steps = slopes(design, xy)
         each = [bound(design, frame.pixels, xy[k], steps[k], BLUR.get(condition, 0.7)) for k in some]
         least = float(np.sqrt(np.mean(np.square(each))))
-    times.append([seconds, their_time])
     count = int((sight[near]).sum())
     slow = "  slow" if seconds > SLOWER * their_time else "      "
     good = count >= len(others) and not wrong and not wrong_names
     good &= NORMALISED[0] <= ratio <= NORMALISED[1]
     limit = LEAST_PX if np.isnan(least) else max(BOUND * least, LEAST_PX)
     good &= condition != "clean" or rms <= limit
-    print(
+    text = (
         f"{name:24} {count:4} of {int(sight.sum()):4} {len(others):4}  {rms:.4f} {least:7.4f} {theirs:7.4f}  "
         f"{off.max():.3f} {scaled.max():5.1f} {ratio:6.2f}  {wrong:3} {wrong_names:4}  "
-        f"{seconds:6.2f} {their_time:6.2f}{slow}  {'ok' if good else 'MISSED'}",
-        flush=True,
+        f"{seconds:6.2f} {their_time:6.2f}{slow}  {'ok' if good else 'MISSED'}"
     )
-    return good
+    figures = (rms, least, theirs), ratio, (seconds, their_time)
+    return Row(text, bool(good), count, int(sight.sum()), len(others), *figures)
+
+
+TITLES = {"charuco": "ChArUco board", "chess": "chessboard", "circ": "circle grid"}
+CLEAN = {"_1_clean.png": "near", "_3_clean.png": "at 60°"}
+"""Ends of the names of clean pictures, and their poses."""
+
+
+def keep(target: str, names: list[str], rows: list[Row]) -> None:
+    """Record the figures of the pictures of a target."""
+    title = TITLES[target]
+    for name, row in zip(names, rows, strict=True):
+        pose = CLEAN.get(name.removeprefix(target))
+        if pose is not None:
+            for who, error in zip(("reseau", "bound", "OpenCV"), row.rms, strict=True):
+                record(f"{title}, {pose}", who, error, table=BESIDE)
+    done = [row for row in rows if row.seconds is not None]
+    sight = sum(row.sight for row in done)
+    for who, k, found in (
+        ("reseau", 0, sum(row.found for row in done)),
+        ("OpenCV", 2, sum(row.theirs for row in done)),
+    ):
+        record(f"{title}, {who}", "found", found, of=sight)
+        record(f"{title}, {who}", "rms of a picture", [row.rms[k] for row in done], "px")
+        seconds = [row.seconds[k // 2] for row in done if row.seconds is not None]
+        record(f"{title}, {who}", "processor time", seconds, "s")
+    ratios = [row.ratio for row in done]
+    record(f"{title}, reseau", "errors ÷ sigmas", ratios)
+    what = f"{title}"
+    record(what, "independent, found", sum(row.found for row in done), of=sight, table=ORIGIN)
+    record(what, "independent, errors ÷ sigmas", ratios, table=ORIGIN)
 
 
 def main() -> int:
@@ -218,35 +271,44 @@ def main() -> int:
     parser.add_argument("--data", type=Path, help="folder of the pictures")
     parser.add_argument("--condition", nargs="+", default=[], help="only these conditions")
     parser.add_argument("--rounds", type=int, default=3, help="of measurements that are timed")
+    add_options(parser)
     options = parser.parse_args()
     root = os.environ.get("RESEAU_DATA")
     folder = options.data or (Path(root) / "independent" / "boards" if root else None)
     if folder is None:
         print("RESEAU_DATA is not set, and --data not given: nothing to measure")
         return 1
-    cv2.setNumThreads(1)
-    good = True
-    for target in DESIGNS if options.target is None else (options.target,):
-        times: list[list[float]] = []
-        print(
-            f"{target:24} measured OpenCV   rms   bound  OpenCV  worst sigma  ratio wrong name  "
-            " seconds OpenCV"
-        )
-        for name, truth in sorted(json.loads((folder / "truth.json").read_text()).items()):
-            if truth.get("target") != target or not (folder / name).is_file():
+    good, contents = True, json.loads((folder / "truth.json").read_text())
+    with executor_of(options) as executor:
+        for target in DESIGNS if options.target is None else (options.target,):
+            pictures = [
+                (name, truth, mirrored)
+                for name, truth in sorted(contents.items())
+                if truth.get("target") == target and (folder / name).is_file()
+                if not options.condition or truth["condition"] in options.condition
+                for mirrored in ((False, True) if (target, truth["condition"]) == MIRRORED else (False,))
+            ]
+            print(
+                f"{target:24} measured OpenCV   rms   bound  OpenCV  worst sigma  ratio wrong name  "
+                " seconds OpenCV"
+            )
+            rows = []
+            work = partial(measured, folder.resolve(), target, options.rounds)
+            for row in outcomes(executor, work, pictures):
+                print(row.text, flush=True)
+                rows.append(row)
+            good &= all(row.good for row in rows)
+            times = [row.seconds for row in rows if row.seconds is not None]
+            if not times:
                 continue
-            if options.condition and truth["condition"] not in options.condition:
-                continue
-            for mirrored in (
-                (False, True) if target == "charuco" and truth["condition"] == "mirror" else (False,)
-            ):
-                good &= line(name, target, truth, folder, mirrored, options.rounds, times)
-        ours, theirs = np.mean(times, axis=0)
-        print(
-            f"{target:24} mean of {len(times)} pictures: {ours:.3f} {theirs:.3f} s, ratio {ours / theirs:.2f}"
-        )
+            ours, theirs = np.mean(times, axis=0)
+            print(
+                f"{target:24} mean of {len(times)} pictures: {ours:.3f} {theirs:.3f} s, "
+                f"ratio {ours / theirs:.2f}"
+            )
+            keep(target, [name for name, _, _ in pictures], rows)
     return 0 if good else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main_of(__file__))

@@ -1,8 +1,9 @@
 """Pins in real B-mode frames compared with PLUS: wires found, differences in pixels, and deviations in mm.
 
-Run from the checkout: ``python benchmarks/pins.py [DATA] [--overlay DIR]``. DATA contains the folder
-ultrasound_nwire; the default is $RESEAU_DATA or ../shared/data. PLUS computes a centroid, we the middle of
-the line: for an echo with a tail (a reverberation below it), the two differ by the weight of the tail.
+Run from the checkout: ``python benchmarks/pins.py [DATA] [--overlay DIR] [--jobs N]``. DATA contains the
+folder ultrasound_nwire; the default is $RESEAU_DATA or ../shared/data. PLUS computes a centroid, we the
+middle of the line: for an echo with a tail (a reverberation below it), the two differ by the weight of the
+tail.
 
 In the frames of DATA/independent/pins designs are laid over the echoes: four parallel wires, and with two
 slanted ones between them. Few wires prove little; they are right within 3 px, or declined.
@@ -13,16 +14,19 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import time
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from figures import ORIGIN, record
+from parts import add_options, executor_of, main_of, outcomes, timed
 
 from reseau.core.data import Array, Frame, ImagePoints
 from reseau.core.failure import Failure
+from reseau.execution import Executor
 from reseau.io import ReseauDesign
 from reseau.io.images import read_image, write_image
 from reseau.measure import PinDetections, PinOptions, Wires, find_pins, lay_wires, measure_pins
@@ -146,27 +150,29 @@ def picture(frame: Frame, seen: PinDetections, wires: Array) -> Array:
     return canvas
 
 
-def sequence(folder: Path, name: str, overlay: Path | None, others: int) -> Tally:
+def seen_in(folder: Path, names: list[str], others: int, k: int) -> tuple[PinDetections, float]:
+    """What is found in a frame of a sequence, and the processor time (s)."""
+    apart = [names[(k + step * len(names) // (others + 1)) % len(names)] for step in range(1, others + 1)]
+    frames = tuple(read_image(folder / each) for each in apart)
+    return timed(partial(find_pins, read_image(folder / names[k]), others=frames), "pins")
+
+
+def sequence(executor: Executor, folder: Path, name: str, overlay: Path | None, others: int) -> Tally:
     """Measure all frames of a sequence."""
     reference = json.loads((folder / f"{name}.reference.json").read_text("utf-8"))
     tally = Tally()
-    frames = [read_image(folder / record["image"]) for record in reference["frames"]]
-    pictured = len(frames) // 3
-    for k, (record, frame) in enumerate(zip(reference["frames"], frames, strict=True)):
-        apart = [
-            frames[(k + step * len(frames) // (others + 1)) % len(frames)] for step in range(1, others + 1)
-        ]
-        start = time.process_time()
-        seen = find_pins(frame, others=tuple(apart))
-        tally.seconds.append(time.process_time() - start)
-        points = record["points"]
+    names = [each["image"] for each in reference["frames"]]
+    done = outcomes(executor, partial(seen_in, folder.resolve(), names, others), range(len(names)))
+    for k, (each, (seen, seconds)) in enumerate(zip(reference["frames"], done, strict=True)):
+        tally.seconds.append(seconds)
+        points = each["points"]
         wires = np.array(list(points.values()) if isinstance(points, dict) else points, float).reshape(-1, 2)
-        candidates = np.array(record.get("candidates", []), float).reshape(-1, 3)[:, :2]
-        compare(record["image"], seen, wires, candidates, tally)
+        candidates = np.array(each.get("candidates", []), float).reshape(-1, 3)[:, :2]
+        compare(each["image"], seen, wires, candidates, tally)
         if "phantom_wires" in reference:
             number(seen, points, reference["phantom_wires"], tally)
-        if overlay is not None and k == pictured:
-            write_image(overlay / f"{name}.png", picture(frame, seen, wires))
+        if overlay is not None and k == len(names) // 3:
+            write_image(overlay / f"{name}.png", picture(read_image(folder / names[k]), seen, wires))
     return tally
 
 
@@ -179,6 +185,10 @@ def report(name: str, tally: Tally) -> None:
         f"   {sigma[0]:6.3f} {sigma[1]:5.3f}"
         f" {max(tally.further):8} {sum(tally.further):6} {np.mean(tally.seconds):8.2f}"
     )
+    record(name, "found", len(tally.deviation), of=tally.wires)
+    for axis in (0, 1):
+        record(name, f"from PLUS in {'xy'[axis]}, rms", away[axis], "px")
+    record(name, "processor time", tally.seconds, "s")
     for line in tally.missed:
         print(f"    missed: {line}")
     if not tally.residual_mm:
@@ -195,34 +205,48 @@ def report(name: str, tally: Tally) -> None:
     print(f"    slanted wires, used in no fit: depth rms {np.sqrt((depth**2).mean()):.2f} mm")
 
 
-def laid(folder: Path) -> int:
+def laid_over(folder: Path, job: tuple[str, ReseauDesign, PinOptions]) -> ImagePoints | None:
+    """The points of a design that is laid over the echoes of a frame; nothing if it is declined."""
+    found = measure_pins(read_image(folder / job[0]), *job[1:])
+    if isinstance(found, Failure):
+        return None
+    return ImagePoints(tuple(np.array(found.ids)[found.ok].tolist()), found.xy[found.ok], found.cov[found.ok])
+
+
+def laid(executor: Executor, folder: Path) -> int:
     """Lay two designs over the echoes of each frame, with what a user may know; number of wrong answers."""
     reference = json.loads((folder / "reference.json").read_text("utf-8"))
     parallel = json.loads((folder / "wires.design.json").read_text("utf-8"))
     at = {point["id"]: (point["x"], point["y"]) for point in parallel["points"]}
     between = [{"id": f"N{k}", "x": at[f"L{k}"][0], "y": at[f"L{k}"][1], "end": at[f"R{k}"]} for k in (1, 2)]
     slanted = parallel | {"points": parallel["points"] + between}
+    designs = [ReseauDesign.parse(json.dumps(each), where="wires") for each in (parallel, slanted)]
+    known = (PinOptions(), PinOptions(mirrored=False), PinOptions(mirrored=False, max_rotation_deg=30))
+    jobs = [
+        (each["image"], design, options)
+        for each in reference["frames"]
+        for design in designs
+        for options in known
+    ]
+    true = {
+        each["image"]: dict(zip(("R1", "N1", "L1", "R2", "N2", "L2"), np.array(each["points"]), strict=True))
+        for each in reference["frames"]
+    }
     wrong = 0
     print(f"\n{'frame':30} {'wires':>5}  {'mirrored':8} {'rotation':>8}  largest difference from PLUS, px")
-    for record in reference["frames"]:
-        frame = read_image(folder / record["image"])
-        true = dict(zip(("R1", "N1", "L1", "R2", "N2", "L2"), np.array(record["points"]), strict=True))
-        for content in (parallel, slanted):
-            design = ReseauDesign.parse(json.dumps(content), where="wires")
-            for options in (
-                PinOptions(),
-                PinOptions(mirrored=False),
-                PinOptions(mirrored=False, max_rotation_deg=30),
-            ):
-                found = measure_pins(frame, design, options)
-                print(f"{record['image']:30} {len(design.ids):5}  {options.mirrored!s:8}", end="")
-                print(f" {options.max_rotation_deg:8.0f}  ", end="")
-                if isinstance(found, Failure):
-                    print("declined")
-                    continue
-                off = max(np.hypot(*(found.xy[k] - true[found.ids[k]])) for k in np.flatnonzero(found.ok))
-                wrong += int(off > WITHIN_PX)
-                print(f"{off:.1f}{' WRONG' if off > WITHIN_PX else ''}")
+    done = outcomes(executor, partial(laid_over, folder.resolve()), jobs)
+    for (name, design, options), found in zip(jobs, done, strict=True):
+        print(f"{name:30} {len(design.ids):5}  {options.mirrored!s:8}", end="")
+        print(f" {options.max_rotation_deg:8.0f}  ", end="")
+        if found is None:
+            print("declined")
+            continue
+        off = max(
+            np.hypot(*(xy - true[name][point])) for point, xy in zip(found.names, found.xy, strict=True)
+        )
+        wrong += int(off > WITHIN_PX)
+        print(f"{off:.1f}{' WRONG' if off > WITHIN_PX else ''}")
+    record("designs of four and six wires", "wrong", wrong)
     return wrong
 
 
@@ -236,9 +260,17 @@ def main() -> None:
     parser.add_argument(
         "--others", type=int, default=0, help="further frames by which what stands still is told"
     )
+    add_options(parser)
     arguments = parser.parse_args()
+    with executor_of(arguments) as executor:
+        raise SystemExit(0 if held(executor, arguments) else 1)
+
+
+def held(executor: Executor, arguments: argparse.Namespace) -> bool:
+    """Print the tables; whether all values are within their limits."""
+    of_few = arguments.data / "independent" / "pins"
     if arguments.laid:
-        raise SystemExit(bool(laid(arguments.data / "independent" / "pins")))
+        return not laid(executor, of_few)
     folder = arguments.data / "ultrasound_nwire"
     names = sorted(path.name.removesuffix(".reference.json") for path in folder.glob("*.reference.json"))
     if not names:
@@ -253,14 +285,14 @@ def main() -> None:
         f" {'x':>6} {'y':>5}   {'x':>6} {'y':>5}   {'x':>6} {'y':>5}"
         f" {'most':>8} {'all':>6} {'s/frame':>8}"
     )
-    tallies = [sequence(folder, name, arguments.overlay, arguments.others) for name in names]
+    tallies = [sequence(executor, folder, name, arguments.overlay, arguments.others) for name in names]
     for name, tally in zip(names, tallies, strict=True):
         report(name, tally)
     away = rms([deviation for tally in tallies for deviation in tally.deviation])
     missed, wrong = (sum(len(t.missed) for t in tallies), sum(t.wrong for t in tallies))
     further = max(max(t.further) for t in tallies)
-    astray = laid(arguments.data / "independent" / "pins")
-    held = (
+    astray = laid(executor, of_few)
+    within = (
         not astray
         and bool((away <= LIMITS_PX).all())
         and not missed
@@ -271,10 +303,14 @@ def main() -> None:
         f"over all: rms {away[0]:.2f} px in x (limit {LIMITS_PX[0]}), {away[1]:.2f} px in y"
         f" (limit {LIMITS_PX[1]});"
         f" {missed} missed, {wrong} misnumbered, at most {further} further reflectors a frame (limit"
-        f" {MOST_FURTHER}): {'held' if held else 'NOT HELD'}"
+        f" {MOST_FURTHER}): {'held' if within else 'NOT HELD'}"
     )
-    raise SystemExit(0 if held else 1)
+    wires = sum(t.wires for t in tallies)
+    record(
+        "wires in B-mode frames, beside PLUS", "independent, found", wires - missed, of=wires, table=ORIGIN
+    )
+    return within
 
 
 if __name__ == "__main__":
-    main()
+    main_of(__file__)

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import ORIGIN, record
 from tables import judged
 from worlds.oscilloscope import World, designs_of, truth_of
 
@@ -229,6 +230,25 @@ def _root(pairs: Iterable[Array]) -> float:
     return float(np.sqrt(square / count)) if count else np.nan
 
 
+def keep(sets: Sequence[Refined], done: Sequence[Refined]) -> None:
+    """Record the figures of each set, and of all of them beside the simulator's."""
+    for s in sets:
+        record(s.name, "found", s.found, of=s.known)
+        record(s.name, "wrong", s.wrong)
+        if len(s.errors):
+            record(s.name, "rms", np.sqrt((s.mm**2).mean()), "mm")
+            record(s.name, "errors ÷ sigmas", np.sqrt((s.errors**2).mean()))
+            record(s.name, "of group A", _root([s.a]))
+            record(s.name, "of group B", _root([s.b]))
+    what = "oscilloscope, points of PHOTO III"
+    found, known = sum(s.found for s in sets), sum(s.known for s in sets)
+    record(what, "independent, found", found, of=known, table=ORIGIN)
+    column = "independent, errors ÷ sigmas"
+    record(what, column, [np.sqrt((s.errors**2).mean()) for s in done], table=ORIGIN)
+    for group, values in (("A", [_root([s.a]) for s in done]), ("B", [_root([s.b]) for s in done])):
+        record(f"oscilloscope, coefficients of group {group}", column, values, table=ORIGIN)
+
+
 def print_refined(
     title: str, sets: Sequence[Refined], low: float, high: float, low_c: float, high_c: float
 ) -> None:
@@ -251,6 +271,7 @@ def print_refined(
     done = [s for s in sets if len(s.errors)]
     if not done:
         return
+    keep(sets, done)
     errors = np.concatenate([s.errors for s in done])
     x, y = np.sqrt((errors**2).mean(axis=0)).tolist()
     shares = np.array([s.found / s.known for s in sets])

@@ -16,6 +16,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from figures import record
 from shared import of_the_tests
 
 from reseau.core.data import Array
@@ -73,6 +74,9 @@ def found_table(frames: ModuleType, all_measured: list[Measured]) -> None:
         source = m.case.design.xy[ok]
         need = SmoothField.fit(source, m.result.xy[ok], trials=TRIALS).need
         count = "-" if reference is None else str(theirs.sum())
+        record(m.case.name, "RESLOC, found", np.nan if reference is None else int(theirs.sum()))
+        record(m.case.name, "reseau, found", int(ok.sum()))
+        record(m.case.name, "more than 1 px off the prediction by the others", int((distance > 1).sum()))
         print(
             f"{m.case.name:<28} {count:>6} {ok.sum():>5} {(ok & theirs).sum():>5} {(theirs & ~ok).sum():>5} "
             f"{f'{(distance > 1).sum()}, {(axis > 1).sum()}':>7} {distance.max():>12.2f} {pair(need):>12} "
@@ -100,6 +104,11 @@ def deviation_table(frames: ModuleType, all_measured: list[Measured]) -> None:
                 if reference is None
                 else pair(rms(frames.leave_one_out(source[marks], reference[marks], degree)))
             )
+            if label == "collocation":
+                if reference is not None:
+                    off = rms(frames.leave_one_out(source[marks], reference[marks], degree))
+                    record(m.case.name, "RESLOC, leave-one-out rms", np.sqrt((off**2).mean()), "px")
+                record(m.case.name, "reseau, leave-one-out rms", np.sqrt((ours**2).mean()), "px")
             print(f"{m.case.name:<28} {label:<34} {marks.sum():>5} {theirs:>12} {pair(ours):>12}")
     print()
 

@@ -1,7 +1,7 @@
 """Marks in frames of other programs: errors compared with the Cramér–Rao bound and with their sigmas.
 
 Run from the checkout: ``RESEAU_DATA=… python benchmarks/reseau_independent.py [--part data|worlds|compressed]
-[--kind K] [--count N]``. `data` measures the frames in ``independent/marks`` and the crossings of
+[--kind K] [--count N] [--jobs N]``. `data` measures the frames in ``independent/marks`` and the crossings of
 ``independent/oscilloscope``; `worlds` draws N sheets of each kind with ``benchmarks/worlds/marks.py``, which
 shares no formation of images with the project: crosses, disks and short crossings of three contrasts in one
 frame, and wires at any rotation with slopes to 0.1. The bound is that of position, contrast, background and
@@ -15,18 +15,21 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from figures import ORIGIN, record
+from parts import add_options, executor_of, main_of, outcomes
 from worlds.marks import Sheet, write
 
 from reseau.core.data import Array
 from reseau.core.failure import Failure
+from reseau.execution import Executor
 from reseau.io import ReseauDesign
 from reseau.io.images import read_image
 from reseau.measure import measure_reseau
@@ -51,36 +54,43 @@ def measured(image: Path, design: Path, ids: list[str]) -> tuple[Array, Array, A
     return found.xy[rows], sigma, found.ok[rows]
 
 
-def marks_of(folder: Path, bounds: str = "crlb") -> Iterator[tuple[str, Any]]:
+def marks_of(executor: Executor, folder: Path, bounds: str = "crlb") -> Iterator[tuple[str, Any]]:
     """Name, and errors, sigmas, bounds (n, 2) of the measured marks and the number of all, of each frame."""
-    for path in sorted(folder.glob("*.truth.json")):
-        name = path.name.removesuffix(".truth.json")
-        truth = json.loads(path.read_text())
-        seen = measured(folder / f"{name}.png", folder / f"{name}.design.json", truth["id"])
-        if isinstance(seen, str):
-            yield name, seen
-            continue
-        xy, sigma, ok = seen
-        bound = np.stack([truth[bounds]["sigma_x"], truth[bounds]["sigma_y"]], axis=1)
-        error = xy - np.stack([truth["x"], truth["y"]], axis=1)
-        yield name, (error[ok], sigma[ok], bound[ok], len(ok))
+    return outcomes(executor, partial(in_frame, bounds), sorted(folder.resolve().glob("*.truth.json")))
 
 
-def crossings_of(folder: Path) -> Iterator[tuple[str, Any]]:
+def in_frame(bounds: str, path: Path) -> tuple[str, Any]:
+    """The same of the frame whose truth is in a file."""
+    name, truth = path.name.removesuffix(".truth.json"), json.loads(path.read_text())
+    seen = measured(path.with_name(f"{name}.png"), path.with_name(f"{name}.design.json"), truth["id"])
+    if isinstance(seen, str):
+        return name, seen
+    xy, sigma, ok = seen
+    bound = np.stack([truth[bounds]["sigma_x"], truth[bounds]["sigma_y"]], axis=1)
+    error = xy - np.stack([truth["x"], truth["y"]], axis=1)
+    return name, (error[ok], sigma[ok], bound[ok], len(ok))
+
+
+def crossings_of(executor: Executor, folder: Path) -> Iterator[tuple[str, Any]]:
     """The same for the crossings of oscilloscope photographs, whose bound is not known."""
-    for path in sorted(folder.glob("*.truth.json")):
-        name = path.name.removesuffix(".truth.json")
-        truth = json.loads(path.read_text())
-        for number, photo in enumerate(("I", "II", "III"), start=1):
-            image = folder / f"{name}.photo{number}.png"
-            seen = measured(image, folder / f"{name}.reseau.design.json", truth["reseau"]["id"])
-            if isinstance(seen, str):
-                yield f"{name} {photo}", seen
-                continue
-            xy, sigma, ok = seen
-            at = truth["photos"][photo]["crossings"]
-            error = xy - np.stack([at["x"], at["y"]], axis=1)
-            yield f"{name} {photo}", (error[ok], sigma[ok], None, len(ok))
+    paths = sorted(folder.resolve().glob("*.truth.json"))
+    return outcomes(executor, in_photograph, [(path, number) for path in paths for number in (1, 2, 3)])
+
+
+def in_photograph(job: tuple[Path, int]) -> tuple[str, Any]:
+    """The same of one of the three photographs of a set."""
+    (path, number), photo = job, "I" * job[1]
+    name, truth = path.name.removesuffix(".truth.json"), json.loads(path.read_text())
+    image, design = (
+        path.with_name(f"{name}.{rest}") for rest in (f"photo{number}.png", "reseau.design.json")
+    )
+    seen = measured(image, design, truth["reseau"]["id"])
+    if isinstance(seen, str):
+        return f"{name} {photo}", seen
+    xy, sigma, ok = seen
+    at = truth["photos"][photo]["crossings"]
+    error = xy - np.stack([at["x"], at["y"]], axis=1)
+    return f"{name} {photo}", (error[ok], sigma[ok], None, len(ok))
 
 
 def line(name: str, parts: list[Any], ratio_to: float = MOST_RATIO, coded: bool = False) -> bool:
@@ -94,6 +104,11 @@ def line(name: str, parts: list[Any], ratio_to: float = MOST_RATIO, coded: bool 
         ratio, good = f"{over:.3f}", good and over <= ratio_to
     worst = np.abs(error / sigma).max()
     all_marks = sum(part[3] for part in parts)
+    record(name, "measured", len(error), of=all_marks)
+    record(name, "rms", rms, "px")
+    record(name, "rms ÷ bound", float(ratio or "nan"))
+    record(name, "errors ÷ sigmas", scaled)
+    record(name, "largest error", worst, "sigma")
     good &= bool(worst <= WRONG) and (coded or len(error) >= FEWEST * all_marks)
     print(
         f"{name:24} {len(error):5} of {all_marks:5}  {rms:.4f} px  {ratio:>6}  {scaled:.3f}  {worst:.1f}"
@@ -103,7 +118,7 @@ def line(name: str, parts: list[Any], ratio_to: float = MOST_RATIO, coded: bool 
     return good
 
 
-def table(title: str, frames: Iterator[tuple[str, Any]], each: bool = True, coded: bool = False) -> bool:
+def table(title: str, frames: Iterable[tuple[str, Any]], each: bool = True, coded: bool = False) -> bool:
     """Measure frames and print their rows and that of all; whether all are within their limits."""
     parts, good = [], True
     for name, found in frames:
@@ -115,10 +130,16 @@ def table(title: str, frames: Iterator[tuple[str, Any]], each: bool = True, code
         if each:
             # Some 200 marks: errors ÷ sigmas are known to 5 per cent.
             good &= line(name, [found], MOST_OF_FILE)
+    if each and parts:
+        what = f"{title.removeprefix('all ')} of a reseau"
+        counts = sum(len(part[0]) for part in parts), sum(part[3] for part in parts)
+        record(what, "independent, found", counts[0], of=counts[1], table=ORIGIN)
+        ratios = [np.sqrt(((part[0] / part[1]) ** 2).mean()) for part in parts]
+        record(what, "independent, errors ÷ sigmas", ratios, table=ORIGIN)
     return (line(title, parts, coded=coded) if parts else coded) and good
 
 
-def compressed(folder: Path, quality: int) -> Iterator[tuple[str, Any]]:
+def compressed(executor: Executor, folder: Path, quality: int) -> Iterator[tuple[str, Any]]:
     """Results of the frames of a folder after compression with JPEG; the bound no longer holds."""
     with tempfile.TemporaryDirectory() as name:
         copies = Path(name)
@@ -132,7 +153,7 @@ def compressed(folder: Path, quality: int) -> Iterator[tuple[str, Any]]:
                 cv2.imwrite(str(copies / path.name), coded)
             elif path.suffix == ".json":
                 (copies / path.name).write_bytes(path.read_bytes())
-        for name, found in marks_of(copies):
+        for name, found in marks_of(executor, copies):
             yield name, found if isinstance(found, str) else (*found[:2], None, found[3])
 
 
@@ -141,8 +162,15 @@ def main() -> int:
     parser.add_argument("--part", choices=("data", "worlds", "compressed"))
     parser.add_argument("--kind", choices=KINDS)
     parser.add_argument("--count", type=int, default=11, help="sheets of each kind")
+    add_options(parser)
     options = parser.parse_args()
     print(f"{'':24} {'measured':>14}  {'rms':9}  /bound  error/sigma  worst")
+    with executor_of(options) as executor:
+        return 0 if chosen(executor, options) else 1
+
+
+def chosen(executor: Executor, options: argparse.Namespace) -> bool:
+    """Do what the options ask for; whether all is within its limits."""
     good = True
     if options.part in (None, "data"):
         root = os.environ.get("RESEAU_DATA")
@@ -151,26 +179,30 @@ def main() -> int:
             good = options.part is None
         else:
             independent = Path(root) / "independent"
-            good &= table("all marks", marks_of(independent / "marks"))
-            good &= table("all crossings", crossings_of(independent / "oscilloscope"))
-    if options.part in (None, "worlds"):
-        for kind in KINDS if options.kind is None else (options.kind,):
+            good &= table("all marks", marks_of(executor, independent / "marks"))
+            good &= table("all crossings", crossings_of(executor, independent / "oscilloscope"))
+    for kind in KINDS if options.kind is None else (options.kind,):
+        if options.part in (None, "worlds"):
             with tempfile.TemporaryDirectory() as name:
                 folder = Path(name)
-                for seed in range(options.count):
-                    write(
-                        folder, f"{kind}-{seed:02}", Sheet.drawn_from(kind, np.random.default_rng(seed)), seed
-                    )
-                good &= table(f"{kind}, own worlds", marks_of(folder, "crlb_slopes"), each=False)
-    if options.part in (None, "compressed"):
-        for kind in KINDS if options.kind is None else (options.kind,):
+                list(outcomes(executor, partial(drawn, folder, kind), range(options.count)))
+                frames = marks_of(executor, folder, "crlb_slopes")
+                good &= table(f"{kind}, own worlds", frames, each=False)
+    for kind in KINDS if options.kind is None else (options.kind,):
+        if options.part in (None, "compressed"):
             with tempfile.TemporaryDirectory() as name:
                 folder = Path(name)
                 write(folder, kind, Sheet.drawn_from(kind, np.random.default_rng(0)), 0)
                 for quality in QUALITIES:
-                    good &= table(f"{kind}, quality {quality}", compressed(folder, quality), False, True)
-    return 0 if good else 1
+                    frames = compressed(executor, folder, quality)
+                    good &= table(f"{kind}, quality {quality}", frames, False, True)
+    return good
+
+
+def drawn(folder: Path, kind: str, seed: int) -> None:
+    """Draw a sheet of a kind into a folder."""
+    write(folder, f"{kind}-{seed:02}", Sheet.drawn_from(kind, np.random.default_rng(seed)), seed)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main_of(__file__))

@@ -16,6 +16,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from figures import record
 
 from reseau.designs import board
 from reseau.io.images import read_image
@@ -63,6 +64,7 @@ def main() -> int:
                 measure(path) for path in sorted((Path(root) / "chessboard_stereo").glob(f"{side}*.jpg"))
             ]
             seen = [one for one in found if one is not None and len(one[1]) >= LEAST]
+            record(f"{side}, {name}", "photographs", len(seen), of=len(found))
             if len(seen) < 3:
                 print(f"{side:6} {name:10} {len(seen):2} of {len(found)} photographs")
                 continue
@@ -77,6 +79,9 @@ def main() -> int:
                 image = cv2.projectPoints(a[k], turn, shift, camera, lens)[0].reshape(-1, 2)
                 square.append(((image - b[k]) ** 2).sum(axis=1))
             crossed = float(np.sqrt(np.concatenate(square).mean()))
+            record(f"{side}, {name}", "corners", sum(map(len, b)))
+            record(f"{side}, {name}", "reprojection", rms, "px")
+            record(f"{side}, {name}", "cross-validated", crossed, "px")
             print(
                 f"{side:6} {name:10} {len(seen):2} of {len(found)} photographs, {sum(map(len, b))} corners: "
                 f"reprojection {rms:.3f} px, cross-validated {crossed:.3f} px"

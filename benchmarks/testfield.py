@@ -22,6 +22,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from figures import ORIGIN, record
 from parts import main_of, outcomes
 from scipy.optimize import linear_sum_assignment
 from shared import of_the_tests
@@ -211,7 +212,7 @@ def table(done: list[Recording]) -> bool:
         f"\n{'targets':<16} {'number':>6} {'paper px':>9} {'rms x/y px':>15} {'rms/bound x/y':>14} "
         f"{'all':>6} {'predicted/empirical':>20} {'bias x/y 1e-3 px':>17} {'binary/matching':>16}"
     )
-    kept = True
+    kept, tilt = True, max(r.station.phi for r in done)
     for big in (True, False):
         for name in SHAPES:
             of = (shape == name) & (large == big)
@@ -225,6 +226,11 @@ def table(done: list[Recording]) -> bool:
             good = ratio <= (1.15 if big else 1.2) and 0.9 <= predicted <= 1.1
             kept &= good
             bias = 1e3 * e.mean(axis=0)
+            label = f"{'large' if big else 'small'} {name}s, φ up to {tilt:.0f}°"
+            record(label, "measured", len(e), of=measured.size)
+            record(label, "rms", np.sqrt((e**2).mean()), "px")
+            record(label, "rms ÷ bound", ratio)
+            record(label, "predicted ÷ empirical", predicted)
             print(
                 f"{('large ' if big else 'small ') + name:<16} {len(e):>6} {PAPER[name, big]:>9.3f} "
                 f"{rms[0]:>7.4f}/{rms[1]:.4f} {rms[0] / least[0]:>8.3f}/{rms[1] / least[1]:.3f} "
@@ -242,6 +248,9 @@ def counts(label: str, done: list[Recording]) -> bool:
     measured = sum(int((r.result.ok & CENTRAL).sum()) for r in done)
     every = sum(r.result.found for r in done)
     misnumbered = sum(int((np.hypot(*r.error.T) > 1.0).sum()) for r in done)
+    record(label, "measured", measured, of=inside)
+    record(label, "misclassified in their cluster", int(wrong[1]))
+    record(label, "misnumbered", misnumbered)
     off = np.concatenate([lines(r) for r in done])
     worst = max(float(np.sqrt((lines(r) ** 2).mean())) for r in done)
     print(f"\n{label}: {len(done)} recordings")
@@ -252,6 +261,19 @@ def counts(label: str, done: list[Recording]) -> bool:
         f"misnumbered {misnumbered}"
     )
     return worst <= 0.03 and wrong[1] == 0 and misnumbered == 0
+
+
+def keep(done: list[Recording]) -> None:
+    """Record what is recorded of images of independent origin, too; each value is that of one recording."""
+    ratios, what = [], "coded testfield"
+    for r in done:
+        of = r.result.ok & CENTRAL
+        # What formation by other programs may add is not in pictures of the own simulator.
+        variance = np.diagonal(r.result.cov[of], axis1=1, axis2=2) - FORMED_PX**2
+        ratios.append(np.sqrt((r.error[of] ** 2 / variance).mean()))
+    measured = sum(int((r.result.ok & CENTRAL).sum()) for r in done)
+    record(what, "simulator, found", measured, of=int(CENTRAL.sum()) * len(done), table=ORIGIN)
+    record(what, "simulator, errors ÷ sigmas", ratios, table=ORIGIN)
 
 
 def timed(frame: Frame) -> tuple[float, float]:
@@ -406,6 +428,7 @@ def main() -> int:
     kept.append(table(paper))
     print("\nφ = 60°:", end="")
     kept.append(table(steep))
+    keep(paper + steep)
     speed(paper[:36], arguments.jobs)
     return 0 if all(kept) else 1
 

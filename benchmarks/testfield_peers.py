@@ -21,6 +21,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from figures import BOUND, record
 from scipy.spatial import KDTree
 from shared import of_the_tests
 
@@ -52,10 +53,10 @@ class View:
 
 @dataclass(eq=False)
 class Tally:
-    """Errors of a program in all views (v, n, 2), NaN where it failed, and its time."""
+    """Errors of a program in all views (v, n, 2), NaN where it failed, and its time (s) for each view."""
 
     errors: list[Array] = field(default_factory=list)
-    seconds: float = 0.0
+    seconds: list[float] = field(default_factory=list)
 
 
 Locate = Callable[[View], Array]
@@ -246,7 +247,7 @@ def located(name: str, needs: str, make: Any, views: list[View]) -> Tally | None
     for view in views:
         clock = time.perf_counter()
         found = locate(view)
-        tally.seconds += time.perf_counter() - clock
+        tally.seconds.append(time.perf_counter() - clock)
         tally.errors.append(found - view.truth)
     return tally
 
@@ -254,14 +255,22 @@ def located(name: str, needs: str, make: Any, views: list[View]) -> Tally | None
 def row(name: str, tally: Tally) -> str:
     errors = np.stack(tally.errors)
     known = np.isfinite(errors[..., 0])
+    record(name, "targets", int(known.sum()), of=known.size)
     if not known.any():
         return f"{name:<34} {'':>8} {'':>8} {'':>8} {known.size:>5}/{known.size}"
     size = np.hypot(*np.moveaxis(errors, -1, 0))
     means = [np.nanmean(e, axis=0) for e, k in zip(errors, known, strict=True) if k.any()]
     bias = np.sqrt(np.mean(np.square(means)))
+    each = [float(np.sqrt(np.nanmean(e**2))) for e, k in zip(errors, known, strict=True) if k.any()]
+    record(name, "rms of a photograph", each, "px")
+    record(name, "bias", bias, "px")
+    record(name, "time for a target", 1e3 * np.array(tally.seconds) / known.shape[1], "ms")
+    if "chessboard" not in name and "ChArUco" not in name:
+        own = name.startswith("reseau")
+        record("disk, tilted to 45°", "reseau" if own else name, np.sqrt(np.nanmean(errors**2)), table=BOUND)
     return (
         f"{name:<34} {np.sqrt(np.nanmean(errors**2)):>8.4f} {bias:>8.4f} {np.nanmedian(size):>8.4f} "
-        f"{(~known).sum():>5}/{known.size} {1e3 * tally.seconds / known.size:>9.3f}"
+        f"{(~known).sum():>5}/{known.size} {1e3 * sum(tally.seconds) / known.size:>9.3f}"
     )
 
 

@@ -31,8 +31,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import record
 from numpy.typing import NDArray
-from parts import add_options, executor_of, main_of, outcomes
+from parts import add_options, executor_of, main_of, outcomes, timed
 
 from reseau.bundle import Camera, Network, Result, adjust_network
 from reseau.bundle.network import Rig
@@ -176,8 +177,7 @@ def solved(name: str, seed: int) -> dict[str, Any]:
     network = network_of(scenario, detections, board)
     if peer is None:
         network = displaced(network)
-    before = time.process_time()
-    result = adjust_network(network)
+    result, seconds = timed(partial(adjust_network, network), name)
     assert isinstance(result, Result), f"{name} {seed}: {result}"
     own, normal = errors_of_network(scenario, result)
     return {
@@ -186,7 +186,7 @@ def solved(name: str, seed: int) -> dict[str, Any]:
         "peer": [[np.nan]] * len(QUANTITIES) if peer is None else errors_of_peer(scenario, peer),
         "largest_px": float(np.abs(result.residuals).max()),
         "sigma0": result.sigma0,
-        "seconds": [time.process_time() - before, middle - begin],
+        "seconds": [seconds, middle - begin],
     }
 
 
@@ -222,6 +222,8 @@ def main() -> None:
         with executor_of(chosen) as executor:
             rows = list(outcomes(executor, partial(kept, chosen.keep, name), range(seeds)))
         times = np.median([row["seconds"] for row in rows], axis=0)
+        for k, who in enumerate(("reseau", "AquaCal")):
+            record(f"{name}, processor time", who, [row["seconds"][k] for row in rows], "s")
         largest = max(row["largest_px"] for row in rows)
         print(
             f"{name}: {seeds} seed{'s' * (seeds > 1)}, {times[0]:.1f} s each, AquaCal {times[1]:.1f} s "
@@ -235,6 +237,10 @@ def main() -> None:
                 for part in ("own", "peer", "normal")
             )
             one, other = np.abs(own).mean(), np.abs(peer).mean()
+            what, unit = quantity.split(", ")
+            for who, part in (("reseau", "own"), ("AquaCal", "peer")):
+                each = [np.abs(row[part][q]).mean() for row in rows]
+                record(f"{name}, error of the {what}", who, each, unit)
             # Errors of one seed are correlated: the interval is that of the mean squares of seeds.
             squares = np.array([np.mean(np.square(row["normal"][q])) for row in rows])
             rms = float(np.sqrt(np.mean(normal**2)))

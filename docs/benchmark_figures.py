@@ -1,4 +1,6 @@
-"""Draws the pictures of docs/benchmarks.md and docs/scale.md from the tables of these pages.
+"""Draws the pictures of docs/benchmarks.md from the figures of the last `make bench`.
+
+That of docs/scale.md is drawn from the tables there, whose networks take hours.
 
 python docs/benchmark_figures.py
 """
@@ -6,6 +8,7 @@ python docs/benchmark_figures.py
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -14,7 +17,11 @@ from themes import save
 
 from reseau.core.figures import ACCENT, BLUE, FAINT, INK, drawing
 
-DOCS = Path(__file__).parent
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
+import figures
+
+DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
 
 
@@ -71,24 +78,37 @@ def stopped_early(cell: str) -> bool:
     return above is not None and float(above[1]) >= 0.01
 
 
+def rows_of(table: str) -> dict[str, dict[str, figures.Figure]]:
+    """The recorded figures of a table, by row and column."""
+    rows: dict[str, dict[str, figures.Figure]] = {}
+    for each in figures.recorded(table):
+        rows.setdefault(each.row, {})[each.column] = each
+    return rows
+
+
 def beside_others() -> Figure:
     """Errors of image coordinates: ours, the bound, and those of other programs."""
-    rows = table("benchmarks.md", "Cramér–Rao bound | other program")
-    figure = Figure(figsize=(8.4, 0.34 * len(rows) + 1.1), layout="constrained")
+    lines = [
+        (row, cells, name)
+        for row, cells in rows_of(figures.BOUND).items()
+        for name in cells
+        if name not in ("reseau", "bound")
+    ]
+    figure = Figure(figsize=(8.4, 0.34 * len(lines) + 1.1), layout="constrained")
     axes = figure.subplots()
     axes.set_xlim(0.0012, 1.0)
-    for y, row in enumerate(rows):
+    for y, (_, cells, name) in enumerate(lines):
         for column, style in (
-            (1, {"marker": "o", "color": ACCENT, "s": 40, "zorder": 3}),
-            (2, {"marker": "|", "color": INK, "s": 160, "zorder": 4}),
-            (4, {"marker": "s", "color": BLUE, "s": 26, "zorder": 2}),
+            ("reseau", {"marker": "o", "color": ACCENT, "s": 40, "zorder": 3}),
+            ("bound", {"marker": "|", "color": INK, "s": 160, "zorder": 4}),
+            (name, {"marker": "s", "color": BLUE, "s": 26, "zorder": 2}),
         ):
-            for value in numbers(row[column])[:1]:
-                axes.scatter(value, y, **style)
-        other, error = row[3].strip("`"), numbers(row[4])
-        said = other if error else f"{other}: {row[4]}"
+            if column in cells and cells[column].value is not None:
+                axes.scatter(cells[column].value, y, **style)
+        error = cells[name].value
+        said = name if error is not None else f"{name}: not found"
         place = {"textcoords": "offset points", "va": "center", "fontsize": 8}
-        axes.annotate(said, (error[0] if error else 0.05, y), (8, 0), **place)
+        axes.annotate(said, (error if error is not None else 0.05, y), (8, 0), **place)
     for label, marker, colour in (
         ("reseau", "o", ACCENT),
         ("Cramér–Rao bound", "|", INK),
@@ -97,27 +117,33 @@ def beside_others() -> Figure:
         axes.scatter([], [], marker=marker, color=colour, label=label)
     axes.set_xscale("log")
     axes.set_xlabel("rms error of a coordinate, px")
-    labelled(axes, [row[0] for row in rows])
+    labelled(axes, [row for row, _, _ in lines])
     axes.legend(frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0, 1))
     return figure
 
 
 def independent() -> Figure:
     """Errors over sigmas of the simulator's images and of independent ones."""
-    rows = table("benchmarks.md", "independent, errors ÷ sigmas")
+    rows = rows_of(figures.ORIGIN)
     figure = Figure(figsize=(8.4, 0.34 * len(rows) + 1.1), layout="constrained")
     axes = figure.subplots()
     axes.axvline(1.0, color=FAINT, lw=1)
-    for k, row in enumerate(rows):
-        for column, colour, off, marker in ((2, BLUE, -0.15, "s"), (4, ACCENT, 0.15, "o")):
-            if values := numbers(row[column]):
-                ends = [min(values), max(values)]
-                axes.plot(ends, [k + off] * 2, color=colour, lw=2, marker=marker, ms=4)
+    for k, cells in enumerate(rows.values()):
+        for origin, colour, off, marker in (
+            ("simulator", BLUE, -0.15, "s"),
+            ("independent", ACCENT, 0.15, "o"),
+        ):
+            found = cells.get(f"{origin}, errors ÷ sigmas")
+            if found is None or found.value is None:
+                continue
+            if found.low is not None and found.high is not None:
+                axes.plot([found.low, found.high], [k + off] * 2, color=colour, lw=2)
+            axes.plot(found.value, k + off, color=colour, marker=marker, ms=4)
     for label, colour, marker in (("simulator", BLUE, "s"), ("independent origin", ACCENT, "o")):
         axes.plot([], [], color=colour, lw=2, marker=marker, ms=4, label=label)
-    axes.set_xlabel("errors ÷ sigmas; lines are ranges over conditions")
+    axes.set_xlabel("errors ÷ sigmas; lines from the least to the greatest of conditions")
     axes.set_xlim(0, None)
-    labelled(axes, [row[0] for row in rows])
+    labelled(axes, list(rows))
     axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0, 1))
     return figure
 
