@@ -121,6 +121,25 @@ def test_a_model_that_a_format_lacks_is_converted_with_its_differences(
     assert difference[inside].max() < 1.1 * done.greatest_px
 
 
+def test_the_largest_difference_of_a_fisheye_in_a_rational_model_is_that_between_the_points_of_the_fit(
+    tmp_path: Path,
+) -> None:
+    wide = CENTRE | {"fx": 500.0, "fy": 503.0, "k1": 0.03, "k2": -0.004, "k3": 1e-3, "k4": -2e-4}
+    given = calibration("fisheye")
+    values = {
+        key: Quantity(value=value, sigma=0.0, unit=unit_of(key, "fisheye")) for key, value in wide.items()
+    }
+    given = given.model_copy(update={"parameters": given.parameters | values})
+    done = export_calibration(given, "mrcal", file(tmp_path, "mrcal"))
+    assert done.greatest_px > 1
+    again = import_calibration(file(tmp_path, "mrcal"))
+    x, y = np.meshgrid(np.linspace(0, SIZE[0] - 1, 60), np.linspace(0, SIZE[1] - 1, 45))
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    uv = given.mapping().mapping.inverse(pixels)  # type: ignore[attr-defined]
+    difference = again.mapping().to_pixels(uv) - pixels  # type: ignore[attr-defined]
+    assert np.linalg.norm(difference, axis=1).max() < 1.05 * done.greatest_px
+
+
 @pytest.mark.parametrize("camera", HELD["opencv"])
 def test_opencv_reads_the_file_and_projects_the_same_points(camera: str, tmp_path: Path) -> None:
     path, given = file(tmp_path, "opencv"), calibration(camera)

@@ -17,8 +17,9 @@ from .registry import camera_model
 
 __all__ = ["Converted", "convert"]
 
-# Points along the longer side of the image.
-_POINTS = 41
+# Points along the longer side of the image to which the camera is fitted, and at which it is compared: it may
+# be worst between the former.
+_POINTS, _COMPARED = 41, 161
 # Greatest number of steps, and damping of the first one (columns have unit length).
 _ITERATIONS, _DAMPING = 200, 1e-3
 
@@ -164,10 +165,7 @@ def convert(
     if camera.parallel != wanted.parallel:
         rays = "parallel" if camera.parallel else "central"
         raise UsageError(f"has {rays} rays, the model `{model}` has not", where="camera to be converted")
-    step = max(grid.width, grid.height) / _POINTS
-    columns = np.linspace(0, grid.width - 1, max(2, round(grid.width / step)))
-    rows = np.linspace(0, grid.height - 1, max(2, round(grid.height / step)))
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    pixels = _over(grid, _POINTS)
     directions = camera.inverse(pixels)
     known: Mask = np.asarray(np.isfinite(directions).all(axis=1))
     if 2 * known.sum() <= len(known):
@@ -180,9 +178,21 @@ def convert(
     found = _fitted(wanted.mapping(wanted.start_values(f, grid), grid, options), uv, target, at)
     names = tuple(name for name, chosen in zip(wanted.names, at, strict=True) if chosen)
     by_original = _by_original(camera, found, uv, at)
+    pixels = _over(grid, _COMPARED)
+    directions = camera.inverse(pixels)
+    seen: Mask = np.asarray(np.isfinite(directions).all(axis=1))
+    difference = found(directions[seen]) - pixels[seen]
     return Converted(
-        found, target, found(uv) - target, float(known.mean()), names, by_original, tuple(camera.names)
+        found, pixels[seen], difference, float(seen.mean()), names, by_original, tuple(camera.names)
     )
+
+
+def _over(grid: PixelGrid, across: int) -> Array:
+    """Pixels (n, 2) over the image, from edge to edge, so many along its longer side."""
+    step = max(grid.width, grid.height) / across
+    columns = np.linspace(0, grid.width - 1, max(2, round(grid.width / step)))
+    rows = np.linspace(0, grid.height - 1, max(2, round(grid.height / step)))
+    return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
 
 
 def _by_original(camera: PlaneMapping, found: PlaneMapping, uv: Array, at: Array) -> Array:
