@@ -292,3 +292,12 @@ BATTERY = {
     "polynomial": polynomial(),
 }
 """Every model of a camera that can be calibrated."""
+
+
+def points_of(remark: str) -> set[tuple[str, str]]:
+    """Images and points that a remark names, as `in image i1: points p1, p2; in image i2: point p3`."""
+    found = set()
+    for part in remark.split("in image ")[1:]:
+        image, _, names = part.partition(": point")
+        found |= {(image, name.strip()) for name in names.removeprefix("s").partition(";")[0].split(",")}
+    return found

@@ -63,9 +63,9 @@ def test_gross_errors_that_are_kept_are_named() -> None:
     network, bad = disturbed(world.noisy(1), 0.01, 1)
     result = required(adjust_network(network))
     remark = next(w.text for w in result.warnings if w.text.startswith("gross errors are likely in"))
+    named = networks.points_of(remark)
     for k in bad:
-        where = f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}"
-        assert where in remark
+        assert (network.images[network.image_of[k]], network.points[network.point_of[k]]) in named
 
 
 @pytest.mark.slow

@@ -75,7 +75,7 @@ def make(case: str, photo: Any, folder: Path) -> tuple[Path, Path]:
 CASES = [
     ("text instead of an image", "bad.png", "is not a PNG, JPEG, TIFF or BMP image"),
     ("truncated image", "bad.png", "truncated"),
-    ("empty file", "bad.png", "is not a PNG"),
+    ("empty file", "bad.png", "is empty"),
     ("no such image", "bad.png", "No such file"),
     ("folder instead of an image", "bad.png", "Is a directory"),
     ("all black", "bad.png", "black"),

@@ -149,7 +149,7 @@ def test_gross_errors_are_named_and_rejected(reseau: Run, network: Callable[...,
     where = (table["image"][17], table["point"][17])
     status, out, _ = reseau("bundle", path, "--json")
     assert status == 0
-    assert any(f"{where[1]} in image {where[0]}" in warning for warning in json.loads(out)["warnings"])
+    assert any(f"in image {where[0]}: point {where[1]}" in warning for warning in json.loads(out)["warnings"])
     status, out, _ = reseau("bundle", path, "--reject", "--json")
     assert status == 0
     found = json.loads(out)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from markupsafe import escape
 
 from reseau.calibration import Calibration
 from reseau.io import ReseauMeasurement
@@ -215,10 +216,13 @@ def test_photographs_are_measured_and_blank_ones_are_named(reseau: Run, tmp_path
     images = sorted(tmp_path.glob("*.png"))
     status, out, err = reseau(
         "calibrate", *images, "-d", tmp_path / "field.json", "--free", "fx,fy,cx,cy", "--fill", 0.8,
-        "-o", tmp_path / "K.json", "--jobs", 1,
+        "-o", tmp_path / "K.json", "--report", tmp_path / "F.html", "--jobs", 1,
     )  # fmt: skip
     assert (status, err) == (0, "")
-    assert "left out: blank.png: " in out
+    why = out.partition("left out: blank.png: ")[2].partition("\n")[0]
+    assert why
+    page = (tmp_path / "F.html").read_text()
+    assert f"<li><b>blank.png</b>: {escape(why)}</li>" in page.partition("Photographs left out")[2]
     found = Calibration.read(tmp_path / "K.json").parameters["fx"]
     assert abs(found.value - 57.5 / 0.027) < 4 * found.sigma
     # Two processes find the same to the byte, whichever is first.

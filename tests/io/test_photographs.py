@@ -107,6 +107,12 @@ def test_values_of_ten_bit_fill_the_scale_of_sixteen(tmp_path: Path) -> None:
     assert np.abs(found.pixels - values * (65535 / 1023)).max() <= 1
 
 
+def test_an_empty_file_is_declined_as_empty(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").touch()
+    with pytest.raises(ImageError, match=r"a\.jpg: is empty"):
+        read_image(tmp_path / "a.jpg")
+
+
 def test_an_image_that_is_too_large_is_declined_by_its_header(tmp_path: Path) -> None:
     for suffix in (".gif", ".pgm"):
         made(tmp_path / f"a{suffix}", gradient()[:, :, 0])

@@ -392,7 +392,7 @@ def _write_report(
 
     page = bundle_report(
         done.result, title=title, provenance=provenance, against=differences, distances=distances or (),
-        assessments=done.assessments, photograph=pictures,
+        assessments=done.assessments, photograph=pictures, declined=done.declined,
     )  # fmt: skip
     write_whole(path, page)
 

@@ -168,6 +168,8 @@ def open_scan(path: Path | str) -> Scan:
             magic = stream.read(132)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    if not magic:
+        raise ImageError("is empty", where=path, do=_AGAIN)
     if is_dicom(whole, magic):
         return open_dicom(whole, number, MAX_PIXELS)
     path = Path(path)

@@ -42,6 +42,7 @@ def bundle_report(
     distances: Sequence[float] = (),
     assessments: Mapping[str, Assessment] | None = None,
     photograph: Callable[[str], Frame | None] | None = None,
+    declined: Mapping[str, str] | None = None,
 ) -> str:
     """Render the report of a bundle adjustment.
 
@@ -63,6 +64,8 @@ def bundle_report(
     photograph : callable, optional
         Returns the photograph of an image, or None where there is none; those with the largest residuals are
         shown.
+    declined : mapping of str to str, optional
+        Photographs that were left out, and why.
 
     Returns
     -------
@@ -92,6 +95,7 @@ def bundle_report(
         worst=worst_points(result),
         photographs=[] if photograph is None else _photographs(result, photograph),
         more_photographs=max(0, int(result.fit.usable.images.sum()) - _PHOTOGRAPHS),
+        declined=list((declined or {}).items()),
         patterns=patterns_of(result),
         differences=[_difference(name, found) for name, found in (against or {}).items()],
         left_out=left_out_table(result)[:_IMAGES],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import scipy.special
@@ -18,7 +18,7 @@ from .patterns import CommonPattern, by_place, common_pattern
 from .regularisation import regularised
 from .result import Result
 
-__all__ = ["LISTED", "checks", "listed", "unmodelled_pattern"]
+__all__ = ["LISTED", "checks", "in_images", "listed", "unmodelled_pattern"]
 
 LISTED = 8
 SHOWN = 3
@@ -44,6 +44,22 @@ def listed(names: Iterable[object], most: int = LISTED) -> str:
     every = [str(name) for name in names]
     more = f" and {len(every) - most} more" if len(every) > most else ""
     return ", ".join(every[:most]) + more
+
+
+def in_images(network: Network, rows: Rows, said: Callable[[int], str] = lambda row: "") -> str:
+    """Name image points by their images, in the order of the first of each; of many only the first.
+
+    `said` is written after a point.
+    """
+    points = dict[str, list[str]]()
+    for k in rows[:LISTED].tolist():
+        image = network.images[network.image_of[k]]
+        points.setdefault(image, []).append(f"{network.points[network.point_of[k]]}{said(k)}")
+    words = [
+        f"in image {image}: point{'s' * (len(names) > 1)} {', '.join(names)}"
+        for image, names in points.items()
+    ]
+    return "; ".join([*words, *([f"and {len(rows) - LISTED} more"] if len(rows) > LISTED else [])])
 
 
 def _gaps(result: Result) -> list[Remark]:
@@ -212,14 +228,11 @@ def _large(result: Result) -> list[Remark]:
         return []
     rows = rows[np.argsort(-w[rows], kind="stable")]
     network = result.network
-    names = [
-        f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]} (w {w[k]:.1f})"
-        for k in rows
-    ]
+    names = in_images(network, rows, lambda k: f" (w {w[k]:.1f})")
     return [
         Remark(
             f"{len(rows)} image {_plural('point', rows)} deviate{'s' * (len(rows) == 1)} more than chance "
-            f"explains (test value w above {critical:.1f}): {listed(names)}",
+            f"explains (test value w above {critical:.1f}) {names}",
             Code.GROSS_ERRORS,
         )
     ]

@@ -20,7 +20,7 @@ from ..diagnostics.causes import (
     outside_image,
     seen_frontally,
 )
-from ..diagnostics.checks import listed
+from ..diagnostics.checks import in_images, listed
 from ..diagnostics.control_check import suspected, without_control
 from ..diagnostics.stage_check import checked_readings, without_readings
 from ..diagnostics.suspects import contradicting, doubtful_parameters, grouped, without_false_bars
@@ -526,10 +526,7 @@ def _doubts(
 
 
 def _gross(network: Network, rows: Rows) -> Remark:
-    names = [
-        f"{network.points[network.point_of[k]]} in image {network.images[network.image_of[k]]}" for k in rows
-    ]
-    return Remark(f"gross errors are likely in {listed(names)}", Code.GROSS_ERRORS)
+    return Remark(f"gross errors are likely {in_images(network, rows)}", Code.GROSS_ERRORS)
 
 
 def _worst_images(network: Network, size: Array) -> list[Remark]:
