@@ -232,9 +232,10 @@ def page(path: Path = RECORDED) -> str:
                 absent.append(f"{peer} in “{entry.title}”: {PEERS[peer]} was not installed")
     if absent:
         lines += ["Missing:", "", *(f"- {each}" for each in absent), ""]
-    lines += ["### Errors of clean targets beside the bound", "", _beside_the_bound(path), ""]
+    lines += ["### Errors of clean targets beside the bound", "", _beside_the_bound(path)]
     lines += [_TARGETS, "", "### Images of independent origin beside the simulator's", "", _ORIGINS, ""]
-    lines += [markdown(recorded(ORIGIN, path), "what"), _PICTURE, ""]
+    origins = sorted(recorded(ORIGIN, path), key=lambda each: each.column.startswith("independent"))
+    lines += [markdown(origins, "what"), _PICTURE, ""]
     for entry in known:
         document = entries[entry.name]
         peers = ", ".join(f"{peer} {number}" for peer, number in document["peers"].items() if number)

@@ -409,8 +409,8 @@ def _report(rows: list[dict[str, object]], seconds: float) -> None:
     record("blurred targets", "independent, found", len(good), of=len(rows), table=ORIGIN)
     if good:
         error, least, sigma = (np.array([row[key] for row in good]) for key in ("error", "bound", "sigma"))
-        for who, values in (("reseau", error), ("bound", least)):
-            record("blurred target", who, np.sqrt((values**2).mean()), table=BOUND)
+        record("blurred target", "reseau", np.sqrt((error**2).mean()), table=BOUND)
+        record("blurred target", "bound", np.sqrt((least**2).mean()), table=BOUND)
         for method, name in (("gravity", "centre of gravity"), ("ellipse", "ellipse"),
                              ("matching", "ordinary matching")):  # fmt: skip
             record("blurred target", name, np.sqrt((_errors_of(good, method) ** 2).mean()), table=BOUND)

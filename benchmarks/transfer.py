@@ -137,7 +137,7 @@ def compare(family: str, rounds: int) -> bool:
                     wrong[program] += not right
     for program, times in taken.items():
         record(family, program, times, "ms")
-        record(f"{family}, pictures unlike the screen", program, wrong[program], of=rounds)
+        record(family, program, wrong[program], of=rounds, table="unlike the screen")
         print(
             f"{family:14} {program:10} {np.median(times):7.1f} ms ({min(times):.1f} to {max(times):.1f}); "
             f"{wrong[program]} of {rounds} unlike the screen",
@@ -154,6 +154,7 @@ def main() -> int:
     if os.geteuid() != 0:
         print("only root may open the portmapper's port 111: nothing to compare")
         return 0
+    right = [compare(family, given.rounds) for family in given.family]
     if shutil.which("lxi") is None:
         print("no lxi: apt-get install lxi-tools")
     else:
@@ -164,7 +165,6 @@ def main() -> int:
             times.append(1e3 * (time.perf_counter() - began))
         record("starting the program alone", "lxi", times, "ms")
         print(f"lxi, its start alone: {np.median(times):.1f} ms")
-    right = [compare(family, given.rounds) for family in given.family]
     return 0 if all(right) else 1
 
 
