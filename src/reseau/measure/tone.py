@@ -34,8 +34,8 @@ _LINEAR = 0.15
 """Deviation of an exponent from 1 that does no harm."""
 _ATTEMPTS = 6
 """Iterations of the exponent."""
-_SETTLED = 0.01
-"""Change of the exponent from which it is not iterated."""
+_SETTLED, _SHRINKS = 0.01, 0.7
+"""Change of the exponent from which it is not iterated; ratio of the last two changes above which it drifts."""
 _LEAST, _MOST = 0.35, 3.5
 """Exponents that cameras have."""
 _LIKE_SRGB = 0.5
@@ -211,19 +211,21 @@ def _estimated(
 
     `first` is the exponent estimated `at` marks matched in grey values as they are.
     """
-    gamma = 1.0
+    gamma, change = 1.0, [np.inf, np.inf]
     for attempt in range(_ATTEMPTS):
         found = first if first and not attempt else estimate_gamma(*at, gamma, full_scale)
         if attempt and abs(found.gamma - gamma) < max(found.sigma, _SETTLED):
             break
-        gamma = float(np.clip(found.gamma, 0.3, 4.0))
+        before, gamma = gamma, float(np.clip(found.gamma, 0.3, 4.0))
+        change = [change[1], abs(gamma - before)]
         again = matched(ToneCurve(gamma))
         if again is None:
             return None
         at = again
     else:
         # The exponent of a camera settles; that of correlated residuals, as of compression, drifts.
-        return None
+        if change[1] > _SHRINKS * change[0]:
+            return None
     usable = _LEAST < gamma < _MOST and abs(gamma - 1) > _LINEAR
     return (gamma, found.sigma, at) if usable else None
 
