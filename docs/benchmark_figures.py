@@ -96,7 +96,7 @@ def beside_others() -> Figure:
     ]
     figure = Figure(figsize=(8.4, 0.34 * len(lines) + 1.1), layout="constrained")
     axes = figure.subplots()
-    axes.set_xlim(0.0012, 1.0)
+    axes.set_xlim(0.0012, 8.0)
     for y, (_, cells, name) in enumerate(lines):
         for column, style in (
             ("reseau", {"marker": "o", "color": ACCENT, "s": 40, "zorder": 3}),
@@ -124,7 +124,8 @@ def beside_others() -> Figure:
 
 def independent() -> Figure:
     """Errors over sigmas of the simulator's images and of independent ones."""
-    rows = rows_of(figures.ORIGIN)
+    known = rows_of(figures.ORIGIN)
+    rows = {row: cells for row, cells in known.items() if any("sigmas" in column for column in cells)}
     figure = Figure(figsize=(8.4, 0.34 * len(rows) + 1.1), layout="constrained")
     axes = figure.subplots()
     axes.axvline(1.0, color=FAINT, lw=1)
