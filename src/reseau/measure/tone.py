@@ -35,7 +35,7 @@ _LINEAR = 0.15
 _ATTEMPTS = 6
 """Iterations of the exponent."""
 _SETTLED, _SHRINKS = 0.01, 0.7
-"""Change of the exponent from which it is not iterated; ratio of the last two changes from which it drifts."""
+"""Change of the exponent from which it is not iterated; ratio of the last two from which it drifts."""
 _LEAST, _MOST = 0.35, 3.5
 """Exponents that cameras have."""
 _LIKE_SRGB = 0.5
