@@ -3,7 +3,8 @@
 from .adjustment import Options, adjust_network, problem_of
 from .board import BoardChoice, BoardModel, choose_board, held_as_designed
 from .calibration import calibration_of, with_estimates
-from .choice import Candidate, Compared, ModelChoice, camera_candidates, choose_model
+from .candidates import Candidate, camera_candidates
+from .choice import Compared, ModelChoice, choose_model
 from .lacking import Lacking, lacking
 from .search import (
     Kind,
