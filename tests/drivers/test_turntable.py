@@ -211,6 +211,37 @@ def test_stop_works_from_any_thread(which: int) -> None:
     assert machine.violations == []
 
 
+def test_in_a_run_nothing_moves_after_a_stop_until_it_is_resumed() -> None:
+    table, machine = tables()[0]
+    with table:
+        table.home("tilt")
+        table.stage()
+        table.stop()
+        for begin in (lambda: table.move("tilt", 10.0), lambda: table.home("tilt")):
+            with pytest.raises(StateError, match="was stopped"):
+                begin()
+        assert table.state("tilt").position == pytest.approx(0.0, abs=1e-3)
+        table.resume()
+        assert table.move("tilt", 10.0).position == pytest.approx(10.0, abs=0.01)
+        table.stop()
+        table.stage()
+        assert table.move("tilt", 12.0).position == pytest.approx(12.0, abs=0.01)
+    assert machine.violations == []
+
+
+def test_by_hand_a_stop_does_not_count_for_the_next_movement() -> None:
+    """Outside of a run: before one, and after its end."""
+    table, machine = tables()[0]
+    with table:
+        table.home("tilt")
+        table.stop()
+        assert table.move("tilt", 10.0).position == pytest.approx(10.0, abs=0.01)
+        table.stage()
+        table.unstage()
+        assert table.move("tilt", 12.0).position == pytest.approx(12.0, abs=0.01)
+    assert machine.violations == []
+
+
 @pytest.mark.parametrize("which", range(5))
 def test_after_a_stop_between_two_queries_the_second_part_of_a_movement_does_not_begin(
     which: int, monkeypatch: pytest.MonkeyPatch

@@ -410,7 +410,7 @@ class CameraDriver(Device[S]):
         InstrumentError
             If the connection is lost or the data are not a valid frame.
         """
-        self._stopping.clear()
+        self._begin("expose")
         with self._exchange("expose", seconds) as deadline:
             return self._next(deadline, stale=False, ready=ready)
 
@@ -429,7 +429,7 @@ class CameraDriver(Device[S]):
         InstrumentError
             As :meth:`expose`.
         """
-        self._stopping.clear()
+        self._begin("frames")
         for _ in range(count):
             with self._exchange("frames", seconds) as deadline:
                 shot = self._next(deadline, stale=True)

@@ -170,7 +170,7 @@ class Rig(Device[RigSettings]):
         InstrumentError
             If a camera fails, or delivers no frame in time; the frames of the others are discarded.
         """
-        self._stopping.clear()
+        self._begin("expose")
         with self._exchange("expose", seconds) as deadline:
             return self._exposed(deadline)
 

@@ -257,7 +257,7 @@ class CompactPulser(Device[CompactPulserSettings]):
         if not isinstance(self._carrier, Turntable):
             raise StateError("has no carrier", where=self.name, command="scan", do="set the option carrier")
         deadline = Deadline(self._seconds * s.lines if seconds is None else seconds)
-        self._stopping.clear()
+        self._begin("scan")
         self._scanning = True
         try:
             lines = [self._line_at(self._carrier, k, deadline) for k in range(s.lines)]
@@ -270,8 +270,7 @@ class CompactPulser(Device[CompactPulserSettings]):
 
     def _line_at(self, carrier: Turntable, number: int, deadline: Deadline) -> Waveform:
         """Return one line of a section, given its index."""
-        if self._stopping.is_set():
-            raise StateError("was stopped", where=self.name, command="scan")
+        self._require_unstopped("scan")
         if deadline.expired:
             what = f"did not finish within {deadline.seconds:g} s"
             raise DeadlineError(what, where=self.name, command="scan")

@@ -175,11 +175,10 @@ class Ping360(Device[Ping360Settings]):
         """
         s = self.settings
         deadline = Deadline(self._answer_s * len(s.angles) if seconds is None else seconds)
-        self._stopping.clear()
+        self._begin("scan")
         lines = []
         for angle in s.angles:
-            if self._stopping.is_set():
-                raise StateError("was stopped", where=self.name, command="scan")
+            self._require_unstopped("scan")
             if deadline.expired:
                 raise DeadlineError(
                     f"did not finish within {deadline.seconds:g} s", where=self.name, command="scan"

@@ -371,7 +371,7 @@ class Table(Device[TableSettings]):
             If the search does not finish in time; the axis is then stopped.
         """
         command, plan = f"home {axis}", self._plan(axis)
-        self._stopping.clear()
+        self._begin(command)
         deadline = Deadline(self.MOVE_S if seconds is None else seconds)
         with self._exchange(command, deadline.left) as time:
             self._require_unstopped(command)
@@ -408,7 +408,7 @@ class Table(Device[TableSettings]):
         """
         command, plan = f"move {axis} to {position:g} {self._plan(axis).unit}", self._plan(axis)
         plan.require_reachable(f"{axis} of {self.name}", position)
-        self._stopping.clear()
+        self._begin(command)
         deadline = Deadline(self.MOVE_S if seconds is None else seconds)
         state = self.state(axis, deadline.at_most(self._seconds))
         if not state.homed:

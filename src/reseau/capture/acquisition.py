@@ -342,11 +342,16 @@ class Acquisition:
                 self._silent |= {name}
                 self.watch("without", {"instrument": name, "why": str(error)})
 
-    def rest(self) -> None:
-        """Stop all motion and transmission. Never raises, never moves an axis."""
+    def rest(self, *, over: bool = False) -> None:
+        """Stop all motion and transmission. Never raises, never moves an axis.
+
+        Nothing moves then until the bench is made ready again; if the run is `over`, instruments can be used
+        by hand.
+        """
         self._at_rest = True
+        bench = self.bench.without(self._silent)
         try:
-            self.bench.without(self._silent).stop()
+            (bench.unstage if over else bench.stop)()
         except InstrumentError as error:
             self.watch("rest", {"failed": str(error)})
 
@@ -358,7 +363,7 @@ class Acquisition:
         except ReseauError as error:
             self.watch("rest", {"failed": str(error)})
         finally:
-            self.rest()
+            self.rest(over=True)
 
     def settle(self) -> None:
         """Wait until an interrupted message has finished; its picture is stored and checked."""

@@ -407,11 +407,17 @@ class Bench:
         BenchError
             If an instrument could not be stopped; names all such instruments.
         """
-        failures = [
-            each for each in self._all(lambda instrument: instrument.stop()).values() if each is not None
-        ]
-        if failures:
-            raise BenchError(failures)
+        self._all_or_raise(lambda instrument: instrument.stop())
+
+    def unstage(self) -> None:
+        """Stop all instruments after a run: they can be used by hand again.
+
+        Raises
+        ------
+        BenchError
+            As :meth:`stop`.
+        """
+        self._all_or_raise(lambda instrument: instrument.unstage())
 
     def close(self) -> None:
         """Close all connections; never raises."""
@@ -448,6 +454,11 @@ class Bench:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _all_or_raise(self, work: Callable[[Instrument], object]) -> None:
+        failures = [each for each in self._all(work).values() if isinstance(each, ReseauError)]
+        if failures:
+            raise BenchError(failures)
 
     def _all(self, work: Callable[[Instrument], T]) -> dict[str, T | ReseauError]:
         """The outcome of the same work on every instrument, each in its own thread."""

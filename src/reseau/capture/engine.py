@@ -120,7 +120,7 @@ def carry_out(
             raise known from None
         raise
     finally:
-        run.rest()
+        run.rest(over=True)
         run.settle()
         if retreat and status != "done":
             run.retreat(retreat)

@@ -79,7 +79,7 @@ class Device(ABC, Generic[S]):
         self._settings: S = settings.changed({}, self._limits)
         self._seconds = seconds
         self._lock, self._stopping = threading.RLock(), threading.Event()
-        self._connected = False
+        self._connected = self._staged = False
         self._reading: dict[str, Any] = {}
         self._read_once = False
         self.images = ImageStore(name)
@@ -178,7 +178,7 @@ class Device(ABC, Generic[S]):
         self.reconnections += 1
 
     def _drop(self) -> None:
-        self._connected = False
+        self._connected = self._staged = False
         with suppress(Exception):
             self._disconnect()
 
@@ -204,6 +204,7 @@ class Device(ABC, Generic[S]):
     def close(self) -> None:
         """Close the connection; never raises."""
         self._stopping.set()
+        self._staged = False
         # A call in progress sees the flag; if it hangs, its connection is closed anyway.
         got = self._lock.acquire(timeout=_GRACE_S)
         try:
@@ -221,6 +222,9 @@ class Device(ABC, Generic[S]):
 
     def stop(self, *, success: bool = False) -> None:
         """Stop the instrument, from any thread; a call in progress is interrupted after one second.
+
+        Between :meth:`stage` and :meth:`unstage` nothing moves or is taken until one of :meth:`stage` and
+        :meth:`resume` allows it again; by hand, the next call begins anew.
 
         Raises
         ------
@@ -268,6 +272,7 @@ class Device(ABC, Generic[S]):
 
     def stage(self) -> list[Any]:
         """Connect for a run."""
+        self._staged = True
         self._stopping.clear()
         self.images.restart()
         self.connect()
@@ -275,8 +280,11 @@ class Device(ABC, Generic[S]):
 
     def unstage(self) -> list[Any]:
         """Stop the instrument after a run; the connection stays open."""
-        self.stop()
-        self._stopping.clear()
+        try:
+            self.stop()
+        finally:
+            self._staged = False
+            self._stopping.clear()
         return [self]
 
     def pause(self) -> None:
@@ -367,6 +375,13 @@ class Device(ABC, Generic[S]):
                     "limits": {"control": {"low": low, "high": high}},
                 }
         return found
+
+    def _begin(self, command: str) -> None:
+        """Begin what a stop interrupts; raise if the run in which it is asked for was stopped."""
+        if self._staged:
+            self._require_unstopped(command)
+        else:
+            self._stopping.clear()
 
     def _require_unstopped(self, command: str) -> None:
         """Raise if a stop was asked for since the call began; asked before a motion, the connection held.

@@ -539,7 +539,7 @@ class Worker:
 
         from ..report.overlay import preview
 
-        number, shown = 0, ""
+        number, shown, stops = 0, "", self._stops
         while not self.over.wait(_STEADY_S):
             if (
                 time.monotonic() - self._looked > _LIVE_S
@@ -556,7 +556,11 @@ class Worker:
                         continue
                     frame, shown = kept.picture(found[-1]), step
                 else:
-                    frame = self._bench.one(Camera).expose().frame
+                    camera = self._bench.one(Camera)
+                    if stops != self._stops:
+                        stops = self._stops
+                        camera.stage()  # a stop does not end the live picture: nothing moves
+                    frame = camera.expose().frame
                 edge = edge_sigma(frame)
                 number += 1
                 facts = {
