@@ -257,9 +257,7 @@ def main() -> None:
     parser.add_argument("data", nargs="?", type=Path, default=default)
     parser.add_argument("--laid", action="store_true", help="designs of few wires only")
     parser.add_argument("--overlay", type=Path, help="folder for one picture of each sequence")
-    parser.add_argument(
-        "--others", type=int, default=0, help="further frames by which what stands still is told"
-    )
+    parser.add_argument("--others", type=int, default=0, help="further frames that show what stands still")
     add_options(parser)
     arguments = parser.parse_args()
     with executor_of(arguments) as executor:

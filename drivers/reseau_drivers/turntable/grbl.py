@@ -146,7 +146,7 @@ class Grbl:
             boot = deadline.part(_BOOT_S)
             until(lambda: self._synchronise(boot), lambda: boot.expired)
             self._synchronised = True
-        # Its settings are told at rest only; while it moves it has its reference.
+        # It reports its settings at rest only; while it moves it has its reference.
         if not self._suitable and self._report(deadline).state in ("Idle", "Alarm"):
             said = self._exchange("$$", deadline)
             settings = dict(text.split("=", 1) for text in said if text.startswith("$") and "=" in text)

@@ -211,7 +211,7 @@ class Axis:
         return Status(lambda: self._table.move(self._key, value), self.name)
 
     def locate(self) -> dict[str, float]:
-        """Return where the axis was last told to move, and where it is; before a move both are the same."""
+        """Return the last target of the axis, and where it is; before a move both are the same."""
         position = self.position
         return {"setpoint": position if math.isnan(self._setpoint) else self._setpoint, "readback": position}
 

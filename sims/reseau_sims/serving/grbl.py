@@ -1,7 +1,7 @@
 """Simulated GRBL controller.
 
 Source: see :mod:`reseau_drivers.codecs.gcode`. Movements are queued and carried out one after the other, with
-constant speed; the end of homing and alarms are told unasked.
+constant speed; the end of homing and alarms are reported unasked.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class GrblController(Machine):
 
     @property
     def due(self) -> float | None:
-        """When it tells something unasked: an alarm, or the end of homing."""
+        """When it reports something unasked: an alarm, or the end of homing."""
         if self._unasked:
             return self._clock()
         ends = [motor.arrival for motor in self._motors] if self._homing else []
@@ -128,8 +128,8 @@ class GrblController(Machine):
     def emit(self) -> Sequence[bytes]:
         """Return what is due."""
         self._advance()
-        told, self._unasked = self._unasked, []
-        return told
+        reports, self._unasked = self._unasked, []
+        return reports
 
     def disconnected(self) -> None:
         """Discard an incomplete line."""
@@ -207,9 +207,9 @@ class GrblController(Machine):
         self._waiting.clear()
         if self._state == "Door":
             self._state = "Idle"
-        told, self._unasked = b"".join(self._unasked), []
+        reports, self._unasked = b"".join(self._unasked), []
         self._line.clear()
-        return told + _BANNER + (_LOCKED if self._state == "Alarm" else b"")
+        return reports + _BANNER + (_LOCKED if self._state == "Alarm" else b"")
 
     def _alarm(self, code: int) -> None:
         self._queue.clear()

@@ -112,19 +112,19 @@ class KinesisController(Machine):
 
     @property
     def due(self) -> float | None:
-        """When the next movement ends: that is told unasked."""
+        """When the next movement ends: it is reported unasked."""
         ends = [channel.motor.arrival for channel in self._channels.values() if channel.ends is not None]
         now = self._clock()
         return min((now if end is None else end for end in ends), default=None)
 
     def emit(self) -> Sequence[bytes]:
         """Return the messages on movements that have ended."""
-        told = []
+        reports = []
         for address, channel in self._channels.items():
             if channel.ends is not None and not channel.motor.moving:
-                told.append(encode(self._end(address, channel, channel.ends)))
+                reports.append(encode(self._end(address, channel, channel.ends)))
                 channel.ends = None
-        return told
+        return reports
 
     def disconnected(self) -> None:
         """Discard an incomplete message."""

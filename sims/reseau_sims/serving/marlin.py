@@ -108,7 +108,7 @@ class MarlinController(Machine):
 
     @property
     def due(self) -> float | None:
-        """When it says something unasked."""
+        """When it reports something unasked."""
         if self._unasked:
             return self._clock()
         if not self._homing:
@@ -119,8 +119,8 @@ class MarlinController(Machine):
     def emit(self) -> Sequence[bytes]:
         """Return what is due."""
         self._advance()
-        told, self._unasked = self._unasked, []
-        return told
+        reports, self._unasked = self._unasked, []
+        return reports
 
     def disconnected(self) -> None:
         """Discard an incomplete line."""

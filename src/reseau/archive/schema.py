@@ -253,7 +253,7 @@ def _sqlite(path: Path, read_only: bool) -> Engine:
         if not read_only:
             raw.execute("PRAGMA journal_mode=WAL")
             raw.execute("PRAGMA synchronous=FULL")
-        # Each connection has a cache of its own, of 2 MB unless told: a service would grow with its archive
+        # Each connection has a cache of its own, of 2 MB by default: a service would grow with its archive
         # up to that for each. The system has these pages, too.
         raw.execute(f"PRAGMA cache_size=-{_CACHE_KB}")
         raw.execute("PRAGMA foreign_keys=ON")

@@ -102,7 +102,7 @@ def carry_out(
         run.ready()
         with one_thread():  # the same sums for any number of processors
             with contextlib.redirect_stdout(_Prints()), _ended_by_signals(engine, ended, in_main):
-                outcome = _engaged(engine, _whole(run, ended.heeded(plan), park or {}), paused, ended)
+                outcome = _engaged(engine, _whole(run, ended.interruptible(plan), park or {}), paused, ended)
             run.settle()
             status = "stopped" if outcome is None else "done"
             if outcome is not None:
@@ -330,7 +330,7 @@ class _Asked:
             self._interrupted.clear()
             self._inserted = False
 
-    def heeded(self, plan: Plan) -> Plan:
+    def interruptible(self, plan: Plan) -> Plan:
         """The plan, which pauses before its next message where the engine has lost the request to pause.
 
         On a busy machine a pause that is requested while the engine waits for an instrument can be lost.

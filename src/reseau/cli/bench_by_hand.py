@@ -162,7 +162,7 @@ def _number(text: str) -> tuple[str, float]:
 def stop(bench: BenchPath = _BENCH) -> None:
     """Stop all motion, transmission and recording, also those of a session of another process.
 
-    Such a session is told to stop: it can be resumed. This is no emergency stop: it needs this computer, the
+    Such a session is asked to stop: it can be resumed. This is no emergency stop: it needs this computer, the
     connection and the controller.
     """
     from ..capture import Bench

@@ -283,7 +283,7 @@ def _found_target(
                 try:
                     yield read_frame(path, channel.value, sensor)
                 except ImageError:
-                    continue  # is told with its name when all are measured
+                    continue  # is reported with its name when all are measured
 
     name, design = required(which_target(frames(), designs_beside([*folders, Path()])), "--design auto")
     typer.echo(f"note: the target is {name}", err=True)

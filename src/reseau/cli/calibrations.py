@@ -272,7 +272,7 @@ def drift(
 ) -> None:
     """Chart all parameters and the field since the last service event; exit status 1 if one has drifted.
 
-    With covariates, drift that they explain is told from drift.
+    With covariates, drift that they explain is distinguished from other drift.
     """
     from ..core.provenance import canonical_json
     from ..service import ChartOptions, CovariateTable

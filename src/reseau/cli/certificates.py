@@ -325,16 +325,16 @@ def _document(
         "missing": missing,
     }  # fmt: skip
     if simulated is not None:
-        told = validate(budget, simulated)
+        checked = validate(budget, simulated)
         found["monte_carlo"] = {
             "draws": simulated.draws, "lost": simulated.lost, "stable": simulated.stable,
             "mean": simulated.mean.tolist(),
             "sigma": simulated.sigma.tolist(), "low": simulated.low.tolist(), "high": simulated.high.tolist(),
             "covariance": simulated.covariance.tolist(), "joint_factor": simulated.joint_factor,
-            "difference": {"low": told.low.tolist(), "high": told.high.tolist(),
-                           "error": told.error.tolist(), "tolerance": told.tolerance.tolist(),
-                           "joint_factor": told.joint_factor},
-            "verdict": list(told.verdicts),
+            "difference": {"low": checked.low.tolist(), "high": checked.high.tolist(),
+                           "error": checked.error.tolist(), "tolerance": checked.tolerance.tolist(),
+                           "joint_factor": checked.joint_factor},
+            "verdict": list(checked.verdicts),
         }  # fmt: skip
     return found
 
@@ -358,11 +358,11 @@ def _say_budget(budget: UncertaintyBudget, probability: float, simulated: Simula
     joint = budget.joint_factor(probability)
     say(f"all together: ellipsoid of the covariance with the factor {joint:.3f}\n")
     if simulated is not None:
-        told = validate(budget, simulated)
+        checked = validate(budget, simulated)
         stable = {None: "", True: ", stable", False: ", not stable yet"}[simulated.stable]
         say(f"Monte Carlo, {simulated.draws} draws{stable}: ends of the intervals minus those above\n")
         for name, low, high, error, verdict in zip(
-            budget.names, told.low, told.high, told.error, told.verdicts, strict=True
+            budget.names, checked.low, checked.high, checked.error, checked.verdicts, strict=True
         ):
             say(f"{name:<8} {low:+.1e}, {high:+.1e} (± {error:.0e}): {verdict}\n")
-        say(f"factor of the ellipsoid: {told.joint_factor:+.3f}\n")
+        say(f"factor of the ellipsoid: {checked.joint_factor:+.3f}\n")

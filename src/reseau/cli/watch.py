@@ -109,7 +109,7 @@ def watch(
                 page.show(frame, seen, count)
         except KeyboardInterrupt:
             pass
-        except (InstrumentError, InputError) as error:  # what was taken is told before it
+        except (InstrumentError, InputError) as error:  # what was taken is reported before it
             failed = error
     for line in watching.verdict:
         say(f"{line}\n")

@@ -33,7 +33,7 @@ class _Series:
         self.key, self.uid = key, str(uuid.uuid4())
         self.folder = folder / self.uid
         self.shape, self.dtype = pixels.shape, pixels.dtype
-        self.count, self.told = 0, 0
+        self.count, self.reported = 0, 0
         self.announced = False
         self.folder.mkdir(parents=True)
 
@@ -119,7 +119,7 @@ class ImageStore:
         }  # fmt: skip
 
     def stream_documents(self, index: int | None = None) -> Iterator[Document]:
-        """Yield what has not been told of the images before `index`; by default of all."""
+        """Yield what has not been reported of the images before `index`; by default of all."""
         for series in self._series.values():
             if not series.announced:
                 series.announced = True
@@ -132,22 +132,23 @@ class ImageStore:
                     },
                 )  # fmt: skip
             end = series.count if index is None else min(index, series.count)
-            if end > series.told:
+            if end > series.reported:
                 yield (
                     "stream_datum",
                     {
-                        "uid": f"{series.uid}/{series.told}", "stream_resource": series.uid, "descriptor": "",
-                        "indices": {"start": series.told, "stop": end}, "seq_nums": {"start": 0, "stop": 0},
+                        "uid": f"{series.uid}/{series.reported}", "stream_resource": series.uid,
+                        "descriptor": "", "indices": {"start": series.reported, "stop": end},
+                        "seq_nums": {"start": 0, "stop": 0},
                     },
                 )  # fmt: skip
-                series.told = end
+                series.reported = end
 
     def datum_id(self, key: str, number: int) -> str:
         """Return the name by which an event refers to an image of the present series."""
         return f"{self._series[key].uid}/{number}"
 
     def datum_documents(self) -> Iterator[Document]:
-        """Yield `resource` and `datum` of the images of which nothing has been told."""
+        """Yield `resource` and `datum` of the images of which nothing has been reported."""
         for series in self._series.values():
             if not series.announced:
                 series.announced = True
@@ -161,7 +162,7 @@ class ImageStore:
                         "path_semantics": os.name.replace("nt", "windows"),
                     },
                 )  # fmt: skip
-            for number in range(series.told, series.count):
+            for number in range(series.reported, series.count):
                 yield (
                     "datum",
                     {
@@ -169,4 +170,4 @@ class ImageStore:
                         "datum_kwargs": {"point_number": number},
                     },
                 )  # fmt: skip
-            series.told = series.count
+            series.reported = series.count

@@ -26,22 +26,22 @@ class Monitor:
 
     Notes
     -----
-    A reading that fails is left out: a monitor must not end a run. The first reading is told at once.
+    A reading that fails is left out: a monitor must not end a run. The first reading is reported at once.
 
     Examples
     --------
     >>> values, seen = iter([1.0, 1.0, 2.0] + [2.0] * 99), threading.Event()
-    >>> told = []
+    >>> seen = []
     >>> def note(reading):
-    ...     told.append(reading["x"]["value"])
-    ...     if len(told) == 2:
+    ...     seen.append(reading["x"]["value"])
+    ...     if len(seen) == 2:
     ...         seen.set()
     >>> monitor = Monitor(lambda: {"x": {"value": next(values), "timestamp": 0.0}}, every_s=0.001)
     >>> monitor.subscribe(note)
     >>> seen.wait(10.0)
     True
     >>> monitor.clear(note)
-    >>> told
+    >>> seen
     [1.0, 2.0]
     """
 

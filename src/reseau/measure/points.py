@@ -59,7 +59,7 @@ class Reason(str):
 
 
 _FAR_ABOVE = 5.0
-"""Ratio of deviations from predictions to their standard deviations from which the user is told."""
+"""Ratio of deviations from predictions to their standard deviations from which there is a warning."""
 
 
 def deviating(deviation: Array, cov: Array) -> tuple[Remark, ...]:

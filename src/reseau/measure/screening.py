@@ -26,9 +26,9 @@ _BLOCK = 6
 _SPIKE = 6.0
 """A pixel is a bit error if it leaves the range of its neighbours by more than this many noise sigmas."""
 
-_LOW, _ROUNDED, _TOLD = 4, 1.5, 8
+_LOW, _ROUNDED, _ENOUGH = 4, 1.5, 8
 """Frequencies of the cosine transform along an axis that images of marks have; coefficients that rounding of
-grey values does not make; fewest of one frequency that tell its step."""
+grey values does not make; fewest of one frequency that show its step."""
 _SIDE, _STEEP, _STEPS = 8, 8.0, 1.15
 """Side of the blocks of JPEG; grey levels above which a step is one of the scene; least ratio of the steps
 between blocks to those elsewhere (along both axes at most 1.09 without compression in frames of reseaux, 1.1
@@ -230,7 +230,7 @@ def lost_in_blocks(pixels: NDArray[Any]) -> float | None:
     coefficients = np.abs(dctn(blocks, axes=(1, 3), norm="ortho")).transpose(1, 3, 0, 2)
     found = []
     for u, v in list(product(range(_LOW), repeat=2))[1:]:
-        told = coefficients[u, v][coefficients[u, v] > _ROUNDED]
-        if len(told) >= _TOLD:
-            found.append(np.quantile(told, 0.1))
+        distinct = coefficients[u, v][coefficients[u, v] > _ROUNDED]
+        if len(distinct) >= _ENOUGH:
+            found.append(np.quantile(distinct, 0.1))
     return float(np.median(found) / np.sqrt(12)) if found else 0.0

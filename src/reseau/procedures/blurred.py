@@ -67,7 +67,7 @@ _SETTLED_PX = 0.3
 _FEWEST = 6
 """Points for an orientation: twice what its six unknowns need."""
 _MISFIT, _LEAST_MISFIT_PX = 3.0, 0.05
-"""Residuals of the orientation over sigmas, and in pixels, from which the user is told."""
+"""Residuals of the orientation over sigmas, and in pixels, from which there is a warning."""
 _FLAT = 0.01
 """Largest difference between a design and its points in a network, in extents of the design."""
 

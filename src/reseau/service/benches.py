@@ -30,7 +30,7 @@ _BUSY = ("running", "pausing", "paused", "asking", "ending")
 _MOST_WAITING = 4
 """Commands of a bench that wait for one another; further ones are refused."""
 
-Told = Callable[[str, dict[str, Any]], None]
+OnEvent = Callable[[str, dict[str, Any]], None]
 
 
 class BenchLink:
@@ -44,7 +44,7 @@ class BenchLink:
         Archive; `objects` its files, if it is a database.
     state : StateFolder
         Has the certificates.
-    told : callable
+    on_event : callable
         Called with each event of the worker: kind, and facts.
     elsewhere : (str, int), optional
         Address and port of a worker on another machine, which is neither started nor ended.
@@ -61,11 +61,12 @@ class BenchLink:
         archive: str,
         objects: str | None,
         state: StateFolder,
-        told: Told,
+        on_event: OnEvent,
         elsewhere: tuple[str, int] | None = None,
     ) -> None:
         self._elsewhere, self._wrong = elsewhere, ""
-        self.path, self._archive, self._objects, self._state, self._told = path, archive, objects, state, told
+        self.path, self._archive, self._objects = path, archive, objects
+        self._state, self._on_event = state, on_event
         self.text = read_text(path)
         self.name = BenchFile.parse_toml(self.text, where=path).name
         self._certificates = Certificates(state)
@@ -178,7 +179,7 @@ class BenchLink:
             # What an earlier worker said last is not true of this one, which has not said anything yet.
             self._status = {}
             self._wire, self._met = wire, True
-            self._told("up", {})
+            self._on_event("up", {})
             try:
                 threading.Thread(target=self._greet, daemon=True).start()
                 while True:
@@ -193,7 +194,7 @@ class BenchLink:
                     if not each.done():
                         each.set_exception(ConnectionLost("its worker ended", where=f"bench {self.name}"))
                 if not self._over.is_set():
-                    self._told("down", {})
+                    self._on_event("down", {})
                 # One that ends again and again, such as by a driver that crashes, is not started at once.
                 if time.monotonic() - begun > _LONGEST_PAUSE_S:
                     pause = _PAUSE_S
@@ -203,12 +204,12 @@ class BenchLink:
     def _greet(self) -> None:
         with contextlib.suppress(ReseauError):
             self._status = self.request("status")
-            self._told("status", {})
+            self._on_event("status", {})
 
     def _received(self, header: dict[str, Any], body: bytes) -> None:
         if "event" in header:
             self._status = header.get("status", self._status)
-            self._told(str(header["event"]), header.get("facts", {}))
+            self._on_event(str(header["event"]), header.get("facts", {}))
             return
         with self._lock:
             answer = self._waiting.get(header.get("id", 0))

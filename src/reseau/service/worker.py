@@ -163,7 +163,7 @@ class Worker:
             raise StateError(self._error or "is not connected", where=self.name)
         return self._bench
 
-    # What is told.
+    # What is reported.
 
     def _wrong(self) -> str:
         """What is wrong with the bench: why it is not held, or which instruments are silent."""
@@ -275,7 +275,7 @@ class Worker:
 
     def _follow(self, arrived: threading.Event) -> None:
         """Tell where the axes are while they move."""
-        with contextlib.suppress(Exception):  # whoever moves them is told what is wrong
+        with contextlib.suppress(Exception):  # whoever moves them gets the error
             while not arrived.wait(_FOLLOW_S):
                 self._axes()
                 self._say("axes")
@@ -699,13 +699,13 @@ def run(
         If bench, archive, certificates or address cannot be used.
     """
     share_freed_memory()
-    told = None if address is not None else StateFolder(folder)
-    certificates = Certificates.in_folder(folder) if told is None else Certificates(told)
+    state = None if address is not None else StateFolder(folder)
+    certificates = Certificates.in_folder(folder) if state is None else Certificates(state)
     text = read_text(bench)
     with contextlib.ExitStack() as stack:
-        if told is not None:
+        if state is not None:
             # A service that was killed may have started one that has not said so yet: that one stays.
-            where = address_file(told, BenchFile.parse_toml(text, where=bench).name)
+            where = address_file(state, BenchFile.parse_toml(text, where=bench).name)
             stack.enter_context(BenchLock([str(where)], f"worker of {bench}"))
         archive = stack.enter_context(Archive.open(place, objects or None, create=True))
         worker = Worker(text, archive, certificates)
@@ -718,10 +718,10 @@ def run(
 
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, end)
-        if told is None:
+        if state is None:
             worker.serve(address or ("127.0.0.1", 0))
         else:
-            worker.serve(place=address_file(told, worker.name))
+            worker.serve(place=address_file(state, worker.name))
 
 
 def _main() -> None:

@@ -107,11 +107,11 @@ def _camera(camera: Camera) -> list[Remark]:
             views = {}
     else:
         pitch, views = 0.0, {name: half / values[name] for name in scale}
-    told, with_size = set[float](), model.needs_pitch and not camera.in_pixels
+    reported, with_size = set[float](), model.needs_pitch and not camera.in_pixels
     for name, view in views.items():
-        if _within(view, (_NARROWEST, _WIDEST)) or values[name] in told:
+        if _within(view, (_NARROWEST, _WIDEST)) or values[name] in reported:
             continue
-        told.add(values[name])
+        reported.add(values[name])
         unit = camera.unit_of(name)
         size = f"{values[name]:g} {unit}"
         across = f"{2 * half * pitch:.3g} mm" if with_size else f"{2 * half:.0f} px"

@@ -65,7 +65,7 @@ def in_images(network: Network, rows: Rows, said: Callable[[int], str] = lambda 
 def _gaps(result: Result) -> list[Remark]:
     """Return remarks on points, images and cameras that were left out, with the reasons.
 
-    Images whose points data snooping rejected are told where that was decided.
+    Images whose points data snooping rejected are reported where that is decided.
     """
     network, fit = result.network, result.fit
     found = []
@@ -253,7 +253,7 @@ def _correlations(result: Result) -> list[Remark]:
             pairs = listed(f"{names[k]} and {names[i]} (correlation {r[i, k]:.3f})" for i, k in at)
             found.append(
                 Remark(
-                    f"{camera.label}: {pairs} can hardly be told apart; use them together",
+                    f"{camera.label}: {pairs} can hardly be distinguished; use them together",
                     Code.CORRELATED,
                 )
             )
@@ -266,7 +266,7 @@ def _correlations(result: Result) -> list[Remark]:
         names_of = listed(result.network.images[i] for i in images)
         found.append(
             Remark(
-                f"{_plural('image', images)} {names_of}: position and rotation can hardly be told apart "
+                f"{_plural('image', images)} {names_of}: position and rotation can hardly be distinguished "
                 f"(correlation above {_CORRELATED}); use them together",
                 Code.CORRELATED,
             )

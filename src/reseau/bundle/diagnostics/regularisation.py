@@ -111,8 +111,8 @@ def regularised(result: Result, c: int) -> Regularised | None:
     -----
     With the cofactors Q of the parameters and the sigmas S of their observations, the noise of all other
     observations contributes Q − Q S⁻² Q (see :class:`~reseau.bundle.PriorInfluence`). The share of the
-    rest in the variance of the projection is told at each place. Rotations of the camera,
-    which the poses compensate, are removed at the places with image points.
+    rest in the variance of the projection is reported at each place. Rotations of the camera, which the poses
+    compensate, are removed at the places with image points.
 
     Examples
     --------

@@ -54,7 +54,7 @@ _ALIKE = 0.8
 _DISTURBED = 2.5
 """Largest ratio of the residuals of a target to those of the others."""
 _MISFIT = 1.5
-"""Ratio of the residuals of all targets to the noise from which the user is told."""
+"""Ratio of the residuals of all targets to the noise from which there is a warning."""
 _FEWEST = 8
 """Targets from which the noise as a function of the grey value is estimated."""
 

@@ -276,7 +276,7 @@ class MarkMeasurement:
         again = self._match(at[suspect], predicted, self._options(), self.size_spread, _TURNED, valid)
         better = again.converged & (again.noise < found.noise[suspect]) & (again.seen > _ENOUGH)
         cleared = found.replaced(suspect[better], again.select(better))
-        # What could not be told apart from the mark itself still pulls it.
+        # What cannot be distinguished from the mark itself still displaces it.
         own = np.sqrt(np.trace(cleared.cov[suspect], axis1=1, axis2=2) / 2)
         # Residual distortion has more large values than a normal distribution.
         largest = float(np.nanmax(np.abs(judged.deviation[at[plain]])))

@@ -521,7 +521,7 @@ class _Measurement:
         """Learn mapping, light and sharpness from matched targets."""
         scene = self.scene
         mapping = refit(scene.mapping, self.at[rows[sure]], first.xy[sure], _UNMODELLED_PX)
-        # In small blurred targets contrast, sharpness and size can hardly be told apart.
+        # In small blurred targets contrast, sharpness and size can hardly be distinguished.
         large = sure & scene.design.large[rows]
         plain = large if large.sum() >= _LEAST_FIRST else sure
         amplitude = first.contrast * (first.level if scene.design.polarity == "dark" else 1.0)

@@ -1,8 +1,8 @@
 """Motion of the camera during the exposure: images of marks averaged along a straight path.
 
 A motion of constant speed over a path m adds the covariance m mᵀ / 12 to the point-spread function. Its part
-that is equal in all directions cannot be told from blur; the rest is estimated from the residuals of matched
-targets: half the second derivatives of their images, weighted with the covariance.
+that is equal in all directions cannot be distinguished from blur; the rest is estimated from the residuals of
+matched targets: half the second derivatives of their images, weighted with the covariance.
 """
 
 from __future__ import annotations

@@ -51,10 +51,10 @@ _WIDTH_PX = 0.2
 _LEAST_VARIANCE = 1e-6
 """Residual variance assumed where an image of a few pixels fits exactly."""
 _ENOUGH_PX = 7
-"""Half the number of pixels on a side of the windows in which targets are told apart; of larger ones, not all
-pixels are used."""
+"""Half the number of pixels on a side of the windows in which targets are distinguished; of larger ones, not
+all pixels are used."""
 _LEAST_STEP_PX = 2.5
-"""Least distance of targets in the image, along either direction, at which they can be told apart."""
+"""Least distance of targets in the image, along either direction, at which they can be distinguished."""
 _LEAST_PIXELS = 7
 """Least number of pixels of a target that is compared with formed images, of five unknowns."""
 _MOST_SQUARES = 4
@@ -223,7 +223,7 @@ class _Clusters:
             return
         self.group, self.frames = _grouped(frames[legible])
         reach = np.ceil(np.abs(self.frames).sum(axis=2).max(axis=0) * self.step / 2).astype(int)
-        # Large targets are told apart by every second pixel, or less.
+        # Large targets are distinguished by every second pixel, or less.
         wide = float(shortest[legible].min()) / _LEAST_STEP_PX
         self.each = max(1, min(round(reach.min() / _ENOUGH_PX), int(wide)))
         reach += -reach % self.each

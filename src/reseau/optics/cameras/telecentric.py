@@ -67,7 +67,7 @@ register_camera(
         "telecentric",
         (
             Parameter("m", "", "scale", usual=True, required=True),
-            # Without distortion they cannot be told from a shift of the camera.
+            # Without distortion they cannot be distinguished from a shift of the camera.
             *(replace(p, usual=p.name == "K1") for p in PARAMETERS[1:]),
         ),
         _build,

@@ -146,8 +146,8 @@ def _short(message: str) -> str:
 def _rules(xml: bytes, rules: Path) -> Verdict:
     fired = check_rules(xml, rules)
     warnings = sum(each.role == "warning" for each in fired)
-    told = f"no error by {rules.name}" + (f", {warnings} warnings" if warnings else "")
-    return _joined("rules", [each.text for each in fired if each.role == "error"], told)
+    passed = f"no error by {rules.name}" + (f", {warnings} warnings" if warnings else "")
+    return _joined("rules", [each.text for each in fired if each.role == "error"], passed)
 
 
 def _signatures(xml: bytes, root: Any, trusted: Sequence[Path]) -> Verdict:

@@ -65,7 +65,7 @@ class Jobs:
     objects : str, optional
         Its files, if it is a database.
     events : Events
-        Told of each change.
+        Called with each change.
     """
 
     def __init__(self, place: str, objects: str | None, events: Events) -> None:

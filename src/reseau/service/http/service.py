@@ -109,7 +109,7 @@ class Service:
 
             link = BenchLink(
                 path.absolute(), str(self._place(options.archive)), options.objects, self.state,
-                self._told_by(path), options.workers.get(path),
+                self._on_event_of(path), options.workers.get(path),
             )  # fmt: skip
             if link.name in self.benches:
                 raise UsageError("is the name of several benches", where=link.name, do="rename one")
@@ -223,8 +223,8 @@ class Service:
     def _place(archive: str) -> str | Path:
         return archive if "://" in archive else Path(archive).absolute()
 
-    def _told_by(self, path: Path) -> Callable[[str, dict[str, Any]], None]:
-        def told(kind: str, facts: dict[str, Any]) -> None:
+    def _on_event_of(self, path: Path) -> Callable[[str, dict[str, Any]], None]:
+        def on_event(kind: str, facts: dict[str, Any]) -> None:
             name = self._names.get(path, str(path))
             self.events.publish("bench", name, {"what": kind, **facts})
             self.meters.events.labels("bench").inc()
@@ -235,7 +235,7 @@ class Service:
                 session = self.benches[name].status["session"] or {}
                 log(f"bench {kind}", **facts | {"bench": name, "session": session.get("name", "")})
 
-        return told
+        return on_event
 
     def record_later(self, who: Principal, action: str, about: str) -> None:
         """Record what must not wait for its record."""
