@@ -1,23 +1,20 @@
 """Simulated GRBL controller.
 
-Source: see :mod:`reseau_drivers.codecs.gcode`. Movements are queued and carried out one after the other, with
-constant speed; the end of homing and alarms are reported unasked.
+Source: see :mod:`reseau_drivers.codecs.gcode`. The end of homing and alarms are reported unasked.
 """
 
 from __future__ import annotations
 
-import math
 import re
 import time
-from collections import deque
 from collections.abc import Sequence
 
 from reseau.core.errors import ProtocolError
 from reseau_drivers.codecs.gcode import AXES, decode_numbered, words_of
 
 from .faults import Kind
-from .machine import Machine
-from .motion import Clock, Motor
+from .gcode import GcodeController
+from .motion import Clock
 
 __all__ = ["GrblController"]
 
@@ -30,7 +27,7 @@ _RAPID = 80.0
 """Speed of G0 (mm/s)."""
 
 
-class GrblController(Machine):
+class GrblController(GcodeController):
     r"""Simulated controller; positions in millimetres, of any number of axes.
 
     Parameters
@@ -65,10 +62,8 @@ class GrblController(Machine):
         settings: dict[str, str] | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
-        super().__init__()
-        self._clock, self._largest, self._limits = clock, speed, (low, high)
-        # Switches are beyond the soft limits; the reference is at zero.
-        self._motors = [Motor(low - 50.0, high + 50.0, speed, clock, at=12.34) for _ in range(axes)]
+        # The reference is at zero.
+        super().__init__(axes, low, high, speed, 12.34, clock)
         self.settings = {"$10": "1", "$13": "0", "$20": "1", "$21": "1", "$22": "1"} | (settings or {})
         self._line = bytearray()
         self._power_on()
@@ -77,21 +72,8 @@ class GrblController(Machine):
         self._state = "Alarm" if self.settings["$22"] == "1" else "Idle"
         self._homing = self._held = False
         self._relative, self._feed = False, 0.0
-        self._queue: deque[tuple[list[float], float]] = deque()
-        self._waiting: list[bytes] = []
-        self._unasked: list[bytes] = []
+        self._forget()
         self._line.clear()
-
-    @property
-    def motors(self) -> dict[int, Motor]:
-        """Motors by the number of the axis, from 1."""
-        return dict(enumerate(self._motors, 1))
-
-    def position(self, axis: int = 1) -> float:
-        """Return the current position of an axis (mm), independent of queries."""
-        with self.lock:
-            self._advance()
-            return self._motors[axis - 1].position
 
     def receive(self, data: bytes) -> Sequence[bytes]:
         """Return the answers to these bytes."""
@@ -125,12 +107,6 @@ class GrblController(Machine):
         ends = [motor.arrival for motor in self._motors] if self._homing else []
         return max((end for end in ends if end is not None), default=self._clock() if self._homing else None)
 
-    def emit(self) -> Sequence[bytes]:
-        """Return what is due."""
-        self._advance()
-        reports, self._unasked = self._unasked, []
-        return reports
-
     def disconnected(self) -> None:
         """Discard an incomplete line."""
         self._line.clear()
@@ -146,34 +122,19 @@ class GrblController(Machine):
         elif kind == "out of range":
             self._alarm(1)
         elif kind == "power-cycled":
-            for motor in self._motors:
-                motor.cut_power()
+            self._cut_power()
             self._power_on()
             self._unasked = [_BANNER, _LOCKED]
 
     def _advance(self) -> None:
-        """Begin what is queued, and end what has ended."""
         if self._homing and not any(motor.moving for motor in self._motors):
             self._homing, self._state = False, "Idle"
-            self._unasked.append(b"ok\r\n")
-            waiting, self._waiting = self._waiting, []
-            for line in waiting:
-                self._unasked += self._take(line)
-        while self._queue and not self._held and not any(motor.moving for motor in self._motors):
-            targets, speed = self._queue.popleft()
-            ways = [abs(t - motor.position) for t, motor in zip(targets, self._motors, strict=True)]
-            seconds = math.hypot(*ways) / speed
-            for motor, target, way in zip(self._motors, targets, ways, strict=True):
-                if way:
-                    motor.speed = way / seconds
-                    motor.go(target)
+            self._report_homed(b"ok\r\n")
+        if not self._held:
+            self._begin_queued()
 
     def _moves(self) -> bool:
         return bool(self._queue) or any(motor.moving for motor in self._motors)
-
-    def _stand(self) -> None:
-        for motor in self._motors:
-            motor.stop()
 
     def _hold(self) -> None:
         if self._homing:
@@ -220,7 +181,6 @@ class GrblController(Machine):
         self._unasked.append(b"ALARM:%d\r\n" % code)
 
     def _take(self, line: bytes) -> list[bytes]:
-        """Carry out a line; while it homes, lines wait."""
         if self._homing:
             self._waiting.append(line)
             return []

@@ -1,7 +1,7 @@
 """Simulated Marlin controller.
 
 Source: see :mod:`reseau_drivers.codecs.gcode`. Homing blocks: lines that come meanwhile wait, and it says
-that it is busy. Movements run one after the other, with constant speed.
+that it is busy.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections import deque
 from collections.abc import Sequence
 
 from reseau.core.errors import ProtocolError
@@ -17,8 +16,8 @@ from reseau_drivers.codecs.gcode import AXES, decode_numbered, words_of
 from reseau_drivers.codecs.stream import Damaged, LineDecoder
 
 from .faults import Kind
-from .machine import Machine
-from .motion import Clock, Motor
+from .gcode import GcodeController
+from .motion import Clock
 
 __all__ = ["MarlinController"]
 
@@ -30,7 +29,7 @@ _BUSY_S = 2.0
 _IGNORED = ("G21", "G4", "M17", "M84", "M18", "M105", "M111", "M117", "M155", "M400", "M82", "M104", "M140")
 
 
-class MarlinController(Machine):
+class MarlinController(GcodeController):
     r"""Simulated controller; positions in millimetres, of any number of axes.
 
     Parameters
@@ -65,10 +64,8 @@ class MarlinController(Machine):
         steps: float = 400.0,
         clock: Clock = time.monotonic,
     ) -> None:
-        super().__init__()
-        self._clock, self._largest, self._limits, self._steps = clock, speed, (low, high), steps
-        self._lines = LineDecoder(limit=96)
-        self._motors = [Motor(low - 50.0, high + 50.0, speed, clock, at=0.0) for _ in range(axes)]
+        super().__init__(axes, low, high, speed, 0.0, clock)
+        self._lines, self._steps = LineDecoder(limit=96), steps
         self._power_on()
 
     def _power_on(self) -> None:
@@ -78,22 +75,9 @@ class MarlinController(Machine):
         """Where the axes are to be, as M114 reports it."""
         # Step counters start at zero wherever the axes are.
         self._zero = [motor.position for motor in self._motors]
-        self._queue: deque[tuple[list[float], float]] = deque()
+        self._forget()
         self._homing: list[int] = []
-        self._waiting: list[bytes] = []
-        self._unasked: list[bytes] = []
         self._busy_at = math.inf
-
-    @property
-    def motors(self) -> dict[int, Motor]:
-        """Motors by the number of the axis, from 1."""
-        return dict(enumerate(self._motors, 1))
-
-    def position(self, axis: int = 1) -> float:
-        """Return the current position of an axis (mm), independent of queries."""
-        with self.lock:
-            self._advance()
-            return self._motors[axis - 1].position
 
     def receive(self, data: bytes) -> Sequence[bytes]:
         """Return the answers to these bytes."""
@@ -116,12 +100,6 @@ class MarlinController(Machine):
         ends = [end for k in self._homing if (end := self._motors[k].arrival) is not None]
         return min(max(ends, default=self._clock()), self._busy_at)
 
-    def emit(self) -> Sequence[bytes]:
-        """Return what is due."""
-        self._advance()
-        reports, self._unasked = self._unasked, []
-        return reports
-
     def disconnected(self) -> None:
         """Discard an incomplete line."""
         self._lines.reset()
@@ -138,13 +116,11 @@ class MarlinController(Machine):
             else:
                 self._unasked.append(b"echo:endstops hit:  X:%.2f\n" % self._motors[0].position)
         elif kind == "power-cycled":
-            for motor in self._motors:
-                motor.cut_power()
+            self._cut_power()
             self._power_on()
             self._unasked = [b"start\n", b"echo:Marlin 2.1.2\n"]
 
     def _advance(self) -> None:
-        """Begin what is queued, and end what has ended."""
         if self._homing:
             if any(self._motors[k].moving for k in self._homing):
                 if self._clock() >= self._busy_at:
@@ -154,23 +130,12 @@ class MarlinController(Machine):
             for k in self._homing:
                 self._wanted[k] = self._zero[k] = 0.0
             self._homing, self._busy_at = [], math.inf
-            self._unasked.append(self._state() + b"ok\n")
-            waiting, self._waiting = self._waiting, []
-            for line in waiting:
-                self._unasked += self._take(line)
-        while self._queue and not any(motor.moving for motor in self._motors):
-            targets, speed = self._queue.popleft()
-            ways = [abs(t - motor.position) for t, motor in zip(targets, self._motors, strict=True)]
-            seconds = math.hypot(*ways) / speed
-            for motor, target, way in zip(self._motors, targets, ways, strict=True):
-                if way:
-                    motor.speed = way / seconds
-                    motor.go(target)
+            self._report_homed(self._state() + b"ok\n")
+        self._begin_queued()
 
     def _stand(self) -> None:
         self._queue.clear()
-        for motor in self._motors:
-            motor.stop()
+        super()._stand()
 
     def _stop(self) -> None:
         """Stop; where the axes are is where they are to be."""

@@ -31,17 +31,17 @@ class Monitor:
     Examples
     --------
     >>> values, seen = iter([1.0, 1.0, 2.0] + [2.0] * 99), threading.Event()
-    >>> seen = []
+    >>> noted = []
     >>> def note(reading):
-    ...     seen.append(reading["x"]["value"])
-    ...     if len(seen) == 2:
+    ...     noted.append(reading["x"]["value"])
+    ...     if len(noted) == 2:
     ...         seen.set()
     >>> monitor = Monitor(lambda: {"x": {"value": next(values), "timestamp": 0.0}}, every_s=0.001)
     >>> monitor.subscribe(note)
     >>> seen.wait(10.0)
     True
     >>> monitor.clear(note)
-    >>> seen
+    >>> noted
     [1.0, 2.0]
     """
 
