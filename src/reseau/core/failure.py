@@ -359,7 +359,7 @@ class Failure:
         Returns
         -------
         ndarray (h, w, 3) of uint8
-            See :meth:`reseau.measure.points.Measured.overlay`.
+            The frame, enlarged by a whole number if it is small, with a legend below it.
 
         Raises
         ------

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.data import Array, Frame, ImagePoints, Mask
 from ..core.display import Display
 from ..core.errors import UsageError
 from ..core.failure import Code, Remark
+from ..core.overlaid import Overlaid
 from ..io import ReseauMeasurement
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def deviating(deviation: Array, cov: Array) -> tuple[Remark, ...]:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Measured(Display):
+class Measured(Display, Overlaid):
     """Points of a design measured in one frame, in columns over all n points of the design.
 
     Parameters
@@ -161,30 +161,11 @@ class Measured(Display):
         axes.set_title(f"{self.image}: {self.found} of {len(self.ids)} measured", loc="left")
         return axes
 
-    def overlay(self, frame: Frame, path: Path | str | None = None) -> NDArray[np.uint8]:
-        """Draw what was measured and what was declined, and why, over every pixel of the frame.
+    def _heading(self) -> str:
+        return f"{self.image}: {self.found} of {len(self.ids)} measured"
 
-        Parameters
-        ----------
-        frame : Frame
-            The frame that was measured.
-        path : str or Path, optional
-            PNG file to write.
-
-        Returns
-        -------
-        ndarray (h, w, 3) of uint8
-            The frame, enlarged by a whole number if it is small, with a legend below it.
-
-        Raises
-        ------
-        InputError
-            When the file cannot be written.
-        """
-        from ..core.overlay import draw_overlay
-
-        title = f"{self.image}: {self.found} of {len(self.ids)} measured"
-        return draw_overlay(frame.pixels, self.layers(), title, [str(note) for note in self.remarks], path)
+    def _footnotes(self) -> list[str]:
+        return [str(note) for note in self.remarks]
 
     def layers(self) -> list[Layer]:
         """What is drawn over the frame: first what was measured, then each reason for declining."""

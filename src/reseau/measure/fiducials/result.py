@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjust import Adjustment
 from ...calibration.film import TRANSFORMS
 from ...core.data import Array, ImagePoints, Mask
 from ...core.display import Display
 from ...core.failure import Code, Remark
+from ...core.overlaid import Overlaid
 from ...io import FiducialDesign, FiducialOrientation, FrameTransform, MeasuredCorner, MeasuredFiducial
 from ..film import Kind
 from ..points import Reason
@@ -26,7 +25,7 @@ __all__ = ["FiducialResult"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FiducialResult(Display):
+class FiducialResult(Display, Overlaid):
     """Fiducial marks of one photograph, and its inner orientation.
 
     Parameters
@@ -186,25 +185,11 @@ class FiducialResult(Display):
         )
         return [measured, *declined]
 
-    def overlay(self, pixels: NDArray[Any], path: Path | str | None = None) -> NDArray[np.uint8]:
-        """Draw what was measured and what was declined, and why, over the scan.
+    def _heading(self) -> str:
+        return f"{self.image}: {int(self.ok.sum())} of {len(self.ok)} fiducial marks, {self.attitude}"
 
-        Parameters
-        ----------
-        pixels : ndarray (h, w) or (h, w, 3)
-            Grey or RGB values of the scan.
-        path : str or Path, optional
-            PNG file to write.
-
-        Raises
-        ------
-        InputError
-            When the file cannot be written.
-        """
-        from ...core.overlay import draw_overlay
-
-        title = f"{self.image}: {int(self.ok.sum())} of {len(self.ok)} fiducial marks, {self.attitude}"
-        return draw_overlay(pixels, self.layers(), title, [str(note) for note in self.notes], path=path)
+    def _footnotes(self) -> list[str]:
+        return [str(note) for note in self.notes]
 
 
 def _code(why: str) -> Code:

@@ -6,14 +6,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...core.data import Array, Frame
 from ...core.display import Display
 from ...core.failure import Code, Failure
+from ...core.overlaid import Overlaid
 from ...io import CORNERS, EDGES, FrameOrientation, MeasuredCorner, MeasuredEdge
 from ...io.scans import Scan
 from .border import Band, read_band
@@ -103,7 +103,7 @@ class FrameOptions:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FrameResult(Display):
+class FrameResult(Display, Overlaid):
     """One oriented frame, or the reason for declining it; falsy if declined.
 
     Parameters
@@ -183,30 +183,8 @@ class FrameResult(Display):
         axes.set_title(f"{self.image}: {self.status}", loc="left")
         return axes
 
-    def overlay(self, pixels: NDArray[Any], path: Path | str | None = None) -> NDArray[np.uint8]:
-        """Draw edges and corners, and why edges are missing, over every pixel of the scan.
-
-        Parameters
-        ----------
-        pixels : ndarray (h, w) or (h, w, 3)
-            Grey or RGB values of the scan.
-        path : str or Path, optional
-            PNG file to write.
-
-        Returns
-        -------
-        ndarray (h, w, 3) of uint8
-            See :meth:`reseau.measure.points.Measured.overlay`.
-
-        Raises
-        ------
-        InputError
-            When the file cannot be written.
-        """
-        from ...core.overlay import draw_overlay
-
-        title = f"{self.image}: {self.status}" + (f" ({self.why})" if self.why else "")
-        return draw_overlay(pixels, self.layers(), title, path=path)
+    def _heading(self) -> str:
+        return f"{self.image}: {self.status}" + (f" ({self.why})" if self.why else "")
 
     def layers(self) -> list[Layer]:
         """What is drawn over the scan: corners, measured edges, and the edges that were not found."""

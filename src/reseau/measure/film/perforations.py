@@ -10,20 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...adjust import BatchOptions, GaussMarkov, Parameters, adjust_batch, robust
 from ...core.data import Array
 from ...core.failure import Code, Failure
+from ...core.overlaid import Overlaid
 from ...io.scans import Scan
 from .border import binned, read_band
 from .edges import measure_profiles
 from .lines import robust_line
 from .steps import profile_function
+
+if TYPE_CHECKING:
+    from ...core.overlay import Layer
 
 __all__ = ["PITCH_MM", "FilmPlane", "edge_of", "film_plane"]
 
@@ -46,7 +48,7 @@ _LEAST_CONTRAST = 8.0
 
 
 @dataclass(frozen=True, eq=False)
-class FilmPlane:
+class FilmPlane(Overlaid):
     """Transformation from pixels of a scan to millimetres on the film.
 
     Parameters
@@ -81,30 +83,14 @@ class FilmPlane:
         """Number of edges found."""
         return len(self.at)
 
-    def overlay(self, pixels: NDArray[Any], path: Path | str | None = None) -> NDArray[np.uint8]:
-        """Draw the edges of the perforations over every pixel of the scan.
+    def layers(self) -> list[Layer]:
+        """What is drawn over the scan: the edges of the perforations."""
+        from ...core.overlay import Layer
 
-        Parameters
-        ----------
-        pixels : ndarray (h, w) or (h, w, 3)
-            Grey or RGB values of the scan.
-        path : str or Path, optional
-            PNG file to write.
+        return [Layer(f"edges, {self.edges}", self.at, symbol="|")]
 
-        Returns
-        -------
-        ndarray (h, w, 3) of uint8
-            See :meth:`reseau.measure.points.Measured.overlay`.
-
-        Raises
-        ------
-        InputError
-            When the file cannot be written.
-        """
-        from ...core.overlay import Layer, draw_overlay
-
-        edges = Layer(f"edges, {self.edges}", self.at, symbol="|")
-        return draw_overlay(pixels, [edges], f"edges of perforations, rms {self.rms_px:.2g} px", path=path)
+    def _heading(self) -> str:
+        return f"edges of perforations, rms {self.rms_px:.2g} px"
 
     def to_mm(self, xy: Array) -> Array:
         """Film coordinates (n, 2) in mm of pixels (n, 2)."""

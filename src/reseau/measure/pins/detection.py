@@ -12,14 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...core.data import Array, Frame, ImagePoints, Mask, Rows
 from ...core.failure import Code
+from ...core.overlaid import Overlaid
 from ..matching import MatchOptions
 from ..points import Reason
 from ..screening import Screened, screen
@@ -108,7 +107,7 @@ class PinOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class PinDetections:
+class PinDetections(Overlaid):
     """Spots of a frame and reasons for rejection, in columns, the brightest first.
 
     Parameters
@@ -178,30 +177,8 @@ class PinDetections:
         """Codes (m,) of the reasons; None where a spot is a pin."""
         return tuple(why.code if isinstance(why, Reason) else None for why in self.why)
 
-    def overlay(self, frame: Frame, path: Path | str | None = None) -> NDArray[np.uint8]:
-        """Draw the pins with their arcs, and rejected spots with the reasons, over every pixel of the frame.
-
-        Parameters
-        ----------
-        frame : Frame
-            The frame.
-        path : str or Path, optional
-            PNG file to write.
-
-        Returns
-        -------
-        ndarray (h, w, 3) of uint8
-            See :meth:`reseau.measure.points.Measured.overlay`.
-
-        Raises
-        ------
-        InputError
-            When the file cannot be written.
-        """
-        from ...core.overlay import draw_overlay
-
-        count = int(self.ok.sum())
-        return draw_overlay(frame.pixels, self.layers(), f"{self.image}: {count} echoes found", path=path)
+    def _heading(self) -> str:
+        return f"{self.image}: {int(self.ok.sum())} echoes found"
 
     def layers(self) -> list[Layer]:
         """What is drawn over the frame: pins, then rejected spots, one layer for each reason."""
