@@ -31,8 +31,6 @@ _FAR, _FAR_SIGMAS = 4.0, 5.0
 """Distance from an outline, pixels and widths of the spread, beyond which a pixel is inside or outside."""
 _NODES = 24
 """Nodes of the integration over the disk of a scanner out of focus."""
-PITCH_35_MM = 38.0
-"""From one 35 mm frame to the next: eight perforations."""
 
 
 class FrameFormat(NamedTuple):

@@ -16,12 +16,10 @@ from ..core.provenance import sha256_of
 from .dicom import count_dicom, is_dicom
 from .images import Channel, count_pages, grey_of, read_image
 
-__all__ = ["STACKS", "VIDEOS", "frames_of"]
+__all__ = ["VIDEOS", "frames_of"]
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 """Suffixes of videos."""
-STACKS = (".tif", ".tiff", ".dcm", *VIDEOS)
-"""Suffixes of files that may have several frames."""
 _LOSSLESS = ("FFV1", "HFYU", "FFVH", "MPNG", "PNG ", "RAW ", "DIB ", "Y800", "GREY", "\0\0\0\0")
 """Codes of video formats that keep grey values."""
 

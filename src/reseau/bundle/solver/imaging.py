@@ -424,10 +424,6 @@ class Imaging:
             np.array([extra.base for extra in extras] or [(0.0, 0.0)]),
         )
 
-    def of_kernels(self, camera_of: Rows) -> Mask:
-        """Return which observations by these cameras (n,) use the compiled loops."""
-        return np.asarray(self.kind[camera_of] != _NO_KERNEL)
-
     def bent(
         self,
         seen: Seen,
