@@ -17,6 +17,8 @@ from reseau.archive import Archive, Session, Verdict
 from reseau.capture import Goal, Plan, Step, at_heights, carry_out, paper_steps, plans, rerun
 from reseau.core.data import Frame
 from reseau.core.errors import ArchiveError, EstimationError, StateError, UsageError
+from reseau.core.failure import Failure
+from reseau.procedures.testfield import TestfieldProcedure
 
 from .fieldrig import FieldRig
 
@@ -73,14 +75,48 @@ def test_a_plan_stores_frames_verdicts_documents_and_results(rig: FieldRig, sess
     assert rig.table.stops > 0
 
 
+def cofactors_of(made: TestfieldProcedure) -> dict[float, float]:
+    """Cofactors of c (standard deviations for a sigma0 of 1), by the standard deviations that are reported.
+
+    These are cofactors times sigma0, and enlarged by the scatter between images, which nobody can predict.
+    """
+    progress, found = made.progress, dict[float, float]()
+
+    def noted() -> dict[str, float]:
+        reached = progress()
+        if reached:
+            calibrated = made.calibrated()
+            assert not isinstance(calibrated, Failure)
+            variance = calibrated.result.camera_covariance(0)[0, 0]
+            found[reached["sigma_c"]] = float(np.sqrt(variance) / calibrated.result.sigma0)
+        return reached
+
+    made.progress = noted  # type: ignore[method-assign]
+    return found
+
+
+def reached_over_predicted(rig: FieldRig, kind: str, cofactors: dict[float, float]) -> list[float]:
+    """Ratios of the cofactors of c that were reached to those that events of a kind predicted."""
+    found, predicted, enlarged = list[float](), None, np.nan
+    for what, facts in rig.events:
+        if what == kind and facts["sigma_c"] is not None:
+            predicted = facts["sigma_c"] / enlarged
+        elif what == "precision":
+            cofactor = cofactors[facts["sigma_c"]]
+            if predicted is not None:
+                found.append(cofactor / predicted)
+            predicted, enlarged = None, facts["sigma_c"] / cofactor
+    return found
+
+
 @pytest.mark.slow
 def test_the_precision_after_the_next_pose_is_predicted(rig: FieldRig, session: Session) -> None:
-    run = rig.acquisition(session, rig.procedure())
+    made = rig.procedure()
+    cofactors = cofactors_of(made)
+    run = rig.acquisition(session, made)
     carry_out(run, plans.poses(run, FEW))
     # From two frames on there is a calibration, from which little can be predicted; the last is from most.
-    predicted = [facts for kind, facts in rig.events if kind == "outlook"][-1]
-    (came,) = [f for kind, f in rig.events if kind == "precision" and f["step"] == predicted["step"]]
-    assert abs(predicted["sigma_c"] / came["sigma_c"] - 1) < 0.1
+    assert abs(reached_over_predicted(rig, "outlook", cofactors)[-1] - 1) < 0.1
 
 
 def test_a_full_disk_stops_the_session_which_can_be_resumed(
@@ -380,7 +416,9 @@ def test_failed_checks_stop_the_acquisition(rig: FieldRig, session: Session) -> 
 @pytest.mark.slow
 def test_the_closed_loop_chooses_poses_until_the_goal_is_met(rig: FieldRig, session: Session) -> None:
     """The precision predicted from the design matrix is reached."""
-    run = rig.acquisition(session, rig.procedure())
+    made = rig.procedure()
+    cofactors = cofactors_of(made)
+    run = rig.acquisition(session, made)
     goal = Goal("c", 0.007, "mm")
     first = (EVERY[0], EVERY[4], EVERY[9])
     candidates = [step for step in EVERY if step.position["camera_roll"] == 0]
@@ -388,11 +426,10 @@ def test_the_closed_loop_chooses_poses_until_the_goal_is_met(rig: FieldRig, sess
     reached = run.reached("c")
     assert reached is not None
     assert reached < goal.limit
-    predicted = [(f["step"], f["sigma_c"]) for kind, f in rig.events if kind == "next"]
-    came = {f["step"]: f["sigma_c"] for kind, f in rig.events if kind == "precision"}
-    assert predicted
-    for name, sigma in predicted:
-        assert sigma is None or 0.9 < came[name] / sigma < 1.1
+    # Which targets will be hidden, and how sharp they will be, is not known before.
+    ratios = reached_over_predicted(rig, "next", cofactors)
+    assert ratios
+    np.testing.assert_allclose(ratios, 1, atol=0.1)
     # It begins anew: every choice is remembered.
     again = rig.acquisition(session, rig.procedure())
     exposures = rig.camera.exposures
