@@ -90,7 +90,7 @@ def test_draws_have_the_stated_variance(distribution: str) -> None:
     assert np.allclose(found.mean, [1.0, 2.0], atol=0.02)
 
 
-def test_monte_carlo_agrees_with_closed_forms_and_the_difference_is_told() -> None:
+def test_monte_carlo_agrees_with_closed_forms_and_the_difference_is_reported() -> None:
     """The sum of two squares (JCGM 101, 9.4) is linear far from zero, and not at zero."""
     noise = Contribution("noise", np.diag([0.005**2, 0.005**2]))
     for at, verdict in ((np.array([0.5, 0.0]), "linear"), (np.array([0.0, 0.0]), "not linear")):

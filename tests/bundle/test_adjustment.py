@@ -109,7 +109,7 @@ def undetermined_camera() -> BundleProblem:
     """Affinity B1 and the principal distance with the scale of y are one and the same in one view only."""
     cam = networks.camera(free=("c", "K1"))
     world = networks.world(images=4, points=20, cameras=(cam,), control=20)
-    # All points seen at one radius alone: c and K1 cannot be told apart.
+    # All points seen at one radius alone: c and K1 cannot be distinguished.
     flat = replace(world.network, sigma=np.zeros((20, 3)), xyz=world.xyz)
     angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(20)])

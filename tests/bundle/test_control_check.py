@@ -36,7 +36,7 @@ def parabolic() -> Array:
 
 
 @pytest.mark.parametrize("outliers", ["keep", "reject"])
-def test_a_bent_figure_that_is_given_as_plane_is_told_with_its_deflection(outliers: str) -> None:
+def test_a_bent_figure_that_is_given_as_plane_is_reported_with_its_deflection(outliers: str) -> None:
     found = adjust_network(plane(parabolic()), Options(outliers=outliers))  # type: ignore[arg-type]
     assert found
     said = [remark for remark in found.warnings if remark.code is Code.DOUBTFUL_CONTROL]
@@ -45,7 +45,7 @@ def test_a_bent_figure_that_is_given_as_plane_is_told_with_its_deflection(outlie
     assert not found.rejected.any()
 
 
-def test_neither_a_plane_nor_a_wrong_point_of_it_is_told_as_bent() -> None:
+def test_neither_a_plane_nor_a_wrong_point_of_it_is_reported_as_bent() -> None:
     for off in (np.zeros(49), np.where(np.arange(49) == 24, DEFLECTION, 0.0)):
         shape = control_shape(plane(off))
         assert shape is not None

@@ -1,4 +1,4 @@
-"""Broken networks: each is told with its cause and the offending element, with and without rejection.
+"""Broken networks: each is reported with its cause and the offending element, with and without rejection.
 
 A network that is fine is not accused.
 """
@@ -637,7 +637,7 @@ SLOW = {
     "case",
     [pytest.param(c, marks=pytest.mark.slow if c.name in SLOW else (), id=c.name) for c in BROKEN],
 )
-def test_a_broken_network_is_told_with_its_cause(case: Broken, outliers: str) -> None:
+def test_a_broken_network_is_reported_with_its_cause(case: Broken, outliers: str) -> None:
     if outliers == "reject" and not case.rejecting:
         pytest.skip("what is rejected is listed with the result")
     text, codes = said(case.network(), outliers)

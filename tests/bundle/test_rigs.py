@@ -196,7 +196,7 @@ def test_errors_with_known_bases_have_their_covariances() -> None:
     assert np.mean(q) == pytest.approx(1.0, abs=0.3)
 
 
-def test_a_wrong_base_is_named_and_told_in_the_result() -> None:
+def test_a_wrong_base_is_named_and_reported_in_the_result() -> None:
     network = with_bases(drawn(cameras=3, control=True), (0, 1, 2.0, 0.05), (0, 2, 0.0, 0.05))
     result = adjust_network(network).required()
     said = "the distance camera camera 0 to camera camera 1 (152.266 mm, by "

@@ -219,7 +219,7 @@ def test_a_turntable_that_turns_the_other_way_about_a_given_axis_is_refused(sigm
     assert "turns about the given axis in the opposite sense" in failure.reason
 
 
-def test_the_sense_about_an_approximate_axis_is_told() -> None:
+def test_the_sense_about_an_approximate_axis_is_reported() -> None:
     network = turned(angles_deg=STEPS_DEG).network
     result, found = adjusted(replace(network, stage=replace(stage_of(network), axis=-AXIS)))
     assert found.direction @ AXIS > 0.99

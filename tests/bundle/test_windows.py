@@ -175,7 +175,7 @@ def test_what_images_cannot_determine_is_named() -> None:
     )
 
 
-def test_what_windows_leave_undetermined_is_told_with_the_element_and_the_cause() -> None:
+def test_what_windows_leave_undetermined_is_reported_with_the_element_and_the_cause() -> None:
     free = ("index of air", "index of glass", "index of water")
     world = networks.refracted(networks.world(cameras=CALIBRATED, control=25), "plane port", free)
     failure = world.problem(world.noisy(0)).adjusted()
@@ -185,7 +185,7 @@ def test_what_windows_leave_undetermined_is_told_with_the_element_and_the_cause(
     )
 
 
-def test_a_window_that_noise_alone_determines_is_told_with_the_element() -> None:
+def test_a_window_that_noise_alone_determines_is_reported_with_the_element() -> None:
     """Distance, thickness and index together: seen from one side, a pane shifts rays as another one does."""
     free = ("thickness of port", "distance of port", "index of glass")
     world = networks.refracted(networks.world(cameras=CALIBRATED, control=25), "plane port", free)
@@ -221,7 +221,7 @@ def test_a_point_before_the_window_is_computed_as_in_air_and_named() -> None:
     assert any("no ray through the windows leads to points p24 in image" in text for text in remarks)
 
 
-def test_correlated_parameters_of_windows_are_told_with_their_partners() -> None:
+def test_correlated_parameters_of_windows_are_reported_with_their_partners() -> None:
     free = ("distance of port", "index of water")
     world = networks.refracted(networks.world(cameras=CALIBRATED, control=25), "plane port", free)
     result = adjust_network(world.noisy(0))

@@ -76,7 +76,7 @@ def test_gain_is_lowered_before_the_exposure() -> None:
     assert steered.gain == 0.0
 
 
-def test_too_little_light_is_told() -> None:
+def test_too_little_light_is_reported() -> None:
     camera: Any = Eye(0.0001)
     steered = steer(camera, LightRule(longest_us=5000.0))
     assert not steered

@@ -20,7 +20,7 @@ def test_requests_are_carried_out_or_refused_with_the_reason() -> None:
     assert done == ["dark", "lit"]
 
 
-def test_a_program_that_is_not_there_or_does_not_answer_is_told() -> None:
+def test_a_program_that_is_not_there_or_does_not_answer_is_reported() -> None:
     with pytest.raises(UsageError, match="write tcp://host:port"):
         RemoteOperator("laboratory")
     silent = FaultyConnection(SimulatedOperator({}), FaultScript({0: Fault("dropped")}))

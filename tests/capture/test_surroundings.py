@@ -81,7 +81,7 @@ def test_conditions_are_stored_with_every_frame_and_summarised_in_the_provenance
         assert [each.same for each in rerun(session, rig.procedure())] == [True]
 
 
-def test_a_sensor_that_fails_is_told_and_does_not_end_the_session(tmp_path: Path) -> None:
+def test_a_sensor_that_fails_is_reported_and_does_not_end_the_session(tmp_path: Path) -> None:
     now = 0.0
     rig, machine = _plain_rig(), ModbusSensor(lambda: AIR, clock=lambda: now)
     _with(rig, air=_modbus(machine))

@@ -101,7 +101,7 @@ def test_tables_that_are_none_are_refused(
     assert len(err.strip().splitlines()) == 1
 
 
-def test_angles_in_radians_are_told(reseau: Run, measured: Path, tmp_path: Path) -> None:
+def test_angles_in_radians_are_reported(reseau: Run, measured: Path, tmp_path: Path) -> None:
     lines = [line.split(",") for line in (measured / "angles.txt").read_text().split()]
     rows = [f"{name},{np.radians(float(angle))},,{pose}" for name, angle, _, pose in lines[1:]]
     known = [row.replace(",,", ",0,") for row in rows]

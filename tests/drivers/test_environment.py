@@ -72,7 +72,7 @@ def test_impossible_values_are_refused(value: float) -> None:
         air.environment()
 
 
-def test_a_device_that_refuses_its_registers_is_told() -> None:
+def test_a_device_that_refuses_its_registers_is_reported() -> None:
     machine = ModbusSensor(lambda: AIR)
     far = {"temperature": {"register": 40}}
     sensor = environment_modbus("air", InProcess(lambda: FaultyConnection(machine)), quantities=far)
@@ -85,7 +85,7 @@ def test_a_device_that_refuses_its_registers_is_told() -> None:
         sensor.connect()
 
 
-def test_lines_that_are_no_measurement_are_told() -> None:
+def test_lines_that_are_no_measurement_are_reported() -> None:
     machine = LineSensor(lambda: AIR, every_s=0.02)
     link = InProcess(lambda: FaultyConnection(machine))
     with environment_line("air", link, pattern=LineSensor.PATTERN, quantities=LINE) as air:

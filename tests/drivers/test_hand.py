@@ -173,7 +173,7 @@ def test_a_question_at_the_terminal_can_be_stopped_and_ends_in_time(monkeypatch:
         assert time.monotonic() - began < 60.0
 
 
-def test_a_program_that_gives_no_number_is_told() -> None:
+def test_a_program_that_gives_no_number_is_reported() -> None:
     hands = SimulatedHands(["tilt"])
     with (
         TcpServer(lambda: FaultyConnection(hands)) as server,

@@ -311,7 +311,7 @@ def test_ros_and_kalibr_have_their_own_names(tmp_path: Path) -> None:
         ("a.yml", "%YAML:1.0\n---\ncamera_matrix: 3\n", "is not a file of OpenCV"),
     ],
 )
-def test_broken_files_are_told_in_one_line(name: str, text: str, said: str, tmp_path: Path) -> None:
+def test_broken_files_are_reported_in_one_line(name: str, text: str, said: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text)
     with pytest.raises(FormatError, match=said) as error:
         import_calibration(tmp_path / name)

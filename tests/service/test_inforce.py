@@ -68,7 +68,7 @@ def opencv_camera(fx: float = 800.0, k1: float = 0.064) -> Calibration:
     )
 
 
-def test_calibrations_of_another_model_are_converted_and_the_error_is_told(archive: Archive) -> None:
+def test_calibrations_of_another_model_are_converted_and_the_error_is_reported(archive: Archive) -> None:
     known, _ = started(archive)
     made = known.decide("left", opencv_camera(), RULES, since=day(7))
     told = {each.rule: each for each in made.judgement.findings}

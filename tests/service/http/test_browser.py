@@ -402,7 +402,7 @@ def test_two_browsers_show_the_same_bench_also_where_connections_are_cut(
         assert other.text("#state").startswith("ready")
 
 
-def test_a_connection_that_is_dead_without_an_end_is_told_and_opened_again(
+def test_a_connection_that_is_dead_without_an_end_is_reported_and_opened_again(
     place: Place, browser: Browser
 ) -> None:
     enter(place, browser)

@@ -196,7 +196,7 @@ def test_a_calibration_has_parameters_with_sigmas_correlations_and_findings(clie
         assert svg.text.startswith("<svg"), figure
 
 
-def test_cameras_and_target_are_told_in_space(client: TestClient) -> None:
+def test_cameras_and_target_are_reported_in_space(client: TestClient) -> None:
     found = client.get("/api/1/sessions/monday/scene").json()
     assert [each["name"] for each in found["cameras"]] == ["frontal", "right", "down", "left"]
     assert len(found["points"]) == len(found["xyz"]) > 300
