@@ -39,6 +39,7 @@ __all__ = [
     "common_forms",
     "displaced_by_lines",
     "edge_beside_line",
+    "ends_with_line",
     "is_one_step",
     "sharp_steps",
 ]
@@ -305,6 +306,17 @@ def edge_beside_line(
     if two.chi > _MOST_MISFIT or two.without < _LEAST_GAIN * two.chi or not there:
         return None, min(two.without, two.chi) < _MOST_MISFIT
     return two.adjacent_edge(band, line), True
+
+
+def ends_with_line(
+    grey: Array, band: Band, line: Array, level: Array, noise: float, width: float
+) -> AdjacentEdge | None:
+    """The edge with a line behind it, without a test of the model; arguments as in :func:`edge_beside_line`.
+
+    Its covariance assumes that the model is correct.
+    """
+    two = _two_lines(grey, band, line, level, noise, width)
+    return None if two is None else two.adjacent_edge(band, line)
 
 
 def is_one_step(grey: Array, band: Band, line: Array, level: Array, noise: float, width: float) -> bool:
