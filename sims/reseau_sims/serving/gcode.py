@@ -37,9 +37,10 @@ class GcodeController(Machine):
 
     Examples
     --------
-    >>> from reseau_sims.serving import GrblController
-    >>> issubclass(GrblController, GcodeController)
-    True
+    >>> from reseau_sims.serving import MarlinController
+    >>> board = MarlinController(2)
+    >>> sorted(board.motors), board.position(2)
+    ([1, 2], 0.0)
     """
 
     def __init__(self, axes: int, low: float, high: float, speed: float, at: float, clock: Clock) -> None:
