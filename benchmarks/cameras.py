@@ -28,6 +28,7 @@ from worlds import lenses
 
 from reseau.bundle import Camera, ModelChoice, Network, Result, adjust_network, choose_model
 from reseau.calibration.camera import by_rotation
+from reseau.core.compiled import compiled, kernel
 from reseau.execution import Executor
 from reseau.io.network import Network1
 from reseau.optics import PixelGrid, camera_models
@@ -39,7 +40,7 @@ from reseau.optics.cameras import (
     SplineGrid,
     Stereographic,
 )
-from reseau.optics.cameras.kernels import CameraColumns, camera, compiled, kernel
+from reseau.optics.cameras.kernels import CameraColumns, camera
 from reseau.optics.poses import rotation_matrix
 
 DATA = Path(os.environ.get("RESEAU_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))

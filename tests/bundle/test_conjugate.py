@@ -199,6 +199,6 @@ def test_steps_are_the_same_in_any_number_of_threads(monkeypatch: pytest.MonkeyP
     problem = replace(with_cameras_of_their_own(), memory=ALWAYS)
     seen = list[Array]()
     for count in (1, 2):
-        monkeypatch.setattr("reseau.bundle.solver.compiled.processors", lambda count=count: count)
+        monkeypatch.setattr("reseau.bundle.solver.threads.processors", lambda count=count: count)
         seen.append(required(problem).values.xyz)
     np.testing.assert_array_equal(seen[0], seen[1])

@@ -13,10 +13,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from reseau.core.compiled import kernel
 from reseau.core.data import Array
 from reseau.optics import CameraModel, Derivatives, PixelGrid, PlaneMapping
 from reseau.optics.cameras import Parameter
-from reseau.optics.cameras.kernels import CameraColumns, kernel
+from reseau.optics.cameras.kernels import CameraColumns
 from reseau.optics.mapping import as_points, as_values
 
 PARAMETERS = (

@@ -18,13 +18,14 @@ import pytest
 import scipy.stats
 
 from reseau.bundle import Camera, Network, Result, adjust_network
+from reseau.core.compiled import compiled
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.core.failure import Failure
 from reseau.io.network import CameraEntry, Network1
 from reseau.optics import CameraModel, PixelGrid, PlaneMapping, camera_model, camera_models, convert
 from reseau.optics.cameras import distortion_names, register_camera, unit_of
-from reseau.optics.cameras.kernels import CameraColumns, compiled
+from reseau.optics.cameras.kernels import CameraColumns
 from reseau_sims import FieldBench, Station
 
 from ..bundle import networks

@@ -6,16 +6,15 @@ a measurement solves again and again: there most of its time is spent between th
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.compiled import compiled
+
 __all__ = ["reweighted"]
 
-F = TypeVar("F", bound=Callable[..., Any])
 Floats = NDArray[Any]
 
 _MAD_TO_SIGMA, _TUKEY = 1.4826, 4.685
@@ -24,13 +23,7 @@ _EPS = float(np.finfo(np.float64).eps)
 """As in :mod:`reseau.adjust.batch` and :func:`reseau.adjust.weight_function`."""
 
 
-def _compiled(function: F) -> F:
-    """Compile with Numba, cached on disk, releasing the GIL."""
-    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
-    return cast(F, numba.njit(**options)(function))
-
-
-@_compiled
+@compiled
 def _robust_factors(residuals: Floats, least: float, factors: Floats) -> None:
     """Tukey's factors (n,) on the weights of residuals (n,), of which the scale is at least `least`."""
     scale = max(_MAD_TO_SIGMA * np.median(np.abs(residuals)), least)
@@ -39,7 +32,7 @@ def _robust_factors(residuals: Floats, least: float, factors: Floats) -> None:
         factors[i] = within * within
 
 
-@_compiled
+@compiled
 def _cost(residuals: Floats, factors: Floats, x: Floats, prior: float) -> float:
     total = 0.0
     for i in range(len(residuals)):
@@ -49,7 +42,7 @@ def _cost(residuals: Floats, factors: Floats, x: Floats, prior: float) -> float:
     return total
 
 
-@_compiled
+@compiled
 def _step(normal: Floats, gradient: Floats, damping: float, step: Floats) -> float:
     """Fill the damped correction (u,); the decrease of the sum of squares that it predicts."""
     u = len(gradient)
@@ -69,7 +62,7 @@ def _step(normal: Floats, gradient: Floats, damping: float, step: Floats) -> flo
     return predicted
 
 
-@_compiled
+@compiled
 def reweighted(
     design: Floats, observed: Floats, prior: float, tolerance: float, most: int
 ) -> tuple[Floats, Floats]:

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.compiled import compiled
+
 __all__ = ["filtered"]
 
-F = TypeVar("F", bound=Callable[..., Any])
 Floats = NDArray[Any]
 
 
-def _compiled(function: F) -> F:
-    """Compile with Numba, cached on disk, releasing the GIL."""
-    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
-    return cast(F, numba.njit(**options)(function))
-
-
-@_compiled
+@compiled
 def filtered(images: Floats, kernel: Floats) -> Floats:
     """Images (m, r, c) weighted by an even kernel (2 p + 1, 2 p + 1), without their borders of p pixels.
 
@@ -55,13 +48,13 @@ def filtered(images: Floats, kernel: Floats) -> Floats:
     return found
 
 
-@_compiled
+@compiled
 def _times(image: Floats, weight: float, total: Floats) -> None:
     for i in range(len(total)):
         total[i] = weight * image[i]
 
 
-@_compiled
+@compiled
 def _add(image: Floats, first: int, offsets: Floats, weights: Floats, total: Floats) -> None:
     """Add two weighted sums of two pixels each."""
     n, one, two = len(total), weights[0], weights[1]

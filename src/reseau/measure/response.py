@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.data import Array, Mask, Rows
+from .compiled_filter import filtered
 from .matching import Shape, Window
 
 __all__ = ["FilteredShape", "Samples", "estimate_kernel", "sharpened_from_px", "unexplained"]
@@ -82,8 +83,6 @@ class FilteredShape:
         return _widened(window, len(self.kernel) // 2)
 
     def _filtered(self, images: Array) -> Array:
-        from .compiled_filter import filtered  # takes half a second to import; not every command needs it
-
         every = np.ascontiguousarray(images, dtype=np.float32).reshape(-1, *images.shape[-2:])
         found = filtered(every, self.kernel.astype(np.float32))
         return np.asarray(found.reshape(*images.shape[:-2], *found.shape[1:]), dtype=images.dtype)

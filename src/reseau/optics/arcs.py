@@ -27,14 +27,13 @@ The position is the middle between the two ends, whatever the brightness does be
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, TypeVar, cast
+from typing import Any
 
-import numba
 import numpy as np
 from scipy.special import ndtr
 
+from ..core.compiled import compiled
 from ..core.data import Array, Rows
 
 __all__ = ["Arcs"]
@@ -49,7 +48,6 @@ _MOST_EXPONENT = 50.0
 
 _DARK = 9.0
 """Widths beyond which a Gaussian is 0 as far as digits go: 3e-18."""
-F = TypeVar("F", bound=Callable[..., Any])
 _HALF_ROOT, _DENSITY = math.sqrt(0.5), 1 / math.sqrt(2 * math.pi)
 
 
@@ -199,24 +197,19 @@ def _exponential(exponent: Array) -> Array:
     return bounded
 
 
-def _compiled(function: F) -> F:
-    """Compile with Numba, cached on disk, releasing the GIL."""
-    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
-
-
-@_compiled
+@compiled
 def _tail(z: float) -> float:
     """Normal distribution."""
     return 0.5 * math.erfc(-z * _HALF_ROOT)
 
 
-@_compiled
+@compiled
 def _bell(z: float) -> float:
     """Density of the normal distribution."""
     return math.exp(-0.5 * z * z) * _DENSITY
 
 
-@_compiled
+@compiled
 def _differentiated(
     arcs: Array, even: bool, xy: Array, columns: Array, rows: Array, image: Array, parts: Array
 ) -> None:

@@ -7,21 +7,16 @@ rows and columns within its reach, all nodes of a shape in one loop.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
-import numba
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
-from numba.np.arrayobj import make_array
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from ..core.compiled import Instruction, compiled
+
 __all__ = ["PER_SIGMA", "filtered", "formed", "gathered", "normal_table", "responses"]
 
-F = TypeVar("F", bound=Callable[..., Any])
 Single = NDArray[Any]
 Double = NDArray[Any]
 
@@ -50,19 +45,13 @@ def normal_table(far: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 _FINE_STEP, _FINE_BELL = normal_table(_FAR)
 _STEP, _BELL = (values.astype(np.float32) for values in normal_table(_SIDE))
 f32 = np.float32
-_FREE = {"nnan", "ninf", "nsz"}
+_FREE = frozenset({"nnan", "ninf", "nsz"})
 """Assumptions allowed to the compiler. Sums must not be reordered, and products not be fused into sums: both
 would make the last bits depend on the compilation. (Products of matrices are left to BLAS.)
 """
 
 
-def _compiled(function: F) -> F:
-    """Compile with Numba, cached on disk, releasing the GIL."""
-    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": _FREE}
-    return cast(F, numba.njit(**options)(function))
-
-
-@_compiled
+@compiled(fastmath=_FREE)
 def _edges(
     offset: Single, count: int, shift: np.float32, inverse: np.float32, step: Single, bell: Single
 ) -> None:
@@ -79,7 +68,8 @@ def _edges(
         bell[k] = b * (f32(1) - d * (middle - f32(0.5) * d * (middle * middle - f32(1))))
 
 
-def _sum_of_eight(context: Any, sums: Any, at: Any, factors: Any, rows: Any, begin: Any) -> Any:
+@Instruction
+def _add_eight(context: Any, sums: Any, at: Any, factors: Any, rows: Any, begin: Any) -> Any:
     """Add factors[k] · rows[k, begin : begin + 8] to sums[k, at : at + 8] with vector instructions.
 
     The compiler would leave loops as short as these in single numbers. There are no checks of the limits.
@@ -89,6 +79,10 @@ def _sum_of_eight(context: Any, sums: Any, at: Any, factors: Any, rows: Any, beg
     sums, rows : tuple of ndarray (n,)
         As many as there are factors; a row may be given several times, and is read once.
     """
+
+    from llvmlite import ir
+    from numba import types
+    from numba.np.arrayobj import make_array
 
     def code(target: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         eight = ir.VectorType(ir.FloatType(), 8)
@@ -114,10 +108,7 @@ def _sum_of_eight(context: Any, sums: Any, at: Any, factors: Any, rows: Any, beg
     return types.void(sums, types.intp, factors, rows, types.intp), code
 
 
-_add_eight: Any = intrinsic(_sum_of_eight)
-
-
-@_compiled
+@compiled(fastmath=_FREE)
 def _steps(offset: Single, count: int, shift: np.float32, inverse: np.float32, step: Single) -> None:
     """Distribution at (offset + shift) · inverse, as in :func:`_edges`."""
     for k in range(count):
@@ -129,7 +120,7 @@ def _steps(offset: Single, count: int, shift: np.float32, inverse: np.float32, s
         step[k] = _STEP[i] + _BELL[i] * d * (f32(1) - f32(0.5) * d * middle)
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def _responses(
     points: Single,
     n: int,
@@ -181,7 +172,7 @@ def _responses(
     return stride
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def formed(
     nodes: Single,
     tangents: Single,
@@ -282,7 +273,7 @@ def formed(
                 parts[k, 0, r, c] += total
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def responses(points: Single, first: Single, sigma: Single, out: Single) -> None:
     """Integral, value and derivative of the response of adjacent pixels, in double precision.
 
@@ -334,7 +325,7 @@ def responses(points: Single, first: Single, sigma: Single, out: Single) -> None
                 out[2, k, j, c] = (bell[c + 1] - bell[c]) * inverse
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def _basis(t: float, out: Double) -> None:
     """Values (6,) of the B-spline of fifth degree around a point, at t ∈ [0, 1) of its cell."""
     for side in range(2):
@@ -346,7 +337,7 @@ def _basis(t: float, out: Double) -> None:
         out[2 + side] = c - 6 * b + 15 * a
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def gathered(at: Double, weights: Double, cells: Double) -> None:
     """Add the weights (q, j) of nodes at (2, j), in cells, to the cells (q, r, c) around them."""
     of_x, of_y = np.empty(6), np.empty(6)
@@ -362,7 +353,7 @@ def gathered(at: Double, weights: Double, cells: Double) -> None:
                     line[k] += factor * of_x[k]
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def filtered(cells: Double, taps: Double, low: int, per_px: int, summed: Double, out: Double) -> None:
     """Filter cells (g, m) with taps (q, t): out[i, q] = Σ taps[q, k] cells[per_px i − low − k].
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import exp, pi, sqrt
-from typing import Any, TypeVar, cast
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.compiled import compiled
 from .compiled import PER_SIGMA, normal_table
 
 __all__ = ["formed", "six_formed"]
 
-F = TypeVar("F", bound=Callable[..., Any])
 Floats = NDArray[Any]
 
 _FAR = 5.5
@@ -35,13 +33,7 @@ _NOTHING = 34.0
 """Square of a distance, in widths over 1 + |correlation|, beyond which densities are below 5e-8."""
 
 
-def _compiled(function: F) -> F:
-    """Compile with Numba, cached on disk, releasing the GIL."""
-    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
-    return cast(F, numba.njit(**options)(function))
-
-
-@_compiled
+@compiled
 def _normal(z: float) -> tuple[float, float]:
     """Normal distribution and density, from a table with two more terms of the series; errors below 1e-9."""
     z = min(max(z, -_TABLE), _TABLE)
@@ -52,7 +44,7 @@ def _normal(z: float) -> tuple[float, float]:
     return step, bell * (1.0 - d * (m - d * (0.5 * (m * m - 1.0) - d * m * (m * m - 3.0) * (1 / 6))))
 
 
-@_compiled
+@compiled
 def _near_edge(z: float) -> tuple[float, float]:
     """Normal distribution and density; exactly 0 or 1, and 0, far from an edge, where most pixels are."""
     if abs(z) < _FAR:
@@ -60,7 +52,7 @@ def _near_edge(z: float) -> tuple[float, float]:
     return (1.0, 0.0) if z > 0 else (0.0, 0.0)
 
 
-@_compiled
+@compiled
 def _rule(rho: float, at: Floats, inverse: Floats, weight: Floats) -> int:
     """Fill nodes of the integral of the density of two normal variables over their correlation."""
     kind = 0
@@ -73,7 +65,7 @@ def _rule(rho: float, at: Floats, inverse: Floats, weight: Floats) -> int:
     return int(_COUNT[kind])
 
 
-@_compiled
+@compiled
 def formed(
     normal: Floats,
     bend: Floats,
@@ -165,7 +157,7 @@ def formed(
                     images[k, 7, i, j] = -0.5 * by_b * along2 * along2 / s
 
 
-@_compiled
+@compiled
 def six_formed(
     normal: Floats,
     bend: Floats,

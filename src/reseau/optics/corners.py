@@ -34,6 +34,7 @@ import numpy as np
 
 from ..core.data import Array, Mask, Rows
 from ..core.threads import one_thread
+from .compiled_corners import formed, six_formed
 
 __all__ = ["Corners", "corner_images"]
 
@@ -130,8 +131,6 @@ def corner_images(
     >>> float(image[0, 0, 4, 4]), float(image[0, 0, 8, 4].round(2)), float(image[0, 0, 0, 4].round(2))
     (0.5, 1.0, 0.0)
     """
-    from .compiled_corners import formed, six_formed  # takes half a second to import
-
     parts = 4 + form.shape[1] if derivatives else 1
     images = np.empty((len(corners), parts, rows.shape[1], columns.shape[1]), np.float32)
     wanted = np.zeros((0, 1, 1), dtype=bool) if needed is None else np.ascontiguousarray(needed)

@@ -26,6 +26,7 @@ from scipy.special import ndtr
 
 from ..core.data import Array
 from ..core.errors import UsageError
+from .compiled import responses
 
 __all__ = [
     "Outline",
@@ -285,8 +286,6 @@ class PixelResponse:
 
 def _compiled_orders(pixels: Array, points: Array, sigma: Array | float) -> list[Array]:
     """Integral, value and derivative of the response of adjacent pixels (k, c) to light at points (k, j)."""
-    from .compiled import responses  # takes half a second to import; not every command needs it
-
     count = np.broadcast_shapes(pixels.shape[:1], points.shape[:1])[0]
     width = np.broadcast_to(np.asarray(sigma, dtype=np.float64), (count, 1, 1))[:, 0, 0]
     out = np.empty((3, count, points.shape[1], pixels.shape[1]))

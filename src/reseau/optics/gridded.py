@@ -22,6 +22,7 @@ from scipy.ndimage import spline_filter1d
 
 from ..core.data import Array
 from ..core.errors import UsageError
+from .compiled import gathered
 from .formation import Outline, PixelResponse
 
 __all__ = ["GriddedOutline"]
@@ -77,8 +78,6 @@ class GriddedOutline:
         UsageError
             When the nodes are not near each other.
         """
-        from .compiled import gathered  # takes half a second to import; not every command needs it
-
         (dx, dy), none = outline.dxy.T, np.zeros((0, *outline.xy.shape))
         v = none if motions is None else motions
         weights = np.concatenate([dy[None], v[..., 0] * dy - v[..., 1] * dx])

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import map_coordinates
 
 from ..core.data import Array
@@ -41,6 +40,8 @@ def on_lattice(mapping: Callable[[Array], Array], columns: Array, rows: Array) -
         Mapped coordinates, accurate to 1e-6 px for the distortion of a camera. Near undefined places the
         mapping is evaluated at every pixel.
     """
+
+    from scipy.interpolate import RectBivariateSpline  # a fifth of the time of importing
 
     def nodes(at: Array) -> Array:
         return np.linspace(at[0], at[-1], max(4, int(np.ceil((at[-1] - at[0]) / _STEP)) + 1))

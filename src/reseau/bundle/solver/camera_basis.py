@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
+from ...core.compiled import compiled
 from ...core.data import Array, Rows, rows_of_groups
-from .compiled import compiled
 from .normal import Sums
 from .unknowns import Unknowns
 

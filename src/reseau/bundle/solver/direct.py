@@ -8,11 +8,11 @@ import scipy.sparse
 from ...core.data import Array, Mask, Rows
 from .arrow import Arrow, full
 from .camera_basis import CameraBasis
-from .compiled import in_parallel
 from .conjugate import Conjugate
 from .constraints import Constrained
 from .linear import Linear
 from .normal import Pattern, Sums, assemble, gradients, reduce_sides, substitute
+from .threads import in_parallel
 from .values import Correction
 
 __all__ = ["Normal", "formed"]

@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...core.compiled import Kernel, compiled, kernel
 from ...core.data import Array, Mask, Rows
 from ...optics import PlaneMapping
-from ...optics.cameras.kernels import CameraColumns, Kernel, camera, compiled, kernel
+from ...optics.cameras.kernels import CameraColumns, camera
 from ...optics.cameras.registry import additional_model, camera_model
 from ...optics.poses import Pose, matrix_to_vector, project
 from ...optics.refraction import RefractedRays

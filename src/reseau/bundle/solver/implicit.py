@@ -6,11 +6,11 @@ import numpy as np
 import scipy.sparse
 
 from ...core.data import Array, Mask
-from .compiled import in_parallel
 from .conjugate import Conjugate
 from .direct import Normal, formed
 from .linear import Linear
 from .normal import Sums, assemble_blocks, product
+from .threads import in_parallel
 
 __all__ = ["Implicit", "normal_of"]
 

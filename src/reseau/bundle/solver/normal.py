@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...core.compiled import compiled, kernel
 from ...core.data import Array, Rows
-from .compiled import called, compiled
 
 __all__ = [
     "SEGMENTS",
@@ -136,7 +136,7 @@ def through(rows: Array, image: Rows, blocks: Array, place: int, out: Array) -> 
                 out[k, r, c], out[k, r, place + c] = one, other
 
 
-@called
+@kernel
 def _inverse(j: int, v: Array, out: Array) -> float:
     """Invert a symmetric positive definite 3×3 matrix; return the smallest pivot with unit diagonal."""
     s0, s1, s2 = 1.0 / np.sqrt(v[0, 0]), 1.0 / np.sqrt(v[1, 1]), 1.0 / np.sqrt(v[2, 2])
@@ -156,7 +156,7 @@ def _inverse(j: int, v: Array, out: Array) -> float:
     return float(min(d1, d2))
 
 
-@called
+@kernel
 def _blocks(k: int, rows: Array, misfits: Array, pattern: Pattern, sums: Sums) -> None:
     """Add AᵀA and Aᵀr of one ray to the matrix and the right-hand side."""
     start, width, column, border = pattern.start, pattern.width, pattern.column, sums.border
@@ -182,7 +182,7 @@ def _blocks(k: int, rows: Array, misfits: Array, pattern: Pattern, sums: Sums) -
                         sums.band[sb + j, at - sb - j] += x0 * rows[k, 0, cb + j] + x1 * rows[k, 1, cb + j]
 
 
-@called
+@kernel
 def _eliminate(j: int, w: Array, t: Array, pattern: Pattern, sums: Sums) -> None:
     """Add −T Wᵀ of one point to the matrix."""
     bands, border, first = len(sums.band), sums.border, pattern.local[j]
@@ -228,7 +228,7 @@ def _eliminate(j: int, w: Array, t: Array, pattern: Pattern, sums: Sums) -> None
                         sums.band[sb + q, at - sb - q] -= t0 * w0[q] + t1 * w1[q] + t2 * w2[q]
 
 
-@called
+@kernel
 def _cross(j: int, rows: Array, pattern: Pattern, w: Array) -> None:
     """Compute W of one point (3, m), for the unknowns that it depends on."""
     end = rows.shape[2]
@@ -244,13 +244,13 @@ def _cross(j: int, rows: Array, pattern: Pattern, w: Array) -> None:
                     w[q, place + i] += x0 * rows[k, 0, end - 3 + q] + x1 * rows[k, 1, end - 3 + q]
 
 
-@called
+@kernel
 def _touched(j: int, pattern: Pattern) -> int:
     last = pattern.local[j + 1] - 1
     return pattern.offset[last] + pattern.size[last] if last >= pattern.local[j] else 0
 
 
-@called
+@kernel
 def _point(
     j: int, rows: Array, misfits: Array, pattern: Pattern, prior: Array, damping: float, v: Array,
     inverse: Array, side: Array, diagonal: Array,
@@ -463,7 +463,7 @@ def gradients(
                     side[j, q] += rows[k, 0, last + q] * r0 + rows[k, 1, last + q] * r1
 
 
-@called
+@kernel
 def _entry(band: Array, border: Array, i: int, o: int) -> float:
     """Entry of a symmetric arrow matrix, both triangles of whose full rows are stored."""
     bands = len(band)
@@ -521,7 +521,7 @@ def posterior(
             _hat(j, k, rows, pattern, band, border, y, points, cross, seen)
 
 
-@called
+@kernel
 def _hat(
     j: int, k: int, rows: Array, pattern: Pattern, band: Array, border: Array, y: Array, q: Array,
     cross: Array, out: Array,

@@ -26,9 +26,9 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
+from ...core.compiled import compiled
 from ...core.data import Array, Mask, Rows, rows_of_groups
 from .arrow import Arrow, Singular
-from .compiled import compiled
 from .linear import Linear
 from .normal import SEGMENTS, Pattern
 

@@ -15,7 +15,6 @@ from ...adjust.reliability import Whitened
 from ...adjust.stochastic import Blocks, Weighting
 from ...core.data import Array, Mask, Rows
 from .arrow import Arrow, Singular
-from .compiled import in_parallel
 from .conjugate import Conjugate
 from .constraints import Constraints
 from .datum import Freedom, held_for
@@ -26,6 +25,7 @@ from .normal import posterior
 from .orthogonal import ROUNDING, cofactors_from_rows
 from .rank import PARALLEL
 from .reduced import Reduced, Referral
+from .threads import in_parallel
 
 __all__ = ["BlockSolution", "Cofactors", "cofactors_of"]
 

@@ -11,11 +11,11 @@ from ...adjust.stochastic import Weighting
 from ...core.data import Array, Mask, Rows, rows_of_groups
 from ...optics import PlaneMapping
 from ..network import Network
-from .compiled import chunks_of, in_parallel
 from .constraints import Constraints
 from .imaging import Bent, Imaging, Seen, mapped
 from .normal import Pattern
 from .observations import OtherObservations
+from .threads import chunks_of, in_parallel
 from .unknowns import Unknowns
 from .values import Values
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from ...core.compiled import compiled
 
 __all__ = ["add_images", "pixels_around"]
 
 Floats = NDArray[Any]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def pixels_around(
     start: Floats, across: Floats, half: tuple[int, int], reach: float, along: float
 ) -> NDArray[np.bool_]:
@@ -51,7 +52,7 @@ def pixels_around(
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def add_images(total: Floats, images: Floats, factor: Floats, first: Floats) -> None:
     """Add images (k, r, c), times factors (k,), to `total` (h, w), from pixels x, y `first` (k, 2) on."""
     high, wide = total.shape

@@ -5,22 +5,23 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from ...core.compiled import compiled
 
 __all__ = ["next_corners", "seen_edges"]
 
 Floats = NDArray[Any]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _apart(a: float, b: float) -> float:
     """Angle between directions, 0 to π."""
     return abs((a - b + np.pi) % (2 * np.pi) - np.pi)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _level(grey: Floats, x: float, y: float) -> float:
     """Grey value between pixels; that of the border beyond it."""
     x, y = min(max(x, 0.0), grey.shape[1] - 1.001), min(max(y, 0.0), grey.shape[0] - 1.001)
@@ -30,7 +31,7 @@ def _level(grey: Floats, x: float, y: float) -> float:
     return float((1 - v) * above + v * ((1 - u) * grey[i + 1, j] + u * grey[i + 1, j + 1]))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _is_edge(grey: Floats, start: Floats, end: Floats, along: int, beside: float, least: float) -> bool:
     """Whether a line is dark on the right, seen in the image, and bright on the left, all along."""
     dx, dy = end[0] - start[0], end[1] - start[1]
@@ -46,7 +47,7 @@ def _is_edge(grey: Floats, start: Floats, end: Floats, along: int, beside: float
     return bool(contrast.min() > least * np.median(contrast))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def seen_edges(grey: Floats, xy: Floats, edges: Floats, radius: float, count: int) -> Floats:
     """Directions of the edges (n, 2) of saddles by where a circle around them crosses their own grey value.
 
@@ -78,7 +79,7 @@ def seen_edges(grey: Floats, xy: Floats, edges: Floats, radius: float, count: in
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def next_corners(
     grey: Floats,
     xy: Floats,

@@ -18,6 +18,7 @@ from ...core.failure import Code
 from ...optics import Chain
 from ...optics.corners import Corners, corner_images
 from ...optics.formation import PixelResponse, polygons
+from ..compiled_filter import filtered
 from ..matching import GrownOutline, Matches, Shape, Window
 from ..points import Reason
 from ..reseau.lens_mapping import UNFIT, mapping_through
@@ -27,6 +28,7 @@ from ..reseau.plane_marks import PlaneMarks
 from ..response import sharpened_from_px
 from ..screening import Screened
 from ..testfield.lattice_mapping import images_of, second_order
+from .compiled_corners import add_images, pixels_around
 
 __all__ = ["CornerMarks", "CornerShape", "DeltilleMarks", "Sectors"]
 
@@ -230,8 +232,6 @@ class CornerMarks(PlaneMarks):
 
     def _region(self, rows: Rows, half: tuple[int, int]) -> Mask | None:
         """See :class:`PlaneMarks`: the half squares around a corner, and what lies along its edges."""
-        from .compiled_corners import pixels_around  # takes half a second to import
-
         back = np.linalg.inv(self._steps(rows)[0])
         across = np.einsum("kei,kij->kej", self.sectors.normal[rows], back)
         return np.asarray(
@@ -256,9 +256,6 @@ class CornerMarks(PlaneMarks):
             with np.errstate(invalid="ignore"):
                 if alike and np.nanmax(np.abs(corners - before)) < _ALIKE_PX:
                     return share
-        from ..compiled_filter import filtered  # takes half a second to import; not every command needs it
-        from .compiled_corners import add_images
-
         at = corners
         h, w = self.screened.grey.shape
         share = np.zeros((h, w), dtype=np.float32)

@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask, Rows
 from .candidates import Saddles
+from .compiled_tags import next_corners, seen_edges
 
 __all__ = ["SEARCHES", "read_tags", "tag_outlines", "with_seen_edges"]
 
@@ -45,8 +46,6 @@ _EDGE = 0.35
 
 def with_seen_edges(grey: NDArray[np.float32], saddles: Saddles, radius: float = _NEAR_PX) -> Saddles:
     """Saddles with the directions in which their edges are seen, which second derivatives do not show."""
-    from .compiled_tags import seen_edges  # takes half a second to import; not every command needs it
-
     edges = seen_edges(grey, saddles.xy, saddles.edges, radius, _PLACES)
     return Saddles(saddles.xy, edges, saddles.strength)
 
@@ -70,8 +69,6 @@ def tag_outlines(grey: NDArray[np.float32], saddles: Saddles, weak: float, radiu
     strong = np.flatnonzero(saddles.strength > weak * saddles.strength[:30].mean())
     saddles, count = saddles.select(strong), len(strong)
     # The dark sectors of a saddle extend from its second edge to the first, turned by 180°, and opposite.
-    from .compiled_tags import next_corners  # takes half a second to import; not every command needs it
-
     first, second = with_seen_edges(grey, saddles, radius).edges.T
     turn = np.pi * np.arange(2)[:, None]
     # Seen from a corner, the interior of a tag is the sector from `leaves` to `arrives`, x into y: a cycle

@@ -9,13 +9,12 @@ convergence) is marked STALE: the caller forms its image with derivatives, and l
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.compiled import compiled
 from ...optics.compiled import formed
 
 __all__ = [
@@ -33,7 +32,6 @@ __all__ = [
     "windows",
 ]
 
-F = TypeVar("F", bound=Callable[..., Any])
 Floats = NDArray[Any]
 
 ACTIVE, DONE, STALE, FAILED = 0, 1, 2, 3
@@ -52,21 +50,11 @@ _TINY = 1e-300
 _TOGETHER = 1024
 """Number of pixels whose derivatives are multiplied together: they fit into a cache."""
 f32 = np.float32
+_ANY_ORDER = frozenset({"reassoc", "nsz", "contract"})
+"""Sums may be formed in any order, as several at once."""
 
 
-def _compiled(function: F) -> F:
-    """Compile with Numba, cached on disk, releasing the GIL."""
-    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
-    return cast(F, numba.njit(**options)(function))
-
-
-def _vectorised(function: F) -> F:
-    """As :func:`_compiled`; sums may be formed in any order, as several at once."""
-    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
-    return cast(F, numba.njit(**options, fastmath={"reassoc", "nsz", "contract"})(function))
-
-
-@_compiled
+@compiled
 def cut(
     pixels: Floats, valid: Floats, centre: Floats, half: tuple[int, int], grey: Floats, weights: Floats
 ) -> None:
@@ -86,7 +74,7 @@ def cut(
                 i += 1
 
 
-@_compiled
+@compiled
 def windows(pixels: Floats, centre: Floats, half: tuple[int, int]) -> Floats:
     """Values (k, r, c) of windows around pixels `centre` (k, 2); beyond the frame those of its border."""
     (h, w), (right, down) = pixels.shape, half
@@ -100,7 +88,7 @@ def windows(pixels: Floats, centre: Floats, half: tuple[int, int]) -> Floats:
     return found
 
 
-@_compiled
+@compiled
 def weighed(
     x: Floats,
     share: Floats,
@@ -130,7 +118,7 @@ def weighed(
     return found
 
 
-@_compiled
+@compiled
 def compared(
     grey: Floats,
     x: Floats,
@@ -186,7 +174,7 @@ def compared(
     return correlation, count, seen, rejected
 
 
-@_compiled
+@compiled
 def _add_weighted(factors: Floats, begin: int, rows: Floats, out: Floats) -> None:
     """Add `rows` (m, n), times factors from `begin` on, to `out` (n,): three at a time, each of them once."""
     m, n = 0, len(out)
@@ -203,7 +191,7 @@ def _add_weighted(factors: Floats, begin: int, rows: Floats, out: Floats) -> Non
         m += 1
 
 
-@_compiled
+@compiled
 def _formed(
     x: Floats,
     share: Floats,
@@ -227,7 +215,7 @@ def _formed(
             grey[i] = plane[i] + contrast[i] * share[i]
 
 
-@_compiled
+@compiled
 def _product(a: Floats, b: Floats, begin: int, end: int) -> float:
     """Scalar product of a part, as four sums side by side: each waits for its own last addition only.
 
@@ -244,14 +232,14 @@ def _product(a: Floats, b: Floats, begin: int, end: int) -> float:
     return (one + two) + (three + four)
 
 
-@_compiled
+@compiled
 def _multiply(a: Floats, b: Floats, out: Floats) -> None:
     """a · b; few arrays, so that the compiler can prove that they do not overlap."""
     for i in range(len(out)):
         out[i] = a[i] * b[i]
 
 
-@_compiled
+@compiled
 def _without_common(values: Floats, slope: Floats, weighted: Floats, columns: int, part: Floats) -> None:
     """Subtract from each row its common error along `slope`; see `Patches.whiten`.
 
@@ -278,7 +266,7 @@ def _without_common(values: Floats, slope: Floats, weighted: Floats, columns: in
         values[i] -= slope[i] * part[i]
 
 
-@_compiled
+@compiled
 def _factorised(normal: Floats, damping: float, scale: Floats, lower: Floats) -> bool:
     """Cholesky factor of normal equations scaled to a unit diagonal; False where they are singular."""
     u = len(normal)
@@ -298,7 +286,7 @@ def _factorised(normal: Floats, damping: float, scale: Floats, lower: Floats) ->
     return True
 
 
-@_compiled
+@compiled
 def _solve(lower: Floats, right: Floats) -> None:
     """Solve L Lᵀ x = right in place."""
     u = len(right)
@@ -312,7 +300,7 @@ def _solve(lower: Floats, right: Floats) -> None:
         right[i] /= lower[i, i]
 
 
-@_compiled
+@compiled
 def _step(
     normal: Floats, gradient: Floats, damping: float, scale: Floats, lower: Floats, step: Floats
 ) -> float:
@@ -332,7 +320,7 @@ def _step(
     return predicted
 
 
-@_compiled
+@compiled
 def _next(
     k: int,
     normal: Floats,
@@ -367,7 +355,7 @@ def _next(
         x[k] = trial[k]
 
 
-@_compiled
+@compiled
 def _roots(weights: Floats, root: Floats) -> int:
     """Fill square roots of the weights (n,); the number of pixels used."""
     used = 0
@@ -377,7 +365,7 @@ def _roots(weights: Floats, root: Floats) -> int:
     return used
 
 
-@_compiled
+@compiled
 def _factors(
     plane: Floats,
     contrast: Floats,
@@ -404,14 +392,14 @@ def _factors(
         rest[:] = root
 
 
-@_compiled
+@compiled
 def _widening(log_width: float, psf: float) -> float:
     """Derivative of the width of the point-spread function by its logarithm above the lower bound."""
     wide = math.exp(log_width)
     return wide * wide / math.hypot(psf, wide)
 
 
-@_compiled
+@compiled
 def _fill_jacobian(
     slopes: Floats,
     factors: Floats,
@@ -438,7 +426,7 @@ def _fill_jacobian(
         _multiply(by_share, slopes[3 + m], jacobian[at + m])
 
 
-@_compiled
+@compiled
 def _fill_gradient(
     slopes: Floats,
     factors: Floats,
@@ -471,7 +459,7 @@ def _fill_gradient(
         gradient[_LEVEL + m] = -_product(monomials[m], part, 0, n)
 
 
-@_vectorised
+@compiled(fastmath=_ANY_ORDER)
 def _with_four(a: Floats, one: Floats, two: Floats, three: Floats, four: Floats) -> tuple[Any, Any, Any, Any]:
     """Scalar products of a row with four others, which load it once."""
     w = x = y = z = f32(0)
@@ -483,7 +471,7 @@ def _with_four(a: Floats, one: Floats, two: Floats, three: Floats, four: Floats)
     return w, x, y, z
 
 
-@_vectorised
+@compiled(fastmath=_ANY_ORDER)
 def _with_one(a: Floats, b: Floats) -> Any:
     """Scalar product."""
     total = f32(0)
@@ -492,7 +480,7 @@ def _with_one(a: Floats, b: Floats) -> Any:
     return total
 
 
-@_compiled
+@compiled
 def _fill_normal(jacobian: Floats, normal: Floats) -> None:
     """Fill the products (u, u) of the rows of a Jacobian (u, n).
 
@@ -525,19 +513,19 @@ def _fill_normal(jacobian: Floats, normal: Floats) -> None:
             normal[m, i] = normal[i, m]
 
 
-@_vectorised
+@compiled(fastmath=_ANY_ORDER)
 def _add_three(a: float, b: float, c: float, one: Floats, two: Floats, three: Floats, out: Floats) -> None:
     for i in range(len(out)):
         out[i] += a * one[i] + b * two[i] + c * three[i]
 
 
-@_vectorised
+@compiled(fastmath=_ANY_ORDER)
 def _add_one(a: float, one: Floats, out: Floats) -> None:
     for i in range(len(out)):
         out[i] += a * one[i]
 
 
-@_compiled
+@compiled
 def _fill_weighted(factors: Floats, first: int, rows: Floats, begin: int, out: Floats) -> None:
     """Fill `out` (k,) with columns of `rows` (m, n) from `begin` on, times factors (m,) from `first` on."""
     out[:] = f32(0)
@@ -551,13 +539,13 @@ def _fill_weighted(factors: Floats, first: int, rows: Floats, begin: int, out: F
         m += 1
 
 
-@_compiled
+@compiled
 def _add_squares(part: Floats, out: Floats) -> None:
     for i in range(len(out)):
         out[i] += part[i] * part[i]
 
 
-@_compiled
+@compiled
 def _fill_influence(
     jacobian: Floats, cofactor: Floats, root: Floats, part: Floats, on_position: Floats, leverage: Floats
 ) -> None:
@@ -587,7 +575,7 @@ def _fill_influence(
             _add_squares(some, leverage[begin:end])
 
 
-@_compiled
+@compiled
 def linearised(
     rows: Floats,
     share: Floats,
@@ -710,14 +698,14 @@ def linearised(
             _fill_influence(jacobian, cofactors[k], root, some, on_position[k], leverage[k])
 
 
-@_compiled
+@compiled
 def _unweighted(off: Floats, root: Floats, residuals: Floats) -> None:
     """Fill residuals (n,) from weighted ones; 0 where a pixel is not used."""
     for i in range(len(off)):
         residuals[i] = off[i] / root[i] if root[i] > 0 else 0.0
 
 
-@_compiled
+@compiled
 def influenced(
     rows: Floats,
     places: Floats,
@@ -756,7 +744,7 @@ def influenced(
         _fill_influence(jacobian, cofactors[k], root, some, on_position[k], leverage[k])
 
 
-@_compiled
+@compiled
 def _extrapolated(
     x: Floats,
     trial: Floats,
@@ -784,7 +772,7 @@ def _extrapolated(
     x[:] = trial
 
 
-@_compiled
+@compiled
 def advanced(
     rows: Floats,
     places: Floats,
@@ -861,7 +849,7 @@ def advanced(
                 _next(k, normals[k], gradients[k], limit, x, trial, iteration, state)
 
 
-@_compiled
+@compiled
 def adjusted(
     shares: Floats,
     slopes: Floats,

@@ -19,6 +19,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import uniform_filter
 
 from ...core.data import Array, Mask, Rows
+from ..compiled_filter import filtered
 from .matches import Matches
 
 __all__ = ["displaced", "with_alike_errors"]
@@ -121,8 +122,6 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     unity = np.where(known, largest, 1.0).astype(single)
     scaled: Any = np.where(known[:, None, None, None], uneven, 0.0) / unity[:, None, None, None]
     wide = np.pad(scaled, ((0, 0), (0, 0), (_LAGS, _LAGS), (_LAGS, _LAGS)))
-    from ..compiled_filter import filtered  # takes half a second to import; not every command needs it
-
     together = filtered(wide.reshape(-1, *wide.shape[2:]), kernel)
     extra = _products(scaled, together.reshape(scaled.shape)) * unity[:, None, None].astype(np.float64) ** 2
     extra -= np.where(known[:, None, None], _products(influence, influence), 0.0)

@@ -17,6 +17,7 @@ from ...adjust import BatchAdjustment, BatchOptions, BatchReason, adjust_batch
 from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
 from ...optics.formation import Outline
+from .compiled import ACTIVE, DONE, FAILED, STALE, adjusted, advanced, influenced, linearised
 from .matches import Matches, matches_of, with_rows
 from .noise import medians
 from .patches import CONTRAST, SHARPEST, WIDTH, MatchOptions, Patches, X, Y
@@ -297,8 +298,6 @@ def _compiled(
     if outlines is None:
         found = _iterated(patch, every, start, start, patch.first, weights, free, options, noise)
         return found, np.empty(0, np.intp)
-    from .compiled import adjusted  # takes half a second to import; not every command needs it
-
     share, slopes = patch.first
     (k, n), (plain, at) = patch.grey.shape, outlines
     work = _Iteration(patch, start, options, noise)
@@ -346,16 +345,12 @@ class _Iteration:
     @property
     def left(self) -> Mask:
         """Marks that have not converged."""
-        from .compiled import DONE  # takes half a second to import; not every command needs it
-
         return np.asarray(self.state != DONE)
 
     def finished(self, patch: Patches, rows: Rows, weights: Array, free: Array) -> BatchAdjustment:
         """Results of the marks `rows`; their influences are left with `patch`."""
         if len(self.influence[1]):
             patch.keep(rows, *self.influence)
-        from .compiled import FAILED  # takes half a second to import; not every command needs it
-
         redundancy = (weights > 0).sum(axis=1) + np.isfinite(free).sum() - self.x.shape[1]
         reasons = np.where(self.left, BatchReason.MAX_ITERATIONS, BatchReason.CONVERGED)
         cost = np.where(np.isfinite(self.iteration[:, 0]), self.iteration[:, 0], np.nan)
@@ -396,8 +391,6 @@ def _iterated(
     noise : float, optional
         Standard deviation of grey values, if shifts of rows are among the errors.
     """
-    from .compiled import ACTIVE, DONE, STALE, advanced, influenced, linearised  # half a second to import
-
     work, (m, u), n = _Iteration(patch, start, options, noise), start.shape, patch.grey.shape[1]
     every = len(rows) == len(patch.xy)
     observed, psf = (v if every else v[rows] for v in (patch.grey, SHARPEST * patch.psf))

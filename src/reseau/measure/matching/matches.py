@@ -9,6 +9,7 @@ import numpy as np
 
 from ...adjust import BatchAdjustment
 from ...core.data import Array, Mask, Rows
+from .compiled import compared
 from .patches import CONTRAST, LEVEL, Patches
 
 __all__ = ["Matches", "matches_of", "with_rows"]
@@ -126,8 +127,6 @@ def matches_of(
     x, k = found.estimates, len(patch.xy)
     flat = (patch.share(x) if share is None else share).reshape(k, -1)
     monomials, dark = np.ascontiguousarray(patch.monomials.T), patch.options.polarity == "dark"
-    from .compiled import compared  # takes half a second to import; not every command needs it
-
     correlation, count, seen, rejected = compared(
         patch.grey, x, monomials, flat, patch.weights, used, patch.near, dark
     )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
 from ...optics.formation import PixelResponse
+from .compiled import cut, weighed
 from .noise import LEAST, medians, relative_weights
 from .shapes import Shape, Window
 
@@ -141,8 +142,6 @@ class Patches:
         k = len(xy)
         self.shape = (k, len(down), len(right))
         self.grey, self.weights = np.empty((2, k, len(down) * len(right)))
-        from .compiled import cut  # takes half a second to import; not every command needs it
-
         cut(pixels, valid, self.centre, options.half, self.grey, self.weights)
         if others is not None:
             self.grey -= others.reshape(k, -1)
@@ -187,8 +186,6 @@ class Patches:
         else:
             x[:, CONTRAST], x[:, self.ground] = light
         if self.options.variance is not None:
-            from .compiled import weighed  # takes half a second to import; not every command needs it
-
             share, dark = self.first[0].reshape(len(x), -1), self.options.polarity == "dark"
             self.relative_weights = weighed(
                 *(x, share, self.weights, self.terms, dark, self.options.variance, LEAST)

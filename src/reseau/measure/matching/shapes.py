@@ -13,6 +13,7 @@ import numpy as np
 
 from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
+from ...optics.compiled import formed
 from ...optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
 
 __all__ = ["FormedShape", "GrownOutline", "Shape", "ShapeSubset", "Window", "outlines_of"]
@@ -143,8 +144,6 @@ class GrownOutline:
 
     def _compiled(self, xy: Array, width: Array, form: Array, at: Rows, window: Window, parts: int) -> Array:
         """Share and as many of its derivatives as `parts` asks for, (m, parts, r, c)."""
-        from ...optics.compiled import formed  # takes half a second to import; not every command needs it
-
         corner = np.stack([window.columns[:, 0], window.rows[:, 0]], axis=1)
         images: Any = np.empty((len(at), parts, window.rows.shape[1], window.columns.shape[1]), np.float32)
         place, forms, sigma = (v.astype(np.float32) for v in (xy - corner, form, width))

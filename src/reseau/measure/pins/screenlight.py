@@ -11,7 +11,6 @@ The blur is estimated from the edges of the wires.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from ...core.data import Array, Mask
@@ -161,6 +160,8 @@ def _blur_across(grey: Grey, hidden: Mask, noise: float) -> tuple[float, float] 
     shares = (profiles[flat] - ground) / depth[flat, None]
     centre = np.clip((shares * offsets).sum(axis=1) / np.maximum(shares.sum(axis=1), 1e-3), -_OFF_PX, _OFF_PX)
     values = np.array([usual / 3, 1.0, 1.0, 0.0])
+
+    from scipy.optimize import least_squares  # a fifth of the time of importing
 
     def rest(values: Array) -> Array:
         half, blur, height, level = values

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from ...core.data import Array, Rows
 from ...core.failure import Code
@@ -75,6 +74,8 @@ def cut_segments(
     >>> cuts.row, cuts.share.round(3)
     (array([0]), array([0.4]))
     """
+    from scipy.optimize import linear_sum_assignment  # a fifth of the time of importing
+
     count = len(segments)
     none = np.full(count, np.nan)
     row = np.full(count, -1)

@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 from scipy.special import gammaln
 
@@ -332,6 +331,8 @@ def nearest_pairs(predicted: Array, seen: Array, gate: float) -> tuple[Rows, Row
     mine, theirs : ndarray of int (k,)
         Indices of the paired points and detections.
     """
+    from scipy.optimize import linear_sum_assignment  # a fifth of the time of importing
+
     distance = np.hypot(*np.moveaxis(predicted[:, None] - seen[None], -1, 0))
     cost = np.minimum(distance / gate, 1.0) ** 2
     mine, theirs = linear_sum_assignment(cost)
@@ -341,6 +342,8 @@ def nearest_pairs(predicted: Array, seen: Array, gate: float) -> tuple[Rows, Row
 
 def _read_segments(wires: Wires, seen: Array, layout: Layout) -> None:
     """Assign to the segments detections that lie on them and belong to no point."""
+    from scipy.optimize import linear_sum_assignment  # a fifth of the time of importing
+
     askew = np.flatnonzero(~wires.fixed)
     free = np.setdiff1d(np.arange(len(seen)), layout.row)
     if not len(askew) or not len(free):

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from ...core.compiled import compiled
 
 __all__ = ["part_sums"]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def part_sums(labels: NDArray[Any], count: int) -> tuple[NDArray[Any], NDArray[Any]]:
     """Moments and extents of connected components.
 

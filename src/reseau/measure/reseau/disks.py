@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask
+from .components import part_sums
 
 __all__ = ["Disks", "find_disks"]
 
@@ -99,8 +100,6 @@ def _compact(grey: NDArray[Any]) -> NDArray[Any]:
 
 def _parts(mask: Mask, contrast: NDArray[Any], side: int) -> tuple[Array, Array, Array, Array]:
     """Centres (m, 2), second moments (m, 2, 2), ellipticity (m,), strength (m,) of elliptic components."""
-    from .components import part_sums  # takes half a second to import; not every command needs it
-
     h, w = mask.shape
     count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
     sums, (left, right, top, bottom) = part_sums(labels, count)

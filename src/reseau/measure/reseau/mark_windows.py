@@ -26,6 +26,7 @@ from ..matching import (
     Window,
     match,
 )
+from ..matching.compiled import windows
 from ..response import FilteredShape, Samples
 from ..screening import Screened
 from ..testfield.targets import merged
@@ -276,8 +277,6 @@ class MarkWindows(ABC):
 
     def _cut(self, values: NDArray[Any], rows: Rows, half: tuple[int, int]) -> NDArray[Any]:
         """Values (k, r, c) of a frame in the windows of marks."""
-        from ..matching.compiled import windows  # takes half a second to import; not every command needs it
-
         return np.asarray(windows(values, np.rint(self.start[rows]).astype(np.intp), half))
 
     def _form_sigma(self) -> Array:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from ...core.data import Array, Mask
 from ...optics import Chain
@@ -90,6 +89,8 @@ def fisheye_of(at: Array, xy: Array, shape: tuple[int, int]) -> float:
     at, xy, shape
         See :func:`plane_through`.
     """
+
+    from scipy.optimize import minimize_scalar  # a fifth of the time of importing
 
     def left(strength: float) -> float:
         straight = projectivity_behind(at, xy, shape, strength)[0]

@@ -13,7 +13,6 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.spatial import KDTree
 
 from ...core.data import Array, Frame, Mask, Rows
@@ -288,6 +287,8 @@ class PlaneMarks(MarkWindows):
         that are even about a mark, and do not displace it. The covariance is then C + f E, or at least that
         of the odd residuals, whichever agrees better with the scatter.
         """
+        from scipy.optimize import brentq  # a fifth of the time of importing
+
         extra = alike.cov - plain.cov
         good = plain.converged & (plain.t > 8) & (plain.rejected < 0.1) & (plain.seen > SEEN)
         # A polynomial through few marks has too few terms for a lens.

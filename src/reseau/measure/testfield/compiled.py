@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from ...core.compiled import compiled
 
 __all__ = [
     "add_windows",
@@ -24,7 +25,7 @@ __all__ = [
 ]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def supported(
     xy: NDArray[Any],
     normal: NDArray[Any],
@@ -84,7 +85,7 @@ def supported(
     return ends
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _line_through(
     xy: NDArray[Any],
     normal: NDArray[Any],
@@ -136,7 +137,7 @@ def _line_through(
     return (across - slope * along) / scale, (distance + level - slope * middle) / scale, ends, rows
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def distinct_lines(
     xy: NDArray[Any],
     normal: NDArray[Any],
@@ -192,7 +193,7 @@ def distinct_lines(
     return kept[:count].copy(), normals[:count].copy(), places[:count].copy(), ends[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _agree(one: NDArray[Any], other: NDArray[Any], none: int, alike: float) -> bool:
     """Whether most lines have the same numbers in both (n,), except for an offset; `none` is no number."""
     first, second, most = 0, 0, 0
@@ -207,7 +208,7 @@ def _agree(one: NDArray[Any], other: NDArray[Any], none: int, alike: float) -> b
     return most > 1 and most >= alike * min(first, second)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def numberings(
     at: NDArray[Any],
     weight: NDArray[Any],
@@ -315,7 +316,7 @@ def numberings(
     return chosen != none, chosen, worths[kept[:made]]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def voted(
     xy: NDArray[Any], own: NDArray[Any], direction: NDArray[Any], spread: int, reach: int
 ) -> NDArray[Any]:
@@ -344,7 +345,7 @@ def voted(
     return votes
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def add_windows(
     total: NDArray[Any], seen: NDArray[Any], first: NDArray[Any], images: NDArray[Any], wanted: bool
 ) -> None:
@@ -362,7 +363,7 @@ def add_windows(
                     seen[top + r, left + c] = True
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def without_own(
     total: NDArray[Any], first: NDArray[Any], own: NDArray[Any], sign: float, others: NDArray[Any]
 ) -> None:
@@ -379,7 +380,7 @@ def without_own(
                 others[k, r, c] = sign * (total[y, x] - own[k, r, c])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def attenuate(free: NDArray[Any], contrast: NDArray[Any], size: NDArray[Any]) -> None:
     """Replace the free share of pixels (h, w) by the light that is missing there.
 
@@ -402,7 +403,7 @@ def attenuate(free: NDArray[Any], contrast: NDArray[Any], size: NDArray[Any]) ->
             free[r, c] = light * (1.0 - free[r, c])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def bends(
     grey: NDArray[Any], total: NDArray[Any], near: NDArray[Any], sign: float, limit: float
 ) -> NDArray[Any]:
@@ -429,7 +430,7 @@ def bends(
     return found[:count]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def ridges(
     xx: NDArray[Any], yy: NDArray[Any], xy: NDArray[Any], x: NDArray[Any], y: NDArray[Any], least: float
 ) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -467,7 +468,7 @@ def ridges(
     return points[:count].copy(), normals[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def curved(
     nodes: NDArray[Any],
     tangents: NDArray[Any],
@@ -508,7 +509,7 @@ def curved(
             dxy[k] = -dxy[k]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def illumination(design: NDArray[Any], values: NDArray[Any], undetermined: float) -> NDArray[Any]:
     """Coefficients (b, m) of b sets of values at n points, adjusted three times without outliers.
 

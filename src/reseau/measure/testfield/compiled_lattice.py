@@ -8,17 +8,16 @@ with the strength of a fisheye between both (4,). See :mod:`reseau.measure.testf
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from ...core.compiled import compiled
+
 __all__ = ["assigned", "images", "lattice_coordinates", "monomials", "profiles", "radially", "shade_lines"]
 
-F = TypeVar("F", bound=Callable[..., Any])
 Floats = NDArray[Any]
 Mapped = tuple[Floats, Floats, Floats]
 
@@ -36,13 +35,7 @@ _AT = np.arange(-_FAR * _PER_SIGMA, _FAR * _PER_SIGMA + 1) / _PER_SIGMA
 _STEP, _BELL = ndtr(_AT), np.exp(-0.5 * _AT * _AT) / np.sqrt(2 * np.pi)
 
 
-def _compiled(function: F) -> F:
-    """Compile with Numba, cached on disk, releasing the GIL."""
-    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
-    return cast(F, numba.njit(**options)(function))
-
-
-@_compiled
+@compiled
 def _degree(coefficients: Floats) -> int:
     degree = 0
     while (degree + 1) * (degree + 2) // 2 < coefficients.shape[1]:
@@ -50,7 +43,7 @@ def _degree(coefficients: Floats) -> int:
     return degree
 
 
-@_compiled
+@compiled
 def _powers(u: float, degree: int, table: Floats) -> None:
     """Powers of u, their first and their second derivatives (3, degree + 1)."""
     table[0, 0], table[1, 0], table[2, 0] = 1.0, 0.0, 0.0
@@ -60,7 +53,7 @@ def _powers(u: float, degree: int, table: Floats) -> None:
         table[2, i] = i * table[1, i - 1]
 
 
-@_compiled
+@compiled
 def _equidistant(square: float, strength: float) -> tuple[float, float, float]:
     """The factor atan(√(w s)) / √(w s) of points at the squared distance s, and its derivatives by s."""
     z = strength * square
@@ -76,7 +69,7 @@ def _equidistant(square: float, strength: float) -> tuple[float, float, float]:
     return factor, strength * first, strength * strength * (-share * share - 3 * first) / (2 * z)
 
 
-@_compiled
+@compiled
 def _through_fisheye(seen: Floats, first: Floats, inner: Floats, strength: float, before: Floats) -> None:
     """Replace a point (2,) and its derivatives (2, 2), (2, 2, 2) by those of its image; `before` is space."""
     p, q = seen
@@ -99,7 +92,7 @@ def _through_fisheye(seen: Floats, first: Floats, inner: Floats, strength: float
     seen[0], seen[1] = factor * p, factor * q
 
 
-@_compiled
+@compiled
 def images(mapping: Mapped, at: Floats, value: Floats, slope: Floats, bend: Floats) -> None:
     """Images of lattice coordinates `at` (n, 2), and derivatives.
 
@@ -184,7 +177,7 @@ def images(mapping: Mapped, at: Floats, value: Floats, slope: Floats, bend: Floa
                         bend[k, c, i, j] = second[0] + second[1] + second[2] + second[3]
 
 
-@_compiled
+@compiled
 def lattice_coordinates(mapping: Mapped, back: Floats, curved: bool, xy: Floats, longest: float) -> Floats:
     """Lattice coordinates (n, 2) of image points, by Newton steps with the slope of the projectivity.
 
@@ -232,7 +225,7 @@ def lattice_coordinates(mapping: Mapped, back: Floats, curved: bool, xy: Floats,
     return at
 
 
-@_compiled
+@compiled
 def monomials(mapping: Mapped, at: Floats, degree: int) -> tuple[Floats, Floats]:
     """Monomials (n, m) of the polynomial, and images (n, 2) without it."""
     matrix, _, normal = mapping
@@ -258,7 +251,7 @@ def monomials(mapping: Mapped, at: Floats, degree: int) -> tuple[Floats, Floats]
     return found, straight
 
 
-@_compiled
+@compiled
 def assigned(
     matrix: Floats,
     normal: Floats,
@@ -310,7 +303,7 @@ def assigned(
     return rows[:found].copy(), axes[:found].copy()
 
 
-@_compiled
+@compiled
 def radially(
     matrix: Floats,
     distortion: float,
@@ -407,7 +400,7 @@ def radially(
     return k
 
 
-@_compiled
+@compiled
 def _normal(z: float) -> float:
     """Distribution function of the normal distribution: an entry of a table and three terms of the series."""
     if not abs(z) < _FAR:
@@ -419,7 +412,7 @@ def _normal(z: float) -> float:
     return share
 
 
-@_compiled
+@compiled
 def _crossings(nodes: Floats, high: int, wide: int, beyond: float) -> tuple[int, int, Floats, Floats, Floats]:
     """Crossings of a line, of which `nodes` (m, 2) were computed, with the rows or columns of a frame.
 
@@ -467,7 +460,7 @@ def _crossings(nodes: Floats, high: int, wide: int, beyond: float) -> tuple[int,
     return axis, int(lowest), place, normal, along
 
 
-@_compiled
+@compiled
 def profiles(
     grey: Floats, nodes: Floats, beside: Floats, blur: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
@@ -538,7 +531,7 @@ def profiles(
     return lines[:found].copy(), params[:found].copy(), xy[:found].copy(), normals[:found].copy()
 
 
-@_compiled
+@compiled
 def shade_lines(
     free: Floats, nodes: Floats, beside: Floats, path: tuple[Floats, Floats], longest: float, blur: float
 ) -> None:

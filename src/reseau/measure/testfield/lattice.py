@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
+from .compiled import distinct_lines, numberings, supported, voted
+from .compiled import ridges as compiled_ridges
 
 __all__ = ["BETWEEN_SIDES", "Lattice", "Ridges", "find_lattices", "median", "quantile", "ridge_points", "rms"]
 
@@ -132,8 +134,6 @@ def ridge_points(grey: NDArray[np.float32], noise: float, sigma: float = 1.0) ->
     sigma : float
         Width of the smoothing Gaussian in pixels.
     """
-    from .compiled import ridges as compiled_ridges  # takes half a second to import
-
     reach = int(np.ceil(4 * sigma))
     offset = np.arange(-reach, reach + 1)
     bell = np.exp(-0.5 * (offset / sigma) ** 2)
@@ -259,8 +259,6 @@ def _candidates(ridges: Ridges) -> _Lines:
     weight = votes[turn, distance] * share
     order = np.argsort(-weight, kind="stable")
     order = order[share[order] > _LEAST_SHARE]
-    from .compiled import distinct_lines  # takes half a second to import; not every command needs it
-
     across = np.stack([np.cos(angle), np.sin(angle)], axis=1)[order]
     place = rho[order] + across @ centre
     near = _APART_PX / 2, _PARALLEL, _FEW_POINTS
@@ -274,8 +272,6 @@ def _centre(shape: tuple[int, ...]) -> Array:
 
 def _hough(ridges: Ridges) -> tuple[NDArray[np.float32], int]:
     """Votes of the ridge points for lines (angles, distances), and the index of distance 0."""
-    from .compiled import voted  # takes half a second to import; not every command needs it
-
     at = ridges.xy - _centre(ridges.darkness.shape)
     reach = int(np.hypot(*ridges.darkness.shape) / 2) + 2
     turns = round(np.pi / _TURN)
@@ -292,8 +288,6 @@ def _dark_share(
     Of the whole line, or of the part of it with dense ridge points, of which every `each`-th is given with
     its normal, from the centre of the frame: a testfield may be small in the frame.
     """
-    from .compiled import supported  # takes half a second to import; not every command needs it
-
     h, w = darkness.shape
     apart = max(2, round(max(h, w) / _SAMPLED))
     along = np.arange(-max(h, w) * 0.7, max(h, w) * 0.7, apart)
@@ -368,8 +362,6 @@ def _numbered(lines: _Lines, rows: Rows) -> list[_Numbering]:
     at = (lines.distance[rows] - lines.normal[rows] @ middle) / (lines.normal[rows] @ along)
     order = np.argsort(at, kind="stable")
     rows, at, weight = rows[order], at[order], lines.weight[rows[order]]
-    from .compiled import numberings  # takes half a second to import; not every command needs it
-
     limits = _OFF_STEP, _NEAREST, 0.5 * float(np.log(_NEXT_GAP)), _WIDEST
     given = at, weight, limits, (_MOST_TRIED, _NUMBERINGS), _ALIKE, _STRONGEST
     found = []

@@ -17,10 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from ...adjust.compiled import reweighted
 from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
 from ...optics import Chain
 from ...optics.field import trend_degree
+from .compiled_lattice import assigned, monomials, profiles, radially
 from .lattice import BETWEEN_SIDES, Lattice, Ridges, median, quantile, rms
 from .lattice_mapping import (
     degree_of,
@@ -237,8 +239,6 @@ def _radially(mapping: Chain, xy: Array, normal: Array, at: Array, axis: Rows) -
 
     With u the image of the projectivity from the middle of the frame, the image is u (1 + k u²).
     """
-    from .compiled_lattice import radially  # takes half a second to import; not every command needs it
-
     on, each = at.copy(), np.arange(len(at))
     on[each, axis] = np.rint(on[each, axis])
     matrix, coefficients, middle = numbers_of(mapping)
@@ -259,8 +259,6 @@ def _radially(mapping: Chain, xy: Array, normal: Array, at: Array, axis: Rows) -
 
 def _sharpened(fit: LatticeFit, grey: NDArray[np.float32], width: float, blur: float) -> LatticeFit:
     """The lattice adjusted to the profiles of its lines, which are ten times as accurate as ridge points."""
-    from .compiled_lattice import profiles  # takes half a second to import; not every command needs it
-
     columns = []
     for axis, (numbers, others) in enumerate(((fit.across, fit.along), (fit.along, fit.across))):
         along = np.linspace(others.min(), others.max(), max(grey.shape) // 4)
@@ -284,8 +282,6 @@ def _assigned(
 
     Only the lines of these numbers count, and points between the outermost of them and half a step beyond.
     """
-    from .compiled_lattice import assigned  # takes half a second to import; not every command needs it
-
     first, last = (np.array([pick(number) for number in numbers]) for pick in (np.min, np.max))
     count = last - first + 1
     there = np.zeros((2, count.max()), dtype=bool)
@@ -351,8 +347,6 @@ def common_part(at: Array, residuals: Array) -> Array | None:
 
 def monomials_of(mapping: Chain, at: Array) -> tuple[Array, Array]:
     """Monomials (n, m) of the polynomial at lattice coordinates (n, 2), and images by the projectivity."""
-    from .compiled_lattice import monomials  # takes half a second to import; not every command needs it
-
     found: tuple[Array, Array] = monomials(numbers_of(mapping), np.ascontiguousarray(at), degree_of(mapping))
     return found
 
@@ -363,8 +357,6 @@ def _solved(mapping: Chain, design: Array, observed: Array, sigma_px: float) -> 
     The projectivity is kept. The coefficients of the polynomial are linear: all of them in one problem, or
     those of x and those of y, which share a design matrix (n, u), in two.
     """
-    from ...adjust.compiled import reweighted  # takes half a second to import; not every command needs it
-
     with one_thread():
         given = np.ascontiguousarray(design), np.ascontiguousarray(observed)
         added, residuals = reweighted(*given, (sigma_px / _MOST_PX) ** 2, 0.1 * sigma_px, 5)

@@ -15,6 +15,8 @@ import numpy as np
 
 from ...core.data import Array
 from ...optics import Chain, Equidistant, PlaneMapping, RationalPolynomial
+from .compiled_lattice import images
+from .compiled_lattice import lattice_coordinates as inverted
 
 __all__ = [
     "degree_of",
@@ -107,8 +109,6 @@ _NONE: tuple[Array, Array] = np.empty((0, 2, 2)), np.empty((0, 2, 2, 2))
 
 def images_of(mapping: Chain, at: Array) -> Array:
     """Images (n, 2) of lattice coordinates (n, 2)."""
-    from .compiled_lattice import images  # takes half a second to import; not every command needs it
-
     value = np.empty((len(at), 2))
     images(numbers_of(mapping), np.ascontiguousarray(at, dtype=np.float64), value, *_NONE)
     return value
@@ -116,8 +116,6 @@ def images_of(mapping: Chain, at: Array) -> Array:
 
 def slope_of(mapping: Chain, at: Array) -> Array:
     """Derivatives (n, 2, 2) of a mapping at lattice coordinates (n, 2)."""
-    from .compiled_lattice import images  # takes half a second to import; not every command needs it
-
     value, slope = np.empty((len(at), 2)), np.empty((len(at), 2, 2))
     images(numbers_of(mapping), np.ascontiguousarray(at, dtype=np.float64), value, slope, _NONE[1])
     return slope
@@ -133,8 +131,6 @@ def stretches(slope: Array) -> tuple[Array, Array]:
 
 def second_order(mapping: Chain, at: Array) -> tuple[Array, Array, Array]:
     """A mapping at points (n, 2) with its first (n, 2, 2) and second derivatives (n, 2, 2, 2)."""
-    from .compiled_lattice import images  # takes half a second to import; not every command needs it
-
     n = len(at)
     found = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 2, 2, 2))
     images(numbers_of(mapping), np.ascontiguousarray(at, dtype=np.float64), *found)
@@ -150,8 +146,6 @@ def straightened(mapping: Chain, xy: Array) -> Array:
 
 def lattice_coordinates(mapping: Chain, xy: Array) -> Array:
     """Lattice coordinates (n, 2) of image points; a few Newton steps are accurate enough here."""
-    from .compiled_lattice import lattice_coordinates as inverted  # takes half a second to import
-
     numbers = numbers_of(mapping)
     zero = of_degree(mapping, degree_of(mapping)).second
     bent = bool((mapping.second.values != zero.values).any())

@@ -13,6 +13,7 @@ from ...optics import Chain
 from ...optics.formation import Outline
 from ...optics.targets import target_outline
 from ..matching import SIZE, GrownOutline
+from .compiled import curved
 from .lattice_mapping import second_order, stretches
 
 __all__ = ["flat_outline", "form_targets", "stacked"]
@@ -52,8 +53,6 @@ def form_targets(
     reach : ndarray (k, 2)
         Half the width and half the height of each image.
     """
-    from .compiled import curved  # takes half a second to import; not every command needs it
-
     value, slope, bend = second_order(mapping, at)
     # The spacing of nodes is determined where a millimetre is largest in the image.
     scale = float(stretches(slope @ frame)[0].max())

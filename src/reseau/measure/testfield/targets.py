@@ -22,6 +22,7 @@ from ...io import TestfieldDesign
 from ...optics import Chain
 from ...optics.formation import PixelResponse
 from ..matching import FormedShape, Matches, MatchOptions, Shape, ShapeSubset, Window, match
+from .compiled import add_windows, attenuate, bends, illumination, without_own
 from .lattice import median
 from .lattice_mapping import images_of, slope_of
 from .line_profiles import blur_of
@@ -50,8 +51,6 @@ class Light:
     @classmethod
     def through(cls, xy: Array, level: Array, contrast: Array, size: tuple[float, float]) -> Light:
         """Fit to values at points (n, 2), twice: the second time without outliers."""
-        from .compiled import illumination  # takes half a second to import; not every command needs it
-
         level, contrast = illumination(_quadratic(xy, size), np.stack([level, contrast]), _UNDETERMINED)
         return cls(level, contrast, size)
 
@@ -305,8 +304,6 @@ class _Canvas:
 
     def _lay(self, part: Rows, half: Rows, *, wanted: bool = False) -> _Part:
         """Add the light of some targets to the sum; derivatives are formed for those to be measured."""
-        from .compiled import add_windows  # takes half a second to import; not every command needs it
-
         xy = self.xy[part]
         centre = np.rint(xy)
         right, down = (np.arange(-n, n + 1.0) for n in half)
@@ -336,8 +333,6 @@ class _Canvas:
         scene = self.scene
         if scene.row_jitter_px == 0:
             return scene.noise
-        from .compiled import bends  # takes half a second to import; not every command needs it
-
         sign = 1.0 if scene.design.polarity == "dark" else -1.0
         limit = 2 * _FLAT * scene.noise / scene.row_jitter_px
         bend = bends(scene.grey, self.total, self.near & scene.valid, sign, limit)
@@ -354,8 +349,6 @@ class _Canvas:
         searching: bool,
         contrast_slope: float | None,
     ) -> Matches:
-        from .compiled import without_own  # takes half a second to import; not every command needs it
-
         scene, half = self.scene, part.half
         centre = np.rint(self.xy[part.rows]).astype(np.intp)
         others = np.empty(part.own.shape, np.float32)
@@ -395,7 +388,6 @@ class _Canvas:
 
 def _line_light(scene: Scene) -> NDArray[np.float32]:
     """Grey values that the lines attenuate or add, (h, w)."""
-    from .compiled import attenuate  # takes half a second to import; not every command needs it
     from .compiled_lattice import shade_lines
 
     h, w = scene.grey.shape

@@ -10,12 +10,13 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.compiled import kernel
 from ...core.data import Array, Mask
 from ...core.errors import UsageError
 from ..composition import Inverted
 from ..mapping import Derivatives, PlaneMapping, as_points, as_values
 from .grid import PixelGrid
-from .kernels import CameraColumns, additional, kernel
+from .kernels import CameraColumns, additional
 from .radial import Radial, first_root
 from .registry import CameraModel, Option, Parameter, register_camera
 

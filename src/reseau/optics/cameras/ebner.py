@@ -8,10 +8,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.compiled import kernel
 from ...core.data import Array
 from ...core.errors import UsageError
 from ..mapping import Derivatives, PlaneMapping, as_points, as_values
-from .kernels import CameraColumns, kernel
+from .kernels import CameraColumns
 from .registry import AdditionalModel, register_additional
 
 __all__ = ["EbnerCorrection"]

@@ -10,10 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.compiled import kernel
 from ...core.data import Array
 from ..mapping import Derivatives, PlaneMapping, as_points, as_values
 from .grid import PixelGrid
-from .kernels import CameraColumns, kernel
+from .kernels import CameraColumns
 from .opencv import OpenCV
 from .registry import CameraModel, Parameter, register_camera
 

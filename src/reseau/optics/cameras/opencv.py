@@ -11,11 +11,12 @@ import numpy as np
 from numpy.polynomial import polynomial as poly
 from numpy.typing import ArrayLike
 
+from ...core.compiled import kernel
 from ...core.data import Array
 from ...core.errors import UsageError
 from ..mapping import Derivatives, as_points, as_values
 from .grid import PixelGrid
-from .kernels import CameraColumns, kernel
+from .kernels import CameraColumns
 from .radial import Radial, first_root
 from .registry import CameraModel, Parameter, register_camera
 

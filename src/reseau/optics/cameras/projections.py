@@ -16,10 +16,11 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.compiled import kernel
 from ...core.data import Array
 from ..mapping import Derivatives, as_points, as_values
 from .grid import PixelGrid
-from .kernels import CameraColumns, kernel
+from .kernels import CameraColumns
 from .radial import Radial, first_root
 from .registry import CameraModel, Parameter, register_camera
 

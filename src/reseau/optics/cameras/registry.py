@@ -15,12 +15,12 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.compiled import Kernel
 from ...core.data import Array
 from ...core.errors import UsageError
 from ...core.plugins import CAMERAS, plugin, plugins
 from ..mapping import PlaneMapping
 from .grid import PixelGrid
-from .kernels import Kernel
 
 __all__ = [
     "AdditionalModel",

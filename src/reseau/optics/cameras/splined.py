@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.compiled import kernel
 from ...core.data import Array, Rows
 from ...core.errors import UsageError
 from ..mapping import Derivatives, PlaneMapping, as_points, as_values
 from .grid import PixelGrid
-from .kernels import CameraColumns, kernel
+from .kernels import CameraColumns
 from .registry import CameraModel, Parameter, register_camera, register_family
 
 __all__ = ["SplineGrid", "SplinedStereographic"]

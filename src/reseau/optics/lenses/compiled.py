@@ -7,18 +7,14 @@ values; a code says why and where.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
-
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.compiled import compiled
 from .prescription import COEFFICIENTS
 
 __all__ = ["traced"]
 
-F = TypeVar("F", bound=Callable[..., Any])
 Numbers = NDArray[np.float64]
 
 _BLOCK = 256
@@ -29,16 +25,10 @@ _NEAR = 1e-8
 left is the square of it."""
 
 # Products and sums may be one instruction; sums are not reordered: results do not depend on the block.
-_FREE = {"contract", "nsz"}
+_FREE = frozenset({"contract", "nsz"})
 
 
-def _compiled(function: F) -> F:
-    """Compile with Numba, cached on disk, releasing the GIL."""
-    options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": _FREE}
-    return cast(F, numba.njit(**options)(function))
-
-
-@_compiled
+@compiled(fastmath=_FREE)
 def _turn(turn: Numbers, rays: Numbers) -> None:
     """Turn rays by a rotation (9,)."""
     a, b, c, d, e, f, g, h, k = turn
@@ -50,7 +40,7 @@ def _turn(turn: Numbers, rays: Numbers) -> None:
             rays[first + 2, i] = g * u + h * v + k * w
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def _to_plane(shift: Numbers, rays: Numbers, lost: Numbers, code: float) -> None:
     """Shift rays, and follow them to the plane z = 0."""
     right, up, along = shift[0], shift[1], shift[2]
@@ -63,7 +53,7 @@ def _to_plane(shift: Numbers, rays: Numbers, lost: Numbers, code: float) -> None
         lost[i] = code if none & (lost[i] == 0) else lost[i]
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def _to_conic(shift: Numbers, c: float, k: float, rays: Numbers, lost: Numbers, code: float) -> None:
     """Shift rays, and follow them to a conic (Welford 1986, section 4.5, for any direction).
 
@@ -90,7 +80,7 @@ def _to_conic(shift: Numbers, c: float, k: float, rays: Numbers, lost: Numbers, 
         lost[i] = code if missed & (lost[i] == 0) else lost[i]
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def _slope(surface: Numbers, square: float) -> float:
     """Derivative by r² of the sag of an asphere."""
     inside = 1.0 - (1.0 + surface[2]) * surface[1] * surface[1] * square
@@ -103,7 +93,7 @@ def _slope(surface: Numbers, square: float) -> float:
     return slope
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def _to_asphere(surface: Numbers, rays: Numbers, lost: Numbers, code: float, bad: Numbers) -> None:
     """Rays from near an even asphere to it, by Newton's method; `bad` is memory for a block."""
     c, k1 = surface[1], 1.0 + surface[2]
@@ -135,7 +125,7 @@ def _to_asphere(surface: Numbers, rays: Numbers, lost: Numbers, code: float, bad
         lost[i] = code if (bad[i] != 0.0) & (lost[i] == 0) else lost[i]
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def _bent(ratio: float, q: float, square: float) -> tuple[float, float]:
     """Return by how much of its normal a refracted ray differs, and what is under its root.
 
@@ -146,7 +136,7 @@ def _bent(ratio: float, q: float, square: float) -> tuple[float, float]:
     return (root if q >= 0.0 else -root) - ratio * q, under
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def _bend_conic(c: float, k: float, ratio: float, rays: Numbers, lost: Numbers, code: float) -> None:
     """Refract rays at a conic; its normal (-c x, -c y, 1 - c (1 + k) z) has the length 1 on a sphere."""
     if k == 0.0:
@@ -169,7 +159,7 @@ def _bend_conic(c: float, k: float, ratio: float, rays: Numbers, lost: Numbers, 
         rays[5, i] = ratio * rays[5, i] + step * w
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def _mirror_conic(c: float, k: float, rays: Numbers) -> None:
     """Reflect rays at a conic."""
     for i in range(rays.shape[1]):
@@ -180,7 +170,7 @@ def _mirror_conic(c: float, k: float, rays: Numbers) -> None:
         rays[5, i] += step * w
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def _bend_asphere(
     surface: Numbers,
     ratio: float,
@@ -203,7 +193,7 @@ def _bend_asphere(
         rays[5, i] = ratio * rays[5, i] + step
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def _stop_at(aperture: Numbers, corners: Numbers, rays: Numbers, lost: Numbers, code: float) -> None:
     """Mark rays that an aperture does not let pass; see :class:`reseau.optics.lenses.Aperture`."""
     shape, a, b, cx, cy, c, s, blocks = aperture[1:9]
@@ -232,7 +222,7 @@ def _stop_at(aperture: Numbers, corners: Numbers, rays: Numbers, lost: Numbers, 
         lost[i] = code if (inside == (blocks != 0)) & (lost[i] == 0) else lost[i]
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def _through(
     surfaces: Numbers,
     places: Numbers,
@@ -272,7 +262,7 @@ def _through(
             seen[s] = rays
 
 
-@_compiled
+@compiled(fastmath=_FREE)
 def traced(
     surfaces: Numbers,
     places: Numbers,

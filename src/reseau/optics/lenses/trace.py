@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask
 from ...core.errors import UsageError
+from .compiled import traced
 from .prescription import COEFFICIENTS, Aperture, Prescription, Surface
 
 __all__ = ["SURFACE_PARAMETERS", "RayDerivatives", "Rays", "Traced", "Tracer"]
@@ -199,8 +200,6 @@ class Tracer:
         seen : bool
             Whether the rays behind each surface are wanted.
         """
-        from .compiled import traced  # takes half a second to import; not every command needs it
-
         n = len(rays)
         points, directions = (np.ascontiguousarray(part, np.float64) for part in (rays.xyz, rays.directions))
         ends, behind, lost = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, dtype=np.int64)

@@ -26,8 +26,8 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from ...core.compiled import compiled, kernel
 from ...core.data import Array, Mask, Rows
-from ..cameras.kernels import compiled, kernel
 from .windows import RefractionColumns
 
 __all__ = ["RefractedRays"]

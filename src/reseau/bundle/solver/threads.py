@@ -1,4 +1,4 @@
-"""Compiled loops over observations, in parallel threads.
+"""Loops over observations in parallel threads.
 
 Whole-array NumPy allocates an array for every product; for a hundred thousand image points that takes ten
 times as long as the arithmetic (``docs/decisions/0002-numba.md``).
@@ -11,36 +11,17 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
-from typing import Any, TypeVar, cast
 
-import numba
 import numpy as np
 
 from ...core.data import Rows
 
-__all__ = ["called", "chunks_of", "compiled", "in_parallel"]
-
-F = TypeVar("F", bound=Callable[..., Any])
+__all__ = ["chunks_of", "in_parallel"]
 
 # Sums are formed in this many parts for any number of processors, so that results do not depend on it.
 _PARTS = 4
 # Minimum number of observations in a part.
 _PART_SIZE = 2000
-
-
-def compiled(function: F) -> F:
-    """Compile a function at its first call, cached on disk, without the global interpreter lock."""
-    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
-
-
-def called(function: F) -> F:
-    """Compile a function that compiled ones call, and that allocates no array: without reference counts.
-
-    Counting the references to the arrays that it is given takes longer than short loops over their elements.
-    It is not cached on disk, from where it could not be inlined; what calls it is.
-    """
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
-    return cast(F, numba.njit(**options)(function))
 
 
 def chunks_of(starts: Rows) -> list[tuple[int, int]]:
