@@ -282,7 +282,7 @@ def test_marks_that_have_no_trials_left_are_never_corrected_with_derivatives_of_
         batches.append((len(rows), len(first[1])))
         corrected(rows, place, first, *rest)
 
-    monkeypatch.setattr(compiled, "advanced", advanced)
+    monkeypatch.setattr(matcher, "advanced", advanced)
     monkeypatch.setattr(matcher, "outlines_of", lambda *_: None)
     monkeypatch.setattr(matcher, "_FIRST", trials)
     level = np.zeros((len(xy), 3))

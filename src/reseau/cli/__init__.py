@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from ..core.errors import ReseauError
+from ..core.notice import before_compiling
 from ..core.optional import missing
 from ..core.version import __version__
 from . import (
@@ -112,6 +113,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 def run(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit status."""
+    if sys.stderr.isatty():
+        before_compiling(lambda: print("compiling for this processor, once, what is called", file=sys.stderr))
     try:
         return int(app(arguments, standalone_mode=False) or 0)
     except ReseauError as error:
