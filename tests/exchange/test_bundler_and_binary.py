@@ -122,8 +122,8 @@ def test_colmaps_binary_files_are_read(tmp_path: Path) -> None:
 
 
 def test_binary_files_that_end_or_have_an_unknown_model_are_one_line(tmp_path: Path) -> None:
-    binary(tmp_path, kind=9)
-    with pytest.raises(FormatError, match="model number 9"):
+    binary(tmp_path, kind=12)
+    with pytest.raises(FormatError, match="model number 12"):
         read_colmap(tmp_path)
     binary(tmp_path)
     for name in ("cameras", "points3D", "images"):

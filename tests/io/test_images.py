@@ -74,11 +74,17 @@ def test_truncated_images_are_refused(tmp_path: Path, suffix: str, part: float) 
         read_image(tmp_path / f"b{suffix}")
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", b"%PDF-1.4", bytes(1000)])
-def test_a_file_that_is_not_an_image_is_refused_by_name(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"", "is empty"),
+        *((content, "is not a PNG, JPEG, TIFF or BMP") for content in (b"hello", b"%PDF-1.4", bytes(1000))),
+    ],
+)
+def test_a_file_that_is_not_an_image_is_refused_by_name(tmp_path: Path, content: bytes, why: str) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(content)
-    with pytest.raises(ImageError, match=r"a\.png: is not a PNG, JPEG, TIFF or BMP"):
+    with pytest.raises(ImageError, match=rf"a\.png: {why}"):
         read_image(path)
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
-from PIL import Image
+from PIL import Image, ImageFile
 
 from reseau.core.errors import ImageError
 from reseau.io.images import read_image
@@ -75,7 +75,11 @@ def made(path: Path, *pictures: np.ndarray) -> None:  # type: ignore[type-arg]
 @pytest.mark.parametrize(
     ("suffix", "loss"), [(".webp", 0), (".gif", 0), (".avif", 3), (".jp2", 0), (".pgm", 0), (".ppm", 0)]
 )
-def test_formats_of_web_pages_and_archives_are_read(tmp_path: Path, suffix: str, loss: int) -> None:
+def test_formats_of_web_pages_and_archives_are_read(
+    tmp_path: Path, suffix: str, loss: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As WeasyPrint does for the whole process.
+    monkeypatch.setattr(ImageFile, "LOAD_TRUNCATED_IMAGES", True)
     path = tmp_path / f"a{suffix}"
     pixels = gradient()
     made(path, pixels[:, :, 0] if suffix in (".gif", ".pgm") else pixels)

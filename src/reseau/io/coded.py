@@ -7,6 +7,8 @@ file stores: a rotation for viewers is not applied.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +70,7 @@ def decoded_coded(path: Path, kind: str, largest: int) -> tuple[NDArray[Any], tu
     from PIL import Image
 
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _whole_files():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path) as image:
                 width, height = image.size
@@ -81,6 +83,18 @@ def decoded_coded(path: Path, kind: str, largest: int) -> tuple[NDArray[Any], tu
         ) from error
     except (OSError, ValueError, SyntaxError, EOFError, RuntimeError) as error:
         raise ImageError(f"is a damaged {kind} image", where=path, do="copy it again") from error
+
+
+@contextmanager
+def _whole_files() -> Iterator[None]:
+    """Refuse files that end too early, also where another library (WeasyPrint) has Pillow fill them up."""
+    from PIL import ImageFile
+
+    before, ImageFile.LOAD_TRUNCATED_IMAGES = ImageFile.LOAD_TRUNCATED_IMAGES, False
+    try:
+        yield
+    finally:
+        ImageFile.LOAD_TRUNCATED_IMAGES = before
 
 
 def _pixels(image: Any) -> NDArray[Any]:
