@@ -1,12 +1,12 @@
-"""What users wait for: the first call after installation, imports, the demo, 21 photographs, a roll of film.
+"""What users wait for: the first call after installation, imports, the demo, photographs, a roll of film.
 
     python benchmarks/waiting.py [DATA] [--checkout FOLDER] [--times 3] [--only import demo …]
 
 Every command is a process of its own, of this checkout or of another one, and finds its compiled code unless
-it is the first call. The photographs are those of DATA/testfield_camcal (see `camcal.py`), DATA is by default
-$RESEAU_DATA or ../shared/data; the roll is five simulated scans of 300 dpi. Printed are medians of the
-processor time, and the least wall time; photographs and scans are measured by the process of the command,
-whose time would not contain that of others.
+it is the first call. The photographs are those of DATA/testfield_camcal (see `camcal.py`), and for `board`
+the left ones of DATA/chessboard_stereo; DATA is by default $RESEAU_DATA or ../shared/data. The roll is five
+simulated scans of 300 dpi. Printed are medians of the processor time, and the least wall time; photographs
+and scans are measured by the process of the command, whose time would not contain that of others.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from statistics import median
 
 from shared import of_the_tests
 
+from reseau.designs import board
 from reseau.io.images import write_image
 from reseau_sims.filmframe import FilmFrame
 
@@ -64,6 +65,13 @@ def commands(data: Path, folder: Path) -> dict[str, tuple[str, list[str | Path]]
         )
     else:
         print(f"without `calibrate`: no photographs in {photographs}")
+    chessboard = sorted((data / "chessboard_stereo").glob("left*.jpg"))
+    if chessboard:
+        board("chess", 10, 7, 25.0).write(folder / "chessboard.json")
+        words = ["--jobs", "1", "-o", folder / "chessboard-camera.json"]
+        found["board"] = (RESEAU, ["calibrate", *chessboard, "--design", folder / "chessboard.json", *words])
+    else:
+        print(f"without `board`: no photographs in {data / 'chessboard_stereo'}")
     (folder / "roll").mkdir()
     scans = [folder / "roll" / f"{number + 1:02}.png" for number in range(5)]
     for number, scan in enumerate(scans):
@@ -82,7 +90,7 @@ def main() -> int:
     parser.add_argument("data", nargs="?", default=os.environ.get("RESEAU_DATA", "../shared/data"), type=Path)
     parser.add_argument("--checkout", type=Path, default=ROOT, help="of which the commands are")
     parser.add_argument("--times", type=int, default=3)
-    parser.add_argument("--only", nargs="+", help="some of version, import, demo, calibrate, orient")
+    parser.add_argument("--only", nargs="+", help="some of version, import, demo, calibrate, board, orient")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

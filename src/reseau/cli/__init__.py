@@ -29,6 +29,7 @@ from . import (
     capture_own,
     capture_sensor,
     certificates,
+    compile,
     demo,
     design,
     edge,
@@ -47,6 +48,8 @@ from . import (
 )
 
 __all__ = ["app", "main"]
+
+_COMPILING = "compiling for this processor, once, what this command calls; `reseau compile` does it ahead"
 
 app = typer.Typer(
     name="reseau",
@@ -89,6 +92,7 @@ app.command("blurred")(blurred_network.blurred_network)
 app.command()(calibrate.calibrate)
 app.command()(bundle_compare.compare)
 app.command()(schema.schema)
+app.command("compile")(compile.compile_loops)
 
 
 def _version(requested: bool) -> None:
@@ -114,7 +118,7 @@ def main(arguments: list[str] | None = None) -> None:
 def run(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     if sys.stderr.isatty():
-        before_compiling(lambda: print("compiling for this processor, once, what is called", file=sys.stderr))
+        before_compiling(lambda: print(_COMPILING, file=sys.stderr))
     try:
         return int(app(arguments, standalone_mode=False) or 0)
     except ReseauError as error:

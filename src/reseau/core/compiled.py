@@ -129,11 +129,6 @@ class Compiled(Kernel[P, R]):
         made.compile(types)
         return bool(sum(made.stats.cache_misses.values()) > before)
 
-    def kept(self, types: tuple[Any, ...]) -> bool:
-        """Whether it was compiled for types of arguments before, here or in another process."""
-        made = self.dispatcher
-        return bool(made._cache.has(types, made.targetctx.codegen()))
-
     def __call__(self, *arguments: P.args, **named: P.kwargs) -> R:
         """Run the compiled function."""
         return cast(R, (self._dispatcher or self.dispatcher)(*arguments, **named))
@@ -391,11 +386,6 @@ class _Kept:
 
     def flush(self) -> None:
         """Do nothing; what is kept belongs to what was compiled."""
-
-    def has(self, signature: Any, codegen: Any) -> bool:
-        """Whether there is code for a signature, on this processor."""
-        name = self.file(signature, codegen)
-        return any((folder / name).is_file() for folder in self._folders)
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return what was compiled for a signature, or None when it is to be compiled."""
