@@ -14,7 +14,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-__all__ = ["Array", "Scene", "edge", "form", "form_at", "interpolated"]
+__all__ = ["Array", "Scene", "edge", "form", "form_at", "interpolated", "per_sample"]
 
 Array = NDArray[np.float64]
 Scene = Callable[[Array, Array, float], Array]
@@ -29,6 +29,16 @@ _NODES = 14
 def edge(inside: Array, spacing: float) -> Array:
     """Share of a sample inside, from the signed distance to an edge (positive inside)."""
     return np.clip(0.5 + inside / spacing, 0.0, 1.0)
+
+
+def per_sample(values: Array) -> Array:
+    """Change (h, w) of a function from a sample to the next, along the axis where it is larger.
+
+    An edge softened over as much is true at any angle: where samples repeat along it, as at 45°, what they
+    add to its spectrum has whole frequencies along that axis, which the softening does not pass. Softened
+    by the slope, an edge at 45° with four samples per pixel is up to 0.015 px aside.
+    """
+    return np.asarray(np.abs(np.gradient(values)).max(axis=0))
 
 
 def interpolated(function: Callable[[Array, Array], Array], x: Array, y: Array) -> Array:

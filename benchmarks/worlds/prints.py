@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from .pixels import Array, edge
+from .pixels import Array, edge, per_sample
 
 __all__ = ["Deltille", "Print", "aprilgrid", "charuco", "chess", "circles", "dotted", "markers", "puzzle"]
 
@@ -85,7 +85,7 @@ class Print:
 
     def printed(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Shares (h, w) of paper, and of ink on it, at places that follow each other closely."""
-        half = [np.hypot(*np.gradient(at)) / 2 for at in (x, y)]
+        half = [per_sample(at) / 2 for at in (x, y)]
         low, high = self._known["ends"]
         paper = np.ones(x.shape)
         for at, a, b, reach in ((x, low[0], high[0], half[0]), (y, low[1], high[1], half[1])):
@@ -105,9 +105,7 @@ class Print:
             part = tuple(slice(max(0, (r.min() - 1) * _COARSE), (r.max() + 2) * _COARSE) for r in rows)
             dx, dy = x[part] - u, y[part] - v
             away = np.maximum(np.hypot(dx, dy), 1e-9)
-            # Change of the distance over a sample, from those of both coordinates.
-            change = 2 * np.hypot(dx / away * half[0][part], dy / away * half[1][part])
-            inside = edge(radius - away, change)
+            inside = edge(radius - away, np.maximum(per_sample(away), 1e-9))
             white = k >= len(self.disks)
             ink[part] = np.minimum(ink[part], 1 - inside) if white else np.maximum(ink[part], inside)
         return paper, ink
@@ -262,7 +260,7 @@ class Deltille:
         for angle in np.deg2rad([90.0, 210.0, 330.0]):
             away = (x * np.cos(angle) + y * np.sin(angle)) / high
             line = np.rint(away)
-            inside = (away - line) / np.maximum(np.hypot(*np.gradient(away)), 1e-9)
+            inside = (away - line) / np.maximum(per_sample(away), 1e-9)
             sign *= (2 * edge(inside, 1.0) - 1) * np.where(line % 2 == 0, 1, -1)
         # No further corners of a row fit into half a side.
         low, top = (
@@ -270,7 +268,7 @@ class Deltille:
         )
         within, paper = np.ones(x.shape), np.ones(x.shape)
         for at, a, b in ((x, low[0], top[0]), (y, low[1], top[1])):
-            step = np.maximum(np.hypot(*np.gradient(at)), 1e-9)
+            step = np.maximum(per_sample(at), 1e-9)
             within *= edge(np.minimum(at - a, b - at) / step, 1.0)
             paper *= edge(np.minimum(at - a, b - at) / step + self.side / step, 1.0)
         # Between the upward edges of a corner one sign is positive and two are not: that is white.

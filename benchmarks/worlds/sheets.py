@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from worlds.pixels import Array, edge, form, interpolated
+from worlds.pixels import Array, edge, form, interpolated, per_sample
 
 __all__ = ["CONDITIONS", "Fisheye", "Printed", "Sheet", "View", "Wide", "coded", "pose", "views"]
 
@@ -108,7 +108,7 @@ class Sheet:
         """Shares (h, w) of paper, which is everywhere, and of ink."""
         inside = self.inside(x, y)
         # From millimetres to samples, by the slope of the distance itself.
-        return np.ones(x.shape), edge(inside / np.maximum(np.hypot(*np.gradient(inside)), 1e-9), 1.0)
+        return np.ones(x.shape), edge(inside / np.maximum(per_sample(inside), 1e-9), 1.0)
 
     def design(self) -> dict[str, Any]:
         """The design as a document."""
