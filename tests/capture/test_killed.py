@@ -35,13 +35,9 @@ POSES = paper_steps()[:12]
 FRAMES = 40
 FAULTY = ("faults", "two cameras")
 SIDES = ("left", "right")
-HEAVY = (
-    "reseau.optics.compiled",
-    "reseau.bundle.solver.compiled",
-    "reseau.measure.testfield.measure",
-    "reseau.bundle.modelling.adjustment",
-)
-"""Modules that take long to import."""
+HEAVY = ("reseau.bundle.modelling.adjustment", "tests.capture.loaded")
+"""Modules that take long to import, and one that loads compiled loops: a session that is killed while it loads
+them makes no progress."""
 
 
 def work(place: Path, kind: str, seed: int) -> None:
