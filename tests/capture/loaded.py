@@ -1,4 +1,4 @@
-"""Loads the compiled loops of a session for processes that are forked later, each of which may be killed soon."""
+"""Loads the compiled loops of a session for processes that are forked later, each of which may be killed."""
 
 from reseau.designs import coded_testfield
 from reseau.measure import measure_testfield
