@@ -287,9 +287,9 @@ def _inverted(rows: _Rows, blocks: list[_Block], triangles: list[Array]) -> From
 
 def _spread(some: Rows, part: _Part, root: Array, first: Rows, points: Array, seen: Array) -> None:
     """Write the cofactors of some points and of the adjusted coordinates of their rays."""
-    own = (part.d @ root).reshape(len(some), 3, -1)
+    own = (part.d @ root).reshape(len(some), 3, root.shape[1])
     points[some] = part.points + own @ np.swapaxes(own, 1, 2)
-    pairs = (part.f @ root)[part.by_ray].reshape(len(part.seen), 2, -1)
+    pairs = (part.f @ root)[part.by_ray].reshape(len(part.seen), 2, root.shape[1])
     count = first[some + 1] - first[some]
     begin = np.repeat(first[some] - np.cumsum(count) + count, count)
     seen[begin + np.arange(len(part.seen))] = part.seen + pairs @ np.swapaxes(pairs, 1, 2)
