@@ -90,7 +90,9 @@ ENTRIES = (
           "independent/boards"),
     Entry("other-boards", "Chessboards, ChArUco, circles in images of independent origin", "other_boards.py",
           ("OpenCV",), "independent/boards"),
-    Entry("drawn-boards", "Boards of other programs, drawn", "drawn_boards.py --count 1",
+    Entry("drawn-boards", "Boards of other programs, drawn",
+          "drawn_boards.py --count 1 --kind aprilgrid1 aprilgrid2 markers charuco chess_square deltille "
+          "circles asymmetric",
           ("OpenCV", "aprilgrid", "AprilTag", "mrgingham")),
     Entry("reseau-simulated", "Reseaus in the simulator's images",
           'reseau_formed.py --least 400 --only "dark, 40 dB"'),
@@ -113,7 +115,7 @@ ENTRIES = (
           ("AquaCal",)),
     Entry("nist", "Certified problems of NIST", "nist.py", (), "nist_strd"),
     Entry("archive", "Archive, beside writing files", "archive.py --frames 2000 --objects 100"),
-    Entry("gige", "GigE Vision", "gige.py --frames 100 --rounds 5", ("Aravis",)),
+    Entry("gige", "GigE Vision", "gige.py --frames 100 --rounds 3", ("Aravis",)),
     Entry("transfer", "Pictures of an oscilloscope's screen", "transfer.py", ("lxi", "pyvisa-py")),
 )  # fmt: skip
 
