@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
-from scipy.ndimage import uniform_filter
 
 from ...core.data import Array, Mask, Rows
 from ..compiled_filter import filtered
+from .compiled_errors import by_class, of_neighbours, products, standardised, weighted
 from .matches import Matches
 
 __all__ = ["displaced", "with_alike_errors"]
@@ -70,6 +70,7 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     --------
     Errors that extend over three pixels along both axes, and pixels that influence a position together:
 
+    >>> from scipy.ndimage import uniform_filter
     >>> rng = np.random.default_rng(0)
     >>> one, none, window = np.ones(30), np.zeros((30, 0)), np.ones((30, 17, 17))
     >>> alike = 3 * uniform_filter(rng.standard_normal(window.shape), (0, 3, 3))
@@ -89,42 +90,28 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
         # A part of many marks shows what they have in common.
         rows = np.flatnonzero(sure)
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(np.intp))]
-        unit, shown, activity = _prepared(found.select(rows), None if centres is None else centres[rows])
+        unit, shown, activity = _prepared(found, rows, None if centres is None else centres[rows])
         if not shown.any():
             return found
         free = 1 - found.leverage[rows]
-        # Beside a mark, where its image is even, residuals show the errors of pixels alone; on it, also what
-        # the formed image lacks, which is alike in all marks and symmetric.
-        beside = shown & (activity <= np.median(activity[shown]))
-        if not _neighbours(unit, beside, free, both_ways=centres is not None):
+        if not _neighbours(unit, shown, activity, free, both_ways=centres is not None):
             return found
-    limits = np.quantile(activity[shown], np.arange(1, _CLASSES) / _CLASSES)
-    kind = _kinds(activity, limits)
-    variance = np.ones(_CLASSES)
-    for k in range(_CLASSES):
-        those = shown & (kind == k)
-        if those.any():
-            variance[k] = (unit[those] ** 2).sum() / max(free[those].sum(), 1.0)
-    correlation = _correlation(unit / np.maximum(np.sqrt(variance)[kind], 1e-6), shown, free)
-    single = np.float32
-    influence: Any = found.influence.astype(single, copy=False)
-    influence = influence * found.noise.astype(single)[:, None, None, None]
-    kind = _kinds(_activity(influence), limits)
-    uneven = influence * np.sqrt(variance).astype(single)[kind][:, None]
+    limits = _limits(activity, shown, np.arange(1, _CLASSES) / _CLASSES)
+    variance = by_class(unit, shown, activity, limits, free)
+    correlation = _correlation(unit, shown, free)
     # The errors that a pixel has in common with those around it, weighted by their influence.
-    kernel = np.zeros((2 * _LAGS + 1,) * 2, single)
+    kernel = np.zeros((2 * _LAGS + 1,) * 2, np.float32)
     kernel[_LAGS, _LAGS] = 1.0
     for (down, right), r in correlation.items():
         kernel[_LAGS + down, _LAGS + right] = kernel[_LAGS - down, _LAGS - right] = r
-    # Windows in units of their largest value; beside them are no errors.
-    largest = np.abs(uneven).max(axis=(1, 2, 3))
-    known = np.isfinite(largest) & (largest > 0)
-    unity = np.where(known, largest, 1.0).astype(single)
-    scaled: Any = np.where(known[:, None, None, None], uneven, 0.0) / unity[:, None, None, None]
-    wide = np.pad(scaled, ((0, 0), (0, 0), (_LAGS, _LAGS), (_LAGS, _LAGS)))
-    together = filtered(wide.reshape(-1, *wide.shape[2:]), kernel)
-    extra = _products(scaled, together.reshape(scaled.shape)) * unity[:, None, None].astype(np.float64) ** 2
-    extra -= np.where(known[:, None, None], _products(influence, influence), 0.0)
+    k, _, high, broad = found.influence.shape
+    # Beside the windows are no errors.
+    wide = np.zeros((k, 2, high + 2 * _LAGS, broad + 2 * _LAGS), np.float32)
+    largest, plain = np.empty(k), np.empty((k, 2, 2))
+    classes = limits, np.sqrt(variance)
+    weighted(found.influence, found.noise, classes, _SPREAD, wide, (largest, plain))
+    together = filtered(wide.reshape(-1, *wide.shape[2:]), kernel).reshape(found.influence.shape)
+    extra = products(wide, together) * largest[:, None, None] ** 2 - plain
     extra = (extra + np.swapaxes(extra, 1, 2)) / 2
     # Errors that cancel each other, as after sharpening, are not relied upon without further evidence.
     cov, least = found.cov + extra, found.cov if centres is None else _CANCELLED * found.cov
@@ -133,61 +120,25 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     return replace(found, cov=cov)
 
 
-def _prepared(found: Matches, centres: Array | None) -> tuple[Array, Mask, Array]:
+def _prepared(found: Matches, rows: Rows, centres: Array | None) -> tuple[Array, Mask, Array]:
     """Residuals in units of their standard deviations, the pixels used, and their influence on positions.
 
-    See :func:`with_alike_errors` for `centres`.
+    See :func:`with_alike_errors` for `centres`. An image is reflected at the half pixel that is nearest to
+    its point.
     """
-    used = np.isfinite(found.residuals)
-    unit = np.where(used, found.residuals, 0.0) / np.maximum(found.noise, 1e-300)[:, None, None]
+    shape = len(rows), *found.residuals.shape[1:]
+    shifts = np.zeros((0, 2), np.int64)
     if centres is not None:
-        unit, used = _odd(unit, used, found.xy - centres)
-    return unit, used, _activity(found.influence * found.noise[:, None, None, None])
+        shifts = np.rint(2 * (found.xy[rows] - centres)).astype(np.int64)
+    unit, used, activity = np.empty(shape, np.float32), np.empty(shape, bool), np.empty(shape, np.float32)
+    standardised(rows, found.residuals, found.noise, found.influence, shifts, _SPREAD, (unit, used, activity))
+    return unit, used, activity
 
 
-def _kinds(activity: Array, limits: Array) -> Rows:
-    """Number of `limits` that each value reaches."""
-    kind = np.zeros(activity.shape, np.uint8)
-    for limit in limits:
-        kind += activity >= limit
-    return kind.astype(np.intp)
-
-
-def _products(one: Array, other: Array) -> Array:
-    """Scalar products (k, 2, 2) of pairs of windows (k, 2, rows, columns)."""
-    a, b = (part.reshape(*part.shape[:2], -1) for part in (one, other))
-    return np.asarray(a @ np.swapaxes(b, 1, 2), dtype=np.float64)
-
-
-def _activity(influence: Array) -> Array:
-    """Influence (k, rows, columns) of pixels and those around them on positions; at most 1."""
-    activity = uniform_filter((influence**2).sum(axis=1), (0, _SPREAD, _SPREAD))
-    return np.asarray(activity / np.maximum(activity.max(axis=(1, 2), keepdims=True), 1e-30))
-
-
-def _odd(unit: Array, used: Mask, off: Array) -> tuple[Array, Mask]:
-    """Odd part of images about points (k, 2) near their middles, of the same variance, and its pixels.
-
-    An image is reflected at the half pixel that is nearest to its point.
-    """
-    other, both = np.zeros_like(unit), np.zeros_like(used)
-    twice = np.rint(2 * off)
-    for shift in np.unique(twice, axis=0):
-        if not np.isfinite(shift).all() or np.abs(shift).max() >= min(unit.shape[1:]):
-            continue
-        these, (right, down) = (twice == shift).all(axis=1), shift.astype(int)
-        there, here = (
-            tuple(
-                slice(max(0, s * t), n + min(0, s * t))
-                for t, n in zip((down, right), unit.shape[1:], strict=True)
-            )
-            for s in (1, -1)
-        )
-        turned, seen = unit[these, ::-1, ::-1], used[these, ::-1, ::-1]
-        part, mask = np.zeros_like(turned), np.zeros_like(seen)
-        part[:, *there], mask[:, *there] = turned[:, *here], seen[:, *here]
-        other[these], both[these] = part, mask & used[these]
-    return np.where(both, (unit - other) / np.sqrt(2), 0.0), both
+def _limits(activity: Array, shown: Mask, share: float | Array) -> Array:
+    """Quantiles of the activity of the pixels shown; one in four shows them."""
+    some = np.s_[:, ::2, ::2] if shown[:, ::2, ::2].any() else np.s_[:]
+    return np.atleast_1d(np.quantile(activity[some][shown[some]], share))
 
 
 def _no_less(cov: Array, least: Array) -> Array:
@@ -223,30 +174,31 @@ def displaced(values: NDArray[Any], down: int, right: int) -> tuple[NDArray[Any]
     )
 
 
-def _at(lag: tuple[int, int], unit: Array, used: Mask, free: Array) -> tuple[float, float]:
-    """Correlation of residuals in units of their standard deviations, and its standard deviation."""
-    if not used.any() or not unit[used].any():
-        return 0.0, np.inf
-    here, there = displaced(np.where(used, unit, 0.0), *lag)
-    both = np.logical_and(*displaced(used, *lag))
-    count = max(int(both.sum()), 1)
+def _neighbours(unit: Array, shown: Mask, activity: Array, free: Array, both_ways: bool) -> bool:
+    """Whether pixels next to each other have errors in common, or also opposite ones.
+
+    Beside a mark, where its image is even, residuals show the errors of pixels alone; on it, also what the
+    formed image lacks, which is alike in all marks and symmetric.
+    """
+    most = float(_limits(activity, shown, 0.5)[0])
+    side, pairs, above, columns, squares, count = of_neighbours(unit, shown, activity, most)
+    if not squares > 0:
+        return False
     # Residuals are smaller than errors by what the adjustment has taken from them.
-    taken = 1 - float(free[used].mean())
-    power = float((unit[used] ** 2).mean()) / (1 - taken)
-    return float((here * there).sum()) / count / power + _TAKEN * taken, 1 / np.sqrt(count)
-
-
-def _neighbours(unit: Array, used: Mask, free: Array, both_ways: bool) -> bool:
-    """Whether pixels next to each other have errors in common, or also opposite ones."""
-    found = [_at(lag, unit, used, free) for lag in ((0, 1), (1, 0))]
-    return any((abs(r) if both_ways else r) > max(_LEAST, _SIGNIFICANT * sigma) for r, sigma in found)
+    taken = 1 - float(free[shown & (activity <= most)].mean())
+    power = squares / count / (1 - taken)
+    for total, number in ((side, pairs), (above, columns)):
+        r = total / max(number, 1) / power + _TAKEN * taken
+        if (abs(r) if both_ways else r) > max(_LEAST, _SIGNIFICANT / np.sqrt(max(number, 1))):
+            return True
+    return False
 
 
 def _correlation(unit: Array, used: Mask, free: Array) -> dict[tuple[int, int], float]:
     """Significant correlations by distance; a part of many marks shows them."""
     some = np.unique(np.linspace(0, len(unit) - 1, _SHOWN).astype(np.intp))
     unit, used, free = unit[some], used[some], free[some]
-    sums, pairs = (_lag_sums(values.astype(np.float32)) for values in (np.where(used, unit, 0.0), used))
+    sums, pairs = (_lag_sums(values) for values in (unit, used.astype(np.float32)))
     taken = 1 - float(free[used].mean())
     power = float((unit[used] ** 2).mean()) / (1 - taken)
     rows, columns = unit.shape[1:]
@@ -261,7 +213,7 @@ def _correlation(unit: Array, used: Mask, free: Array) -> dict[tuple[int, int], 
     return found
 
 
-def _lag_sums(windows: Array) -> Array:
+def _lag_sums(windows: NDArray[Any]) -> Array:
     """Sums of products of pixels of windows (k, rows, columns) at all distances (down, right) up to `_LAGS`.
 
     Negative distances are counted from the end. By the theorem of Wiener and Khinchin these are the transform
