@@ -66,6 +66,33 @@ def _rule(rho: float, at: Floats, inverse: Floats, weight: Floats) -> int:
 
 
 @compiled
+def _distances(
+    x: Floats, x0: float, tx: float, ty: float, nx: float, ny: float, bend: float, scale: float, d: Floats
+) -> None:
+    """Fill the signed distances (c,) of the pixels of a row from a bent edge, in widths."""
+    for j in range(len(d)):
+        along = tx * (x[j] - x0) + ty
+        d[j] = (nx * (x[j] - x0) + ny - bend * along * along) * scale
+
+
+@compiled
+def _fill_sectors(first: Floats, second: Floats, two: bool, row: Floats) -> None:
+    """Fill the share (c,) of the light of the pixels of a row that are far from both edges."""
+    if two:
+        for j in range(len(row)):
+            row[j] = 1.0 if (first[j] > 0) == (second[j] > 0) else 0.0
+    else:
+        for j in range(len(row)):
+            row[j] = 1.0 if first[j] > 0 and second[j] > 0 else 0.0
+
+
+@compiled
+def _clear(needed: Floats, row: Floats) -> None:
+    for j in range(len(row)):
+        row[j] = row[j] if needed[j] else 0.0
+
+
+@compiled
 def formed(
     normal: Floats,
     bend: Floats,
@@ -83,6 +110,7 @@ def formed(
     derived, curved, every = images.shape[1] > 1, form.shape[1] > 2, len(needed) == 0
     box, fourth = fill**2 / 12, -(fill**4) / 120 / 24
     at, inverse, weight = np.empty(10), np.empty(10), np.empty(10)
+    first, second = np.empty(images.shape[3]), np.empty(images.shape[3])
     for k in range(len(normal)):
         width = max(sigma[k], _SHARPEST)
         s = sqrt(width * width + box)
@@ -102,23 +130,21 @@ def formed(
         two = opposite[k]
         for i in range(images.shape[2]):
             y = rows[k, i] - xy[k, 1]
+            # Most pixels are far from both edges: what they have in common is done for a whole row at once.
+            _distances(columns[k], xy[k, 0], t1x, t1y * y, n1x, n1y * y, 0.5 * bend1, 1 / s, first)
+            _distances(columns[k], xy[k, 0], t2x, t2y * y, n2x, n2y * y, 0.5 * bend2, 1 / s, second)
+            _fill_sectors(first, second, two, images[k, 0, i])
+            for p in range(1, images.shape[1]):
+                images[k, p, i] = 0.0
+            if not every:
+                _clear(needed[k, i], images[k, 0, i])
             for j in range(images.shape[3]):
-                if not (every or needed[k, i, j]):
-                    for p in range(images.shape[1]):
-                        images[k, p, i, j] = 0.0
+                a, b = first[j], second[j]
+                near1, near2 = abs(a) < _FAR, abs(b) < _FAR
+                if not (near1 or near2) or not (every or needed[k, i, j]):
                     continue
                 x = columns[k, j] - xy[k, 0]
                 along1, along2 = t1x * x + t1y * y, t2x * x + t2y * y
-                a = (n1x * x + n1y * y - 0.5 * bend1 * along1 * along1) / s
-                b = (n2x * x + n2y * y - 0.5 * bend2 * along2 * along2) / s
-                near1, near2 = abs(a) < _FAR, abs(b) < _FAR
-                if not (near1 or near2):
-                    both = (a > 0 and b > 0) or (two and a < 0 and b < 0)
-                    images[k, 0, i, j] = 1.0 if both else 0.0
-                    if derived:
-                        for p in range(1, images.shape[1]):
-                            images[k, p, i, j] = 0.0
-                    continue
                 pa, bell_a = _near_edge(a)
                 pb, bell_b = _near_edge(b)
                 share = pa * pb + (1 - pa) * (1 - pb) if two else pa * pb

@@ -101,8 +101,7 @@ def _compact(grey: NDArray[Any]) -> NDArray[Any]:
 def _parts(mask: Mask, contrast: NDArray[Any], side: int) -> tuple[Array, Array, Array, Array]:
     """Centres (m, 2), second moments (m, 2, 2), ellipticity (m,), strength (m,) of elliptic components."""
     h, w = mask.shape
-    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
-    sums, (left, right, top, bottom) = part_sums(labels, count)
+    sums, (left, right, top, bottom) = part_sums(mask)
     keep = (sums[0] >= _LEAST_AREA) & (np.maximum(right - left, bottom - top) < side - 1)
     keep &= (left > 0) & (top > 0) & (right < w - 1) & (bottom < h - 1)
     area = sums[0, keep]
