@@ -166,6 +166,8 @@ class MarkWindows(ABC):
     eccentric: ClassVar[bool] = False
     """Whether the mapping moves the centres of images so much that marks are matched again with the
     one through all of them."""
+    even: ClassVar[bool] = False
+    """Whether images of marks are even about their points."""
     least_seen: ClassVar[float] = SEEN
     """Least share of a mark on pixels that can be used."""
     bounded: ClassVar[bool] = False

@@ -83,8 +83,6 @@ class PlaneMarks(MarkWindows):
     Parameters as of :class:`MarkWindows`.
     """
 
-    even: ClassVar[bool] = False
-    """Whether images of marks are even about their points."""
     formed_px: ClassVar[float] = _FORMED_PX
     """Standard deviation of what no formed image contains."""
 
