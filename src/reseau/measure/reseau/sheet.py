@@ -51,6 +51,9 @@ _SIDES = 12
 """Sides of a polygon whose centroid is that of the image of a disk."""
 _NODES_PX = 1.1
 """Distance of nodes on an outline, in widths of the point-spread function."""
+_POINTS = 17
+"""Points of an outline that are mapped; see :meth:`reseau.optics.formation.Outline.through`."""
+_CIRCLE = Outline.circle(0.5, np.pi / (_POINTS - 0.5))
 
 
 def measure_sheet(frame: Frame, design: ReseauDesign, options: ReseauOptions) -> dict[str, Any] | Failure:
@@ -126,12 +129,10 @@ class DiskMarks(PlaneMarks):
         """Images of the disks around the images of their centres."""
         at = self.at[rows]
         scale = float(np.linalg.norm(slope_of(self.mapping, at) @ self.frame, ord=2, axis=(1, 2)).max())
-        flat = Outline.circle(self.look.size / 2, _NODES_PX * self.look.psf_px / scale)
-        around = (at[:, None] + flat.xy @ self.frame.T).reshape(-1, 2)
-        slope = slope_of(self.mapping, around).reshape(len(at), -1, 2, 2)
-        nodes = images_of(self.mapping, around).reshape(len(at), -1, 2)
-        tangents = np.einsum("kjab,jb->kja", slope, flat.dxy @ self.frame.T)
-        outline = Outline(nodes - images_of(self.mapping, at)[:, None], tangents).oriented().single()
+        count = max(_POINTS, int(np.ceil(np.pi * self.look.size * scale / (_NODES_PX * self.look.psf_px))))
+        around = np.concatenate([np.zeros((1, 2)), _CIRCLE.xy * self.look.size]) @ self.frame.T
+        images = images_of(self.mapping, (at[:, None] + around).reshape(-1, 2)).reshape(len(at), -1, 2)
+        outline = Outline.through(images[:, 1:] - images[:, :1], count).oriented().single()
         return GrownOutline(outline, _FORM), np.abs(outline.xy).max(axis=1)
 
     def settle(self, first: Matches) -> Matches:
