@@ -152,15 +152,15 @@ def _respond(marks: MarkWindows, first: Matches, rows: Rows, begun_px: float) ->
     if not (marks.precise_start and near and not marks.surrounded):
         first = marks.settle(marks.match(rows))
         weigh(marks, first, rows)
-    if marks.even and marks.image.curve is None and _plain(marks, first, rows):
+    if _plain(marks, first, rows):
         return ()
     few = np.arange(len(rows)) % _FEW == 0
     kernel, sharper, gain = estimate_kernel(marks.samples(first.select(few), rows[few])[0])
-    bent = False
+    linear = False  # whether grey values are known to be proportional to the light
     notes: tuple[Remark, ...] = ()
     if gain < _FILTERED and marks.curve_first:
-        first, bent, notes = _straighten(marks, first, rows, beside=gain)
-        if bent:
+        first, linear, notes = _straighten(marks, first, rows, beside=gain)
+        if linear:
             kernel, sharper, gain = estimate_kernel(marks.samples(first.select(few), rows[few])[0])
     if gain < _FILTERED:
         plain = marks.look
@@ -180,17 +180,21 @@ def _respond(marks: MarkWindows, first: Matches, rows: Rows, begun_px: float) ->
             _without_border(marks, sharpened_from_px(kernel))
             text = "the images are smeared by motion or sharpened: this was estimated and is modelled"
             notes = (*notes, Remark(text, Code.FILTERED))
-    if not bent:
+        linear = linear or _plain(marks, first, rows)
+    if not linear:
         notes = (*notes, *_straighten(marks, first, rows)[2])
     return notes
 
 
 def _plain(marks: MarkWindows, first: Matches, rows: Rows) -> bool:
-    """Whether residuals at the edges of marks are those of noise, as beside them.
+    """Whether residuals at the edges of marks are those of noise, as beside them: nothing is left to learn.
 
+    Of marks that are not even a curve may shift the edges without residuals, and one of the file is tried.
     Motion, sharpening and curves change images where these have a slope: in pictures with any of them the
     mean square residuals at edges were 1.8 to 33 times those beside, in others up to 1.2 times.
     """
+    if not marks.even or marks.image.curve is not None:
+        return False
     high, wide = (n // 2 for n in first.residuals.shape[1:])
     x, y = marks.pixels(rows, (wide, high))
     used = np.isfinite(first.residuals)
