@@ -239,6 +239,11 @@ class CornerMarks(PlaneMarks):
         )
 
     @property
+    def balanced(self) -> bool:
+        """See :class:`MarkWindows`: with a dark sector opposite."""
+        return self.even and bool(self.sectors.opposite.all())
+
+    @property
     def surrounded(self) -> bool:
         """See :class:`MarkWindows`."""
         return len(self.sectors.outlines) > 0

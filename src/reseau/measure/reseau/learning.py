@@ -189,11 +189,11 @@ def _respond(marks: MarkWindows, first: Matches, rows: Rows, begun_px: float) ->
 def _plain(marks: MarkWindows, first: Matches, rows: Rows) -> bool:
     """Whether residuals at the edges of marks are those of noise, as beside them: nothing is left to learn.
 
-    Of marks that are not even a curve may shift the edges without residuals, and one of the file is tried.
+    Of marks that are not balanced a curve may shift edges without residuals, and one of the file is tried.
     Motion, sharpening and curves change images where these have a slope: in pictures with any of them the
     mean square residuals at edges were 1.8 to 33 times those beside, in others up to 1.2 times.
     """
-    if not marks.even or marks.image.curve is not None:
+    if not marks.balanced or marks.image.curve is not None:
         return False
     high, wide = (n // 2 for n in first.residuals.shape[1:])
     x, y = marks.pixels(rows, (wide, high))

@@ -208,6 +208,11 @@ class MarkWindows(ABC):
         """Half the mean extent (k,) of marks in the image."""
 
     @property
+    def balanced(self) -> bool:
+        """Whether a curve between light and grey values shifts no mark: edges of all directions alike."""
+        return self.even
+
+    @property
     def surrounded(self) -> bool:
         """Whether there is other ink of the target beside marks."""
         return False
