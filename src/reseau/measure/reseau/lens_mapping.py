@@ -32,6 +32,7 @@ from ..testfield.lattice_mapping import (
     strength_of,
     with_coefficients,
 )
+from .compiled_lens import distorted, projected
 from .plane_mapping import fisheye_of, polynomial_through
 
 __all__ = ["UNFIT", "FoundMapping", "free_through", "lens_through", "mapping_through"]
@@ -161,42 +162,13 @@ def _changes(free: Chain, at: Array, xy: Array, weight: Array) -> Callable[[Arra
     return changed
 
 
-def _distortion(u: Array, x: Array) -> tuple[Array, Array, Array]:
-    """Distortion (n, 2) at points, its derivatives by these (n, 2, 2) and by its parameters (n, 2, 8)."""
-    (k1, k2, k3), c, stretch, (p1, p2) = x[:3], x[3:5], np.array([1.0, 1.0 + x[5]]), x[6:]
-    off = u - c
-    d = off * stretch
-    dx, dy = d.T
-    r2 = dx * dx + dy * dy
-    radial, rate = r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))
-    by_p = np.stack([2 * dx * dy, r2 + 2 * dx * dx, r2 + 2 * dy * dy, 2 * dx * dy], axis=1).reshape(-1, 2, 2)
-    q = d * radial[:, None] + by_p @ [p1, p2]
-    slope = radial[:, None, None] * np.eye(2) + rate[:, None, None] * d[:, :, None] * d[:, None]
-    cross = 2 * (p1 * dx + p2 * dy)
-    slope += np.stack([2 * p1 * dy + 6 * p2 * dx, cross, cross, 6 * p1 * dy + 2 * p2 * dx], axis=1).reshape(
-        -1, 2, 2
-    )
-    by_u = slope * stretch / stretch[:, None]
-    by_a = slope[:, :, 1] * off[:, 1, None]
-    by_a[:, 1] -= q[:, 1] / stretch[1]
-    by_k = d[:, :, None] * (r2[:, None] ** [1, 2, 3])[:, None]
-    parts = by_k / stretch[:, None], -by_u, (by_a / stretch)[..., None], by_p / stretch[:, None]
-    by_x = np.concatenate(parts, axis=2)
-    return q / stretch, by_u, by_x
-
-
 def _seen(source: Array, x: Array, strength: float) -> tuple[Array, Array]:
     """Images (n, 2) of points (n, 3) in homogeneous coordinates, and derivatives (n, 2, 16) by parameters."""
-    p = source @ np.append(x[:8], 1.0).reshape(3, 3).T
-    u = p[:, :2] / p[:, 2:]
-    by_h = np.zeros((len(source), 2, 8))
-    by_h[:, 0, :3] = by_h[:, 1, 3:6] = source / p[:, 2:]
-    by_h[:, :, 6:] = -u[:, :, None] * (source[:, None, :2] / p[:, 2:, None])
+    u, by_matrix = projected(source, x[:8])
     if strength > 0:
         u, slope = Equidistant(np.array([strength])).derivatives(u)[:2]
-        by_h = slope @ by_h
-    bent, by_u, by_x = _distortion(u, x[8:])
-    return u + bent, np.concatenate([(by_u + np.eye(2)) @ by_h, by_x], axis=2)
+        by_matrix = slope @ by_matrix
+    return distorted(u, by_matrix, x[8:])
 
 
 def lens_through(
@@ -267,7 +239,7 @@ def _expanded(x: Array) -> Array:
     """Coefficients (36, 2) of distortion in the monomials 1, u, v, u², u v, v², …"""
     # They are found from values, of which a polynomial of that degree has no residuals.
     u, inverse = _expansion()
-    return np.asarray(inverse @ _distortion(u, x)[0])
+    return np.asarray(inverse @ (distorted(u, np.zeros((len(u), 2, 0)), x)[0] - u))
 
 
 @lru_cache(maxsize=1)
