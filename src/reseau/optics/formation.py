@@ -136,8 +136,10 @@ class Outline:
         >>> bool(np.abs(again.dxy - many.dxy).max() < 1e-12)
         True
         """
-        value, slope = _interpolation(xy.shape[-2], count)
-        return cls(value @ xy, slope @ xy)
+        flat = np.moveaxis(xy, -2, 0).reshape(xy.shape[-2], -1)
+        nodes = (matrix @ flat for matrix in _interpolation(xy.shape[-2], count))
+        shape = count, *xy.shape[:-2], 2
+        return cls(*(np.ascontiguousarray(np.moveaxis(each.reshape(shape), 0, -2)) for each in nodes))
 
     def mapped(self, mapping: Callable[[Array], tuple[Array, Array]]) -> Outline:
         """Map the outline with a smooth mapping; after a mirroring one, call :meth:`oriented`.
@@ -172,12 +174,12 @@ class Outline:
 @lru_cache(maxsize=32)
 def _interpolation(points: int, count: int) -> tuple[Array, Array]:
     """Matrices (count, points) by which values at points become those, and weighted slopes, at nodes."""
-    angle = 2 * np.pi * ((np.arange(count)[:, None] + 0.5) / count - (np.arange(points) + 0.5) / points)
     waves = np.arange(1, points // 2 + 1)
-    across, along = np.cos(waves[:, None, None] * angle), np.sin(waves[:, None, None] * angle)
-    value = (1 + 2 * across.sum(axis=0)) / points
-    slope = -2 * np.tensordot(waves.astype(np.float64), along, axes=1) / points * (2 * np.pi / count)
-    return np.asarray(value), np.asarray(slope)
+    there, here = (2 * np.pi * np.outer((np.arange(n) + 0.5) / n, waves) for n in (count, points))
+    cosine, sine = np.cos(here).T, np.sin(here).T
+    value = (1 + 2 * (np.cos(there) @ cosine + np.sin(there) @ sine)) / points
+    slope = (np.cos(there) * waves) @ sine - (np.sin(there) * waves) @ cosine
+    return np.asarray(value), np.asarray(slope * (4 * np.pi / (points * count)))
 
 
 def polygons(corners: Array, spacing: float) -> Outline:
