@@ -85,7 +85,7 @@ def screen(frame: Frame, run: int | None, *, noisy: bool = True) -> Screened:
     grey = pixels.astype(np.float32)
     if run is None:
         valid = np.ones(pixels.shape, dtype=bool)
-        return Screened(grey, valid, _noise(pixels, valid) if noisy else np.nan)
+        return Screened(grey, valid, _noise(pixels, None) if noisy else np.nan)
     valid = ~_lost(pixels, run)
     if (share := float(np.mean(valid & (pixels > low)))) < 0.02:
         raise ImageError(
@@ -107,17 +107,28 @@ def _lost(pixels: NDArray[Any], run: int) -> Mask:
     return mask
 
 
-def _noise(pixels: NDArray[Any], valid: Mask) -> float:
+def _noise(pixels: NDArray[Any], valid: Mask | None) -> float:
     """Robust standard deviation from second differences along the lines where all three pixels are valid."""
     rows = slice(None, None, max(1, len(pixels) // 256))  # a few hundred lines are enough
-    grey, seen = pixels[rows].astype(np.float32), valid[rows]
-    usable = seen[:, 1:-1] & seen[:, :-2] & seen[:, 2:]
-    bend = (grey[:, 1:-1] - (grey[:, :-2] + grey[:, 2:]) / 2)[usable]
-    steps = np.diff(np.unique(pixels[:: max(1, len(pixels) // 100)]).astype(np.float64))
+    grey = pixels[rows].astype(np.float32)
+    bend = grey[:, :-2] + grey[:, 2:]
+    bend *= -0.5
+    bend += grey[:, 1:-1]
+    if valid is not None:
+        seen = valid[rows]
+        bend = bend[seen[:, 1:-1] & seen[:, :-2] & seen[:, 2:]]
+    steps = np.diff(_values(pixels[:: max(1, len(pixels) // 100)]).astype(np.float64))
     quantisation = float(np.median(steps) / np.sqrt(12))
     if not bend.size:
         return quantisation
     return max(float(1.4826 * _median_size(bend, pixels.dtype) / np.sqrt(1.5)), quantisation)
+
+
+def _values(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Grey values that occur, in ascending order; of bytes they are counted, which is faster than sorting."""
+    if pixels.dtype == np.uint8:
+        return np.flatnonzero(np.bincount(pixels.ravel(), minlength=256))
+    return np.unique(pixels)
 
 
 def _median_size(bend: NDArray[Any], of: np.dtype[Any]) -> float:
@@ -125,7 +136,7 @@ def _median_size(bend: NDArray[Any], of: np.dtype[Any]) -> float:
     if of.kind != "u" or of.itemsize > 1:
         return float(np.median(np.abs(bend)))
     # Few values are possible, multiples of a half: counting them is faster than a partition.
-    count = np.cumsum(np.bincount((2 * np.abs(bend)).astype(np.intp)))
+    count = np.cumsum(np.bincount((2 * np.abs(bend)).astype(np.intp).ravel()))
     middle = np.searchsorted(count, [(bend.size - 1) // 2, bend.size // 2], side="right")
     return float(middle.mean()) / 2
 

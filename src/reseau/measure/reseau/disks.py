@@ -73,11 +73,14 @@ def find_disks(grey: NDArray[np.float32], valid: Mask, noise: float) -> Disks:
     """
     found, values, before = [], _compact(grey), 1
     low = high = values
+    # Integers are compared with an integer: with a number of another kind all of them would be converted.
+    least: Any = _LEAST_CONTRAST * noise
+    least = int(least) if values.dtype.kind in "ui" else least
     for side in _SIDES_PX:
         square = np.ones((side - before + 1,) * 2, np.uint8)  # minimum over a square of squares
         low, high, before = cv2.erode(low, square), cv2.dilate(high, square), side
         contrast = high - low
-        dark = (values - low < high - values) & (contrast > _LEAST_CONTRAST * noise) & valid
+        dark = (values - low < high - values) & (contrast > least) & valid
         found.append(_parts(dark, contrast, side))
     xy, moments, quality, t = (np.concatenate(column) for column in zip(*found, strict=True))
     if not len(xy):
