@@ -43,6 +43,8 @@ _SPREAD = 16
 _ALIKE_PX = 0.3
 """Deviation of a mark, as it was found, from the mapping through precise ones, up to which it is expected
 where this has it."""
+_WITHIN_PX = 0.49
+"""Distance from the middle of a pixel within which a position has that one in the middle of its window."""
 _FITS, _ROUGH_PX = 4.0, 0.01
 """Deviation of precise marks from that mapping, in their sigmas and a part that does not count, up to which
 it predicts others."""
@@ -112,10 +114,15 @@ def _sharpness(marks: MarkWindows, rows: Rows) -> float:
 
 def _learn(marks: MarkWindows, first: Matches, rows: Rows) -> Matches:
     """Learn mapping, sharpness, size and noise from reliable marks; their form refers to the new size."""
-    marks.start[rows] = first.xy
     known = marks.found if marks.precise_start else np.isin(np.arange(len(marks.at)), rows)
     h, w = marks.screened.grey.shape
-    marks.mapping = plane_through(marks.at[known], marks.start[known], (h, w))
+    xy, centre = marks.start.copy(), np.rint(marks.start[rows])
+    xy[rows] = first.xy
+    marks.mapping = plane_through(marks.at[known], xy[known], (h, w))
+    weigh(marks, first, rows)
+    # Windows remain where they are, if possible: residuals are those of their pixels.
+    within = np.clip(first.xy, centre - _WITHIN_PX, centre + _WITHIN_PX)
+    marks.start[rows] = np.where(np.abs(first.xy - within) < 1 - _WITHIN_PX, within, first.xy)
     if marks.precise_start and len(rows) >= _SPREAD:
         sigma = np.sqrt(first.variance)
         precise = mapping_through(marks.at[rows], first.xy, sigma, (h, w)).mapping
@@ -126,7 +133,6 @@ def _learn(marks: MarkWindows, first: Matches, rows: Rows) -> Matches:
             near = marks.found & (np.abs(predicted - marks.start) < _ALIKE_PX).all(axis=1)
             near &= ~np.isin(np.arange(len(near)), rows)
             marks.start[near] = predicted[near]
-    weigh(marks, first, rows)
     first = marks.settle(first)
     marks.look = replace(
         marks.look,

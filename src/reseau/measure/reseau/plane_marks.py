@@ -157,13 +157,13 @@ class PlaneMarks(MarkWindows):
             found, settled = self._moved(rows, found, sure)
             if settled:
                 return found
+            weigh(self, found.select(sure), rows[sure])  # with the windows in which they were matched
             self.start[rows[sure]] = found.xy[sure]
             lost = rows[~sure & ~self.found[rows]]
             self.start[lost] = self.mapping(self.at[lost])
             if self.eccentric:
                 # Growth about the image of the point is not that of the mark on its plane.
                 self.settle(found.select(sure))
-            weigh(self, found.select(sure), rows[sure])
             found = self._match_all(rows)
             sure = _sure(found)
         return found
