@@ -155,9 +155,11 @@ def _respond(marks: MarkWindows, first: Matches, rows: Rows, begun_px: float) ->
     # figures beside them.
     near = abs(np.log(np.median(first.psf_px) / begun_px)) < _NEAR_WIDTH
     near &= bool((np.median(np.abs(first.form), axis=0) < _NEAR_FORM).all())
-    if not (marks.precise_start and near and not marks.surrounded):
-        first = marks.settle(marks.match(rows))
-        weigh(marks, first, rows)
+    if marks.precise_start and near and not marks.surrounded and _plain(marks, first, rows):
+        return ()
+    # What is left is explained with images by the mapping through precise marks.
+    first = marks.settle(marks.match(rows))
+    weigh(marks, first, rows)
     if _plain(marks, first, rows):
         return ()
     few = np.arange(len(rows)) % _FEW == 0
