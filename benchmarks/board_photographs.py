@@ -41,7 +41,7 @@ def by_another(path: Path, design: BoardDesign) -> Array:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
     if pixels.dtype != np.uint8:
         pixels = (pixels * (255.0 / pixels.max())).astype(np.uint8)
-    return by_others(design, pixels)[0]
+    return by_others(design, pixels)[0].xy
 
 
 def scatter(at: Array, xy: Array, shape: tuple[int, int]) -> float:

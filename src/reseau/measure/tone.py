@@ -28,7 +28,7 @@ _LEAST_GAIN, _STRONG = 0.995, 0.9
 """Ratios of mean square residuals below which a curve matters, and is beyond doubt."""
 _CERTAIN, _CORRELATED = 6.0, 0.12
 """Least significance of a curve; correlation of residuals from which they have another cause."""
-_USUAL, _KNOWN = 2.2, 0.2
+_USUAL, _KNOWN = 2.2, 0.1
 """Exponent of most cameras; its standard deviation up to which one that agrees with it is no accident."""
 _LINEAR = 0.15
 """Deviation of an exponent from 1 that does no harm."""
@@ -40,6 +40,9 @@ _LEAST, _MOST = 0.35, 3.5
 """Exponents that cameras have."""
 _LIKE_SRGB = 0.5
 """Deviation of an exponent from 2.2 within which the curve of sRGB is tried, too."""
+_BROUGHT = 0.5
+"""Share of the decrease of residuals that the first estimate predicts, which a curve must bring; what a curve
+leaves of the residuals of compression is by chance."""
 _DOUBTFUL = 1.03
 """Ratio of the residuals with the curve that the file states to those with a straight line up to which marks
 do not contradict the file; in strongly compressed pictures they do not tell."""
@@ -179,7 +182,7 @@ def find_curve(
     rest = estimate_gamma(*at, 1.0, full_scale)
     if not rest.certain or abs(rest.gamma - 1) < _LINEAR or not rest.gain < beside:
         return best
-    least = _misfit(its_own, at, full_scale)
+    least = _misfit(its_own, at, full_scale) * (1 - _BROUGHT * (1 - np.sqrt(rest.gain)))
     power = _estimated(matched, rest if at is straight else None, straight, full_scale)
     if power is None:
         return best

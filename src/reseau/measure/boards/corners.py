@@ -139,7 +139,7 @@ class CornerMarks(PlaneMarks):
     form_sigma = np.array([_TURN, _TURN])
     learnt_form_sigma = np.array([_TURNED, _TURNED])
     learnt_from = 24
-    sampled = 12
+    sampled = 8
     precise_start = True
     bounded = True
     curve_first = True

@@ -274,7 +274,7 @@ class CircleMarks(DiskMarks):
 
     word = "circle"
     learnt_from = 24
-    sampled = 12
+    sampled = 8
     precise_start = True
     bounded = True
     curve_first = True

@@ -24,6 +24,7 @@ from .plane_mapping import plane_through
 
 __all__ = ["learn", "weigh"]
 
+_GOLDEN = (np.sqrt(5) - 1) / 2
 _FEW = 3
 """One in so many of these shows whether a kernel is needed."""
 _KERNELS = 2
@@ -72,11 +73,23 @@ def learn(marks: MarkWindows) -> tuple[Remark, ...]:
     """
     rows = np.flatnonzero(marks.found)
     if len(rows) > marks.learnt_from:
+        # With the first and the last: a mapping is not known beyond the marks that show it.
         rows = rows[np.linspace(0, len(rows) - 1, marks.learnt_from).astype(np.intp)]
     first, sure, begun_px = _first(marks, rows)
     if sure.sum() < ENOUGH:
         return ()
     return _respond(marks, _learn(marks, first.select(sure), rows[sure]), rows[sure], begun_px)
+
+
+def _some_of(count: int, most: int) -> Rows:
+    """Indices of at most so many of `count` marks, in all rows and columns of a grid.
+
+    Equal steps may be as long as a row, and give one column. Multiples of the golden ratio have no common
+    measure with any length, and leave no gaps (Weyl's equidistribution).
+    """
+    if count <= most:
+        return np.arange(count)
+    return np.unique((count * ((np.arange(most) + 0.5) * _GOLDEN % 1.0)).astype(np.intp))
 
 
 def _first(marks: MarkWindows, rows: Rows) -> tuple[Matches, Mask, float]:
@@ -99,7 +112,7 @@ def _first(marks: MarkWindows, rows: Rows) -> tuple[Matches, Mask, float]:
 
 def _sharpness(marks: MarkWindows, rows: Rows) -> float:
     """Width of the point-spread function by the steepest slopes around some of the marks, pixels."""
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, _SHARPNESS_OF).astype(np.intp))]
+    rows = rows[_some_of(len(rows), _SHARPNESS_OF)]
     half = _AROUND_PX + int(np.ceil(marks.radius(rows).max()))
     x, y = marks.pixels(rows, (half, half))
     grey = marks.screened.grey[y, x]
@@ -149,7 +162,7 @@ def _respond(marks: MarkWindows, first: Matches, rows: Rows, begun_px: float) ->
 
     `begun_px` is the sharpness from which the first match began.
     """
-    some = np.unique(np.linspace(0, len(rows) - 1, marks.sampled).astype(np.intp))
+    some = _some_of(len(rows), marks.sampled)
     first, rows = first.select(np.isin(np.arange(len(rows)), some)), rows[some]
     # The first match may have begun far from the sharpness and form of these images, or with other
     # figures beside them.
