@@ -62,6 +62,8 @@ in sigmas, from which both follow each other, and total change from which marks 
 match gives is the middle of an image to first order only."""
 _LENGTH_OF = 80
 """Number of marks from which the correlation length of what a polynomial leaves is that of half as many."""
+_BOUND = 2.0
+"""Standard deviations up to which the variance of positions may be larger than their scatter shows."""
 _PER_SMOOTH = 2.5
 """Least number of coordinates for each term of the polynomial about which positions scatter."""
 _BLURRED = 1.8
@@ -312,7 +314,9 @@ class PlaneMarks(MarkWindows):
         share, left = (0.0, none) if abs(none) < abs(whole) else (1.0, whole)
         if none * whole < 0:
             share, left = float(brentq(excess, 0.0, 1.0, xtol=0.01)), 0.0
-        even = max(1 + none / redundancy, self._odd_share(plain.residuals[good])) if none < 0 else 1.0
+        scatter = 1 + none / redundancy
+        bound = min(self._odd_share(plain.residuals[good]), scatter * (1 + _BOUND * np.sqrt(2 / redundancy)))
+        even = max(scatter, bound) if none < 0 else 1.0
         if abs(left) < abs((none + redundancy) / even - redundancy):
             return replace(alike, cov=plain.cov + share * extra)
         return replace(alike, cov=even * plain.cov)
