@@ -57,6 +57,8 @@ _LEAST_EDGE = 0.1
 """Share of the pixels of an edge below which it is not seen."""
 _BORDER = 2.0
 """Least distance of a corner from the outermost pixels, in widths of the point-spread function."""
+_STRONG, _INTACT, _SHOWS_GROWTH = 8.0, 0.1, 12
+"""Significance and share of rejected pixels of corners that show the growth of ink; least number of them."""
 _FLAT = 0.35
 """Least sine of the angle between the edges of a corner."""
 _FAR_PX, _FIGURES_PX = 1e5, 24
@@ -293,6 +295,45 @@ class CornerMarks(PlaneMarks):
             add_images(share, taken, self.sectors.ink[part], low[part].astype(np.intp))
         self.figures = share, at, width, look.kernel
         return share
+
+    def _without_growth(self, rows: Rows, found: Matches) -> Matches:
+        """See :class:`PlaneMarks`: corners of single tags without a shift of their edges.
+
+        Ink spreads on paper, and an error of the curve or the kernel of the camera looks similar: the edges
+        of all tags are shifted. Opposite corners of a tag are images of each other turned by 180° and move in
+        opposite directions, which no smooth mapping does. The shifts along x and y of both pairs are
+        estimated, with a polynomial, from what the mapping leaves.
+        """
+        good = found.converged & (found.t > _STRONG) & (found.rejected < _INTACT)
+        mapping, known = self.precise or (self.mapping, rows)
+        good &= np.isin(rows, known)
+        if self.balanced or good.sum() < _SHOWS_GROWTH:
+            return found
+        shape = self._images(rows)[0]
+        assert isinstance(shape, CornerShape)
+        shift = np.linalg.inv(shape.corners.normal)  # (k, xy, edge): of the point, by that of each edge
+        pair = self.sectors.normal[rows].sum(axis=1).prod(axis=1) > 0
+        shift = np.concatenate([np.where(of[:, None, None], shift, 0.0) for of in (pair, ~pair)], axis=2)
+        terms = self._smooth_terms(rows[good])
+        if terms is None:
+            at = self._straight(rows[good])
+            terms = np.column_stack([np.ones(len(at)), at - at.mean(axis=0)])
+        none = np.zeros_like(terms)
+        design = np.block([[terms, none, shift[good, 0]], [none, terms, shift[good, 1]]])
+        if len(design) <= design.shape[1]:
+            return found
+        sigma = np.sqrt(np.diagonal(found.cov[good], axis1=1, axis2=2)).T.ravel()
+        bent = (found.xy[good] - mapping(self.at[rows[good]])).T.ravel() / sigma
+        weighted = design / sigma[:, None]
+        inverse = np.linalg.pinv(weighted.T @ weighted, hermitian=True)
+        values = inverse @ (weighted.T @ bent)
+        square = float(((weighted @ values - bent) ** 2).sum()) / (len(design) - design.shape[1])
+        cofactor = max(square, 1.0) * inverse[-4:, -4:]
+        return replace(
+            found,
+            xy=found.xy - shift @ values[-4:],
+            cov=found.cov + shift @ cofactor @ np.swapaxes(shift, 1, 2),
+        )
 
     def _width(self, at: Array) -> Array:
         """Widths (m,) of the point-spread function at places of the lattice; if it varies, those near."""

