@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from reseau.core.data import Array
+from reseau.measure.reseau.compiled_lens import distorted, projected
 from reseau.measure.reseau.lens_mapping import lens_through, mapping_through
 from reseau.measure.reseau.plane_mapping import plane_through
 from reseau.measure.testfield.lattice_mapping import second_order, slope_of
@@ -26,6 +27,21 @@ def seen_through_a_fisheye(seed: int) -> tuple[Array, Array]:
     radius, angle = FOCAL * np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
     xy = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]) + 511.5
     return at, xy + rng.normal(0, NOISE_PX, xy.shape)
+
+
+def test_derivatives_of_the_images_through_a_lens_are_those_of_differences() -> None:
+    rng = np.random.default_rng(2)
+    source = np.column_stack([rng.uniform(-1, 1, (9, 2)), np.ones(9)])
+    first = [1.1, 0.02, 0.03, -0.01, 0.9, 0.05, 0.02, -0.03]
+    x = np.array([*first, 0.1, -0.05, 0.01, 0.02, -0.03, 0.004, 0.002, -0.001])
+
+    def images(x: Array) -> tuple[Array, Array]:
+        return distorted(*projected(source, x[:8]), x[8:])
+
+    slopes = images(x)[1]
+    for k, step in enumerate(1e-6 * np.eye(len(x))):
+        difference = (images(x + step)[0] - images(x - step)[0]) / 2e-6
+        np.testing.assert_allclose(slopes[..., k], difference, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -57,6 +57,8 @@ _LEAST_EDGE = 0.1
 """Share of the pixels of an edge below which it is not seen."""
 _BORDER = 2.0
 """Least distance of a corner from the outermost pixels, in widths of the point-spread function."""
+_SAMPLED_OF_TAGS = 20
+"""Most corners of single tags that show the camera's response."""
 _STRONG, _INTACT, _SHOWS_GROWTH = 8.0, 0.1, 12
 """Significance and share of rejected pixels of corners that show the growth of ink; least number of them."""
 _FLAT = 0.35
@@ -155,6 +157,9 @@ class CornerMarks(PlaneMarks):
         super().__init__(image, screened, located, options, sectors.reach)
         self.sectors = sectors
         self.figures: tuple[Array, Array, Array, Array | None] | None = None
+        if not self.balanced:
+            # What is not known of the camera shifts them: it is learnt from more.
+            self.sampled = _SAMPLED_OF_TAGS
         self.widths = np.full(len(self.xy), np.nan)  # of the point-spread function at corners, if it varies
 
     def _curvature(self, mapping: Chain, rows: Rows) -> Array:

@@ -159,7 +159,7 @@ class MarkWindows(ABC):
     """The same for marks whose common size is known."""
     learnt_from: ClassVar[int] = _LEARNT_FROM
     """Most marks from which mapping and appearance are learnt first."""
-    sampled: ClassVar[int] = 20
+    sampled: int = 20
     """Most marks that show the camera's response."""
     precise_start: ClassVar[bool] = False
     """Whether marks are found so precisely that a match can continue from what is known of them."""
