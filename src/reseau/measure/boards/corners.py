@@ -247,8 +247,8 @@ class CornerMarks(PlaneMarks):
 
     @property
     def balanced(self) -> bool:
-        """See :class:`MarkWindows`: with a dark sector opposite."""
-        return self.even and bool(self.sectors.opposite.all())
+        """See :class:`MarkWindows`: with a dark sector opposite, or three of six."""
+        return bool(self.sectors.opposite.all())
 
     @property
     def surrounded(self) -> bool:
