@@ -126,7 +126,7 @@ class PlaneMarks(MarkWindows):
             found = replaced(found, ~doubtful, self._match_all(rows[doubtful]))
         found = self._without_growth(rows, found)
         alike = with_alike_errors(found, np.rint(self.start[rows]) if self.even else None)
-        found = self._tempered(rows, found, alike) if self.even else alike
+        found = self._tempered(rows, found, alike) if self.precise_start else alike
         if self.precise_start:
             found = self._with_doubtful_light(rows, found)
         found = replace(found, cov=found.cov + self._misformed(rows, found))
@@ -320,7 +320,8 @@ class PlaneMarks(MarkWindows):
         if none * whole < 0:
             share, left = float(brentq(excess, 0.0, 1.0, xtol=0.01)), 0.0
         scatter = 1 + none / redundancy
-        bound = min(self._odd_share(plain.residuals[good]), scatter * (1 + _BOUND * np.sqrt(2 / redundancy)))
+        odd = self._odd_share(plain.residuals[good]) if self.even else 1.0
+        bound = min(odd, scatter * (1 + _BOUND * np.sqrt(2 / redundancy)))
         even = max(scatter, bound) if none < 0 else 1.0
         if abs(left) < abs((none + redundancy) / even - redundancy):
             return replace(alike, cov=plain.cov + share * extra)
