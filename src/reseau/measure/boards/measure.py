@@ -22,7 +22,7 @@ from ..reseau.marks import ReseauOptions
 from ..reseau.plane_marks import PlaneMarks
 from ..reseau.sheet import DiskMarks
 from ..screening import Screened, screen
-from ..testfield.lattice_mapping import second_order
+from ..testfield.lattice_mapping import second_order, stretches
 from .candidates import Saddles, find_saddles
 from .corners import CornerMarks, DeltilleMarks, Sectors
 from .deltilles import find_deltille
@@ -292,9 +292,9 @@ class CircleMarks(DiskMarks):
     def _region(self, rows: Rows, half: tuple[int, int]) -> Mask | None:
         """See :class:`PlaneMarks`: what lies before the next circles."""
         slope = second_order(self.mapping, self.at[rows])[1] @ self.frame
-        value = np.linalg.svd(slope, compute_uv=False)
-        limit = self.free - _CIRCLE_EDGE * self.look.blur_px / value[:, 1]
-        if (np.hypot(*half) < limit * value[:, 1]).all():
+        least = stretches(slope)[1]
+        limit = self.free - _CIRCLE_EDGE * self.look.blur_px / least
+        if (np.hypot(*half) < limit * least).all():
             return None
         centre = np.rint(self.start[rows])
         x = centre[:, :1] + np.arange(-half[0], half[0] + 1) - self.start[rows, :1]

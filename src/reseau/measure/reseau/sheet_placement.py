@@ -21,7 +21,7 @@ from ...core.errors import UsageError
 from ...core.failure import Code, Failure
 from ...io import ReseauDesign
 from ...optics import Chain
-from ..testfield.lattice_mapping import second_order, started
+from ..testfield.lattice_mapping import second_order, started, stretches
 from .assignment import spacing
 from .disks import Disks
 from .plane_mapping import plane_through
@@ -175,7 +175,7 @@ def grown_disks(
     for _ in range(3 * count):
         beside = grid[KDTree(nodes).query(grid)[0] < _FROM]
         predicted, slopes, _ = second_order(mapping, beside)
-        pixels = np.linalg.svd(slopes, compute_uv=False)[:, 1]
+        pixels = stretches(slopes)[1]
         gap, row = tree.query(predicted)
         # The area of an ellipse is proportional to that of the mesh around it.
         alike = np.abs(size[row] - size[seed] - np.log(np.abs(np.linalg.det(slopes) / np.linalg.det(slope))))
