@@ -38,8 +38,8 @@ _CLASS_PX = 4
 """Step of the window sizes."""
 _GROUND_PX, _GROUND_WIDTHS = 5, 3.0
 """Background shown by a window around its mark: pixels, and widths of the point-spread function."""
-_AT_ONCE_PX = 250_000
-"""Number of pixels of windows matched together: what is formed in them takes some 30 MB."""
+_AT_ONCE_PX = 70_000
+"""Number of pixels of windows matched together: what is formed in them takes some 8 MB."""
 _SHARED_PX = 8_000
 """Number of pixels whose matching takes as long as what windows of one more size take beside it."""
 _LEARNT_FROM = 120
