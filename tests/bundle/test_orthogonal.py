@@ -11,6 +11,7 @@ from reseau.bundle import BundleFit
 from reseau.bundle.solver.arrow import Singular
 from reseau.bundle.solver.orthogonal import cofactors_from_rows
 
+from . import networks
 from .test_conjugate import NEVER, banded_world, with_distances_and_observed_parameters
 from .test_problem import required
 
@@ -100,3 +101,19 @@ def test_rows_that_leave_an_unknown_open_are_singular(monkeypatch: pytest.Monkey
     fit = banded(monkeypatch, shared=False)
     with pytest.raises(Singular):
         cofactors_from_rows(fit.linear, np.zeros(fit.unknowns.size, dtype=bool))
+
+
+def test_points_without_image_points_that_are_adjusted_together_change_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = networks.world(images=6, points=30, control=6)
+    network, lost = world.noisy(1), np.arange(24, 30)
+    fit = required(world.problem(network.select(~np.isin(network.point_of, lost)), memory=NEVER))
+    # Three rows of each of the six are adjusted together, before those of the others.
+    monkeypatch.setattr("reseau.bundle.solver.orthogonal._ROWS", 9)
+    found = cofactors_from_rows(fit.linear, fit.cofactors.reduced.held)
+    seen = np.setdiff1d(np.arange(6, 30), lost)
+    size = np.sqrt(np.diagonal(fit.cofactors.points[seen], axis1=1, axis2=2))
+    difference = (found.points - fit.cofactors.points)[seen] / (size[:, :, None] * size[:, None, :])
+    np.testing.assert_allclose(difference, 0.0, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found.seen, fit.cofactors.seen, rtol=0, atol=1e-8)
