@@ -102,6 +102,8 @@ class ModelChoice(Display):
         The chosen camera, with its estimates as approximate values.
     compared : tuple of Compared
         All candidates, by description length; those that failed last.
+    chosen : Compared
+        The chosen one of them.
 
     Examples
     --------
@@ -116,14 +118,10 @@ class ModelChoice(Display):
 
     camera: Camera
     compared: tuple[Compared, ...]
+    chosen: Compared
 
     def __bool__(self) -> bool:
         return True
-
-    @property
-    def chosen(self) -> Compared:
-        """The chosen candidate."""
-        return next(each for each in self.compared if each.reason.startswith("chosen"))
 
     @property
     def alternatives(self) -> tuple[Compared, ...]:
@@ -306,7 +304,7 @@ def _chosen(
     camera = fit.problem.network.cameras[0]
     observed = np.array([name in camera.sigma for name in camera.names])
     camera = replace(camera, values=np.where(observed, camera.values, fit.values.cameras[0, : len(observed)]))
-    return ModelChoice(replace(camera, id=network.cameras[0].id), tuple(found))
+    return ModelChoice(replace(camera, id=network.cameras[0].id), tuple(found), found[order.index(best)])
 
 
 def _reason(one: Compared, best: bool, worse: bool, chosen: Candidate, equal: int) -> str:
