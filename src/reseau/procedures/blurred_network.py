@@ -79,10 +79,6 @@ class NetworkOptions:
     initial : {"given", "centroid", "edge"}
         Ordinary coordinates: those of the network, or measured near these as centres of gravity or of
         ellipses through the edges. A target that this does not find keeps the coordinates given.
-    reduce : bool
-        Whether image coordinates are reduced to a fixed projection centre by the design of the lens: its
-        entrance pupil moves with the direction, which shifts the images of near points behind a window by
-        some hundredths of a pixel.
     bundle : reseau.bundle.Options
         Options of the adjustments.
 
@@ -96,7 +92,6 @@ class NetworkOptions:
     rounds: int = 6
     keep_sharp: bool = True
     initial: Literal["given", "centroid", "edge"] = "given"
-    reduce: bool = True
     bundle: BundleOptions = field(default_factory=BundleOptions)
 
     def __post_init__(self) -> None:
@@ -440,11 +435,10 @@ class _Run:
         if not any(found.ok.any() for found in measured.values()):
             return Failure("no target of the network could be measured by rays", Code.NOT_FOUND)
         shift = np.hypot(*(xy - network.xy)[replaced].T) if replaced.any() else np.zeros(1)
-        if self.options.reduce:
-            reduction = self._reduction(last)
-            # Without a ray through the lens the coordinates cannot be reduced.
-            declined |= ~np.isfinite(reduction).all(axis=1)
-            xy = xy - np.nan_to_num(reduction)
+        reduction = self._reduction(last)
+        # Without a ray through the lens the coordinates cannot be reduced.
+        declined |= ~np.isfinite(reduction).all(axis=1)
+        xy = xy - np.nan_to_num(reduction)
         start = replace(network, xy=xy, cov=cov).select(~declined)
         result = adjust_network(start, self.options.bundle)
         if isinstance(result, Failure):

@@ -20,37 +20,16 @@ from .calibration import CameraOptions, PlaneDesign
 from .target_measurement import Measurer
 from .testfield import TestfieldProcedure
 
-__all__ = ["Seen", "WatchOptions", "Watching"]
+__all__ = ["Seen", "Watching"]
 
 _ACROSS, _DOWN = 12, 9
-_LEAST_IMAGES = 3
-
-
-@dataclass(frozen=True)
-class WatchOptions:
-    """When a frame is taken.
-
-    Parameters
-    ----------
-    still_px : float
-        Largest movement of the points since the frame before, root mean square.
-    sharp : float
-        Largest ratio of the median standard deviation of the points to the smallest of the frames taken.
-    new : float
-        Smallest movement of the points since each frame taken before, root mean square, in image widths.
-    least_points : int
-        Smallest number of points.
-
-    Examples
-    --------
-    >>> WatchOptions().new
-    0.05
-    """
-
-    still_px: float = 1.5
-    sharp: float = 2.5
-    new: float = 0.05
-    least_points: int = 12
+_LEAST_IMAGES, _LEAST_POINTS = 3, 12
+_STILL_PX = 1.5
+"""Largest movement of the points since the frame before, root mean square."""
+_SHARP = 2.5
+"""Largest ratio of the median standard deviation of the points to the smallest of the frames taken."""
+_NEW = 0.05
+"""Smallest movement of the points since each frame taken before, root mean square, in image widths."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +89,6 @@ class Watching:
         Measures the target in a frame.
     model : CameraOptions
         Camera model and parameters to estimate.
-    options : WatchOptions, optional
-        When a frame is taken.
 
     Examples
     --------
@@ -123,18 +100,11 @@ class Watching:
     False
     """
 
-    def __init__(
-        self,
-        design: PlaneDesign,
-        measure: Measurer,
-        model: CameraOptions,
-        options: WatchOptions | None = None,
-    ) -> None:
-        self.options = options or WatchOptions()
+    def __init__(self, design: PlaneDesign, measure: Measurer, model: CameraOptions) -> None:
         self._measure = measure
         self._current: Measured | Failure | None = None
         self._procedure = TestfieldProcedure(
-            design, self._again, model, name="watch", least_points=self.options.least_points
+            design, self._again, model, name="watch", least_points=_LEAST_POINTS
         )
         self._before: ImagePoints | None = None
         self._taken: list[ImagePoints] = []
@@ -190,14 +160,14 @@ class Watching:
         if points is None:
             assert isinstance(self._current, Failure)
             return f"the target is not seen: {self._current.reason}"
-        if len(points) < self.options.least_points:
+        if len(points) < _LEAST_POINTS:
             return f"only {len(points)} points are seen: show more of the target"
         moved = np.inf if self._before is None else _moved(points, self._before)
-        if moved > self.options.still_px:
+        if moved > _STILL_PX:
             return "hold still"
-        if min((_moved(points, each) for each in self._taken), default=np.inf) < self.options.new * width:
+        if min((_moved(points, each) for each in self._taken), default=np.inf) < _NEW * width:
             return "seen before: move the target to another place, or tilt it"
-        if _sigma(points) > self.options.sharp * self._best:
+        if _sigma(points) > _SHARP * self._best:
             return "not sharp: hold still, add light, or focus"
         return ""
 
