@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from reseau.core import ahead
-from reseau.core.ahead import Loop, compile_ahead, loops_of, modules_of
+from reseau.core.ahead import Loop, by_module, compile_ahead, main_loops
 from reseau.core.compiled import Compiled, types_of
 from reseau.core.errors import InputError
 from reseau.core.executors import Here
@@ -18,7 +18,7 @@ from reseau.core.executors import Here
 RESEAU = "from reseau.cli import main; main()"
 
 
-@pytest.mark.parametrize("loop", loops_of(), ids=lambda loop: loop.function.rpartition(":")[2])
+@pytest.mark.parametrize("loop", main_loops(), ids=lambda loop: loop.function.rpartition(":")[2])
 def test_every_loop_of_the_list_is_a_compiled_function_of_as_many_arguments(loop: Loop) -> None:
     function = loop.compiled()
     assert isinstance(function, Compiled)
@@ -27,12 +27,12 @@ def test_every_loop_of_the_list_is_a_compiled_function_of_as_many_arguments(loop
 
 def test_loops_are_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    one = next(loop for loop in loops_of() if loop.function.endswith("components:part_sums"))
+    one = next(loop for loop in main_loops() if loop.function.endswith("components:part_sums"))
     command = [
         sys.executable,
         "-c",
         "from reseau.core.ahead import *; from reseau.core.executors import Here\n"
-        f"print(compile_ahead(Here(), {{'components': [loops_of()[{loops_of().index(one)}]]}}))",
+        f"print(compile_ahead(Here(), {{'components': [main_loops()[{main_loops().index(one)}]]}}))",
     ]
     said = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2)]
     assert "compiled=1, found=0" in said[0]
@@ -47,7 +47,7 @@ def test_a_list_that_is_older_than_the_code_is_named_with_what_to_do() -> None:
 
 
 def test_modules_have_all_loops() -> None:
-    assert sum(map(len, modules_of().values())) == len(loops_of())
+    assert sum(map(len, by_module(main_loops()).values())) == len(main_loops())
     assert ahead.LOOPS.is_file()
 
 
@@ -67,7 +67,7 @@ def test_what_was_compiled_ahead_is_all_that_a_calibration_of_a_board_calls(tmp_
     run("design", "board", "--kind", "chess", "--columns", "10", "--rows", "7", "--pitch", "25",
         "--json", tmp_path / "board.json")  # fmt: skip
     before = run("compile")
-    assert before >= len(loops_of())
+    assert before >= len(main_loops())
     after = run(
         "calibrate", *photographs, "--design", tmp_path / "board.json", "-o", tmp_path / "camera.json"
     )

@@ -13,10 +13,10 @@ __all__ = ["compile_loops"]
 
 def compile_loops(jobs: Jobs = None) -> None:
     """Compile for this processor, once, what commands compile at their first call otherwise."""
-    from ..core.ahead import compile_ahead, modules_of
+    from ..core.ahead import by_module, compile_ahead, main_loops
     from ..execution import executor_at
 
-    begun, modules = time.perf_counter(), modules_of()
+    begun, modules = time.perf_counter(), by_module(main_loops())
     with executor_at(jobs, parts=len(modules)) as executor, progress("compiling", len(modules)) as step:
         done = compile_ahead(executor, modules, step)
     if done.compiled:

@@ -7,8 +7,9 @@ costs the time of its compilation at its first call, and nothing else.
 
 from __future__ import annotations
 
+import gc
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,7 +20,7 @@ from .errors import InputError
 from .executors import Executor
 from .failure import Code, Failure
 
-__all__ = ["LOOPS", "Ahead", "Loop", "compile_ahead", "loops_of", "modules_of"]
+__all__ = ["LOOPS", "Ahead", "Loop", "by_module", "compile_ahead", "main_loops"]
 
 LOOPS = Path(__file__).with_name("ahead.json")
 
@@ -68,34 +69,30 @@ class Ahead:
 
 
 @cache
-def _listed() -> tuple[Loop, ...]:
+def main_loops() -> tuple[Loop, ...]:
+    """Return the loops that the main jobs call.
+
+    Examples
+    --------
+    >>> "calibrate" in next(
+    ...     loop.jobs for loop in main_loops() if loop.function == "reseau.optics.compiled:formed"
+    ... )
+    True
+    """
     content = json.loads(LOOPS.read_text(encoding="utf-8"))
     return tuple(Loop(**entry | {"jobs": tuple(entry["jobs"])}) for entry in content)
 
 
-def loops_of(job: str | None = None) -> list[Loop]:
-    """Return the loops that a job calls, or all.
+def by_module(loops: Iterable[Loop]) -> dict[str, list[Loop]]:
+    """Return loops by their modules, in the order given.
 
     Examples
     --------
-    >>> from reseau.core.ahead import loops_of
-    >>> "reseau.optics.compiled:formed" in {loop.function for loop in loops_of("calibrate")}
-    True
-    """
-    return [loop for loop in _listed() if job is None or job in loop.jobs]
-
-
-def modules_of(job: str | None = None) -> dict[str, list[Loop]]:
-    """Return the loops that a job calls, or all, by their modules, the longest to compile first.
-
-    Examples
-    --------
-    >>> from reseau.core.ahead import modules_of
-    >>> "reseau.optics.compiled" in modules_of("calibrate")
-    True
+    >>> len(by_module(main_loops())["reseau.adjust.compiled"])
+    1
     """
     modules: dict[str, list[Loop]] = {}
-    for loop in loops_of(job):
+    for loop in loops:
         modules.setdefault(loop.function.partition(":")[0], []).append(loop)
     return modules
 
@@ -114,7 +111,7 @@ def compile_ahead(
     executor : Executor
         The processes.
     modules : mapping
-        Loops by module; see :func:`modules_of`.
+        Loops by module; see :func:`by_module`.
     step : callable
         Is told each module that is done.
 
@@ -138,7 +135,12 @@ def compile_ahead(
 
 def _group(loops: Sequence[Loop]) -> int | Failure:
     """Compile loops of a module; the number of those that had not been compiled before."""
+    collects = gc.isenabled()
+    gc.disable()  # a compiler makes so many objects that looking for circles takes a tenth of its time
     try:
         return sum(loop.compiled().compile(types_of(loop.arguments)) for loop in loops)
     except Exception as error:  # Numba's are not ours to name
         return Failure(" ".join(str(error).split())[:300], Code.CRASHED)
+    finally:
+        if collects:
+            gc.enable()
