@@ -260,7 +260,7 @@ def _left(result: Result, at: Rows, normal: Array) -> Array:
     turned, by_points = _slopes(result, at, shifts)
     columns = scipy.sparse.csc_array(by_points)
     for k in range(0, shifts, _AT_ONCE):
-        side = columns[:, k : k + _AT_ONCE].toarray().reshape(p, 3, -1)
+        side = columns[:, k : k + _AT_ONCE].toarray(order="C").reshape(p, 3, -1)
         turned[:, k : k + _AT_ONCE] += cofactors.normal.reduced_sides(side)
     z = cofactors.reduced if cofactors.referral is None else cofactors.referral.before
     inverse = scipy.sparse.bsr_array((cofactors.normal.inverse, np.arange(p), np.arange(p + 1)))
