@@ -9,6 +9,7 @@ import pytest
 
 from reseau.bundle import Network, Result, by_place, by_point, common_pattern
 from reseau.bundle.diagnostics import patterns
+from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.core.failure import Code
 
@@ -140,3 +141,22 @@ def test_a_pattern_of_the_frame_gives_a_warning() -> None:
     result = adjusted(replace(network, xy=network.xy + offset))
     assert any(warning.code is Code.UNMODELLED for warning in result.warnings)
     assert not any(warning.code is Code.UNMODELLED for warning in adjusted(network).warnings)
+
+
+@pytest.mark.parametrize("datum", ["free", "control"])
+def test_joint_cofactors_are_the_same_where_points_are_not_eliminated(
+    datum: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With fewer points than images these are unknowns beside the cameras."""
+    world = networks.world(points=12, images=14, datum=datum, control=0 if datum == "free" else 4)
+
+    def joint() -> tuple[Array, int]:
+        fit = world.problem(world.noisy(4)).adjusted().required()
+        columns, points = fit.unknowns.camera[0] + np.arange(3), np.flatnonzero(fit.usable.points)[::2]
+        return fit.cofactors.joint(columns, points), int((fit.unknowns.kept >= 0).sum())
+
+    (eliminated, none), _ = joint(), monkeypatch.setattr("reseau.bundle.solver.unknowns._BANDS", ((0, 2.0),))
+    kept, count = joint()
+    assert none == 0 < count
+    scale = np.sqrt(np.maximum(np.diag(eliminated), np.diag(eliminated).max() * 1e-12))
+    np.testing.assert_allclose(kept / np.outer(scale, scale), eliminated / np.outer(scale, scale), atol=1e-6)

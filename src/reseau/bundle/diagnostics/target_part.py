@@ -52,14 +52,10 @@ def covariance_by_targets(result: Result, c: int) -> Array | None:
         return None
     k, cofactors = len(columns), fit.cofactors
     total = np.zeros((k, k))
-    kept = fit.unknowns.kept[at]
-    between = [cofactors.reduced.block(columns, start + np.arange(3)) for start in kept[kept >= 0]]
-    eliminated = at[kept < 0]
-    for begin in range(0, len(eliminated), _AT_ONCE):
-        some = eliminated[begin : begin + _AT_ONCE]
-        joint = cofactors.joint(columns, some)[:k, k:]
-        between += list(joint.reshape(k, len(some), 3).transpose(1, 0, 2))
-    for j, block in zip([*at[kept >= 0], *eliminated], between, strict=True):
-        weighted = block[:, observed[j]] / network.sigma[j, observed[j]]
+    for begin in range(0, len(at), _AT_ONCE):
+        some = at[begin : begin + _AT_ONCE]
+        between = cofactors.joint(columns, some)[:k, k:].reshape(k, len(some), 3)
+        weight = np.where(observed[some], 1.0 / np.where(observed[some], network.sigma[some], 1.0), 0.0)
+        weighted = (between * weight).reshape(k, -1)
         total += weighted @ weighted.T
     return total * fit.variance

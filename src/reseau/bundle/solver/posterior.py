@@ -122,7 +122,7 @@ class Cofactors:
         columns : ndarray of int (k,)
             Reduced unknowns.
         points : ndarray of int (q,)
-            Eliminated points.
+            Adjusted points, eliminated or among the reduced unknowns.
 
         Returns
         -------
@@ -131,20 +131,25 @@ class Cofactors:
         """
         linear, inverse = self.normal.linear, self.normal.inverse
         system, k, size = linear.system, len(columns), len(columns) + 3 * len(points)
+        own = k + 3 * np.arange(len(points))[:, None] + np.arange(3)
+        kept = system.unknowns.kept[points]
+        reduced = np.flatnonzero(kept >= 0)
+        at_reduced = kept[reduced, None] + np.arange(3)
         through = np.zeros((size, system.unknowns.size))
         through[np.arange(k), columns] = 1.0
-        for q, j in enumerate(points):
-            through[k + 3 * q : k + 3 * q + 3] = -(_cross(linear, int(j)) @ inverse[j]).T
+        through[own[reduced], at_reduced] = 1.0
+        for q in np.flatnonzero(kept < 0):
+            through[own[q]] = -(_cross(linear, int(points[q])) @ inverse[points[q]]).T
         z = self.reduced if self.referral is None else self.referral.before
         at = np.flatnonzero(through.any(axis=0))
         joint = through[:, at] @ z.block(at, at) @ through[:, at].T
-        for q, j in enumerate(points):
-            own = slice(k + 3 * q, k + 3 * q + 3)
-            joint[own, own] += inverse[j]
+        for q in np.flatnonzero(kept < 0):
+            joint[np.ix_(own[q], own[q])] += inverse[points[q]]
         if self.referral is not None:
             r = self.referral
             g = np.concatenate([r.freedom.reduced[columns], *r.freedom.points[points]])
             h = np.concatenate([r.h[columns], *r.h_points[points]])
+            g[own[reduced]], h[own[reduced]] = r.freedom.reduced[at_reduced], r.h[at_reduced]
             one = g @ r.weight @ h.T
             joint = joint - one - one.T + g @ r.m @ g.T
         free = np.concatenate([np.ones(k), system.movable[points].ravel()])
