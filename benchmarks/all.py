@@ -82,6 +82,8 @@ ENTRIES = (
     Entry("cameras", "Camera models", "cameras.py --part projections", ("OpenCV", "mrcal", "COLMAP")),
     Entry("calibrations", "Calibrations of the same corners", "cameras.py --part calibrations",
           ("OpenCV", "mrcal", "COLMAP"), "chessboard_stereo"),
+    Entry("next-photograph", "The photograph that a calibration proposes, beside the best by brute force",
+          "next_photograph.py --first 40 --seeds 8", ("OpenCV",)),
     Entry("stereo", "Photographs of a chessboard", "stereo_chessboard.py", ("OpenCV", "mrgingham"),
           "chessboard_stereo"),
     Entry("disks", "Disks", "testfield_peers.py", ("OpenCV", "photutils", "trackpy", "scikit-image")),

@@ -32,6 +32,7 @@ __all__ = [
     "options_of",
     "places",
     "projection_field",
+    "projection_slopes",
     "reach",
     "referred",
     "worst",
@@ -286,15 +287,44 @@ def projection_field(lens: CameraMapping, across: int = 25, down: int | None = N
     (2, 3)
     """
     xy, shape = places(lens, across, down)
+    slope, reach_deg = projection_slopes(lens, xy)
+    cov = slope @ lens.covariance @ np.swapaxes(slope, 1, 2)
+    return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2), reach_deg)
+
+
+def projection_slopes(lens: CameraMapping, xy: Array) -> tuple[Array, float]:
+    """Derivatives of the images of rays by the parameters that were estimated.
+
+    Parameters
+    ----------
+    lens : CameraMapping
+        A calibrated camera.
+    xy : ndarray (g, 2)
+        Where the rays are imaged, pixels.
+
+    Returns
+    -------
+    slopes : ndarray (g, 2, u)
+        Without the part that a rotation explains over these places; NaN where there is no ray.
+    reach_deg : float
+        See :class:`ProjectionField`.
+
+    Examples
+    --------
+    >>> from reseau.optics import OpenCV
+    >>> lens = OpenCV.from_parameters({"fx": 800.0, "fy": 800.0, "cx": 319.5, "cy": 239.5, "k1": -0.1})
+    >>> camera = CameraMapping(lens, 640, 480, np.array([0]), np.array([[0.25]]))
+    >>> projection_slopes(camera, np.array([[0.0, 0.0], [639.0, 0.0], [0.0, 479.0]]))[0].shape
+    (3, 2, 1)
+    """
     uv = lens.mapping.inverse(xy)
     known = np.isfinite(uv).all(axis=1)
     seen = lens.mapping.derivatives(uv[known])
-    slope = referred(
+    slope = np.full((len(xy), 2, len(lens.rows)), np.nan)
+    slope[known] = referred(
         seen.d_xy @ by_rotation(uv[known], lens.mapping.parallel), seen.d_parameters[:, :, lens.rows]
     )
-    cov = np.full((len(xy), 2, 2), np.nan)
-    cov[known] = slope @ lens.covariance @ np.swapaxes(slope, 1, 2)
-    return ProjectionField(xy.reshape(*shape, 2), cov.reshape(*shape, 2, 2), reach(uv[known], lens))
+    return slope, reach(uv[known], lens)
 
 
 def corners_of(values: Array) -> Array:
