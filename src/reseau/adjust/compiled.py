@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.assign import assign
 from ..core.compiled import compiled
 
 __all__ = ["reweighted"]
@@ -101,11 +102,11 @@ def reweighted(
                 for m in range(u):
                     for i in range(n):
                         weighted[m, i] = turned[m, i] * factors[i]
-                normal[:] = np.dot(weighted, design)
-                gradient[:] = -np.dot(weighted, residuals)
+                np.dot(weighted, design, normal)
+                np.dot(weighted, residuals, gradient)
                 for m in range(u):
                     normal[m, m] += prior
-                    gradient[m] -= x[m] * prior
+                    gradient[m] = -gradient[m] - x[m] * prior
             if turn == most:
                 break
             predicted = _step(normal, gradient, damping, step)
@@ -129,5 +130,6 @@ def reweighted(
                 damping, growth = damping * growth, 2.0 * growth
                 if damping > _MOST_DAMPING:
                     break
-        estimates[k], left[k] = x, residuals
+        assign(estimates[k], x)
+        assign(left[k], residuals)
     return estimates, left

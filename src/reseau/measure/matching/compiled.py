@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.assign import assign
 from ...core.compiled import compiled
 from ...optics.compiled import formed
 
@@ -352,7 +353,7 @@ def _next(
     iteration[k, _PREDICTED] = iteration[k, _LAST] = predicted
     if done:
         state[k] = DONE
-        x[k] = trial[k]
+        assign(x[k], trial[k])
 
 
 @compiled
@@ -389,7 +390,7 @@ def _factors(
         for i in range(n):
             by_share[i] = contrast[i] * root[i]
         _multiply(share, root, by_contrast)
-        rest[:] = root
+        assign(rest, root)
 
 
 @compiled
@@ -414,8 +415,9 @@ def _fill_jacobian(
     _multiply(by_share, slopes[0], jacobian[0])
     _multiply(by_share, slopes[1], jacobian[1])
     _multiply(by_share, slopes[2], jacobian[_WIDTH])
-    jacobian[_WIDTH] *= f32(widening)
-    jacobian[_CONTRAST] = by_contrast
+    for i in range(jacobian.shape[1]):
+        jacobian[_WIDTH, i] *= f32(widening)
+    assign(jacobian[_CONTRAST], by_contrast)
     for m in range(ground):
         _multiply(rest, monomials[m], jacobian[_LEVEL + m])
     at = _LEVEL + ground
@@ -650,7 +652,7 @@ def linearised(
         _multiply(residuals[k], root, left)
         if len(slope):
             along, heavy = slope[k], weighted[k]
-            along[:] = jacobian[0]
+            assign(along, jacobian[0])
             for first in range(0, n, columns):
                 length2 = variance * _product(along, along, first, first + columns)
                 factor = f32(variance * (1.0 - 1.0 / math.sqrt(1.0 + jitter * length2)) / max(length2, 1e-30))
@@ -664,10 +666,10 @@ def linearised(
         for m in range(u):
             cost += prior[m] * (mean[k, m] - x[k, m]) ** 2
         _fill_normal(jacobian, normals[k])
-        gradients[k] = -np.dot(jacobian, left)
+        gradient = np.dot(jacobian, left)
         for m in range(u):
             normals[k, m, m] += prior[m]
-            gradients[k, m] += prior[m] * (mean[k, m] - x[k, m])
+            gradients[k, m] = prior[m] * (mean[k, m] - x[k, m]) - gradient[m]
         freedom = used + np.count_nonzero(prior) - u
         iteration[k, _COST], iteration[k, _LAST], iteration[k, _FRESH] = cost, 0.0, 1.0
         if not (math.isfinite(cost) and freedom >= 0 and _factorised(normals[k], 0.0, scale, lower)):
@@ -769,7 +771,7 @@ def _extrapolated(
     _add_weighted(steps, 0, jacobian, off)
     _unweighted(off, root, residuals)
     _add_weighted(steps, u, slopes, share)
-    x[:] = trial
+    assign(x, trial)
 
 
 @compiled
@@ -818,7 +820,8 @@ def advanced(
         gain = (iteration[k, _COST] - cost) / max(iteration[k, _PREDICTED], _TINY)
         limit = share_of_sigma**2 * cost / max(used + np.count_nonzero(prior) - u, 1)
         if gain > _SERVES:
-            x[k], residuals[k] = trial[k], grey
+            assign(x[k], trial[k])
+            assign(residuals[k], grey)
             if len(slope):
                 # The transposed of what made the derivatives independent.
                 _without_common(left, weighted[k], slope[k], columns, part)
@@ -834,7 +837,9 @@ def advanced(
         elif iteration[k, _FRESH] == 0.0:
             state[k] = STALE
         elif gain > _GAINS:
-            x[k], residuals[k], state[k] = trial[k], grey, STALE
+            assign(x[k], trial[k])
+            assign(residuals[k], grey)
+            state[k] = STALE
             iteration[k, _COST], iteration[k, _GROWTH] = cost, 2.0
             shrink = max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
             iteration[k, _DAMPING] = max(iteration[k, _DAMPING] * shrink, _LEAST_DAMPING)
@@ -912,7 +917,10 @@ def adjusted(
     for begin in range(0, count, together):
         part = slice(begin, min(begin + together, count))
         some = part.stop - begin
-        first[:some], trial[:some], begun[:some] = x[part], x[part], flat[part]
+        for j in range(some):
+            assign(first[j], x[begin + j])
+            assign(trial[j], x[begin + j])
+            assign(begun[j], flat[begin + j])
         linear = first[:some], begun[:some], slopes[part]
         work = (
             residuals[part],
@@ -976,7 +984,7 @@ def adjusted(
             )
             tried = images[:active].reshape(active, n)
             for j in range(active):
-                flat[begin + rows[j]] = tried[j]
+                assign(flat[begin + rows[j]], tried[j])
             advanced(
                 rows[:active],
                 rows[:active],

@@ -115,7 +115,8 @@ def _line_through(
     rows, ends = rows[:count].copy(), np.empty((2, 2))
     along = np.array([-across[1], across[0]])
     if count < least:
-        ends[0], ends[1] = across * distance, across * distance
+        for k in range(2):
+            ends[k, 0], ends[k, 1] = across[0] * distance, across[1] * distance
         return across.copy(), distance, ends, rows
     at, middle = np.empty(count), 0.0
     for i in range(count):
@@ -133,7 +134,9 @@ def _line_through(
     at.sort()
     for k in range(2):
         t = at[int(np.rint((0.02, 0.98)[k] * (count - 1)))]
-        ends[k] = t * along + (distance + level + slope * (t - middle)) * across
+        off = distance + level + slope * (t - middle)
+        for c in range(2):
+            ends[k, c] = t * along[c] + off * across[c]
     return (across - slope * along) / scale, (distance + level - slope * middle) / scale, ends, rows
 
 
@@ -186,7 +189,10 @@ def distinct_lines(
                 off = max(off, abs(end[e, 0] * normals[j, 0] + end[e, 1] * normals[j, 1] - places[j]))
             apart = apart and off > 2 * near[0]
         if apart:
-            kept[count], normals[count], places[count], ends[count] = k, turned, place, end
+            kept[count], places[count] = k, place
+            for e in range(2):
+                normals[count, e] = turned[e]
+                ends[count, e, 0], ends[count, e, 1] = end[e, 0], end[e, 1]
             count += 1
             for i in rows:
                 free[i] = False
@@ -506,7 +512,8 @@ def curved(
             area += right * turn - down * along
             reach[k, 0], reach[k, 1] = max(reach[k, 0], abs(right)), max(reach[k, 1], abs(down))
         if area < 0:
-            dxy[k] = -dxy[k]
+            for j in range(nodes.shape[1]):
+                dxy[k, j, 0], dxy[k, j, 1] = -dxy[k, j, 0], -dxy[k, j, 1]
 
 
 @compiled

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from ...core.assign import assign
 from ...core.compiled import compiled
 
 __all__ = ["assigned", "images", "lattice_coordinates", "monomials", "profiles", "radially", "shade_lines"]
@@ -74,7 +75,8 @@ def _through_fisheye(seen: Floats, first: Floats, inner: Floats, strength: float
     """Replace a point (2,) and its derivatives (2, 2), (2, 2, 2) by those of its image; `before` is space."""
     p, q = seen
     factor, by_s, by_ss = _equidistant(p * p + q * q, strength)
-    before[:] = first
+    for d in range(2):
+        assign(before[d], first[d])
     for i in range(2):
         for j in range(2):
             # Of s = p² + q², by the lattice coordinates.
@@ -524,9 +526,11 @@ def profiles(
             shift = x[2] / equations[2, 2] / depth
             if not (depth < 0 and abs(shift) < _MOST_PX):
                 continue
-            lines[found], params[found], normals[found] = line, along[k], normal[k]
+            lines[found], params[found] = line, along[k]
             xy[found, axis], xy[found, 1 - axis] = at, place[k]
-            xy[found] += shift * normal[k]
+            for c in range(2):
+                normals[found, c] = normal[k, c]
+                xy[found, c] += shift * normal[k, c]
             found += 1
     return lines[:found].copy(), params[:found].copy(), xy[:found].copy(), normals[:found].copy()
 
