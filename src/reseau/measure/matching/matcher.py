@@ -28,6 +28,9 @@ __all__ = ["SIZE", "match"]
 _PLAIN = 1.25
 """Multiple of the rejection limit from which blunders are searched for when good start values are known."""
 
+_OTHER_SCALE = 1.2
+"""Ratio of the residuals to those by which prior knowledge was weighed from which it is weighed again."""
+
 _FIRST, _MOST = 10, 50
 """Iterations before the search for blunders, and maximum."""
 _LAST = 4
@@ -194,7 +197,8 @@ def _searched(patch: Patches, free: Array, noise: float) -> Matches:
         kept = patch.weights * (np.abs(residuals) < limit)
         # Model errors caused by a scene count as noise; otherwise prior knowledge would have no weight there.
         rougher = np.maximum(noise, _rms(residuals, kept, start.shape[1]))
-        renewed = (kept != used).any(axis=1) | (rougher > 1.2 * scale)[:, 0]
+        other = np.maximum(rougher / scale, scale / rougher)[:, 0]
+        renewed = (kept != used).any(axis=1) | (other > _OTHER_SCALE)
         renewed |= found.reasons == BatchReason.MAX_ITERATIONS
         changed = np.flatnonzero(renewed)
         if not len(changed):
@@ -297,7 +301,7 @@ def _compiled(
     outlines = outlines_of(patch.form, every)
     if outlines is None:
         found = _iterated(patch, every, start, start, patch.first, weights, free, options, noise)
-        return found, np.empty(0, np.intp)
+        return found, np.flatnonzero(found.reasons == BatchReason.MAX_ITERATIONS)
     share, slopes = patch.first
     (k, n), (plain, at) = patch.grey.shape, outlines
     work = _Iteration(patch, start, options, noise)

@@ -240,7 +240,7 @@ class Patches:
         x[:, WIDTH] = np.log(np.hypot(self.psf, 0.7 * self.options.start_px))
         share = self.share(x)
         self.single = share.dtype == np.float32
-        x[:, WIDTH] = np.log(self.psf)
+        x[:, WIDTH] = np.log(self.psf * np.sqrt(1 - SHARPEST**2))
         around = self.weights * (share.reshape(len(x), -1) < 0.02)
         around[:, 0] = np.where(around.any(axis=1), around[:, 0], 1.0)  # a median needs at least one value
         there = around > 0

@@ -114,7 +114,9 @@ class PlaneMarks(MarkWindows):
         rows, self.learning, self.quick = self._in_sight(), False, False
         found = self._match_all(rows)
         # Marks with something in front of them show neither the mapping nor its errors.
-        plain = _sure(found) & ~self._uneasy(found) & (found.seen > _WHOLE) & (found.rejected == 0)
+        plain = _sure(found) & ~self._uneasy(found) & (found.rejected == 0)
+        whole = plain & (found.seen > _WHOLE)
+        plain = whole if whole.sum() >= ENOUGH else plain  # on saturated paper none is whole
         if self.eccentric or self._bent(rows[plain], found.select(plain)):
             found = self._mapped(rows, found, _sure(found) if self.eccentric else plain)
         doubtful, field = self._doubtful(rows, found)
