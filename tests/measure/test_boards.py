@@ -334,6 +334,43 @@ def test_corners_on_paper_that_is_saturated_everywhere_are_measured_to_their_sig
     assert 0.8 < np.sqrt(((error / sigma) ** 2).mean()) < 1.2
 
 
+@pytest.mark.parametrize(("seed", "least"), [(0, 76), (1, 64)])
+def test_corners_of_markers_on_saturated_paper_have_the_sigmas_of_their_errors(seed: int, least: int) -> None:
+    """As many as OpenCV finds; the level of the paper is known from the dark halves of edges only.
+
+    Corners that were matched by knowledge with the weight of far larger residuals were off by ten sigma.
+    """
+    printed = prints.markers(6, 5, 30.0, 10.0, "DICT_4X4_100")
+    view = View(printed, *pose(seed, printed), seed=10 * seed, light=340.0)
+    design = board("markers", 6, 5, 40.0, size=30.0, dictionary="DICT_4X4_100")
+    found = measured(Frame(view.picture(), 255.0, "bright"), design)
+    error = renamed(found, view.truth)
+    sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
+    assert found.found >= least
+    assert np.sqrt((error**2).mean()) < 0.07
+    assert np.abs(error / sigma).max() < 4.5
+    assert 0.75 < np.sqrt(((error / sigma) ** 2).mean()) < 1.2
+
+
+def test_circles_cut_by_the_border_are_right_where_a_filter_does_not_know_what_is_beyond() -> None:
+    """The outermost lines of a blurred file continue its border: circles there were off by ten sigma."""
+    printed, design = prints.circles(9, 7, 25.0, 12.0), board("circles", 9, 7, 25.0, size=12.0)
+    turn = cv2.Rodrigues(np.array([0.1, 0.0, 0.06]))[0] @ np.diag([1.0, -1.0, -1.0])
+    middle = turn @ np.append(printed.xy.mean(axis=0), 0.0)
+    view = View(printed, turn, np.array([0.0, 0.0, 330.0]) - middle, blur=0.8, noise=0.0)
+    top = int(np.sort(view.truth[:, 1])[:9].mean()) - 25
+    part, truth = view.picture()[top:].astype(float), view.truth - [0, top]
+    grey = cv2.GaussianBlur(part, (0, 0), 0.6, borderType=cv2.BORDER_REPLICATE)
+    grey = np.rint(grey + np.random.default_rng(0).normal(0, 1.5, grey.shape)).clip(0, 255)
+    found = measured(Frame(grey.astype(np.uint8), 255.0, "cut"), design)
+    error = renamed(found, truth)
+    scaled = np.abs(error / np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2)))
+    cut = found.xy[found.ok, 1] < 20
+    assert cut.sum() >= 3
+    assert scaled[cut].max() < 4.0
+    assert 0.8 < np.sqrt((scaled**2).mean()) < 1.2
+
+
 @pytest.mark.parametrize(
     ("design", "printed"),
     [

@@ -15,7 +15,7 @@ from scipy.ndimage import median_filter
 from ..core.data import Array, Frame, Mask
 from ..core.errors import ImageError
 
-__all__ = ["Screened", "lost_in_blocks", "quiet_noise", "screen"]
+__all__ = ["Screened", "inner_pixels", "lost_in_blocks", "quiet_noise", "screen"]
 
 _BORDER = 3
 """Outermost lines of a frame whose level is compared with that of the lines further inside."""
@@ -94,6 +94,20 @@ def screen(frame: Frame, run: int | None, *, noisy: bool = True) -> Screened:
     noise = _noise(pixels, valid)
     valid &= ~_spikes(grey, noise)
     return Screened(_level_borders(grey, valid), valid, noise)
+
+
+def inner_pixels(valid: Mask, width: int) -> Mask:
+    """Valid pixels (h, w) without the outermost lines of a frame, `width` of them on each side.
+
+    Examples
+    --------
+    >>> int(inner_pixels(np.ones((5, 6), dtype=bool), 2).sum())
+    2
+    """
+    inner = np.zeros_like(valid)
+    kept = slice(width, valid.shape[0] - width), slice(width, valid.shape[1] - width)
+    inner[kept] = valid[kept]
+    return inner
 
 
 def _lost(pixels: NDArray[Any], run: int) -> Mask:

@@ -30,7 +30,7 @@ from ..screening import Screened
 from ..testfield.lattice_mapping import images_of, second_order
 from .compiled_corners import add_images, pixels_around
 
-__all__ = ["CornerMarks", "CornerShape", "DeltilleMarks", "Sectors"]
+__all__ = ["BORDER_PX", "CornerMarks", "CornerShape", "DeltilleMarks", "Sectors"]
 
 _TURN = 0.1
 """Standard deviation of the directions of edges before the mapping is known, radians."""
@@ -55,8 +55,11 @@ _ALIKE_WIDTH, _ALIKE_PX = 0.05, 0.05
 """Relative change of the sharpness, and shift, from which markers are formed anew."""
 _LEAST_EDGE = 0.1
 """Share of the pixels of an edge below which it is not seen."""
+BORDER_PX = 2
+"""Outermost lines of a frame that are not used: filters of cameras and programs do not know what is beyond
+the frame, and displace edges there."""
 _BORDER = 2.0
-"""Least distance of a corner from the outermost pixels, in widths of the point-spread function."""
+"""Least distance of a corner from the outermost pixels used, in widths of the point-spread function."""
 _SAMPLED_OF_TAGS = 20
 """Most corners of single tags that show the camera's response."""
 _STRONG, _INTACT, _SHOWS_GROWTH = 8.0, 0.1, 12
@@ -367,7 +370,7 @@ class CornerMarks(PlaneMarks):
         gap = np.minimum(found.xy, np.array([w - 1, h - 1]) - found.xy).min(axis=1)
         # What the kernel takes from beyond the frame is unknown.
         beyond = 0 if self.look.kernel is None else sharpened_from_px(self.look.kernel)
-        near = gap < max(_BORDER * self.look.blur_px, beyond)
+        near = gap < max(BORDER_PX + _BORDER * self.look.blur_px, beyond)
         border = near, Reason("on the border of the frame", Code.OUTSIDE)
         # Without its pixels an edge is where faint tails of its blur have it.
         part = found.converged & (np.isfinite(found.residuals).sum(axis=(1, 2)) < self.own_px[rows])

@@ -21,10 +21,10 @@ from ..reseau.mark_windows import Located
 from ..reseau.marks import ReseauOptions
 from ..reseau.plane_marks import PlaneMarks
 from ..reseau.sheet import DiskMarks
-from ..screening import Screened, screen
+from ..screening import Screened, inner_pixels, screen
 from ..testfield.lattice_mapping import second_order, stretches
 from .candidates import Saddles, find_saddles
-from .corners import CornerMarks, DeltilleMarks, Sectors
+from .corners import BORDER_PX, CornerMarks, DeltilleMarks, Sectors
 from .deltilles import find_deltille
 from .markers import find_markers, find_tags
 from .placement import Placed, find_puzzle, lay_chessboard, lay_circles, lay_marked
@@ -210,7 +210,8 @@ def _measured(frame: Frame, design: BoardDesign, options: BoardOptions) -> Board
     # Whether a bright pixel beside a clipped one is itself clipped depends on its noise.
     clipped = cv2.dilate((frame.pixels >= frame.full_scale).astype(np.uint8), np.ones((3, 3), np.uint8))
     bright = frame.pixels > _BRIGHT * frame.full_scale
-    screened = replace(screened, valid=screened.valid & ~(bright & (clipped > 0)))
+    valid = screened.valid & ~(bright & (clipped > 0))
+    screened = replace(screened, valid=inner_pixels(valid, BORDER_PX))
     common = ReseauOptions(
         psf_px=options.psf_px,
         row_jitter_px=options.row_jitter_px,

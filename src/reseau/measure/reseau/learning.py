@@ -17,6 +17,7 @@ from ...core.tone import ToneCurve
 from ..matching import Matches, grey_variance
 from ..matching.noise import relative_weights
 from ..response import Samples, estimate_kernel, sharpened_from_px
+from ..screening import inner_pixels
 from ..tone import find_curve
 from .lens_mapping import mapping_through
 from .mark_windows import DISTURBED, ENOUGH, Appearance, MarkWindows
@@ -239,10 +240,7 @@ def _plain(marks: MarkWindows, first: Matches, rows: Rows) -> bool:
 def _without_border(marks: MarkWindows, width: int) -> None:
     """Use no pixels within some from the border of the frame."""
     if width:
-        valid = np.zeros_like(marks.screened.valid)
-        inner = slice(width, -width), slice(width, -width)
-        valid[inner] = marks.screened.valid[inner]
-        marks.screened = replace(marks.screened, valid=valid)
+        marks.screened = replace(marks.screened, valid=inner_pixels(marks.screened.valid, width))
 
 
 def _straighten(
