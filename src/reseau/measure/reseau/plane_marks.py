@@ -333,6 +333,8 @@ class PlaneMarks(MarkWindows):
     def _odd_share(residuals: Array) -> float:
         """Mean square of the part of residuals (k, r, c) that is odd about the middle, over that of all."""
         turned = residuals[:, ::-1, ::-1]
+        if not np.isfinite(residuals - turned).any():
+            return 1.0  # on saturated paper no pixel has one opposite
         whole = float(np.nanmean(np.where(np.isfinite(turned), residuals**2, np.nan)))
         return min(float(np.nanmean((residuals - turned) ** 2)) / 2 / max(whole, 1e-300), 1.0)
 
