@@ -92,9 +92,7 @@ ENTRIES = (
           "independent/boards"),
     Entry("other-boards", "Chessboards, ChArUco, circles in images of independent origin", "other_boards.py",
           ("OpenCV",), "independent/boards"),
-    Entry("drawn-boards", "Boards of other programs, drawn",
-          "drawn_boards.py --count 1 --kind aprilgrid1 aprilgrid2 markers charuco chess_square deltille "
-          "circles asymmetric",
+    Entry("drawn-boards", "Boards of other programs, drawn", "drawn_boards.py --count 1",
           ("OpenCV", "aprilgrid", "AprilTag", "mrgingham")),
     Entry("reseau-simulated", "Reseaus in the simulator's images",
           'reseau_formed.py --least 400 --only "dark, 40 dB"'),
