@@ -44,7 +44,7 @@ def numbers(cell: str) -> list[float]:
 
 def bundle_size() -> Figure:
     """Processor time over the number of image points; hollow where a program stopped before the minimum."""
-    figure = Figure(figsize=(8.4, 3.6), layout="constrained")
+    figure = Figure(figsize=(8.4, 4.0), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     own, peers = table("scale.md", "| solved by |"), table("scale.md", "| Ceres | COLMAP |")
     rays = {row[0]: numbers(row[1])[0] for row in own}
@@ -68,7 +68,8 @@ def bundle_size() -> Figure:
         [], [], s=140, facecolor="none", edgecolor=INK, label="ended 1 % or more above the minimum"
     )
     panels[0].set_ylabel("processor time, s")
-    panels[0].legend(frameon=False)
+    # Below: lines cross the panels from one corner to the other.
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 
