@@ -42,6 +42,19 @@ def test_a_program_captures_and_reruns_a_session(archive: Archive) -> None:
     assert sessions.calibration_of(session).parameters["c"].unit == "mm"
 
 
+def test_the_report_of_a_session_lists_the_frames_that_were_left_out(archive: Archive) -> None:
+    away = [["edge on", {"tilt": 88.0, "roll": 0.0, "camera_roll": 0.0}]]
+    given = {"design.json": DESIGN.to_json()}
+    session = sessions.begin(archive, "monday", "testfield", {**TESTFIELD, "steps": STEPS + away}, given)
+    sessions.capture(session, FieldRig().bench)
+    declined = session.frames(step="edge on", ok=False)[-1].verdict
+    assert declined is not None
+    results = {each.name: each for each in session.results()}
+    page = session.content(results["report.html"]).decode()
+    assert "edge on" in page
+    assert declined.why in page
+
+
 def test_a_rerun_does_not_import_the_command_line() -> None:
     code = """
         import sys

@@ -307,9 +307,15 @@ def _calibration_results(procedure: TestfieldProcedure, session: Session) -> dic
     results = procedure.finish()
     found = procedure.calibrated().required()
     frames = {each.step: each for each in session.frames(kind="frame")}
+    # Of a frame without enough points there is a verdict, of one that the calibration has left out a reason.
+    declined = {
+        step: each.verdict.why for step, each in frames.items()
+        if each.verdict is not None and not each.verdict.ok
+    }  # fmt: skip
     report = bundle_report(
         found.result, title=f"Calibration {session.name}", provenance=procedure.provenance,
         assessments=found.assessments, photograph=lambda name: session.picture(frames[name]),
+        declined=declined | found.declined,
     )  # fmt: skip
     return results | {"report.html": report, SCENE: scene_of(found.result).to_json()}
 
