@@ -1,6 +1,6 @@
 """Assignment of arrays in compiled functions.
 
-``out[:] = values`` would compile a check of shapes with its message: a second, for every pair of dimensions.
+``out[:] = values`` would compile a check of shapes with its message, which takes longer than the assignment.
 """
 
 from __future__ import annotations
