@@ -116,7 +116,7 @@ class PlaneMarks(MarkWindows):
         # Marks with something in front of them show neither the mapping nor its errors.
         plain = _sure(found) & ~self._uneasy(found) & (found.rejected == 0)
         whole = plain & (found.seen > _WHOLE)
-        plain = whole if whole.sum() >= ENOUGH else plain  # on saturated paper none is whole
+        plain = whole if whole.any() else plain  # on saturated paper none is whole
         if self.eccentric or self._bent(rows[plain], found.select(plain)):
             found = self._mapped(rows, found, _sure(found) if self.eccentric else plain)
         doubtful, field = self._doubtful(rows, found)
