@@ -421,7 +421,8 @@ def pictures(kinds: list[str], conditions: list[str], count: int) -> Iterator[tu
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--kind", nargs="+", default=list(KINDS), choices=list(KINDS))
-    parser.add_argument("--condition", nargs="+", default=[*CONDITIONS, "held"])
+    known = [*CONDITIONS, "held"]
+    parser.add_argument("--condition", nargs="+", default=known, choices=known)
     parser.add_argument("--count", type=int, default=2)
     parser.add_argument("--calibrate", type=int, default=0, help="number of calibrations, and nothing else")
     add_options(parser)
