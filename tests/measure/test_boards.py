@@ -463,8 +463,7 @@ def test_the_curve_of_a_camera_is_learnt_from_few_circles(seed: int) -> None:
     view = views("gamma", seed + 1, CLOSE_PRINT)[seed]
     found = measured(Frame(view.picture(), 255.0, "gamma"), CLOSE)
     assert Code.NONLINEAR in [note.code for note in found.notes]
-    near = np.hypot(*(found.xy[found.ok, None] - view.truth).transpose(2, 0, 1)).argmin(axis=1)
-    error = found.xy[found.ok] - view.truth[near]
+    error = renamed(found, view.truth)
     sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
     assert np.sqrt(((error / sigma) ** 2).mean()) < 1.25
     assert np.abs(error.mean(axis=0)).max() < 0.0015

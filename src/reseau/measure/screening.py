@@ -124,10 +124,7 @@ def _lost(pixels: NDArray[Any], run: int) -> Mask:
 def _noise(pixels: NDArray[Any], valid: Mask | None) -> float:
     """Robust standard deviation from second differences along the lines where all three pixels are valid."""
     rows = slice(None, None, max(1, len(pixels) // 256))  # a few hundred lines are enough
-    grey = pixels[rows].astype(np.float32)
-    bend = grey[:, :-2] + grey[:, 2:]
-    bend *= -0.5
-    bend += grey[:, 1:-1]
+    bend = _second_differences(pixels[rows].astype(np.float32))
     if valid is not None:
         seen = valid[rows]
         bend = bend[seen[:, 1:-1] & seen[:, :-2] & seen[:, 2:]]
@@ -136,6 +133,14 @@ def _noise(pixels: NDArray[Any], valid: Mask | None) -> float:
     if not bend.size:
         return quantisation
     return max(float(1.4826 * _median_size(bend, pixels.dtype) / np.sqrt(1.5)), quantisation)
+
+
+def _second_differences(grey: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Half the negative second differences (h, w − 2) along the lines."""
+    bend = grey[:, :-2] + grey[:, 2:]
+    bend *= -0.5
+    bend += grey[:, 1:-1]
+    return bend
 
 
 def _values(pixels: NDArray[Any]) -> NDArray[Any]:
@@ -157,9 +162,7 @@ def _median_size(bend: NDArray[Any], of: np.dtype[Any]) -> float:
 
 def quiet_noise(grey: NDArray[np.float32]) -> float:
     """Standard deviation of the noise in the quietest tenth of a frame that is otherwise full of targets."""
-    bend = grey[:, :-2] + grey[:, 2:]
-    bend *= -0.5
-    bend += grey[:, 1:-1]
+    bend = _second_differences(grey)
     side = _BLOCK
     rows, columns = bend.shape[0] // side, bend.shape[1] // side
     if not rows or not columns:

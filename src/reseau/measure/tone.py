@@ -13,13 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.data import Array, Mask
 from ..core.failure import Code, Remark
 from ..core.tone import ToneCurve
-from .matching import displaced
 from .response import Samples, unexplained
 
 __all__ = ["Exponent", "FoundCurve", "Matched", "estimate_gamma", "find_curve"]
@@ -290,11 +291,27 @@ def estimate_gamma(samples: Samples, formed: Array, gamma: float, full_scale: fl
     return Exponent(gamma + step, float(sigma), after / max(before, 1e-300), correlation)
 
 
+def _displaced(values: NDArray[Any], down: int, right: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Two views of windows (..., rows, columns), the second displaced against the first.
+
+    Examples
+    --------
+    >>> here, there = _displaced(np.arange(6).reshape(2, 3), 1, -1)
+    >>> here.tolist(), there.tolist()
+    ([[1, 2]], [[3, 4]])
+    """
+    rows, columns = values.shape[-2:]
+    return (
+        values[..., : rows - down, max(0, -right) : columns - max(0, right)],
+        values[..., down:, max(0, right) : columns + min(0, right)],
+    )
+
+
 def _correlation(rest: Array, used: Mask) -> float:
     """Largest correlation of the residuals (k, r, c) of neighbouring pixels."""
     square = float((rest**2).sum()) / max(float(used.sum()), 1)
     found = []
     for lag in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        (a, b), both = displaced(rest, *lag), np.logical_and(*displaced(used, *lag))
+        (a, b), both = _displaced(rest, *lag), np.logical_and(*_displaced(used, *lag))
         found.append(abs(float((a * b)[both].sum())) / max(float(both.sum()), 1))
     return max(found) / max(square, 1e-300)

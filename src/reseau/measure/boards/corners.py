@@ -24,7 +24,7 @@ from ..points import Reason
 from ..reseau.lens_mapping import UNFIT, mapping_through
 from ..reseau.mark_windows import ENOUGH, Located
 from ..reseau.marks import ReseauOptions
-from ..reseau.plane_marks import PlaneMarks
+from ..reseau.plane_marks import PlaneMarks, intact
 from ..response import sharpened_from_px
 from ..screening import Screened
 from ..testfield.lattice_mapping import images_of, second_order
@@ -62,8 +62,8 @@ _BORDER = 2.0
 """Least distance of a corner from the outermost pixels used, in widths of the point-spread function."""
 _SAMPLED_OF_TAGS = 20
 """Most corners of single tags that show the camera's response."""
-_STRONG, _INTACT, _SHOWS_GROWTH = 8.0, 0.1, 12
-"""Significance and share of rejected pixels of corners that show the growth of ink; least number of them."""
+_SHOWS_GROWTH = 12
+"""Least number of corners that show the growth of ink."""
 _FLAT = 0.35
 """Least sine of the angle between the edges of a corner."""
 _FAR_PX, _FIGURES_PX = 1e5, 24
@@ -312,9 +312,8 @@ class CornerMarks(PlaneMarks):
         opposite directions, which no smooth mapping does. The shifts along x and y of both pairs are
         estimated, with a polynomial, from what the mapping leaves.
         """
-        good = found.converged & (found.t > _STRONG) & (found.rejected < _INTACT)
-        mapping, known = self.precise or (self.mapping, rows)
-        good &= np.isin(rows, known)
+        mapping, known = self._best_known(rows)
+        good = intact(found) & known
         if self.balanced or good.sum() < _SHOWS_GROWTH:
             return found
         shape = self._images(rows)[0]

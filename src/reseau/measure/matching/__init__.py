@@ -1,6 +1,6 @@
 """Least-squares matching: windows of a frame are adjusted to formed images of marks."""
 
-from .correlation import displaced, with_alike_errors
+from .correlation import with_alike_errors
 from .matcher import SIZE, match
 from .matches import Matches
 from .noise import grey_variance
@@ -16,7 +16,6 @@ __all__ = [
     "Shape",
     "ShapeSubset",
     "Window",
-    "displaced",
     "grey_variance",
     "match",
     "with_alike_errors",

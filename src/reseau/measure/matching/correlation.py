@@ -22,7 +22,7 @@ from ..compiled_filter import filtered
 from .compiled_errors import by_class, of_neighbours, products, standardised, weighted
 from .matches import Matches
 
-__all__ = ["displaced", "with_alike_errors"]
+__all__ = ["with_alike_errors"]
 
 _LAGS = 7
 """Largest distance of pixels along either axis: errors of a compressed picture end with its blocks of 8."""
@@ -156,22 +156,6 @@ def _lags() -> Iterator[tuple[int, int]]:
     for down in range(_LAGS + 1):
         for right in range(-_LAGS if down else 1, _LAGS + 1):
             yield down, right
-
-
-def displaced(values: NDArray[Any], down: int, right: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Two views of windows (..., rows, columns), the second displaced against the first.
-
-    Examples
-    --------
-    >>> here, there = displaced(np.arange(6).reshape(2, 3), 1, -1)
-    >>> here.tolist(), there.tolist()
-    ([[1, 2]], [[3, 4]])
-    """
-    rows, columns = values.shape[-2:]
-    return (
-        values[..., : rows - down, max(0, -right) : columns - max(0, right)],
-        values[..., down:, max(0, right) : columns + min(0, right)],
-    )
 
 
 def _neighbours(unit: Array, shown: Mask, activity: Array, free: Array, both_ways: bool) -> bool:

@@ -175,8 +175,7 @@ class Patches:
         grey values best with images of the expected width.
         """
         x = np.zeros((len(self.xy), self.form_at + self.forms))
-        # Start with the expected width; see `width`.
-        x[:, WIDTH] = np.log(self.psf * np.sqrt(1 - SHARPEST**2))
+        x[:, WIDTH] = self._expected_width
         self.first = self.slopes(x, np.arange(len(x)))
         self.single = self.first[0].dtype == np.float32
         if light is None:
@@ -191,6 +190,11 @@ class Patches:
                 *(x, share, self.weights, self.terms, dark, self.options.variance, LEAST)
             )
         return x
+
+    @property
+    def _expected_width(self) -> Array:
+        """Value (k,) of the width with which :meth:`width` is the expected one."""
+        return np.asarray(np.log(self.psf * np.sqrt(1 - SHARPEST**2)))
 
     @cached_property
     def terms(self) -> tuple[Array, Array, int]:
@@ -240,7 +244,7 @@ class Patches:
         x[:, WIDTH] = np.log(np.hypot(self.psf, 0.7 * self.options.start_px))
         share = self.share(x)
         self.single = share.dtype == np.float32
-        x[:, WIDTH] = np.log(self.psf * np.sqrt(1 - SHARPEST**2))
+        x[:, WIDTH] = self._expected_width
         around = self.weights * (share.reshape(len(x), -1) < 0.02)
         around[:, 0] = np.where(around.any(axis=1), around[:, 0], 1.0)  # a median needs at least one value
         there = around > 0

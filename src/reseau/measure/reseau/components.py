@@ -32,8 +32,8 @@ def part_sums(mask: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         First and last column, first and last row of each.
     """
     h, w = mask.shape
-    size, count = 256, 0
-    sums, extent, parent = np.zeros((size, 6)), np.zeros((size, 4), np.int64), np.zeros(size, np.int64)
+    count, parent = 0, np.zeros(256, np.int64)
+    sums, extent = np.zeros((len(parent), 6)), np.zeros((len(parent), 4), np.int64)
     # First column, column after the last, and component of the runs of two rows.
     runs = np.empty((2, 3, w // 2 + 1), np.int64)
     before = 0
@@ -58,10 +58,8 @@ def part_sums(mask: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
                     parent[other] = part
                 touched += 1
             if part < 0:
-                if count == size:
-                    sums, extent = _longer(sums), _longer(extent)
-                    parent = np.concatenate((parent, np.zeros(size, np.int64)))
-                    size *= 2
+                if count == len(parent):
+                    sums, extent, parent = _longer(sums), _longer(extent), _longer(parent)
                 part, parent[count] = count, count
                 extent[count] = first, x - 1, y, y
                 count += 1

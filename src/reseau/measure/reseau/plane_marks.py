@@ -32,7 +32,7 @@ from .lens_mapping import UNFIT, free_through, mapping_through
 from .mark_windows import BESIDE, DISTURBED, ENOUGH, SEEN, Located, MarkWindows
 from .marks import ReseauOptions
 
-__all__ = ["PlaneMarks"]
+__all__ = ["PlaneMarks", "intact"]
 
 _HIGH_RESIDUALS = 1.25
 """Multiple of the usual residuals from which something is suspected in front of a mark."""
@@ -74,9 +74,14 @@ _LEAST_RIM = 0.25
 """Share of the edge of a mark below which the level of the paper is hardly seen, and has no slope."""
 
 
+def intact(found: Matches) -> Mask:
+    """Marks of which hardly anything was rejected."""
+    return found.converged & (found.t > 8) & (found.rejected < 0.1)
+
+
 def _sure(found: Matches) -> Mask:
     """Marks that show the mapping."""
-    return found.converged & (found.t > 8) & (found.rejected < 0.1) & (found.seen > SEEN)
+    return intact(found) & (found.seen > SEEN)
 
 
 class PlaneMarks(MarkWindows):
@@ -255,6 +260,11 @@ class PlaneMarks(MarkWindows):
         largest = scale[self.found].max() if self.found.any() else np.inf
         return np.flatnonzero(inside & (self.found | (scale < _LARGER * largest)))
 
+    def _best_known(self, rows: Rows) -> tuple[Chain, Mask]:
+        """The most precise mapping, and which of some marks (k,) it was found from."""
+        mapping, known = self.precise or (self.mapping, rows)
+        return mapping, np.isin(rows, known)
+
     def _without_growth(self, rows: Rows, found: Matches) -> Matches:
         """Matches without the growth of ink that all marks have in common; balanced marks are not shifted."""
         return found
@@ -297,10 +307,9 @@ class PlaneMarks(MarkWindows):
         from scipy.optimize import brentq  # a fifth of the time of importing
 
         extra = alike.cov - plain.cov
-        good = plain.converged & (plain.t > 8) & (plain.rejected < 0.1) & (plain.seen > SEEN)
         # A polynomial through few marks has too few terms for a lens.
-        mapping, known = self.precise or (self.mapping, rows)
-        good &= np.isin(rows, known)
+        mapping, known = self._best_known(rows)
+        good = _sure(plain) & known
         terms = self._smooth_terms(rows[good])
         if terms is None:
             return alike
