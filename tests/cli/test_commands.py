@@ -42,6 +42,12 @@ def test_the_version_is_that_of_the_package(reseau: Run) -> None:
     assert reseau("--version")[:2] == (0, f"reseau {__version__}\n")
 
 
+def test_the_package_runs_as_the_command() -> None:
+    done = subprocess.run([sys.executable, "-m", "reseau", "--version"], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("reseau ")
+
+
 def test_marks_are_measured_at_their_true_positions(reseau: Run, photo: Any, tmp_path: Path) -> None:
     status, out, _ = reseau("measure", "reseau", photo.image, "-d", photo.design, "-o", tmp_path / "m.json")
     assert status == 0
