@@ -344,6 +344,35 @@ def test_weak_points_are_left_out_of_the_datum_unless_they_are_chosen() -> None:
     assert any("2 weak points left out of the datum: p24, p25" in remark.text for remark in checks(result))
 
 
+def seen_twice(apart: float) -> networks.World:
+    """The last five points are seen from two places only, `apart` metres from each other."""
+    whole = networks.world(images=7, datum="free", control=0)
+    x0, rotation, network = whole.x0.copy(), whole.rotation.copy(), whole.network
+    x0[6] = x0[5] + [0.0, 0.0, apart]
+    rotation[6] = networks.looking_at(x0[6], np.zeros(3), 0.3)
+    network = network.select((network.point_of < 20) | (network.image_of > 4))
+    xy, cam = network.xy.copy(), network.cameras[0]
+    rows = network.image_of > 4
+    for i in (5, 6):
+        own = network.image_of == i
+        xy[own] = networks.image_points(cam, rotation[i], x0[i], whole.xyz[network.point_of[own]])
+    inside = ~rows | ((xy > 0).all(axis=1) & (xy < [639, 479]).all(axis=1))
+    return networks.World(replace(network, xy=xy).select(inside), rotation, x0, whole.xyz)
+
+
+def test_points_seen_from_one_place_only_are_left_out_before_the_iteration() -> None:
+    """An image repeated from the same place, and one from 4 cm beside: there the points are determined."""
+    there = seen_twice(1e-5)
+    fit = required(there.problem(there.noisy(4), **TOLERANCE))
+    assert np.flatnonzero(~fit.usable.points).tolist() == [20, 21, 22, 23, 24]
+    assert fit.iterations < 20
+    known = there.noisy(4)
+    less = required(replace(there, network=known.select(known.point_of < 20)).problem(**TOLERANCE))
+    np.testing.assert_allclose(fit.values.cameras, less.values.cameras, rtol=1e-7)
+    beside = seen_twice(0.04)
+    assert required(beside.problem(beside.noisy(4), **TOLERANCE)).usable.points.all()
+
+
 def test_large_coordinates_lose_no_precision() -> None:
     near, far = networks.world(), networks.world(shift=(4.5e6, 5.6e6, 300.0))
     one = required(near.problem(near.noisy(5), **TOLERANCE))

@@ -34,6 +34,7 @@ from .rank import (
     SCALE_OF_WINDOWS,
     axis_without_effect,
     missing_windows,
+    points_from_one_place,
     poorly_determined_points,
     steady_points,
     undetermined,
@@ -417,6 +418,9 @@ class _Run:
         if astray is not None:
             return astray
         start = self._start()
+        alone = points_from_one_place(self.system, start)
+        if len(alone) and problem.rounds < LAST_ROUND:
+            return self._without(alone, start)._adjusted(self.options)
         freedom = freedom_of(self.system, start, self.usable.points)
         if network.datum == "control" and freedom.defect:
             return Failure(

@@ -12,7 +12,8 @@ from ..network import Network
 from .arrow import full
 from .datum import Freedom, held_for, similarity_changes
 from .direct import formed
-from .linear import Linear
+from .linear import Linear, linearised
+from .system import System
 from .values import Values
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "SCALE_OF_WINDOWS",
     "axis_without_effect",
     "missing_windows",
+    "points_from_one_place",
     "poorly_determined_points",
     "steady_points",
     "undetermined",
@@ -47,6 +49,9 @@ _IDLE_AXIS = 1e-10
 _SAME = 1e-9
 # A point with this many times the median uncertainty is poorly determined.
 _POOR = 50.0
+# A point is seen from one place where the centres of its images are no farther apart than the first part of
+# its distance, and determine this no better than to the second part of it.
+_ONE_PLACE, _NOWHERE = 1e-4, 0.05
 # Greatest part of a change of the projection centres that is left by a similarity which explains it.
 _LIKE = 0.05
 # Largest uncertainty of a datum point from its own rays, relative to the median of all points.
@@ -267,18 +272,57 @@ def poorly_determined_points(linear: Linear) -> Rows:
     return np.asarray(np.flatnonzero(_unsteady(linear, every, _POOR)), dtype=np.intp)
 
 
+def points_from_one_place(system: System, values: Values) -> Rows:
+    """Return the points of which all images were taken from practically the same place.
+
+    Their distances follow from the errors of the projection centres alone. They contribute nothing, but each
+    change of the projection centres moves them, so that the iteration creeps along a curved valley.
+
+    Parameters
+    ----------
+    system : System
+        The observations.
+    values : Values
+        Approximate values.
+    """
+    seen, first = system.seen, system.unknowns.first
+    rays, images = np.diff(first), len(values.x0)
+    lit = np.flatnonzero(rays)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        near = 1.0 / np.linalg.norm(values.xyz[seen.point] - values.x0[seen.image], axis=1)
+        # Harmonic means: approximate values of some points may lie far away.
+        distance = np.bincount(seen.image, minlength=images) / np.bincount(seen.image, near, images)
+    base = np.linalg.norm(values.x0[seen.image] - values.x0[seen.image[first[seen.point]]], axis=1)
+    # The centre of a parallel projection says nothing about distances.
+    base[system.unknowns.network.parallel[seen.image]] = np.inf
+    wide = np.full(len(rays), np.inf)
+    wide[lit] = np.maximum.reduceat(base / distance[seen.image], first[lit])
+    points = np.flatnonzero((wide < _ONE_PLACE) & (rays > 1) & system.unknowns.by_rays)
+    if not len(points):
+        return points
+    least = _least_information(linearised(system, values), points)
+    known: Mask = least * (_NOWHERE * distance[seen.image[first[points]]]) ** 2 > 1.0
+    return points[~known]
+
+
 def _unsteady(linear: Linear, chosen: Mask, times: float) -> Mask:
     """Points (p,) above a multiple of the median uncertainty of the chosen ones, with images held."""
-    v, movable = _own_normals(linear), linear.system.movable > 0
-    # Held coordinates have no uncertainty: they must not count as undetermined.
-    largest = np.diagonal(v, axis1=1, axis2=2).max(axis=1)
-    j, axis = np.nonzero(~movable)
-    v[j, axis, axis] = largest[j]
-    rows = np.flatnonzero(chosen & movable.any(axis=1) & linear.system.unknowns.by_rays)
+    movable = (linear.system.movable > 0).any(axis=1)
+    rows = np.flatnonzero(chosen & movable & linear.system.unknowns.by_rays)
     size = np.zeros(len(chosen))
-    size[rows] = 1.0 / np.sqrt(np.maximum(np.linalg.eigvalsh(v[rows])[:, 0], np.finfo(float).tiny))
+    size[rows] = 1.0 / np.sqrt(np.maximum(_least_information(linear, rows), np.finfo(float).tiny))
     median = float(np.median(size[rows])) if len(rows) else 0.0
     return np.asarray(size > times * median) if median > 0 else np.zeros(len(chosen), dtype=bool)
+
+
+def _least_information(linear: Linear, points: Rows) -> Array:
+    """Smallest eigenvalues of the normal equations of these points, each with all images held."""
+    v = _own_normals(linear)[points]
+    # Held coordinates have no uncertainty: they must not count as undetermined.
+    largest = np.diagonal(v, axis1=1, axis2=2).max(axis=1)
+    j, axis = np.nonzero(linear.system.movable[points] == 0)
+    v[j, axis, axis] = largest[j]
+    return np.asarray(np.linalg.eigvalsh(v)[:, 0])
 
 
 def _own_normals(linear: Linear) -> Array:
