@@ -58,6 +58,8 @@ _ENOUGH = 0.6
 _CROSSED = 0.3
 """Least difference between the darkest of the bright sectors and the brightest of the dark ones, of that
 between their means."""
+_CLOSE = 0.3
+"""Part of the way to the middle of a triangle at which a sector is seen close to its corner."""
 _MOSTLY = 0.8
 """Share of the corners in sight with which a deltille is not looked for any further."""
 _SHORTER_PX = 0.7
@@ -187,13 +189,14 @@ def find_deltille(
     ways += [partial(find_oblique, grey, noise, angle) for angle in np.pi / 4 * np.arange(4)]
     corners = ways[0]()
     first = lay_deltille(grey, corners, design)
-    best: Placed | None = None
+    best, most = None, (0, 0)
     for k, way in enumerate(ways):
         found = lay_deltille(grey, way(), design) if k else first
         if isinstance(found, Failure):
             continue
-        if best is None or found.located.found.sum() > best.located.found.sum():
-            best = found
+        seen = _seen(grey, found)
+        if best is None or seen > most:
+            best, most = found, seen
         if not best.notes and _complete(best, grey.shape):
             break
     return best or first, corners.xy
@@ -204,6 +207,16 @@ def _complete(placed: Placed, shape: tuple[int, ...]) -> bool:
     at = images_of(placed.located.mapping, placed.located.at)
     sight = ((at > 0) & (at < np.array(shape[::-1]) - 1)).all(axis=1)
     return bool(placed.located.found.sum() >= _MOSTLY * sight.sum())
+
+
+def _seen(grey: NDArray[np.float32], placed: Placed) -> tuple[int, int]:
+    """Number of the corners found whose sectors are seen close to them, and number of all found.
+
+    In a frame that was shortened, a place on an edge beside each corner of a large deltille looks like one.
+    """
+    located = placed.located
+    close = _crossed(_levels(grey, located.mapping, located.at[located.found], _CLOSE))
+    return int(close.sum()), len(close)
 
 
 def lay_deltille(grey: NDArray[np.float32], corners: SixSectors, design: BoardDesign) -> Placed | Failure:
@@ -295,10 +308,13 @@ def _seeds(corners: SixSectors) -> list[tuple[int, Array]]:
     return [(i, step) for _, i, step in found[:_SEEDS]]
 
 
-def _levels(grey: NDArray[np.float32], mapping: Chain, nodes: Array) -> Array:
-    """Grey values (n, 6) in the middles of the triangles around nodes: three bright ones, three dark ones."""
+def _levels(grey: NDArray[np.float32], mapping: Chain, nodes: Array, part: float = 1.0) -> Array:
+    """Grey values (n, 6) in the triangles around nodes: three bright ones, three dark ones.
+
+    They are those of the middles, or of places on the way to these, at a part of it.
+    """
     third = np.array([[1, 1], [-2, 1], [1, -2], [-1, -1], [2, -1], [-1, 2]]) / 3
-    at = images_of(mapping, (nodes[:, None] + third).reshape(-1, 2)).astype(np.float32)
+    at = images_of(mapping, (nodes[:, None] + part * third).reshape(-1, 2)).astype(np.float32)
     # Beside the border of the frame a sector is seen up to there.
     at = np.clip(np.nan_to_num(at), 0, np.array([grey.shape[1] - 1, grey.shape[0] - 1], np.float32))
     values = cv2.remap(grey, at[:, 0].reshape(-1, 6), at[:, 1].reshape(-1, 6), cv2.INTER_LINEAR)
