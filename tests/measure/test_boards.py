@@ -334,21 +334,27 @@ def test_corners_on_paper_that_is_saturated_everywhere_are_measured_to_their_sig
     assert 0.8 < over_sigmas(found, error) < 1.2
 
 
-@pytest.mark.parametrize(("seed", "least"), [(0, 76), (1, 64)])
-def test_corners_of_markers_on_saturated_paper_have_the_sigmas_of_their_errors(seed: int, least: int) -> None:
+@pytest.mark.parametrize(
+    ("family", "seed", "least", "low"),
+    [("DICT_4X4_100", 0, 76, 0.75), ("DICT_4X4_100", 1, 64, 0.75), (APRIL_FAMILY, 1, 68, 0.5)],
+)
+def test_corners_of_markers_on_saturated_paper_have_the_sigmas_of_their_errors(
+    family: str, seed: int, least: int, low: float
+) -> None:
     """As many as OpenCV finds; the level of the paper is known from the dark halves of edges only.
 
-    Corners that were matched by knowledge with the weight of far larger residuals were off by ten sigma.
+    Corners that were matched by knowledge with the weight of far larger residuals were off by ten sigma. Of
+    tags all corners are found a pixel aside; the matches of some show where the others are.
     """
-    printed = prints.markers(6, 5, 30.0, 10.0, "DICT_4X4_100")
+    printed = prints.markers(6, 5, 30.0, 10.0, family)
     view = View(printed, *pose(seed, printed), seed=10 * seed, light=340.0)
-    design = board("markers", 6, 5, 40.0, size=30.0, dictionary="DICT_4X4_100")
+    design = board("markers", 6, 5, 40.0, size=30.0, dictionary=family)
     found = measured(Frame(view.picture(), 255.0, "bright"), design)
     error = renamed(found, view.truth)
     assert found.found >= least
     assert np.sqrt((error**2).mean()) < 0.07
     assert np.abs(in_sigmas(found, error)).max() < 4.5
-    assert 0.75 < over_sigmas(found, error) < 1.2
+    assert low < over_sigmas(found, error) < 1.2
 
 
 def test_circles_cut_by_the_border_are_right_where_a_filter_does_not_know_what_is_beyond() -> None:

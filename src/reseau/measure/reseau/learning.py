@@ -45,6 +45,8 @@ _SPREAD = 16
 _ALIKE_PX = 0.3
 """Deviation of a mark, as it was found, from the mapping through precise ones, up to which it is expected
 where this has it."""
+_ASIDE = 2.0
+"""The same as a multiple of what the precise ones had, if that is more."""
 _WITHIN_PX = 0.49
 """Distance from the middle of a pixel within which a position has that one in the middle of its window."""
 _FITS, _ROUGH_PX = 4.0, 0.01
@@ -131,6 +133,7 @@ def _learn(marks: MarkWindows, first: Matches, rows: Rows) -> Matches:
     known = marks.found if marks.precise_start else np.isin(np.arange(len(marks.at)), rows)
     h, w = marks.screened.grey.shape
     xy, centre = marks.start.copy(), np.rint(marks.start[rows])
+    moved = float(np.median(np.abs(first.xy - marks.start[rows]).max(axis=1)))
     xy[rows] = first.xy
     marks.mapping = plane_through(marks.at[known], xy[known], (h, w))
     weigh(marks, first, rows)
@@ -143,8 +146,10 @@ def _learn(marks: MarkWindows, first: Matches, rows: Rows) -> Matches:
         marks.mapping = precise if marks.eccentric else marks.mapping
         predicted, limit = precise(marks.at), _FITS * np.hypot(sigma, _ROUGH_PX)[:, None]
         if (np.abs(predicted[rows] - first.xy) < limit).all():
-            # Other marks that it predicts as they were found are nearer to it than they were found.
-            near = marks.found & (np.abs(predicted - marks.start) < _ALIKE_PX).all(axis=1)
+            # Other marks that it predicts as they were found are nearer to it than they were found, also
+            # where all were found aside, as tags between saturated paper.
+            alike = max(_ALIKE_PX, _ASIDE * moved)
+            near = marks.found & (np.abs(predicted - marks.start) < alike).all(axis=1)
             near &= ~np.isin(np.arange(len(near)), rows)
             marks.start[near] = predicted[near]
     first = marks.settle(first)
