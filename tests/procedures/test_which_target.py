@@ -10,9 +10,10 @@ import pytest
 from PIL import Image
 
 from reseau.core.data import Frame
-from reseau.core.failure import Failure
+from reseau.core.failure import Code, Failure
 from reseau.designs import board, coded_sheet, coded_testfield
 from reseau.designs.dots import dot_signs
+from reseau.designs.known import known_designs
 from reseau.io import BoardDesign
 from reseau.procedures.exposures import of_another_lens
 from reseau.procedures.target_measurement import Measurer, measurer_of
@@ -86,6 +87,31 @@ def test_a_puzzleboard_is_found_by_the_parts_that_photographs_show(start: tuple[
     assert not isinstance(moved, Failure)
     assert isinstance(moved[1], BoardDesign)
     assert (moved[1].start, moved[1].pitch) == (start, 15.0)
+
+
+def test_boards_that_are_drawn_by_default_are_known() -> None:
+    boards = {name: design for name, design in known_designs().items() if isinstance(design, BoardDesign)}
+    for printed, name in (
+        (prints.markers(7, 10, 18.4, 4.6, "DICT_5X5_100"), "markers on A4"),
+        (prints.Deltille(7, 10, 20.0), "deltille on A4"),
+    ):
+        frame = Frame(View(printed, *pose(3, printed), seed=3).picture(), 255.0)
+        assert which_target([frame], boards) == (name, boards[name])
+
+
+def test_parts_of_a_larger_chessboard_are_not_taken_for_a_smaller_one() -> None:
+    larger, smaller = board("chess", 9, 8, 24.0), board("chess", 7, 7, 24.0)
+    frame, xy = picture(larger)
+    corners = xy.reshape(7, 8, 2)[:6, :6].reshape(-1, 2)
+    (left, top), (right, bottom) = np.rint(corners.min(axis=0)), np.rint(corners.max(axis=0))
+    part = Frame(frame.pixels[int(top) - 9 : int(bottom) + 10, int(left) - 9 : int(right) + 10].copy(), 255.0)
+    assert measurer_of(smaller)(part)
+    assert which_target([part, part, part], {"smaller": smaller}) == ("smaller", smaller)
+    # Of three photographs that show a part of it, and others, also those after the first three tell.
+    found = which_target([part, part, part, frame, frame], {"smaller": smaller})
+    assert isinstance(found, Failure)
+    assert found.code is Code.NOT_FOUND
+    assert which_target([part, part, part, frame], {"smaller": smaller, "larger": larger})
 
 
 def test_photographs_with_another_zoom_are_named(tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from .testfield import coded_testfield
 __all__ = ["known_designs"]
 
 _SHEET, _FIELD, _BOARD = (10, 13), (8, 8), (7, 10)
-_KINDS: tuple[BoardKind, ...] = ("charuco", "aprilgrid", "circles", "chess")
+_KINDS: tuple[BoardKind, ...] = ("charuco", "aprilgrid", "markers", "circles", "chess", "deltille")
+"""All but the PuzzleBoard, whose dots tell what a photograph shows of it."""
 
 
 def known_designs() -> dict[str, ReseauDesign | TestfieldDesign | BoardDesign]:

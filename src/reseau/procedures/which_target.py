@@ -31,6 +31,9 @@ _PUZZLE_MM = 10.0
 """Side of the squares of a PuzzleBoard of which nothing is known."""
 _APART = 10
 """Corners between two parts of a code that may belong to one board."""
+_MORE, _LARGER = 6, 1 / 3
+"""Further photographs in which a plain pattern is looked for; the most that may show a larger lattice, as a
+share of those that show it: something beside a board may continue it by chance."""
 _CODED, _PLAIN, _LINED = range(3)
 """Kinds of targets in the order in which they are looked for."""
 
@@ -70,8 +73,8 @@ def which_target(
     designs : mapping of str to design
         The candidates.
     tried : int
-        Number of photographs in which targets are looked for; the others are not taken from the iterable
-        unless they show how large a PuzzleBoard is.
+        Number of photographs in which targets are looked for; others are taken from the iterable where they
+        tell how large a PuzzleBoard is, or whether a plain pattern is a part of a larger one.
 
     Examples
     --------
@@ -87,15 +90,36 @@ def which_target(
     points = _counted(small, candidates)
     if not any(points.values()) and any(a is not b for a, b in zip(full, small, strict=True)):
         points = _counted(full, candidates)
-    most = max(points.values(), default=0)
-    if most == 0:
-        return Failure("shows none of the known targets; give the design", Code.NOT_FOUND)
-    order = sorted(candidates, key=lambda name: _effort(candidates[name]) == _PLAIN)
-    name = next(name for name in order if points[name] >= _ENOUGH * most)
-    if puzzle is not None and name == puzzle[0]:
-        # Those tried may show a part of it.
-        return _puzzle_of(chain(small, map(_reduced, others)), usual) or puzzle
-    return name, candidates[name]
+    order = sorted(candidates, key=lambda name: _plain(candidates[name]))
+    further: list[Frame] | None = None
+    while most := max(points.values(), default=0):
+        name = next(name for name in order if points[name] >= _ENOUGH * most)
+        if puzzle is not None and name == puzzle[0]:
+            # Those tried may show a part of it.
+            return _puzzle_of(chain(small, map(_reduced, others)), usual) or puzzle
+        if not _plain(candidates[name]):
+            return name, candidates[name]
+        if further is None:
+            further = [*full, *islice(others, _MORE)]
+        if not _is_part_of_another(further, candidates[name]):
+            return name, candidates[name]
+        pattern = _pattern(candidates[name])
+        points |= {name: 0 for name, design in candidates.items() if _pattern(design) == pattern}
+    return Failure(
+        "none of the known targets is seen; describe yours with `reseau design board --json board.json`, and "
+        "give that file",
+        Code.NOT_FOUND,
+    )
+
+
+def _is_part_of_another(frames: Iterable[Frame], design: Design) -> bool:
+    """Whether photographs show a larger lattice: parts of it may pass for the design."""
+    shown = larger = 0
+    for frame in frames:
+        measured = measurer_of(design)(_reduced(frame))
+        shown += not isinstance(measured, Failure)
+        larger += isinstance(measured, Failure) and measured.code is Code.OTHER_DESIGN
+    return larger > _LARGER * shown
 
 
 def _puzzle_of(frames: Iterable[Frame], usual: BoardDesign | None) -> tuple[str, BoardDesign] | None:
@@ -167,7 +191,7 @@ def _counted(frames: Sequence[Frame], designs: Mapping[str, Design]) -> dict[str
                     measured = measurer_of(design)(frame)
                     count = 0 if isinstance(measured, Failure) else len(measured.points)
                     seen[pattern] = count if count >= _LEAST else 0
-                    whole = _ENOUGH * len(design.ids) if effort == _PLAIN else _LEAST
+                    whole = _ENOUGH * len(design.ids) if _plain(design) else _LEAST
                     enough |= count >= whole
                 if enough:
                     break
@@ -175,7 +199,7 @@ def _counted(frames: Sequence[Frame], designs: Mapping[str, Design]) -> dict[str
             total[pattern] += count
             times[pattern] += count > 0
     return {
-        name: 0 if _effort(designs[name]) == _PLAIN and 2 * times[pattern] <= shown else total[pattern]
+        name: 0 if _plain(designs[name]) and 2 * times[pattern] <= shown else total[pattern]
         for name, pattern in patterns.items()
     }
 
@@ -194,11 +218,17 @@ def _pattern(design: Design) -> str:
     return repr(("reseau", design.ids, (design.xy / scale).round(4).tolist(), rings, design.mark.shape))
 
 
-def _effort(design: Design) -> int:
-    """What finding the target takes: markers or rings are read, lattices grown, lines of a testfield laid."""
+def _plain(design: Design) -> bool:
+    """Whether nothing but its margin tells a whole target from a part of a larger one."""
     if isinstance(design, TestfieldDesign):
-        return _LINED
+        return False
     if isinstance(design, BoardDesign):
-        plain = design.kind == "circles" or (design.kind == "chess" and not design.dots)
-        return _PLAIN if plain else _CODED
-    return _PLAIN if design.rings is None else _CODED
+        return design.kind in ("circles", "deltille") or (design.kind == "chess" and not design.dots)
+    return design.rings is None
+
+
+def _effort(design: Design) -> int:
+    """What finding the target takes: markers or rings are read, lattices grown, lines laid."""
+    if isinstance(design, TestfieldDesign) or (isinstance(design, BoardDesign) and design.kind == "deltille"):
+        return _LINED
+    return _PLAIN if _plain(design) else _CODED
