@@ -46,6 +46,9 @@ _NEIGHBOURS = 6
 """Number of neighbours whose light is taken."""
 _BULGED = 0.3
 """Largest deviation of a mark from its neighbours' prediction, in radii: paper bulges."""
+_SAFELY = 0.2
+"""Part of the largest deviation from a prediction by neighbours up to which marks, which then lie on a
+polynomial through the others, need not be compared with it."""
 _UNMODELLED_PX = 0.05
 """Scatter of positions beyond their own sigmas: the sheet is not plane."""
 _FORMED_PX = 0.002
@@ -137,8 +140,12 @@ class PlaneMarks(MarkWindows):
         if self.precise_start:
             found = self._with_doubtful_light(rows, found)
         found = replace(found, cov=found.cov + self._misformed(rows, found))
-        why, field = self._judged(rows, found, field)
-        return self._spread(rows, found, why, field, with_field)
+        why, off = self._why(rows, found), None
+        if self.precise_start and not with_field:
+            off = self._off_polynomial(rows[why == ""], found.xy[why == ""])
+        if off is None or not (np.abs(off) < _SAFELY * self.options.neighbour_px).all():
+            (why, field), off = self._judged(rows, found, field), None
+        return self._spread(rows, found, why, field, with_field, off)
 
     def _uncovered(self, rows: Rows, found: Matches, doubtful: Mask, field: SmoothField) -> Matches:
         """Matches of which the doubtful ones are made without what lies in front of them.
@@ -478,13 +485,27 @@ class PlaneMarks(MarkWindows):
             (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
         ]
 
+    def _why(self, rows: Rows, found: Matches) -> Array:
+        """Reason why each mark (k,) is rejected by its own image; empty where it is not."""
+        why = np.full(len(rows), "", dtype=object)
+        for mask, reason in self._objections(rows, found):
+            why[mask & (why == "")] = reason
+        return why
+
+    def _off_polynomial(self, rows: Rows, xy: Array) -> Array | None:
+        """Deviations (k, 2) of marks from a polynomial through the others; None for too few of them."""
+        terms = self._smooth_terms(rows)
+        if terms is None:
+            return None
+        q, off = np.linalg.qr(terms)[0], xy - self.mapping(self.at[rows])
+        spare = 1 - np.einsum("ku,ku->k", q, q)
+        return np.asarray((off - q @ (q.T @ off)) / np.maximum(spare, 1e-9)[:, None])
+
     def _judged(
         self, rows: Rows, found: Matches, before: SmoothField | None = None
     ) -> tuple[Array, SmoothField | None]:
         """Reason why each mark is rejected, and the field through the others; `before` has its length."""
-        why = np.full(len(rows), "", dtype=object)
-        for mask, reason in self._objections(rows, found):
-            why[mask & (why == "")] = reason
+        why = self._why(rows, found)
         source, field, known = self._straight(rows), None, before
         variance = np.trace(found.cov, axis1=1, axis2=2) / 2 + _UNMODELLED_PX**2
         radius = self.radius(rows)
@@ -509,9 +530,15 @@ class PlaneMarks(MarkWindows):
         return why, field
 
     def _spread(
-        self, rows: Rows, found: Matches, why: Array, field: SmoothField | None, with_field: bool
+        self,
+        rows: Rows,
+        found: Matches,
+        why: Array,
+        field: SmoothField | None,
+        with_field: bool,
+        off: Array | None = None,
     ) -> dict[str, Any]:
-        """Columns over all marks of the design."""
+        """Columns over all marks; `off` are deviations of good ones from the others, else of the field."""
         n, good = len(self.at), why == ""
         ok, reasons = (
             np.zeros(n, dtype=bool),
@@ -519,7 +546,9 @@ class PlaneMarks(MarkWindows):
         )
         ok[rows], reasons[rows] = good, why
         predicted, deviation = self.mapping(self.at), np.full((n, 2), np.nan)
-        if field is not None:
+        if off is not None:
+            predicted[rows[good]], deviation[rows[good]] = found.xy[good] - off, off
+        elif field is not None:
             predicted[rows] = field(self._straight(rows))
             deviation[rows[good]] = field.leave_one_out()[0]
 
