@@ -83,6 +83,8 @@ _NEAR_PX = 2.5
 _NEAR = 0.2
 _LENS_FROM, _MARKER_PX = 16, 1.0
 """Corners of markers that determine the distortion of a lens; their standard deviation as they are found."""
+_READ_PX = 2.0
+"""Error of the corners of markers as they are read, at most; below it a fisheye does not show."""
 _ASTRAY = 0.25
 """Largest share of the markers read that do not lie where the board has them: misread, or bent aside."""
 _FEW_READ = 3
@@ -387,11 +389,11 @@ def _plane_of_markers(
     if len(plane) == 4:
         matrix = cv2.getPerspectiveTransform(plane.astype(np.float32), image.astype(np.float32))
         return np.asarray(matrix), np.ones(4, dtype=bool)
-    # Good to two pixels: distortion bends the board.
+    # They are good to two pixels; distortion bends the board.
     limit = max(3.0, 0.006 * max(shape))
     found, good = projectivity_behind(plane, image, shape, 0.0, limit)
     while _LENS_FROM <= good.sum() < len(good):
-        start = plane_through(plane[good], image[good], shape)
+        start = plane_through(plane[good], image[good], shape, _READ_PX)
         lens = lens_through(plane[good], image[good], np.full(good.sum(), _MARKER_PX), shape, start)
         if lens is None:
             break
@@ -459,7 +461,7 @@ def lay_marked(
     use = np.repeat(whole, 4) if whole.any() else good
     if np.linalg.det(matrix[:2, :2] - np.outer(matrix[:2, 2], matrix[2, :2]) / matrix[2, 2]) > 0:
         return Failure("the board is seen mirrored", Code.MIRRORED)
-    mapping = plane_through(plane[use], image[use], shape)
+    mapping = plane_through(plane[use], image[use], shape, _READ_PX)
     nodes = design.xy / design.pitch
     frame, origin = np.eye(2) / design.pitch, np.zeros(2)
     if design.kind == "markers":

@@ -27,7 +27,7 @@ _ENOUGH = 30
 """Number of points in the centre of the frame from which the projectivity is estimated from these alone."""
 
 
-def plane_through(at: Array, xy: Array, shape: tuple[int, int]) -> Chain:
+def plane_through(at: Array, xy: Array, shape: tuple[int, int], rough_px: float = _LEFT_PX) -> Chain:
     """Mapping through points, behind a fisheye if that leaves much less than none.
 
     Parameters
@@ -36,12 +36,14 @@ def plane_through(at: Array, xy: Array, shape: tuple[int, int]) -> Chain:
         Lattice coordinates and images.
     shape : (int, int)
         Height and width of the frame.
+    rough_px : float
+        Root mean square of what a mapping without a fisheye leaves up to which none is tried, pixels.
     """
     plain = polynomial_through(at, xy, shape)
     if len(at) < _FEWEST_FISHEYE:
         return plain
     left = _rms(plain, at, xy)
-    if left < _LEFT_PX:
+    if left < rough_px:
         return plain
     strength = fisheye_of(at, xy, shape)
     if not strength > 0:
