@@ -320,6 +320,7 @@ class PlaneMarks(MarkWindows):
         terms = self._smooth_terms(rows[good])
         if terms is None:
             return alike
+        terms = np.linalg.qr(terms)[0]  # for normal equations
         bent = plain.xy[good] - mapping(self.at[rows[good]])
         c, e = (np.diagonal(cov[good], axis1=1, axis2=2) for cov in (plain.cov, extra))
         redundancy = 2 * (len(terms) - terms.shape[1])
@@ -330,7 +331,8 @@ class PlaneMarks(MarkWindows):
                 root = np.sqrt(c[:, k] + share * e[:, k])
                 weighted = terms / root[:, None]
                 off = bent[:, k] / root
-                total += float(((off - weighted @ np.linalg.lstsq(weighted, off, rcond=None)[0]) ** 2).sum())
+                rest = off - weighted @ np.linalg.solve(weighted.T @ weighted, weighted.T @ off)
+                total += float(rest @ rest)
             return float(total - redundancy)
 
         none, whole = excess(0.0), excess(1.0)
@@ -348,11 +350,12 @@ class PlaneMarks(MarkWindows):
     @staticmethod
     def _odd_share(residuals: Array) -> float:
         """Mean square of the part of residuals (k, r, c) that is odd about the middle, over that of all."""
-        turned = residuals[:, ::-1, ::-1]
-        if not np.isfinite(residuals - turned).any():
+        off = residuals - residuals[:, ::-1, ::-1]
+        both = np.isfinite(off)
+        off, whole = off[both], residuals[both]
+        if not len(off):
             return 1.0  # on saturated paper no pixel has one opposite
-        whole = float(np.nanmean(np.where(np.isfinite(turned), residuals**2, np.nan)))
-        return min(float(np.nanmean((residuals - turned) ** 2)) / 2 / max(whole, 1e-300), 1.0)
+        return min(float(off @ off) / 2 / max(float(whole @ whole), 1e-300), 1.0)
 
     def _smooth_terms(self, rows: Rows) -> Array | None:
         """Terms (k, u) of the polynomial about which positions of marks scatter; None for too few of them."""
