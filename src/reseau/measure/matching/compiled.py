@@ -9,14 +9,25 @@ convergence) is marked STALE: the caller forms its image with derivatives, and l
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...core.assign import assign
 from ...core.compiled import compiled
 from ...optics.compiled import formed
+from .compiled_rows import (
+    TOGETHER,
+    Floats,
+    add_squares,
+    add_weighted,
+    factorised,
+    fill_normal,
+    fill_weighted,
+    multiply,
+    product,
+    solve,
+    without_common,
+)
 
 __all__ = [
     "ACTIVE",
@@ -33,8 +44,6 @@ __all__ = [
     "windows",
 ]
 
-Floats = NDArray[Any]
-
 ACTIVE, DONE, STALE, FAILED = 0, 1, 2, 3
 """States of a window: to be evaluated at its trial, converged, to be linearised at its estimates, without a
 solution."""
@@ -42,17 +51,13 @@ _COST, _DAMPING, _PREDICTED, _LAST, _FRESH, _GROWTH = range(6)
 """Columns of an iteration: sum of squares, damping, its decrease that is predicted, and the same in the
 iteration before, whether the Jacobian is that at the estimates, factor of the damping after a refusal."""
 _WIDTH, _CONTRAST, _LEVEL = 2, 3, 4
-_SERVES, _SHRINKS, _SINGULAR, _LEAST_DAMPING, _MOST_DAMPING = 0.75, 0.1, 1e-12, 1e-10, 1e12
+_SERVES, _SHRINKS, _LEAST_DAMPING, _MOST_DAMPING = 0.75, 0.1, 1e-10, 1e12
 _GAINS, _HELD = 1e-4, 1e-2
 """As in :mod:`reseau.adjust.batch`."""
 _AT_ONCE = 40_000
 """Number of pixels in the windows that are adjusted together."""
 _TINY = 1e-300
-_TOGETHER = 1024
-"""Number of pixels whose derivatives are multiplied together: they fit into a cache."""
 f32 = np.float32
-_ANY_ORDER = frozenset({"reassoc", "nsz", "contract"})
-"""Sums may be formed in any order, as several at once."""
 
 
 @compiled
@@ -153,7 +158,7 @@ def compared(
     correlation, plane = np.zeros(len(grey)), np.empty(grey.shape[1])
     for k in range(len(grey)):
         plane[:] = 0.0
-        _add_weighted(x[k], _LEVEL, monomials, plane)
+        add_weighted(x[k], _LEVEL, monomials, plane)
         whole, a, b = 0.0, 0.0, 0.0
         for i in range(grey.shape[1]):
             covered = share[k, i]
@@ -176,23 +181,6 @@ def compared(
 
 
 @compiled
-def _add_weighted(factors: Floats, begin: int, rows: Floats, out: Floats) -> None:
-    """Add `rows` (m, n), times factors from `begin` on, to `out` (n,): three at a time, each of them once."""
-    m, n = 0, len(out)
-    while m + 3 <= len(rows):
-        a, b, c = factors[begin + m], factors[begin + m + 1], factors[begin + m + 2]
-        one, two, three = rows[m], rows[m + 1], rows[m + 2]
-        for i in range(n):
-            out[i] += a * one[i] + b * two[i] + c * three[i]
-        m += 3
-    while m < len(rows):
-        a, one = factors[begin + m], rows[m]
-        for i in range(n):
-            out[i] += a * one[i]
-        m += 1
-
-
-@compiled
 def _formed(
     x: Floats,
     share: Floats,
@@ -206,8 +194,8 @@ def _formed(
     """Background, contrast and grey values (n,) of a window of which `share` (n,) is covered."""
     n, ground = len(share), len(monomials)
     plane[:], contrast[:] = 0.0, x[_CONTRAST]
-    _add_weighted(x, _LEVEL, monomials, plane)
-    _add_weighted(x, _LEVEL + ground, across, contrast)
+    add_weighted(x, _LEVEL, monomials, plane)
+    add_weighted(x, _LEVEL + ground, across, contrast)
     if dark:
         for i in range(n):
             grey[i] = plane[i] * (1.0 - contrast[i] * share[i])
@@ -217,101 +205,16 @@ def _formed(
 
 
 @compiled
-def _product(a: Floats, b: Floats, begin: int, end: int) -> float:
-    """Scalar product of a part, as four sums side by side: each waits for its own last addition only.
-
-    A slice of an array would take longer than its product.
-    """
-    fours, one, two, three, four = end - (end - begin) % 4, 0.0, 0.0, 0.0, 0.0
-    for i in range(begin, fours, 4):
-        one += a[i] * b[i]
-        two += a[i + 1] * b[i + 1]
-        three += a[i + 2] * b[i + 2]
-        four += a[i + 3] * b[i + 3]
-    for i in range(fours, end):
-        one += a[i] * b[i]
-    return (one + two) + (three + four)
-
-
-@compiled
-def _multiply(a: Floats, b: Floats, out: Floats) -> None:
-    """a · b; few arrays, so that the compiler can prove that they do not overlap."""
-    for i in range(len(out)):
-        out[i] = a[i] * b[i]
-
-
-@compiled
-def _without_common(values: Floats, slope: Floats, weighted: Floats, columns: int, part: Floats) -> None:
-    """Subtract from each row its common error along `slope`; see `Patches.whiten`.
-
-    `part` is memory of the kind of `values`. Loops over all rows together are faster than one for each row.
-    """
-    n = len(values)
-    for i in range(n):
-        part[i] = weighted[i] * values[i]
-    for first in range(0, n, columns):
-        end = first + columns
-        fours, zero = end - columns % 4, part.dtype.type(0)
-        one, two, three, four = zero, zero, zero, zero
-        for i in range(first, fours, 4):
-            one += part[i]
-            two += part[i + 1]
-            three += part[i + 2]
-            four += part[i + 3]
-        for i in range(fours, end):
-            one += part[i]
-        total = (one + two) + (three + four)
-        for i in range(first, end):
-            part[i] = total
-    for i in range(n):
-        values[i] -= slope[i] * part[i]
-
-
-@compiled
-def _factorised(normal: Floats, damping: float, scale: Floats, lower: Floats) -> bool:
-    """Cholesky factor of normal equations scaled to a unit diagonal; False where they are singular."""
-    u = len(normal)
-    for i in range(u):
-        scale[i] = 1.0 / math.sqrt(normal[i, i]) if normal[i, i] > 0 else 1.0
-    for i in range(u):
-        for j in range(i + 1):
-            total = normal[i, j] * scale[i] * scale[j] + (damping if i == j else 0.0)
-            for m in range(j):
-                total -= lower[i, m] * lower[j, m]
-            if i > j:
-                lower[i, j] = total / lower[j, j]
-            elif total > _SINGULAR:
-                lower[i, i] = math.sqrt(total)
-            else:
-                return False
-    return True
-
-
-@compiled
-def _solve(lower: Floats, right: Floats) -> None:
-    """Solve L Lᵀ x = right in place."""
-    u = len(right)
-    for i in range(u):
-        for m in range(i):
-            right[i] -= lower[i, m] * right[m]
-        right[i] /= lower[i, i]
-    for i in range(u - 1, -1, -1):
-        for m in range(i + 1, u):
-            right[i] -= lower[m, i] * right[m]
-        right[i] /= lower[i, i]
-
-
-@compiled
 def _step(
     normal: Floats, gradient: Floats, damping: float, scale: Floats, lower: Floats, step: Floats
 ) -> float:
     """Fill a damped correction; the decrease of the sum of squares it predicts, negative if there is none."""
-    if not _factorised(normal, damping, scale, lower):
+    if not factorised(normal, damping, scale, lower):
         return -1.0
     u = len(gradient)
     for i in range(u):
         step[i] = gradient[i] * scale[i]
-    _solve(lower, step)
+    solve(lower, step)
     # The decrease 2 sᵀ g − sᵀ N s of the sum of squares, with (N + d I) s = g.
     predicted = 0.0
     for i in range(u):
@@ -389,7 +292,7 @@ def _factors(
     else:
         for i in range(n):
             by_share[i] = contrast[i] * root[i]
-        _multiply(share, root, by_contrast)
+        multiply(share, root, by_contrast)
         assign(rest, root)
 
 
@@ -412,20 +315,20 @@ def _fill_jacobian(
     monomials, across, _ = window
     by_share, by_contrast, rest = factors[0], factors[1], factors[2]
     ground, u = len(monomials), len(jacobian)
-    _multiply(by_share, slopes[0], jacobian[0])
-    _multiply(by_share, slopes[1], jacobian[1])
-    _multiply(by_share, slopes[2], jacobian[_WIDTH])
+    multiply(by_share, slopes[0], jacobian[0])
+    multiply(by_share, slopes[1], jacobian[1])
+    multiply(by_share, slopes[2], jacobian[_WIDTH])
     for i in range(jacobian.shape[1]):
         jacobian[_WIDTH, i] *= f32(widening)
     assign(jacobian[_CONTRAST], by_contrast)
     for m in range(ground):
-        _multiply(rest, monomials[m], jacobian[_LEVEL + m])
+        multiply(rest, monomials[m], jacobian[_LEVEL + m])
     at = _LEVEL + ground
     for m in range(len(across)):
-        _multiply(by_contrast, across[m], jacobian[at + m])
+        multiply(by_contrast, across[m], jacobian[at + m])
     at += len(across)
     for m in range(u - at):
-        _multiply(by_share, slopes[3 + m], jacobian[at + m])
+        multiply(by_share, slopes[3 + m], jacobian[at + m])
 
 
 @compiled
@@ -444,107 +347,21 @@ def _fill_gradient(
     """
     monomials, across, _ = window
     ground, forms, n = len(monomials), len(slopes) - 3, len(off)
-    _multiply(factors[0], off, part)
+    multiply(factors[0], off, part)
     for m in range(len(slopes)):
         at = m if m <= _WIDTH else len(gradient) - forms + m - 3
-        gradient[at] = -_product(slopes[m], part, 0, n)
+        gradient[at] = -product(slopes[m], part, 0, n)
     gradient[_WIDTH] *= widening
-    _multiply(factors[1], off, part)
+    multiply(factors[1], off, part)
     total = 0.0
     for i in range(n):
         total += part[i]
     gradient[_CONTRAST] = -total
     for m in range(len(across)):
-        gradient[_LEVEL + ground + m] = -_product(across[m], part, 0, n)
-    _multiply(factors[2], off, part)
+        gradient[_LEVEL + ground + m] = -product(across[m], part, 0, n)
+    multiply(factors[2], off, part)
     for m in range(ground):
-        gradient[_LEVEL + m] = -_product(monomials[m], part, 0, n)
-
-
-@compiled(fastmath=_ANY_ORDER)
-def _with_four(a: Floats, one: Floats, two: Floats, three: Floats, four: Floats) -> tuple[Any, Any, Any, Any]:
-    """Scalar products of a row with four others, which load it once."""
-    w = x = y = z = f32(0)
-    for i in range(len(a)):
-        w += a[i] * one[i]
-        x += a[i] * two[i]
-        y += a[i] * three[i]
-        z += a[i] * four[i]
-    return w, x, y, z
-
-
-@compiled(fastmath=_ANY_ORDER)
-def _with_one(a: Floats, b: Floats) -> Any:
-    """Scalar product."""
-    total = f32(0)
-    for i in range(len(a)):
-        total += a[i] * b[i]
-    return total
-
-
-@compiled
-def _fill_normal(jacobian: Floats, normal: Floats) -> None:
-    """Fill the products (u, u) of the rows of a Jacobian (u, n).
-
-    A library for matrices takes three times as long for so few rows. Sums of parts are in double precision.
-    """
-    u, n = jacobian.shape
-    normal[:] = 0.0
-    for begin in range(0, n, _TOGETHER):
-        end = min(begin + _TOGETHER, n)
-        for i in range(u):
-            a, m = jacobian[i, begin:end], 0
-            while m + 4 <= i + 1:
-                w, x, y, z = _with_four(
-                    a,
-                    jacobian[m, begin:end],
-                    jacobian[m + 1, begin:end],
-                    jacobian[m + 2, begin:end],
-                    jacobian[m + 3, begin:end],
-                )
-                normal[i, m] += w
-                normal[i, m + 1] += x
-                normal[i, m + 2] += y
-                normal[i, m + 3] += z
-                m += 4
-            while m <= i:
-                normal[i, m] += _with_one(a, jacobian[m, begin:end])
-                m += 1
-    for i in range(u):
-        for m in range(i):
-            normal[m, i] = normal[i, m]
-
-
-@compiled(fastmath=_ANY_ORDER)
-def _add_three(a: float, b: float, c: float, one: Floats, two: Floats, three: Floats, out: Floats) -> None:
-    for i in range(len(out)):
-        out[i] += a * one[i] + b * two[i] + c * three[i]
-
-
-@compiled(fastmath=_ANY_ORDER)
-def _add_one(a: float, one: Floats, out: Floats) -> None:
-    for i in range(len(out)):
-        out[i] += a * one[i]
-
-
-@compiled
-def _fill_weighted(factors: Floats, first: int, rows: Floats, begin: int, out: Floats) -> None:
-    """Fill `out` (k,) with columns of `rows` (m, n) from `begin` on, times factors (m,) from `first` on."""
-    out[:] = f32(0)
-    m, end = first, begin + len(out)
-    while m + 3 <= len(rows):
-        parts = rows[m, begin:end], rows[m + 1, begin:end], rows[m + 2, begin:end]
-        _add_three(factors[m], factors[m + 1], factors[m + 2], *parts, out)
-        m += 3
-    while m < len(rows):
-        _add_one(factors[m], rows[m, begin:end], out)
-        m += 1
-
-
-@compiled
-def _add_squares(part: Floats, out: Floats) -> None:
-    for i in range(len(out)):
-        out[i] += part[i] * part[i]
+        gradient[_LEVEL + m] = -product(monomials[m], part, 0, n)
 
 
 @compiled
@@ -558,7 +375,7 @@ def _fill_influence(
     """
     u, n = jacobian.shape
     scale, factor = np.empty(u), np.empty((u, u))
-    positive = _factorised(cofactor, 0.0, scale, factor)
+    positive = factorised(cofactor, 0.0, scale, factor)
     first, columns = cofactor[:2].astype(f32), np.zeros((u, u), f32)
     for m in range(u):
         for i in range(m, u):
@@ -568,13 +385,13 @@ def _fill_influence(
         end = min(begin + len(part), n)
         some = part[: end - begin]
         for m in range(2):
-            _fill_weighted(first[m], 0, jacobian, begin, some)
-            _multiply(some, root[begin:end], on_position[m, begin:end])
+            fill_weighted(first[m], 0, jacobian, begin, some)
+            multiply(some, root[begin:end], on_position[m, begin:end])
         if not positive:
             continue
         for m in range(u):
-            _fill_weighted(columns[m], m, jacobian, begin, some)
-            _add_squares(some, leverage[begin:end])
+            fill_weighted(columns[m], m, jacobian, begin, some)
+            add_squares(some, leverage[begin:end])
 
 
 @compiled
@@ -637,7 +454,7 @@ def linearised(
     n, u, forms = observed.shape[1], x.shape[1], slopes.shape[1] - 3
     plane, contrast, grey = np.empty(n), np.empty(n), np.empty(n)
     root, part, factors = np.empty(n, f32), np.empty(n, f32), np.empty((3, n), f32)
-    jacobian, some = np.empty((u, n), f32), np.empty(_TOGETHER, f32)
+    jacobian, some = np.empty((u, n), f32), np.empty(TOGETHER, f32)
     scale, lower, left = np.empty(u), np.empty((u, u)), np.empty(n, f32)
     for j in range(len(rows)):
         k = rows[j]
@@ -649,36 +466,36 @@ def linearised(
         for i in range(n):
             # Pixels that are not used may carry any value.
             residuals[k, i] = grey[i] - seen[i] if root[i] > 0 else 0.0
-        _multiply(residuals[k], root, left)
+        multiply(residuals[k], root, left)
         if len(slope):
             along, heavy = slope[k], weighted[k]
             assign(along, jacobian[0])
             for first in range(0, n, columns):
-                length2 = variance * _product(along, along, first, first + columns)
+                length2 = variance * product(along, along, first, first + columns)
                 factor = f32(variance * (1.0 - 1.0 / math.sqrt(1.0 + jitter * length2)) / max(length2, 1e-30))
                 for i in range(first, first + columns):
                     heavy[i] = along[i] * factor
-            _without_common(left, along, heavy, columns, part)
+            without_common(left, along, heavy, columns, part)
             for m in range(u):
-                _without_common(jacobian[m], along, heavy, columns, part)
+                without_common(jacobian[m], along, heavy, columns, part)
             _unweighted(left, root, residuals[k])
-        cost = _product(left, left, 0, n)
+        cost = product(left, left, 0, n)
         for m in range(u):
             cost += prior[m] * (mean[k, m] - x[k, m]) ** 2
-        _fill_normal(jacobian, normals[k])
+        fill_normal(jacobian, normals[k])
         gradient = np.dot(jacobian, left)
         for m in range(u):
             normals[k, m, m] += prior[m]
             gradients[k, m] = prior[m] * (mean[k, m] - x[k, m]) - gradient[m]
         freedom = used + np.count_nonzero(prior) - u
         iteration[k, _COST], iteration[k, _LAST], iteration[k, _FRESH] = cost, 0.0, 1.0
-        if not (math.isfinite(cost) and freedom >= 0 and _factorised(normals[k], 0.0, scale, lower)):
+        if not (math.isfinite(cost) and freedom >= 0 and factorised(normals[k], 0.0, scale, lower)):
             state[k] = FAILED
             continue
         for m in range(u):
             for i in range(u):
                 cofactors[k, m, i] = 1.0 if i == m else 0.0
-            _solve(lower, cofactors[k, m])
+            solve(lower, cofactors[k, m])
             for i in range(u):
                 cofactors[k, m, i] *= scale[i] * scale[m]
         limit = share_of_sigma**2 * cost / max(freedom, 1)
@@ -736,7 +553,7 @@ def influenced(
     n, u = weights.shape[1], at.shape[1]
     plane, contrast, grey = np.empty(n), np.empty(n), np.empty(n)
     root, factors = np.empty(n, f32), np.empty((3, n), f32)
-    jacobian, some = np.empty((u, n), f32), np.empty(_TOGETHER, f32)
+    jacobian, some = np.empty((u, n), f32), np.empty(TOGETHER, f32)
     for j in range(len(rows)):
         k, p = rows[j], places[j]
         _formed(at[p], share[p], monomials, across, dark, plane, contrast, grey)
@@ -768,9 +585,9 @@ def _extrapolated(
         steps[m] = trial[m] - x[m]
     for m in range(len(slopes)):
         steps[u + m] = steps[m if m <= _WIDTH else u - forms + m - 3] * f32(widened if m == _WIDTH else 1.0)
-    _add_weighted(steps, 0, jacobian, off)
+    add_weighted(steps, 0, jacobian, off)
     _unweighted(off, root, residuals)
-    _add_weighted(steps, u, slopes, share)
+    add_weighted(steps, u, slopes, share)
     assign(x, trial)
 
 
@@ -810,11 +627,11 @@ def advanced(
         used = _roots(weights[k], root)
         for i in range(n):
             grey[i] = grey[i] - seen[i] if root[i] > 0 else 0.0
-        _multiply(grey, root, left)
+        multiply(grey, root, left)
         if len(slope):
-            _without_common(left, slope[k], weighted[k], columns, part)
+            without_common(left, slope[k], weighted[k], columns, part)
             _unweighted(left, root, grey)
-        cost = _product(left, left, 0, n)
+        cost = product(left, left, 0, n)
         for m in range(u):
             cost += prior[m] * (trial[k, m] - mean[k, m]) ** 2
         gain = (iteration[k, _COST] - cost) / max(iteration[k, _PREDICTED], _TINY)
@@ -824,7 +641,7 @@ def advanced(
             assign(residuals[k], grey)
             if len(slope):
                 # The transposed of what made the derivatives independent.
-                _without_common(left, weighted[k], slope[k], columns, part)
+                without_common(left, weighted[k], slope[k], columns, part)
             _formed(at[p], begun[p], monomials, across, dark, plane, contrast, grey)
             _factors(plane, contrast, begun[p], root, dark, factors[0], factors[1], factors[2])
             widening = _widening(at[p, _WIDTH], psf[k])
