@@ -24,10 +24,9 @@ from .core.data import Frame, ImagePoints
 from .core.display import Display
 from .core.errors import UsageError
 from .core.failure import Failure
-from .exchange import Lens, read_network
+from .exchange import Lens, read_network, read_target
 from .exchange import read_lens as _read_lens
 from .io import BoardDesign, ReseauDesign, TestfieldDesign, is_points, read_measurement
-from .io import read_design as _read_design
 from .io.images import Channel, open_scan
 from .io.images import read_image as _read_image
 from .io.scans import scan_of
@@ -125,7 +124,7 @@ def read_design(source: DesignLike) -> ReseauDesign | TestfieldDesign | BoardDes
     Parameters
     ----------
     source : str, Path, ReseauDesign, TestfieldDesign or BoardDesign
-        A file, or a design, which is returned as it is.
+        A file, also one in which Kalibr or OpenCV describes a board; or a design, which is returned as it is.
 
     Raises
     ------
@@ -143,7 +142,7 @@ def read_design(source: DesignLike) -> ReseauDesign | TestfieldDesign | BoardDes
     """
     if isinstance(source, ReseauDesign | TestfieldDesign | BoardDesign):
         return source
-    return _read_design(_path(source, "source", "a path or a design"))
+    return read_target(_path(source, "source", "a path or a design"))
 
 
 def read_calibration(source: CalibrationLike) -> Calibration:

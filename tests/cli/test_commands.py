@@ -167,6 +167,34 @@ def test_a_design_is_written_with_its_drawings(reseau: Run, tmp_path: Path) -> N
     assert (design.name, len(design.points), design.mark.size) == ("five", 20, 2.0)
 
 
+def test_a_board_file_is_read_and_its_unit_is_asked_for(reseau: Run, tmp_path: Path) -> None:
+    text = (
+        "target_type: 'circlegrid'\ntargetCols: 7\ntargetRows: 10\nspacingMeters: 0.02\nasymmetricGrid: 0\n"
+    )
+    (tmp_path / "kalibr.yaml").write_text(text)
+    file = tmp_path / "board.json"
+    # Kalibr does not say how large the circles are.
+    status, _, err = reseau(
+        "design", "board", "--from", tmp_path / "kalibr.yaml", "--size", 8, "--json", file
+    )
+    assert (status, err) == (0, "")
+    written = json.loads(file.read_text())
+    assert (written["pitch"], written["size"]) == (20.0, 8.0)
+    # The design again, in another size.
+    assert reseau("design", "board", "--from", file, "--pitch", 25, "--json", file)[0] == 0
+    assert json.loads(file.read_text()) == written | {"pitch": 25.0}
+    storage = "%YAML:1.0\n---\nsquaresX: 7\nsquaresY: 10\nsquareLength: 0.024\nmarkerLength: 0.018\n"
+    (tmp_path / "opencv.yml").write_text(storage + "dictionary: 5\n")
+    status, _, err = reseau("design", "board", "--from", tmp_path / "opencv.yml", "--json", file)
+    assert status == 0
+    assert "note: the pitch is 0.024 mm; if opencv.yml is in metres, give --pitch" in err
+    # A pitch of zero is no pitch that was not given.
+    for target in ("board", "sheet", "testfield"):
+        status, out, err = reseau("design", target, "--pitch", 0)
+        assert (status, out) == (2, "")
+        assert "pitch" in err or "0 mm" in err
+
+
 def test_a_report_is_written_on_request(reseau: Run, photo: Any, tmp_path: Path) -> None:
     page = tmp_path / "r.html"
     arguments = ("refine", "--photo-i", photo.image, "--reseau", photo.design, "--report", page)

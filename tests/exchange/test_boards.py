@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import pytest
 
 from reseau.core.errors import FormatError
-from reseau.exchange import read_board
+from reseau.designs import board
+from reseau.exchange import read_board, read_target
 
 XML = """<?xml version="1.0"?>
 <opencv_storage>
@@ -65,3 +67,28 @@ def test_settings_of_the_calibration_sample_of_opencv_are_read(tmp_path: Path) -
     }  # fmt: skip
     with pytest.raises(FormatError, match="Calibrate_Pattern"):
         read(tmp_path, XML, "a.xml")
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
+def test_a_charuco_board_that_opencv_stores_by_its_arguments_is_read(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"board{suffix}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    sizes: dict[str, int | float] = {"squaresX": 8, "squaresY": 6, "squareLength": 30.0, "markerLength": 22.0}
+    for key, value in (sizes | {"dictionary": int(cv2.aruco.DICT_4X4_50), "legacyPattern": 1}).items():
+        storage.write(key, value)
+    storage.release()
+    assert read_board(path) == board(
+        "charuco", 8, 6, 30.0, size=22.0, dictionary="DICT_4X4_50", legacy=True, name="board"
+    )
+    path.write_text(path.read_text().replace("squaresX", "columns"))
+    with pytest.raises(FormatError, match="squaresX"):
+        read_board(path)
+
+
+def test_a_target_is_a_design_or_a_board_of_another_program(tmp_path: Path) -> None:
+    design = board("chess", 10, 7, 101.0, name="c")
+    design.write(tmp_path / "c.json")
+    text = "target_type: 'checkerboard'\ntargetCols: 9\ntargetRows: 6\nrowSpacingMeters: 0.101\n"
+    (tmp_path / "c.yaml").write_text(text + "colSpacingMeters: 0.101\n")
+    for name in ("c.json", "c.yaml"):
+        assert read_target(tmp_path / name) == read_board(tmp_path / name) == design

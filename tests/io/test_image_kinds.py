@@ -298,3 +298,13 @@ def test_an_unknown_channel_is_named(tmp_path: Path) -> None:
     path = _other(".png", RGB8)(tmp_path)
     with pytest.raises(UsageError, match="cyan: is not a channel; use luma, red, green or blue"):
         read_image(path, "cyan")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("suffix", "code"), [("mp4", "mp4v"), ("avi", "MJPG"), ("mkv", "MJPG")])
+def test_a_film_is_called_one(tmp_path: Path, suffix: str, code: str) -> None:
+    path = tmp_path / f"film.{suffix}"
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 10, (64, 48))
+    film.write(np.zeros((48, 64, 3), np.uint8))
+    film.release()
+    with pytest.raises(ImageError, match="is a film; write some of its pictures"):
+        read_image(path)

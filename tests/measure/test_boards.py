@@ -751,6 +751,15 @@ def test_a_mirrored_charuco_board_is_declined_or_measured_as_such() -> None:
     assert np.abs(found.xy - (truth * [-1, 1] + [frame.width - 1, 0])).max() < 0.03
 
 
+def test_a_mirrored_aprilgrid_is_declined_although_one_of_its_tags_is_like_another() -> None:
+    design = board("aprilgrid", 6, 6, 31.2, size=24.0, border_bits=2)
+    frame, _ = picture(design, distance=460.0)
+    assert measured(frame, design).found > 100
+    declined = measure_board(replace(frame, pixels=np.ascontiguousarray(frame.pixels[:, ::-1])), design)
+    assert not declined
+    assert declined.code is Code.MIRRORED
+
+
 def test_a_mirrored_aprilgrid_is_declined() -> None:
     frame, _ = picture(APRIL, 20.0, 10.0, 300.0)
     found = measure_board(replace(frame, pixels=np.ascontiguousarray(frame.pixels[:, ::-1])), APRIL)

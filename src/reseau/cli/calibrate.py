@@ -200,8 +200,8 @@ def calibrate(
     if overlay is not None and not executor.local:
         raise UsageError("is drawn by this machine only", where="--overlay", do="leave out --cluster")
     from ..core.provenance import sha256_of
+    from ..exchange import read_target
     from ..execution import Outputs
-    from ..io import parse_design, read_text
     from ..measure import TestfieldOptions
     from ..procedures.calibration import calibrate_camera, measurer_of
     from ..procedures.exposures import photograph_reader, photographs_of
@@ -211,7 +211,7 @@ def calibrate(
     drawn = {} if overlay is None else overlay_files(overlay, files)
     distance = positive(distance)
     kind, automatic = component_kind(components), str(design) == "auto"
-    target = _found_target(files, channel, sensor) if automatic else parse_design(read_text(design), design)
+    target = _found_target(files, channel, sensor) if automatic else read_target(design)
     others = {path.name: read_lens(path) for path in against or []}
     if others and taken:
         raise UsageError("requires one camera", where="--against", do="compare the cameras one by one")

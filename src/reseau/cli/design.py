@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["app"]
 
+_SMALL_MM = 1.0
+"""Pitch below which a file of OpenCV, which has no unit, is rather in metres."""
+
 app = typer.Typer(
     help="Draw a target for printing in true size, and write its coordinates.", no_args_is_help=True
 )
@@ -144,7 +147,7 @@ def sheet(
     def of(pitch: float, size: float | None = None) -> ReseauDesign:
         return coded_sheet(columns, rows, pitch, size=size, name=name, polarity=polarity.value)
 
-    pitch = pitch or _filling(of, paper)
+    pitch = _filling(of, paper) if pitch is None else pitch
     design = of(pitch, size)
     _write(design, svg, pdf, out, paper, f"{columns} × {rows} disks, pitch {pitch:g} mm")
 
@@ -212,7 +215,7 @@ def coded_field(
             columns, rows, pitch, turn_seed=turn_seed, polarity=polarity.value, name=name, **sizes
         )
 
-    pitch = pitch or _filling(of, paper)
+    pitch = _filling(of, paper) if pitch is None else pitch
     design = of(pitch, **{key: value for key, value in given.items() if value is not None})
     _write(design, svg, pdf, out, paper, f"{columns} × {rows} squares, pitch {pitch:g} mm")
 
@@ -272,7 +275,12 @@ def board(
         tuple[int, int], typer.Option(help="Column and row of a PuzzleBoard's first corner in its code.")
     ] = (0, 0),
     given: Annotated[
-        Path | None, typer.Option("--from", help="Board file of Kalibr or OpenCV to read (YAML, XML).")
+        Path | None,
+        typer.Option(
+            "--from",
+            help="Board file to read, of Kalibr or OpenCV (YAML, XML) or a design; --pitch and --size "
+            "replace what it says.",
+        ),
     ] = None,
     name: Annotated[str, typer.Option(help="Name of the design.")] = "board",
     svg: Svg = None,
@@ -283,8 +291,17 @@ def board(
     """Design a chessboard, PuzzleBoard, deltille, ChArUco board, circle grid or grid of tags."""
     if given is not None:
         from ..exchange import read_board
+        from ..io import BoardDesign as Board
 
         design = read_board(given)
+        other = {key: value for key, value in (("pitch", pitch), ("size", size)) if value is not None}
+        design = Board.from_content(design.to_dict() | other, where=given)
+        if design.pitch < _SMALL_MM:
+            typer.echo(
+                f"note: the pitch is {design.pitch:g} mm; if {given.name} is in metres, give --pitch and "
+                "--size in mm",
+                err=True,
+            )
     else:
         from ..designs import board as board_of
 
@@ -297,7 +314,7 @@ def board(
                 start=start, name=name,
             )  # fmt: skip
 
-        design = of(pitch or _filling(of, paper), size)
+        design = of(_filling(of, paper) if pitch is None else pitch, size)
     what = f"{design.kind}, {design.columns} × {design.rows}, pitch {design.pitch:g} mm"
     _write(design, svg, pdf, out, paper, what)
 

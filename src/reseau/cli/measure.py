@@ -157,11 +157,11 @@ def board(
     as_json: AsJson = False,
 ) -> None:
     """Measure a chessboard, PuzzleBoard, deltille, ChArUco board, circle grid or grid of tags."""
-    from ..io import BoardDesign
+    from ..exchange import read_board
     from ..measure import BoardOptions, measure_board
 
     task = Task(image, out, overlay, as_json, "points")
-    target = BoardDesign.read(design)
+    target = read_board(design)
     options = BoardOptions(mirrored=mirrored, row_jitter_px=row_jitter, fill=fill)
     task.run(
         lambda: read_frame(image, channel.value, sensor),

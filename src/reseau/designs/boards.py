@@ -13,7 +13,7 @@ from ..core.errors import UsageError
 from ..io.board import BoardDesign, BoardKind
 from .dots import dotted_squares
 
-__all__ = ["board", "board_figures", "marker_cells", "marker_dictionary"]
+__all__ = ["board", "board_figures", "dictionary_name", "marker_cells", "marker_dictionary"]
 
 _SIZES = {"puzzle": 1 / 3, "charuco": 0.75, "circles": 0.5, "aprilgrid": 1 / 1.3, "markers": 0.8}
 """Sizes of dots, markers, circles and tags in pitches, where none is given; tags are 0.3 of a side apart."""
@@ -106,9 +106,34 @@ def marker_dictionary(name: str) -> Any:
     number = getattr(cv2.aruco, name, None)
     if not name.startswith("DICT_") or not isinstance(number, int):
         raise UsageError(
-            f"{name!r} is not a dictionary of OpenCV", where="dictionary of a board", do="as DICT_5X5_100"
+            f"{name!r} is not one of OpenCV", where="dictionary of a board", do="give one, as DICT_5X5_100"
         )
     return cv2.aruco.getPredefinedDictionary(number)
+
+
+def dictionary_name(number: int) -> str:
+    """Name of the dictionary that has a number in OpenCV.
+
+    Raises
+    ------
+    UsageError
+        When OpenCV has no such dictionary.
+
+    Examples
+    --------
+    >>> dictionary_name(5)
+    'DICT_5X5_100'
+    """
+    import cv2
+
+    names = (name for name in dir(cv2.aruco) if name.startswith("DICT_"))
+    found = next((name for name in names if getattr(cv2.aruco, name) == number), None)
+    if found is None:
+        raise UsageError(
+            f"{number} is not the number of one of OpenCV", where="dictionary of a board",
+            do="give its name, as DICT_5X5_100",
+        )  # fmt: skip
+    return found
 
 
 def marker_cells(design: BoardDesign) -> tuple[Array, NDArray[np.bool_]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .bal import read_bal, write_bal
-from .boards import read_board
+from .boards import read_board, read_target
 from .bundler import read_bundler
 from .calibrations import export_calibration, export_rig, import_calibration
 from .codev import read_codev
@@ -44,6 +44,7 @@ __all__ = [
     "read_network",
     "read_openptv",
     "read_photomodeler",
+    "read_target",
     "read_turntable",
     "read_zemax",
     "write_bal",

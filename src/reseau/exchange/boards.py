@@ -1,4 +1,4 @@
-"""Boards as other programs describe them: Kalibr's target files and the settings of OpenCV's sample."""
+"""Boards as other programs describe them: Kalibr's target files, and files of OpenCV's storage."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import FormatError, UsageError
-from ..designs.boards import board
-from ..io import read_text
+from ..designs.boards import board, dictionary_name
+from ..io import ReseauDesign, TestfieldDesign, read_design, read_text
 from ..io.board import BoardDesign, BoardKind
 
-__all__ = ["read_board"]
+__all__ = ["read_board", "read_target"]
+
+_SUFFIXES = (".yaml", ".yml", ".xml")
+"""Suffixes of files of other programs."""
 
 _KALIBR: dict[str, BoardKind] = {
     "aprilgrid": "aprilgrid",
@@ -27,15 +30,17 @@ _OPENCV: dict[str, BoardKind] = {
 
 
 def read_board(path: Path | str) -> BoardDesign:
-    """Read a board from Kalibr's target file (YAML), or from the settings of OpenCV's calibration sample.
+    """Read a board from its design, from Kalibr's target file (YAML), or from a file of OpenCV's storage.
 
     Kalibr counts the inner corners of a chessboard and measures in metres; so does OpenCV count them, in a
-    unit of the user, which is taken as the millimetre. A ChArUco board is given there by its squares.
+    unit of the user, which is taken as the millimetre. A ChArUco board is given there by its squares. Of
+    OpenCV are read the settings of its calibration sample, and the arguments of its `CharucoBoard`
+    (`squaresX`, `squaresY`, `squareLength`, `markerLength`, `dictionary`, `legacyPattern`).
 
     Parameters
     ----------
     path : str or Path
-        YAML of Kalibr; YAML or XML of OpenCV.
+        ``reseau-board/1``; YAML of Kalibr; YAML, XML or JSON of OpenCV.
 
     Raises
     ------
@@ -56,26 +61,52 @@ def read_board(path: Path | str) -> BoardDesign:
     ('aprilgrid', 6, 88.0, 114.4)
     """
     path = Path(path)
-    entries = _entries(read_text(path))
+    text = read_text(path)
+    if f'"{BoardDesign.SCHEMA}"' in text[:4096]:
+        return BoardDesign.parse(text, where=path)
+    entries = _entries(text)
     get = _Values(entries, path)
     try:
         if "target_type" in entries:
             return _kalibr(get, path.stem)
         if "Calibrate_Pattern" in entries:
             return _opencv(get, path.stem)
+        if "squaresX" in entries:
+            return _charuco(get, path.stem)
     except UsageError as error:
         raise FormatError(f"describes no board: {error.what}", where=path) from None
     raise FormatError(
-        "has neither `target_type` (Kalibr) nor `Calibrate_Pattern` (OpenCV)", where=path,
-        do="give a file of Kalibr or of OpenCV's calibration sample",
+        "has neither `target_type` (Kalibr) nor `Calibrate_Pattern` or `squaresX` (OpenCV)", where=path,
+        do="give a target file of Kalibr, the settings of OpenCV's calibration sample or a CharucoBoard",
     )  # fmt: skip
 
 
+def read_target(path: Path | str) -> ReseauDesign | TestfieldDesign | BoardDesign:
+    """Read a design of a target, or the file in which Kalibr or OpenCV describes a board, by its suffix.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is no design, and describes no board.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     board("chess", 7, 10, 23.0).write(Path(folder) / "board.json")
+    ...     read_target(Path(folder) / "board.json").kind
+    'chess'
+    """
+    return read_board(path) if Path(path).suffix.lower() in _SUFFIXES else read_design(path)
+
+
 def _entries(text: str) -> dict[str, str]:
-    """Keys and values of flat YAML, or of XML elements without children."""
+    """Keys and values of flat YAML or JSON, or of XML elements without children."""
     found = dict(re.findall(r"<(\w+)[^<>/]*>\s*([^<>]*?)\s*</\1>", text))
     for line in text.splitlines():
-        pair = re.match(r"\s*(\w+)\s*:\s*(.*?)\s*(?:#.*)?$", line)
+        pair = re.match(r"""\s*['"]?(\w+)['"]?\s*:\s*(.*?),?\s*(?:#.*)?$""", line)
         if pair and pair[2]:
             found[pair[1]] = pair[2]
     return {key: value.strip().strip("'\"") for key, value in found.items()}
@@ -141,3 +172,14 @@ def _opencv(get: _Values, name: str) -> BoardDesign:
     if kind == "charuco":
         options |= {"size": get.number("Marker_Size"), "dictionary": get.text("ArUco_Dict_Name")}
     return board(kind, columns + more, rows + more, get.number("Square_Size"), name=name, **options)
+
+
+def _charuco(get: _Values, name: str) -> BoardDesign:
+    words = get.text("dictionary")
+    if words.isdecimal():
+        words = dictionary_name(int(words))
+    legacy = get.text("legacyPattern", "0").lower() in ("true", "1")
+    return board(
+        "charuco", get.count("squaresX"), get.count("squaresY"), get.number("squareLength"),
+        size=get.number("markerLength"), dictionary=words, legacy=legacy, name=name,
+    )  # fmt: skip

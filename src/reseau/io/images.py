@@ -244,6 +244,10 @@ def _header_size(magic: bytes, path: Path) -> tuple[int, int]:
             abs(int.from_bytes(magic[18:22], "little", signed=True)),
             abs(int.from_bytes(magic[22:26], "little", signed=True)),
         )
+    if _is_film(magic):
+        raise ImageError(
+            "is a film", where=path, do="write some of its pictures, sharp and from different sides, as PNG"
+        )
     if magic.startswith(b"\xff\xd8"):
         with path.open("rb") as stream:
             stream.seek(2)
@@ -255,6 +259,12 @@ def _header_size(magic: bytes, path: Path) -> tuple[int, int]:
                 stream.seek(length - 2, 1)
         raise ImageError("is a damaged JPEG", where=path, do=_AGAIN)
     raise ImageError("is not a PNG, JPEG, TIFF or BMP image", where=path)
+
+
+def _is_film(magic: bytes) -> bool:
+    """Whether a file begins like MP4, QuickTime, AVI or Matroska."""
+    avi = magic[:4] == b"RIFF" and magic[8:12] == b"AVI "
+    return avi or magic[4:8] in (b"ftyp", b"moov") or magic[:4] == b"\x1aE\xdf\xa3"
 
 
 def _coded_dpi(magic: bytes) -> float | None:

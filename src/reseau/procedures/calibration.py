@@ -474,7 +474,7 @@ def calibrate_camera(
     for c, name in enumerate(cameras):
         if of.count(c) < _LEAST_IMAGES:
             which = f" of camera {name}" if taken else ""
-            why = "".join(f"; {image}: {reason}" for image, reason in declined.items())
+            why = "".join(f"; {images}: {reason}" for reason, images in _by_reason(declined).items())
             show = f"image{which} shows" if of.count(c) == 1 else f"images{which} show"
             return Failure(
                 f"{of.count(c)} {show} the target, {_LEAST_IMAGES} are needed, 10 are good{why}",
@@ -628,6 +628,17 @@ def _measured(
 
 def _camera_of(name: str, taken: Mapping[str, Taken] | None) -> str:
     return taken[name].camera if taken else _CAMERA
+
+
+def _by_reason(declined: Mapping[str, str]) -> dict[str, str]:
+    """Each reason with the images to which it applies, of more than three the first and their number."""
+    found: dict[str, list[str]] = {}
+    for image, reason in declined.items():
+        found.setdefault(reason, []).append(image)
+    return {
+        reason: ", ".join(images) if len(images) < 4 else f"{images[0]} and {len(images) - 1} others"
+        for reason, images in found.items()
+    }
 
 
 def _without(

@@ -16,14 +16,15 @@ from ..core.errors import ReseauError
 from ..core.failure import Code, Failure
 from ..designs import board
 from ..designs.known import known_designs
-from ..io import BoardDesign, ReseauDesign, TestfieldDesign, read_text
-from ..io.testfield import parse_design
+from ..exchange import read_target
+from ..io import BoardDesign, ReseauDesign, TestfieldDesign
 from ..measure import PuzzlePart, puzzle_part
 from .target_measurement import measurer_of
 
 __all__ = ["designs_beside", "which_target"]
 
 Design = ReseauDesign | TestfieldDesign | BoardDesign
+_DESIGNS = (".json", ".yaml", ".yml", ".xml")
 _ENOUGH, _LEAST = 0.8, 8
 _LONG_PX = 1600
 """Length of the longer side of a frame from whose double it is reduced."""
@@ -48,9 +49,9 @@ def designs_beside(folders: Iterable[Path]) -> dict[str, Design]:
     """
     found = dict[str, Design]()
     for folder in folders:
-        for file in sorted(folder.glob("*.json")):
+        for file in sorted(path for path in folder.glob("*") if path.suffix.lower() in _DESIGNS):
             try:
-                found[str(file)] = parse_design(read_text(file), file)
+                found[str(file)] = read_target(file)
             except ReseauError:
                 continue  # another document
     return found | dict(known_designs())

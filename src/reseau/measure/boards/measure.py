@@ -35,6 +35,9 @@ __all__ = ["BoardOptions", "BoardResult", "measure_board", "puzzle_part"]
 
 _BRIGHT = 0.75
 """Share of the range of the sensor below which no noise makes a pixel clipped."""
+_MIRRORED = "the board is seen mirrored: the print is, or the program that took the picture mirrors it"
+_MISREAD = 3
+"""Most markers that may be misread: a mirrored one of many is like another one of its dictionary."""
 _CIRCLE_EDGE = 3.0
 """Distance from the next circle in which pixels are not used, in widths of the point-spread function."""
 
@@ -249,15 +252,16 @@ def _placed(frame: Frame, screened: Screened, design: BoardDesign) -> Placed | F
         if isinstance(found, Failure) and found.code is Code.OTHER_DESIGN and design.kind == "puzzle":
             grey = np.ascontiguousarray(screened.grey[:, ::-1])
             if lay_chessboard(grey, saddles.mirrored(frame.width), design):
-                return Failure("the board is seen mirrored", Code.MIRRORED)
+                return Failure(_MIRRORED, Code.MIRRORED)
     else:
         markers = _markers(frame, screened.grey, saddles, design)
         found = lay_marked(screened.grey, saddles, design, markers)
-        if isinstance(found, Failure) and not len(markers[1]):
+        read = len(markers[1])
+        if isinstance(found, Failure) or read <= _MISREAD:
             turned = replace(frame, pixels=np.ascontiguousarray(frame.pixels[:, ::-1]))
             grey = np.ascontiguousarray(screened.grey[:, ::-1])
-            if len(_markers(turned, grey, saddles.mirrored(frame.width), design)[1]) > 1:
-                return Failure("the board is seen mirrored", Code.MIRRORED)
+            if len(_markers(turned, grey, saddles.mirrored(frame.width), design)[1]) > max(1, 2 * read):
+                return Failure(_MIRRORED, Code.MIRRORED)
     return replace(found, places=saddles.xy[: 4 * len(design.ids)]) if isinstance(found, Failure) else found
 
 
