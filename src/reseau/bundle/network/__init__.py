@@ -1,8 +1,9 @@
 """The network: cameras, images, points and their observations, in columns."""
 
 from .calibrated import calibrated_camera, film_camera
+from .camera import Additional, Camera
 from .example import example_network
-from .network import Additional, Camera, ControlPoints, Network
+from .network import ControlPoints, Network
 from .rig import Rig
 from .settings import network_document, with_control, with_datum, with_parameters, with_sigma
 from .shutter import Shutter

@@ -18,7 +18,7 @@ from ...core.data import Array
 from ...core.errors import UsageError
 from ...io import FrameOrientation
 from ...optics.cameras import camera_model
-from .network import Camera
+from .camera import Camera
 from .shutter import Shutter
 
 __all__ = ["calibrated_camera", "film_camera"]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ...optics.poses import Pose, matrix_to_vector, project
-from .network import Camera, Network
+from .camera import Camera
+from .network import Network
 
 __all__ = ["example_network"]
 

@@ -20,7 +20,8 @@ from ...io.network import (
     PointColumns,
     ShutterEntry,
 )
-from .network import Camera, ControlPoints, Datum, Network, finite
+from .camera import Camera
+from .network import ControlPoints, Datum, Network, finite
 from .turntable import turntable_of_stage
 
 __all__ = ["network_document", "with_control", "with_datum", "with_parameters", "with_sigma"]
