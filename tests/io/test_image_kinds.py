@@ -306,5 +306,5 @@ def test_a_film_is_called_one(tmp_path: Path, suffix: str, code: str) -> None:
     film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 10, (64, 48))
     film.write(np.zeros((48, 64, 3), np.uint8))
     film.release()
-    with pytest.raises(ImageError, match="is a film; write some of its pictures"):
+    with pytest.raises(ImageError, match="is a video; write some of its pictures"):
         read_image(path)

@@ -244,9 +244,9 @@ def _header_size(magic: bytes, path: Path) -> tuple[int, int]:
             abs(int.from_bytes(magic[18:22], "little", signed=True)),
             abs(int.from_bytes(magic[22:26], "little", signed=True)),
         )
-    if _is_film(magic):
+    if _is_video(magic):
         raise ImageError(
-            "is a film", where=path, do="write some of its pictures, sharp and from different sides, as PNG"
+            "is a video", where=path, do="write some of its pictures, sharp and from different sides, as PNG"
         )
     if magic.startswith(b"\xff\xd8"):
         with path.open("rb") as stream:
@@ -261,7 +261,7 @@ def _header_size(magic: bytes, path: Path) -> tuple[int, int]:
     raise ImageError("is not a PNG, JPEG, TIFF or BMP image", where=path)
 
 
-def _is_film(magic: bytes) -> bool:
+def _is_video(magic: bytes) -> bool:
     """Whether a file begins like MP4, QuickTime, AVI or Matroska."""
     avi = magic[:4] == b"RIFF" and magic[8:12] == b"AVI "
     return avi or magic[4:8] in (b"ftyp", b"moov") or magic[:4] == b"\x1aE\xdf\xa3"
