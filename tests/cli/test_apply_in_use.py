@@ -22,18 +22,22 @@ DISTORTION = np.array([-0.2, 0.05, 0, 0])
 SIZE = (160, 120)
 
 
-@pytest.fixture
-def lens(tmp_path: Path) -> Path:
+def camera(model: str, values: dict[str, float], size: tuple[int, int]) -> Calibration:
     """A camera with an uncertain fx."""
-    Calibration(
+    return Calibration(
         kind="camera", name="lens", sigma0=1.0, redundancy=9,
-        model={"model": "opencv", "width": SIZE[0], "height": SIZE[1], "pitch_mm": [1.0, 1.0]},
+        model={"model": model, "width": size[0], "height": size[1], "pitch_mm": [1.0, 1.0]},
         parameters={
             k: Quantity(value=v, sigma=0.1 if k == "fx" else 0.0, unit="px" if k[0] in "fc" else "")
-            for k, v in VALUES.items()
+            for k, v in values.items()
         },
         covariance=Covariance(names=("fx",), matrix=((0.01,),)),
-    ).write(tmp_path / "lens.json")  # fmt: skip
+    )  # fmt: skip
+
+
+@pytest.fixture
+def lens(tmp_path: Path) -> Path:
+    camera("opencv", VALUES, SIZE).write(tmp_path / "lens.json")
     return tmp_path / "lens.json"
 
 
@@ -110,15 +114,90 @@ def test_a_video_is_undistorted(reseau: Run, lens: Path, tmp_path: Path) -> None
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
 def test_ffmpeg_undistorts_with_the_tables(reseau: Run, lens: Path, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "in.png"), scene())
-    assert reseau("apply", lens, "--tables", tmp_path / "m.pgm")[0] == 0
-    files = ("in.png", "m-x.pgm", "m-y.pgm")
-    inputs = [word for name in files for word in ("-i", str(tmp_path / name))]
-    command = ["ffmpeg", "-v", "error", *inputs, "-lavfi", "remap", str(tmp_path / "out.png")]
-    subprocess.run(command, check=True)
+    status, said, _ = reseau("apply", lens, "--tables", tmp_path / "m.pgm")
+    assert status == 0
+    names = {"video.mp4": str(tmp_path / "in.png"), "undistorted.mp4": str(tmp_path / "out.png")}
+    command = [names.get(word, word) for word in said.splitlines()[-1].split()]
+    assert command.count("image2") == 2  # the contents of some tables look like other formats
+    subprocess.run(["ffmpeg", "-v", "error", *command[1:]], check=True)
     new = cv2.imread(str(tmp_path / "out.png"), cv2.IMREAD_GRAYSCALE).astype(float)
     own = cv2.undistort(scene(), MATRIX, DISTORTION)
     # Whole pixels: the slope of the scene is at most 7 grey values in a pixel.
     assert np.abs(new[8:-8, 8:-8] - own[8:-8, 8:-8]).max() < 9
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
+def test_frames_of_a_video_are_those_of_the_sensor_whatever_players_turn(
+    reseau: Run, lens: Path, tmp_path: Path
+) -> None:
+    cv2.imwrite(str(tmp_path / "in.png"), scene())
+    for given, name, how in (
+        ("in.png", "plain.mov", ["-c:v", "mjpeg", "-q:v", "2"]),
+        ("plain.mov", "turned.mov", ["-c", "copy", "-metadata:s:v", "rotate=180"]),
+    ):
+        command = ["ffmpeg", "-v", "error", "-i", str(tmp_path / given), *how, str(tmp_path / name)]
+        subprocess.run(command, check=True)
+        assert reseau("apply", lens, tmp_path / name, "-o", tmp_path / f"{name}.avi")[0] == 0
+    played = cv2.VideoCapture(str(tmp_path / "turned.mov")).read()[1]
+    assert np.abs(played[::-1, ::-1, 0].astype(float) - scene())[8:-8, 8:-8].mean() < 4
+    plain, turned = (cv2.VideoCapture(str(tmp_path / f"{n}.mov.avi")).read()[1] for n in ("plain", "turned"))
+    assert np.array_equal(plain, turned)
+
+
+def test_no_input_is_written_over(reseau: Run, lens: Path, tmp_path: Path) -> None:
+    photograph, video = tmp_path / "p.png", tmp_path / "v.avi"
+    cv2.imwrite(str(photograph), scene())
+    written = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 10, SIZE)
+    written.write(cv2.cvtColor(scene(), cv2.COLOR_GRAY2BGR))
+    written.release()
+    (tmp_path / "p.csv").write_text("id,x,y\na,20.5,30.25\n")
+    beside = lens.with_suffix(".png")  # the camera of the undistorted image would be the calibration
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    for source, out in ((photograph, photograph), (video, video), (tmp_path / "p.csv", tmp_path / "p.csv"),
+                        (photograph, beside), (tmp_path / "p.csv", lens)):  # fmt: skip
+        status, _, err = reseau("apply", lens, source, "-o", out)
+        assert status == 2
+        assert "is an input of this command; choose another name" in err
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_folder_of_which_no_image_can_be_corrected_is_an_error(
+    reseau: Run, lens: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "photos").mkdir()
+    cv2.imwrite(str(tmp_path / "photos" / "a.png"), np.zeros((50, 60), np.uint8))
+    status, out, err = reseau("apply", lens, tmp_path / "photos")
+    assert (status, out) == (2, "")
+    assert "left out: " in err
+    assert "none of its 1 images could be corrected" in err
+
+
+def test_points_outside_the_validity_come_back_too(reseau: Run, tmp_path: Path) -> None:
+    lens = tmp_path / "wide.json"
+    camera("fisheye", {"fx": 80.0, "fy": 80.0, "cx": 79.5, "cy": 59.5}, SIZE).write(lens)
+    (tmp_path / "p.csv").write_text("id,x,y,sx,sy\na,20.5,30.25,0.1,0.1\nb,-1,-2,0.1,0.1\nc,9e5,9e5,1,1\n")
+    assert reseau("apply", lens, tmp_path / "p.csv", "-o", tmp_path / "flat.csv")[0] == 0
+    head, *rows = (tmp_path / "flat.csv").read_text().splitlines()
+    assert head == "id,x,y,sx,sy,ok,why"
+    assert "nan" in rows[-1]
+    assert reseau("apply", lens, tmp_path / "flat.csv", "-o", tmp_path / "q.csv", "--inverse")[0] == 0
+    found = {
+        row[0]: row[1:3] for row in (r.split(",") for r in (tmp_path / "q.csv").read_text().splitlines())
+    }
+    assert np.array([found["a"], found["b"]], float) == pytest.approx(
+        np.array([[20.5, 30.25], [-1, -2]]), abs=2e-5
+    )
+    assert "c" not in found
+
+
+def test_the_whole_field_of_a_fisheye_is_declined_with_what_to_do(reseau: Run, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((240, 320), np.uint8))
+    for f in (80.0, 127.01):  # directions beyond 90°, and one of 90°, which is too far out
+        wide = camera("fisheye", {"fx": f, "fy": f, "cx": 159.5, "cy": 119.5}, (320, 240))
+        wide.write(tmp_path / "wide.json")
+        status, _, err = reseau("apply", tmp_path / "wide.json", tmp_path / "a.png", "--fov", "all")
+        assert status == 2
+    assert "more than a plane image can show of this lens; give an angle" in err
 
 
 @pytest.mark.parametrize("options", [(), ("--directions",), ("--alpha", "0.5")])

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import http.client
 import json
+import signal
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -19,6 +21,7 @@ from reseau.core.data import Frame, ImagePoints
 from reseau.core.errors import ConnectionLost
 from reseau.core.failure import Code, Failure
 from reseau.designs import board
+from reseau.io.images import write_image
 from reseau.optics import OpenCV, Pose, project
 from reseau.procedures.calibration import CameraOptions
 from reseau.procedures.watching import Seen, Watching
@@ -226,3 +229,71 @@ def test_the_width_of_edges_is_shown_with_the_best_so_far() -> None:
     assert [state["edge_px"] for state in shown[:3]] == pytest.approx([3.0, 1.0, 2.0], rel=0.1)
     assert [state["sharpest_px"] for state in shown] == pytest.approx([3.0, 1.0, 1.0, 1.0], rel=0.1)
     assert shown[3]["edge_px"] is None
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("during", ["expose", "measure", "write", "show"])
+def test_a_signal_at_any_moment_loses_no_frame_and_ends_with_what_was_taken(
+    during: str, number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """The signal comes while the second frame is exposed, measured, written or shown."""
+    monkeypatch.chdir(tmp_path)
+    DESIGN.write("board.json")
+    calls = dict.fromkeys(("expose", "measure", "write", "show"), 0)
+
+    def at(moment: str) -> None:
+        calls[moment] += 1
+        # Frames are taken from the second on, every second one.
+        if moment == during and calls[moment] == {"expose": 4, "measure": 4, "write": 2, "show": 4}[moment]:
+            signal.raise_signal(number)
+
+    class Still:
+        name = "still"
+
+        def expose(self) -> Any:
+            at("expose")
+            return SimpleNamespace(frame=Frame(np.full((SIZE[1], SIZE[0]), 90, np.uint8), 255.0))
+
+    class Alone:
+        def one(self, *_: object) -> Still:
+            return Still()
+
+        def part(self, _: object) -> Alone:
+            return self
+
+        def lock(self, _: str) -> nullcontext[None]:
+            return nullcontext()
+
+        def __enter__(self) -> Alone:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+    def measured(_: object) -> Any:
+        at("measure")
+        pair = (calls["measure"] - 1) // 2
+        return seen_from(0.4 - 0.3 * pair, 0.2 * pair, 1.5 * pair)
+
+    def written(path: Path, pixels: Any) -> None:
+        write_image(path, pixels)
+        at("write")
+
+    monkeypatch.setattr("reseau.cli.watch._bench", lambda *_: Alone())
+    monkeypatch.setattr("reseau.procedures.calibration.measurer_of", lambda _: measured)
+    monkeypatch.setattr("reseau.io.images.write_image", written)
+    shown = LivePage.show
+    monkeypatch.setattr(LivePage, "show", lambda *given: (at("show"), shown(*given)))
+    before = signal.getsignal(number)
+    free = ("--free", "fx,fy,cx,cy", "--no-window")
+    assert run(["watch", "--design", "board.json", "--seconds", "60", *free]) == 0
+    assert signal.getsignal(number) is before
+    said = capsys.readouterr().out.splitlines()
+    count = 1 if during == "expose" else 2
+    files = sorted(path.name for path in Path("photos").iterdir())
+    assert files == ["001.png", "002.png"][:count]
+    assert [line.split(":")[0] for line in said if ".png: " in line] == [f"photos/{name}" for name in files]
+    assert said[-1].startswith(f"{count} frame{'s' * (count > 1)} in photos; next: reseau calibrate photos")
+    for name in files:
+        assert cv2.imread(f"photos/{name}", cv2.IMREAD_GRAYSCALE).shape == SIZE[::-1]

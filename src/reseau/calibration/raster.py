@@ -145,10 +145,14 @@ class CorrectedImage:
             return cls._between(camera, alpha, scale)
         if fov == "all":
             uv = camera.mapping.inverse(_border((camera.width, camera.height)))
-            uv = uv[np.isfinite(uv).all(axis=1)]
-            if not len(uv):
-                raise UsageError("sees no direction at its border", where="camera", do="use `keep`")
-            return cls._over(camera, uv.min(axis=0), uv.max(axis=0), (focal[0], focal[1]), False)
+            low, high = uv.min(axis=0), uv.max(axis=0)
+            # A direction that is not finite is 90° or more off the axis, or beyond what the model describes.
+            if not float(np.prod((high - low) * focal)) <= MAX_PIXELS:
+                raise UsageError(
+                    "`all` is more than a plane image can show of this lens", where="fov",
+                    do="give an angle, such as 120",
+                )  # fmt: skip
+            return cls._over(camera, low, high, (focal[0], focal[1]), False)
         width, height = (max(2, round(n * scale)) for n in (camera.width, camera.height))
         if fov == "keep":
             centre = (axis.value[0] + 0.5) * scale - 0.5

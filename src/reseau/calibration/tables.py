@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import ImageError, InputError, UsageError
 from ..io import write_whole
+from ..io.stacks import open_video
 from ..optics.resampling import on_lattice
 from .raster import CorrectedImage
 
@@ -129,7 +130,8 @@ def undistort_video(
     Parameters
     ----------
     source : Path
-        Video that OpenCV can read.
+        Video that OpenCV can read. Its frames are taken as the sensor recorded them, like photographs: a turn
+        that the file prescribes to players is not made.
     out : Path
         Video to write; its suffix gives the format: MPEG-4, or Motion JPEG in ``.avi``. Sound is left out.
     raster : CorrectedImage
@@ -174,13 +176,9 @@ def undistort_video(
     suffix = out.suffix.lower()
     if suffix not in _CODECS:
         raise UsageError(f"has the suffix {suffix!r}", where=out, do=f"use {', '.join(_CODECS)}")
-    if not source.is_file():
-        raise InputError("does not exist", where=source)
-    video: Any = cv2.VideoCapture(str(source))
+    video = open_video(source)
     draft = out.with_name(f".{out.stem}.{os.getpid()}{suffix}")
     try:
-        if not video.isOpened():
-            raise ImageError("is no video that can be read", where=source)
         width, height = (int(video.get(k)) for k in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         raster.mapping.check_size(width, height, source)
         rate = video.get(cv2.CAP_PROP_FPS) or 25.0

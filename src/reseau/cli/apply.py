@@ -147,6 +147,9 @@ def apply(
     _only(stored.kind, "oscilloscope", {"--object": object_system})
     _only(stored.kind, "sensor", {"--exposure-ms": exposure_ms is not None})
     mapping = _mapping(stored, object_system)
+    if out is not None and not (source is not None and source.is_dir()):
+        beside = [out.with_suffix(".json")] if stored.kind == "camera" else []
+        _spare([calibration, *([source] if source is not None else [])], [out, *beside])
     if tables is not None:
         _tables(mapping, tables, view)
         if source is None:
@@ -162,7 +165,7 @@ def apply(
     elif isinstance(mapping, SensorCorrection):
         _frame(mapping, origin, source, out, exposure_ms, as_json)
     elif source.is_dir():
-        _folder(stored, mapping, origin, source, out, view, as_json)
+        _folder(stored, mapping, origin, source, out, view, as_json, calibration)
     elif source.suffix.lower() in VIDEOS:
         _video(stored, mapping, source, out, view)
     else:
@@ -191,6 +194,19 @@ def _in_force(
         raise UsageError(f"has no calibration in force at {time:%Y-%m-%d %H:%M}Z", where=name)
     stored = applied.calibration
     return stored, {f"{name} {applied.key}": sha256_of(stored.to_json().encode("utf-8"))}
+
+
+def _spare(inputs: list[Path], outputs: list[Path]) -> None:
+    """Refuse to write over an input.
+
+    Raises
+    ------
+    UsageError
+        If a file to be written is one of those that are read.
+    """
+    for path in outputs:
+        if any(given.exists() and path.exists() and path.samefile(given) for given in inputs):
+            raise UsageError("is an input of this command", where=path, do="choose another name for --out")
 
 
 def _only(kind: str, required: str, options: dict[str, bool]) -> None:
@@ -351,7 +367,9 @@ def _tables(mapping: CalibratedMapping, path: Path, view: _View) -> None:
     files = write_tables(writable(path), raster)
     say("".join(f"{file}: {raster.width} × {raster.height} px\n" for file in files))
     if len(files) == 2:
-        say(f"ffmpeg -i video.mp4 -i {files[0]} -i {files[1]} -lavfi remap undistorted.mp4\n")
+        # Without the format, ffmpeg takes the numbers of some tables for music.
+        tables = " ".join(f"-f image2 -i {file}" for file in files)
+        say(f"ffmpeg -i video.mp4 {tables} -lavfi remap undistorted.mp4\n")
 
 
 def _folder(
@@ -362,6 +380,7 @@ def _folder(
     out: Path | None,
     view: _View,
     as_json: bool,
+    calibration: Path,
 ) -> None:
     """Resample the images of a folder into another; one that cannot be read costs one line."""
     from ..core.errors import ImageError, InputError
@@ -376,12 +395,17 @@ def _folder(
         out.mkdir(exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot be created ({error.strerror})", where=out) from None
+    done = 0
     for image in images:
         suffix = image.suffix if image.suffix.lower() in _IMAGES else ".png"
         try:
+            _spare([calibration], [out / f"{image.stem}.json"])
             _image(stored, mapping, origin, image, out / f"{image.stem}{suffix}", view, as_json)
+            done += 1
         except (ImageError, UsageError) as error:
             typer.echo(f"left out: {error}", err=True)
+    if not done:
+        raise InputError(f"none of its {len(images)} images could be corrected", where=source)
 
 
 def _video(

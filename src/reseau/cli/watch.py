@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
@@ -85,6 +89,7 @@ def watch(
         instruments.lock("reseau watch"),
         instruments,
         LivePage(f"{source.name}: {target.name}", port) as page,
+        _Ending() as ending,
     ):
         out.mkdir(parents=True, exist_ok=True)
         typer.echo(f"{page.url}  (Ctrl-C ends)", err=True)
@@ -97,8 +102,9 @@ def watch(
                 typer.echo(f"warning: {steered.why}", err=True)
         end = time.monotonic() + (seconds or float("inf"))
         try:
-            while kept < count and time.monotonic() < end:
-                frame = source.expose().frame
+            while kept < count and time.monotonic() < end and not ending.asked:
+                with ending.at_once():
+                    frame = source.expose().frame
                 name = f"{number + 1:03d}.png"
                 seen = watching.on_frame(frame, name)
                 if seen.taken:
@@ -113,9 +119,54 @@ def watch(
             failed = error
     for line in watching.verdict:
         say(f"{line}\n")
-    say(f"{kept} frames in {out}; next: reseau calibrate {out} --design {design}\n")
+    if kept:
+        say(f"{kept} frame{'s' * (kept > 1)} in {out}; next: reseau calibrate {out} --design {design}\n")
+    else:
+        say("no frame was taken\n")
     if failed is not None:
         raise failed
+
+
+class _Ending:
+    """Ctrl-C, SIGTERM and a closed terminal end the wait for a frame, and otherwise wait for the present one.
+
+    A frame that is being measured or written is counted and reported before the end; a second Ctrl-C is not
+    waited for.
+    """
+
+    _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._now = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        # Handlers are those of the process: only its main thread may set them.
+        if threading.current_thread() is threading.main_thread():
+            numbers = [getattr(signal, name) for name in self._SIGNALS if hasattr(signal, name)]
+            self._before = {number: signal.signal(number, self._on_signal) for number in numbers}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Inside, a signal raises KeyboardInterrupt."""
+        self._now = True
+        try:
+            if self.asked:
+                raise KeyboardInterrupt
+            yield
+        finally:
+            self._now = False
+
+    def _on_signal(self, *_: object) -> None:
+        again, self.asked = self.asked, True
+        if again or self._now:
+            raise KeyboardInterrupt
 
 
 def _has_display() -> bool:

@@ -145,7 +145,10 @@ class ReseauMeasurement(Document):
 
     @classmethod
     def read_csv(cls, path: Path | str, *, sha256: str = "") -> Self:
-        """Read ``id,x,y[,sx,sy]``: coordinates measured by hand or by another program.
+        """Read ``id,x,y[,sx,sy][,ok,why]``: coordinates measured by hand or by another program.
+
+        The last columns are those that ``reseau apply`` writes of points outside the validity; points that
+        have no position there are left out.
 
         Raises
         ------
@@ -156,14 +159,16 @@ class ReseauMeasurement(Document):
         """
         lines = csv.reader(read_text(Path(path)).splitlines())
         header = [column.strip() for column in next(lines, [])]
-        if header not in (["id", "x", "y"], ["id", "x", "y", "sx", "sy"]):
+        judged = header[-2:] == ["ok", "why"]
+        numbers = header[1:-2] if judged else header[1:]
+        if header[:1] != ["id"] or numbers not in (["x", "y"], ["x", "y", "sx", "sy"]):
             raise FormatError("the first line must be `id,x,y` or `id,x,y,sx,sy`", where=path)
         points: list[MeasuredPoint] = []
         for number, cells in enumerate(lines, start=2):
-            if not cells:
+            if not cells or (judged and cells[-2:-1] == ["0"] and cells[1:3] == ["nan", "nan"]):
                 continue
             try:
-                x, y, *sigma = (float(cell) for cell in cells[1:])
+                x, y, *sigma = (float(cell) for cell in cells[1 : 1 + len(numbers)])
                 if (
                     len(cells) != len(header)
                     or not np.isfinite([x, y, *sigma]).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from ..core.provenance import sha256_of
 from .dicom import count_dicom, is_dicom
 from .images import Channel, count_pages, grey_of, read_image
 
-__all__ = ["VIDEOS", "frames_of"]
+__all__ = ["VIDEOS", "frames_of", "open_video"]
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 """Suffixes of videos."""
@@ -69,6 +70,40 @@ def frames_of(path: Path | str, channel: Channel = "luma") -> Iterator[Frame]:
         yield read_image(path.with_name(f"{path.name}#{k + 1}"), channel, digest)
 
 
+def open_video(path: Path) -> Any:
+    """Open a video; its frames are as the sensor recorded them, without the turn that a player makes.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    cv2.VideoCapture
+        To be released by the caller.
+
+    Raises
+    ------
+    InputError
+        When there is no such file.
+    ImageError
+        When it is not a video that OpenCV can read.
+    """
+    import cv2
+
+    if not path.is_file():
+        raise InputError("cannot be read (No such file or directory)", where=path)
+    # Otherwise the decoder prints a line of its own before ours.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    video: Any = cv2.VideoCapture(str(path))
+    if not video.isOpened():
+        video.release()
+        raise ImageError("is no video that can be read", where=path)
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    return video
+
+
 def _count(path: Path) -> int:
     try:
         with path.open("rb") as stream:
@@ -83,12 +118,8 @@ def _count(path: Path) -> int:
 def _of_video(path: Path, number: int | None, channel: Channel) -> Iterator[Frame]:
     import cv2
 
-    if not path.is_file():
-        raise InputError("cannot be read (No such file or directory)", where=path)
-    video: Any = cv2.VideoCapture(str(path))
+    video = open_video(path)
     try:
-        if not video.isOpened():
-            raise ImageError("is no video that can be read", where=path)
         code = int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("latin-1").upper()
         notes: tuple[str, ...] = ()
         if code not in _LOSSLESS:
