@@ -15,7 +15,7 @@ from reseau.core.failure import Code
 from reseau.designs import coded_sheet
 from reseau.optics import OpenCV
 from reseau.procedures.assessment import Use
-from reseau.procedures.calibration import Calibrated, CameraOptions, calibrate_camera
+from reseau.procedures.calibration import Calibrated, CalibrationOptions, CameraOptions, calibrate_camera
 
 DESIGN = coded_sheet(9, 8, 20.0)
 SIZE = (800, 600)
@@ -32,13 +32,15 @@ def measured(
     noise: float = SIGMA,
     tilt: float = 30.0,
     zoom: float = 1.0,
+    bent: float = 0.0,
 ) -> list[tuple[str, ImagePoints]]:
     """Coordinates by OpenCV's projection; with `side` the target is in the left part of all images.
 
-    From the middle on, images are taken with another `zoom`.
+    From the middle on, images are taken with another `zoom`. The middle of the target is `bent` by some mm.
     """
     rng, found = np.random.default_rng(4), []
-    xyz = np.column_stack([DESIGN.xy * [1, -1], np.zeros(len(DESIGN.xy))])
+    across = DESIGN.xy[:, 0] - DESIGN.xy[:, 0].mean()
+    xyz = np.column_stack([DESIGN.xy * [1, -1], bent * (1 - (across / across.max()) ** 2)])
     for k in range(count):
         roll = cv2.Rodrigues(np.array([0, 0, np.pi / 2 * k]))[0]
         axis = np.deg2rad(tilt) * np.array([np.cos(1.3 * k), np.sin(1.3 * k), 0])
@@ -53,9 +55,13 @@ def measured(
     return found
 
 
-def calibrated(images: list[tuple[str, ImagePoints]], free: tuple[str, ...] = ()) -> Calibrated:
+def calibrated(
+    images: list[tuple[str, ImagePoints]],
+    free: tuple[str, ...] = (),
+    options: CalibrationOptions | None = None,
+) -> Calibrated:
     model = CameraOptions("opencv", free or ("fx", "fy", "cx", "cy", "k1", "k2"))
-    return calibrate_camera(images, DESIGN, lambda frame: None, SIZE, model).required()  # type: ignore[arg-type, return-value]
+    return calibrate_camera(images, DESIGN, lambda frame: None, SIZE, model, options).required()  # type: ignore[arg-type, return-value]
 
 
 def test_a_covered_and_accurate_calibration_is_usable_for_measurement() -> None:
@@ -100,6 +106,17 @@ def test_photographs_that_contradict_each_other_are_not_made_up_for_by_another_o
     assert not calibrated(measured()).assessments["camera"].contradicts
     # Precise points show a scatter that does not matter.
     assert not replace(found, centre_px=0.1).contradicts
+
+
+def test_a_bent_target_that_is_held_flat_is_no_fault_of_the_photographs() -> None:
+    bent = measured(bent=1.5)
+    found = calibrated(bent, options=CalibrationOptions(target="flat")).assessments["camera"]
+    assert found.lines[0].startswith("not usable: ")
+    assert found.lines[0].endswith("; the target is not as its points are held")
+    assert found.lines[1].endswith("; see the warning, then calibrate anew")
+    (said,) = (remark.text for remark in found.warnings if remark.code is Code.DOUBTFUL_CONTROL)
+    assert "of a target `--target free`" in said
+    assert calibrated(bent).assessments["camera"].use is Use.MEASUREMENT
 
 
 def test_the_part_without_points_is_named_and_the_next_photograph_shows_the_target_there() -> None:

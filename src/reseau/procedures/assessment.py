@@ -138,6 +138,12 @@ class Assessment:
         return _contradict(self.scatter, self.centre_px)
 
     @property
+    def _held_wrongly(self) -> bool:
+        """Whether points of the target are held that the images show elsewhere, with an effect."""
+        doubtful = any(remark.code is Code.DOUBTFUL_CONTROL for remark in self.warnings)
+        return doubtful and self.use is not Use.MEASUREMENT
+
+    @property
     def lines(self) -> tuple[str, str]:
         """The verdict in two lines."""
         first = f"{_FOR[self.use]}: "
@@ -150,7 +156,9 @@ class Assessment:
             first += f" ({_two(far)} mm at 1 m)" if np.isfinite(far) else ""
         else:
             first += "the projection is not determined in the corners"
-        if self.contradicts:
+        if self._held_wrongly:
+            first += "; the target is not as its points are held"
+        elif self.contradicts:
             first += f"; the photographs contradict each other, by {_two(self.scatter)} times their sigmas"
         elif not self.fits:
             more = f" and lacks {self.lacks}" if self.lacks else ""
@@ -175,7 +183,9 @@ class Assessment:
             second += f"; {self.images} photographs are few, take 10 or more"
         if self.tilt_deg < _STRAIGHT:
             second += f"; the target is seen nearly straight, tilted by {self.tilt_deg:.0f}° at most: tilt it"
-        if self.contradicts:
+        if self._held_wrongly:
+            second += "; see the warning, then calibrate anew"
+        elif self.contradicts:
             second += "; take them anew: focus, zoom, stabilisation or the target changed between them"
         elif self.next_photograph is not None:
             then = self.next_photograph

@@ -272,6 +272,7 @@ def bent_plane(deflection: float, unit: str) -> str:
     """
     return (
         f"the control points are given in a plane, but the images show them bent by {deflection:.2g} {unit}: "
-        "estimate their coordinates (`--datum free`), or give them standard deviations of this size; "
+        "estimate their coordinates (`--datum free`, of a target `--target free`), or give them standard "
+        "deviations of this size; "
         "until then only gross errors can be rejected"
     )
