@@ -43,17 +43,54 @@ def test_joined_sheets_show_every_disk_where_it_belongs() -> None:
     content, shown = content_of(design), dict[tuple[float, float], int]()
     sheets = sheets_of(content, "A4")
     assert len(sheets) == 6
+    (left, _), (_, high) = content.low, content.high
     for k, sheet in enumerate(sheets):
         x0, y0, x1, y1 = sheet.target
         assert 0 < x0 < x1 < sheet.width - 15  # with room for the flap
         assert 0 < y0 < y1 < sheet.height - 30
         row, column = (int(n) - 1 for n in re.findall(r"row (\d+), column (\d+)", sheet.texts[0][3])[0])
         assert k == row * 3 + column
-        for x, y, _ in sheet.circles:
+        for x, y, radius in sheet.circles:
             if x0 <= x < x1 and y0 <= y < y1:
-                at = content.low[0] + column * (x1 - x0) + x - x0, content.high[1] - row * (y1 - y0) - y + y0
-                shown[round(at[0], 6), round(at[1], 6)] = k
+                shown[round(left + x - x0, 6), round(high - y + y0, 6)] = k
+                assert x0 + radius < x < x1 - radius  # not cut through
+                assert y0 + radius < y < y1 - radius
+        left, high = (left + x1 - x0, high) if column < 2 else (content.low[0], high - (y1 - y0))
     assert sorted(shown) == sorted((round(x, 6), round(y, 6)) for x, y in design.xy.tolist())
+
+
+@pytest.mark.parametrize(
+    ("design", "free"),
+    [
+        (board("chess", 7, 10, 50.0), 25.0),
+        (board("charuco", 9, 6, 40.0), 20.0),
+        (board("circles", 7, 10, 50.0), 25.0),
+        (board("circles", 4, 11, 45.0, asymmetric=True), 22.5),
+        (board("aprilgrid", 6, 6, 70.0, border_bits=2), 8.0),
+        (board("markers", 5, 7, 60.0), 6.0),
+        (board("deltille", 7, 10, 50.0), 12.0),
+        (coded_sheet(10, 13, 40.0), 20.0),
+        (coded_testfield(8, 8, 60.0), 7.0),
+    ],
+)
+@pytest.mark.parametrize("paper", ["A4", "Tabloid"])
+def test_joints_lie_between_the_marks(design: Drawable, free: float, paper: str) -> None:
+    content = content_of(design)
+    sheets = sheets_of(content, paper)
+    places = [re.findall(r"row (\d+), column (\d+)", sheet.texts[0][3])[0] for sheet in sheets]
+    assert len(sheets) > 1
+    for axis, start in ((0, content.low[0]), (1, content.high[1])):
+        # Widths of the first row of sheets, heights of the first column.
+        cut = start
+        for sheet, place in zip(sheets, places, strict=True):
+            if place[axis] != "1":
+                continue
+            x0, y0, x1, y1 = sheet.target
+            assert x1 - x0 <= max(PAPERS[paper]) - 24
+            cut = cut + x1 - x0 if axis == 0 else cut - (y1 - y0)
+            if content.low[axis] + 1e-6 < cut < content.high[axis] - 1e-6:
+                assert np.abs(design.xy[:, axis] - cut).min() >= free - 1e-6
+        np.testing.assert_allclose(cut, (content.high[0], content.low[1])[axis], rtol=0, atol=1e-9)
 
 
 def test_single_targets_are_never_divided() -> None:

@@ -10,6 +10,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.data import Array
 from ..core.errors import UsageError
@@ -113,7 +114,19 @@ def _reseau(design: ReseauDesign) -> Content:
         if mark_id is not None
     }
     title = f"{design.name}: {len(xy)} marks, {_describe(design)}"
-    return Content(low, high, polygons, circles, title, letters)
+    return Content(low, high, polygons, circles, title, letters, between=_between(xy))
+
+
+def _between(xy: Array, lines: tuple[ArrayLike, ArrayLike] = ((), ())) -> tuple[Array, Array]:
+    """The middles of the widest gaps between columns, and rows, of points, but for those where lines are."""
+    found = []
+    for values, drawn in zip(xy.T, lines, strict=True):
+        at = np.unique(values.round(6))
+        gaps, line = np.diff(at), np.asarray(drawn, dtype=np.float64)
+        free = ~((line > at[:-1, None]) & (line < at[1:, None])).any(axis=1)
+        wide = gaps > 0.9 * gaps[free].max(initial=0.0)
+        found.append((at[:-1] + gaps / 2)[free & wide])
+    return found[0], found[1]
 
 
 def _ring_sectors(design: ReseauDesign) -> Iterator[Array]:
@@ -148,7 +161,8 @@ def _testfield(design: TestfieldDesign) -> Content:
         f"{len(targets.id)} targets"
     )
     low, high = np.array([x0, y0]) - around, np.array([x1, y1]) + around
-    return Content(low, high, polygons, circles, title, {})
+    between = _between(design.xy, (lines.vertical_x, lines.horizontal_y))
+    return Content(low, high, polygons, circles, title, {}, between=between)
 
 
 def _board(design: BoardDesign) -> Content:
@@ -165,11 +179,17 @@ def _board(design: BoardDesign) -> Content:
     if design.kind == "puzzle":
         title += f", from corner {design.start}"
     elif design.size is not None:
-        title += f", size {design.size:g} mm"
+        title += f", {'diameter' if design.kind == 'circles' else 'markers'} {design.size:g} mm"
     if design.dictionary is not None:
         title += f", {design.dictionary}"
+    title += f", borders of {design.border_bits} bits" if design.border_bits > 1 else ""
+    title += f", from marker {design.first_id}" if design.first_id else ""
+    title += ", asymmetric" if design.asymmetric else ""
+    title += ", legacy layout" if design.legacy else ""
     rounds = [(float(x), float(y), float(radius)) for x, y, radius in circles]
-    return Content(low, high, polygons, rounds, title, {})
+    tags = design.kind in ("aprilgrid", "markers")
+    between = _between(design.xy.reshape(-1, 4, 2).mean(axis=1) if tags else design.xy)
+    return Content(low, high, polygons, rounds, title, {}, between=between)
 
 
 def _cell(design: SpaceTargets) -> float:

@@ -59,6 +59,8 @@ class Content:
         Labels and the positions of their lower left corners.
     how : (str, str)
         What to do with the sheet, in two lines.
+    between : (ndarray (m,), ndarray (n,))
+        Coordinates x and y at which the target is best divided, ascending: as far as possible from marks.
     """
 
     low: Array
@@ -68,6 +70,7 @@ class Content:
     title: str
     letters: dict[str, Array]
     how: tuple[str, str] = HOW
+    between: tuple[Array, Array] = (np.zeros(0), np.zeros(0))
 
     @property
     def size(self) -> Array:
@@ -239,14 +242,31 @@ def _grid(content: Content, width: float, height: float) -> tuple[int, int]:
     return max(1, int(across)), max(1, int(down))
 
 
+def _edges(low: float, high: float, count: int, most: float, between: Array) -> Array:
+    """Edges (count + 1) of parts of a length that are at most so long: between marks, where they fit."""
+    even = np.linspace(low, high, count + 1)
+    if count == 1 or not len(between):
+        return even
+    edges = even.copy()
+    for k in range(1, count):
+        # What is left must fit the other sheets.
+        room = between[(between <= edges[k - 1] + most) & (between >= high - (count - k) * most)]
+        if not len(room):
+            return even
+        edges[k] = room[np.abs(room - even[k]).argmin()]
+    return edges
+
+
 def _tile(content: Content, paper: tuple[float, float], grid: tuple[int, int], at: tuple[int, int]) -> Page:
     """One of several sheets: its part of the target, and hairlines where its neighbours lie."""
     (width, height), (across, down), (row, column) = paper, grid, at
-    cell = content.size / grid
-    x, y = content.low[0] + column * cell[0], content.high[1] - row * cell[1]
+    cell, (cuts_x, cuts_y) = _cell(*paper), content.between
+    across_at = _edges(content.low[0], content.high[0], across, cell[0], cuts_x)
+    down_at = -_edges(-content.high[1], -content.low[1], down, cell[1], -cuts_y[::-1])
+    x, y = across_at[column], down_at[row]
     # Marks for the upper cut are beside the target, where printers print.
     left, top = _EDGE + _FLAP / 2, _EDGE + _TITLE
-    target = (left, top, float(left + cell[0]), float(top + cell[1]))
+    target = (left, top, float(left + across_at[column + 1] - x), float(top + y - down_at[row + 1]))
     drawn = _drawn(content, target, x, y)
     number = row * across + column + 1
     lines, texts = _foot(width, height, _CHECK, content.how if number == 1 else _JOIN)
