@@ -48,13 +48,15 @@ HELD = {
     "kalibr": ("radial", "fisheye", "omni", "spheres"),
     "colmap": ("radial", "rational", "fisheye"),
     "mrcal": ("radial", "five", "rational", "prism"),
-    "metashape": ("radial", "five"),
+    "metashape": ("radial", "five", "fisheye"),
     "photomodeler": ("photo",),
     "dbat": ("photo",),
     "matlab": ("radial", "five"),
     "openptv": ("tracking",),
 }
 PITCH = {"brown": [0.008, 0.0081], "openptv": [0.008, 0.0081]}
+MRCALS = "/usr/bin/python3"
+"""The Python that has Debian's mrcal."""
 PAIRS = [(form, camera) for form, cameras in HELD.items() for camera in cameras]
 
 
@@ -121,23 +123,75 @@ def test_a_model_that_a_format_lacks_is_converted_with_its_differences(
     assert difference[inside].max() < 1.1 * done.greatest_px
 
 
-def test_the_largest_difference_of_a_fisheye_in_a_rational_model_is_that_between_the_points_of_the_fit(
-    tmp_path: Path,
-) -> None:
-    wide = CENTRE | {"fx": 500.0, "fy": 503.0, "k1": 0.03, "k2": -0.004, "k3": 1e-3, "k4": -2e-4}
+WIDE = CENTRE | {"fx": 500.0, "fy": 503.0, "k1": 0.03, "k2": -0.004, "k3": 1e-3, "k4": -2e-4}
+
+
+def wide() -> Calibration:
+    """A fisheye of 150° along the rows."""
     given = calibration("fisheye")
     values = {
-        key: Quantity(value=value, sigma=0.0, unit=unit_of(key, "fisheye")) for key, value in wide.items()
+        key: Quantity(value=value, sigma=0.0, unit=unit_of(key, "fisheye")) for key, value in WIDE.items()
     }
-    given = given.model_copy(update={"parameters": given.parameters | values})
-    done = export_calibration(given, "mrcal", file(tmp_path, "mrcal"))
-    assert done.greatest_px > 1
-    again = import_calibration(file(tmp_path, "mrcal"))
+    return given.model_copy(update={"parameters": given.parameters | values})
+
+
+def over_the_image(given: Calibration) -> tuple[Array, Array]:
+    """Pixels over the image, and their directions."""
     x, y = np.meshgrid(np.linspace(0, SIZE[0] - 1, 60), np.linspace(0, SIZE[1] - 1, 45))
     pixels = np.stack([x.ravel(), y.ravel()], axis=1)
-    uv = given.mapping().mapping.inverse(pixels)  # type: ignore[attr-defined]
+    return pixels, given.mapping().mapping.inverse(pixels)  # type: ignore[attr-defined]
+
+
+def test_the_largest_difference_of_a_fisheye_in_a_polynomial_is_that_between_the_points_of_the_fit(
+    tmp_path: Path,
+) -> None:
+    done = export_calibration(wide(), "photomodeler", file(tmp_path, "photomodeler"))
+    assert done.greatest_px > 1
+    again = import_calibration(file(tmp_path, "photomodeler"))
+    pixels, uv = over_the_image(wide())
     difference = again.mapping().to_pixels(uv) - pixels  # type: ignore[attr-defined]
     assert np.linalg.norm(difference, axis=1).max() < 1.05 * done.greatest_px
+
+
+def test_a_fisheye_is_a_spline_surface_for_mrcal(tmp_path: Path) -> None:
+    path = file(tmp_path, "mrcal")
+    done = export_calibration(wide(), "mrcal", path)
+    assert "LENSMODEL_SPLINED_STEREOGRAPHIC" in path.read_text()
+    assert done.rms_px < 1e-3
+    assert done.greatest_px < 0.02
+    pixels, uv = over_the_image(wide())
+    again = import_calibration(path).mapping().to_pixels(uv)  # type: ignore[attr-defined]
+    assert np.abs(again - pixels).max() < 1.05 * done.greatest_px
+    need_mrcal()
+    assert np.abs(by_mrcal(path, uv, tmp_path) - pixels).max() < 1.05 * done.greatest_px
+
+
+@pytest.mark.parametrize("form", ["openptv", "matlab"])
+def test_a_fisheye_is_not_written_where_no_model_is_near(form: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=f"cannot be written as {form}.*use one of opencv, ros"):
+        export_calibration(wide(), form, file(tmp_path, form))
+    assert not list(tmp_path.iterdir())
+
+
+def test_metashape_has_fisheyes_by_the_formula_of_its_manual(tmp_path: Path) -> None:
+    path = file(tmp_path, "metashape")
+    export_calibration(wide(), "metashape", path)
+    text = path.read_text()
+    assert "<projection>fisheye</projection>" in text
+    number = {
+        name: float(text.split(f"<{name}>")[1].split("<")[0])
+        for name in ("width", "height", "f", "cx", "cy", "b1", "k1", "k2", "k3", "k4")
+    }
+    pixels, uv = over_the_image(wide())
+    r = np.hypot(*uv.T)
+    x, y = (uv * (np.arctan(r) / r)[:, None]).T
+    r2 = x * x + y * y
+    bend = 1 + sum(number[f"k{i}"] * r2**i for i in range(1, 5))
+    u = 0.5 * number["width"] + number["cx"] + x * bend * (number["f"] + number["b1"])
+    v = 0.5 * number["height"] + number["cy"] + y * bend * number["f"]
+    assert np.abs(np.stack([u, v], axis=1) - 0.5 - pixels).max() < 1e-9
+    path.write_text(text.replace(">fisheye<", ">equidistant_fisheye<"))  # as newer versions call it
+    assert import_calibration(path).model["model"] == "fisheye"  # type: ignore[typeddict-item]
 
 
 @pytest.mark.parametrize("camera", HELD["opencv"])
@@ -185,27 +239,33 @@ def test_colmap_reads_the_file_and_projects_the_same_points(camera: str, tmp_pat
     assert np.abs(back - projected(given)).max() < 1e-6
 
 
-@pytest.mark.parametrize("camera", HELD["mrcal"])
-def test_mrcal_reads_the_file_and_projects_the_same_points(camera: str, tmp_path: Path) -> None:
-    python = "/usr/bin/python3"
+def need_mrcal() -> None:
     if (
-        not Path(python).exists()
-        or subprocess.run([python, "-c", "import mrcal"], capture_output=True).returncode
+        not Path(MRCALS).exists()
+        or subprocess.run([MRCALS, "-c", "import mrcal"], capture_output=True).returncode
     ):
         pytest.skip("mrcal is not installed (apt-get install python3-mrcal)")
-    given, path = calibration(camera), file(tmp_path, "mrcal")
-    export_calibration(given, "mrcal", path)
+
+
+def by_mrcal(path: Path, uv: Array, folder: Path) -> Array:
+    """Directions projected by mrcal with a file, which it writes again as ``back.cameramodel``."""
     code = (
         "import sys, mrcal, numpy as np; m = mrcal.cameramodel(sys.argv[1]); "
         "np.save(sys.argv[2], mrcal.project(np.load(sys.argv[2]), *m.intrinsics())); m.write(sys.argv[3])"
     )
-    np.save(tmp_path / "points.npy", np.column_stack([directions(), np.ones(63)]))
-    subprocess.run(
-        [python, "-c", code, str(path), str(tmp_path / "points.npy"), str(tmp_path / "back.cameramodel")],
-        check=True,
-        capture_output=True,
-    )
-    assert np.abs(np.load(tmp_path / "points.npy") - projected(given)).max() < 1e-8
+    points = folder / "points.npy"
+    np.save(points, np.column_stack([uv, np.ones(len(uv))]))
+    command = [MRCALS, "-c", code, str(path), str(points), str(folder / "back.cameramodel")]
+    subprocess.run(command, check=True, capture_output=True)
+    return np.asarray(np.load(points))
+
+
+@pytest.mark.parametrize("camera", HELD["mrcal"])
+def test_mrcal_reads_the_file_and_projects_the_same_points(camera: str, tmp_path: Path) -> None:
+    need_mrcal()
+    given, path = calibration(camera), file(tmp_path, "mrcal")
+    export_calibration(given, "mrcal", path)
+    assert np.abs(by_mrcal(path, directions(), tmp_path) - projected(given)).max() < 1e-8
     # What it writes itself is read.
     back = projected(import_calibration(tmp_path / "back.cameramodel"))
     assert np.abs(back - projected(given)).max() < 1e-6
@@ -302,8 +362,8 @@ def test_ros_and_kalibr_have_their_own_names(tmp_path: Path) -> None:
         ("a.yaml", "distortion_model: x\nprojection_matrix: 1", "has no complete camera_matrix"),
         (
             "a.xml",
-            "<calibration><projection>fisheye</projection></calibration>",
-            "has the projection 'fisheye'",
+            "<calibration><projection>spherical</projection></calibration>",
+            "has the projection 'spherical'",
         ),
         ("a.m", "fc = [ 1 ; 2 ]; cc = 1", "is not a calibration"),
         ("a.m", "fc = [1;2];\ncc = [1;2];\nkc = [0;0;0;0;0];\n", "has no complete fc"),

@@ -15,7 +15,7 @@ from ...core.errors import FormatError, UsageError
 from ...core.provenance import Provenance, sha256_of
 from ...io import read_text, write_whole
 from ...optics import PixelGrid
-from ...optics.cameras import SplinedStereographic, camera_model, convert, unit_of
+from ...optics.cameras import SplinedStereographic, SplineGrid, camera_model, convert, unit_of
 from ...optics.poses import rotation_matrix
 from . import brown, colmap, matlab, metashape, mrcal, opencv, openptv, yamls
 from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, Mounted, PlainCamera
@@ -43,6 +43,12 @@ _ORDER = (
 _NOMINAL_MM = 0.005
 # Differences (px) below which a simpler model of a format is not replaced by a more general one.
 _SAME = 1e-3
+# Differences (px) up to which a spline surface, with hundreds of parameters, does not replace a simple model.
+_POOR = 0.05
+# Intervals of a spline surface across the image, which hold a usual fisheye to 0.01 px, and its margin.
+_INTERVALS, _MARGIN = 15, 1.05
+# Root mean square difference, in widths of the image, beyond which a file would be of no use.
+_USELESS = 0.01
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,8 @@ class CalibrationFormat:
         Camera of a text.
     beside : mapping of str to callable
         Texts of further files, by the suffixes with which they lie beside the first.
+    splined : bool
+        Whether it also holds cameras with a spline surface, which describe every lens.
 
     Examples
     --------
@@ -79,6 +87,7 @@ class CalibrationFormat:
     recognises: Callable[[str], bool]
     read: Callable[[str, Path], PlainCamera]
     beside: Mapping[str, Callable[[PlainCamera], str]] = field(default_factory=dict)
+    splined: bool = False
 
 
 def calibration_formats() -> dict[str, CalibrationFormat]:
@@ -112,10 +121,10 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
         CalibrationFormat(
             "mrcal", (".cameramodel",),
             (("opencv", _RADTAN), *wide, ("opencv_full", _TWELVE), ("stereographic", _CENTRE)), mrcal.write,
-            mrcal.recognises, mrcal.read,
+            mrcal.recognises, mrcal.read, splined=True,
         ),
         CalibrationFormat(
-            "metashape", (".xml",), (("opencv", _FIVE),),
+            "metashape", (".xml",), (("opencv", _FIVE), fisheye),
             metashape.write, metashape.recognises, metashape.read,
         ),
         CalibrationFormat(
@@ -272,8 +281,38 @@ def export_rig(calibrations: Sequence[Calibration], to: str, path: Path | str) -
 
 
 def _in_a_model_of(form: CalibrationFormat, calibration: Calibration, lens: CameraMapping) -> Exported:
-    """The camera in one of the models of a format."""
-    return exported_lens(form, calibration.name, lens, cast(dict[str, Any], calibration.model))
+    """The camera in one of the models of a format.
+
+    Raises
+    ------
+    UsageError
+        When none describes it, even roughly.
+    """
+    found = exported_lens(form, calibration.name, lens, cast(dict[str, Any], calibration.model))
+    if found.rms_px > _USELESS * max(lens.size):
+        known = ", ".join(formats_holding(calibration))
+        raise UsageError(
+            f"cannot be written as {form.name}: its nearest model differs by {found.rms_px:.0f} px rms",
+            where=f"calibration {calibration.name}",
+            do=f"use one of {known}" if known else "undistort the images, and give their camera",
+        )
+    return found
+
+
+def _splined(lens: CameraMapping) -> str:
+    """Name of the spline surface over the image of a camera, in mrcal's stereographic plane."""
+    grid = PixelGrid(*lens.size, (1.0, 1.0))
+    along = np.linspace(0, 1, 33)
+    rim = np.concatenate([np.stack([along, 0 * along + k], 1) for k in (0, 1)])
+    rim = np.concatenate([rim, rim[:, ::-1]]) * (np.array([grid.width, grid.height]) - 1.0)
+    uv = lens.mapping.inverse(rim)
+    uv = uv[np.isfinite(uv).all(axis=1)]
+    r = np.hypot(*uv.T)
+    plane = uv * (2 * np.tan(np.arctan(r) / 2) / np.maximum(r, 1e-12))[:, None]
+    across, down = _MARGIN * np.abs(plane).max(axis=0, initial=1e-3)
+    fov = int(np.ceil(np.rad2deg(4 * np.arctan(across / 2))))
+    rows = int(np.ceil(_INTERVALS * down / across)) + 3
+    return SplineGrid(3, _INTERVALS + 3, rows, fov).name
 
 
 def _as_it_is(
@@ -295,7 +334,7 @@ def _as_it_is(
         same = wanted.partition("_full")[0] == model.partition("_full")[0] and set(own) <= set(names)
         if plain and same and options == _options(wanted):
             return PlainCamera(name, width, height, wanted, own, (given[0], given[1]), options)
-    if form.name == "mrcal" and isinstance(lens.mapping, SplinedStereographic):
+    if form.splined and isinstance(lens.mapping, SplinedStereographic):
         return PlainCamera(name, width, height, model, own)
     return None
 
@@ -307,7 +346,7 @@ def formats_holding(calibration: Calibration) -> tuple[str, ...]:
     --------
     >>> camera = PlainCamera("front", 640, 480, "fisheye", {"fx": 300.0, "fy": 300.0, "k1": 0.1})
     >>> formats_holding(_calibration(camera, {}))
-    ('opencv', 'ros', 'kalibr', 'colmap')
+    ('opencv', 'ros', 'kalibr', 'colmap', 'metashape')
     """
     lens = calibration.mapping()
     if not isinstance(lens, CameraMapping):
@@ -355,7 +394,10 @@ def exported_lens(
     pitch_mm = float(stored["pitch_mm"][0])
     best: Exported | None = None
     why = "no model of the format describes it"
-    for wanted, names in form.models:
+    splined = ((_splined(lens), ()),) if form.splined else ()
+    for wanted, names in (*form.models, *splined):
+        if not names and best is not None and best.greatest_px < _POOR:
+            break
         pitch = _pitch(lens, pitch_mm) if camera_model(wanted).needs_pitch else (1.0, 1.0)
         try:
             done = convert(
@@ -364,8 +406,8 @@ def exported_lens(
         except UsageError as error:
             why = str(error)
             continue
-        values = dict(zip(camera_model(wanted).names, done.mapping.values.tolist(), strict=False))
-        held = {key: values[key] for key in names if key in values}
+        values = dict(zip(done.mapping.names, done.mapping.values.tolist(), strict=True))
+        held = {key: values[key] for key in names or values if key in values}
         camera = PlainCamera(name, width, height, wanted, held, pitch, _options(wanted))
         trial = Exported(camera, done.rms_px, done.greatest_px, done.share)
         if best is None or trial.greatest_px < best.greatest_px:

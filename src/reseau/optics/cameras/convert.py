@@ -22,6 +22,8 @@ __all__ = ["Converted", "convert"]
 _POINTS, _COMPARED = 41, 161
 # Greatest number of steps, and damping of the first one (columns have unit length).
 _ITERATIONS, _DAMPING = 200, 1e-3
+# Pixels that a parameter as large as its standard deviation by the prior counts.
+_WEAK = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +177,11 @@ def convert(
     centre = camera.inverse(grid.centre[None])
     f = float(camera.derivatives(centre if np.isfinite(centre).all() else uv[:1]).d_xy[0, 0, 0])
     at = np.array([not free or name in free for name in wanted.names])
-    found = _fitted(wanted.mapping(wanted.start_values(f, grid), grid, options), uv, target, at)
+    priors = wanted.priors(wanted.names)
+    start = wanted.mapping(wanted.start_values(f, grid), grid, options)
+    found = _fitted(
+        start, uv, target, at, np.array([_WEAK / priors.get(name, np.inf) for name in wanted.names])
+    )
     names = tuple(name for name, chosen in zip(wanted.names, at, strict=True) if chosen)
     by_original = _by_original(camera, found, uv, at)
     pixels = _over(grid, _COMPARED)
@@ -211,22 +217,29 @@ def _by_original(camera: PlaneMapping, found: PlaneMapping, uv: Array, at: Array
     return scaled
 
 
-def _fitted(mapping: PlaneMapping, uv: Array, target: Array, at: Array) -> PlaneMapping:
-    """Levenberg–Marquardt in columns of unit length; undetermined corrections have least norm."""
-    cost, damping, slow = _cost(mapping, uv, target), _DAMPING, 0
+def _fitted(mapping: PlaneMapping, uv: Array, target: Array, at: Array, weights: Array) -> PlaneMapping:
+    """Levenberg–Marquardt in columns of unit length; undetermined corrections have least norm.
+
+    Parameters with a prior are observed as zero, with these weights (px per unit): too little to be seen
+    where there are points, enough to determine what has hardly any.
+    """
+    weak = weights[at] > 0
+    cost, damping, slow = _cost(mapping, uv, target, weights), _DAMPING, 0
     for _ in range(_ITERATIONS):
         seen = mapping.derivatives(uv)
         design = seen.d_parameters[:, :, at].reshape(2 * len(uv), -1)
+        design = np.vstack([design, np.diag(weights[at])[weak]])
+        misfit = np.append((target - seen.value).ravel(), -(weights * mapping.values)[at][weak])
         size = np.linalg.norm(design, axis=0)
         size[size == 0] = 1.0
         left, values, right = np.linalg.svd(design / size, full_matrices=False)
-        along = np.where(values > 1e-13 * values[0], left.T @ (target - seen.value).ravel(), 0.0)
+        along = np.where(values > 1e-13 * values[0], left.T @ misfit, 0.0)
         before = cost
         while True:
             full = np.zeros(len(at))
             full[at] = right.T @ (along * values / (values**2 + damping)) / size
             trial = mapping.with_values(mapping.values + full)
-            after = _cost(trial, uv, target)
+            after = _cost(trial, uv, target, weights)
             # A pole or fold between the points costs nothing at them, but ruins the image there.
             if after < cost and trial.one_to_one(uv).all():
                 mapping, cost, damping = trial, after, max(damping / 10, 1e-24)
@@ -234,13 +247,14 @@ def _fitted(mapping: PlaneMapping, uv: Array, target: Array, at: Array) -> Plane
             damping *= 10
             if damping > 1e6:
                 return mapping
-        slow = slow + 1 if before - cost < 1e-9 * before else 0
+        # A surface that hardly any point determines at its rim creeps on there for long.
+        slow = slow + 1 if before - cost < (1e-2 if weak.any() else 1e-9) * before else 0
         if slow == 3:
             break
     return mapping
 
 
-def _cost(mapping: PlaneMapping, uv: Array, target: Array) -> float:
+def _cost(mapping: PlaneMapping, uv: Array, target: Array, weights: Array) -> float:
     with np.errstate(all="ignore"):
-        cost = float(((mapping(uv) - target) ** 2).sum())
+        cost = float(((mapping(uv) - target) ** 2).sum() + ((weights * mapping.values) ** 2).sum())
     return cost if np.isfinite(cost) else np.inf
