@@ -48,6 +48,7 @@ from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
 from ..core.numbers import measured as with_sigma
 from ..execution import Executor, Outputs
+from ..io import BoardDesign
 from ..io.network import TurntableEntry
 from ..io.photographs import Exif
 from ..io.refraction import RefractionEntry
@@ -57,6 +58,7 @@ from ..optics.refraction import RefractedRays, Refraction
 from .assessment import Assessment, assess
 from .exposures import Taken
 from .target_measurement import MeasuredPhotograph, Measurer, Photograph, measured_in_order, measurer_of
+from .turned_targets import named_alike, ways_to_turn
 from .z_stage import Heights
 
 if TYPE_CHECKING:
@@ -79,6 +81,9 @@ _LEAST_IMAGES = 3
 _HARDLY = 0.2
 _FOCAL_OFF = 1.5
 """Factor beyond which the focal length of the homographies contradicts that which the camera says."""
+_CONTRADICTED, _BETTER, _RENAMED = 1.5, 0.7, 3
+"""Standard deviation of unit weight from which photographs may name the points of a regular target
+differently; share of it to which the same names must lower it; most attempts."""
 _MORE_TILTED = "add images with the camera tilted by 20 to 40 degrees in different directions"
 _CAMERA = "camera"
 """Name of a camera that is alone."""
@@ -469,6 +474,39 @@ def calibrate_camera(
     photographs = list(measured_in_order(_checked(frames, taken), measure, executor, outputs))
     measured, declined, sizes = _measured(photographs, size, taken)
     measured = _without(measured, options.without)
+    notes = tuple(note for each in photographs for note in each.notes)
+    done = _calibrated(measured, declined, sizes, notes, design, model, options, taken, executor)
+    if isinstance(design, BoardDesign) and ways_to_turn(design) and options.control is None:
+        # A better camera tells better which photographs name the points in another way.
+        for _ in range(_RENAMED):
+            if isinstance(done, Failure) or done.sigma0 < _CONTRADICTED:
+                break
+            lenses = {
+                image: camera_mapping(done.result, int(c))
+                for image, c in zip(done.result.network.images, done.result.network.camera_of, strict=True)
+            }
+            alike = named_alike(done.measured, design, lenses)
+            if all(points.names == done.measured[image].names for image, points in alike.items()):
+                break
+            again = _calibrated(alike, declined, sizes, notes, design, model, options, taken, executor)
+            if isinstance(again, Failure) or again.sigma0 > _BETTER * done.sigma0:
+                break
+            done = again
+    return done
+
+
+def _calibrated(
+    measured: dict[str, ImagePoints],
+    declined: dict[str, str],
+    sizes: Mapping[str, tuple[int, int]],
+    notes: tuple[str, ...],
+    design: PlaneDesign,
+    model: CameraOptions | None,
+    options: CalibrationOptions,
+    taken: Mapping[str, Taken] | None,
+    executor: Executor | None,
+) -> Calibrated | Failure:
+    """Calibrate from the points of photographs."""
     cameras = list(dict.fromkeys(each.camera for each in taken.values())) if taken else [_CAMERA]
     of = [cameras.index(taken[name].camera) if taken else 0 for name in measured]
     for c, name in enumerate(cameras):
@@ -531,7 +569,6 @@ def calibrate_camera(
         if found.code is Code.NOT_CONVERGED:
             return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
         return found
-    notes = tuple(note for each in photographs for note in each.notes)
     calibrated = Calibrated(found, measured, declined, choice, board, notes)
     loose = _without_scale(calibrated.result)
     return calibrated if loose is None else loose
