@@ -17,7 +17,7 @@ from reseau.designs.known import known_designs
 from reseau.io import BoardDesign
 from reseau.procedures.exposures import of_another_lens
 from reseau.procedures.target_measurement import Measurer, measurer_of
-from reseau.procedures.which_target import Design, which_target
+from reseau.procedures.which_target import Design, designs_beside, which_target
 
 from ..measure.board_pictures import picture
 
@@ -97,6 +97,16 @@ def test_boards_that_are_drawn_by_default_are_known() -> None:
     ):
         frame = Frame(View(printed, *pose(3, printed), seed=3).picture(), 255.0)
         assert which_target([frame], boards) == (name, boards[name])
+
+
+def test_boards_of_other_programs_beside_photographs_are_candidates(tmp_path: Path) -> None:
+    text = "target_type: 'checkerboard'\ntargetCols: 9\ntargetRows: 6\nrowSpacingMeters: 0.1\n"
+    text += "colSpacingMeters: 0.1\n"
+    (tmp_path / "chess.yaml").write_text(text)
+    (tmp_path / "camchain.yaml").write_text("cam0:\n  camera_model: pinhole\n")
+    found = designs_beside([tmp_path])
+    assert found[str(tmp_path / "chess.yaml")] == board("chess", 10, 7, 100.0, name="chess")
+    assert str(tmp_path / "camchain.yaml") not in found
 
 
 def test_parts_of_a_larger_chessboard_are_not_taken_for_a_smaller_one() -> None:

@@ -35,6 +35,8 @@ __all__ = [
 ]
 
 
+_DESCRIBING = (".json", ".yaml", ".yml", ".xml")
+"""Suffixes of designs and calibrations, which are kept beside photographs."""
 _NUMBER = re.compile(r"\d+(?=\D*$)")
 
 
@@ -94,11 +96,13 @@ def photographs_in(folder: Path) -> list[Path]:
 def files_left_out(folder: Path) -> str:
     """Name the files of a folder that :func:`photographs_in` leaves out, in one line; empty without any.
 
+    Designs, and other documents, are not named.
+
     Examples
     --------
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     for name in ("a.png", "film.mp4", "notes.txt"):
+    ...     for name in ("a.png", "board.json", "film.mp4", "notes.txt"):
     ...         (Path(folder) / name).touch()
     ...     files_left_out(Path(folder)).removeprefix(folder)
     ': film.mp4 and notes.txt are left out: no photographs by their suffixes'
@@ -107,7 +111,10 @@ def files_left_out(folder: Path) -> str:
     names = sorted(
         path.name
         for path in folder.iterdir()
-        if path.is_file() and not path.name.startswith(".") and path not in used
+        if path.is_file()
+        and not path.name.startswith(".")
+        and path not in used
+        and path.suffix.lower() not in _DESCRIBING
     )
     if not names:
         return ""

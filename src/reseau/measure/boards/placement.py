@@ -367,7 +367,8 @@ def lay_circles(disks: Disks, design: BoardDesign, shape: tuple[int, int]) -> Pl
         if len(best[0]) >= _ENOUGH * len(numbers):
             break
     if best is None or len(best[0]) < min(_FEWEST, len(numbers)):
-        return failed(0 if best is None else len(best[0]), "circles in a lattice")
+        width = f"circles with a diameter of {100 * design.size / design.pitch:.0f} % of the pitch"
+        return failed(0 if best is None else len(best[0]), f"{width} in a lattice")
     nodes, rows, mapping = best
     return numbered(design, nodes.astype(np.intp), disks.xy[rows], mapping, shape, None)
 
