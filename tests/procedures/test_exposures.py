@@ -9,7 +9,14 @@ import pytest
 
 from reseau.core.errors import ArchiveError, InputError, UsageError
 from reseau.io.images import write_image
-from reseau.procedures.exposures import exposures_of_files, files_of, photograph_reader, photographs_of
+from reseau.procedures.exposures import (
+    exposures_of_files,
+    files_left_out,
+    files_of,
+    photograph_reader,
+    photographs_in,
+    photographs_of,
+)
 from reseau.procedures.target_measurement import Unread
 
 
@@ -80,3 +87,16 @@ def test_a_photograph_is_read_from_the_store_unless_it_changed_there(tmp_path: P
     else:
         with pytest.raises(ArchiveError, match="has been changed"):
             one.read()
+
+
+def test_undistorted_images_beside_their_photographs_are_not_photographs_of_the_camera(
+    tmp_path: Path,
+) -> None:
+    for name in ("1.png", "2.png", "1-undistorted.png", "1-undistorted.json", "3-undistorted.png"):
+        (tmp_path / name).touch()
+    # One without its camera beside it may be a name that somebody chose.
+    assert [path.name for path in photographs_in(tmp_path)] == ["1.png", "2.png", "3-undistorted.png"]
+    line = files_left_out(tmp_path)
+    assert line.endswith(": 1-undistorted.png: not used, undistorted by `reseau apply`")
+    (tmp_path / "notes.txt").touch()
+    assert files_left_out(tmp_path).endswith("undistorted by `reseau apply`, nor 1 other files")

@@ -9,10 +9,16 @@ import numpy as np
 import pytest
 
 from reseau.bundle import adjust_network, example_network
+from reseau.calibration import CameraMapping
 from reseau.core.data import Frame
+from reseau.core.numbers import power
+from reseau.core.provenance import Provenance
+from reseau.optics import PixelGrid
+from reseau.optics.cameras import camera_model
 from reseau.procedures.assessment import assess
 from reseau.report import applied_report, oscilloscope_report
 from reseau.report.bundle import bundle_report
+from reseau.report.bundle_figures import _radial, distortion_figure
 from reseau.report.template import TEMPLATES, environment
 
 from .conftest import Bench
@@ -105,3 +111,42 @@ def test_all_pages_have_one_frame_and_one_way_to_show_figures_and_tables() -> No
         assert text.count("<table") == text.count('<div class="wide" tabindex="0"><table')
         if name in TEMPLATES:
             assert text.startswith('{% extends "_page.html.j2" %}')
+
+
+def wide_lens() -> CameraMapping:
+    """A fisheye of 170° along the diagonal, with the uncertainty of its coefficients."""
+    lens = camera_model("fisheye").mapping(
+        [500.0, 500.0, 639.5, 479.5, 0.03, -0.008, 0.002, -3e-4], PixelGrid(1280, 960, (1.0, 1.0))
+    )
+    rows = np.array([lens.names.index(name) for name in ("k1", "k2", "k3", "k4")], dtype=np.intp)
+    return CameraMapping(lens, 1280, 960, rows, np.diag([1e-4, 1e-4, 1e-5, 1e-6]) ** 2)
+
+
+def test_the_distortion_of_a_wide_lens_is_drawn_by_the_angle() -> None:
+    found = distortion_figure(wide_lens())
+    assert found is not None
+    assert found[1].startswith("Radius in the image by the angle of the ray")
+    at, radius, sigma, ideal = _radial(wide_lens())  # type: ignore[misc]
+    angle = np.deg2rad(at)
+    k = (0.03, -0.008, 0.002, -3e-4)
+    own = 500.0 * angle * (1 + sum(c * angle ** (2 * i) for i, c in enumerate(k, start=1)))
+    assert np.abs(radius - own).max() < 1e-6
+    assert np.abs(ideal - 500.0 * angle).max() < 1e-6
+    effect = [500.0 * s * angle ** (2 * i + 1) for i, s in enumerate((1e-4, 1e-4, 1e-5, 1e-6), start=1)]
+    assert np.abs(sigma - np.sqrt(sum(e**2 for e in effect))).max() < 1e-6
+    assert 80 < at[-1] < 90
+
+
+def test_powers_of_ten_stand_with_each_number_and_options_that_were_not_given_are_not_listed() -> None:
+    macros = environment().get_template("_macros.html.j2").module
+    cells = re.findall(r"<td>(.*?)</td>", str(macros.quantity(power(5.882e-4, 1.0e-5))))  # type: ignore[attr-defined]
+    assert len(cells) == 2
+    assert all("10<sup>−4</sup>" in cell for cell in cells)
+    result = adjust_network(example_network()).required()
+    given = Provenance({}, {"sigma": None, "reject": False, "free": (), "leave_out": "", "row_jitter": 0.0})
+    page = bundle_report(result, title="Block", provenance=given)
+    listed = page.split("<h2>Provenance</h2>")[1]
+    assert "None" not in listed
+    assert "False" not in listed
+    assert "<dt>free</dt>" not in listed
+    assert "<dt>row jitter</dt><dd>0.0</dd>" in listed

@@ -73,6 +73,8 @@ def files_of(pattern: str) -> list[Path]:
 def photographs_in(folder: Path) -> list[Path]:
     """Images in a folder, in the order of their names; without any, its files of image coordinates (CSV).
 
+    Undistorted images that `reseau apply` wrote beside their photographs are left out.
+
     Raises
     ------
     InputError
@@ -85,12 +87,22 @@ def photographs_in(folder: Path) -> list[Path]:
     ...
     reseau.core.errors.InputError: src/reseau/optics: has no photograph; put some in: .jpg, .png, .tif, .heic
     """
-    files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    files = sorted(
+        path
+        for path in folder.iterdir()
+        if path.is_file() and not path.name.startswith(".") and not _undistorted(path)
+    )
     for suffixes in (PHOTOGRAPHS, (".csv",)):
         found = [path for path in files if path.suffix.lower() in suffixes]
         if found:
             return found
     raise InputError("has no photograph", where=folder, do="put some in: .jpg, .png, .tif, .heic")
+
+
+def _undistorted(path: Path) -> bool:
+    """Whether `reseau apply` wrote this file beside its photograph: it is by another camera."""
+    beside = path.with_suffix(".json")
+    return path.stem.endswith("-undistorted") and beside.is_file() and path.suffix.lower() in PHOTOGRAPHS
 
 
 def files_left_out(folder: Path) -> str:
@@ -116,14 +128,24 @@ def files_left_out(folder: Path) -> str:
         and path not in used
         and path.suffix.lower() not in _DESCRIBING
     )
+    undistorted = [name for name in names if _undistorted(folder / name)]
+    if undistorted:
+        of_these = {Path(name).with_suffix(".json").name for name in undistorted}
+        rest = [name for name in names if name not in undistorted and name not in of_these]
+        more = f", nor {len(rest)} other files" if rest else ""
+        return f"{folder}: {_listed(undistorted)}: not used, undistorted by `reseau apply`{more}"
     if not names:
         return ""
     if len(names) == 1:
         return f"{folder}: {names[0]} is left out: no photograph by its suffix"
+    return f"{folder}: {_listed(names)} are left out: no photographs by their suffixes"
+
+
+def _listed(names: list[str]) -> str:
+    """Some names, the first of many."""
     if len(names) > 4:
         names = [*names[:3], f"{len(names) - 3} more files"]
-    named = f"{', '.join(names[:-1])} and {names[-1]}"
-    return f"{folder}: {named} are left out: no photographs by their suffixes"
+    return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else names[0]
 
 
 def photographs_named(paths: Iterable[Path]) -> list[Path]:

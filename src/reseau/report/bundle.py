@@ -225,7 +225,8 @@ def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any
         "rows": rows,
         "residuals": Markup(residual_figure(result, c, at)),
         "fields": [] if lens is None else _fields(result, c, lens, at, distances),
-        "profile": None if profile is None else Markup(profile),
+        "profile": None if profile is None else Markup(profile[0]),
+        "profile_of": "" if profile is None else profile[1],
     }
 
 

@@ -20,6 +20,8 @@ _MANY_POINTS, _ELLIPSES, _CELLS, _WEAK = 4000, 250, 12, 5.0
 _BAND = 3.0
 """Standard deviations of the band."""
 _DIRECTIONS, _RADII = 24, 60
+_WIDE_DEG = 55.0
+"""Angle to the axis in a corner from which on a lens is wide."""
 
 
 def network_figure(result: Result) -> str:
@@ -132,8 +134,11 @@ def next_figure(result: Result, c: int, rows: Rows, assessed: Assessment) -> str
         return to_svg(figure)
 
 
-def distortion_figure(lens: CameraMapping) -> str | None:
+def distortion_figure(lens: CameraMapping) -> tuple[str, str] | None:
     """Draw the radial distortion with its confidence band, and its standard deviation.
+
+    Of a wide lens, whose distortion against a central projection has no limit, the radius in the image is
+    drawn by the angle of the ray.
 
     Parameters
     ----------
@@ -142,35 +147,43 @@ def distortion_figure(lens: CameraMapping) -> str | None:
 
     Returns
     -------
-    str or None
-        An SVG element; None where no distortion was estimated.
+    (str, str) or None
+        An SVG element, and what it shows; None where no distortion was estimated.
     """
     found = _radial(lens)
     if found is None:
         return None
-    r, curve, sigma = found
+    at, curve, sigma, ideal = found
+    by_angle = ideal is not None
     with drawing():
         figure = Figure(figsize=(8.6, 3.0), layout="constrained")
         left, right = figure.subplots(1, 2)
         left.fill_between(
-            r, curve - _BAND * sigma, curve + _BAND * sigma, color=ACCENT, alpha=0.3, linewidth=0
+            at, curve - _BAND * sigma, curve + _BAND * sigma, color=ACCENT, alpha=0.3, linewidth=0
         )
-        left.plot(r, curve, color=INK, linewidth=1)
-        left.axhline(0, color=FAINT, linewidth=0.6, zorder=0)
-        left.set_title(f"radial distortion ± {_BAND:g} σ", loc="left")
-        left.set_ylabel("px")
+        left.plot(at, curve, color=INK, linewidth=1)
+        if ideal is None:
+            left.axhline(0, color=FAINT, linewidth=0.6, zorder=0)
+        else:
+            left.plot(at, ideal, color=FAINT, linewidth=1, linestyle="--", zorder=0)
+        left.set_title(f"{'radius' if by_angle else 'radial distortion'} ± {_BAND:g} σ", loc="left")
+        left.set_ylabel("radius / px" if by_angle else "px")
         for axes in (left, right):
-            axes.set_xlabel("radius / px")
-        right.fill_between(r, 0, _BAND * sigma, color=PALE, linewidth=0)
-        right.plot(r, sigma, color=ACCENT, linewidth=1)
+            axes.set_xlabel("angle to the axis / °" if by_angle else "radius / px")
+        right.fill_between(at, 0, _BAND * sigma, color=PALE, linewidth=0)
+        right.plot(at, sigma, color=ACCENT, linewidth=1)
         right.set_ylim(bottom=0)
         right.set_title(f"its σ; up to {_BAND:g} σ in grey", loc="left")
         right.set_ylabel("px")
-        return to_svg(figure)
+        what = "Radius in the image by the angle of the ray (dashed: proportional to it)"
+        return to_svg(figure), what if by_angle else "Radial distortion"
 
 
-def _radial(lens: CameraMapping) -> tuple[Array, Array, Array] | None:
+def _radial(lens: CameraMapping) -> tuple[Array, Array, Array, Array | None] | None:
     """Radius, mean radial distortion over all directions, and its standard deviation (px).
+
+    Of a wide lens: angle (°), radius, its standard deviation, and the radius that is proportional to the
+    angle (px).
 
     Distortion is the difference between the mapping and the central projection with its slope on the axis.
     """
@@ -183,16 +196,25 @@ def _radial(lens: CameraMapping) -> tuple[Array, Array, Array] | None:
     if not np.isfinite(corner).all():
         return None
     reach = float(np.hypot(*corner.T).max())
-    angle = np.linspace(0, 2 * np.pi, _DIRECTIONS, endpoint=False)
-    away = np.column_stack([np.cos(angle), np.sin(angle)])
-    uv = np.linspace(0, reach, _RADII)[:, None, None] * away
-    seen = lens.mapping.derivatives(uv.reshape(-1, 2))
-    ideal = axis.value + uv.reshape(-1, 2) @ axis.d_xy[0].T
+    wide = reach > np.tan(np.deg2rad(_WIDE_DEG))
+    turn = np.linspace(0, 2 * np.pi, _DIRECTIONS, endpoint=False)
+    away = np.column_stack([np.cos(turn), np.sin(turn)])
+    angles = np.linspace(0, np.arctan(reach), _RADII)
+    lengths = np.tan(angles) if wide else np.linspace(0, reach, _RADII)
+    uv = (lengths[:, None, None] * away).reshape(-1, 2)
+    seen = lens.mapping.derivatives(uv)
+    ideal = axis.value + uv @ axis.d_xy[0].T
     out = away @ axis.d_xy[0].T
+    slope = float(np.linalg.norm(out, axis=1).mean())
     out = np.tile(out / np.linalg.norm(out, axis=1, keepdims=True), (_RADII, 1))
-    curve = ((seen.value - ideal) * out).sum(axis=1).reshape(_RADII, -1).mean(axis=1)
-    slope = np.einsum("ni,niu->nu", out, seen.d_parameters[:, :, lens.rows[own]])
-    slope = slope.reshape(_RADII, _DIRECTIONS, -1).mean(axis=1)
-    variance = np.einsum("ri,ij,rj->r", slope, lens.covariance[np.ix_(own, own)], slope)
+    curve = (
+        ((seen.value - (axis.value if wide else ideal)) * out).sum(axis=1).reshape(_RADII, -1).mean(axis=1)
+    )
+    by = np.einsum("ni,niu->nu", out, seen.d_parameters[:, :, lens.rows[own]])
+    by = by.reshape(_RADII, _DIRECTIONS, -1).mean(axis=1)
+    variance = np.einsum("ri,ij,rj->r", by, lens.covariance[np.ix_(own, own)], by)
+    sigma = np.sqrt(np.maximum(variance, 0.0))
+    if wide:
+        return np.rad2deg(angles), curve, sigma, slope * angles
     radius = np.hypot(*(ideal - axis.value).T).reshape(_RADII, -1).mean(axis=1)
-    return radius, curve, np.sqrt(np.maximum(variance, 0.0))
+    return radius, curve, sigma, None

@@ -33,6 +33,7 @@ def camera_section(result: Result, images: int, true: Mapping[str, float]) -> Ro
         for name, value, s in zip(names, values, sigma, strict=True)
     ]
     errors = np.array([float(row[-1]) for row in rows])
+    profile = distortion_figure(camera_mapping(result, 0))
     return {
         "images": images,
         "points": len(result.network.xy),
@@ -41,7 +42,8 @@ def camera_section(result: Result, images: int, true: Mapping[str, float]) -> Ro
         "rows": rows,
         "rms": f"{np.sqrt(np.mean(errors**2)):.2f}",
         "network": Markup(network_figure(result)),
-        "distortion": _markup(distortion_figure(camera_mapping(result, 0))),
+        "distortion": None if profile is None else Markup(profile[0]),
+        "distortion_of": "" if profile is None else profile[1],
     }
 
 
@@ -49,7 +51,3 @@ def _alike(*values: float) -> tuple[str, ...]:
     """Estimate, sigma and truth with two digits of the sigma."""
     decimals = max(0, 1 - int(np.floor(np.log10(values[1]))))
     return tuple(f"{value:.{decimals}f}" for value in values)
-
-
-def _markup(figure: str | None) -> Markup | None:
-    return None if figure is None else Markup(figure)

@@ -12,7 +12,7 @@ from ..core.figures import ACCENT, FAINT, INK, draw_contours, drawing, image_axe
 
 __all__ = ["difference_figure", "uncertainty_figure"]
 
-_SIZE = (8.6, 5.2)
+_SIZE = (6.2, 4.6)
 """Inches."""
 _ARROWS = 13
 _SURE = 0.01

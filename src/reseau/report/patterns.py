@@ -74,7 +74,7 @@ def _figure(result: Result, pattern: CommonPattern, grouped: bool) -> str:
     sure = pattern.p_at < _SURE
     width = 8.6 if across > 1 else 6.0
     with drawing():
-        figure = Figure(figsize=(8.6, 0.5 + width * down * shape / across), layout="constrained")
+        figure = Figure(figsize=(width, 0.5 + width * down * shape / across), layout="constrained")
         grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
         for axes in grid.flat[len(names) :]:
             axes.remove()

@@ -23,6 +23,8 @@ TEMPLATES = (
 )
 """Those of pages; the others are parts."""
 _WIDE_PT = 450.0
+# Of a drawing of 8.6 inches that is as wide as the page.
+_REM_PER_PT = 59 / 619.2
 
 
 def rendered(template: str, **content: object) -> str:
@@ -56,9 +58,12 @@ def environment() -> jinja2.Environment:
 def _named_by(svg: str, element: str) -> Markup:
     """An SVG element as one picture for screen readers, with the text of another element as its name.
 
-    Wide drawings are scrolled on a narrow page: their text would be too small.
+    Wide drawings are scrolled on a narrow page: their text would be too small. Narrow ones are not enlarged,
+    so that all have text of one size.
     """
     named = str(svg).replace("<svg", f'<svg role="img" aria-labelledby="{element}"', 1)
     width = re.search(r'^<svg [^>]*?\bwidth="([\d.]+)pt"', named)
     wide = width is not None and float(width[1]) > _WIDE_PT
+    if width is not None and not wide:
+        named = named.replace("<svg", f'<svg style="max-width: {_REM_PER_PT * float(width[1]):.1f}rem"', 1)
     return Markup(f'<div class="wide" tabindex="0">{named}</div>' if wide else named)
