@@ -11,9 +11,12 @@ import pytest
 from markupsafe import escape
 
 from reseau.calibration import Calibration
+from reseau.designs import board
 from reseau.io import ReseauMeasurement
 from reseau.io.images import write_image
 from reseau_sims import FieldBench, Station
+
+from ..measure.board_pictures import picture
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -263,6 +266,20 @@ def test_sigma_naught_refers_to_the_given_sigma(reseau: Run, measured: tuple[Pat
     assert status == 0
     sigma0 = float(out.partition("sigma0 ")[2].partition(",")[0])
     assert sigma0 == pytest.approx(0.5, abs=0.025)
+
+
+def test_the_size_of_a_target_that_was_found_is_not_known(
+    reseau: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    design = board("charuco", 7, 10, 23.0)
+    (tmp_path / "photos").mkdir()
+    write_image(tmp_path / "photos" / "a.png", picture(design, distance=460.0)[0].pixels)
+    _, _, err = reseau("calibrate", tmp_path / "photos", "--design", "auto", "--jobs", 1)
+    assert "note: the target is charuco on A4; photographs do not tell its size" in err
+    design.write(tmp_path / "mine.json")
+    _, _, err = reseau("calibrate", tmp_path / "photos", "--design", "auto", "--jobs", 1)
+    assert "mine.json\n" in err
 
 
 def test_too_few_images_are_refused_with_their_reasons(reseau: Run, measured: tuple[Path, ...]) -> None:

@@ -286,7 +286,8 @@ def _found_target(
                     continue  # is reported with its name when all are measured
 
     name, design = required(which_target(frames(), designs_beside([*folders, Path()])), "--design auto")
-    typer.echo(f"note: the target is {name}", err=True)
+    size = "" if Path(name).is_file() else "; photographs do not tell its size, on which only lengths depend"
+    typer.echo(f"note: the target is {name}{size}", err=True)
     return design
 
 
