@@ -174,6 +174,12 @@ def test_frontal_photographs_are_not_usable() -> None:
     assert "towards the camera" in found.next_photograph.words
 
 
+def test_a_camera_that_is_known_but_for_its_corners_is_not_called_undetermined() -> None:
+    found = replace(calibrated(measured()).assessments["camera"], use=Use.NOTHING, corners_px=3.0)
+    assert found.lines[0].endswith("; the photographs do not determine the corners")
+    assert replace(found, centre_px=2.5).lines[0].endswith("; the photographs do not determine the camera")
+
+
 def test_the_calibration_contains_the_verdict() -> None:
     done = calibrated(measured())
     entry = done.calibration("c").validity["assessment"]

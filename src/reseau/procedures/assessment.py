@@ -172,7 +172,8 @@ class Assessment:
             where = "at the margin" if self.circular_deg else "in the corners"
             first += f"; the model lacks {self.lacks} ({_two(self.lacks_px)} px {where}): {do}"
         elif self.use is Use.NOTHING:
-            first += "; the photographs do not determine the camera"
+            what = "the corners" if self.centre_px <= _LIMITS[-1][0] else "the camera"
+            first += f"; the photographs do not determine {what}"
         else:
             first += f"; the model fits (to {_rounded(self.misfit_px)})"
         # Rounded down: points are in the whole image only where no part is left.
