@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -188,6 +189,46 @@ def test_points_outside_the_validity_come_back_too(reseau: Run, tmp_path: Path) 
         np.array([[20.5, 30.25], [-1, -2]]), abs=2e-5
     )
     assert "c" not in found
+
+
+def test_points_with_covariances_come_back_from_their_own_undistorted_image_only(
+    reseau: Run, lens: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "p.csv").write_text("id,x,y,sx,sy\na,20.5,30.25,0.1,0.1\nb,140,100,0.1,0.1\n")
+    flat, back = tmp_path / "flat.json", tmp_path / "q.json"
+    assert reseau("apply", lens, tmp_path / "p.csv", "-o", flat, "--fov", "40")[0] == 0
+    assert reseau("apply", lens, flat, "-o", back, "--inverse", "--fov", "40")[0] == 0
+    there, here = (json.loads(path.read_text())["points"] for path in (flat, back))
+    assert here["x"] == pytest.approx([20.5, 140.0], abs=1e-6)
+    assert here["y"] == pytest.approx([30.25, 100.0], abs=1e-6)
+    assert abs(there["rho"][0]) > 1e-3
+    # By the derivatives of OpenCV's projection, with the covariance of the points and that of fx.
+    camera = json.loads(flat.read_text())["camera"]
+    ideal = [(there["x"][0] - camera["cx"]) / camera["fx"], (there["y"][0] - camera["cy"]) / camera["fy"]]
+    step = np.eye(2) * 1e-5
+
+    def seen(uv: np.ndarray, fx: float = 210.0) -> np.ndarray:  # type: ignore[type-arg]
+        matrix = MATRIX.copy()
+        matrix[0, 0] = fx
+        point = np.array([[*uv, 1.0]])
+        return cv2.projectPoints(point, np.zeros(3), np.zeros(3), matrix, DISTORTION)[0][0, 0]
+
+    slope = np.stack([(seen(ideal + s) - seen(ideal - s)) / 2e-5 for s in step], axis=1)
+    slope = slope / [camera["fx"], camera["fy"]]
+    of_fx = (seen(np.array(ideal), 210.5) - seen(np.array(ideal), 209.5)) * 0.1
+    sx, sy, rho = (there[key][0] for key in ("sx", "sy", "rho"))
+    cov = slope @ [[sx * sx, rho * sx * sy], [rho * sx * sy, sy * sy]] @ slope.T + np.outer(of_fx, of_fx)
+    own = [here["sx"][0], here["sy"][0], here["rho"][0]]
+    sigma = np.sqrt(np.diag(cov))
+    assert own == pytest.approx([*sigma, cov[0, 1] / sigma.prod()], rel=1e-3, abs=1e-4)
+    status, _, err = reseau("apply", lens, flat, "--inverse")
+    assert status == 2
+    assert "has points of another undistorted image; repeat --fov" in err
+    status, _, err = reseau("apply", lens, flat)
+    assert status == 2
+    assert "has points of the system undistorted, not image" in err
+    flat.write_text('{"schema": "reseau-points/1", "system": "image"}')
+    assert "is not a complete reseau-points/1" in reseau("apply", lens, flat)[2]
 
 
 def test_the_whole_field_of_a_fisheye_is_declined_with_what_to_do(reseau: Run, tmp_path: Path) -> None:

@@ -301,17 +301,18 @@ def _points(
     """Correct points; for a camera, to pixels of the undistorted image, or without `shown` to directions."""
     from ..calibration import CameraMapping
     from ..core.provenance import canonical_json
-    from ..io import read_measurement, write_whole
+    from ..io import write_whole
 
     if "points" not in mapping.applies_to:
         raise UsageError("a sensor calibration corrects images, not points", where=source, do="give an image")
     suffix = ".csv" if out is None else suffix_of(writable(out), (".csv", ".json"))
-    measured = read_measurement(source).image_points()
     more: dict[str, Any] = {}
     raster = None
     if isinstance(mapping, CameraMapping) and shown is not None:
         raster = _raster(mapping, mapping.size, view)
         more = {"camera": raster.pinhole}
+    given = "image" if not inverse else mapping.system if raster is None else "undistorted"
+    measured = _measured(source, given, more if inverse else {})
     if inverse:
         points = mapping.inverse(measured if raster is None else _to_directions(measured, raster))
         why, unit, system = mapping.why_not(points), "px", "image"
@@ -336,6 +337,51 @@ def _points(
     else:
         say(f"{out}: {len(points)} points in {unit}\n")
     _warn(points.names, why)
+
+
+def _measured(source: Path, system: str, camera: dict[str, Any]) -> ImagePoints:
+    """Read points, also those that this command wrote, with their covariances and their `camera`.
+
+    Raises
+    ------
+    UsageError
+        If the points are in another coordinate system, or in an undistorted image of another camera.
+    FormatError
+        If the file is incomplete.
+    """
+    import json
+
+    import numpy as np
+
+    from ..core.data import ImagePoints
+    from ..core.errors import FormatError
+    from ..io import read_measurement, read_text
+
+    try:
+        content = json.loads(read_text(source)) if source.suffix.lower() == ".json" else None
+    except ValueError:
+        content = None
+    if not isinstance(content, dict) or content.get("schema") != "reseau-points/1":
+        return read_measurement(source).image_points()
+    if content.get("system") != system:
+        raise UsageError(f"has points of the system {content.get('system')}, not {system}", where=source)
+    for key, pinhole in camera.items():
+        own = content.get(key) or {}
+        if any(abs(own.get(name, np.inf) - value) > 1e-6 for name, value in pinhole.items()):
+            raise UsageError(
+                "has points of another undistorted image", where=source,
+                do="repeat --fov, --alpha or --scale as for that one",
+            )  # fmt: skip
+    try:
+        table = content["points"]
+        keys = ("x", "y", "sx", "sy", "rho")
+        x, y, sx, sy, rho = (np.array(table[key], dtype=np.float64) for key in keys)
+        known = np.asarray(np.isfinite([x, y, sx, sy, rho]).all(axis=0))
+        cov = np.stack([np.stack([sx * sx, rho * sx * sy], -1), np.stack([rho * sx * sy, sy * sy], -1)], -1)
+        names = tuple(str(name) for name, one in zip(table["id"], known, strict=True) if one)
+        return ImagePoints(names, np.stack([x, y], axis=-1)[known], cov[known])
+    except (KeyError, TypeError, ValueError):
+        raise FormatError("is not a complete reseau-points/1", where=source) from None
 
 
 def _in_pixels(points: ImagePoints, raster: CorrectedImage) -> ImagePoints:
