@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 __all__ = ["watch"]
 
+_LEAST = 3
+"""Frames without which there is no calibration."""
+
 
 def watch(
     design: Annotated[
@@ -35,7 +38,7 @@ def watch(
         typer.Option(help="Camera of the bench, or a video device, as /dev/video0. Default: the only one."),
     ] = None,
     bench: Annotated[Path, typer.Option("--bench", "-b", help="Bench file.")] = Path("bench.toml"),
-    count: Annotated[int, typer.Option(min=3, help="Number of frames to take.")] = 15,
+    count: Annotated[int, typer.Option(min=_LEAST, help="Number of frames to take.")] = 15,
     model: Annotated[str, typer.Option(metavar="NAME", help="Camera model, as for calibrate.")] = "",
     pitch: Annotated[float | None, typer.Option(min=1e-6, help="Pixel size, mm.")] = None,
     free: Annotated[str, typer.Option(help="Parameters to estimate, e.g. c,x0,y0,K1.")] = "",
@@ -119,10 +122,10 @@ def watch(
             failed = error
     for line in watching.verdict:
         say(f"{line}\n")
-    if kept:
-        say(f"{kept} frame{'s' * (kept > 1)} in {out}; next: reseau calibrate {out} --design {design}\n")
+    if kept < _LEAST:
+        say(f"{kept or 'no'} frame{'s' * (kept != 1)} in {out}, too few to calibrate; --resume continues\n")
     else:
-        say("no frame was taken\n")
+        say(f"{kept} frames in {out}; next: reseau calibrate {out} --design {design}\n")
     if failed is not None:
         raise failed
 
