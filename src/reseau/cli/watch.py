@@ -61,15 +61,15 @@ def watch(
 
     from ..capture import steer
     from ..core.errors import InputError, InstrumentError
+    from ..exchange import read_target
     from ..instruments import Camera
-    from ..io import parse_design, read_text
     from ..io.images import read_image, write_image
     from ..procedures.calibration import CameraOptions, measurer_of
     from ..procedures.exposures import photographs_in
     from ..procedures.watching import Watching
     from ..service.live import LivePage
 
-    target = parse_design(read_text(design), design)
+    target = read_target(design)
     names = tuple(name.strip() for name in free.split(",") if name.strip())
     options = CameraOptions(model, names, None if pitch is None else (pitch, pitch))
     if options.automatic:

@@ -73,6 +73,11 @@ class ReseauError(Exception):
         line = what if where is None else f"{where}: {what}"
         super().__init__(" ".join((line if do is None else f"{line}; {do}").split()))
 
+    @property
+    def reason(self) -> str:
+        """What is wrong and what to do, where the place is named already."""
+        return self.what if self.do is None else f"{self.what}; {self.do}"
+
 
 class UsageError(ReseauError):
     """Wrong or contradictory arguments."""

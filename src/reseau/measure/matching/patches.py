@@ -284,7 +284,7 @@ class Patches:
             off[:, X] / width,
             off[:, Y] / width,
             off[:, WIDTH],
-            off[:, CONTRAST] / np.abs(x[:, CONTRAST]),
+            off[:, CONTRAST] / np.maximum(np.abs(x[:, CONTRAST]), np.finfo(float).tiny),
         ]
         return np.asarray(np.max([*parts, *off[:, self.form_at :].T], axis=0))
 

@@ -577,7 +577,7 @@ def _drawn(calibration: Calibration, figure: str) -> str:
     drawn = distortion_figure(lens)
     if drawn is None:
         raise NotFound("has no distortion", where=calibration.name)
-    return drawn
+    return drawn[0]
 
 
 @router.get("/comparisons")
