@@ -14,7 +14,6 @@ from .common import (
     ObjectsPlace,
     Out,
     open_archive,
-    points_document,
     progress,
     say,
     say_files_left_out,
@@ -301,7 +300,7 @@ def _points(
     """Correct points; for a camera, to pixels of the undistorted image, or without `shown` to directions."""
     from ..calibration import CameraMapping
     from ..core.provenance import canonical_json
-    from ..io import write_whole
+    from ..io import points_document, write_whole
 
     if "points" not in mapping.applies_to:
         raise UsageError("a sensor calibration corrects images, not points", where=source, do="give an image")
@@ -353,15 +352,13 @@ def _measured(source: Path, system: str, camera: dict[str, Any]) -> ImagePoints:
 
     import numpy as np
 
-    from ..core.data import ImagePoints
-    from ..core.errors import FormatError
-    from ..io import read_measurement, read_text
+    from ..io import POINTS, points_of, read_measurement, read_text
 
     try:
         content = json.loads(read_text(source)) if source.suffix.lower() == ".json" else None
     except ValueError:
         content = None
-    if not isinstance(content, dict) or content.get("schema") != "reseau-points/1":
+    if not isinstance(content, dict) or content.get("schema") != POINTS:
         return read_measurement(source).image_points()
     if content.get("system") != system:
         raise UsageError(f"has points of the system {content.get('system')}, not {system}", where=source)
@@ -372,16 +369,7 @@ def _measured(source: Path, system: str, camera: dict[str, Any]) -> ImagePoints:
                 "has points of another undistorted image", where=source,
                 do="repeat --fov, --alpha or --scale as for that one",
             )  # fmt: skip
-    try:
-        table = content["points"]
-        keys = ("x", "y", "sx", "sy", "rho")
-        x, y, sx, sy, rho = (np.array(table[key], dtype=np.float64) for key in keys)
-        known = np.asarray(np.isfinite([x, y, sx, sy, rho]).all(axis=0))
-        cov = np.stack([np.stack([sx * sx, rho * sx * sy], -1), np.stack([rho * sx * sy, sy * sy], -1)], -1)
-        names = tuple(str(name) for name, one in zip(table["id"], known, strict=True) if one)
-        return ImagePoints(names, np.stack([x, y], axis=-1)[known], cov[known])
-    except (KeyError, TypeError, ValueError):
-        raise FormatError("is not a complete reseau-points/1", where=source) from None
+    return points_of(content, source)
 
 
 def _in_pixels(points: ImagePoints, raster: CorrectedImage) -> ImagePoints:

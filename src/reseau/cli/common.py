@@ -239,20 +239,6 @@ def overlay_files(path: Path, images: Sequence[Path]) -> dict[Path, Path]:
     return dict(zip(shown, files, strict=True))
 
 
-def points_document(points: ImagePoints, unit: str, system: str) -> dict[str, Any]:
-    """Return points in columns, as `--json` prints them."""
-    s = points.sigma
-    table = {
-        "id": list(points.names),
-        "x": points.xy[:, 0].tolist(),
-        "y": points.xy[:, 1].tolist(),
-        "sx": s[:, 0].tolist(),
-        "sy": s[:, 1].tolist(),
-        "rho": (points.cov[:, 0, 1] / (s[:, 0] * s[:, 1])).tolist(),
-    }
-    return {"schema": "reseau-points/1", "unit": unit, "system": system, "points": table}
-
-
 def probability(p: float) -> str:
     """A probability as text, to two digits.
 

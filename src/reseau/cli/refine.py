@@ -17,7 +17,6 @@ from .common import (
     Out,
     orientation,
     overlay_files,
-    points_document,
     probability,
     progress,
     read_photo,
@@ -322,7 +321,7 @@ def _by_calibration(
     """Apply or test a stored calibration."""
     from ..calibration import InstrumentCorrection, read_calibration
     from ..core.provenance import canonical_json
-    from ..io import ReseauDesign, write_whole
+    from ..io import ReseauDesign, points_document, write_whole
 
     stored = read_calibration(calibration)
     instrument, design, rods = InstrumentCorrection.from_calibration(stored)
@@ -432,7 +431,7 @@ def _write_true(third: list[tuple[Path, PhotoIII]], true: Path | None, unit: str
     """Write true coordinates; with several photographs, names have that of their photograph as prefix."""
     from ..core.data import ImagePoints
     from ..core.provenance import canonical_json
-    from ..io import write_whole
+    from ..io import points_document, write_whole
 
     if true is None or not third or unit is None:
         return

@@ -28,12 +28,14 @@ from .frame import (
 )
 from .lens import LensDocument, LensSensor
 from .measurement import MeasuredPoint, PhotographPoints, PointColumns, ReseauMeasurement
+from .points import POINTS, points_document, points_of
 from .reading import is_points, read_design, read_measurement
 from .testfield import SHAPES, FieldLines, FieldTargets, TestfieldDesign, parse_design
 
 __all__ = [
     "CORNERS",
     "EDGES",
+    "POINTS",
     "SHAPES",
     "BoardDesign",
     "DesignPoint",
@@ -66,6 +68,8 @@ __all__ = [
     "TestfieldDesign",
     "is_points",
     "parse_design",
+    "points_document",
+    "points_of",
     "read_design",
     "read_measurement",
     "read_text",
