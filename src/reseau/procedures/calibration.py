@@ -475,7 +475,11 @@ def calibrate_camera(
     measured, declined, sizes = _measured(photographs, size, taken)
     measured = _without(measured, options.without)
     notes = tuple(note for each in photographs for note in each.notes)
-    done = _calibrated(measured, declined, sizes, notes, design, model, options, taken, executor)
+
+    def calibrated(points: dict[str, ImagePoints]) -> Calibrated | Failure:
+        return _calibrated(points, declined, sizes, notes, design, model, options, taken, executor)
+
+    done = calibrated(measured)
     if isinstance(design, BoardDesign) and ways_to_turn(design) and options.control is None:
         # A better camera tells better which photographs name the points in another way.
         for _ in range(_RENAMED):
@@ -488,7 +492,7 @@ def calibrate_camera(
             alike = named_alike(done.measured, design, lenses)
             if all(points.names == done.measured[image].names for image, points in alike.items()):
                 break
-            again = _calibrated(alike, declined, sizes, notes, design, model, options, taken, executor)
+            again = calibrated(alike)
             if isinstance(again, Failure) or again.sigma0 > _BETTER * done.sigma0:
                 break
             done = again

@@ -130,9 +130,8 @@ def files_left_out(folder: Path) -> str:
     )
     undistorted = [name for name in names if _undistorted(folder / name)]
     if undistorted:
-        of_these = {Path(name).with_suffix(".json").name for name in undistorted}
-        rest = [name for name in names if name not in undistorted and name not in of_these]
-        more = f", nor {len(rest)} other files" if rest else ""
+        rest = len(names) - len(undistorted)
+        more = f", nor {rest} other files" if rest else ""
         return f"{folder}: {_listed(undistorted)}: not used, undistorted by `reseau apply`{more}"
     if not names:
         return ""

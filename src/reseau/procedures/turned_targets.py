@@ -92,9 +92,9 @@ def named_alike(
     dict of str to ImagePoints
         The same points; names of some photographs are those of the target turned.
     """
-    row = {name: k for k, name in enumerate(design.ids)}
+    row, ways = {name: k for k, name in enumerate(design.ids)}, ways_to_turn(design)
     seen = {image: _deviations(points, design, row, lenses[image]) for image, points in measured.items()}
-    fields = {image: _named(design, *each) for image, each in seen.items() if each is not None}
+    fields = {image: _named(design, ways, *each) for image, each in seen.items() if each is not None}
     # Photographs with most points first: the others are compared with their mean.
     order = sorted(fields, key=lambda image: -len(measured[image].names))
     chosen = dict.fromkeys(order[:1], 0)
@@ -127,13 +127,13 @@ def _deviations(
 
 
 def _named(
-    design: BoardDesign, rows: NDArray[np.intp], deviations: Array
+    design: BoardDesign, ways: tuple[Way, ...], rows: NDArray[np.intp], deviations: Array
 ) -> list[tuple[NDArray[np.intp], Array]]:
     """Each way to name the points, the given one first: their rows, and deviations (n, 2) of all points."""
     nodes, found = design.nodes, []
     index = np.full(nodes.max(axis=0) + 1, -1)
     index[tuple(nodes.T)] = np.arange(len(nodes))
-    for way in ways_to_turn(design):
+    for way in ways:
         turned = nodes[way.rows[rows]]
         low, high = turned.min(axis=0), nodes.max(axis=0) - turned.max(axis=0)
         shifts = np.mgrid[-low[0] : high[0] + 1, -low[1] : high[1] + 1].reshape(2, -1).T

@@ -144,7 +144,7 @@ class PlaneMarks(MarkWindows):
         if self.precise_start and not with_field:
             off = self._off_polynomial(rows[why == ""], found.xy[why == ""])
         if off is None or not (np.abs(off) < _SAFELY * self.options.neighbour_px).all():
-            (why, field), off = self._judged(rows, found, field), None
+            (why, field), off = self._judged(rows, found, why, field), None
         return self._spread(rows, found, why, field, with_field, off)
 
     def _uncovered(self, rows: Rows, found: Matches, doubtful: Mask, field: SmoothField) -> Matches:
@@ -246,7 +246,7 @@ class PlaneMarks(MarkWindows):
             )
             if not (doubtful & ~self.dazzled[rows]).any():
                 return doubtful & ~self.dazzled[rows], None
-        why, field = self._judged(rows, found)
+        why, field = self._judged(rows, found, self._why(rows, found))
         return ((why != "") | self._uneasy(found)) & ~self.dazzled[rows], field
 
     def _bent(self, rows: Rows, found: Matches) -> bool:
@@ -320,7 +320,6 @@ class PlaneMarks(MarkWindows):
         terms = self._smooth_terms(rows[good])
         if terms is None:
             return alike
-        terms = np.linalg.qr(terms)[0]  # for normal equations
         bent = plain.xy[good] - mapping(self.at[rows[good]])
         c, e = (np.diagonal(cov[good], axis1=1, axis2=2) for cov in (plain.cov, extra))
         redundancy = 2 * (len(terms) - terms.shape[1])
@@ -358,14 +357,14 @@ class PlaneMarks(MarkWindows):
         return min(float(off @ off) / 2 / max(float(whole @ whole), 1e-300), 1.0)
 
     def _smooth_terms(self, rows: Rows) -> Array | None:
-        """Terms (k, u) of the polynomial about which positions of marks scatter; None for too few of them."""
+        """Orthonormal terms (k, u) of the polynomial about which marks scatter; None for too few of them."""
         degree = next((d for d in (5, 4, 3) if _PER_SMOOTH * (d + 1) * (d + 2) <= 2 * len(rows)), None)
         if degree is None:
             return None
         at = self._straight(rows)
         at = (at - at.mean(axis=0)) / np.maximum(np.ptp(at, axis=0) / 2, 1e-9)
         terms = [at[:, 0] ** i * at[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)]
-        return np.stack(terms, axis=1)
+        return np.linalg.qr(np.stack(terms, axis=1))[0]
 
     def _match_all(self, rows: Rows) -> Matches:
         """Match disks; on even paper where paper is saturated all around."""
@@ -500,15 +499,18 @@ class PlaneMarks(MarkWindows):
         terms = self._smooth_terms(rows)
         if terms is None:
             return None
-        q, off = np.linalg.qr(terms)[0], xy - self.mapping(self.at[rows])
-        spare = 1 - np.einsum("ku,ku->k", q, q)
-        return np.asarray((off - q @ (q.T @ off)) / np.maximum(spare, 1e-9)[:, None])
+        off = xy - self.mapping(self.at[rows])
+        spare = 1 - np.einsum("ku,ku->k", terms, terms)
+        return np.asarray((off - terms @ (terms.T @ off)) / np.maximum(spare, 1e-9)[:, None])
 
     def _judged(
-        self, rows: Rows, found: Matches, before: SmoothField | None = None
+        self, rows: Rows, found: Matches, why: Array, before: SmoothField | None = None
     ) -> tuple[Array, SmoothField | None]:
-        """Reason why each mark is rejected, and the field through the others; `before` has its length."""
-        why = self._why(rows, found)
+        """Reason why each mark is rejected, and the field through the others; `before` has its length.
+
+        `why` (k,) are the reasons of their own images.
+        """
+        why = why.copy()
         source, field, known = self._straight(rows), None, before
         variance = np.trace(found.cov, axis1=1, axis2=2) / 2 + _UNMODELLED_PX**2
         radius = self.radius(rows)
