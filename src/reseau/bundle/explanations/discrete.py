@@ -1,0 +1,131 @@
+"""Explanations that choose among image points and images: gross errors, another camera.
+
+Each choice pays for what it selects: k of n image points have the prior probability 1/(n·C(n, k)), k of m images
+accordingly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.special
+
+from ...core.data import Rows
+from ..diagnostics.evidence import Effect, Scores, scores
+from .effects import Sight
+
+__all__ = ["Chosen", "gross_errors", "other_cameras"]
+
+_SUSPECTS, _PATIENCE = 120, 6
+"""Image points that are looked at as gross errors, and how many more are tried when one does not help."""
+_SPLITS = 60
+"""Divisions of the images by their principal distances that are compared."""
+
+
+class Chosen:
+    """A choice with the logarithm of its evidence.
+
+    Parameters
+    ----------
+    log_evidence : float
+        Of the image points, with the probability of the choice.
+    rows : ndarray of int
+        Used image points, or images, that were chosen.
+    explained : float
+        Decrease of the sum of squares.
+    """
+
+    def __init__(self, log_evidence: float, rows: Rows, explained: float) -> None:
+        self.log_evidence, self.rows, self.explained = log_evidence, rows, explained
+
+
+def _log_choice(n: int, k: int) -> float:
+    """Logarithm of the number of choices of k of n, for each of n numbers."""
+    return float(
+        scipy.special.gammaln(n + 1) - scipy.special.gammaln(k + 1) - scipy.special.gammaln(n - k + 1)
+        + np.log(n)
+    )  # fmt: skip
+
+
+def gross_errors(sight: Sight, known: float) -> Chosen | None:
+    """Single image points that are wrong, found one after the other."""
+    result, n = sight.result, len(sight.rows)
+    w = np.nan_to_num(np.abs(result.test_values[sight.rows]).max(axis=1))
+    suspects = np.argsort(-w, kind="stable")[: min(_SUSPECTS, n // 4)]
+    if not len(suspects):
+        return None
+    group = np.full(n, -1, dtype=np.intp)
+    group[suspects] = np.arange(len(suspects))
+    slope = np.tile(np.eye(2), (n, 1, 1)) * sight.sigma[:, None, None]
+    every = scores(result.fit, [Effect(slope, group, len(suspects))])
+    best: Chosen | None = None
+    chosen, left = list[int](), every
+    far = 1e4
+    for _ in range(len(suspects)):
+        own = left.m.reshape(len(suspects), 2, len(suspects), 2)
+        k = np.arange(len(suspects))
+        blocks, g = own[k, :, k, :] + np.eye(2) / far**2, left.g.reshape(-1, 2)
+        gain = np.einsum("ni,ni->n", g, np.linalg.solve(blocks, g[:, :, None])[:, :, 0])
+        gain[chosen] = -np.inf
+        at = int(np.argmax(gain))
+        chosen.append(at)
+        left = left.with_effects(np.array([2 * at, 2 * at + 1]), far)
+        columns = (2 * np.array(chosen)[:, None] + np.arange(2)).ravel()
+        part = every.part(columns)
+        found = part.log_evidence(known=known) - _log_choice(n, len(chosen))
+        if best is None or found > best.log_evidence:
+            best = Chosen(found, suspects[chosen], every.square - left.square)
+        elif len(chosen) >= len(best.rows) + _PATIENCE:
+            break
+    return best
+
+
+def other_cameras(sight: Sight, part: Scores, known: float) -> Chosen | None:
+    """Images that have another principal distance and point than the others, the same among themselves.
+
+    Parameters
+    ----------
+    sight : Sight
+        The image points.
+    part : Scores
+        Of principal distance and principal point of each image (3m).
+    known : float
+        Probability that the variance factor is one.
+    """
+    network, images = sight.network, len(sight.network.images)
+    used = np.bincount(sight.image, minlength=images) > 0
+    best, total = None, []
+    units = np.sqrt(np.maximum(np.diag(part.m), 1e-300))
+    plain = part.scaled(1.0 / units)
+    off = np.linalg.solve(plain.m + 1e-4 * np.eye(3 * images), plain.g).reshape(-1, 3) / units.reshape(-1, 3)
+    only = part.part(3 * np.arange(images))
+    first = np.sqrt(np.maximum(np.diag(only.m), 1e-300))
+    alone = np.linalg.solve(only.m / np.outer(first, first) + 1e-4 * np.eye(images), only.g / first) / first
+    for c in range(len(network.cameras)):
+        own = np.flatnonzero(used & (network.camera_of == c))
+        count, seen = len(own), set[bytes]()
+        for along in (alone, *off.T) if count > 2 else ():
+            order = own[np.argsort(along[own], kind="stable")]
+            for k in np.unique(np.linspace(1, count - 1, min(_SPLITS, count - 1)).astype(int)):
+                rows = np.sort(order[:k] if k <= count - k else order[k:])
+                if rows.tobytes() in seen:
+                    continue
+                seen.add(rows.tobytes())
+                member = np.zeros(images)
+                member[rows] = 1.0
+                split = part.mapped(np.kron(member[:, None], np.eye(3)))
+                split = split.scaled(1.0 / np.sqrt(np.maximum(np.diag(split.m), 1e-300)))
+                for columns in (np.arange(1), np.arange(1, 3), np.arange(3)):
+                    one = split.part(columns)
+                    found = one.log_evidence(_INFORMATION, known=known)
+                    found -= _log_choice(count, len(rows)) + np.log(3.0)
+                    total.append(found)
+                    if best is None or found > best.log_evidence:
+                        best = Chosen(found, rows, one.explained(one.best_size(_INFORMATION)))
+    if best is None:
+        return None
+    best.log_evidence = float(scipy.special.logsumexp(total))
+    return best
+
+
+_INFORMATION = np.geomspace(0.3, 3e4, 24)
+"""Sizes of effects whose unit is what the image points determine."""

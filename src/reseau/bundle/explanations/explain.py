@@ -1,0 +1,443 @@
+"""What is wrong in an adjusted network, if anything: explanations compete for the same image points.
+
+Each explanation displaces the image points by effects that the adjustment did not know of; see
+:mod:`reseau.bundle.diagnostics.evidence`. They are compared by the density of the image points, which is the
+product of those with which each is predicted by the others before it; a prior probability of one in a hundred
+that anything is wrong, shared by all, says how much better than chance an explanation must predict. The best is
+taken into account, and what is left is looked at again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.special
+
+from ...calibration.camera import by_rotation, places, projection_slopes, referred
+from ...core.data import Array, Rows
+from ...core.failure import Failure
+from ..diagnostics import Result, camera_mapping
+from ..diagnostics.evidence import Effect, Scores, scores, sigma_seen, too_large
+from .discrete import Chosen, gross_errors, other_cameras
+from .effects import Family, Sight, families, lens_at
+from .names import Misnamed
+from .sentences import advice, listed_places
+
+__all__ = ["Cause", "Explanation", "explain"]
+
+_FALSE = 0.01
+"""Probability that something is wrong, before the observations are seen. By Markov's inequality sound networks
+are called wrong no more often than this by Bayes factors against their being sound."""
+_KNOWN = 1 - _FALSE
+"""Probability that the standard deviations of the image points are right, whatever else is wrong."""
+_CAUSES = 3
+"""Causes that are named at most."""
+_ALIKE = 0.05
+"""Probability from which another explanation is named, too."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One explanation of what an adjustment leaves.
+
+    Parameters
+    ----------
+    code : str
+        ``lens``, ``refocus``, ``other-camera``, ``rolling-shutter``, ``motion``, ``target-shape``,
+        ``target-scale``, ``names``, ``blunders``, ``noise`` or ``unknown``.
+    form : str
+        Its form.
+    amount_px : float
+        What it explains in the image points, root mean square.
+    share : float
+        Its part of the sum of squares of the residuals.
+    probability : float
+        Among all explanations that were compared.
+    where : str
+        Images, points or cameras concerned; empty where it is all of them.
+    do : str
+        What to do.
+
+    Examples
+    --------
+    >>> Cause("lens", "radial", 0.12, 0.9, 1.0, "", "estimate more coefficients").code
+    'lens'
+    """
+
+    code: str
+    form: str
+    amount_px: float
+    share: float
+    probability: float
+    where: str = ""
+    do: str = ""
+
+    def entries(self) -> dict[str, object]:
+        """Entries for a document.
+
+        Examples
+        --------
+        >>> list(Cause("lens", "radial", 0.12, 0.9, 1.0).entries())
+        ['code', 'form', 'amount_px', 'share', 'probability', 'where', 'do']
+        """
+        return {
+            "code": self.code, "form": self.form, "amount_px": float(self.amount_px),
+            "share": float(self.share), "probability": float(self.probability), "where": self.where,
+            "do": self.do,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """The explanations of an adjusted network.
+
+    Parameters
+    ----------
+    causes : tuple of Cause
+        The most probable first, then others that explain alike, then what explains the rest; empty where the
+        network is sound.
+    log_evidence : mapping of str to float
+        By code: logarithm of the density of the image points by that if all is right.
+    forms : mapping of str to float
+        The same for each form of each cause.
+    """
+
+    causes: tuple[Cause, ...]
+    log_evidence: Mapping[str, float]
+    forms: Mapping[str, float]
+    _errors: tuple[_Error, ...] = field(default=(), repr=False)
+    _result: Result | None = field(default=None, repr=False)
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is wrong, but perhaps the standard deviations of the image points."""
+        return all(cause.code == "noise" for cause in self.causes)
+
+    def projection_variance(self, c: int, across: int) -> Array:
+        """Mean squares of errors of the projection over the image by what is wrong, or could be.
+
+        Parameters
+        ----------
+        c : int
+            Row of the camera.
+        across : int
+            Places along the longer side.
+
+        Returns
+        -------
+        ndarray (rows, columns, 2, 2)
+            px²; after the rotation that fits best over the image. What the model of the lens lacks counts as
+            much as it is probable; coefficients that were not estimated could be there.
+        """
+        if self._result is None:
+            return np.zeros((2, across, 2, 2))
+        lens = camera_mapping(self._result, c, formal=True)
+        xy, shape = places(lens, across, None)
+        slope, _ = projection_slopes(lens, xy)
+        uv = lens.mapping.inverse(xy)
+        known = np.isfinite(uv).all(axis=1)
+        turn = np.full((len(xy), 2, 3), np.nan)
+        turn[known] = lens.mapping.derivatives(uv[known]).d_xy @ by_rotation(uv[known], lens.mapping.parallel)
+        _, columns, _ = self._result.camera_columns(c)
+        total = np.zeros((len(xy), 2, 2))
+        for error in self._errors:
+            by = -slope @ error.scores.carried[columns]
+            own = error.at(c, xy)
+            if own is not None:
+                by[known] += referred(turn[known], own[known])
+            mean = by @ error.effects
+            total += error.weight * (
+                mean[:, :, None] * mean[:, None, :] + by @ error.covariance @ np.swapaxes(by, 1, 2)
+            )
+        return total.reshape(*shape, 2, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Form:
+    """One form of a cause: its family, columns in their units, scores and evidence."""
+
+    family: Family
+    name: str
+    columns: Rows
+    units: Array | None
+    scores: Scores
+    log_evidence: float
+
+    @property
+    def code(self) -> str:
+        return self.family.code
+
+    @property
+    def size(self) -> float:
+        return self.scores.best_size()
+
+
+@dataclass(frozen=True, eq=False)
+class _Error:
+    """Effects of a form, which may be there with the probability `weight`."""
+
+    form: _Form
+    scores: Scores
+    effects: Array
+    covariance: Array
+    weight: float
+    sight: Sight
+
+    def at(self, c: int, xy: Array) -> Array | None:
+        """Displacements of the projection at places of the image by the effects of a lens (g, 2, k)."""
+        if self.form.code != "lens":
+            return None
+        slope = lens_at(self.sight, self.form.family, c, xy)
+        q = slope.shape[2]
+        found = np.zeros((len(xy), 2, len(self.form.columns)))
+        own = np.flatnonzero(self.form.columns // q == c)
+        found[:, :, own] = slope[:, :, self.form.columns[own] % q]
+        assert self.form.units is not None
+        return found * self.form.units
+
+
+def explain(result: Result, misnamed: Misnamed | None = None) -> Explanation:
+    """Find what is wrong in an adjusted network.
+
+    Parameters
+    ----------
+    result : Result
+        The adjustment.
+    misnamed : Misnamed, optional
+        Image points that were left out before it; see :func:`misnamed`.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> explain(adjust_network(example_network())).causes
+    ()
+    """
+    before = [] if misnamed is None else [_of_names(misnamed, result)]
+    if not result.fit.cofactors.reduced.known or result.redundancy < 1 or not result.fit.cost > 0:
+        return Explanation(tuple(before), {}, {})
+    sight = Sight(result)
+    every = list(families(sight))
+    if too_large(result.fit, sum(family.effect.count for family in every)):
+        return Explanation(tuple(before), {}, {})
+    whole = scores(result.fit, [family.effect for family in every])
+    first, log_evidence, causes = whole, dict[str, float](), list[Cause]()
+    forms: list[_Form] = []
+    errors: list[_Error] = []
+    taken = set[str]()
+    for step in range(_CAUSES):
+        now = _compared(whole, every, sight, taken, discrete=step == 0)
+        if step == 0:
+            log_evidence, forms = now.log_evidence, now.forms
+            errors += _possible(now, sight)
+        found = now.causes(first, sight)
+        if not found:
+            break
+        causes += found
+        best = now.best_form(found[0].code)
+        if found[0].code in ("noise", "unknown") or best is None or best.units is None:
+            break
+        if step or found[0].code != "lens":
+            errors.append(_error(best, 1.0, sight))
+        taken.add(found[0].code)
+        begin = _begins(every)[id(best.family)]
+        whole = whole.with_effects(begin + best.columns, best.size * best.units)
+    if misnamed is not None:
+        causes = [*before, *causes] if all(cause.code == "noise" for cause in causes) else [*causes, *before]
+    each = {f"{form.code}: {form.name}": form.log_evidence for form in forms}
+    return Explanation(tuple(causes), log_evidence, each, tuple(errors), result)
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """Explanations by code, with their evidence against nothing wrong."""
+
+    log_evidence: dict[str, float]
+    forms: list[_Form]
+    chosen: dict[str, Chosen]
+
+    def best_form(self, code: str) -> _Form | None:
+        """The best form of a cause."""
+        own = [form for form in self.forms if form.code == code]
+        return max(own, key=lambda form: form.log_evidence, default=None)
+
+    def causes(self, first: Scores, sight: Sight) -> list[Cause]:
+        """The best explanation, and those that explain alike; none where nothing is wrong."""
+        prior = np.log(_FALSE / len(self.log_evidence))
+        weights = {"": np.log1p(-_FALSE)}
+        weights |= {code: value + prior for code, value in self.log_evidence.items()}
+        weights["noise"] = self.log_evidence["noise"] + np.log(_FALSE)
+        total = float(scipy.special.logsumexp(list(weights.values())))
+        share = {code: float(np.exp(weight - total)) for code, weight in weights.items()}
+        order = sorted(share, key=lambda code: -share[code])
+        if not order[0]:
+            return []
+        found = [self._cause(order[0], share[order[0]], first, sight)]
+        if order[0] not in ("noise", "unknown"):
+            alike = [code for code in order[1:] if code not in ("", "noise", "unknown")]
+            found += [self._cause(code, share[code], first, sight) for code in alike if share[code] > _ALIKE]
+        return found
+
+    def _cause(self, code: str, probability: float, first: Scores, sight: Sight) -> Cause:
+        """What a cause explains, and where."""
+        chosen, form = self.chosen.get(code), self.best_form(code)
+        sigma = float(np.sqrt(np.mean(sight.sigma**2)))
+        where = ""
+        if chosen is not None:
+            explained, name, where = chosen.explained, f"{len(chosen.rows)}", _where(code, chosen.rows, sight)
+        elif form is not None:
+            explained, name = form.scores.explained(form.size), form.name
+            where = _images(form, sight)
+        else:
+            factor = np.sqrt(first.square / first.redundancy)
+            return Cause("noise", f"{factor:.2g} times", sigma * abs(factor - 1), 0.0, probability, "",
+                         advice("noise", f"{factor:.2g}"))  # fmt: skip
+        amount = sigma * np.sqrt(max(explained, 0.0) / (2 * len(sight.rows)))
+        return Cause(code, name, amount, min(explained / first.square, 1.0), probability, where,
+                     advice(code, name))  # fmt: skip
+
+
+def _compared(
+    whole: Scores, every: Sequence[Family], sight: Sight, taken: set[str], *, discrete: bool
+) -> _Comparison:
+    """Compare all explanations of what is left."""
+    forms, parts = list[_Form](), {}
+    for family in every:
+        if family.code in taken:
+            continue
+        begin = _begins(every)[id(family)]
+        part = whole.part(slice(begin, begin + family.effect.count))
+        parts[family.code] = part
+        forms += [_again(form, sight) for form in _forms(family, part, sight)]
+    sound = whole.log_nothing(known=1.0)
+    found = {"noise": whole.log_nothing(known=0.0) - sound}
+    for code in dict.fromkeys(form.code for form in forms):
+        each = [form.log_evidence for form in forms if form.code == code]
+        found[code] = float(scipy.special.logsumexp(each)) - np.log(len(each)) - sound
+    chosen: dict[str, Chosen] = {}
+    if discrete:
+        gross = gross_errors(sight, _KNOWN)
+        other = other_cameras(sight, parts["refocus"], _KNOWN) if "refocus" in parts else None
+        chosen = {
+            code: one for code, one in (("blunders", gross), ("other-camera", other)) if one is not None
+        }
+        found |= {code: one.log_evidence - sound for code, one in chosen.items()}
+    forms = [replace(form, log_evidence=form.log_evidence - sound) for form in forms]
+    return _Comparison(found, forms, chosen)
+
+
+def _begins(every: Sequence[Family]) -> dict[int, int]:
+    """First column of each family."""
+    counts = np.cumsum([0, *(family.effect.count for family in every)])
+    return {id(family): int(at) for family, at in zip(every, counts, strict=False)}
+
+
+def _forms(family: Family, part: Scores, sight: Sight) -> list[_Form]:
+    """The forms of a cause."""
+    effect = family.effect
+    groups, q = effect.groups, effect.slope.shape[2]
+    rms = effect.rms(sight.sigma)
+    sigma = float(np.sqrt(np.mean(sight.sigma**2)))
+    found = []
+    for name, chosen in family.forms.items():
+        if chosen.ndim == 1:
+            # Each effect displaces the points of its group alike; together by one standard deviation.
+            each = np.where(rms > 0, 1.0 / np.where(rms > 0, rms, 1.0), 0.0) / np.sqrt(len(chosen))
+            columns = (np.arange(groups)[:, None] * q + chosen).ravel()
+            units: Array | None = each[:, chosen].ravel()
+            assert units is not None
+            own = part.part(columns).scaled(units)
+        else:
+            columns, units = np.arange(groups * q), None
+            own = part.combined(groups, sigma * chosen)
+        found.append(_Form(family, name, columns, units, own, own.log_evidence(known=_KNOWN)))
+    return found
+
+
+def _again(form: _Form, sight: Sight) -> _Form:
+    """The form with the evidence of a network whose points were moved; as it is where that was not needed.
+
+    Large shifts of object points displace image points by squares of them, too.
+    """
+    moves, result = form.family.moves, sight.result
+    gain = form.log_evidence - form.scores.log_nothing(known=_KNOWN)
+    if moves is None or form.units is None or gain < -np.log(_FALSE):
+        return form
+    moves = moves[:, :, form.columns] * form.units
+    size, fit, xyz = form.size, result.fit, result.fit.values.xyz
+    effects = form.scores.effects(size)
+    problem = fit.problem.continued(fit)
+    for _ in range(2):
+        moved = xyz + moves @ effects
+        network = replace(problem.network, xyz=moved)
+        start = replace(problem.start, xyz=moved)
+        again = replace(problem, network=network, start=start, rounds=0).adjusted()
+        if isinstance(again, Failure):
+            return form
+        seen = Sight(Result(network, again, result.rejected))
+        one = np.zeros(len(seen.rows), dtype=np.intp)
+        own = scores(again, [Effect(seen.by_point @ moves[seen.point], one, 1)])
+        effects = effects + own.effects(size)
+        problem = replace(problem, start=problem.continued(again).start)
+    log = own.log_evidence_at(effects, known=_KNOWN)
+    return form if log < form.log_evidence else replace(form, log_evidence=log)
+
+
+def _possible(now: _Comparison, sight: Sight) -> list[_Error]:
+    """What the lens could have that its model lacks: each form as probable as it is, against nothing."""
+    lens = [form for form in now.forms if form.code == "lens" and form.units is not None]
+    if not lens:
+        return []
+    log = np.array([0.0, *(form.log_evidence - np.log(len(lens)) for form in lens)])
+    share = np.exp(log - scipy.special.logsumexp(log))[1:]
+    return [
+        _error(form, float(weight), sight) for form, weight in zip(lens, share, strict=True) if weight > 1e-3
+    ]
+
+
+def _error(form: _Form, weight: float, sight: Sight) -> _Error:
+    """The effects of a form of its best size, and their covariance."""
+    size = form.size
+    inverse = np.linalg.inv(form.scores.m + np.eye(len(form.scores.g)) / size**2)
+    left = form.scores.square - form.scores.explained(size)
+    variance = max(left / form.scores.redundancy, 0.0)
+    return _Error(form, form.scores, inverse @ form.scores.g, variance * inverse, weight, sight)
+
+
+def _where(code: str, rows: Rows, sight: Sight) -> str:
+    """Image points, or images, that were chosen."""
+    network = sight.network
+    if code == "other-camera":
+        return listed_places([network.images[i] for i in rows], "image")
+    at = sight.rows[rows]
+    names = [f"{network.points[network.point_of[k]]} in {network.images[network.image_of[k]]}" for k in at]
+    return listed_places(names, "point")
+
+
+def _images(form: _Form, sight: Sight) -> str:
+    """The images that an effect of each image concerns most; empty where it is of all."""
+    effect = form.family.effect
+    if effect.groups != len(sight.network.images) or form.units is None:
+        return ""
+    size = np.linalg.norm(form.scores.effects(form.size).reshape(effect.groups, -1), axis=1)
+    share = size**2 / max(float((size**2).sum()), 1e-300)
+    order = np.argsort(-share, kind="stable")
+    count = int(np.searchsorted(np.cumsum(share[order]), 0.5)) + 1
+    if count > max(3, effect.groups // 4):
+        return ""
+    return "most in " + listed_places([sight.network.images[i] for i in order[:count]], "image")
+
+
+def _of_names(misnamed: Misnamed, result: Result) -> Cause:
+    """The cause of image points that were left out because they lie elsewhere."""
+    amount = float(np.sqrt(np.mean(misnamed.off_px**2)))
+    where = listed_places(list(misnamed.labels), "point")
+    share = len(misnamed.labels) / (len(result.network.xy) + len(misnamed.labels))
+    return Cause(misnamed.code, f"{len(misnamed.labels)}", amount, share, 1.0, where,
+                 advice(misnamed.code, f"{len(misnamed.labels)}"))  # fmt: skip
+
+
+def sigma_of(result: Result) -> float:
+    """Standard deviation of the image points, px, root mean square."""
+    return float(np.sqrt(np.mean(sigma_seen(result.fit) ** 2)))
