@@ -88,35 +88,42 @@ def test_the_error_that_is_stated_holds_for_a_lens_with_more_terms(k3: float) ->
     other = CameraMapping(lens, *SIZE, np.array([0]), np.zeros((1, 1)))
     off = calibration_difference(camera_mapping(result.result, 0), other).difference
     corners = np.hypot(*off[[0, 0, -1, -1], [0, -1, 0, -1]].T).max()
-    assert found.lacks == ("k3" if k3 else "")
+    assert [cause.code for cause in found.causes] == (["lens"] if k3 else [])
     assert corners < 2.5 * found.corners_px
     assert found.corners_px < max(2.5 * corners, 0.05)
     if k3:
         assert corners > 0.1
-        assert "; the model lacks k3 (0." in found.lines[0]
-        assert found.entries()["lacks"] == "k3"
+        assert "; the camera model does not describe the lens (0.0" in found.lines[0]
+        assert found.entries()["causes"][0]["code"] == "lens"
 
 
-def test_photographs_that_contradict_each_other_are_not_made_up_for_by_another_one() -> None:
+def test_photographs_with_another_zoom_are_named_and_not_made_up_for_by_another_one() -> None:
     found = calibrated(measured(zoom=1.1)).assessments["camera"]
-    assert found.contradicts
+    assert found.causes[0].code == "other-camera"
     assert found.next_photograph is None
-    assert "; the photographs contradict each other, by " in found.lines[0]
-    assert "; take them anew: focus, zoom, stabilisation or the target changed" in found.lines[1]
-    assert not calibrated(measured()).assessments["camera"].contradicts
-    # Precise points show a scatter that does not matter.
-    assert not replace(found, centre_px=0.1).contradicts
+    assert "; some photographs have another zoom, size or crop (" in found.lines[0]
+    assert calibrated(measured()).assessments["camera"].fits
 
 
 def test_a_bent_target_that_is_held_flat_is_no_fault_of_the_photographs() -> None:
     bent = measured(bent=1.5)
     found = calibrated(bent, options=CalibrationOptions(target="flat")).assessments["camera"]
-    assert found.lines[0].startswith("not usable: ")
-    assert found.lines[0].endswith("; the target is not as its points are held")
-    assert found.lines[1].endswith("; see the warning, then calibrate anew")
-    (said,) = (remark.text for remark in found.warnings if remark.code is Code.DOUBTFUL_CONTROL)
-    assert "of a target `--target free`" in said
+    assert found.causes[0].code == "target-shape"
+    assert "--target free" in found.lines[0]
     assert calibrated(bent).assessments["camera"].use is Use.MEASUREMENT
+
+
+def test_points_with_the_names_of_others_are_left_out_and_said() -> None:
+    images = measured()
+    name, points = images[3]
+    names = list(points.names)
+    names[0], names[20] = names[20], names[0]
+    images[3] = name, ImagePoints(tuple(names), points.xy, points.cov)
+    done = calibrated(images)
+    found = done.assessments["camera"]
+    assert found.causes[0].code == "names"
+    assert name in found.causes[0].where
+    assert done.sigma0 == pytest.approx(1.0, abs=0.05)
 
 
 def test_the_part_without_points_is_named_and_the_next_photograph_shows_the_target_there() -> None:
@@ -150,12 +157,10 @@ def test_the_predicted_uncertainty_is_that_after_the_photograph_was_taken() -> N
 def test_a_model_that_does_not_fit_is_said_so_in_pixels() -> None:
     found = calibrated(measured(k2=0.4), ("fx", "fy", "cx", "cy", "k1")).assessments["camera"]
     assert not found.fits
-    assert found.misfit_px > 0.05
-    assert "the model does not fit by" in found.lines[0]
-    assert found.lines[0].endswith("try --model auto")
-    # Where that was done it is no advice.
-    assert "auto" not in replace(found, compared=True).lines[0]
-    assert any(remark.code is Code.UNMODELLED for remark in found.warnings)
+    assert found.causes[0].code == "lens"
+    assert found.causes[0].amount_px > 0.05
+    assert found.causes[0].share > 0.9
+    assert "the camera model does not describe the lens (" in found.lines[0]
 
 
 def test_a_failed_global_test_of_small_residuals_is_no_alarm() -> None:
@@ -165,6 +170,8 @@ def test_a_failed_global_test_of_small_residuals_is_no_alarm() -> None:
     assert any(remark.code is Code.SIGMAS_DOUBTFUL for remark in found.tests)
     assert found.warnings == ()
     assert found.use is Use.MEASUREMENT
+    assert [cause.code for cause in found.causes] == ["noise"]
+    assert found.fits
 
 
 def test_frontal_photographs_are_not_usable() -> None:

@@ -73,6 +73,8 @@ class CameraMapping(CalibratedMapping):
         Their covariance matrix, a posteriori.
     extent : tuple of float, optional
         Left, top, right and bottom of the observations that it was estimated from, in pixels.
+    dof : float
+        Degrees of freedom of the covariance.
 
     Examples
     --------
@@ -95,6 +97,7 @@ class CameraMapping(CalibratedMapping):
     rows: Rows
     covariance: Array
     extent: tuple[float, ...] | None = None
+    dof: float = float("inf")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -177,7 +180,9 @@ class CameraMapping(CalibratedMapping):
         names, n = calibration.covariance.names, len(calibration.covariance.names)
         matrix = np.array(calibration.covariance.matrix).reshape(n, n)
         size, extent = (model["width"], model["height"]), extent_of(calibration.validity)
-        return cls.of_estimates(mapping, size, values, names, matrix, extent)
+        dof = calibration.validity.get("degrees_of_freedom")
+        dof = float(dof) if isinstance(dof, int | float) and dof > 0 else float("inf")
+        return cls.of_estimates(mapping, size, values, names, matrix, extent, dof)
 
     @classmethod
     def of_estimates(
@@ -188,11 +193,12 @@ class CameraMapping(CalibratedMapping):
         names: tuple[str, ...],
         covariance: Array,
         extent: tuple[float, ...] | None = None,
+        dof: float = float("inf"),
     ) -> Self:
         """A camera with these values of its parameters, of which those named were estimated."""
         mapping = mapping.with_values({name: values[name] for name in mapping.names if name in values})
         rows = np.array([mapping.names.index(name) for name in names], dtype=np.intp)
-        return cls(mapping, *size, rows, covariance, extent)
+        return cls(mapping, *size, rows, covariance, extent, dof)
 
 
 readable_as("camera")(CameraMapping.from_calibration)

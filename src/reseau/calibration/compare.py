@@ -42,6 +42,8 @@ class FieldDifference:
         Rotation vector (rad) by which the rays of the second were rotated.
     statistic, degrees : float, int
         χ² of the whole field, and its degrees of freedom.
+    dof : float
+        Degrees of freedom of the covariances: their scale is an estimate.
 
     Examples
     --------
@@ -57,6 +59,7 @@ class FieldDifference:
     rotation: Array
     statistic: float
     degrees: int
+    dof: float = float("inf")
 
     @property
     def sigma(self) -> Array:
@@ -66,7 +69,7 @@ class FieldDifference:
     @property
     def p(self) -> float:
         """Probability of a difference at least as large when both are calibrations of the same camera."""
-        return float(scipy.special.chdtrc(self.degrees, self.statistic)) if self.degrees else 1.0
+        return float(_tail(self.degrees, self.dof, np.array(self.statistic))) if self.degrees else 1.0
 
     @property
     def p_at(self) -> Array:
@@ -75,7 +78,7 @@ class FieldDifference:
         p = np.full(known.shape, np.nan)
         d = self.difference[known]
         square = np.einsum("ni,ni->n", d, np.linalg.solve(self.cov[known], d[:, :, None])[:, :, 0])
-        p[known] = np.exp(-0.5 * square)
+        p[known] = _tail(2, self.dof, square)
         return p
 
 
@@ -144,8 +147,25 @@ def calibration_difference(
         angle[:2] = 0.0
     return FieldDifference(
         xy.reshape(*shape, 2), difference.reshape(*shape, 2), cov.reshape(*shape, 2, 2), angle, statistic,
-        degrees,
+        degrees, _joint_dof(first, second, referred(g, carried), referred(g, own)),
     )  # fmt: skip
+
+
+def _tail(degrees: int, dof: float, statistic: Array) -> Array:
+    """Probability of a larger sum of squares, by estimated variances of so many degrees of freedom."""
+    if not np.isfinite(dof):
+        return np.asarray(scipy.special.chdtrc(degrees, statistic))
+    return np.asarray(scipy.special.fdtrc(degrees, dof, statistic / degrees))
+
+
+def _joint_dof(first: CameraMapping, second: CameraMapping, by_first: Array, by_second: Array) -> float:
+    """Degrees of freedom of the sum of two covariances (Satterthwaite 1946), of their traces over the field."""
+    parts = [
+        float(np.einsum("nij,jk,nik->", by, lens.covariance, by))
+        for by, lens in ((by_first, first), (by_second, second))
+    ]
+    spread = sum(part**2 / lens.dof for part, lens in zip(parts, (first, second), strict=True))
+    return sum(parts) ** 2 / spread if spread > 0 else float("inf")
 
 
 def _joint_root(first: CameraMapping, second: CameraMapping, by_first: Array, by_second: Array) -> Array:

@@ -23,8 +23,10 @@ from ..bundle import (
     Camera,
     CameraEstimate,
     ControlPoints,
+    Explanation,
     ImageEstimates,
     Kind,
+    Misnamed,
     ModelChoice,
     Network,
     Options,
@@ -36,6 +38,7 @@ from ..bundle import (
     camera_mapping,
     choose_board,
     choose_model,
+    explain,
     held_as_designed,
     model_search_entries,
     search_model,
@@ -57,6 +60,7 @@ from ..optics.cameras import default_camera_model
 from ..optics.refraction import RefractedRays, Refraction
 from .assessment import Assessment, assess
 from .exposures import Taken
+from .misnamed_points import left_out
 from .target_measurement import MeasuredPhotograph, Measurer, Photograph, measured_in_order, measurer_of
 from .turned_targets import named_alike, ways_to_turn
 from .z_stage import Heights
@@ -264,6 +268,8 @@ class Calibrated(Display):
         How the model of the target was chosen.
     notes : tuple of str
         How photographs were read.
+    misnamed : Misnamed, optional
+        Image points that were left out because they lie elsewhere than the others of their image say.
     """
 
     result: Result
@@ -272,6 +278,7 @@ class Calibrated(Display):
     choice: ModelChoice | None = None
     board: BoardChoice | None = None
     notes: tuple[str, ...] = ()
+    misnamed: Misnamed | None = None
 
     def __bool__(self) -> bool:
         return True
@@ -296,12 +303,17 @@ class Calibrated(Display):
         return self.result.cameras
 
     @cached_property
+    def explanation(self) -> Explanation:
+        """What is wrong, if anything."""
+        return explain(self.result, self.misnamed)
+
+    @cached_property
     def assessments(self) -> dict[str, Assessment]:
         """What the calibration of each camera is good for; of those with one set of parameters."""
         network = self.result.network
         one = {c for c, entry in enumerate(network.cameras) if entry.has_plane_mapping}
         return {
-            entry.id: assess(self.result, c, compared=self.choice is not None)
+            entry.id: assess(self.result, c, self.explanation)
             for c, entry in enumerate(network.cameras)
             if c in one and (entry.additional is None or entry.additional.per == "camera")
         }
@@ -526,6 +538,39 @@ def _calibrated(
         raise UsageError(
             "is not known without a photograph", where="size of the images", do="give width and height"
         )
+    stand_in = Camera(_CAMERA, 1, 1, (1.0, 1.0), "opencv", np.zeros(len(camera_model("opencv").names)))
+    wrong = left_out(network_of(measured, design, stand_in), cameras, sizes, of)
+    if wrong is None:
+        return _adjusted(measured, declined, sizes, notes, design, model, options, taken, executor, None)
+    done = _adjusted(
+        wrong.kept(measured), declined, sizes, notes, design, model, options, taken, executor, wrong.found
+    )
+    if isinstance(done, Failure):
+        return done
+    still = wrong.after(done.result)
+    if still is not None and len(still.found.rows) == len(wrong.found.rows):
+        return done
+    # By the adjusted camera some of them are in their own places.
+    kept, found = (measured, None) if still is None else (still.kept(measured), still.found)
+    return _adjusted(kept, declined, sizes, notes, design, model, options, taken, executor, found)
+
+
+def _adjusted(
+    measured: dict[str, ImagePoints],
+    declined: dict[str, str],
+    sizes: Mapping[str, tuple[int, int]],
+    notes: tuple[str, ...],
+    design: PlaneDesign,
+    model: CameraOptions | None,
+    options: CalibrationOptions,
+    taken: Mapping[str, Taken] | None,
+    executor: Executor | None,
+    wrong: Misnamed | None,
+) -> Calibrated | Failure:
+    """Adjust the points of photographs, of which those that are wrong were left out."""
+    measured = {name: points for name, points in measured.items() if len(points) >= _LEAST_POINTS}
+    cameras = list(dict.fromkeys(each.camera for each in taken.values())) if taken else [_CAMERA]
+    of = [cameras.index(taken[name].camera) if taken else 0 for name in measured]
     refraction = None
     if options.refraction is not None:
         refraction = options.refraction.refraction(tuple(measured), tuple(cameras[c] for c in of))
@@ -573,7 +618,7 @@ def _calibrated(
         if found.code is Code.NOT_CONVERGED:
             return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
         return found
-    calibrated = Calibrated(found, measured, declined, choice, board, notes)
+    calibrated = Calibrated(found, measured, declined, choice, board, notes, wrong)
     loose = _without_scale(calibrated.result)
     return calibrated if loose is None else loose
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -37,9 +37,13 @@ class CameraEstimate(Display):
     values : ndarray (u,)
         Estimates, in the units of `units`.
     covariance : ndarray (u, u)
-        Their covariance.
+        Their covariance, which contains what the points of each image have in common.
     units : tuple of str (u,)
         Units; empty for dimensionless parameters.
+    formal : ndarray (u, u), optional
+        The covariance that presumes independent errors of all image points; by default the same.
+    dof : ndarray (u,), optional
+        Degrees of freedom of the variances, for intervals by Student's distribution.
 
     Examples
     --------
@@ -55,11 +59,18 @@ class CameraEstimate(Display):
     values: Array
     covariance: Array
     units: tuple[str, ...]
+    formal: Array | None = field(default=None, kw_only=True)
+    dof: Array | None = field(default=None, kw_only=True)
 
     @property
     def sigma(self) -> Array:
         """Standard deviations (u,)."""
         return _deviations(self.covariance)
+
+    @property
+    def sigma_formal(self) -> Array:
+        """Standard deviations (u,) that presume independent errors of all image points."""
+        return self.sigma if self.formal is None else _deviations(self.formal)
 
     @property
     def correlation(self) -> Array:

@@ -13,7 +13,9 @@ from .result import Result
 __all__ = ["camera_mapping", "projection_field_at"]
 
 
-def camera_mapping(result: Result, c: int, additional: str | None = None) -> CameraMapping:
+def camera_mapping(
+    result: Result, c: int, additional: str | None = None, *, formal: bool = False
+) -> CameraMapping:
     """Return the mapping of an adjusted camera with its covariance.
 
     Parameters
@@ -24,6 +26,8 @@ def camera_mapping(result: Result, c: int, additional: str | None = None) -> Cam
         Row of the camera.
     additional : str, optional
         Set of additional parameters, ``group G`` or ``image I``; required where there are several.
+    formal : bool
+        Whether its covariance is the one that presumes independent errors of all image points.
 
     Raises
     ------
@@ -40,10 +44,15 @@ def camera_mapping(result: Result, c: int, additional: str | None = None) -> Cam
     """
     camera = result.network.cameras[c]
     names, columns, values = own_columns(result, c, additional)
-    covariance = result.fit.cofactors.reduced.block(columns, columns) * result.fit.variance
+    if formal:
+        covariance = result.fit.cofactors.reduced.block(columns, columns) * result.fit.variance
+        degrees = float("inf")
+    else:
+        uncertain = result.uncertainty(columns)
+        covariance, degrees = uncertain.covariance, uncertain.degrees
     found = camera.parameters | dict(zip(names, values.tolist(), strict=True))
     size = (camera.width, camera.height)
-    return CameraMapping.of_estimates(camera.plane_mapping(), size, found, names, covariance)
+    return CameraMapping.of_estimates(camera.plane_mapping(), size, found, names, covariance, dof=degrees)
 
 
 def own_columns(result: Result, c: int, additional: str | None) -> tuple[tuple[str, ...], Rows, Array]:

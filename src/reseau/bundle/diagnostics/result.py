@@ -33,6 +33,8 @@ from .estimates import (
     StageEstimate,
 )
 
+from .shared import SharedErrors, Uncertainty, shared_errors
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -199,10 +201,27 @@ class Result(Display):
 
     def camera(self, c: int) -> CameraEstimate:
         """Return the estimated parameters of the c-th camera of the network."""
-        names, _, values = self.camera_columns(c)
+        names, columns, values = self.camera_columns(c)
         entry = self.network.cameras[c]
         units = tuple(entry.unit_of(name) for name in names)
-        return CameraEstimate(entry.id, names, values, self.camera_covariance(c), units)
+        found = self.uncertainty(columns)
+        return CameraEstimate(
+            entry.id, names, values, found.covariance, units, formal=found.formal, dof=found.dof
+        )
+
+    @cached_property
+    def shared(self) -> SharedErrors | None:
+        """What the points of each image have in common; None where it cannot be estimated."""
+        return shared_errors(self.fit) if self.fit.cofactors.reduced.known else None
+
+    def uncertainty(self, columns: Rows) -> Uncertainty:
+        """Covariance of reduced unknowns (k,) that contains what the points of each image have in common."""
+        if self.shared is not None and len(columns):
+            return self.shared.uncertainty(columns)
+        formal = self.fit.cofactors.reduced.block(columns, columns) * self.fit.variance
+        # Without redundancy the covariance is that of the given standard deviations.
+        degrees = float(self.redundancy) if self.redundancy > 0 else np.inf
+        return Uncertainty(formal, formal, np.full(len(columns), degrees), degrees)
 
     @cached_property
     def cameras(self) -> dict[str, CameraEstimate]:
@@ -399,7 +418,14 @@ class Result(Display):
         return tuple(names), np.array(columns, dtype=np.intp), np.array(found)
 
     def camera_covariance(self, c: int) -> Array:
-        """Return the covariance of the estimated camera parameters, ordered as :meth:`camera_columns`."""
+        """Return the covariance of the estimated camera parameters, ordered as :meth:`camera_columns`.
+
+        It contains what the points of each image have in common; see :mod:`.shared`.
+        """
+        return self.uncertainty(self.camera_columns(c)[1]).covariance
+
+    def formal_camera_covariance(self, c: int) -> Array:
+        """Return the covariance that presumes independent errors of all image points."""
         _, columns, _ = self.camera_columns(c)
         covariance: Array = self.fit.cofactors.reduced.block(columns, columns) * self.fit.variance
         return covariance

@@ -13,7 +13,7 @@ from ...core.data import Rows
 from ..diagnostics.evidence import Effect, Scores, scores
 from .effects import Sight
 
-__all__ = ["Chosen", "gross_errors", "other_cameras"]
+__all__ = ["Chosen", "gross_errors", "log_choice", "other_cameras"]
 
 _SUSPECTS, _PATIENCE = 120, 6
 """Image points that are looked at as gross errors, and how many more are tried when one does not help."""
@@ -38,7 +38,7 @@ class Chosen:
         self.log_evidence, self.rows, self.explained = log_evidence, rows, explained
 
 
-def _log_choice(n: int, k: int) -> float:
+def log_choice(n: int, k: int) -> float:
     """Logarithm of the number of choices of k of n, for each of n numbers."""
     return float(
         scipy.special.gammaln(n + 1) - scipy.special.gammaln(k + 1) - scipy.special.gammaln(n - k + 1)
@@ -71,7 +71,7 @@ def gross_errors(sight: Sight, known: float) -> Chosen | None:
         left = left.with_effects(np.array([2 * at, 2 * at + 1]), far)
         columns = (2 * np.array(chosen)[:, None] + np.arange(2)).ravel()
         part = every.part(columns)
-        found = part.log_evidence(known=known) - _log_choice(n, len(chosen))
+        found = part.log_evidence(known=known) - log_choice(n, len(chosen))
         if best is None or found > best.log_evidence:
             best = Chosen(found, suspects[chosen], every.square - left.square)
         elif len(chosen) >= len(best.rows) + _PATIENCE:
@@ -117,7 +117,7 @@ def other_cameras(sight: Sight, part: Scores, known: float) -> Chosen | None:
                 for columns in (np.arange(1), np.arange(1, 3), np.arange(3)):
                     one = split.part(columns)
                     found = one.log_evidence(_INFORMATION, known=known)
-                    found -= _log_choice(count, len(rows)) + np.log(3.0)
+                    found -= log_choice(count, len(rows)) + np.log(3.0)
                     total.append(found)
                     if best is None or found > best.log_evidence:
                         best = Chosen(found, rows, one.explained(one.best_size(_INFORMATION)))

@@ -20,7 +20,8 @@ from ...core.data import Array, Rows
 from ...core.failure import Failure
 from ..diagnostics import Result, camera_mapping
 from ..diagnostics.evidence import Effect, Scores, scores, sigma_seen, too_large
-from .discrete import Chosen, gross_errors, other_cameras
+from .alternatives import Alternative, alternatives, another_camera
+from .discrete import Chosen, gross_errors, log_choice, other_cameras
 from .effects import Family, Sight, families, lens_at
 from .names import Misnamed
 from .sentences import advice, listed_places
@@ -59,6 +60,8 @@ class Cause:
         Images, points or cameras concerned; empty where it is all of them.
     do : str
         What to do.
+    instead : bool
+        Whether it explains the same as the cause before it.
 
     Examples
     --------
@@ -73,6 +76,7 @@ class Cause:
     probability: float
     where: str = ""
     do: str = ""
+    instead: bool = False
 
     def entries(self) -> dict[str, object]:
         """Entries for a document.
@@ -80,12 +84,12 @@ class Cause:
         Examples
         --------
         >>> list(Cause("lens", "radial", 0.12, 0.9, 1.0).entries())
-        ['code', 'form', 'amount_px', 'share', 'probability', 'where', 'do']
+        ['code', 'form', 'amount_px', 'share', 'probability', 'where', 'do', 'instead']
         """
         return {
             "code": self.code, "form": self.form, "amount_px": float(self.amount_px),
             "share": float(self.share), "probability": float(self.probability), "where": self.where,
-            "do": self.do,
+            "do": self.do, "instead": self.instead,
         }  # fmt: skip
 
 
@@ -236,7 +240,8 @@ def explain(result: Result, misnamed: Misnamed | None = None) -> Explanation:
             break
         causes += found
         best = now.best_form(found[0].code)
-        if found[0].code in ("noise", "unknown") or best is None or best.units is None:
+        large = found[0].code in now.adjusted
+        if found[0].code in ("noise", "unknown") or best is None or best.units is None or large:
             break
         if step or found[0].code != "lens":
             errors.append(_error(best, 1.0, sight))
@@ -256,6 +261,7 @@ class _Comparison:
     log_evidence: dict[str, float]
     forms: list[_Form]
     chosen: dict[str, Chosen]
+    adjusted: dict[str, Alternative]
 
     def best_form(self, code: str) -> _Form | None:
         """The best form of a cause."""
@@ -276,15 +282,20 @@ class _Comparison:
         found = [self._cause(order[0], share[order[0]], first, sight)]
         if order[0] not in ("noise", "unknown"):
             alike = [code for code in order[1:] if code not in ("", "noise", "unknown")]
-            found += [self._cause(code, share[code], first, sight) for code in alike if share[code] > _ALIKE]
+            others = [self._cause(code, share[code], first, sight) for code in alike if share[code] > _ALIKE]
+            found += [replace(cause, instead=True) for cause in others]
         return found
 
     def _cause(self, code: str, probability: float, first: Scores, sight: Sight) -> Cause:
         """What a cause explains, and where."""
         chosen, form = self.chosen.get(code), self.best_form(code)
         sigma = float(np.sqrt(np.mean(sight.sigma**2)))
-        where = ""
-        if chosen is not None:
+        where, other = "", self.adjusted.get(code)
+        if other is not None and chosen is not None:
+            explained, name, where = other.explained, other.form, _where(code, chosen.rows, sight)
+        elif other is not None:
+            explained, name = other.explained, other.form
+        elif chosen is not None:
             explained, name, where = chosen.explained, f"{len(chosen.rows)}", _where(code, chosen.rows, sight)
         elif form is not None:
             explained, name = form.scores.explained(form.size), form.name
@@ -324,7 +335,18 @@ def _compared(
         }
         found |= {code: one.log_evidence - sound for code, one in chosen.items()}
     forms = [replace(form, log_evidence=form.log_evidence - sound) for form in forms]
-    return _Comparison(found, forms, chosen)
+    better: dict[str, Alternative] = {}
+    if discrete and max(found.values()) > -np.log(_FALSE) and max(found, key=found.__getitem__) != "noise":
+        every_other = [*alternatives(sight.result, _KNOWN)]
+        if "other-camera" in chosen:
+            rows = chosen["other-camera"].rows
+            count = len(sight.network.images)
+            every_other.append(another_camera(sight.result, rows, _KNOWN, log_choice(count, len(rows))))
+        for other in every_other:
+            if other is not None and other.log_evidence - sound > found.get(other.code, -np.inf):
+                found[other.code] = other.log_evidence - sound
+                better[other.code] = other
+    return _Comparison(found, forms, chosen, better)
 
 
 def _begins(every: Sequence[Family]) -> dict[int, int]:

@@ -11,7 +11,7 @@ import numpy as np
 from ...calibration.document import Calibration, CameraModel, Covariance, Place, Quantity
 from ...core.errors import UsageError
 from ...optics.poses import matrix_to_vector
-from ..diagnostics import Result, covariance_by_targets, sigma_between_images
+from ..diagnostics import Result, covariance_by_targets
 from ..network import Camera, Network
 
 __all__ = ["calibration_of", "with_estimates"]
@@ -61,8 +61,8 @@ def calibration_of(
     names, _, values = result.camera_columns(c)
     if not names:
         raise UsageError("no parameter was estimated", where=f"camera {camera}")
-    covariance = result.camera_covariance(c)
-    sigma = np.sqrt(np.diag(covariance))
+    found = result.camera(c)
+    covariance, sigma = found.covariance, found.sigma
     parameters = {
         key: Quantity(value=value, sigma=0.0, unit=entry.unit_of(key))
         for key, value in entry.parameters.items()
@@ -70,7 +70,8 @@ def calibration_of(
         key: Quantity(value=float(value), sigma=float(s), unit=entry.unit_of(key))
         for key, value, s in zip(names, values, sigma, strict=True)
     }
-    between = zip(names, sigma_between_images(result, c).tolist(), strict=True)
+    degrees = result.uncertainty(result.camera_columns(c)[1]).degrees
+    dof = {"degrees_of_freedom": degrees} if np.isfinite(degrees) else {}
     used = result.fit.usable.observations & ~result.rejected
     xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
     targets = covariance_by_targets(result, c)
@@ -87,7 +88,7 @@ def calibration_of(
         redundancy=result.redundancy,
         tests=tuple(vars(test) for test in result.camera_tests(c)),
         validity={"extent": [*xy.min(axis=0).tolist(), *xy.max(axis=0).tolist()], "unit": "px",
-                  "sigma_between_images": {key: s for key, s in between if np.isfinite(s)},
+                  "sigma_formal": dict(zip(names, found.sigma_formal.tolist(), strict=True)), **dof,
                   "images": int(np.count_nonzero(result.fit.usable.images & (result.network.camera_of == c))),
                   **by_targets,
                   "warnings": [remark.text for remark in result.warnings],

@@ -1,0 +1,475 @@
+"""What the points of an image have in common: components of variance, and the uncertainty that contains them.
+
+Paper that bends, motion, a lens that focuses anew, or what the model leaves of the lens displace the points of an
+image together. They are described by random effects of each image: a smooth field with the covariance
+τ² exp(−d²/2ℓ²) over distances d in the image, and a change of the principal distance. The variances are those of
+the largest restricted likelihood (Patterson & Thompson 1971, *Biometrika* 58), weighted over several lengths ℓ. With
+the sensitivities H = Q Aᵀ P C of the estimates to the effects θ ~ N(0, T), the covariance of the estimates is
+
+    σ² Q + H T Hᵀ,
+
+of which σ² Q with σ² from all residuals, the formal one, is the least that is taken. Degrees of freedom follow from
+the information on the variances (Satterthwaite 1946; Fai & Cornelius 1996).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+
+from ...core.data import Array, Rows
+from ..solver import BundleFit
+from .evidence import Effect, Scores, places_seen, scores, sensitivities, sigma_seen, too_large, used_rows
+
+__all__ = ["SharedErrors", "Uncertainty", "shared_errors", "smooth_effects"]
+
+_LENGTHS = (0.3, 0.6, 1.2)
+"""Distances, in half the diagonal of the image, over which displacements of an image are alike."""
+_DEGREE, _NODES = 4, 12
+"""Degree of the polynomials that describe a smooth field, and nodes of the integration over the image."""
+_LEAST, _MOST = 3, 48
+"""Fewer images show nothing in common; of more, as many are looked at."""
+_SHAPE = 0.7
+"""Standard deviation of the logarithm by which fields of another form than assumed do more or less to a parameter:
+a factor of two."""
+_GRID = np.geomspace(0.03, 100.0, 10)
+"""Standard deviations of the effects, in that of image points, at which the likelihood is computed first."""
+_POWERS = [(i, d - i) for d in range(_DEGREE + 1) for i in range(d + 1)]
+_COUNT = len(_POWERS)
+
+
+def smooth_effects(fit: BundleFit) -> tuple[Effect, dict[str, Array]]:
+    """Smooth displacements of each image, and their forms by length, (images, q, q).
+
+    The coefficients of polynomials that are orthonormal over the image have the covariance that follows from
+    that of the field.
+    """
+    network, rows = fit.problem.network, used_rows(fit)
+    image = network.image_of[rows]
+    xy = places_seen(fit)
+    slope = np.zeros((len(rows), 2, 2 * _COUNT))
+    sizes = np.array([[camera.width, camera.height] for camera in network.cameras])[network.camera_of]
+    values = _polynomials(2 * (xy + 0.5) / sizes[image] - 1)
+    slope[:, 0, :_COUNT] = slope[:, 1, _COUNT:] = values
+    halves, of = np.unique(sizes / np.hypot(*sizes.T)[:, None], axis=0, return_inverse=True)
+    forms = {}
+    for length in _LENGTHS:
+        both = np.zeros((len(halves), 2 * _COUNT, 2 * _COUNT))
+        for k, half in enumerate(halves):
+            both[k, :_COUNT, :_COUNT] = both[k, _COUNT:, _COUNT:] = _root(half, length)
+        forms[f"{length:g}"] = both[of.ravel()]
+    return Effect(slope, image, len(network.images)), forms
+
+
+def distance_effects(fit: BundleFit) -> Effect:
+    """Displacements of the points of each image by a relative change of its principal distance.
+
+    They are those from the principal point, but for what the distortion changes.
+    """
+    network, rows = fit.problem.network, used_rows(fit)
+    image = network.image_of[rows]
+    xy = places_seen(fit)
+    slope = np.zeros((len(rows), 2, 1))
+    for c, camera in enumerate(network.cameras):
+        own = np.flatnonzero(network.camera_of[image] == c)
+        values = fit.values.cameras[c, : len(camera.values)]
+        centre = camera.bare_mapping(values)(np.zeros((1, 2)))[0] if camera.has_plane_mapping else None
+        centre = np.array([camera.width, camera.height]) / 2 if centre is None else centre
+        slope[own, :, 0] = xy[own] - centre
+    return Effect(slope, image, len(network.images))
+
+
+def _polynomials(at: Array) -> Array:
+    """Products of Legendre polynomials, orthonormal over the square from −1 to 1 (n, k)."""
+    x, y = (np.polynomial.legendre.legvander(np.clip(axis, -1.5, 1.5), _DEGREE) for axis in at.T)
+    norm = np.sqrt(2 * np.arange(_DEGREE + 1) + 1)
+    return np.stack([x[:, i] * norm[i] * y[:, j] * norm[j] for i, j in _POWERS], axis=1)
+
+
+def _root(half: Array, length: float) -> Array:
+    """Root (k, k) of the covariance of the coefficients; `half` is the size of the image by its diagonal."""
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    x, y = (axis.ravel() for axis in np.meshgrid(nodes, nodes))
+    weight = np.outer(weights, weights).ravel() / 4
+    at = np.column_stack([x, y]) * half
+    distance = ((at[:, None] - at) ** 2).sum(axis=2)
+    weighted = _polynomials(np.column_stack([x, y])) * weight[:, None]
+    cov = weighted.T @ np.exp(-0.5 * distance / length**2) @ weighted
+    return np.asarray(np.linalg.cholesky(cov + 1e-12 * np.eye(_COUNT)))
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """Covariance of some unknowns.
+
+    Parameters
+    ----------
+    covariance, formal : ndarray (k, k)
+        With what the points of an image have in common, and that of independent errors.
+    dof : ndarray (k,)
+        Degrees of freedom of the variances.
+    degrees : float
+        Those of the whole, for tests of all together.
+    """
+
+    covariance: Array
+    formal: Array
+    dof: Array
+    degrees: float
+
+
+@dataclass(frozen=True, eq=False)
+class SharedErrors:
+    """Components of variance of an adjusted network.
+
+    Parameters
+    ----------
+    fit : BundleFit
+        The adjustment.
+    variance : float
+        Variance factor of single image points.
+    smooth : ndarray (l,)
+        Standard deviations of the smooth fields, in those of image points, by their length.
+    distance : float
+        The same of displacements by principal distances.
+    weights : ndarray (l,)
+        Weights of the lengths; what is missing to one is that of no shared errors.
+    spread : ndarray (3, 3)
+        Covariance of the estimated variances: of image points, smooth fields and principal distances.
+    scores : Scores
+        Of the parameters of the cameras, as effects of each image that was looked at.
+    pulls : ndarray (i, q, q)
+        Covariances of these scores by the shared errors.
+    """
+
+    fit: BundleFit
+    variance: float
+    smooth: Array
+    distance: float
+    weights: Array
+    spread: Array
+    scores: Scores
+    pulls: Array
+
+    @property
+    def size(self) -> float:
+        """Displacement that the points of an image have in common, in their standard deviations."""
+        return float(np.sqrt(self.weights @ self.smooth**2 + self.distance**2))
+
+    def uncertainty(self, columns: Rows) -> Uncertainty:
+        """The uncertainty of parameters of cameras (k,), by their columns among the reduced unknowns."""
+        every, total, parts, spread = self._of_cameras
+        place = {column: k for k, column in enumerate(every.tolist())}
+        at = np.array([place[column] for column in columns.tolist()], dtype=np.intp)
+        formal = self.fit.cofactors.reduced.block(columns, columns) * self.fit.variance
+        whole, own = total[np.ix_(at, at)], parts[:, at][:, :, at]
+        root = np.linalg.pinv(formal, hermitian=True)
+        # As one variance: the mean of the parts in relation to the formal covariance.
+        mean = np.array([np.trace(root @ part) for part in own])
+        dof = _degrees(np.diagonal(own, axis1=1, axis2=2), spread)
+        return Uncertainty(whole, formal, dof, float(_degrees(mean[:, None], spread)[0]))
+
+    @cached_property
+    def _of_cameras(self) -> tuple[Rows, Array, Array, Array]:
+        """Columns of all cameras, their covariance, its parts by direction, and the covariance of these.
+
+        What shared errors do to the cameras is corrected in each direction of its own: by the scores of the
+        images, which may be larger or smaller than a field of the assumed form makes them.
+        """
+        fit, unknowns = self.fit, self.fit.unknowns
+        columns = _camera_columns(fit)
+        q = fit.cofactors.reduced.block(columns, columns)
+        formal = q * fit.variance
+        shared = self._carried(columns)
+        if not len(columns) or not np.trace(shared) > 0:
+            spread = np.array([[2.0 / fit.redundancy]])
+            return columns, formal, formal[None], spread
+        size = np.sqrt(np.maximum(np.diag(q), 0.0))
+        values, vectors = np.linalg.eigh(q / np.outer(size, size))
+        root = size[:, None] * vectors * np.sqrt(np.maximum(values, 1e-14 * values[-1]))
+        inverse = np.linalg.inv(root)
+        b, turn = np.linalg.eigh(inverse @ shared @ inverse.T)
+        directions, b = root @ turn, np.maximum(b, 0.0)
+        sizes, relative = self._factors(columns, directions, unknowns.camera, unknowns.count)
+        own = sizes**2 * b
+        parts = np.concatenate(
+            [self.variance * q[None], self.variance * own[:, None, None]
+             * directions.T[:, :, None] * directions.T[:, None, :]]
+        )  # fmt: skip
+        total = _not_below(parts.sum(axis=0), formal)
+        # The size of all together is known as well as the likelihood says, that of each as its scores say.
+        spread = np.diag(np.concatenate([[self.spread[0, 0] / self.variance**2], relative]))
+        return columns, total, parts, spread
+
+    def _carried(self, columns: Rows) -> Array:
+        """Covariance (k, k) of parameters by shared errors, for a variance factor of one."""
+        fit, k = self.fit, len(columns)
+        found = np.zeros((k, k))
+        sigma = sigma_seen(fit)
+        typical = float(np.sqrt(np.mean(sigma**2)))
+        if self.smooth.any():
+            smooth, forms = smooth_effects(fit)
+            by = sensitivities(fit, smooth, columns).reshape(k, smooth.groups, -1)
+            for weight, size, root in zip(self.weights, self.smooth, forms.values(), strict=True):
+                if weight * size > 0:
+                    own = np.einsum("kgq,gqp->kgp", by, typical * root).reshape(k, -1)
+                    found += weight * size**2 * (own @ own.T)
+        if self.distance > 0:
+            distance = distance_effects(fit)
+            own = sensitivities(fit, distance, columns) * _inverse(distance.rms(sigma)).ravel()
+            found += self.distance**2 * (own @ own.T)
+        return found
+
+    def _factors(
+        self, columns: Rows, directions: Array, camera: Rows, count: Rows
+    ) -> tuple[Array, Array]:
+        """Factors on the shared errors in each direction (k,), and relative variances of their squares."""
+        groups, width = self.pulls.shape[:2]
+        by_image = np.zeros((groups, width, len(columns)))
+        place = {column: k for k, column in enumerate(columns.tolist())}
+        for i, image in enumerate(_looked_at(self.fit)):
+            c = int(self.fit.problem.network.camera_of[image])
+            for k in range(int(count[c]) if camera[c] >= 0 else 0):
+                by_image[i, k, place[int(camera[c]) + k]] = 1.0
+        turned = by_image @ directions
+        g = np.einsum("iq,iqk->ik", self.scores.g.reshape(groups, width), turned) ** 2 / self.variance
+        k = np.arange(groups)
+        m = self.scores.m.reshape(groups, width, groups, width)[k, :, k, :]
+        own = np.einsum("iqk,iqr,irk->ik", turned, m, turned)
+        shared = np.einsum("iqk,iqr,irk->ik", turned, self.pulls, turned)
+        grid = np.linspace(np.log(0.05), np.log(5.0), 160)
+        var = np.maximum(own + np.exp(2 * grid)[:, None, None] * shared, 1e-300)
+        log = -0.5 * (np.log(var) + g / var).sum(axis=1)
+        together = grid[int(np.argmax(log.sum(axis=1)))]
+        log = log - 0.5 * ((grid[:, None] - together) / _SHAPE) ** 2
+        weight = np.exp(log - log.max(axis=0))
+        weight /= weight.sum(axis=0)
+        # The mean of the variance over what the scores leave possible.
+        mean = (weight * np.exp(2 * grid)[:, None]).sum(axis=0)
+        square = (weight * np.exp(4 * grid)[:, None]).sum(axis=0)
+        return np.sqrt(mean), square / mean**2 - 1
+
+
+def _degrees(parts: Array, spread: Array) -> Array:
+    """Degrees of freedom of sums of parts (p, …) with relative variances and covariances (p, p)."""
+    total = parts.sum(axis=0)
+    variance = np.einsum("i...,ij,j...->...", parts, spread, parts)
+    return np.asarray(np.divide(2 * total**2, variance, out=np.full(total.shape, np.inf), where=variance > 0))
+
+
+def _camera_columns(fit: BundleFit) -> Rows:
+    """Columns of all parameters of cameras among the reduced unknowns."""
+    unknowns = fit.unknowns
+    parts = [
+        unknowns.camera[c] + np.arange(unknowns.count[c]) for c in np.flatnonzero(unknowns.camera >= 0)
+    ]
+    parts += [
+        unknowns.extra[e] + np.arange(unknowns.extra_count[e]) for e in np.flatnonzero(unknowns.extra >= 0)
+    ]
+    return np.concatenate(parts).astype(np.intp) if parts else np.zeros(0, dtype=np.intp)
+
+
+def _looked_at(fit: BundleFit) -> Rows:
+    """Images from which the components are estimated: all, or as many spread over them."""
+    images = np.flatnonzero(fit.usable.images)
+    return images if len(images) <= _MOST else images[np.linspace(0, len(images) - 1, _MOST).astype(int)]
+
+
+def shared_errors(fit: BundleFit) -> SharedErrors | None:
+    """Estimate what the points of each image have in common.
+
+    Parameters
+    ----------
+    fit : BundleFit
+        The adjustment.
+
+    Returns
+    -------
+    SharedErrors or None
+        None with fewer than three images, without redundancy, or where the network is too large.
+    """
+    network = fit.problem.network
+    images = _looked_at(fit)
+    if len(images) < _LEAST or fit.redundancy < 1 or not fit.sigma0 > 0:
+        return None
+    (smooth, forms), distance = smooth_effects(fit), distance_effects(fit)
+    place = np.full(len(network.images), -1, dtype=np.intp)
+    place[images] = np.arange(len(images))
+    some = [
+        Effect(effect.slope, np.where(effect.group >= 0, place[effect.group], -1), len(images))
+        for effect in (smooth, distance)
+    ]
+    if too_large(fit, sum(effect.count for effect in some)) or not len(_camera_columns(fit)):
+        return None
+    own = _camera_effects(fit, place, len(images))
+    every = scores(fit, [*some, own])
+    sigma = sigma_seen(fit)
+    typical = float(np.sqrt(np.mean(sigma**2)))
+    count = some[0].count
+    end = count + some[1].count
+    unit = _inverse(some[1].rms(sigma)).ravel()
+    focal = every.part(slice(count, end)).scaled(unit)
+    cross = every.m[:count, count:end] * unit
+    fits = []
+    for root in forms.values():
+        field = every.part(slice(0, count)).combined(len(images), typical * root[images])
+        between = _across(cross, typical * root[images])
+        m = np.block([[field.m, between], [between.T, focal.m]])
+        joint = Scores(np.concatenate([field.g, focal.g]), m, every.square, every.redundancy, m[:0])
+        seen = np.concatenate([_across(every.m[:count, end:], typical * root[images]), unit[:, None] * every.m[count:end, end:]])
+        fits.append((_largest(joint, count), joint, seen))
+    # Each component pays for itself as a parameter of which there are as many observations as images (Schwarz).
+    log = np.array([found[2] - 0.5 * np.log(len(images)) * np.count_nonzero(found[:2]) for found, *_ in fits])
+    nothing = -0.5 * every.redundancy * np.log(every.square / every.redundancy)
+    weights = np.exp(log - max(float(log.max()), nothing))
+    weights /= weights.sum() + len(weights) * np.exp(nothing - max(float(log.max()), nothing))
+    (size, focal_size, _), joint, _ = fits[int(np.argmax(log))]
+    variance, spread = _information(joint, count, size, focal_size)
+    sizes = np.array([found[0] for found, *_ in fits])
+    focals = np.array([found[1] for found, *_ in fits])
+    width = own.slope.shape[2]
+    pulls = np.zeros((len(images), width, width))
+    k = np.arange(len(images))
+    for weight, a, b, (_, _, seen) in zip(weights, sizes, focals, fits, strict=True):
+        half = (np.repeat([a, b], [count, end - count])[:, None] * seen).reshape(-1, len(images), width)
+        pulls += weight * np.einsum("niq,nir->iqr", half, half)[k]
+    distance_size = float(np.sqrt(weights @ focals**2))
+    by_camera = every.part(slice(end, None))
+    return SharedErrors(fit, variance, sizes, distance_size, weights, spread, by_camera, pulls)
+
+
+def _camera_effects(fit: BundleFit, place: Rows, count: int) -> Effect:
+    """The parameters of the camera as effects of each image: what they are pulled by."""
+    linear, unknowns = fit.linear, fit.unknowns
+    rows, network = used_rows(fit), fit.problem.network
+    image = network.image_of[rows]
+    camera = network.camera_of[image]
+    width = int(unknowns.count.max(initial=0))
+    slope, inverse = np.zeros((len(rows), 2, width)), np.linalg.inv(linear.system.seen.root)
+    pattern = linear.system.pattern
+    for c in np.flatnonzero(unknowns.camera >= 0):
+        own = np.flatnonzero(camera == c)
+        for k in range(unknowns.count[c]):
+            at = unknowns.camera[c] + k
+            inside = (pattern.start[own] <= at) & (at < pattern.start[own] + pattern.width[own])
+            segment = np.argmax(inside, axis=1)
+            column = pattern.column[own, segment] + at - pattern.start[own, segment]
+            slope[own, :, k] = linear.rows[own, :, column] * inside.any(axis=1)[:, None]
+    slope = inverse @ slope
+    return Effect(slope, place[image], count)
+
+
+def _across(cross: Array, roots: Array) -> Array:
+    """Information between combined columns of each image and others."""
+    groups, q, k = roots.shape
+    return np.asarray((np.swapaxes(roots, 1, 2) @ cross.reshape(groups, q, -1)).reshape(groups * k, -1))
+
+
+def _inverse(rms: Array) -> Array:
+    return np.divide(1.0, rms, out=np.zeros_like(rms), where=rms > 0)
+
+
+def _largest(scores: Scores, count: int) -> tuple[float, float, float]:
+    """Sizes of smooth fields and of principal distances of the largest restricted likelihood, and its log."""
+    units = np.zeros(len(scores.g))
+
+    def log_of(smooth: float, distance: float) -> float:
+        units[:count], units[count:] = smooth, distance
+        used = np.flatnonzero(units > 0)
+        if not len(used):
+            return -0.5 * scores.redundancy * np.log(scores.square / scores.redundancy)
+        m = scores.m[np.ix_(used, used)] * np.outer(units[used], units[used])
+        m[np.arange(len(used)), np.arange(len(used))] += 1.0
+        factor = np.linalg.cholesky(m)
+        half = scipy.linalg.solve_triangular(factor, scores.g[used] * units[used], lower=True, check_finite=False)
+        square = max(scores.square - float(half @ half), 1e-300)
+        r = scores.redundancy
+        return -0.5 * r * np.log(square / r) - float(np.log(np.diag(factor)).sum())
+
+    smooth, distance, best = 0.0, 0.0, log_of(0.0, 0.0)
+    for _ in range(3):
+        before = best
+        smooth, best = _along(lambda x: log_of(x, distance), smooth, best)
+        distance, best = _along(lambda x: log_of(smooth, x), distance, best)
+        if best - before < 0.02:
+            break
+    return smooth, distance, best
+
+
+def _along(log_of, at: float, best: float) -> tuple[float, float]:  # type: ignore[no-untyped-def]
+    """Largest value along one size: on a coarse grid, then by parabolas on a logarithmic scale."""
+    if at > 0:
+        grid = at * np.geomspace(0.5, 2.0, 3)
+    else:
+        grid = _GRID
+    values = [log_of(float(x)) for x in grid]
+    k = int(np.argmax(values))
+    if at == 0 and values[k] <= best:
+        return 0.0, best
+    x, step = float(np.log(grid[k])), float(np.log(grid[1] / grid[0]))
+    known = dict(zip(np.log(grid).tolist(), values, strict=True))
+    y = values[k]
+    for _ in range(5):
+        left, right = (
+            known.get(place) if place in known else log_of(float(np.exp(place))) for place in (x - step, x + step)
+        )
+        bend = left - 2 * y + right
+        move = float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) * step if bend < 0 else (
+            step if right > left else -step
+        )
+        new = log_of(float(np.exp(x + move)))
+        if new > y:
+            done = new - y < 1e-3
+            x, y = x + move, new
+            if done:
+                break
+        step /= 3
+        known = {}
+    return (float(np.exp(x)), y) if y > best else (at, best)
+
+
+def _information(scores: Scores, count: int, smooth: float, distance: float) -> tuple[float, Array]:
+    """Variance factor, and covariance (3, 3) of the variances of the three parts."""
+    units = np.concatenate([np.full(count, smooth), np.full(len(scores.g) - count, distance)])
+    used = np.flatnonzero(units > 0)
+    r, m = scores.redundancy, scores.m[np.ix_(used, used)]
+    if not len(used):
+        variance = scores.square / r
+        found = np.zeros((3, 3))
+        found[0, 0] = 2 * variance**2 / r
+        return variance, found
+    s = np.linalg.inv(np.diag(1 / units[used] ** 2) + m)
+    variance = (scores.square - float(scores.g[used] @ s @ scores.g[used])) / r
+    sm = s @ m
+    left = m - m @ sm
+    twice = (np.eye(len(used)) - m @ s) @ left
+    parts = [np.flatnonzero(used < count), np.flatnonzero(used >= count)]
+    fisher = np.zeros((3, 3))
+    fisher[0, 0] = r - 2 * np.trace(sm) + np.einsum("ij,ji->", sm, sm)
+    for i, a in enumerate(parts):
+        fisher[0, i + 1] = fisher[i + 1, 0] = np.trace(twice[np.ix_(a, a)])
+        for j, b in enumerate(parts):
+            fisher[i + 1, j + 1] = (left[np.ix_(a, b)] ** 2).sum()
+    fisher /= 2 * variance**2
+    live = np.flatnonzero(np.diag(fisher) > 0)
+    found = np.zeros((3, 3))
+    found[np.ix_(live, live)] = np.linalg.inv(fisher[np.ix_(live, live)])
+    return variance, found
+
+
+def _not_below(total: Array, formal: Array) -> Array:
+    """The least covariance that is not below either in any direction, to first order."""
+    if not len(total):
+        return total
+    size = np.sqrt(np.maximum(np.diag(formal), 0.0))
+    size = np.where(size > 0, size, 1.0)
+    scaled = np.outer(size, size)
+    values, vectors = np.linalg.eigh(formal / scaled)
+    root = vectors * np.sqrt(np.maximum(values, 1e-14 * values[-1]))
+    inverse = np.linalg.inv(root)
+    ratio, turn = np.linalg.eigh(inverse @ (total / scaled) @ inverse.T)
+    whole = root @ turn
+    return np.asarray((whole * np.maximum(ratio, 1.0)) @ whole.T * scaled)

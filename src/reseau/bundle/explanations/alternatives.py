@@ -1,0 +1,138 @@
+"""Explanations as networks of their own, adjusted: where effects are large, first derivatives do not describe them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from ...core.data import Rows
+from ...core.errors import UsageError
+from ...core.failure import Failure
+from ...optics.cameras import convert
+from ..diagnostics import Result
+from ..diagnostics.evidence import Scores
+from ..modelling.adjustment import problem_of
+from ..modelling.calibration import with_estimates
+from ..network import Camera, Network, Shutter
+
+__all__ = ["Alternative", "alternatives", "another_camera"]
+
+_WIDER = ("opencv_full", "fisheye", "double_sphere")
+"""Models that describe most lenses."""
+_TILT = ("tau_x", "tau_y")
+_LINE_S = 1e-5
+"""Time of a line with which motions are estimated; they are scaled by it."""
+
+
+class Alternative:
+    """Another network of the same image points, adjusted.
+
+    Parameters
+    ----------
+    code, form : str
+        The cause that it stands for.
+    log_evidence : float
+        Logarithm of the density of the image points.
+    explained : float
+        Decrease of the sum of squares.
+    """
+
+    def __init__(self, code: str, form: str, log_evidence: float, explained: float) -> None:
+        self.code, self.form, self.log_evidence, self.explained = code, form, log_evidence, explained
+
+
+def alternatives(result: Result, known: float) -> Iterator[Alternative]:
+    """Yield richer models of the lenses, and motions during the read-out, as far as they can be adjusted."""
+    network = with_estimates(result)
+    for form, cameras in _lenses(network):
+        found = _adjusted(result, replace(network, cameras=cameras), "lens", form, known)
+        if found is not None:
+            yield found
+    one = len(network.cameras) == 1 and network.rig is None and network.stage is None
+    camera = network.cameras[0]
+    if one and camera.shutter is None and camera.compiled_kind is not None and camera.additional is None:
+        try:
+            rolling = replace(camera, shutter=Shutter("rolling", _LINE_S))
+        except UsageError:
+            return
+        found = _adjusted(result, replace(network, cameras=(rolling,)), "rolling-shutter", "motion", known)
+        if found is not None:
+            yield found
+
+
+def another_camera(result: Result, images: Rows, known: float, choice: float) -> Alternative | None:
+    """Some images with a camera of their own; `choice` is the logarithm of the number of such choices."""
+    network = with_estimates(result)
+    c = int(network.camera_of[images[0]])
+    if network.rig is not None or network.refraction is not None:
+        return None
+    camera_of = network.camera_of.copy()
+    camera_of[images] = len(network.cameras)
+    other = replace(network.cameras[c], id=f"{network.cameras[c].id}, other")
+    both = replace(network, cameras=(*network.cameras, other), camera_of=camera_of)
+    form = f"{len(images)}"
+    found = _adjusted(result, both, "other-camera", form, known)
+    if found is not None:
+        found.log_evidence -= choice
+    return found
+
+
+def _lenses(network: Network) -> Iterator[tuple[str, tuple[Camera, ...]]]:
+    """Cameras with more coefficients, or of other models, all of them together."""
+    yield "all coefficients", tuple(_with_all(camera) for camera in network.cameras)
+    for model in _WIDER:
+        cameras = [_converted(camera, model) for camera in network.cameras]
+        if all(camera is not None for camera in cameras):
+            yield model, tuple(camera for camera in cameras if camera is not None)
+
+
+def _with_all(camera: Camera) -> Camera:
+    """The camera with all coefficients of its model, a tilt of the sensor excepted."""
+    model = camera.registered
+    if model is None or camera.sigma:
+        return camera
+    more = [name for name in model.of_role("distortion") if name not in _TILT]
+    return replace(camera, free=tuple(name for name in model.names if name in camera.free or name in more))
+
+
+def _converted(camera: Camera, model: str) -> Camera | None:
+    """The camera by another model with its usual parameters."""
+    if camera.registered is None or camera.parallel or camera.additional is not None or camera.sigma:
+        return None
+    from ...optics.cameras import camera_model
+
+    registered = camera_model(model)
+    free = registered.usual
+    if model == "opencv_full":
+        free = tuple(name for name in registered.names if name not in (*_TILT, "s1", "s2", "s3", "s4"))
+    try:
+        found = convert(camera.plane_mapping(), camera.grid, model, {}, free=free)
+    except UsageError:
+        return None
+    return replace(
+        camera, model=model, values=np.array(found.mapping.values)[: len(registered.names)], free=free,
+        options={}, covariance=None,
+    )  # fmt: skip
+
+
+def _adjusted(result: Result, network: Network, code: str, form: str, known: float) -> Alternative | None:
+    """Adjust another network of the same image points, and compare it."""
+    fit = result.fit
+    problem, _ = problem_of(network)
+    if fit.problem.weights is not None:
+        n = 2 * len(network.xy)
+        weights = np.ones(len(problem.observations))
+        weights[:n] = fit.problem.weights[:n]
+        problem = problem.with_weights(weights)
+    again = replace(problem, rounds=0).adjusted()
+    if isinstance(again, Failure):
+        return None
+    more = result.redundancy - again.redundancy
+    if more < 0 or again.usable.observations.sum() < fit.usable.observations.sum():
+        return None
+    # A parameter costs half the logarithm of the number of observations (Schwarz 1978).
+    plain = Scores(np.zeros(0), np.zeros((0, 0)), again.cost, result.redundancy, np.zeros((0, 0)))
+    log = plain.log_nothing(known=known) - 0.5 * more * np.log(result.redundancy)
+    return Alternative(code, form, log, fit.cost - again.cost)
