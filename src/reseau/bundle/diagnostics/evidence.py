@@ -30,6 +30,7 @@ from ..solver.normal import SEGMENTS
 __all__ = [
     "Effect",
     "Scores",
+    "lower_factor",
     "places_seen",
     "scores",
     "sensitivities",
@@ -223,7 +224,7 @@ class Scores:
         sizes = np.broadcast_to(np.asarray(size, dtype=np.float64), len(columns))
         columns, sizes = columns[sizes > 0], sizes[sizes > 0]
         m, cross = self.m, self.m[:, columns] * sizes
-        factor = scipy.linalg.cho_factor(sizes[:, None] * cross[columns] + np.eye(len(columns)))
+        factor = lower_factor(sizes[:, None] * cross[columns]), True
         side = np.column_stack([self.g[columns], m[columns]]) * sizes[:, None]
         solved = scipy.linalg.cho_solve(factor, side)
         return replace(
@@ -234,6 +235,16 @@ class Scores:
             carried=self.carried - (self.carried[:, columns] * sizes) @ solved[:, 1:],
             log_density=self.log_density - float(np.log(np.diag(factor[0])).sum()),
         )
+
+
+def lower_factor(m: Array) -> Array:
+    """Lower Cholesky factor of I + M; what is negative in M is the rounding error of what unknowns absorb."""
+    one, jitter = np.eye(len(m)), 0.0
+    while True:
+        try:
+            return np.asarray(np.linalg.cholesky(m + (1.0 + jitter) * one))
+        except np.linalg.LinAlgError:
+            jitter = 10 * jitter or 1e-9 * max(float(np.abs(m).max(initial=0.0)), 1.0)
 
 
 def too_large(fit: BundleFit, columns: int) -> bool:

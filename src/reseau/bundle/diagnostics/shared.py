@@ -22,7 +22,17 @@ import scipy.linalg
 
 from ...core.data import Array, Rows
 from ..solver import BundleFit
-from .evidence import Effect, Scores, places_seen, scores, sensitivities, sigma_seen, too_large, used_rows
+from .evidence import (
+    Effect,
+    Scores,
+    lower_factor,
+    places_seen,
+    scores,
+    sensitivities,
+    sigma_seen,
+    too_large,
+    used_rows,
+)
 
 __all__ = ["SharedErrors", "Uncertainty", "shared_errors", "smooth_effects"]
 
@@ -382,8 +392,7 @@ def _largest(scores: Scores, count: int) -> tuple[float, float, float]:
         if not len(used):
             return -0.5 * scores.redundancy * np.log(scores.square / scores.redundancy)
         m = scores.m[np.ix_(used, used)] * np.outer(units[used], units[used])
-        m[np.arange(len(used)), np.arange(len(used))] += 1.0
-        factor = np.linalg.cholesky(m)
+        factor = lower_factor(m)
         half = scipy.linalg.solve_triangular(factor, scores.g[used] * units[used], lower=True, check_finite=False)
         square = max(scores.square - float(half @ half), 1e-300)
         r = scores.redundancy

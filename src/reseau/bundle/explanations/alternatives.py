@@ -35,12 +35,15 @@ class Alternative:
         The cause that it stands for.
     log_evidence : float
         Logarithm of the density of the image points.
+    result : Result
+        Its adjustment.
     explained : float
         Decrease of the sum of squares.
     """
 
-    def __init__(self, code: str, form: str, log_evidence: float, explained: float) -> None:
-        self.code, self.form, self.log_evidence, self.explained = code, form, log_evidence, explained
+    def __init__(self, code: str, form: str, log_evidence: float, result: Result, explained: float) -> None:
+        self.code, self.form, self.log_evidence = code, form, log_evidence
+        self.result, self.explained = result, explained
 
 
 def alternatives(result: Result, known: float) -> Iterator[Alternative]:
@@ -135,4 +138,5 @@ def _adjusted(result: Result, network: Network, code: str, form: str, known: flo
     # A parameter costs half the logarithm of the number of observations (Schwarz 1978).
     plain = Scores(np.zeros(0), np.zeros((0, 0)), again.cost, result.redundancy, np.zeros((0, 0)))
     log = plain.log_nothing(known=known) - 0.5 * more * np.log(result.redundancy)
-    return Alternative(code, form, log, fit.cost - again.cost)
+    adjusted = Result(network, again, np.asarray(again.rejected[: 2 * len(network.xy)].reshape(-1, 2).any(axis=1)))
+    return Alternative(code, form, log, adjusted, fit.cost - again.cost)

@@ -343,10 +343,25 @@ def _compared(
             count = len(sight.network.images)
             every_other.append(another_camera(sight.result, rows, _KNOWN, log_choice(count, len(rows))))
         for other in every_other:
-            if other is not None and other.log_evidence - sound > found.get(other.code, -np.inf):
+            if other is None:
+                continue
+            if other.code != "lens":
+                other.log_evidence += _with_a_lens(other.result)
+            if other.log_evidence - sound > found.get(other.code, -np.inf):
                 found[other.code] = other.log_evidence - sound
                 better[other.code] = other
     return _Comparison(found, forms, chosen, better)
+
+
+def _with_a_lens(result: Result) -> float:
+    """What the lens explains besides, as a logarithm; 0 where that is not more than by chance."""
+    sight = Sight(result)
+    every = [family for family in families(sight) if family.code == "lens"]
+    whole = scores(result.fit, [family.effect for family in every])
+    forms = _compared(whole, every, sight, set(), discrete=False).forms
+    each = [form.log_evidence for form in forms]
+    gain = float(scipy.special.logsumexp(each)) - np.log(len(each)) + whole.log_nothing(known=1.0)
+    return max(gain - whole.log_nothing(known=_KNOWN) + np.log(_FALSE), 0.0)
 
 
 def _begins(every: Sequence[Family]) -> dict[int, int]:
