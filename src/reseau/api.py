@@ -283,7 +283,8 @@ def calibrate(
     design : str, Path, ReseauDesign, TestfieldDesign or BoardDesign
         The target.
     model : str or CameraOptions, optional
-        Name of the camera model; by default ``brown`` where the pixel size is given, else ``opencv``.
+        Name of the camera model; by default it is chosen, see :func:`reseau.bundle.choose_models`. With `free` alone
+        it is ``brown`` where the pixel size is given, else ``opencv``.
     pitch_mm : float, optional
         Size of a pixel in millimetres.
     free : sequence of str
@@ -323,7 +324,7 @@ def calibrate(
     target = read_design(design)
     if not isinstance(model, CameraOptions):
         pitch = None if pitch_mm is None else (pitch_mm, pitch_mm)
-        model = CameraOptions(model or "", tuple(free), pitch)
+        model = CameraOptions(model or ("" if free else "auto"), tuple(free), pitch)
 
     named = list[tuple[str, Path | Frame | ImagePoints]]()
     for number, image in enumerate(photos, start=1):

@@ -14,7 +14,6 @@ import pytest
 from reseau.bundle import Camera, Candidate, ModelChoice, Network, Options, camera_candidates, choose_model
 from reseau.bundle.modelling import choice
 from reseau.core.errors import UsageError
-from reseau.core.executors import Here, Processes
 from reseau.io.network import Network1
 from reseau.optics.cameras import camera_model
 from reseau.optics.poses import rotation_matrix
@@ -104,19 +103,42 @@ def test_a_wide_lens_gets_a_projection_of_wide_lenses() -> None:
     assert standard.length > 1000
 
 
-def test_parameters_that_the_photographs_do_not_determine_in_the_corners_are_left_out() -> None:
-    """Rings of 0.02 px in the middle of a wide lens, outside of which there are no points."""
-    network = network_of(lenses.fisheye(60), noise=0.01)
-    middle = np.array([network.cameras[0].width, network.cameras[0].height]) / 2
-    off = (network.xy - middle) / (0.35 * np.hypot(*middle))
-    radius = np.hypot(*off.T)
-    rings = 0.02 * off / radius[:, None] * np.sin(2.8 * np.pi * radius)[:, None]
-    two, four = (Candidate("fisheye", (*FRAME, *more)) for more in (("k1", "k2"), ("k1", "k2", "k3", "k4")))
-    found = choose_model(replace(network, xy=network.xy + rings).select(radius < 1), [two, four])
+def test_a_tilted_sensor_is_a_step_of_the_ladder_and_competes_with_a_thin_prism() -> None:
+    tilt = (-0.11, 0.1, 0.0025, -0.0018, -0.02, *np.zeros(7), np.radians(7.0), np.radians(-3.0))
+    found = choose_model(network_of(lenses.Lens(1280, 960, MATRIX, np.array(tilt))))
     assert isinstance(found, ModelChoice)
-    assert found.chosen.candidate == two
-    assert found.alternatives[0].length < -100
-    assert found.alternatives[0].reason.startswith("its projection is not determined")
+    assert found.chosen.candidate.label == "opencv_full: k1 k2 p1 p2 k3 tau_x tau_y"
+    assert found.camera.values[-2:] == pytest.approx(tilt[-2:], abs=0.02)
+    prism = next(each for each in found.compared if each.candidate.label.endswith("k3 s1 s2 s3 s4"))
+    assert prism.length > 100
+
+
+def test_images_that_differ_do_not_make_a_model_richer() -> None:
+    """Every image of a phone that focuses anew has a principal distance of its own."""
+    network = network_of(lens_of(-0.1), noise=0.05)
+    factor = np.random.default_rng(5).normal(1, 2e-2, len(network.images))[network.image_of]
+    centre = MATRIX[:2, 2]
+    found = choose_model(replace(network, xy=centre + factor[:, None] * (network.xy - centre)), LADDER)
+    assert isinstance(found, ModelChoice)
+    assert found.chosen.candidate.label == "opencv: k1"
+    assert found.chosen.sigma0 > 1.5
+
+
+def test_two_images_are_too_few_to_choose() -> None:
+    network = network_of(lens_of(-0.1))
+    found = choose_model(network.select(network.image_of < 2), LADDER)
+    assert isinstance(found, ModelChoice)
+    assert found.chosen.candidate.label == "opencv: k1 k2 p1 p2"
+    assert "too few" in found.chosen.reason
+
+
+def test_a_large_network_is_represented_by_some_of_its_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    network = network_of(lens_of(-0.1))
+    monkeypatch.setattr(choice, "_IMAGES", 8)
+    monkeypatch.setattr(choice, "_POINTS", 30)
+    found = choose_model(network, LADDER[:3])
+    assert isinstance(found, ModelChoice)
+    assert found.chosen.candidate.label == "opencv: k1"
 
 
 @pytest.mark.slow
@@ -139,7 +161,9 @@ def test_the_comparison_is_written_as_json() -> None:
 
 def test_candidates_are_of_the_model_that_the_pixel_size_allows() -> None:
     assert not {"brown", "brown_higher"} & {each.model for each in camera_candidates(pitch_known=False)}
-    assert not {"opencv", "opencv_full"} & {each.model for each in camera_candidates(pitch_known=True)}
+    pitch = camera_candidates(pitch_known=True)
+    assert pitch[0].model == "brown"
+    assert all(each.coefficients > 6 for each in pitch if each.model in ("opencv", "opencv_full"))
     with pytest.raises(UsageError, match="there are none"):
         choose_model(network_of(lens_of()), [])
 
@@ -176,8 +200,7 @@ def test_a_spline_surface_is_chosen_where_no_polynomial_describes_the_lens() -> 
     assert found.chosen.candidate.label == "opencv: k1"
 
 
-def test_series_are_compared_and_predict_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(choice, "_HOPELESS", np.inf)
+def test_series_are_compared_and_predict_images() -> None:
     frame = ("c", "x0", "y0")
     series = Candidate("brown", (*frame, "K1"), additional="fourier1")
     plain = Candidate("brown", (*frame, "K1"))
@@ -222,13 +245,3 @@ def test_a_lens_without_perspective_is_telecentric() -> None:
     assert isinstance(found, ModelChoice)
     assert found.chosen.candidate.model == "telecentric"
     assert found.camera.values[0] == pytest.approx(0.5, rel=1e-3)
-
-
-def test_the_choice_is_the_same_whatever_adjusts_the_parts() -> None:
-    network = network_of(lens_of(-0.1))
-    with Processes(2, ["reseau.bundle"]) as executor:
-        one, other = (choose_model(network, LADDER[:3], executor=each) for each in (Here(), executor))
-    assert isinstance(one, ModelChoice)
-    assert isinstance(other, ModelChoice)
-    assert one.entries() == other.entries()
-    assert np.isfinite([each.predicted for each in one.compared]).sum() >= 2

@@ -19,10 +19,8 @@ from .diagnostics import (
     by_point,
     camera_mapping,
     common_pattern,
-    image_scatter,
     projection_field_at,
     regularised,
-    sigma_between_images,
 )
 from .document import ResultDocument, model_search_entries
 from .explanations import Cause, Explanation, Misnamed, explain, misnamed
@@ -41,6 +39,7 @@ from .modelling import (
     camera_candidates,
     choose_board,
     choose_model,
+    choose_models,
     cross_validation,
     eliminate_parameters,
     estimate_components,
@@ -111,6 +110,7 @@ __all__ = [
     "camera_mapping",
     "choose_board",
     "choose_model",
+    "choose_models",
     "common_pattern",
     "cross_validation",
     "eliminate_parameters",
@@ -119,7 +119,6 @@ __all__ = [
     "example_network",
     "film_camera",
     "held_as_designed",
-    "image_scatter",
     "lacking",
     "misnamed",
     "model_search_entries",
@@ -128,6 +127,5 @@ __all__ = [
     "regularised",
     "reweighted",
     "search_model",
-    "sigma_between_images",
     "with_estimates",
 ]

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from ..adjust.significance import CoefficientTest
 from ..core.data import Array
@@ -24,7 +24,6 @@ from .diagnostics import (
     RigEstimate,
     StageEstimate,
     regularised,
-    sigma_between_images,
 )
 from .network import Rig
 from .network.network import finite
@@ -92,15 +91,29 @@ class PriorResult(Strict):
 
 
 class CameraResult(Strict):
-    """A camera: parameters, their standard deviations from the scatter between images, correlation, tests."""
+    """A camera: parameters, correlation, tests.
+
+    The standard deviations and the correlation contain what the points of an image have in common;
+    `sigma_formal` presumes independent errors of all image points. `degrees_of_freedom` are those of the
+    standard deviations, null without limit.
+    """
 
     id: str
     parameters: dict[str, Estimate]
-    # Null with too few images.
-    sigma_between_images: dict[str, float | None]
+    sigma_formal: dict[str, float] | None = None
+    degrees_of_freedom: dict[str, float | None] | None = None
+    # Older documents only.
+    sigma_between_images: dict[str, float | None] | None = None
     correlation: Correlation
     tests: dict[str, Significance]
     priors: PriorResult | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_older_keys(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content: dict[str, Any] = handler(self)
+        if self.sigma_between_images is None:
+            del content["sigma_between_images"]
+        return content
 
 
 class RefractionResult(Strict):
@@ -425,13 +438,14 @@ def _camera(result: Result, c: int) -> CameraResult:
         name: Estimate(value=value, sigma=s)
         for name, value, s in zip(found.parameters, found.values.tolist(), found.sigma.tolist(), strict=True)
     }
-    between = _column(sigma_between_images(result, c))
+    degrees = _column(found.dof) if found.dof is not None else (None,) * len(found.parameters)
     influence = result.priors(c)
     more = {} if influence is None else {"priors": _priors(influence, regularised(result, c))}
     return CameraResult(
         id=camera.id,
         parameters=held | estimated,
-        sigma_between_images=dict(zip(found.parameters, between, strict=True)),
+        sigma_formal=dict(zip(found.parameters, found.sigma_formal.tolist(), strict=True)),
+        degrees_of_freedom=dict(zip(found.parameters, degrees, strict=True)),
         correlation=Correlation(names=found.parameters, matrix=_matrix(found.correlation)),
         tests={test.name: _significance(test) for test in result.camera_tests(c)},
         **more,

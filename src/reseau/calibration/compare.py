@@ -132,6 +132,8 @@ def calibration_difference(
         there = second.mapping.derivatives(turned)
         g = there.d_xy @ by_rotation(turned, parallel)
         off = there.value - xy[known]
+        if not (np.isfinite(g).all() and np.isfinite(off).all()):
+            raise UsageError("do not image the same rays", where="calibrations")
         step = -np.linalg.lstsq(g.reshape(-1, 3), off.ravel(), rcond=None)[0]
         turn = (_shifted(step) if parallel else rotation_matrix(step)) @ turn
     here = first.mapping.derivatives(uv)

@@ -154,7 +154,7 @@ class Acquisition:
         return self._judge.progress().get(f"sigma_{parameter}")
 
     def scatter(self) -> float:
-        """Return how much more the images scatter than their standard deviations say; 1 if not known."""
+        """Return the ratio of the standard deviations to the formal ones; 1 if not known."""
         return self._judge.progress().get("scatter", 1.0)
 
     def done(self, step: Step) -> bool:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
         StageEstimate,
     )
     from ..calibration import FieldDifference
-    from ..core.data import Array
 
 __all__ = [
     "Alpha",
@@ -49,6 +48,8 @@ __all__ = [
 
 # Parameters of a camera that are printed at most.
 _MOST = 60
+_LARGER = 1.05
+"""Ratio of a standard deviation to the formal one from which both are printed: less changes no digit."""
 
 
 class Components(StrEnum):
@@ -149,23 +150,24 @@ def positive(distances: list[float] | None) -> list[float]:
     return distances or []
 
 
-def say_parameters(camera: CameraEstimate, between: Array | None = None) -> None:
-    """Print the parameters of a camera, with sigmas from the scatter `between` images where given."""
-    import math
-
+def say_parameters(camera: CameraEstimate) -> None:
+    """Print the parameters of a camera, with the formal sigmas where these are smaller."""
     from ..core.numbers import at_power, measured, power
 
-    rows = zip(camera.parameters, camera.values.tolist(), camera.sigma.tolist(), camera.units, strict=True)
-    for k, (name, value, sigma, unit) in enumerate(rows):
+    rows = zip(
+        camera.parameters, camera.values.tolist(), camera.sigma.tolist(), camera.sigma_formal.tolist(),
+        camera.units, strict=True,
+    )  # fmt: skip
+    for k, (name, value, sigma, formal, unit) in enumerate(rows):
         if k == _MOST and len(camera.parameters) > _MOST + 1:
             say(f"  … and {len(camera.parameters) - k} more\n")
             break
-        by_images = ""
-        if between is not None and math.isfinite(between[k]):
+        more = ""
+        if sigma > _LARGER * formal:
             shown = power(value, sigma)
             ten = "e" + shown.exponent.replace("\u2212", "-") if shown.exponent else ""
-            by_images = f" (from scatter between images: {at_power(between[k], shown)}{ten})"
-        say(f"  {name:<6} {measured(value, sigma, unit)}{by_images}\n")
+            more = f" (formal: {at_power(formal, shown)}{ten})"
+        say(f"  {name:<6} {measured(value, sigma, unit)}{more}\n")
 
 
 def say_priors(found: PriorInfluence | None) -> None:

@@ -125,8 +125,8 @@ def calibrate(
         str,
         typer.Option(
             metavar="NAME",
-            help="Camera model; by default brown with --pitch, otherwise opencv. `auto` compares models and "
-            "says why it chose one. An unknown name lists all.",
+            help="Camera model, of all cameras; by default, or with `auto`, models are compared and one is chosen "
+            "for each camera. With --free alone brown with --pitch, otherwise opencv. An unknown name lists all.",
         ),
     ] = "",
     pitch: Annotated[float | None, typer.Option(min=1e-6, help="Pixel size, mm; required by brown.")] = None,
@@ -430,6 +430,7 @@ def _camera(
     shutter = None
     if rolling is not None:
         shutter = Shutter("rolling", rolling, chosen) if chosen else Shutter("rolling", rolling)
+    model = model or ("" if names or options else "auto")
     return CameraOptions(model, names, None if pitch is None else (pitch, pitch), options, shutter)
 
 
@@ -465,7 +466,7 @@ def _uncertainty(field: ProjectionField) -> str:
 def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: list[float]) -> None:
     import numpy as np
 
-    from ..bundle import camera_mapping, projection_field_at, sigma_between_images
+    from ..bundle import camera_mapping, projection_field_at
     from ..calibration import projection_field
     from ..procedures.assessment import sorted_remarks
 
@@ -473,8 +474,8 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     for name, assessed in done.assessments.items():
         before = f"camera {name}: " if len(done.cameras) > 1 else ""
         say(before + "\n".join(assessed.lines) + "\n")
-    if done.choice is not None:
-        _say_choice(done.choice)
+    for name, choice in done.choices.items():
+        _say_choice(choice, f"camera {name}: " if len(done.cameras) > 1 else "")
     if done.board is not None:
         _say_board(done.board, result.network.unit)
     count = sum(len(points) for points in done.measured.values())
@@ -486,7 +487,7 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     for c, entry in enumerate(result.network.cameras):
         if len(result.network.cameras) > 1:
             say(f"camera {entry.id}\n")
-        say_parameters(result.camera(c), sigma_between_images(result, c))
+        say_parameters(result.camera(c))
         say_priors(result.priors(c))
         field = _uncertainty(projection_field(camera_mapping(result, c)))
         say(f"uncertainty of the projection: {field.replace(',', ' over the image,')}\n")
@@ -530,17 +531,17 @@ def _say_board(choice: BoardChoice, unit: str) -> None:
         say(line + "\n")
 
 
-def _say_choice(choice: ModelChoice) -> None:
-    """Print the comparison of the camera models."""
+def _say_choice(choice: ModelChoice, before: str) -> None:
+    """Print the comparison of the camera models; those that were not considered are in the document."""
     import numpy as np
 
-    say(f"camera model {choice.chosen.candidate.label} ({choice.chosen.reason})\n")
+    say(f"{before}camera model {choice.chosen.candidate.label} ({choice.chosen.reason})\n")
+    known = [each for each in choice.compared if np.isfinite(each.length)]
+    if not known:
+        return
     say("  model                                      sigma0   length  predicted  at the corners px\n")
-    for each in choice.compared:
-        line = f"  {each.candidate.label[:40]:40}"
-        if np.isfinite(each.sigma0):
-            predicted = f"{each.predicted:9.4f}" if np.isfinite(each.predicted) else "        -"
-            corner = f"{each.corner_px:7.2g}" if np.isfinite(each.corner_px) else "no image"
-            sigma = f" ± {each.corner_sigma_px:.2g}" if np.isfinite(each.corner_sigma_px) else ""
-            line += f" {each.sigma0:8.4f} {each.length:8.1f}  {predicted}  {corner}{sigma}"
-        say(f"{line}  {each.reason}\n")
+    for each in known:
+        line = f"  {each.candidate.label[:40]:40} {each.sigma0:8.4f} {each.length:8.1f}  {each.predicted:9.4f}"
+        corner = f"{each.corner_px:7.2g}" if np.isfinite(each.corner_px) else "no image"
+        sigma = f" ± {each.corner_sigma_px:.2g}" if np.isfinite(each.corner_sigma_px) else ""
+        say(f"{line}  {corner}{sigma}  {each.reason}\n")

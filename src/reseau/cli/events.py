@@ -123,7 +123,7 @@ class Display:
         if kind == "precision":
             scatter = facts.get("scatter", 0.0)
             doubt = (
-                f"\n    the images scatter {scatter:.1f} times as much as their precision"
+                f"\n    images have errors in common: sigmas are {scatter:.1f} times the formal ones"
                 if scatter > 2
                 else ""
             )

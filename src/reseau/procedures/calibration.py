@@ -37,14 +37,14 @@ from ..bundle import (
     calibration_of,
     camera_mapping,
     choose_board,
-    choose_model,
+    choose_models,
     explain,
     held_as_designed,
     model_search_entries,
     search_model,
 )
 from ..bundle.network import stage_of_turntable
-from ..calibration import Calibration
+from ..calibration import Calibration, CameraMapping
 from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display
 from ..core.errors import UsageError
@@ -119,9 +119,9 @@ class CameraOptions:
     Parameters
     ----------
     model : str, optional
-        Name of a registered model, see :func:`reseau.optics.camera_models`, or ``auto``: it is chosen, see
-        :func:`reseau.bundle.choose_model`. By default ``brown`` if the pixel size is given, otherwise
-        ``opencv``.
+        Name of a registered model, see :func:`reseau.optics.camera_models`, or ``auto``: it is chosen for each
+        camera, see :func:`reseau.bundle.choose_models`. By default ``brown`` if the pixel size is given,
+        otherwise ``opencv``.
     free : tuple of str
         Parameters to estimate; by default the usual ones of the model.
     pitch_mm : (float, float), optional
@@ -262,8 +262,8 @@ class Calibrated(Display):
         Measured image points, by image.
     declined : dict
         Reasons why images were left out, by image.
-    choice : ModelChoice, optional
-        How the camera model was chosen.
+    choices : mapping of str to ModelChoice
+        How the models of the cameras were chosen, by their names; empty where the model was given.
     board : BoardChoice, optional
         How the model of the target was chosen.
     notes : tuple of str
@@ -275,7 +275,7 @@ class Calibrated(Display):
     result: Result
     measured: dict[str, ImagePoints]
     declined: dict[str, str]
-    choice: ModelChoice | None = None
+    choices: Mapping[str, ModelChoice] = field(default_factory=dict)
     board: BoardChoice | None = None
     notes: tuple[str, ...] = ()
     misnamed: Misnamed | None = None
@@ -286,6 +286,11 @@ class Calibrated(Display):
     def required(self) -> Calibrated:
         """Return the calibration itself; see :meth:`~reseau.core.failure.Failure.required`."""
         return self
+
+    @property
+    def choice(self) -> ModelChoice | None:
+        """How the model of the only camera was chosen; None where it was given."""
+        return self.choices.get(_CAMERA)
 
     @property
     def sigma0(self) -> float:
@@ -355,8 +360,8 @@ class Calibrated(Display):
         assessed = self.assessments.get(camera or _CAMERA)
         if assessed is not None:
             more |= {"assessment": assessed.entries()}
-        if self.choice is not None:
-            more |= {"camera_models": self.choice.entries()}
+        if (camera or _CAMERA) in self.choices:
+            more |= {"camera_models": self.choices[camera or _CAMERA].entries()}
         if self.board is not None:
             more |= {"target": self.board.entries()}
         return found.model_copy(update={"validity": found.validity | more}) if more else found
@@ -459,14 +464,15 @@ def calibrate_camera(
     size : (int, int), optional
         Width and height in pixels, or those of each camera by its name; required without frames.
     model : CameraOptions, optional
-        Camera model and parameters to estimate.
+        Camera model and parameters to estimate; by default the model is chosen, see
+        :func:`reseau.bundle.choose_models`.
     options : CalibrationOptions, optional
         Options of the calibration.
     taken : mapping of str to Taken, optional
         Camera and exposure of each photograph, by its name, of cameras that are fixed to each other; see
         :func:`~reseau.procedures.exposures.exposures_of_files`. By default all are of one camera.
     executor : Executor, optional
-        What measures the photographs, and compares camera models; by default this process.
+        What measures the photographs; by default this process.
     outputs : Outputs, optional
         Where measurements are kept; see
         :func:`~reseau.procedures.target_measurement.measured_in_order`.
@@ -489,7 +495,7 @@ def calibrate_camera(
     notes = tuple(note for each in photographs for note in each.notes)
 
     def calibrated(points: dict[str, ImagePoints]) -> Calibrated | Failure:
-        return _calibrated(points, declined, sizes, notes, design, model, options, taken, executor)
+        return _calibrated(points, declined, sizes, notes, design, model, options, taken)
 
     done = calibrated(measured)
     if isinstance(design, BoardDesign) and ways_to_turn(design) and options.control is None:
@@ -520,7 +526,6 @@ def _calibrated(
     model: CameraOptions | None,
     options: CalibrationOptions,
     taken: Mapping[str, Taken] | None,
-    executor: Executor | None,
 ) -> Calibrated | Failure:
     """Calibrate from the points of photographs."""
     cameras = list(dict.fromkeys(each.camera for each in taken.values())) if taken else [_CAMERA]
@@ -541,9 +546,9 @@ def _calibrated(
     stand_in = Camera(_CAMERA, 1, 1, (1.0, 1.0), "opencv", np.zeros(len(camera_model("opencv").names)))
     wrong = left_out(network_of(measured, design, stand_in), cameras, sizes, of)
     if wrong is None:
-        return _adjusted(measured, declined, sizes, notes, design, model, options, taken, executor, None)
+        return _adjusted(measured, declined, sizes, notes, design, model, options, taken, None)
     done = _adjusted(
-        wrong.kept(measured), declined, sizes, notes, design, model, options, taken, executor, wrong.found
+        wrong.kept(measured), declined, sizes, notes, design, model, options, taken, wrong.found
     )
     if isinstance(done, Failure):
         return done
@@ -552,7 +557,7 @@ def _calibrated(
         return done
     # By the adjusted camera some of them are in their own places.
     kept, found = (measured, None) if still is None else (still.kept(measured), still.found)
-    return _adjusted(kept, declined, sizes, notes, design, model, options, taken, executor, found)
+    return _adjusted(kept, declined, sizes, notes, design, model, options, taken, found)
 
 
 def _adjusted(
@@ -564,7 +569,6 @@ def _adjusted(
     model: CameraOptions | None,
     options: CalibrationOptions,
     taken: Mapping[str, Taken] | None,
-    executor: Executor | None,
     wrong: Misnamed | None,
 ) -> Calibrated | Failure:
     """Adjust the points of photographs, of which those that are wrong were left out."""
@@ -574,7 +578,7 @@ def _adjusted(
     refraction = None
     if options.refraction is not None:
         refraction = options.refraction.refraction(tuple(measured), tuple(cameras[c] for c in of))
-    model, larger = model or CameraOptions(), _magnification(refraction)
+    model, larger = model or CameraOptions("auto"), _magnification(refraction)
     said = Exif(focal_35_mm=options.focal_35_mm)
     entries = []
     for c, name in enumerate(cameras):
@@ -599,16 +603,18 @@ def _adjusted(
         network = _scaled(network)
     if options.sigma_px is not None:
         network = replace(network, cov=np.tile(np.eye(2) * options.sigma_px**2, (len(network.xy), 1, 1)))
-    choice = None
-    if model is not None and model.automatic:
-        chosen = choose_model(network, options=options.adjustment, executor=executor)
-        if isinstance(chosen, Failure):
-            return chosen
-        choice, network = chosen, replace(network, cameras=(chosen.camera,))
-    board = None
     if options.target == "flat":
         network = held_as_designed(network)
-    elif options.target == "auto":
+    choices = dict[str, ModelChoice]()
+    if model.automatic:
+        chosen = choose_models(network, options=options.adjustment)
+        if isinstance(chosen, Failure):
+            notes = (*notes, f"camera model {model.registered.name}, none could be chosen: {chosen.reason}")
+        else:
+            network = replace(network, cameras=tuple(each.camera for each in chosen))
+            choices = dict(zip(cameras, chosen, strict=True))
+    board = None
+    if options.target == "auto":
         bent = choose_board(network, options.adjustment)
         if isinstance(bent, Failure):
             return bent
@@ -618,24 +624,43 @@ def _adjusted(
         if found.code is Code.NOT_CONVERGED:
             return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
         return found
-    calibrated = Calibrated(found, measured, declined, choice, board, notes, wrong)
+    calibrated = Calibrated(found, measured, declined, choices, board, notes, wrong)
     loose = _without_scale(calibrated.result)
     return calibrated if loose is None else loose
 
 
 def _without_scale(result: Result) -> Failure | None:
-    """A failure where a principal distance, or a magnification, is hardly known at all."""
-    for estimate, camera in zip(result.cameras.values(), result.network.cameras, strict=True):
-        scales = () if camera.registered is None else camera.registered.of_role("scale")
-        rows = zip(estimate.parameters, estimate.values, estimate.sigma, estimate.units, strict=True)
-        for name, value, sigma, unit in rows:
-            if name in scales and sigma > _HARDLY * abs(value):
-                return Failure(
-                    f"{camera.label}: the images do not determine {name} ({with_sigma(value, sigma, unit)}); "
-                    + _MORE_TILTED,
-                    Code.NOT_IDENTIFIED,
-                )
+    """A failure where the pixels in a radian at the centre, or a magnification, are hardly known at all."""
+    for c, camera in enumerate(result.network.cameras):
+        if camera.registered is None or not camera.has_plane_mapping:
+            continue
+        lens = camera_mapping(result, c)
+        relative = _relative_scale(lens)
+        if relative > _HARDLY:
+            scales = [name for name in camera.registered.of_role("scale") if name in lens.names]
+            name = scales[0] if scales else "the scale"
+            return Failure(
+                f"{camera.label}: the images do not determine {name}, which is uncertain by "
+                f"{100 * relative:.0f} %; " + _MORE_TILTED,
+                Code.NOT_IDENTIFIED,
+            )
     return None
+
+
+def _relative_scale(lens: CameraMapping) -> float:
+    """Relative standard deviation of the scale at the centre; some models share it between parameters."""
+    mapping, zero = lens.mapping, np.zeros((1, 2))
+
+    def scale(values: Array) -> float:
+        moved = mapping.with_values(dict(zip(mapping.names, values.tolist(), strict=True)))
+        return float(np.sqrt(abs(np.linalg.det(moved.derivatives(zero).d_xy[0]))))
+
+    values, slope = np.array(mapping.values, dtype=np.float64), np.zeros(len(lens.rows))
+    for k, row in enumerate(lens.rows):
+        step = np.zeros(len(values))
+        step[row] = 1e-4 * max(abs(values[row]), 1e-3)
+        slope[k] = (scale(values + step) - scale(values - step)) / (2 * step[row])
+    return float(np.sqrt(max(float(slope @ lens.covariance @ slope), 0.0))) / scale(values)
 
 
 def _fixed_to_each_other(

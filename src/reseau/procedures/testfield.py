@@ -18,9 +18,7 @@ from ..bundle import (
     Network,
     Result,
     camera_mapping,
-    image_scatter,
     problem_of,
-    sigma_between_images,
     with_estimates,
 )
 from ..core.data import Array, Frame, ImagePoints
@@ -216,8 +214,8 @@ class TestfieldProcedure:
 
         Of a rig they are the largest of its cameras, from the sixth exposure on.
 
-        They are those from the scatter between the images where it is larger. From the sixth image on,
-        ``scatter`` is how much larger it is, over all parameters: see :func:`reseau.bundle.image_scatter`.
+        They contain what the points of an image have in common. ``scatter`` is their ratio to the formal
+        standard deviations: the root mean square over the parameters, of a rig that of its worst camera.
         """
         exposures = {taken.exposure for taken in self._taken.values()}
         if len(self._measured) < _LEAST_IMAGES or 0 < len(exposures) < _LEAST_EXPOSURES:
@@ -226,15 +224,15 @@ class TestfieldProcedure:
         if isinstance(found, Failure):
             return {}
         reached: dict[str, float] = {}
-        scatters = []
+        scatter = 1.0
         for c in range(len(found.result.network.cameras)):
-            names, sigma, between = _sigmas(found.result, c)
-            for name, s in zip(names, sigma, strict=True):
+            estimate = found.result.camera(c)
+            for name, s in zip(estimate.parameters, estimate.sigma, strict=True):
                 reached[f"sigma_{name}"] = max(float(s), reached.get(f"sigma_{name}", 0.0))
-            scatters.append(image_scatter(found.result, c, between))
-        scatter = float(np.fmax.reduce(scatters))
-        more = {"scatter": scatter} if np.isfinite(scatter) else {}
-        return reached | {"sigma0": float(found.result.sigma0)} | more
+            formal = estimate.sigma_formal
+            ratio = estimate.sigma[formal > 0] / formal[formal > 0]
+            scatter = max(scatter, float(np.sqrt(np.mean(ratio**2)))) if len(ratio) else scatter
+        return reached | {"sigma0": float(found.result.sigma0), "scatter": scatter}
 
     def next_pose(self, candidates: Sequence[P], wanted: str) -> tuple[P, float | None] | None:
         """Return the pose that lowers the standard deviation of a parameter most, and the predicted value.
@@ -271,8 +269,8 @@ class TestfieldProcedure:
         )
         if isinstance(mount, Failure):
             raise EstimationError(mount.reason, where="next pose")
-        now = float(_sigmas(result, 0)[1][column])
-        enlarged = float(result.sigma0) * now / float(np.sqrt(result.camera_covariance(0)[column, column]))
+        so_far = result.camera(0)
+        enlarged = float(result.sigma0 * so_far.sigma[column] / so_far.sigma_formal[column])
         best: tuple[P, float] | None = None
         for candidate in candidates:
             joined = _joined(network, result, mount, candidate, self._heights(candidate))
@@ -299,14 +297,6 @@ class TestfieldProcedure:
             f"calibration-{camera}.json": found.calibration(f"{self.name} {camera}", made, camera).to_json()
             for camera in found.cameras
         }
-
-
-def _sigmas(result: Result, camera: int) -> tuple[tuple[str, ...], Array, Array]:
-    """Parameters of a camera: names, the larger standard deviations of the two kinds, those of scatter."""
-    names, _, _ = result.camera_columns(camera)
-    formal: Array = np.sqrt(np.diag(result.camera_covariance(camera)))
-    between = sigma_between_images(result, camera)
-    return tuple(names), np.fmax(formal, between), between
 
 
 def _joined(

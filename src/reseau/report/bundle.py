@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from ..bundle import Result, camera_mapping, projection_field_at, sigma_between_images
+from ..bundle import Result, camera_mapping, projection_field_at
 from ..bundle.network.shutter import MOTION
 from ..calibration import CameraMapping, FieldDifference, projection_field
 from ..core.data import Frame, Rows
@@ -199,18 +199,18 @@ def _reliability(result: Result) -> list[tuple[str, str, str]]:
 def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any]:
     """Table and figures of one camera."""
     camera = result.network.cameras[c]
-    names, _, values = result.camera_columns(c)
-    sigma = np.sqrt(np.diag(result.camera_covariance(c)))
+    found = result.camera(c)
     tests = {test.name: test for test in result.camera_tests(c)}
     rows = []
-    between = sigma_between_images(result, c)
-    for name, value, s, other in zip(names, values, sigma, between, strict=True):
+    for name, value, s, formal in zip(
+        found.parameters, found.values, found.sigma, found.sigma_formal, strict=True
+    ):
         test = tests.get(name)
         rows.append(
             {
                 "name": name,
                 "estimate": power(value, s),
-                "between": at_power(other, power(value, s)) if np.isfinite(other) else "–",
+                "formal": at_power(formal, power(value, s)),
                 "unit": unit_text(camera.unit_of(name)),
                 "statistic": "" if test is None else f"{test.statistic:.1f}",
                 "p": "" if test is None else f"{test.p:.3f}" if test.p >= 5e-4 else "< 0.001",

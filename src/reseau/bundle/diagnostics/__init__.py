@@ -13,7 +13,6 @@ from .estimates import (
     StageEstimate,
 )
 from .fields import camera_mapping, projection_field_at
-from .image_scatter import image_scatter, sigma_between_images
 from .patterns import CommonPattern, by_place, by_point, common_pattern
 from .regularisation import Regularised, regularised
 from .result import Eliminated, Result
@@ -42,8 +41,6 @@ __all__ = [
     "common_pattern",
     "control_shape",
     "covariance_by_targets",
-    "image_scatter",
     "projection_field_at",
     "regularised",
-    "sigma_between_images",
 ]

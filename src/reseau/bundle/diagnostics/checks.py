@@ -13,7 +13,6 @@ from ...core.errors import UsageError
 from ...core.failure import Code, Remark
 from ..network import Network
 from ..solver import BundleFit
-from .image_scatter import sigma_between_images
 from .patterns import CommonPattern, by_place, common_pattern
 from .regularisation import regularised
 from .result import Result
@@ -28,9 +27,6 @@ _CORRELATED, _WEAK, _ALPHA = 0.95, 5.0, 1e-4
 _NEAR = 1e-3
 # Minimum redundancy of an image for comparing its scatter with that of the other images.
 _MIN_REDUNDANCY = 5.0
-# Ratio of the sigma between images to the sigma for independent errors above which a warning is given; noise
-# alone gives about 1.1.
-_SCATTERED = 2.0
 # Minimum number of images of a camera for the search for a common residual pattern.
 _MIN_IMAGES = 3
 # Size of a corner as a fraction of width and height.
@@ -161,7 +157,6 @@ def checks(result: Result) -> list[Remark]:
         *_datum(result),
         *_scatter(result),
         *_patterns(result),
-        *_between(result),
         *_behind(network, fit),
         *_parallel(network, fit),
         *_corners(network, fit),
@@ -244,7 +239,7 @@ def _correlations(result: Result) -> list[Remark]:
         names, _, _ = result.camera_columns(c)
         if not names:
             continue
-        q = result.camera_covariance(c)
+        q = result.formal_camera_covariance(c)
         size = np.sqrt(np.diag(q))
         size = np.where(size > 0, size, 1.0)
         r = q / np.outer(size, size)
@@ -434,26 +429,6 @@ def _patterns(result: Result) -> list[Remark]:
         for camera, pattern in patterns
         if pattern is not None
     ]
-    return found[:LISTED]
-
-
-def _between(result: Result) -> list[Remark]:
-    """Parameters that vary between the images of a camera by more than their sigmas."""
-    found = []
-    for c, camera in enumerate(result.network.cameras):
-        names, _, _ = result.camera_columns(c)
-        sigma = np.sqrt(np.diag(result.camera_covariance(c)))
-        ratio = np.nan_to_num(sigma_between_images(result, c) / np.where(sigma > 0, sigma, np.inf))
-        rows = np.flatnonzero(ratio > _SCATTERED)
-        if len(rows):
-            factors = listed(f"{names[k]} {ratio[k]:.1f}" for k in rows)
-            found.append(
-                Remark(
-                    f"{camera.label}: the scatter between images is larger than the sigmas, by the factor: "
-                    f"{factors}; the camera may have changed between images",
-                    Code.CAMERA_UNSTABLE,
-                )
-            )
     return found[:LISTED]
 
 

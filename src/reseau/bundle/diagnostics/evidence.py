@@ -191,6 +191,15 @@ class Scores:
             found: Array = np.logaddexp(-0.5 * quad + np.log(share), free + np.log1p(-share))
         return found
 
+    def log_profile(self, sizes: Array) -> Array:
+        """Logarithm of the restricted likelihood with effects of these sizes, of the best variance factor."""
+        values, squares = self._spectrum
+        lam, r = sizes[:, None] ** 2, self.redundancy
+        quad = self.square - (lam * squares / (1 + lam * values)).sum(axis=1)
+        log_det = np.log1p(lam * values).sum(axis=1)
+        found: Array = -0.5 * (r * np.log(np.maximum(quad, 1e-300) / r) + log_det) + self.log_density
+        return found
+
     def best_size(self, sizes: Array = _SIZES) -> float:
         """The most probable size of the effects."""
         values, squares = self._spectrum

@@ -45,8 +45,9 @@ _LEAST, _MOST = 3, 48
 _SHAPE = 0.7
 """Standard deviation of the logarithm by which fields of another form than assumed do more or less to a parameter:
 a factor of two."""
-_GRID = np.geomspace(0.03, 100.0, 10)
-"""Standard deviations of the effects, in that of image points, at which the likelihood is computed first."""
+_GRID, _FINE, _CONVERGED = np.geomspace(0.05, 100.0, 8), np.geomspace(0.03, 100.0, 80), 0.01
+"""Standard deviations of the effects, in that of image points, at which the likelihood is computed first, and where
+that is quick; gain of its logarithm that is none."""
 _POWERS = [(i, d - i) for d in range(_DEGREE + 1) for i in range(d + 1)]
 _COUNT = len(_POWERS)
 
@@ -384,60 +385,49 @@ def _inverse(rms: Array) -> Array:
 
 def _largest(scores: Scores, count: int) -> tuple[float, float, float]:
     """Sizes of smooth fields and of principal distances of the largest restricted likelihood, and its log."""
-    units = np.zeros(len(scores.g))
-
-    def log_of(smooth: float, distance: float) -> float:
-        units[:count], units[count:] = smooth, distance
-        used = np.flatnonzero(units > 0)
-        if not len(used):
-            return -0.5 * scores.redundancy * np.log(scores.square / scores.redundancy)
-        m = scores.m[np.ix_(used, used)] * np.outer(units[used], units[used])
-        factor = lower_factor(m)
-        half = scipy.linalg.solve_triangular(factor, scores.g[used] * units[used], lower=True, check_finite=False)
-        square = max(scores.square - float(half @ half), 1e-300)
-        r = scores.redundancy
-        return -0.5 * r * np.log(square / r) - float(np.log(np.diag(factor)).sum())
-
-    smooth, distance, best = 0.0, 0.0, log_of(0.0, 0.0)
-    for _ in range(3):
-        before = best
-        smooth, best = _along(lambda x: log_of(x, distance), smooth, best)
-        distance, best = _along(lambda x: log_of(smooth, x), distance, best)
-        if best - before < 0.02:
+    fields, focal = np.arange(count), np.arange(count, len(scores.g))
+    smooth, best = _along(scores.part(fields), 0.0)
+    distance = 0.0
+    for _ in range(2):
+        left = scores.with_effects(fields, smooth) if smooth else scores
+        log = left.part(focal).log_profile(_FINE)
+        k = int(np.argmax(log))
+        if log[k] <= best + _CONVERGED:
             break
+        distance = float(_FINE[k])
+        smooth, best = _along(scores.with_effects(focal, distance).part(fields), smooth)
     return smooth, distance, best
 
 
-def _along(log_of, at: float, best: float) -> tuple[float, float]:  # type: ignore[no-untyped-def]
-    """Largest value along one size: on a coarse grid, then by parabolas on a logarithmic scale."""
-    if at > 0:
-        grid = at * np.geomspace(0.5, 2.0, 3)
-    else:
-        grid = _GRID
+def _along(scores: Scores, near: float) -> tuple[float, float]:
+    """Size of the largest likelihood: on a coarse grid, then by parabolas on a logarithmic scale."""
+
+    def log_of(x: float) -> float:
+        size, r = float(np.exp(x)), scores.redundancy
+        factor = lower_factor(size**2 * scores.m)
+        half = scipy.linalg.solve_triangular(factor, size * scores.g, lower=True, check_finite=False)
+        square = max(scores.square - float(half @ half), 1e-300)
+        log_det = float(np.log(np.diag(factor)).sum())
+        return -0.5 * r * np.log(square / r) - log_det + scores.log_density
+
+    nothing = -0.5 * scores.redundancy * np.log(scores.square / scores.redundancy) + scores.log_density
+    grid = np.log(_GRID) if not near else np.log(near) + np.log(2.0) * np.arange(-1, 2)
     values = [log_of(float(x)) for x in grid]
     k = int(np.argmax(values))
-    if at == 0 and values[k] <= best:
-        return 0.0, best
-    x, step = float(np.log(grid[k])), float(np.log(grid[1] / grid[0]))
-    known = dict(zip(np.log(grid).tolist(), values, strict=True))
-    y = values[k]
-    for _ in range(5):
-        left, right = (
-            known.get(place) if place in known else log_of(float(np.exp(place))) for place in (x - step, x + step)
-        )
+    x, y, step = float(grid[k]), values[k], float(grid[1] - grid[0])
+    left = values[k - 1] if k else log_of(x - step)
+    right = values[k + 1] if k + 1 < len(values) else log_of(x + step)
+    for _ in range(3):
         bend = left - 2 * y + right
         move = float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) * step if bend < 0 else (
             step if right > left else -step
         )
-        new = log_of(float(np.exp(x + move)))
-        if new > y:
-            done = new - y < 1e-3
-            x, y = x + move, new
-            if done:
-                break
-        step /= 3
-        known = {}
-    return (float(np.exp(x)), y) if y > best else (at, best)
+        new = log_of(x + move)
+        if new <= y + _CONVERGED:
+            break
+        x, y, step = x + move, new, step / 3
+        left, right = log_of(x - step), log_of(x + step)
+    return (float(np.exp(x)), y) if y > nothing else (0.0, nothing)
 
 
 def _information(scores: Scores, count: int, smooth: float, distance: float) -> tuple[float, Array]:

@@ -76,7 +76,7 @@ class Sight:
     @cached_property
     def mappings(self) -> list[PlaneMapping]:
         """Mappings of the cameras, with their estimates."""
-        return [camera_mapping(self.result, c).mapping for c in range(len(self.network.cameras))]
+        return [camera_mapping(self.result, c, formal=True).mapping for c in range(len(self.network.cameras))]
 
     @property
     def simple(self) -> bool:

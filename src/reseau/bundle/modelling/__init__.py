@@ -4,7 +4,7 @@ from .adjustment import Options, adjust_network, problem_of
 from .board import BoardChoice, BoardModel, choose_board, held_as_designed
 from .calibration import calibration_of, with_estimates
 from .candidates import Candidate, camera_candidates
-from .choice import Compared, ModelChoice, choose_model
+from .choice import Compared, ModelChoice, choose_model, choose_models
 from .lacking import Lacking, lacking
 from .search import (
     Kind,
@@ -31,6 +31,7 @@ __all__ = [
     "camera_candidates",
     "choose_board",
     "choose_model",
+    "choose_models",
     "cross_validation",
     "eliminate_parameters",
     "estimate_components",

@@ -376,7 +376,7 @@ def _frontal(network: Network, result: Result) -> list[Remark]:
     for c, camera in enumerate(network.cameras):
         names, _, values = result.camera_columns(c)
         model = camera.registered
-        sigma = np.sqrt(np.diag(result.camera_covariance(c)))
+        sigma = np.sqrt(np.diag(result.formal_camera_covariance(c)))
         scale = () if model is None else model.of_role("scale")
         weak = [
             name for name, v, s in zip(names, values, sigma, strict=True) if name in scale and s > _WEAK * v

@@ -257,7 +257,7 @@ def _camera(fit: BundleFit) -> tuple[tuple[str, ...], Array, Array]:
     network = fit.problem.network
     result = Result(network, fit, np.zeros(len(network.xy), dtype=bool), ())
     names, _, values = result.camera_columns(0)
-    return names, values, result.camera_covariance(0)
+    return names, values, result.formal_camera_covariance(0)
 
 
 class _Sample(NamedTuple):

@@ -1,48 +1,62 @@
-"""Choice of a camera model: which of several describes a camera well enough, without parameters too many.
+"""Choice of a camera model: the simplest one that predicts images which it has not seen as well as any other.
 
-Every candidate is adjusted with the same observations. The description length (Schwarz 1978, *Estimating the
-dimension of a model*, Annals of Statistics 6; Rissanen 1978, Modeling by shortest data description,
-Automatica 14) weighs residuals against the number of parameters. Those that come close are compared by
-cross-validation over images: an image that did not contribute is predicted. The difference of the image
-coordinates from those of the chosen model, after the best rotation, says what the choice matters.
+A first stage adjusts the usual perspective model with a moderate number of coefficients. Where parameters of the same
+model beyond these predict images that are left out no better, nothing is left that the images have in common, and the
+lens is perspective. Otherwise the models of wide lenses and of fisheyes are adjusted, too, each from the best before
+it. Then the candidates of all models that were adjusted are compared by the density with which images that are left
+out are predicted (see :mod:`~reseau.bundle.modelling.left_out`); what is chosen is adjusted, and compared anew.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import scipy.special
 
+from ...calibration import CameraMapping, calibration_difference
 from ...calibration.camera import projection_field
-from ...calibration.compare import calibration_difference
 from ...core.display import Display
 from ...core.errors import UsageError
-from ...core.executors import Executor, Here
 from ...core.failure import Code, Failure
+from ...optics.cameras import camera_model
+from ..diagnostics.checks import unmodelled_pattern
 from ..network import Camera, Network
 from ..solver import BundleFit
 from .adjustment import Options, adjust_network
 from .candidates import (
+    PARALLEL,
+    SERIES,
     Candidate,
-    adjusted_candidates,
-    best_fit,
+    adjusted_to,
     camera_candidates,
-    first_problem,
-    further_candidates,
+    families,
+    first_fit,
+    perspective,
+    surface,
+    wider_model,
+    with_parallel_rays,
 )
-from .determined import mapping_of, parameters_determined, undetermined
-from .prediction import LEVEL, mean_square, predicted_images, worse_predictions
+from .determined import mapping_of, result_of
+from .left_out import Information, Prediction, information_of
 
-__all__ = ["Compared", "ModelChoice", "choose_model"]
+__all__ = ["Compared", "ModelChoice", "choose_model", "choose_models"]
 
-# Description lengths within this of the least are not worse (Kass & Raftery 1995, Bayes factors, JASA 90,
-# table on p. 777: "not worth more than a bare mention"); beyond the second no cross-validation is needed.
-_EQUAL, _HOPELESS = 2.0, 30.0
-# Candidates that are cross-validated at most.
-_VALIDATED = 6
+# A model with more parameters predicts better by more than chance where it makes the images that are left out ten times
+# as probable. One parameter too many does this in 1 % of cases: its logarithm is (χ² − 2) / 2 with one degree of
+# freedom (Stone 1977, J. R. Statist. Soc. B 39), and χ² > 2 + 2 ln 10 has this probability. So have several.
+_ODDS = np.log(10.0)
+_LEVEL = 0.01
+# Least number of images, of which one is left out.
+_LEAST = 3
+# Images, and image points of each, beyond which a choice takes longer and becomes no better.
+_IMAGES, _POINTS = 60, 200
+# Size of the reciprocal of a focal length, in standard deviations, above which there is perspective.
+_SIGNIFICANT = 2.6
+# Places along the longer side at which cameras are compared.
+_ACROSS = 13
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,14 +70,14 @@ class Compared:
     reason : str
         Why it was not chosen, or why it was.
     sigma0 : float
-        Standard deviation of unit weight; NaN where the adjustment failed.
+        Standard deviation of unit weight; NaN where it was not considered.
     cost : float
         vᵀPv.
     length : float
-        Description length −2 ln L + u ln N with the variance estimated, less that of the best candidate.
+        −2 times the logarithm of the density with which images that are left out are predicted, less that of the
+        best candidate.
     predicted : float
-        Root mean square of predicted image coordinates, in their standard deviations, by cross-validation
-        over images; NaN where this was not needed.
+        Root mean square of predicted image coordinates, in their standard deviations.
     p : float
         Probability of the test against the chosen model where one is a part of the other; NaN otherwise.
     rms_px, corner_px : float
@@ -167,13 +181,7 @@ class ModelChoice(Display):
 
 
 def choose_model(
-    network: Network,
-    candidates: Sequence[Candidate] | None = None,
-    options: Options | None = None,
-    *,
-    folds: int = 5,
-    seed: int = 0,
-    executor: Executor | None = None,
+    network: Network, candidates: Sequence[Candidate] | None = None, options: Options | None = None
 ) -> ModelChoice | Failure:
     """Choose the model of the only camera of a network.
 
@@ -182,18 +190,12 @@ def choose_model(
     network : Network
         Network with one camera, of any registered model.
     candidates : sequence of Candidate, optional
-        By default :func:`camera_candidates`. Where the best of these leaves a residual pattern that the
-        images have in common, a spline surface and, with a pixel size, series of additional parameters are
-        compared too; where perspective is not significant, the telecentric camera.
+        By default :func:`camera_candidates`. Where the best of these leaves a residual pattern that the images have in
+        common, a spline surface and, with a pixel size, series of additional parameters are compared too; where
+        perspective is not significant, the telecentric camera.
     options : Options, optional
-        Options of the adjustments. Gross errors are rejected with the candidate of least residuals, so that
-        no good observation is rejected because a model is too simple; all are then compared without them.
-    folds : int
-        Number of parts of the images, each left out once.
-    seed : int
-        Seed of the random division.
-    executor : Executor, optional
-        What adjusts the network without each part of the images; by default this process.
+        Options of the adjustments. Gross errors are rejected with the model that is chosen with them, so that no good
+        observation is rejected because a model is too simple; all are then compared without them.
 
     Returns
     -------
@@ -207,10 +209,9 @@ def choose_model(
 
     Notes
     -----
-    Chosen is the candidate with the fewest parameters of those whose description length is within 2 of the
-    least, and which predict images not significantly worse than another. Residuals alone never decide. A
-    candidate whose projection has a standard deviation of more than 2 px in a corner of the image is left out
-    where another one, with residuals larger by less than 0.02 px, is determined ten times as well.
+    Chosen is the candidate with the fewest parameters of those than which none with more parameters makes images that
+    are left out ten times as probable. One image that others contradict decides nothing: what images tell of the camera
+    counts with the variance with which they differ. Large networks are represented by 60 of their images.
 
     Examples
     --------
@@ -222,143 +223,396 @@ def choose_model(
     >>> [(each.candidate.label, each.p < 0.01) for each in found.alternatives]
     [('brown: K1 K2', False), ('brown: no distortion', True)]
     """
-    if len(network.cameras) != 1 or network.cameras[0].additional is not None or network.cameras[0].sigma:
-        raise UsageError(
-            "needs a network of one camera without additional or observed parameters",
-            where="choice of a model",
-        )
-    camera = network.cameras[0]
-    own = camera.registered
-    usual, pitch_known = candidates is None, own is not None and own.needs_pitch
-    candidates = camera_candidates(pitch_known=pitch_known) if candidates is None else list(candidates)
-    if not candidates:
+    if len(network.cameras) != 1:
+        raise UsageError("has several cameras", where="network", do="choose the models of all with choose_models")
+    found = choose_models(network, candidates, options)
+    return found if isinstance(found, Failure) else found[0]
+
+
+def choose_models(
+    network: Network, candidates: Sequence[Candidate] | None = None, options: Options | None = None
+) -> tuple[ModelChoice, ...] | Failure:
+    """Choose the model of each camera of a network: its kind from its own images, its parameters from all.
+
+    Parameters
+    ----------
+    network, candidates, options
+        See :func:`choose_model`; cameras may be fixed to each other.
+
+    Returns
+    -------
+    tuple of ModelChoice, or Failure
+        In the order of the cameras. A failure when no candidate can be adjusted.
+
+    Raises
+    ------
+    UsageError
+        For a network with additional or observed parameters, or without candidates.
+
+    Examples
+    --------
+    >>> from reseau.bundle import example_network
+    >>> [found.chosen.candidate.label for found in choose_models(example_network())]
+    ['brown: K1']
+    """
+    options, chosen = options or Options(), list[_Search]()
+    for camera in network.cameras:
+        if camera.additional is not None or camera.sigma or camera.covariance is not None:
+            raise UsageError(
+                "has additional or observed parameters", where=f"{camera.label}, choice of a model"
+            )
+    if candidates is not None and not candidates:
         raise UsageError("there are none", where="candidates of the choice of a model")
-    options = options or Options()
-    first = first_problem(network, candidates, options)
-    fits = [first] * len(candidates) if isinstance(first, Failure) else adjusted_candidates(first, candidates)
-    if options.outliers == "reject" and (best := best_fit(fits)) is not None:
-        result = adjust_network(best.problem.network, options)
+    network = _sampled(network)
+    for c in range(len(network.cameras)):
+        found = _alone(network, c, candidates, options)
+        if isinstance(found, Failure):
+            return found
+        chosen.append(found)
+    if len(chosen) > 1:
+        joint = _jointly(network, chosen, options)
+        if isinstance(joint, Failure):
+            return joint
+        chosen = joint
+    return tuple(search.choice() for search in chosen)
+
+
+def _sampled(network: Network) -> Network:
+    """The network with fewer images and points, evenly distributed, where there are many."""
+    keep = np.ones(len(network.xy), dtype=bool)
+    for c in range(len(network.cameras)):
+        images = np.flatnonzero(network.camera_of == c)
+        if len(images) > _IMAGES:
+            if network.rig is None:
+                some = images[np.linspace(0, len(images) - 1, _IMAGES).round().astype(np.intp)]
+            else:
+                # Images that were taken at once stay together.
+                every = np.unique(network.rig.exposure)
+                wanted = every[np.linspace(0, len(every) - 1, _IMAGES).round().astype(np.intp)]
+                some = images[np.isin(network.rig.exposure[images], wanted)]
+            keep &= (network.camera_of[network.image_of] != c) | np.isin(network.image_of, some)
+    typical = float(np.median(np.bincount(network.image_of[keep], minlength=1)[np.unique(network.image_of[keep])]))
+    step = int(np.ceil(typical / _POINTS))
+    if step > 1:
+        some = np.arange(len(network.points)) % step == 0
+        some[network.distance_of.ravel()] = True
+        keep &= some[network.point_of]
+    return network if keep.all() else network.select(keep)
+
+
+def _alone(
+    network: Network, c: int, candidates: Sequence[Candidate] | None, options: Options
+) -> _Search | Failure:
+    """Search for the model of a camera with its own images only."""
+    camera = network.cameras[c]
+    pitch_known = camera.registered is not None and camera.registered.needs_pitch
+    usual = candidates is None
+    every = camera_candidates(pitch_known=pitch_known) if candidates is None else tuple(candidates)
+    if len(network.cameras) > 1:
+        own = network.camera_of == c
+        network = replace(
+            network.select(own[network.image_of]), rig=None, cameras=(camera,),
+            camera_of=np.zeros(len(own), dtype=np.intp),
+        )  # fmt: skip
+    first = first_fit(network, [family[0] for family in families(every)], options)
+    if isinstance(first, Failure) and usual and pitch_known:
+        # Rays that are parallel have no perspective from which a central projection could begin.
+        first = with_parallel_rays(network, PARALLEL[0], options, None)
+        every = PARALLEL
+    if isinstance(first, Failure):
+        return first
+    search = _Search(every, 0, pitch_known).from_fit(first)
+    if isinstance(search, Failure):
+        return search
+    if not search.simple:
+        # A model that does not fit may have led to poor orientations: they are computed anew with the one that does.
+        camera = camera_of(search.fit, 0)
+        again = first_fit(replace(network, cameras=(camera,)), [search.pick], options)
+        if isinstance(again, BundleFit) and search.fit.cost - again.cost > 2 * _ODDS * search.variance:
+            search = _Search(every, 0, pitch_known).from_fit(again)
+            if isinstance(search, Failure):
+                return search
+    if options.outliers == "reject":
+        result = adjust_network(search.fit.problem.network, options)
         if isinstance(result, Failure):
             return result
-        weights = result.fit.problem.weights
-        first = best.problem.continued(best).with_weights(weights)
-        fits = adjusted_candidates(first, candidates)
-    more = further_candidates(network, best_fit(fits), options, pitch_known=pitch_known) if usual else []
-    candidates = [*candidates, *(candidate for candidate, _ in more)]
-    fits = [*fits, *(fit for _, fit in more)]
-    if best_fit(fits) is None:
-        reason = first.reason if isinstance(first, Failure) else "no camera model can be adjusted"
-        return Failure(reason, Code.NOT_CONVERGED)
-    return _chosen(network, candidates, fits, folds, seed, executor or Here())
+        # The kind of model is as before; what the gross errors hid shows now.
+        again = search.fit.problem.continued(search.fit).with_weights(result.fit.problem.weights).adjusted()
+        if isinstance(again, Failure):
+            return again
+        search = _Search(every, 0, pitch_known).from_fit(again)
+        if isinstance(search, Failure):
+            return search
+    if usual:
+        search.add_further(network, options)
+    return search
 
 
-def _chosen(
-    network: Network,
-    candidates: Sequence[Candidate],
-    fits: Sequence[BundleFit | Failure],
-    folds: int,
-    seed: int,
-    executor: Executor,
-) -> ModelChoice:
-    """Compare the adjusted candidates."""
-    good = [k for k, fit in enumerate(fits) if isinstance(fit, BundleFit)]
-    length, number = np.full(len(fits), np.inf), np.zeros(len(fits))
-    for k in good:
-        fit = fits[k]
-        assert isinstance(fit, BundleFit)
-        count = 2 * int(fit.usable.observations.sum())
-        number[k] = parameters_determined(fit)
-        length[k] = count * np.log(fit.cost / count) + number[k] * np.log(count)
-    order = sorted(range(len(fits)), key=lambda k: (length[k], k))
-    vague = undetermined({k: fit for k in order if isinstance(fit := fits[k], BundleFit)})
-    length -= min(length[k] for k in good if k not in vague)
-    close = [k for k in order if k not in vague and length[k] < _HOPELESS][:_VALIDATED]
-    squares = predicted_images([fits[k] for k in close], folds, seed, executor) if len(close) > 1 else None
-    worse = worse_predictions(squares)
-    equal = [k for row, k in enumerate(close) if length[k] <= _EQUAL and row not in worse] or close[:1]
-    best = min(equal, key=lambda k: (number[k], length[k], k))
-    fit = fits[best]
-    assert isinstance(fit, BundleFit)
-    found = []
-    for k in order:
-        other = fits[k]
-        if isinstance(other, Failure):
-            why = "" if other.code is Code.NOT_CONSIDERED else "not adjusted: "
-            found.append(Compared(candidates[k], f"{why}{other.reason}", np.nan, np.nan, np.nan))
-            continue
-        row = close.index(k) if k in close else None
-        predicted = np.nan if squares is None or row is None else float(np.sqrt(mean_square(squares[row])))
-        one = Compared(
-            candidates[k], "", other.sigma0, other.cost, float(length[k]), predicted,
-            _test(candidates[k], other, candidates[best], fit), **_difference(fit, other),
-        )  # fmt: skip
-        reason = _reason(one, k == best, row in worse, candidates[best], len(equal))
-        if k in vague:
-            if np.isfinite(vague[k]):
-                reason = (
-                    f"its projection is not determined ({vague[k]:.2g} px in a corner), that of others is"
-                )
+def _jointly(network: Network, alone: Sequence[_Search], options: Options) -> list[_Search] | Failure:
+    """Search for the parameters of each camera in the network of all, with the kinds of models that were found."""
+    cameras = []
+    for given, search in zip(network.cameras, alone, strict=True):
+        richer = search.start if search.simple else search.pick
+        cameras.append(replace(camera_of(search.adjusted[richer].fit, 0), id=given.id))
+    result = adjust_network(replace(network, cameras=tuple(cameras)), options)
+    if isinstance(result, Failure):
+        return result
+    found, fit = list[_Search](), result.fit
+    for c, search in enumerate(alone):
+        own = [each for each in search.candidates if each.alike(search.pick)]
+        joint = _Search(own, c, search.pitch_known).from_fit(fit)
+        if isinstance(joint, Failure):
+            return joint
+        joint.before = search
+        found.append(joint)
+        fit = joint.fit
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Adjusted:
+    """An adjusted candidate, and what the images tell there; None where that is not known."""
+
+    fit: BundleFit
+    information: Information | None
+
+
+@dataclass(eq=False)
+class _Search:
+    """Candidates for one camera of a network: those that were adjusted, and the choice from them.
+
+    Parameters
+    ----------
+    candidates : sequence of Candidate
+        All of them.
+    camera : int
+        Row of the camera.
+    pitch_known : bool
+        Whether the size of a pixel is known.
+    """
+
+    candidates: Sequence[Candidate]
+    camera: int
+    pitch_known: bool
+    adjusted: dict[Candidate, _Adjusted] = field(default_factory=dict)
+    declined: dict[Candidate, str] = field(default_factory=dict)
+    before: _Search | None = None
+    start: Candidate = field(init=False)
+    pick: Candidate = field(init=False)
+
+    def from_fit(self, first: BundleFit) -> _Search | Failure:
+        """Begin with an adjustment, of one of the candidates if possible, and search."""
+        own = first.problem.network.cameras[self.camera]
+        several = families(self.candidates)
+        given = next((each for each in self.candidates if each.describes(own)), None)
+        if given is not None:
+            several.sort(key=lambda family: not family[0].alike(given))
+            self._add(given, first)
+        for family in several:
+            if self.adjusted:
+                break
+            self._adjust(family[0], first)
+        if not self.adjusted:
+            return Failure("no camera model can be adjusted", Code.NOT_CONVERGED)
+        self.start = next(iter(self.adjusted))
+        beyond = [each for each in self.candidates if self.start.within(each) and each.alike(self.start)]
+        # What parameters do that are far from zero, no linear problem tells: each next step is adjusted.
+        open_ = [each for each in beyond if not any(other.within(each) for other in beyond)]
+        open_ += [family[0] for family in several if not family[0].alike(self.start)]
+        while True:
+            self.pick = self._picked()
+            known = self.pick in self.adjusted
+            if open_ and (not self.simple or (known and self._pattern_left())):
+                for each in open_:
+                    self._adjust(each, (self._nearest(each) if each in beyond else self.best).fit)
+                open_ = []
+            elif known:
+                return self
             else:
-                reason = "its projection is folded before a corner, that of others is not"
-        found.append(replace(one, reason=reason))
-    camera = fit.problem.network.cameras[0]
+                self._adjust(self.pick, self._nearest(self.pick).fit)
+
+    def add_further(self, network: Network, options: Options) -> None:
+        """Compare candidates beyond the usual ones, where those give a reason to."""
+        fit, series = self.fit, SERIES if self.pitch_known else ()
+        flexible = surface(fit, self.camera)
+        further = [*([] if flexible is None else [flexible]), *series]
+        parallel = [each for each in PARALLEL if each not in self.candidates]
+        self.candidates = (*self.candidates, *further, *parallel)
+        for each in further:
+            if self._pattern_left():
+                self._adjust(each, fit)
+            else:
+                self.declined[each] = "not needed: the usual models leave no residual pattern that images have in common"
+        size = perspective(fit, self.camera)
+        for each in parallel:
+            if size > _SIGNIFICANT:
+                self.declined[each] = f"perspective is significant: 1/focal length is {size:.3g} times its sigma"
+            elif not self.pitch_known:
+                self.declined[each] = "needs the size of a pixel"
+            else:
+                self._add(each, with_parallel_rays(network, each, options, fit.problem.weights))
+        while (pick := self._picked()) not in self.adjusted:
+            self._adjust(pick, self._nearest(pick).fit)
+        self.pick = pick
+
+    @property
+    def simple(self) -> bool:
+        """Whether what is chosen has no parameters beyond those with which the search began."""
+        return self.pick == self.start or self.pick.within(self.start)
+
+    @property
+    def variance(self) -> float:
+        """Variance factor of the predictions; where a model does not fit, images contradict each other because of it."""
+        known = (each.information for each in self.adjusted.values())
+        return min((each.variance for each in known if each is not None), default=1.0)
+
+    @property
+    def fit(self) -> BundleFit:
+        """Adjustment of what is chosen."""
+        return self.adjusted[self.pick].fit
+
+    @property
+    def best(self) -> _Adjusted:
+        """The adjustment with the least residuals."""
+        return min(self.adjusted.values(), key=lambda each: each.fit.cost)
+
+    def _adjust(self, candidate: Candidate, fit: BundleFit) -> None:
+        self._add(candidate, adjusted_to(fit, candidate, self.camera))
+
+    def _add(self, candidate: Candidate, fit: BundleFit | Failure) -> None:
+        if isinstance(fit, Failure):
+            text = fit.reason if fit.code is Code.NOT_CONSIDERED else f"not adjusted: {fit.reason}"
+            self.declined[candidate] = text
+            return
+        wider = wider_model(candidate.model)
+        known = any(each.alike(candidate) and each.model == wider for each in self.candidates)
+        self.adjusted[candidate] = _Adjusted(fit, information_of(fit, self.camera, wider if known else None))
+
+    def _nearest(self, candidate: Candidate) -> _Adjusted:
+        """The adjustment of its family that differs from a candidate in the fewest parameters."""
+        several = [item for item in self.adjusted.items() if item[0].alike(candidate)]
+        return min(several, key=lambda item: len(candidate.parts ^ item[0].parts))[1]
+
+    def _predictions(self) -> dict[Candidate, Prediction]:
+        """Predictions of all candidates for which a model with their parameters was adjusted."""
+        found, variance = dict[Candidate, Prediction](), self.variance
+        for each in self.candidates:
+            if each in self.declined or not any(own.alike(each) for own in self.adjusted):
+                continue
+            near = self._nearest(each).information
+            if near is not None and len(near.own) >= _LEAST:
+                found[each] = near.predicted(each.estimated, variance)
+        return found
+
+    def _picked(self) -> Candidate:
+        """The candidate with the fewest parameters than which no richer one predicts better by more than chance."""
+        found = self._predictions()
+        density = {each: float(one.log_density.sum()) for each, one in found.items()}
+        for each in sorted(found, key=lambda each: found[each].parameters):
+            richer = [density[other] for other in found if found[other].parameters >= found[each].parameters]
+            if max(richer) <= density[each] + _ODDS:
+                return each
+        # Too few images to leave one out.
+        usual = camera_model(self.start.model).usual
+        return next((each for each in self.candidates if each.free == usual and each.alike(self.start)), self.start)
+
+    def _pattern_left(self) -> bool:
+        """Whether the residuals of what is chosen have a pattern that the images have in common."""
+        return unmodelled_pattern(result_of(self.fit), self.camera) is not None
+
+    def choice(self) -> ModelChoice:
+        """Return the choice, with all candidates."""
+        found, fit = self._predictions(), self.fit
+        density = {each: float(one.log_density.sum()) for each, one in found.items()}
+        best = max(density.values(), default=0.0)
+        compared = []
+        for each in sorted(self.candidates, key=lambda each: -density.get(each, -np.inf)):
+            one = found.get(each)
+            if each == self.pick and one is None:
+                reason = "chosen: the images are too few to compare models"
+                compared.append(Compared(each, reason, fit.sigma0, fit.cost, np.nan))
+            elif one is None:
+                beside = f"not needed: {self.start.label} leaves nothing that the images have in common"
+                reason = self.declined.get(each, beside if found else "the images are too few to compare models")
+                compared.append(Compared(each, reason, np.nan, np.nan, np.nan))
+            else:
+                compared.append(self._compared(each, one, found[self.pick], 2 * (best - density[each])))
+        chosen = next(each for each in compared if each.candidate == self.pick)
+        if self.before is not None:
+            known = {each.candidate for each in compared}
+            compared += [each for each in self.before.choice().compared if each.candidate not in known]
+        return ModelChoice(camera_of(fit, self.camera), tuple(compared), chosen)
+
+    def _compared(self, own: Candidate, one: Prediction, chosen: Prediction, length: float) -> Compared:
+        """Compare a candidate with the chosen one."""
+        information = self._nearest(own).information
+        assert information is not None
+        left = information.redundancy - one.parameters
+        sigma0 = float(np.sqrt(one.cost / left)) if left > 0 else np.nan
+        predicted = float(np.sqrt(one.squares.sum() / information.count))
+        p, more = np.nan, abs(one.parameters - chosen.parameters)
+        if (own.within(self.pick) or self.pick.within(own)) and more > 0:
+            f = abs(one.cost - chosen.cost) / more / self.variance
+            p = float(scipy.special.fdtrc(more, max(left, 1.0), f))
+        found = Compared(own, "", sigma0, one.cost, length, predicted, p, **self._difference(own, one, chosen))
+        return replace(found, reason=self._reason(found, one, chosen))
+
+    def _reason(self, found: Compared, one: Prediction, chosen: Prediction) -> str:
+        """Say why a candidate was chosen, or not."""
+        gain = float(one.log_density.sum() - chosen.log_density.sum())
+        if found.candidate == self.pick:
+            return "chosen: none with more parameters predicts images better"
+        if self.pick.within(found.candidate):
+            return "too many parameters: predicts images " + ("no better than chance" if gain > 0 else "worse")
+        if one.parameters > chosen.parameters and gain > 0:
+            return "more parameters, and predicts images no better than chance"
+        if found.candidate.within(self.pick):
+            return f"too simple: predicts images worse, the parameters that it lacks have p = {found.p:.2g}"
+        return "predicts images worse"
+
+    def _mapping(self, own: Candidate, one: Prediction) -> CameraMapping:
+        """The camera with the parameters by which images were predicted."""
+        fit = self._nearest(own).fit
+        if own.additional is not None:
+            return mapping_of(fit, self.camera)
+        given, model = fit.problem.network.cameras[self.camera], camera_model(own.model)
+        values = one.values[: len(model.names)]
+        at = np.array([model.names.index(name) for name in own.free], dtype=np.intp)
+        return CameraMapping(
+            model.mapping(values, given.grid, own.options), given.width, given.height, at,
+            one.covariance[np.ix_(at, at)],
+        )  # fmt: skip
+
+    def _difference(self, own: Candidate, one: Prediction, chosen: Prediction) -> dict[str, float]:
+        """Difference of a camera from the chosen one over the image, and what it means."""
+        if own == self.pick:
+            return {"rms_px": 0.0, "corner_px": 0.0, "share": 0.0}
+        best, other = self._mapping(self.pick, chosen), self._mapping(own, one)
+        try:
+            with np.errstate(all="ignore"):
+                field_ = calibration_difference(best, other, _ACROSS)
+        except UsageError:
+            # They have no rays in common: linear problems end anywhere with models that are far from right.
+            return {}
+        size = np.hypot(field_.difference[..., 0], field_.difference[..., 1])
+        richer = best if len(best.rows) >= len(other.rows) else other
+        sigma = projection_field(richer, _ACROSS).sigma
+        corners = [(0, 0), (0, -1), (-1, 0), (-1, -1)]
+        known = [place for place in corners if np.isfinite(size[place])]
+        worst = max(known, key=lambda place: float(size[place]), default=None)
+        seen = np.isfinite(size) & np.isfinite(sigma)
+        limit = np.sqrt(scipy.special.chdtri(2, _LEVEL))
+        return {
+            "rms_px": float(np.sqrt(np.nanmean(size**2))),
+            "corner_px": np.nan if worst is None else float(size[worst]),
+            "corner_sigma_px": np.nan if worst is None else float(sigma[worst]),
+            "share": float((size[seen] > limit * sigma[seen]).mean()) if seen.any() else np.nan,
+        }
+
+
+def camera_of(fit: BundleFit, c: int) -> Camera:
+    """A camera with its estimates as approximate values; parameters that are observed keep what was observed."""
+    camera = fit.problem.network.cameras[c]
     observed = np.array([name in camera.sigma for name in camera.names])
-    camera = replace(camera, values=np.where(observed, camera.values, fit.values.cameras[0, : len(observed)]))
-    return ModelChoice(replace(camera, id=network.cameras[0].id), tuple(found), found[order.index(best)])
-
-
-def _reason(one: Compared, best: bool, worse: bool, chosen: Candidate, equal: int) -> str:
-    """Say why a candidate was chosen, or not."""
-    own = one.candidate
-    if best:
-        text = "chosen: shortest description" if one.length == 0 else "chosen: fewest parameters"
-        return text + (f" of {equal} that are as good" if equal > 1 else "")
-    if one.length <= _EQUAL:
-        if worse:
-            return "predicts images significantly worse"
-        return "as good, with more parameters" if len(own.free) > len(chosen.free) else "as good"
-    if own.within(chosen):
-        return f"too simple: the parameters that it lacks are significant, p = {one.p:.2g}"
-    if chosen.within(own):
-        size = "not " if one.p > LEVEL else "hardly "
-        return f"too many parameters: the others are {size}significant, p = {one.p:.2g}"
-    return f"longer description by {one.length:.1f}" + (", and predicts images worse" if worse else "")
-
-
-def _test(own: Candidate, fit: BundleFit, chosen: Candidate, best: BundleFit) -> float:
-    """F test of the parameters in which one of two nested models exceeds the other."""
-    if own.within(chosen):
-        small, large = fit, best
-    elif chosen.within(own):
-        small, large = best, fit
-    else:
-        return np.nan
-    more = small.redundancy - large.redundancy
-    if more <= 0 or large.redundancy <= 0:
-        return np.nan
-    ratio = max(small.cost - large.cost, 0.0) / more / (large.cost / large.redundancy)
-    return float(scipy.special.fdtrc(more, large.redundancy, ratio))
-
-
-def _difference(best: BundleFit, other: BundleFit) -> dict[str, float]:
-    """Difference of two cameras over the image, and what it means."""
-    if best is other:
-        return {"rms_px": 0.0, "corner_px": 0.0, "share": 0.0}
-    one, two = (mapping_of(fit) for fit in (best, other))
-    try:
-        field_ = calibration_difference(one, two)
-    except UsageError:
-        return {}
-    size = np.hypot(field_.difference[..., 0], field_.difference[..., 1])
-    sigma = projection_field(one if len(one.names) >= len(two.names) else two).sigma
-    corners = [(0, 0), (0, -1), (-1, 0), (-1, -1)]
-    known = [place for place in corners if np.isfinite(size[place])]
-    worst = max(known, key=lambda place: float(size[place]), default=None)
-    seen = np.isfinite(size) & np.isfinite(sigma)
-    limit = np.sqrt(scipy.special.chdtri(2, 0.01))
-    return {
-        "rms_px": float(np.sqrt(np.nanmean(size**2))),
-        "corner_px": np.nan if worst is None else float(size[worst]),
-        "corner_sigma_px": np.nan if worst is None else float(sigma[worst]),
-        "share": float((size[seen] > limit * sigma[seen]).mean()) if seen.any() else np.nan,
-    }
+    values = np.where(observed, camera.values, fit.values.cameras[c, : len(observed)])
+    return replace(camera, values=values)

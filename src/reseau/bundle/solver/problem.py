@@ -245,6 +245,12 @@ class BundleProblem(Display):
         with one_thread():
             return _Run(self, AdjustOptions(max_iterations=max_iterations, damping=_DAMPING)).approach()
 
+    def linearised(self) -> Linear:
+        """Return the linear problem at the approximate values, of all observations that can be used."""
+        with one_thread():
+            run = _Run(self, AdjustOptions())
+            return linearised(run.system, run.start())
+
     def _adjusted(self, options: AdjustOptions) -> BundleFit | Failure:
         with one_thread():
             return _Run(self, options).adjust()
@@ -417,7 +423,7 @@ class _Run:
         astray = self._without_axes()
         if astray is not None:
             return astray
-        start = self._start()
+        start = self.start()
         alone = points_from_one_place(self.system, start)
         if len(alone) and problem.rounds < LAST_ROUND:
             return self._without(alone, start)._adjusted(self.options)
@@ -593,7 +599,7 @@ class _Run:
         """Approximate values in the coordinate system of the network after some iterations."""
         if not self.usable.images.any():
             return None
-        start = self._start()
+        start = self.start()
         freedom = freedom_of(self.system, start, self.usable.points)
         counts = self._counts(freedom)
         if counts[0] - counts[1] + counts[2] < 0:
@@ -644,7 +650,7 @@ class _Run:
         start = replace(values, rotation=rotation, x0=x0, xyz=xyz)
         return replace(self.problem, start=start, rounds=self.problem.rounds + 1)
 
-    def _start(self) -> Values:
+    def start(self) -> Values:
         """Approximate values with reduced coordinates; finite for unused images and points as well."""
         start = self.problem.start.shifted(-self.problem.centre)
         known = finite(start.x0)

@@ -25,7 +25,7 @@ from .telecentric import Telecentric  # isort: skip
 from .openptv import OpenPtv  # isort: skip
 from .line_scan import LineScan  # isort: skip
 from .splined import SplinedStereographic, SplineGrid  # isort: skip
-from .convert import Converted, convert
+from .convert import Converted, convert, roughly
 from .ebner import EbnerCorrection
 from .grid import PixelGrid
 from .registry import (
@@ -80,5 +80,6 @@ __all__ = [
     "distortion_names",
     "register_additional",
     "register_camera",
+    "roughly",
     "unit_of",
 ]

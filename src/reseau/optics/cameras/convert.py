@@ -15,11 +15,13 @@ from ..mapping import PlaneMapping
 from .grid import PixelGrid
 from .registry import camera_model
 
-__all__ = ["Converted", "convert"]
+__all__ = ["Converted", "convert", "roughly"]
 
 # Points along the longer side of the image to which the camera is fitted, and at which it is compared: it may
 # be worst between the former.
 _POINTS, _COMPARED = 41, 161
+# The same for approximate values.
+_FEW = 15
 # Greatest number of steps, and damping of the first one (columns have unit length).
 _ITERATIONS, _DAMPING = 200, 1e-3
 # Pixels that a parameter as large as its standard deviation by the prior counts.
@@ -160,28 +162,8 @@ def convert(
     >>> found.greatest_px < 1e-6, round(found.mapping.value_of("k1"), 6)
     (True, 0.064)
     """
+    found, uv, at = _closest(camera, grid, model, options, free, _POINTS)
     wanted = camera_model(model)
-    unknown = [name for name in free if name not in wanted.names]
-    if unknown:
-        raise UsageError(f"is not one of {', '.join(wanted.names)}", where=unknown[0])
-    if camera.parallel != wanted.parallel:
-        rays = "parallel" if camera.parallel else "central"
-        raise UsageError(f"has {rays} rays, the model `{model}` has not", where="camera to be converted")
-    pixels = _over(grid, _POINTS)
-    directions = camera.inverse(pixels)
-    known: Mask = np.asarray(np.isfinite(directions).all(axis=1))
-    if 2 * known.sum() <= len(known):
-        raise UsageError("has no directions over most of the image", where="camera to be converted")
-    uv, target = directions[known], pixels[known]
-    # Focal length along the rows, in the middle of the image.
-    centre = camera.inverse(grid.centre[None])
-    f = float(camera.derivatives(centre if np.isfinite(centre).all() else uv[:1]).d_xy[0, 0, 0])
-    at = np.array([not free or name in free for name in wanted.names])
-    priors = wanted.priors(wanted.names)
-    start = wanted.mapping(wanted.start_values(f, grid), grid, options)
-    found = _fitted(
-        start, uv, target, at, np.array([_WEAK / priors.get(name, np.inf) for name in wanted.names])
-    )
     names = tuple(name for name, chosen in zip(wanted.names, at, strict=True) if chosen)
     by_original = _by_original(camera, found, uv, at)
     pixels = _over(grid, _COMPARED)
@@ -191,6 +173,55 @@ def convert(
     return Converted(
         found, pixels[seen], difference, float(seen.mean()), names, by_original, tuple(camera.names)
     )
+
+
+def roughly(
+    camera: PlaneMapping,
+    grid: PixelGrid,
+    model: str,
+    options: Mapping[str, Any] | None = None,
+    *,
+    free: tuple[str, ...] = (),
+) -> PlaneMapping:
+    """Return approximate values in another model: :func:`convert` at few points, without its statistics.
+
+    Examples
+    --------
+    >>> from reseau.optics import Brown, PixelGrid
+    >>> grid = PixelGrid(640, 480, (0.01, 0.01))
+    >>> camera = Brown(grid=grid).with_values({"c": 8.0, "K1": 1e-3})
+    >>> round(roughly(camera, grid, "opencv", free=("fx", "fy", "cx", "cy", "k1")).value_of("k1"), 6)
+    0.064
+    """
+    return _closest(camera, grid, model, options, free, _FEW)[0]
+
+
+def _closest(
+    camera: PlaneMapping, grid: PixelGrid, model: str, options: Mapping[str, Any] | None,
+    free: tuple[str, ...], across: int,
+) -> tuple[PlaneMapping, Array, Mask]:  # fmt: skip
+    """The closest camera of a model at so many places across, their directions, and which parameters are free."""
+    wanted = camera_model(model)
+    unknown = [name for name in free if name not in wanted.names]
+    if unknown:
+        raise UsageError(f"is not one of {', '.join(wanted.names)}", where=unknown[0])
+    if camera.parallel != wanted.parallel:
+        rays = "parallel" if camera.parallel else "central"
+        raise UsageError(f"has {rays} rays, the model `{model}` has not", where="camera to be converted")
+    pixels = _over(grid, across)
+    directions = camera.inverse(pixels)
+    known: Mask = np.asarray(np.isfinite(directions).all(axis=1))
+    if 2 * known.sum() <= len(known):
+        raise UsageError("has no directions over most of the image", where="camera to be converted")
+    uv, target = directions[known], pixels[known]
+    # Focal length along the rows, in the middle of the image.
+    centre = camera.inverse(grid.centre[None])
+    f = float(camera.derivatives(centre if np.isfinite(centre).all() else uv[:1]).d_xy[0, 0, 0])
+    at = np.array([not free or name in free for name in wanted.names], dtype=bool)
+    priors = wanted.priors(wanted.names)
+    start = wanted.mapping(wanted.start_values(f, grid), grid, options)
+    weights = np.array([_WEAK / priors.get(name, np.inf) for name in wanted.names])
+    return _fitted(start, uv, target, at, weights), uv, at
 
 
 def _over(grid: PixelGrid, across: int) -> Array:

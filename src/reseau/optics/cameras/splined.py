@@ -181,7 +181,7 @@ class SplinedStereographic(PlaneMapping):
         u = image.copy()
         for _ in range(_STEPS):
             off, slope, _ = self._corrections(u)
-            step = np.linalg.solve(np.eye(2) + np.clip(slope, -0.5, 0.5), (image - u - off)[:, :, None])
+            step = np.linalg.solve(np.eye(2) + np.clip(slope, -0.45, 0.45), (image - u - off)[:, :, None])
             u = u + np.clip(step[:, :, 0], -0.3, 0.3)
         size = (u**2).sum(axis=1, keepdims=True)
         # Tangents of the angles; nothing is seen at 90° and beyond.

@@ -1,11 +1,13 @@
 """The uncertainty of a calibration, by its sources, and that of measurements made with it.
 
-Sources of the uncertainty of the parameters p, with covariance C of the adjustment, a posteriori:
+Sources of the uncertainty of the parameters p, with covariance C of the calibration, a posteriori, of which
+C_f is the part that presumes independent errors of all image points:
 
-* *grey values*: C less the part of the observed target coordinates;
+* *grey values*: C_f less the part of the observed target coordinates;
 * *target coordinates*: Q_pt P_t Q_tp σ₀², Q_pt being the cofactors of parameters and targets;
 * *temperature*: the coefficients times the uncertainty of the temperature;
-* *model*: what errors that images have in common add: with the scatter between images s_b, F C F,
+* *model*: C − C_f, by errors that the points of an image have in common. Calibrations of earlier versions,
+  whose C is C_f, have the standard deviations s_b from the scatter between images instead: F C F,
   f² = max(0, s_b²/s² − 1). Of measured points also the misfit of the model;
 * *reproducibility*: the covariance of the parameters between sessions beyond that within, both by the
   calibrations of a configuration since its last service event.
@@ -35,8 +37,8 @@ __all__ = [
 ]
 
 SOURCES = ("grey values", "target coordinates", "temperature", "model", "reproducibility")
-# The scatter between images is estimated from six of them or more.
-_LEAST_IMAGES = 6
+# Images that show what their points have in common; those that earlier versions needed for their scatter.
+_LEAST_IMAGES, _LEAST_SCATTERED = 3, 6
 _LEAST_SESSIONS = 3
 _ADJUSTMENT = "adjustment"
 _ROUNDS, _CONVERGED_PX = 30, 1e-8
@@ -122,9 +124,9 @@ def uncertainty_of(
     if "covariates" in calibration.validity:
         _add_function(found, missing, calibration, covariance, data)
     else:
-        _add_adjustment(found, missing, calibration, covariance)
+        shared = _add_adjustment(found, missing, calibration, covariance)
         _add_temperature(found, missing, names, data)
-        _add_model(found, missing, calibration, covariance)
+        _add_model(found, missing, calibration, covariance, shared)
         _add_reproducibility(found, missing, calibration, earlier)
     for each in () if data is None else data.contributions:
         row = _row(each.sensitivities, names, each.name)
@@ -171,15 +173,16 @@ def _add_function(
 
 def _add_adjustment(
     found: _Found, missing: dict[str, str], calibration: Calibration, covariance: Array
-) -> None:
-    """Contributions that share the variance factor of the adjustment."""
+) -> Array:
+    """Contributions that share the variance factor of the adjustment; returns the covariance less these."""
     where = f"calibration {calibration.name}"
     degrees = float(calibration.redundancy) if calibration.sigma0 is not None else np.inf
     part = calibration.validity.get("covariance_of_targets")
     targets = np.zeros_like(covariance) if part is None else np.array(part, dtype=np.float64)
     if targets.shape != covariance.shape:
         raise UsageError("has a damaged `covariance_of_targets`", where=where)
-    grey = Contribution("grey values", covariance - targets, degrees, group=_ADJUSTMENT)
+    shared = _shared(calibration, covariance - targets, np.diag(targets))
+    grey = Contribution("grey values", covariance - targets - shared, degrees, group=_ADJUSTMENT)
     found.append(("grey values", grey))
     if part is None:
         missing["target coordinates"] = "they were held, or estimated without observations of them"
@@ -187,6 +190,24 @@ def _add_adjustment(
         found.append(
             ("target coordinates", Contribution("target coordinates", targets, degrees, group=_ADJUSTMENT))
         )
+    return shared
+
+
+def _shared(calibration: Calibration, rest: Array, targets: Array) -> Array:
+    """The part of a covariance by what the points of an image have in common.
+
+    What is left without it has the formal variances, `targets` included, and the correlations of `rest`, as
+    far as it is not above `rest` in any direction: both parts are covariances, and their sum is `rest`.
+    """
+    given = calibration.validity.get("sigma_formal")
+    if given is None:
+        return np.zeros_like(rest)
+    variance, names = np.diag(rest), calibration.covariance.names
+    formal = np.array([given.get(name, np.inf) for name in names], dtype=np.float64) ** 2 - targets
+    ratio = np.sqrt(np.clip(formal / np.where(variance > 0, variance, 1.0), 0.0, 1.0))
+    if (ratio > 1 - 1e-9).all():
+        return np.zeros_like(rest)
+    return _between(rest, rest * np.outer(ratio, ratio))
 
 
 def _add_temperature(
@@ -205,18 +226,42 @@ def _add_temperature(
     found.append(("temperature", Contribution("temperature", cov, nu, given.distribution)))
 
 
-def _add_model(found: _Found, missing: dict[str, str], calibration: Calibration, covariance: Array) -> None:
-    between = calibration.validity.get("sigma_between_images") or {}
-    names = calibration.covariance.names
+def _add_model(
+    found: _Found, missing: dict[str, str], calibration: Calibration, covariance: Array, shared: Array
+) -> None:
+    names, validity = calibration.covariance.names, calibration.validity
+    images = int(validity.get("images", 0))
+    if "sigma_formal" in validity:
+        if 0 < images < _LEAST_IMAGES:
+            missing["model"] = f"what images have in common needs {_LEAST_IMAGES} of them"
+        else:
+            degrees = _degrees_of(calibration, covariance, shared)
+            found.append(("model", Contribution("model: what images have in common", shared, degrees)))
+        return
+    between = validity.get("sigma_between_images") or {}
     if not any(name in between for name in names):
-        missing["model"] = f"the scatter between images needs {_LEAST_IMAGES} of them"
+        missing["model"] = f"the scatter between images needs {_LEAST_SCATTERED} of them"
         return
     formal = np.diag(covariance)
     ratio = np.array([between.get(name, 0.0) ** 2 for name in names]) / np.where(formal > 0, formal, np.inf)
     f = np.sqrt(np.maximum(ratio - 1.0, 0.0))
-    images = int(calibration.validity.get("images", _LEAST_IMAGES))
     cov = covariance * np.outer(f, f)
-    found.append(("model", Contribution("model: scatter between images", cov, max(images - 1.0, 1.0))))
+    degrees = max((images or _LEAST_SCATTERED) - 1.0, 1.0)
+    found.append(("model", Contribution("model: scatter between images", cov, degrees)))
+
+
+def _degrees_of(calibration: Calibration, covariance: Array, shared: Array) -> float:
+    """Degrees of freedom of what images have in common: with them the whole has those of the calibration."""
+    whole = float(calibration.validity.get("degrees_of_freedom", np.inf))
+    size = np.sqrt(np.diag(covariance))
+    scale = np.outer(size, size)
+    root = np.linalg.pinv(covariance / np.where(scale > 0, scale, 1.0), hermitian=True)
+    part = float(np.trace(root @ (shared / np.where(scale > 0, scale, 1.0)))) / max(len(size), 1)
+    if not part > 0 or not np.isfinite(whole):
+        return whole
+    redundancy = float(calibration.redundancy) if calibration.redundancy > 0 else np.inf
+    spread = 1 / whole - (1 - part) ** 2 / redundancy
+    return max(part**2 / spread, 1.0) if spread > 0 else whole
 
 
 def _add_reproducibility(
