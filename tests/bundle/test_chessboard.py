@@ -79,7 +79,7 @@ def test_opencv_and_the_bundle_give_the_same_camera(seen: dict[str, Array]) -> N
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = result.fit.values.cameras[0, :9]
     theirs = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *distortion.ravel()[:5]]
     mine = [fx, fy, cx, cy, k1, k2, p1, p2, k3]
-    sigma = np.sqrt(np.diag(result.camera_covariance(0)))
+    sigma = np.sqrt(np.diag(result.formal_camera_covariance(0)))
     # OpenCV does not iterate to the end; a fiftieth of a standard deviation is no difference.
     assert np.abs((np.array(mine) - theirs) / sigma).max() < 2e-2
     assert np.sqrt((result.residuals**2).sum(axis=1).mean()) == pytest.approx(rms, rel=1e-6)

@@ -147,7 +147,7 @@ def test_a_result_without_statistics_says_so(tmp_path: Path) -> None:
     whole = adjust_network(network, Options(memory_gb=1.0))
     assert whole, whole
     assert Code.TOO_LARGE not in [remark.code for remark in whole.warnings]
-    one, other = result.camera_covariance(0), whole.camera_covariance(0)
+    one, other = result.formal_camera_covariance(0), whole.formal_camera_covariance(0)
     size = np.sqrt(np.diag(other))
     np.testing.assert_allclose((one - other) / np.outer(size, size), 0.0, rtol=0, atol=1e-6)
     document = ResultDocument.of(result)

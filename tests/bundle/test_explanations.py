@@ -44,7 +44,9 @@ def world(
             time = xy[:, 1] / SIZE[1] - 0.5
             for j in range(len(at)) if speed else ():
                 one = cv2.Rodrigues(cv2.Rodrigues(motion[:3] * time[j])[0] @ turn)[0]
-                xy[j] = cv2.projectPoints(xyz[j : j + 1], one, place + motion[3:] * time[j], matrix, lens)[0][0, 0]
+                xy[j] = cv2.projectPoints(xyz[j : j + 1], one, place + motion[3:] * time[j], matrix, lens)[0][
+                    0, 0
+                ]
             if not speed:
                 xy = cv2.projectPoints(xyz, cv2.Rodrigues(turn)[0], place, matrix, lens)[0][:, 0]
         xy = xy + noise * SIGMA * rng.normal(size=xy.shape)

@@ -195,7 +195,7 @@ def test_estimates_are_within_their_covariances_of_the_truth(model: str) -> None
     names, _, values = result.camera_columns(0)
     true = np.array([cam.parameters.get(name, 0.0) for name in names])
     off = values - true
-    covariance = result.camera_covariance(0) / fit.variance
+    covariance = result.formal_camera_covariance(0) / fit.variance
     square = float(off @ np.linalg.solve(covariance, off))
     assert scipy.stats.chi2.sf(square, len(off)) > 1e-4
     assert scipy.stats.chi2.cdf(square, len(off)) > 1e-4
@@ -218,7 +218,7 @@ def test_parameters_per_image_are_estimated_for_their_image() -> None:
     assert len(names) == 72
     assert names[12] == "b1 of image i1"
     off = values - true.ravel()
-    square = float(off @ np.linalg.solve(result.camera_covariance(0) / fit.variance, off))
+    square = float(off @ np.linalg.solve(result.formal_camera_covariance(0) / fit.variance, off))
     assert 1e-3 < scipy.stats.chi2.sf(square, 72) < 1 - 1e-3
 
 

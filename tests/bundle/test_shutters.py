@@ -212,7 +212,9 @@ def test_without_motion_it_is_the_frame_camera() -> None:
     plain, still = (adjust_network(each.noisy(3)).required() for each in (world, moving))
     np.testing.assert_allclose(still.fit.values.cameras, plain.fit.values.cameras, rtol=1e-10)
     np.testing.assert_allclose(still.fit.values.x0, plain.fit.values.x0, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(still.camera_covariance(0), plain.camera_covariance(0), rtol=1e-6)
+    np.testing.assert_allclose(
+        still.formal_camera_covariance(0), plain.formal_camera_covariance(0), rtol=1e-6
+    )
     assert still.motion is None
 
 

@@ -30,6 +30,6 @@ def test_it_is_what_errors_of_the_coordinates_do_to_the_camera() -> None:
     assert found is not None
     scale = np.sqrt(np.diag(expected))
     assert np.abs((found - expected) / np.outer(scale, scale)).max() < 0.01  # not linear to 1 %
-    total = result.camera_covariance(0)
+    total = result.formal_camera_covariance(0)
     assert np.linalg.eigvalsh((total - found) / np.outer(scale, scale)).min() > 0.0
     assert names == ("c", "x0", "y0", "K1")

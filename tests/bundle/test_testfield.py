@@ -190,7 +190,7 @@ def test_additional_parameters_that_are_not_needed_are_dropped_one_by_one() -> N
     assert result.redundancy == plain.redundancy + 10
     assert result.fit.redundancy_numbers.sum() == pytest.approx(result.redundancy, abs=1e-6)
     names, _, values_found = result.camera_columns(0)
-    sigma = np.sqrt(np.diag(result.camera_covariance(0)))
+    sigma = np.sqrt(np.diag(result.formal_camera_covariance(0)))
     kept = np.array([name in ("b3", "b7") for name in names])
     assert (values_found[~kept] == 0).all()
     assert (sigma[~kept] == 0).all()

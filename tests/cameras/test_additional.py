@@ -99,7 +99,7 @@ def normalised(model: AdditionalModel, seeds: range) -> Array:
     for seed in seeds:
         result = result_of(world, values, seed)
         off = result.camera_columns(0)[2] - true
-        squares.append(off @ np.linalg.solve(result.camera_covariance(0), off) / len(off))
+        squares.append(off @ np.linalg.solve(result.formal_camera_covariance(0), off) / len(off))
     return np.array(squares)
 
 

@@ -347,7 +347,7 @@ def test_the_bundle_recovers_the_truth(case: Case, tmp_path: Path) -> None:
     assert names == case.model.usual
     true = world.network.cameras[0].parameters
     off = values - [true[name] for name in names]
-    covariance = result.camera_covariance(0)
+    covariance = result.formal_camera_covariance(0)
     assert float(off @ np.linalg.solve(covariance, off)) < 4 * len(names)
     tested = {test.name for test in result.camera_tests(0)}
     assert tested == set(distortion_names(names, case.model.name))
@@ -387,7 +387,7 @@ def normalised_errors(case: Case, seeds: range) -> tuple[Array, Array]:
         result = result_of(world, seed)
         names, _, values = result.camera_columns(0)
         off = values - [true[name] for name in names]
-        covariance = result.camera_covariance(0)
+        covariance = result.formal_camera_covariance(0)
         single.append(off / np.sqrt(np.diag(covariance)))
         joint.append(off @ np.linalg.solve(covariance, off) / len(off))
     return np.array(single), np.array(joint)

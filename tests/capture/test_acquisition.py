@@ -78,7 +78,7 @@ def test_a_plan_stores_frames_verdicts_documents_and_results(rig: FieldRig, sess
 def cofactors_of(made: TestfieldProcedure) -> dict[float, float]:
     """Cofactors of c (standard deviations for a sigma0 of 1), by the standard deviations that are reported.
 
-    These are cofactors times sigma0, and enlarged by the scatter between images, which nobody can predict.
+    These are cofactors times sigma0, and enlarged by what images have in common, which nobody can predict.
     """
     progress, found = made.progress, dict[float, float]()
 
@@ -87,7 +87,7 @@ def cofactors_of(made: TestfieldProcedure) -> dict[float, float]:
         if reached:
             calibrated = made.calibrated()
             assert not isinstance(calibrated, Failure)
-            variance = calibrated.result.camera_covariance(0)[0, 0]
+            variance = calibrated.result.formal_camera_covariance(0)[0, 0]
             found[reached["sigma_c"]] = float(np.sqrt(variance) / calibrated.result.sigma0)
         return reached
 

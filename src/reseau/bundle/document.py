@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import ConfigDict, Field
 
 from ..adjust.significance import CoefficientTest
 from ..core.data import Array
@@ -107,13 +107,6 @@ class CameraResult(Strict):
     correlation: Correlation
     tests: dict[str, Significance]
     priors: PriorResult | None = None
-
-    @model_serializer(mode="wrap")
-    def _without_older_keys(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        content: dict[str, Any] = handler(self)
-        if self.sigma_between_images is None:
-            del content["sigma_between_images"]
-        return content
 
 
 class RefractionResult(Strict):
@@ -440,7 +433,7 @@ def _camera(result: Result, c: int) -> CameraResult:
     }
     degrees = _column(found.dof) if found.dof is not None else (None,) * len(found.parameters)
     influence = result.priors(c)
-    more = {} if influence is None else {"priors": _priors(influence, regularised(result, c))}
+    more: dict[str, Any] = {} if influence is None else {"priors": _priors(influence, regularised(result, c))}
     return CameraResult(
         id=camera.id,
         parameters=held | estimated,

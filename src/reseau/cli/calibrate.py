@@ -541,7 +541,9 @@ def _say_choice(choice: ModelChoice, before: str) -> None:
         return
     say("  model                                      sigma0   length  predicted  at the corners px\n")
     for each in known:
-        line = f"  {each.candidate.label[:40]:40} {each.sigma0:8.4f} {each.length:8.1f}  {each.predicted:9.4f}"
+        line = (
+            f"  {each.candidate.label[:40]:40} {each.sigma0:8.4f} {each.length:8.1f}  {each.predicted:9.4f}"
+        )
         corner = f"{each.corner_px:7.2g}" if np.isfinite(each.corner_px) else "no image"
         sigma = f" ± {each.corner_sigma_px:.2g}" if np.isfinite(each.corner_sigma_px) else ""
         say(f"{line}  {corner}{sigma}  {each.reason}\n")

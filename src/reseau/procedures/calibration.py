@@ -547,9 +547,7 @@ def _calibrated(
     wrong = left_out(network_of(measured, design, stand_in), cameras, sizes, of)
     if wrong is None:
         return _adjusted(measured, declined, sizes, notes, design, model, options, taken, None)
-    done = _adjusted(
-        wrong.kept(measured), declined, sizes, notes, design, model, options, taken, wrong.found
-    )
+    done = _adjusted(wrong.kept(measured), declined, sizes, notes, design, model, options, taken, wrong.found)
     if isinstance(done, Failure):
         return done
     still = wrong.after(done.result)

@@ -72,7 +72,7 @@ class Effect:
     @property
     def count(self) -> int:
         """Number of columns."""
-        return self.groups * self.slope.shape[2]
+        return self.groups * int(self.slope.shape[2])
 
     def rms(self, sigma: Array) -> Array:
         """Displacements of the points by one unit of each effect in their sigma (n,), (groups, q)."""
@@ -138,9 +138,7 @@ class Scores:
 
     def mapped(self, matrix: Array) -> Scores:
         """The scores of other columns C T."""
-        return replace(
-            self, g=matrix.T @ self.g, m=matrix.T @ self.m @ matrix, carried=self.carried @ matrix
-        )
+        return replace(self, g=matrix.T @ self.g, m=matrix.T @ self.m @ matrix, carried=self.carried @ matrix)
 
     def combined(self, groups: int, matrices: Array) -> Scores:
         """The scores of combinations of the columns of each group, (groups, q, k)."""
@@ -183,9 +181,7 @@ class Scores:
         """Log density of residuals with this sum of squares: of a mixture of σ² = 1 and σ² unknown."""
         half = self.redundancy / 2
         quad = np.maximum(quad, 1e-300)
-        free = (
-            scipy.special.gammaln(half) + half * np.log(2.0) - half * np.log(quad) - np.log(_LOG_RANGE)
-        )
+        free = scipy.special.gammaln(half) + half * np.log(2.0) - half * np.log(quad) - np.log(_LOG_RANGE)
         share = known
         with np.errstate(divide="ignore"):
             found: Array = np.logaddexp(-0.5 * quad + np.log(share), free + np.log1p(-share))
@@ -217,7 +213,7 @@ class Scores:
 
     def effects(self, size: float) -> Array:
         """The most probable effects of this size (k,)."""
-        return np.linalg.solve(self.m + np.eye(len(self.g)) / size**2, self.g)
+        return np.asarray(np.linalg.solve(self.m + np.eye(len(self.g)) / size**2, self.g), dtype=np.float64)
 
     def log_evidence_at(self, effects: Array, sizes: Array = _SIZES, *, known: float = 0.5) -> float:
         """As :meth:`log_evidence`, for scores at these effects (k,), which were taken into account."""

@@ -234,17 +234,17 @@ class SharedErrors:
             found += self.distance**2 * (own @ own.T)
         return found
 
-    def _factors(
-        self, columns: Rows, directions: Array, camera: Rows, count: Rows
-    ) -> tuple[Array, Array]:
+    def _factors(self, columns: Rows, directions: Array, camera: Rows, count: Rows) -> tuple[Array, Array]:
         """Factors on the shared errors in each direction (k,), and relative variances of their squares."""
         groups, width = self.pulls.shape[:2]
+        if not width:
+            return np.ones(len(columns)), np.zeros(len(columns))
         by_image = np.zeros((groups, width, len(columns)))
         place = {column: k for k, column in enumerate(columns.tolist())}
         for i, image in enumerate(_looked_at(self.fit)):
             c = int(self.fit.problem.network.camera_of[image])
-            for k in range(int(count[c]) if camera[c] >= 0 else 0):
-                by_image[i, k, place[int(camera[c]) + k]] = 1.0
+            for q in range(int(count[c]) if camera[c] >= 0 else 0):
+                by_image[i, q, place[int(camera[c]) + q]] = 1.0
         turned = by_image @ directions
         g = np.einsum("iq,iqk->ik", self.scores.g.reshape(groups, width), turned) ** 2 / self.variance
         k = np.arange(groups)
@@ -274,9 +274,7 @@ def _degrees(parts: Array, spread: Array) -> Array:
 def _camera_columns(fit: BundleFit) -> Rows:
     """Columns of all parameters of cameras among the reduced unknowns."""
     unknowns = fit.unknowns
-    parts = [
-        unknowns.camera[c] + np.arange(unknowns.count[c]) for c in np.flatnonzero(unknowns.camera >= 0)
-    ]
+    parts = [unknowns.camera[c] + np.arange(unknowns.count[c]) for c in np.flatnonzero(unknowns.camera >= 0)]
     parts += [
         unknowns.extra[e] + np.arange(unknowns.extra_count[e]) for e in np.flatnonzero(unknowns.extra >= 0)
     ]
@@ -330,7 +328,9 @@ def shared_errors(fit: BundleFit) -> SharedErrors | None:
         between = _across(cross, typical * root[images])
         m = np.block([[field.m, between], [between.T, focal.m]])
         joint = Scores(np.concatenate([field.g, focal.g]), m, every.square, every.redundancy, m[:0])
-        seen = np.concatenate([_across(every.m[:count, end:], typical * root[images]), unit[:, None] * every.m[count:end, end:]])
+        seen = np.concatenate(
+            [_across(every.m[:count, end:], typical * root[images]), unit[:, None] * every.m[count:end, end:]]
+        )
         fits.append((_largest(joint, count), joint, seen))
     # Each component pays for itself as a parameter of which there are as many observations as images (Schwarz).
     log = np.array([found[2] - 0.5 * np.log(len(images)) * np.count_nonzero(found[:2]) for found, *_ in fits])
@@ -408,7 +408,7 @@ def _along(scores: Scores, near: float) -> tuple[float, float]:
         half = scipy.linalg.solve_triangular(factor, size * scores.g, lower=True, check_finite=False)
         square = max(scores.square - float(half @ half), 1e-300)
         log_det = float(np.log(np.diag(factor)).sum())
-        return -0.5 * r * np.log(square / r) - log_det + scores.log_density
+        return float(-0.5 * r * np.log(square / r) - log_det + scores.log_density)
 
     nothing = -0.5 * scores.redundancy * np.log(scores.square / scores.redundancy) + scores.log_density
     grid = np.log(_GRID) if not near else np.log(near) + np.log(2.0) * np.arange(-1, 2)
@@ -419,8 +419,10 @@ def _along(scores: Scores, near: float) -> tuple[float, float]:
     right = values[k + 1] if k + 1 < len(values) else log_of(x + step)
     for _ in range(3):
         bend = left - 2 * y + right
-        move = float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) * step if bend < 0 else (
-            step if right > left else -step
+        move = (
+            float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) * step
+            if bend < 0
+            else (step if right > left else -step)
         )
         new = log_of(x + move)
         if new <= y + _CONVERGED:

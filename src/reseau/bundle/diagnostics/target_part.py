@@ -40,7 +40,7 @@ def covariance_by_targets(result: Result, c: int) -> Array | None:
     >>> network = example_network()
     >>> surveyed = replace(network, sigma=np.full((20, 3), 1e-3), role=("control",) * 20, datum="control")
     >>> result = adjust_network(surveyed)
-    >>> part = covariance_by_targets(result, 0) / result.camera_covariance(0)
+    >>> part = covariance_by_targets(result, 0) / result.formal_camera_covariance(0)
     >>> bool(0.01 < part[0, 0] < 1.0), covariance_by_targets(adjust_network(network), 0)
     (True, None)
     """

@@ -138,5 +138,7 @@ def _adjusted(result: Result, network: Network, code: str, form: str, known: flo
     # A parameter costs half the logarithm of the number of observations (Schwarz 1978).
     plain = Scores(np.zeros(0), np.zeros((0, 0)), again.cost, result.redundancy, np.zeros((0, 0)))
     log = plain.log_nothing(known=known) - 0.5 * more * np.log(result.redundancy)
-    adjusted = Result(network, again, np.asarray(again.rejected[: 2 * len(network.xy)].reshape(-1, 2).any(axis=1)))
+    adjusted = Result(
+        network, again, np.asarray(again.rejected[: 2 * len(network.xy)].reshape(-1, 2).any(axis=1))
+    )
     return Alternative(code, form, log, adjusted, fit.cost - again.cost)

@@ -112,7 +112,7 @@ def other_cameras(sight: Sight, part: Scores, known: float) -> Chosen | None:
                 seen.add(rows.tobytes())
                 member = np.zeros(images)
                 member[rows] = 1.0
-                split = part.mapped(np.kron(member[:, None], np.eye(3)))
+                split = part.mapped(np.asarray(np.kron(member[:, None], np.eye(3)), dtype=np.float64))
                 split = split.scaled(1.0 / np.sqrt(np.maximum(np.diag(split.m), 1e-300)))
                 for columns in (np.arange(1), np.arange(1, 3), np.arange(3)):
                     one = split.part(columns)

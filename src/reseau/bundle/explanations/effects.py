@@ -132,8 +132,8 @@ class Sight:
         The axes are those of the camera. Rotations about the camera itself would move images as shifts do.
         """
         count = np.bincount(self.image, minlength=len(self.network.images))
-        middle = np.stack([np.bincount(self.image, axis, len(count)) for axis in self.in_camera.T], axis=1)
-        middle /= np.maximum(count, 1)[:, None]
+        sums = [np.bincount(self.image, axis, len(count)) for axis in self.in_camera.T]
+        middle: Array = np.stack(sums, axis=1) / np.maximum(count, 1)[:, None]
         cross = _cross(self.in_camera - middle[self.image])
         return np.concatenate([self.by_place @ cross, self.by_place], axis=2)
 
@@ -273,7 +273,7 @@ def _motion(sight: Sight) -> Iterator[Family]:
 def _target(sight: Sight) -> Iterator[Family]:
     """Points of the target, where they are held, elsewhere than designed."""
     network, values = sight.network, sight.result.fit.values
-    held: Mask = network.held.all(axis=1)
+    held: Mask = np.asarray(network.held.all(axis=1))
     seen = np.unique(sight.point)
     if not held[seen].all() or len(seen) < 6:
         return
@@ -317,7 +317,9 @@ def _tag_steps(along: Array, seen: Rows) -> Array:
     Zero where the spacing does not alternate between two values.
     """
     tolerance = 1e-6 * np.ptp(along[seen])
-    places = np.unique(np.round(along[seen] / tolerance).astype(np.int64)) * tolerance if tolerance else []
+    if not tolerance:
+        return np.zeros_like(along)
+    places = np.unique(np.round(along[seen] / tolerance).astype(np.int64)) * tolerance
     if len(places) < 4:
         return np.zeros_like(along)
     gaps = np.diff(places)

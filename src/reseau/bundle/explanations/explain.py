@@ -337,19 +337,19 @@ def _compared(
     forms = [replace(form, log_evidence=form.log_evidence - sound) for form in forms]
     better: dict[str, Alternative] = {}
     if discrete and max(found.values()) > -np.log(_FALSE) and max(found, key=found.__getitem__) != "noise":
-        every_other = [*alternatives(sight.result, _KNOWN)]
+        every_other: list[Alternative | None] = [*alternatives(sight.result, _KNOWN)]
         if "other-camera" in chosen:
             rows = chosen["other-camera"].rows
             count = len(sight.network.images)
             every_other.append(another_camera(sight.result, rows, _KNOWN, log_choice(count, len(rows))))
-        for other in every_other:
-            if other is None:
+        for one in every_other:
+            if one is None:
                 continue
-            if other.code != "lens":
-                other.log_evidence += _with_a_lens(other.result)
-            if other.log_evidence - sound > found.get(other.code, -np.inf):
-                found[other.code] = other.log_evidence - sound
-                better[other.code] = other
+            if one.code != "lens":
+                one.log_evidence += _with_a_lens(one.result)
+            if one.log_evidence - sound > found.get(one.code, -np.inf):
+                found[one.code] = one.log_evidence - sound
+                better[one.code] = one
     return _Comparison(found, forms, chosen, better)
 
 
@@ -361,7 +361,7 @@ def _with_a_lens(result: Result) -> float:
     forms = _compared(whole, every, sight, set(), discrete=False).forms
     each = [form.log_evidence for form in forms]
     gain = float(scipy.special.logsumexp(each)) - np.log(len(each)) + whole.log_nothing(known=1.0)
-    return max(gain - whole.log_nothing(known=_KNOWN) + np.log(_FALSE), 0.0)
+    return float(max(gain - whole.log_nothing(known=_KNOWN) + np.log(_FALSE), 0.0))
 
 
 def _begins(every: Sequence[Family]) -> dict[int, int]:
@@ -387,7 +387,7 @@ def _forms(family: Family, part: Scores, sight: Sight) -> list[_Form]:
             own = part.part(columns).scaled(units)
         else:
             columns, units = np.arange(groups * q), None
-            own = part.combined(groups, sigma * chosen)
+            own = part.combined(groups, np.asarray(sigma * chosen, dtype=np.float64))
         found.append(_Form(family, name, columns, units, own, own.log_evidence(known=_KNOWN)))
     return found
 
@@ -436,7 +436,9 @@ def _possible(now: _Comparison, sight: Sight) -> list[_Error]:
 def _error(form: _Form, weight: float, sight: Sight) -> _Error:
     """The effects of a form of its best size, and their covariance."""
     size = form.size
-    inverse = np.linalg.inv(form.scores.m + np.eye(len(form.scores.g)) / size**2)
+    inverse: Array = np.asarray(
+        np.linalg.inv(form.scores.m + np.eye(len(form.scores.g)) / size**2), dtype=np.float64
+    )
     left = form.scores.square - form.scores.explained(size)
     variance = max(left / form.scores.redundancy, 0.0)
     return _Error(form, form.scores, inverse @ form.scores.g, variance * inverse, weight, sight)

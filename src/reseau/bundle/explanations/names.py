@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -156,7 +157,9 @@ def misnamed(network: Network) -> Misnamed | None:
     if not rows:
         return None
     every = np.concatenate(rows)
-    labels = [f"{network.points[network.point_of[k]]} in {network.images[network.image_of[k]]}" for k in every]
+    labels = [
+        f"{network.points[network.point_of[k]]} in {network.images[network.image_of[k]]}" for k in every
+    ]
     return Misnamed(every, np.concatenate(points), np.concatenate(off), odds, tuple(labels))
 
 
@@ -289,7 +292,8 @@ class _View:
 
     def renamed(self, known: Rows, lens: _Lens) -> Rows:
         """The points in whose places the image points lie."""
-        return known[cKDTree(lens.pixels(_mapped(self.h, self.plane[known]))).query(self.xy)[1]]
+        places = lens.pixels(_mapped(self.h, self.plane[known]))
+        return np.asarray(known[cKDTree(places).query(self.xy)[1]])
 
     def judged(self, lens: _Lens, known: Rows) -> _Image:
         """Where the points lie, and whether in the places of their names."""
@@ -308,9 +312,7 @@ class _View:
         )  # fmt: skip
 
 
-def _view(
-    xy: Array, names: Rows, plane: Array, tree: cKDTree, known: Rows, lens: _Lens
-) -> _View | None:
+def _view(xy: Array, names: Rows, plane: Array, tree: cKDTree, known: Rows, lens: _Lens) -> _View | None:
     """The view of an image in which most names agree, if the target is as named, turned or mirrored."""
     views = []
     for turned in _turned(plane):
@@ -335,7 +337,7 @@ def _turned(plane: Array) -> Iterator[Array]:
             yield plane @ np.array([[c, -s], [s, c]]) * [flip, 1.0]
 
 
-def _mapped(h: Array, at: Array) -> Array:
+def _mapped(h: Any, at: Array) -> Array:
     mapped = np.column_stack([at, np.ones(len(at))]) @ h.T
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 

@@ -5,7 +5,6 @@ from .board import BoardChoice, BoardModel, choose_board, held_as_designed
 from .calibration import calibration_of, with_estimates
 from .candidates import Candidate, camera_candidates
 from .choice import Compared, ModelChoice, choose_model, choose_models
-from .lacking import Lacking, lacking
 from .search import (
     Kind,
     Selection,
@@ -22,7 +21,6 @@ __all__ = [
     "Candidate",
     "Compared",
     "Kind",
-    "Lacking",
     "ModelChoice",
     "Options",
     "Selection",
@@ -36,7 +34,6 @@ __all__ = [
     "eliminate_parameters",
     "estimate_components",
     "held_as_designed",
-    "lacking",
     "problem_of",
     "reweighted",
     "search_model",

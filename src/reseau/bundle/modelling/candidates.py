@@ -203,7 +203,9 @@ def families(candidates: Iterable[Candidate]) -> list[tuple[Candidate, ...]]:
     several = []
     for family in found.values():
         few = [each for each in family if each.coefficients <= _MODERATE]
-        first = max(few, key=lambda each: len(each.free)) if few else min(family, key=lambda each: len(each.free))
+        first = (
+            max(few, key=lambda each: len(each.free)) if few else min(family, key=lambda each: len(each.free))
+        )
         several.append((first, *(each for each in family if each is not first)))
     return several
 
@@ -268,7 +270,9 @@ def adjusted_to(fit: BundleFit, candidate: Candidate, camera: int) -> BundleFit 
     except UsageError:
         # The other model has no directions in most of the image.
         slope = given.bare_mapping().derivatives([[0.0, 0.0]]).d_xy[0, 0, 0]
-        values = model.mapping(model.start_values(float(slope), given.grid), given.grid, candidate.options).values
+        values = model.mapping(
+            model.start_values(float(slope), given.grid), given.grid, candidate.options
+        ).values
     own = _camera(given, candidate, values)
     if isinstance(own, Failure):
         return own

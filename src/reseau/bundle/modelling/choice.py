@@ -224,7 +224,9 @@ def choose_model(
     [('brown: K1 K2', False), ('brown: no distortion', True)]
     """
     if len(network.cameras) != 1:
-        raise UsageError("has several cameras", where="network", do="choose the models of all with choose_models")
+        raise UsageError(
+            "has several cameras", where="network", do="choose the models of all with choose_models"
+        )
     found = choose_models(network, candidates, options)
     return found if isinstance(found, Failure) else found[0]
 
@@ -291,7 +293,9 @@ def _sampled(network: Network) -> Network:
                 wanted = every[np.linspace(0, len(every) - 1, _IMAGES).round().astype(np.intp)]
                 some = images[np.isin(network.rig.exposure[images], wanted)]
             keep &= (network.camera_of[network.image_of] != c) | np.isin(network.image_of, some)
-    typical = float(np.median(np.bincount(network.image_of[keep], minlength=1)[np.unique(network.image_of[keep])]))
+    typical = float(
+        np.median(np.bincount(network.image_of[keep], minlength=1)[np.unique(network.image_of[keep])])
+    )
     step = int(np.ceil(typical / _POINTS))
     if step > 1:
         some = np.arange(len(network.points)) % step == 0
@@ -442,11 +446,15 @@ class _Search:
             if self._pattern_left():
                 self._adjust(each, fit)
             else:
-                self.declined[each] = "not needed: the usual models leave no residual pattern that images have in common"
+                self.declined[each] = (
+                    "not needed: the usual models leave no residual pattern that images have in common"
+                )
         size = perspective(fit, self.camera)
         for each in parallel:
             if size > _SIGNIFICANT:
-                self.declined[each] = f"perspective is significant: 1/focal length is {size:.3g} times its sigma"
+                self.declined[each] = (
+                    f"perspective is significant: 1/focal length is {size:.3g} times its sigma"
+                )
             elif not self.pitch_known:
                 self.declined[each] = "needs the size of a pixel"
             else:
@@ -514,7 +522,9 @@ class _Search:
                 return each
         # Too few images to leave one out.
         usual = camera_model(self.start.model).usual
-        return next((each for each in self.candidates if each.free == usual and each.alike(self.start)), self.start)
+        return next(
+            (each for each in self.candidates if each.free == usual and each.alike(self.start)), self.start
+        )
 
     def _pattern_left(self) -> bool:
         """Whether the residuals of what is chosen have a pattern that the images have in common."""
@@ -533,7 +543,9 @@ class _Search:
                 compared.append(Compared(each, reason, fit.sigma0, fit.cost, np.nan))
             elif one is None:
                 beside = f"not needed: {self.start.label} leaves nothing that the images have in common"
-                reason = self.declined.get(each, beside if found else "the images are too few to compare models")
+                reason = self.declined.get(
+                    each, beside if found else "the images are too few to compare models"
+                )
                 compared.append(Compared(each, reason, np.nan, np.nan, np.nan))
             else:
                 compared.append(self._compared(each, one, found[self.pick], 2 * (best - density[each])))
@@ -554,7 +566,9 @@ class _Search:
         if (own.within(self.pick) or self.pick.within(own)) and more > 0:
             f = abs(one.cost - chosen.cost) / more / self.variance
             p = float(scipy.special.fdtrc(more, max(left, 1.0), f))
-        found = Compared(own, "", sigma0, one.cost, length, predicted, p, **self._difference(own, one, chosen))
+        found = Compared(
+            own, "", sigma0, one.cost, length, predicted, p, **self._difference(own, one, chosen)
+        )
         return replace(found, reason=self._reason(found, one, chosen))
 
     def _reason(self, found: Compared, one: Prediction, chosen: Prediction) -> str:
@@ -563,7 +577,9 @@ class _Search:
         if found.candidate == self.pick:
             return "chosen: none with more parameters predicts images better"
         if self.pick.within(found.candidate):
-            return "too many parameters: predicts images " + ("no better than chance" if gain > 0 else "worse")
+            return "too many parameters: predicts images " + (
+                "no better than chance" if gain > 0 else "worse"
+            )
         if one.parameters > chosen.parameters and gain > 0:
             return "more parameters, and predicts images no better than chance"
         if found.candidate.within(self.pick):

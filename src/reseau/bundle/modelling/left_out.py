@@ -209,9 +209,7 @@ def information_of(fit: BundleFit, camera: int = 0, model: str | None = None) ->
     values[: len(given.values)] = fit.values.cameras[camera, : len(given.values)]
     names, free, prior = wanted.names, given.free, wanted.priors(given.free)
     held = replace(given, values=values[: len(given.values)], free=(), sigma={}, covariance=None)
-    every = replace(
-        given, model=wanted.name, values=values, free=wanted.names, sigma={}, covariance=None
-    )
+    every = replace(given, model=wanted.name, values=values, free=wanted.names, sigma={}, covariance=None)
     if given.additional is not None:
         whole = whole_camera(fit, camera)
         held = replace(
