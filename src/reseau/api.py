@@ -283,8 +283,8 @@ def calibrate(
     design : str, Path, ReseauDesign, TestfieldDesign or BoardDesign
         The target.
     model : str or CameraOptions, optional
-        Name of the camera model; by default it is chosen, see :func:`reseau.bundle.choose_models`. With `free` alone
-        it is ``brown`` where the pixel size is given, else ``opencv``.
+        Name of the camera model; by default it is chosen, see :func:`reseau.bundle.choose_models`. With
+        `free` alone it is ``brown`` where the pixel size is given, else ``opencv``.
     pitch_mm : float, optional
         Size of a pixel in millimetres.
     free : sequence of str

@@ -125,8 +125,8 @@ def calibrate(
         str,
         typer.Option(
             metavar="NAME",
-            help="Camera model, of all cameras; by default, or with `auto`, models are compared and one is chosen "
-            "for each camera. With --free alone brown with --pitch, otherwise opencv. An unknown name lists all.",
+            help="Camera model, of all cameras; by default, or with `auto`, one is chosen for each camera. "
+            "With --free alone brown with --pitch, otherwise opencv. An unknown name lists all.",
         ),
     ] = "",
     pitch: Annotated[float | None, typer.Option(min=1e-6, help="Pixel size, mm; required by brown.")] = None,

@@ -119,8 +119,8 @@ class CameraOptions:
     Parameters
     ----------
     model : str, optional
-        Name of a registered model, see :func:`reseau.optics.camera_models`, or ``auto``: it is chosen for each
-        camera, see :func:`reseau.bundle.choose_models`. By default ``brown`` if the pixel size is given,
+        Name of a registered model, see :func:`reseau.optics.camera_models`, or ``auto``: it is chosen for
+        each camera, see :func:`reseau.bundle.choose_models`. By default ``brown`` if the pixel size is given,
         otherwise ``opencv``.
     free : tuple of str
         Parameters to estimate; by default the usual ones of the model.

@@ -14,7 +14,7 @@ from ...optics import PixelGrid, additional_model
 from ...optics.cameras import SplineGrid, camera_model, roughly
 from ..network import Additional, Camera, Network
 from ..network.network import finite
-from ..solver import BundleFit, BundleProblem
+from ..solver import BundleFit
 from .adjustment import Options, adjust_network, problem_of
 from .determined import result_of, whole_camera
 from .left_out import with_camera
@@ -34,8 +34,8 @@ __all__ = [
     "with_parallel_rays",
 ]
 
-# Iterations of a candidate, which begins close to its solution, and the correction (relative to standard deviations)
-# that remains: predictions contain it.
+# Iterations of a candidate, which begins close to its solution, and the correction (relative to standard
+# deviations) that remains: predictions contain it.
 _STEPS, _ENOUGH = 40, 1e-3
 # Coefficients of the distortion with which a family begins: as many as OpenCV's default has.
 _MODERATE = 5
@@ -210,14 +210,20 @@ def families(candidates: Iterable[Candidate]) -> list[tuple[Candidate, ...]]:
     return several
 
 
-def first_fit(network: Network, starts: Sequence[Candidate], options: Options) -> BundleFit | Failure:
-    """Adjust the only camera of a network: the first of several candidates with which this can be done."""
+def first_fit(
+    network: Network, starts: Sequence[Candidate], options: Options, *, anew: bool = False
+) -> BundleFit | Failure:
+    """Adjust the only camera of a network: the first of several candidates with which this can be done.
+
+    With `anew` only these candidates, without what is known of the camera but its focal length.
+    """
     found: BundleFit | Failure = Failure("no candidate", Code.NOT_CONVERGED)
     camera, plain = network.cameras[0], replace(options, outliers="keep")
     f = float(camera.bare_mapping(distorted=False).derivatives([[0.0, 0.0]]).d_xy[0, 0, 0])
     alike = wider_model(camera.model) == wider_model(starts[0].model)
-    given = [_camera(camera, starts[0], camera.values)] if alike else []
-    for own in (*given, camera, *(_started(camera, start, f) for start in starts[alike:])):
+    given = [*([_camera(camera, starts[0], camera.values)] if alike else []), camera]
+    rest = [_started(camera, start, f) for start in starts[alike and not anew :]]
+    for own in [*([] if anew else given), *rest]:
         if isinstance(own, Failure):
             continue
         problem, _ = problem_of(replace(network, cameras=(own,)), plain)

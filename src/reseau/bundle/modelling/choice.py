@@ -1,10 +1,11 @@
 """Choice of a camera model: the simplest one that predicts images which it has not seen as well as any other.
 
-A first stage adjusts the usual perspective model with a moderate number of coefficients. Where parameters of the same
-model beyond these predict images that are left out no better, nothing is left that the images have in common, and the
-lens is perspective. Otherwise the models of wide lenses and of fisheyes are adjusted, too, each from the best before
-it. Then the candidates of all models that were adjusted are compared by the density with which images that are left
-out are predicted (see :mod:`~reseau.bundle.modelling.left_out`); what is chosen is adjusted, and compared anew.
+A first stage adjusts the usual perspective model with a moderate number of coefficients. Where parameters of
+the same model beyond these predict images that are left out no better, nothing is left that the images have
+in common, and the lens is perspective. Otherwise the models of wide lenses and of fisheyes are adjusted, too,
+each from the best before it. Then the candidates of all models that were adjusted are compared by the density
+with which images that are left out are predicted (see :mod:`~reseau.bundle.modelling.left_out`); what is
+chosen is adjusted, and compared anew.
 """
 
 from __future__ import annotations
@@ -44,9 +45,10 @@ from .left_out import Information, Prediction, information_of
 
 __all__ = ["Compared", "ModelChoice", "choose_model", "choose_models"]
 
-# A model with more parameters predicts better by more than chance where it makes the images that are left out ten times
-# as probable. One parameter too many does this in 1 % of cases: its logarithm is (χ² − 2) / 2 with one degree of
-# freedom (Stone 1977, J. R. Statist. Soc. B 39), and χ² > 2 + 2 ln 10 has this probability. So have several.
+# A model with more parameters predicts better by more than chance where it makes the images that are left out
+# ten times as probable. One parameter too many does this in 1 % of cases: its logarithm is (χ² − 2) / 2 with
+# one degree of freedom (Stone 1977, J. R. Statist. Soc. B 39), and χ² > 2 + 2 ln 10 has this probability. So
+# have several.
 _ODDS = np.log(10.0)
 _LEVEL = 0.01
 # Least number of images, of which one is left out.
@@ -74,8 +76,8 @@ class Compared:
     cost : float
         vᵀPv.
     length : float
-        −2 times the logarithm of the density with which images that are left out are predicted, less that of the
-        best candidate.
+        −2 times the logarithm of the density with which images that are left out are predicted, less that of
+        the best candidate.
     predicted : float
         Root mean square of predicted image coordinates, in their standard deviations.
     p : float
@@ -190,12 +192,12 @@ def choose_model(
     network : Network
         Network with one camera, of any registered model.
     candidates : sequence of Candidate, optional
-        By default :func:`camera_candidates`. Where the best of these leaves a residual pattern that the images have in
-        common, a spline surface and, with a pixel size, series of additional parameters are compared too; where
-        perspective is not significant, the telecentric camera.
+        By default :func:`camera_candidates`. Where the best of these leaves a residual pattern that the
+        images have in common, a spline surface and, with a pixel size, series of additional parameters are
+        compared too; where perspective is not significant, the telecentric camera.
     options : Options, optional
-        Options of the adjustments. Gross errors are rejected with the model that is chosen with them, so that no good
-        observation is rejected because a model is too simple; all are then compared without them.
+        Options of the adjustments. Gross errors are rejected with the model that is chosen with them, so that
+        no good observation is rejected because a model is too simple; all are then compared without them.
 
     Returns
     -------
@@ -209,9 +211,10 @@ def choose_model(
 
     Notes
     -----
-    Chosen is the candidate with the fewest parameters of those than which none with more parameters makes images that
-    are left out ten times as probable. One image that others contradict decides nothing: what images tell of the camera
-    counts with the variance with which they differ. Large networks are represented by 60 of their images.
+    Chosen is the candidate with the fewest parameters of those than which none with more parameters makes
+    images that are left out ten times as probable. One image that others contradict decides nothing: what
+    images tell of the camera counts with the variance with which they differ. Large networks are represented
+    by 60 of their images.
 
     Examples
     --------
@@ -329,13 +332,21 @@ def _alone(
     if isinstance(search, Failure):
         return search
     if not search.simple:
-        # A model that does not fit may have led to poor orientations: they are computed anew with the one that does.
-        camera = camera_of(search.fit, 0)
-        again = first_fit(replace(network, cameras=(camera,)), [search.pick], options)
-        if isinstance(again, BundleFit) and search.fit.cost - again.cost > 2 * _ODDS * search.variance:
-            search = _Search(every, 0, pitch_known).from_fit(again)
-            if isinstance(search, Failure):
-                return search
+        # A model that does not fit may have led to poor orientations: they are computed anew with the one
+        # that does.
+        own = replace(network, cameras=(camera_of(search.fit, 0),))
+        several = [
+            first_fit(own, [search.pick], options),
+            first_fit(network, [search.pick], options, anew=True),
+        ]
+        fresh = min(
+            (fit for fit in several if isinstance(fit, BundleFit)),
+            key=lambda fit: fit.cost,
+            default=search.fit,
+        )
+        if search.fit.cost - fresh.cost > 2 * _ODDS * search.variance:
+            better = _Search(every, 0, pitch_known).from_fit(fresh)
+            search = search if isinstance(better, Failure) else better
     if options.outliers == "reject":
         result = adjust_network(search.fit.problem.network, options)
         if isinstance(result, Failure):
@@ -353,7 +364,7 @@ def _alone(
 
 
 def _jointly(network: Network, alone: Sequence[_Search], options: Options) -> list[_Search] | Failure:
-    """Search for the parameters of each camera in the network of all, with the kinds of models that were found."""
+    """Search for the parameters of each camera in the network of all, with the kinds of models found."""
     cameras = []
     for given, search in zip(network.cameras, alone, strict=True):
         richer = search.start if search.simple else search.pick
@@ -447,7 +458,7 @@ class _Search:
                 self._adjust(each, fit)
             else:
                 self.declined[each] = (
-                    "not needed: the usual models leave no residual pattern that images have in common"
+                    "not needed: the usual models leave no pattern that images have in common"
                 )
         size = perspective(fit, self.camera)
         for each in parallel:
@@ -470,7 +481,7 @@ class _Search:
 
     @property
     def variance(self) -> float:
-        """Variance factor of the predictions; where a model does not fit, images contradict each other because of it."""
+        """Variance factor of the predictions, of the model by which images contradict each other least."""
         known = (each.information for each in self.adjusted.values())
         return min((each.variance for each in known if each is not None), default=1.0)
 
@@ -513,7 +524,7 @@ class _Search:
         return found
 
     def _picked(self) -> Candidate:
-        """The candidate with the fewest parameters than which no richer one predicts better by more than chance."""
+        """The simplest candidate than which no richer one predicts better by more than chance."""
         found = self._predictions()
         density = {each: float(one.log_density.sum()) for each, one in found.items()}
         for each in sorted(found, key=lambda each: found[each].parameters):
@@ -523,7 +534,12 @@ class _Search:
         # Too few images to leave one out.
         usual = camera_model(self.start.model).usual
         return next(
-            (each for each in self.candidates if each.free == usual and each.alike(self.start)), self.start
+            (
+                each
+                for each in self.candidates
+                if each.free == usual and each.alike(self.start) and each not in self.declined
+            ),
+            self.start,
         )
 
     def _pattern_left(self) -> bool:
@@ -627,7 +643,7 @@ class _Search:
 
 
 def camera_of(fit: BundleFit, c: int) -> Camera:
-    """A camera with its estimates as approximate values; parameters that are observed keep what was observed."""
+    """A camera with its estimates as approximate values; observed parameters keep what was observed."""
     camera = fit.problem.network.cameras[c]
     observed = np.array([name in camera.sigma for name in camera.names])
     values = np.where(observed, camera.values, fit.values.cameras[c, : len(observed)])

@@ -1,17 +1,19 @@
 """How well a camera predicts images that are left out, for all subsets of its parameters at once.
 
-With the unknowns other than those of the camera eliminated, R = I − A Q Aᵀ, and K the derivatives of the image
-coordinates by the parameters of the camera (all weighted), the normal equations of a subset S of the parameters are
-N = Kᵀ R K, g = Kᵀ v. An image with the rows B adds T = K̃ᵀ (R_BB)⁻¹ K̃, t = K̃ᵀ (R_BB)⁻¹ v_B, with K̃ = (R K)_B, to
-what all others tell of the camera: without it they are N − T and g − t, also where points of the target are unknown
-and the same for all images. With x = N⁻¹ g, what is left of the image is d = v_B − K̃ x, and its predicted coordinates
-differ from the measured ones by R_BB⁻¹-weighted squares and a density of
+With the unknowns other than those of the camera eliminated, R = I − A Q Aᵀ, and K the derivatives of the
+image coordinates by the parameters of the camera (all weighted), the normal equations of a subset S of the
+parameters are N = Kᵀ R K, g = Kᵀ v. An image with the rows B adds T = K̃ᵀ (R_BB)⁻¹ K̃, t = K̃ᵀ (R_BB)⁻¹ v_B,
+with K̃ = (R K)_B, to what all others tell of the camera: without it they are N − T and g − t, also where
+points of the target are unknown and the same for all images. With x = N⁻¹ g, what is left of the image is d =
+v_B − K̃ x, and its predicted coordinates differ from the measured ones by R_BB⁻¹-weighted squares and a
+density of
 
     q = |d|² + (t − T x)ᵀ (N − T)⁻¹ (t − T x),    ln p = −q / 2ω + ½ ln |N − T| − ½ ln |N| + const
 
 (Förstner & Wrobel 2016, sect. 4.6; Cook & Weisberg 1982, Residuals and Influence in Regression, ch. 2–3). No
-adjustment is repeated, and all subsets of the parameters use the same sums. ω is the variance factor of what images
-tell of the camera: images that differ in more than noise (the paper, a motion, the focus) contradict each other in it.
+adjustment is repeated, and all subsets of the parameters use the same sums. ω is the variance factor of what
+images tell of the camera: images that differ in more than noise (the paper, a motion, the focus) contradict
+each other in it.
 """
 
 from __future__ import annotations
@@ -35,11 +37,11 @@ from .determined import whole_camera
 
 __all__ = ["Information", "Prediction", "information_of", "with_camera"]
 
-# Variance that is added to directions which an image alone determines, relative to that of its coordinates: they
-# predict nothing, and the same for all cameras.
+# Variance that is added to directions which an image alone determines, relative to that of its coordinates:
+# they predict nothing, and the same for all cameras.
 _NOTHING = 1e-6
-# Eigenvalues of scaled normal equations that belong to combinations without effect; information of one image, relative
-# to that of all, without which the others know nothing.
+# Eigenvalues of scaled normal equations that belong to combinations without effect; information of one image,
+# relative to that of all, without which the others know nothing.
 _RANK, _ALONE = 1e-11, 1e-9
 
 
@@ -52,8 +54,8 @@ class Prediction:
     log_density : ndarray (m,)
         Logarithm of the density of the coordinates of each image, without terms that all cameras share.
     squares : ndarray (m,)
-        Sum of squares of the predicted coordinates of each image, in their standard deviations without the variance
-        factor: what vᵀPv of the other images is smaller.
+        Sum of squares of the predicted coordinates of each image, in their standard deviations without the
+        variance factor: what vᵀPv of the other images is smaller.
     cost : float
         vᵀPv of all images.
     parameters : float
@@ -121,8 +123,8 @@ class Information:
     def variance(self) -> float:
         """ω: the variance of unit weight, or that of what images tell of the camera, if it is larger.
 
-        With G = R_BB^(−½) K̃, an image contradicts the estimates by s = Gᵀd with the cofactors T − T N⁻¹ T; sᵀ(T − T
-        N⁻¹ T)⁺s is its χ² of as many degrees of freedom as there are parameters.
+        With G = R_BB^(−½) K̃, an image contradicts the estimates by s = Gᵀd with the cofactors T − T N⁻¹ T;
+        sᵀ(T − T N⁻¹ T)⁺s is its χ² of as many degrees of freedom as there are parameters.
         """
         basis = self._basis(self.free)
         own = basis.T @ self.own @ basis
@@ -269,7 +271,7 @@ def with_camera(fit: BundleFit, camera: int, own: Camera, values: Array | None =
 
 
 def _slopes(linear: Linear, camera: int, count: int) -> Array:
-    """Weighted derivatives (n, 2, u) of the image coordinates by the parameters of a camera, zero for others."""
+    """Weighted derivatives (n, 2, u) of the image coordinates by the parameters of a camera."""
     unknowns, own = linear.system.unknowns, linear.system.seen.camera == camera
     width = unknowns.count[camera]
     last = linear.rows.shape[2] - 3

@@ -200,7 +200,7 @@ def _closest(
     camera: PlaneMapping, grid: PixelGrid, model: str, options: Mapping[str, Any] | None,
     free: tuple[str, ...], across: int,
 ) -> tuple[PlaneMapping, Array, Mask]:  # fmt: skip
-    """The closest camera of a model at so many places across, their directions, and which parameters are free."""
+    """The closest camera of a model at so many places across, directions, and what is free."""
     wanted = camera_model(model)
     unknown = [name for name in free if name not in wanted.names]
     if unknown:
