@@ -18,7 +18,6 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from drawn_networks import CAUSES, SETUPS, SIZES, calibrated, draw_case, draw_sound
@@ -297,9 +296,8 @@ def main() -> int:
                   f"sigma0 {e.sigma0:.3f}: {e.first}: {e.text}")  # fmt: skip
         return 0
     shares(found)
-    if explainer() is not None:
-        confusion(found)
-        totals(found)
+    confusion(found)
+    totals(found)
     times(found)
     failures(found)
     return 0

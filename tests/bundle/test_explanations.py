@@ -73,7 +73,7 @@ def test_nothing_is_wrong_in_sound_networks(target: str) -> None:
 @pytest.mark.parametrize(
     ("code", "changes"),
     [
-        ("lens", {"lens": LENS + [0, 0, 0, 0, 0.02]}),
+        ("lens", {"lens": np.array([-0.2, 0.05, 3e-4, -2e-4, 0.02])}),
         ("refocus", {"focus": 3.0}),
         ("rolling-shutter", {"speed": 3.0}),
         ("target-scale", {"scale": 1.002}),
@@ -100,7 +100,9 @@ def test_what_a_cause_explains_is_stated_in_pixels() -> None:
 
 def test_errors_of_the_projection_contain_what_the_lens_could_have() -> None:
     sound = calibrated(world()).explanation.projection_variance(0, 9)
-    wrong = calibrated(world(lens=LENS + [0, 0, 0, 0, 0.05])).explanation.projection_variance(0, 9)
+    wrong = calibrated(world(lens=np.array([-0.2, 0.05, 3e-4, -2e-4, 0.05]))).explanation.projection_variance(
+        0, 9
+    )
     assert np.linalg.eigvalsh(sound[0, 0]).min() >= 0
     assert np.trace(wrong[0, 0]) > 10 * np.trace(sound[0, 0]) > 0
     # In the middle, where the points are, it is less than in the corners.

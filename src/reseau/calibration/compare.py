@@ -161,7 +161,8 @@ def _tail(degrees: int, dof: float, statistic: Array) -> Array:
 
 
 def _joint_dof(first: CameraMapping, second: CameraMapping, by_first: Array, by_second: Array) -> float:
-    """Degrees of freedom of the sum of two covariances (Satterthwaite 1946), of their traces over the field."""
+    """Degrees of freedom of the sum of two covariances (Satterthwaite 1946), of their traces over the
+    field."""
     parts = [
         float(np.einsum("nij,jk,nik->", by, lens.covariance, by))
         for by, lens in ((by_first, first), (by_second, second))

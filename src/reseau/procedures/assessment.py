@@ -1,9 +1,9 @@
 """What a calibration is good for: its accuracy in pixels, what the photographs do not cover, what to do next.
 
 The accuracy at a place of the image is the root of the squares of the standard deviation of the projection,
-which contains what the points of each image have in common, and of the errors by what is wrong, or by what the
-lens could have that its model lacks, as far as that is probable; see :mod:`reseau.bundle.explanations`. It is a
-size in pixels, not a test: with many points, a test finds errors that are too small to matter.
+which contains what the points of each image have in common, and of the errors by what is wrong, or by what
+the lens could have that its model lacks, as far as that is probable; see :mod:`reseau.bundle.explanations`.
+It is a size in pixels, not a test: with many points, a test finds errors that are too small to matter.
 """
 
 from __future__ import annotations

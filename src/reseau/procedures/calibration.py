@@ -49,7 +49,6 @@ from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
-from ..core.numbers import measured as with_sigma
 from ..execution import Executor, Outputs
 from ..io import BoardDesign
 from ..io.network import TurntableEntry

@@ -1,4 +1,4 @@
-"""Image points of a plane target that lie in the places of others: left out before a calibration, said after it."""
+"""Image points of a plane target that lie in the places of others: left out, and said."""
 
 from __future__ import annotations
 

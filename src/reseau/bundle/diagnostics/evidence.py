@@ -23,7 +23,7 @@ import scipy.linalg
 import scipy.sparse
 import scipy.special
 
-from ...core.data import Array, Mask, Rows
+from ...core.data import Array, Rows
 from ..solver import BundleFit
 from ..solver.normal import SEGMENTS
 

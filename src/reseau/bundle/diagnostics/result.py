@@ -32,7 +32,6 @@ from .estimates import (
     RigEstimate,
     StageEstimate,
 )
-
 from .shared import SharedErrors, Uncertainty, shared_errors
 
 if TYPE_CHECKING:

@@ -1,15 +1,16 @@
 """What the points of an image have in common: components of variance, and the uncertainty that contains them.
 
-Paper that bends, motion, a lens that focuses anew, or what the model leaves of the lens displace the points of an
-image together. They are described by random effects of each image: a smooth field with the covariance
-τ² exp(−d²/2ℓ²) over distances d in the image, and a change of the principal distance. The variances are those of
-the largest restricted likelihood (Patterson & Thompson 1971, *Biometrika* 58), weighted over several lengths ℓ. With
-the sensitivities H = Q Aᵀ P C of the estimates to the effects θ ~ N(0, T), the covariance of the estimates is
+Paper that bends, motion, a lens that focuses anew, or what the model leaves of the lens displace the points
+of an image together. They are described by random effects of each image: a smooth field with the covariance
+τ² exp(−d²/2ℓ²) over distances d in the image, and a change of the principal distance. The variances are
+those of the largest restricted likelihood (Patterson & Thompson 1971, *Biometrika* 58), weighted over
+several lengths ℓ. With the sensitivities H = Q Aᵀ P C of the estimates to the effects θ ~ N(0, T), the
+covariance of the estimates is
 
     σ² Q + H T Hᵀ,
 
-of which σ² Q with σ² from all residuals, the formal one, is the least that is taken. Degrees of freedom follow from
-the information on the variances (Satterthwaite 1946; Fai & Cornelius 1996).
+of which σ² Q with σ² from all residuals, the formal one, is the least that is taken. Degrees of freedom
+follow from the information on the variances (Satterthwaite 1946; Fai & Cornelius 1996).
 """
 
 from __future__ import annotations
@@ -43,11 +44,11 @@ _DEGREE, _NODES = 4, 12
 _LEAST, _MOST = 3, 48
 """Fewer images show nothing in common; of more, as many are looked at."""
 _SHAPE = 0.7
-"""Standard deviation of the logarithm by which fields of another form than assumed do more or less to a parameter:
-a factor of two."""
+"""Standard deviation of the logarithm by which fields of another form than assumed do more or less to a
+parameter: a factor of two."""
 _GRID, _FINE, _CONVERGED = np.geomspace(0.05, 100.0, 8), np.geomspace(0.03, 100.0, 80), 0.01
-"""Standard deviations of the effects, in that of image points, at which the likelihood is computed first, and where
-that is quick; gain of its logarithm that is none."""
+"""Standard deviations of the effects, in that of image points, at which the likelihood is computed first,
+and where that is quick; gain of its logarithm that is none."""
 _POWERS = [(i, d - i) for d in range(_DEGREE + 1) for i in range(d + 1)]
 _COUNT = len(_POWERS)
 
@@ -332,7 +333,7 @@ def shared_errors(fit: BundleFit) -> SharedErrors | None:
             [_across(every.m[:count, end:], typical * root[images]), unit[:, None] * every.m[count:end, end:]]
         )
         fits.append((_largest(joint, count), joint, seen))
-    # Each component pays for itself as a parameter of which there are as many observations as images (Schwarz).
+    # Each component pays for itself as a parameter with as many observations as there are images (Schwarz).
     log = np.array([found[2] - 0.5 * np.log(len(images)) * np.count_nonzero(found[:2]) for found, *_ in fits])
     nothing = -0.5 * every.redundancy * np.log(every.square / every.redundancy)
     weights = np.exp(log - max(float(log.max()), nothing))

@@ -1,4 +1,4 @@
-"""Explanations as networks of their own, adjusted: where effects are large, first derivatives do not describe them."""
+"""Explanations as networks of their own, adjusted: for effects that first derivatives do not describe."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Explanations that choose among image points and images: gross errors, another camera.
 
-Each choice pays for what it selects: k of n image points have the prior probability 1/(n·C(n, k)), k of m images
-accordingly.
+Each choice pays for what it selects: k of n image points have the prior probability 1/(n·C(n, k)), k of m
+images accordingly.
 """
 
 from __future__ import annotations

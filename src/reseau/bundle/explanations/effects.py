@@ -280,7 +280,6 @@ def _target(sight: Sight) -> Iterator[Family]:
     xyz = values.xyz[seen]
     middle = xyz.mean(axis=0)
     _, size, axes = np.linalg.svd(xyz - middle, full_matrices=False)
-    every = np.zeros(len(sight.rows), dtype=np.intp)
     points = Effect(sight.by_point, np.searchsorted(seen, sight.point), len(seen))
     yield Family("target-shape", points, {"points": np.arange(3)})
     if size[2] > _PLANE * size[1]:

@@ -3,8 +3,8 @@
 Each explanation displaces the image points by effects that the adjustment did not know of; see
 :mod:`reseau.bundle.diagnostics.evidence`. They are compared by the density of the image points, which is the
 product of those with which each is predicted by the others before it; a prior probability of one in a hundred
-that anything is wrong, shared by all, says how much better than chance an explanation must predict. The best is
-taken into account, and what is left is looked at again.
+that anything is wrong, shared by all, says how much better than chance an explanation must predict. The
+best is taken into account, and what is left is looked at again.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from .sentences import advice, listed_places
 __all__ = ["Cause", "Explanation", "explain"]
 
 _FALSE = 0.01
-"""Probability that something is wrong, before the observations are seen. By Markov's inequality sound networks
-are called wrong no more often than this by Bayes factors against their being sound."""
+"""Probability that something is wrong, before the observations are seen. By Markov's inequality sound
+networks are called wrong no more often than this by Bayes factors against their being sound."""
 _KNOWN = 1 - _FALSE
 """Probability that the standard deviations of the image points are right, whatever else is wrong."""
 _CAUSES = 3

@@ -1,8 +1,8 @@
 """Image points of a plane target that lie nearer to the place of another point than to their own.
 
 The places of all points in an image follow from those that agree with each other: by a homography, and a
-polynomial for what lenses bend. Neither a camera nor an adjustment is needed, so that wrong names and gross errors
-are found before they spoil one.
+polynomial for what lenses bend. Neither a camera nor an adjustment is needed, so that wrong names and gross
+errors are found before they spoil one.
 """
 
 from __future__ import annotations
