@@ -33,6 +33,9 @@ _FALSE = 0.01
 networks are called wrong no more often than this by Bayes factors against their being sound."""
 _KNOWN = 1 - _FALSE
 """Probability that the standard deviations of the image points are right, whatever else is wrong."""
+_LACKS = 0.1
+"""Probability that a lens has what its model lacks, before observations are seen, for errors in the corners:
+there it is a doubt, not a finding."""
 _CAUSES = 3
 """Causes that are named at most."""
 _ALIKE = 0.05
@@ -422,11 +425,12 @@ def _again(form: _Form, sight: Sight) -> _Form:
 
 
 def _possible(now: _Comparison, sight: Sight) -> list[_Error]:
-    """What the lens could have that its model lacks: each form as probable as it is, against nothing."""
+    """What the lens could have that its model lacks: each form as probable as it is."""
     lens = [form for form in now.forms if form.code == "lens" and form.units is not None]
     if not lens:
         return []
-    log = np.array([0.0, *(form.log_evidence - np.log(len(lens)) for form in lens)])
+    prior = np.log(_LACKS / (1 - _LACKS) / len(lens))
+    log = np.array([0.0, *(form.log_evidence + prior for form in lens)])
     share = np.exp(log - scipy.special.logsumexp(log))[1:]
     return [
         _error(form, float(weight), sight) for form, weight in zip(lens, share, strict=True) if weight > 1e-3
