@@ -28,7 +28,7 @@ def test_a_correction_for_other_misfits_is_that_of_new_normal_equations(kind: st
     """Of second-order steps: with the factors of the first, for the curvature of the misfits."""
     world = networks.world(images=8, points=60, cameras=CAMERAS[kind], control=12)
     run = _Run(world.problem(), Options())
-    linear, rng = linearised(run.system, run._start()), np.random.default_rng(1)
+    linear, rng = linearised(run.system, run.start()), np.random.default_rng(1)
     other = rng.normal(size=linear.misfits.shape), rng.normal(size=linear.other_misfits.shape)
     normal = normal_of(linear, 1e-4)
     normal.correction()

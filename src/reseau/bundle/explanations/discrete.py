@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.special
 
-from ...core.data import Rows
+from ...core.data import Array, Rows
 from ..diagnostics.evidence import Effect, Scores, scores
 from .effects import Sight
 
@@ -94,12 +94,12 @@ def other_cameras(sight: Sight, part: Scores, known: float) -> Chosen | None:
     network, images = sight.network, len(sight.network.images)
     used = np.bincount(sight.image, minlength=images) > 0
     best, total = None, []
-    units = np.sqrt(np.maximum(np.diag(part.m), 1e-300))
-    plain = part.scaled(1.0 / units)
-    off = np.linalg.solve(plain.m + 1e-4 * np.eye(3 * images), plain.g).reshape(-1, 3) / units.reshape(-1, 3)
+    units = _units(part)
+    plain = part.scaled(units)
+    off = (np.linalg.solve(plain.m + _RIDGE * np.eye(3 * images), plain.g) * units).reshape(-1, 3)
     only = part.part(3 * np.arange(images))
-    first = np.sqrt(np.maximum(np.diag(only.m), 1e-300))
-    alone = np.linalg.solve(only.m / np.outer(first, first) + 1e-4 * np.eye(images), only.g / first) / first
+    first = _units(only)
+    alone = np.linalg.solve(only.scaled(first).m + _RIDGE * np.eye(images), only.g * first) * first
     for c in range(len(network.cameras)):
         own = np.flatnonzero(used & (network.camera_of == c))
         count, seen = len(own), set[bytes]()
@@ -113,7 +113,7 @@ def other_cameras(sight: Sight, part: Scores, known: float) -> Chosen | None:
                 member = np.zeros(images)
                 member[rows] = 1.0
                 split = part.mapped(np.asarray(np.kron(member[:, None], np.eye(3)), dtype=np.float64))
-                split = split.scaled(1.0 / np.sqrt(np.maximum(np.diag(split.m), 1e-300)))
+                split = split.scaled(_units(split))
                 for columns in (np.arange(1), np.arange(1, 3), np.arange(3)):
                     one = split.part(columns)
                     found = one.log_evidence(_INFORMATION, known=known)
@@ -127,5 +127,13 @@ def other_cameras(sight: Sight, part: Scores, known: float) -> Chosen | None:
     return best
 
 
+def _units(scores: Scores) -> Array:
+    """Units of the columns in which each has an information of one; 0 where it has none."""
+    own = np.diag(scores.m)
+    seen = own > _ABSORBED * max(float(own.max(initial=0.0)), 1e-300)
+    return np.where(seen, 1.0 / np.sqrt(np.where(seen, own, 1.0)), 0.0)
+
+
+_RIDGE, _ABSORBED = 1e-4, 1e-9
 _INFORMATION = np.geomspace(0.3, 3e4, 24)
 """Sizes of effects whose unit is what the image points determine."""

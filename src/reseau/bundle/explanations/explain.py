@@ -109,6 +109,11 @@ class Explanation:
         By code: logarithm of the density of the image points by that if all is right.
     forms : mapping of str to float
         The same for each form of each cause.
+
+    Examples
+    --------
+    >>> Explanation((Cause("noise", "1.3 times", 0.01, 0.0, 1.0),), {}, {}).sound
+    True
     """
 
     causes: tuple[Cause, ...]
@@ -139,7 +144,7 @@ class Explanation:
             much as it is probable; coefficients that were not estimated could be there.
         """
         if self._result is None:
-            return np.zeros((2, across, 2, 2))
+            return np.zeros((1, 1, 2, 2))
         lens = camera_mapping(self._result, c, formal=True)
         xy, shape = places(lens, across, None)
         slope, _ = projection_slopes(lens, xy)

@@ -53,6 +53,12 @@ class Misnamed:
         Logarithm of the odds that names are wrong, not places.
     labels : tuple of str
         Names of the points, and of their images.
+
+    Examples
+    --------
+    >>> one = np.array([3])
+    >>> Misnamed(one, one, np.array([12.0]), 4.0, ("7 in a.jpg",)).code
+    'names'
     """
 
     rows: Rows
