@@ -232,7 +232,7 @@ def _over(grid: PixelGrid, across: int) -> Array:
     return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
 
 
-def _by_original(camera: PlaneMapping, found: PlaneMapping, uv: Array, at: Array) -> Array:
+def _by_original(camera: PlaneMapping, found: PlaneMapping, uv: Array, at: Mask) -> Array:
     """Derivatives of the estimates by the parameters of the original, to first order.
 
     A change dp of the original moves the directions of fixed pixels by −D⁻¹J·dp, and their images by the new
