@@ -253,11 +253,12 @@ def assess(result: Result, camera: int = 0, explanation: Explanation | None = No
 def _because(causes: tuple[Cause, ...]) -> str:
     """The first cause in words, what explains alike, how much it is, and what to do."""
     first = causes[0]
-    text = described(first.code)
-    alike = [cause for cause in causes[1:] if cause.instead]
-    text += "".join(f", or {described(cause.code)}" for cause in alike)
     if first.code == "noise":
-        return f"{text}, by {first.form}"
+        return (
+            f"the model fits, and image points scatter {first.form} as much as their standard deviations say"
+        )
+    alike = [cause for cause in causes[1:] if cause.instead]
+    text = ", or ".join(described(cause.code) for cause in (first, *alike))
     text += f" ({_two(first.amount_px)} px of the residuals"
     text += f"; {first.where})" if first.where else ")"
     return f"{text}: {first.do}"
