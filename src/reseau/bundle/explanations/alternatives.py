@@ -21,6 +21,8 @@ __all__ = ["Alternative", "alternatives", "another_camera"]
 
 _WIDER = ("opencv_full", "fisheye", "double_sphere")
 """Models that describe most lenses."""
+_STEPS = 25
+"""Iterations, from the estimates of the network that is explained."""
 _TILT = ("tau_x", "tau_y")
 _LINE_S = 1e-5
 """Time of a line with which motions are estimated; they are scaled by it."""
@@ -73,7 +75,12 @@ def another_camera(result: Result, images: Rows, known: float, choice: float) ->
         return None
     camera_of = network.camera_of.copy()
     camera_of[images] = len(network.cameras)
-    other = replace(network.cameras[c], id=f"{network.cameras[c].id}, other")
+    # Few images do not determine a distortion of their own: that of the others is nearly theirs.
+    shared, model = network.cameras[c], network.cameras[c].registered
+    if model is None:
+        return None
+    free = tuple(name for name in shared.free if name in model.of_role("scale", "centre"))
+    other = replace(shared, id=f"{shared.id}, other", free=free)
     both = replace(network, cameras=(*network.cameras, other), camera_of=camera_of)
     form = f"{len(images)}"
     found = _adjusted(result, both, "other-camera", form, known)
@@ -129,7 +136,7 @@ def _adjusted(result: Result, network: Network, code: str, form: str, known: flo
         weights = np.ones(len(problem.observations))
         weights[:n] = fit.problem.weights[:n]
         problem = problem.with_weights(weights)
-    again = replace(problem, rounds=0).adjusted()
+    again = replace(problem, rounds=0, max_iterations=_STEPS).adjusted()
     if isinstance(again, Failure):
         return None
     more = result.redundancy - again.redundancy

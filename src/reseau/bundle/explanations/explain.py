@@ -220,6 +220,15 @@ def explain(result: Result, misnamed: Misnamed | None = None) -> Explanation:
     misnamed : Misnamed, optional
         Image points that were left out before it; see :func:`misnamed`.
 
+    Returns
+    -------
+    Explanation
+        Without causes where the network is sound, and where it is too large to be looked at.
+
+    Notes
+    -----
+    See ``docs/mathematics/explanations.md``.
+
     Examples
     --------
     >>> from reseau.bundle import adjust_network, example_network
