@@ -255,6 +255,10 @@ def explain(result: Result, misnamed: Misnamed | None = None) -> Explanation:
         found = now.causes(first, sight)
         if not found:
             break
+        if found[0].code == "unknown":
+            named = _named_besides(now, whole, every, sight)
+            if named is not None:
+                found = [now.cause(named, found[0].probability, first, sight)]
         causes += found
         best = now.best_form(found[0].code)
         large = found[0].code in now.adjusted
@@ -266,7 +270,9 @@ def explain(result: Result, misnamed: Misnamed | None = None) -> Explanation:
         begin = _begins(every)[id(best.family)]
         whole = whole.with_effects(begin + best.columns, best.size * best.units)
     if misnamed is not None:
-        causes = [*before, *causes] if all(cause.code == "noise" for cause in causes) else [*causes, *before]
+        # What else deviates in these images has perhaps the same cause.
+        alike = all(cause.code in ("noise", "blunders", "unknown") for cause in causes)
+        causes = [*before, *causes] if alike else [*causes, *before]
     each = {f"{form.code}: {form.name}": form.log_evidence for form in forms}
     return Explanation(tuple(causes), log_evidence, each, tuple(errors), result)
 
@@ -296,14 +302,14 @@ class _Comparison:
         order = sorted(share, key=lambda code: -share[code])
         if not order[0]:
             return []
-        found = [self._cause(order[0], share[order[0]], first, sight)]
+        found = [self.cause(order[0], share[order[0]], first, sight)]
         if order[0] not in ("noise", "unknown"):
             alike = [code for code in order[1:] if code not in ("", "noise", "unknown")]
-            others = [self._cause(code, share[code], first, sight) for code in alike if share[code] > _ALIKE]
+            others = [self.cause(code, share[code], first, sight) for code in alike if share[code] > _ALIKE]
             found += [replace(cause, instead=True) for cause in others]
         return found
 
-    def _cause(self, code: str, probability: float, first: Scores, sight: Sight) -> Cause:
+    def cause(self, code: str, probability: float, first: Scores, sight: Sight) -> Cause:
         """What a cause explains, and where."""
         chosen, form = self.chosen.get(code), self.best_form(code)
         sigma = float(np.sqrt(np.mean(sight.sigma**2)))
@@ -368,6 +374,24 @@ def _compared(
                 found[one.code] = one.log_evidence - sound
                 better[one.code] = one
     return _Comparison(found, forms, chosen, better)
+
+
+def _named_besides(now: _Comparison, whole: Scores, every: Sequence[Family], sight: Sight) -> str | None:
+    """The cause that, with smooth fields of what it leaves, predicts better than these fields alone."""
+    fields = [family for family in every if family.code == "unknown"]
+    alone = max(form.log_evidence for form in now.forms if form.code == "unknown")
+    sound, best = whole.log_nothing(known=1.0), (alone - np.log(_FALSE / len(now.log_evidence)), "")
+    for code in dict.fromkeys(form.code for form in now.forms):
+        form = now.best_form(code)
+        if code == "unknown" or form is None or form.units is None:
+            continue
+        left = whole.with_effects(_begins(every)[id(form.family)] + form.columns, form.size * form.units)
+        for family in fields:
+            begin = _begins(every)[id(family)]
+            part = left.part(slice(begin, begin + family.effect.count))
+            both = max(each.log_evidence for each in _forms(family, part, sight)) - sound
+            best = max(best, (both, code))
+    return best[1] or None
 
 
 def _with_a_lens(result: Result) -> float:
