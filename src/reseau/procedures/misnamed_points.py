@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy.spatial
 
 from ..bundle import Camera, Misnamed, Network, Result, camera_mapping, misnamed
 from ..core.data import ImagePoints, Mask
@@ -63,7 +63,7 @@ class LeftOut:
             uv = at[:, :2] if mapping.parallel else at[:, :2] / at[:, 2:]
             places = np.where(mapping.one_to_one(uv)[:, None], mapping(uv), np.nan)
             known = np.flatnonzero(np.isfinite(places).all(axis=1))
-            tree = cKDTree(places[known])
+            tree = scipy.spatial.cKDTree(places[known])
             for k in np.flatnonzero(network.image_of[rows] == image):
                 own = point_of.get(network.points[network.point_of[rows[k]]])
                 if own is None or not np.isfinite(places[own]).all():

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import scipy.special
-from scipy.spatial import cKDTree
+import scipy.spatial
 
 from ...core.data import Array, Mask, Rows
 from ..network import Network
@@ -136,7 +136,7 @@ def misnamed(network: Network) -> Misnamed | None:
         return None
     plane = np.full((len(network.points), 2), np.nan)
     plane[known] = (xyz - xyz.mean(axis=0)) @ axes[:2].T / size[0] * np.sqrt(len(known))
-    tree = cKDTree(plane[known])
+    tree = scipy.spatial.cKDTree(plane[known])
     cameras = network.cameras
     found = dict[int, tuple[Rows, _Image]]()
     for c in range(len(cameras)):
@@ -182,7 +182,7 @@ def _log_odds(near: Array, cell: Array, spread: float) -> float:
 
 
 def _images(
-    network: Network, images: Rows, plane: Array, known: Rows, tree: cKDTree
+    network: Network, images: Rows, plane: Array, known: Rows, tree: scipy.spatial.cKDTree
 ) -> dict[int, tuple[Rows, _Image]]:
     """Places of the points in the images of a camera, with the projection by which most names agree."""
     rays, parts = network.rays_of_images, dict[int, Rows]()
@@ -299,13 +299,13 @@ class _View:
     def renamed(self, known: Rows, lens: _Lens) -> Rows:
         """The points in whose places the image points lie."""
         places = lens.pixels(_mapped(self.h, self.plane[known]))
-        return np.asarray(known[cKDTree(places).query(self.xy)[1]])
+        return np.asarray(known[scipy.spatial.cKDTree(places).query(self.xy)[1]])
 
     def judged(self, lens: _Lens, known: Rows) -> _Image:
         """Where the points lie, and whether in the places of their names."""
         places = np.full(self.plane.shape, np.nan)
         places[known] = lens.pixels(_mapped(self.h, self.plane[known]))
-        tree = cKDTree(places[known])
+        tree = scipy.spatial.cKDTree(places[known])
         near, at = tree.query(self.xy)
         nearest = known[at]
         gap = tree.query(places[self.names], k=2)[0][:, 1]
@@ -318,7 +318,9 @@ class _View:
         )  # fmt: skip
 
 
-def _view(xy: Array, names: Rows, plane: Array, tree: cKDTree, known: Rows, lens: _Lens) -> _View | None:
+def _view(
+    xy: Array, names: Rows, plane: Array, tree: scipy.spatial.cKDTree, known: Rows, lens: _Lens
+) -> _View | None:
     """The view of an image in which most names agree, if the target is as named, turned or mirrored."""
     views = []
     for turned in _turned(plane):
@@ -350,4 +352,4 @@ def _mapped(h: Any, at: Array) -> Array:
 
 def _spacing(xy: Array) -> float:
     """Distance of points from their nearest neighbours; the median."""
-    return float(np.median(cKDTree(xy).query(xy, k=2)[0][:, 1]))
+    return float(np.median(scipy.spatial.cKDTree(xy).query(xy, k=2)[0][:, 1]))

@@ -8,7 +8,7 @@ points of the target are unknown and the same for all images. With x = N⁻¹ g,
 v_B − K̃ x, and its predicted coordinates differ from the measured ones by R_BB⁻¹-weighted squares and a
 density of
 
-    q = |d|² + (t − T x)ᵀ (N − T)⁻¹ (t − T x),    ln p = −q / 2ω + ½ ln |N − T| − ½ ln |N| + const
+    q = |d|² + (t − T x)ᵀ (N − T)⁻¹ (t − T x),    ln p = −q / 2ω + ½ ln det(N − T) − ½ ln det N + const
 
 (Förstner & Wrobel 2016, sect. 4.6; Cook & Weisberg 1982, Residuals and Influence in Regression, ch. 2–3). No
 adjustment is repeated, and all subsets of the parameters use the same sums. ω is the variance factor of what
@@ -89,7 +89,7 @@ class Information:
     own, own_side, square : ndarray (m, u, u), (m, u), (m,)
         T, t and vᵀR⁻¹v of each image.
     offset : ndarray (m,)
-        ½ ln |R| of each image.
+        ½ ln det R of each image.
     cost, redundancy : float
         vᵀPv, and redundancy without the parameters of the camera.
     weight : ndarray (u,)
@@ -332,7 +332,7 @@ class _Others:
         return np.asarray(left - self.cofactors.T @ (self.rows.T @ plain)).reshape(slopes.shape)
 
     def image(self, rays: Rows, columns: Array) -> tuple[Array, Array, float, float]:
-        """T, t, vᵀR⁻¹v and ½ ln |R| of an image with these rays, from its rows of R K."""
+        """T, t, vᵀR⁻¹v and ½ ln det R of an image with these rays, from its rows of R K."""
         rows = (2 * rays[:, None] + np.arange(2)).ravel()
         own = self.by_points[rows]
         left = np.eye(len(rows)) * (1 + _NOTHING) - (own @ (self.points @ own.T)).toarray()
