@@ -13,8 +13,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-import scipy.special
 import scipy.spatial
+import scipy.special
 
 from ...core.data import Array, Mask, Rows
 from ..network import Network
