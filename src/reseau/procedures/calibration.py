@@ -527,8 +527,7 @@ def _calibrated(
     taken: Mapping[str, Taken] | None,
 ) -> Calibrated | Failure:
     """Calibrate from the points of photographs."""
-    cameras = list(dict.fromkeys(each.camera for each in taken.values())) if taken else [_CAMERA]
-    of = [cameras.index(taken[name].camera) if taken else 0 for name in measured]
+    cameras, of = _cameras_of(measured, taken)
     for c, name in enumerate(cameras):
         if of.count(c) < _LEAST_IMAGES:
             which = f" of camera {name}" if taken else ""
@@ -570,8 +569,7 @@ def _adjusted(
 ) -> Calibrated | Failure:
     """Adjust the points of photographs, of which those that are wrong were left out."""
     measured = {name: points for name, points in measured.items() if len(points) >= _LEAST_POINTS}
-    cameras = list(dict.fromkeys(each.camera for each in taken.values())) if taken else [_CAMERA]
-    of = [cameras.index(taken[name].camera) if taken else 0 for name in measured]
+    cameras, of = _cameras_of(measured, taken)
     refraction = None
     if options.refraction is not None:
         refraction = options.refraction.refraction(tuple(measured), tuple(cameras[c] for c in of))
@@ -624,6 +622,12 @@ def _adjusted(
     calibrated = Calibrated(found, measured, declined, choices, board, notes, wrong)
     loose = _without_scale(calibrated.result)
     return calibrated if loose is None else loose
+
+
+def _cameras_of(images: Iterable[str], taken: Mapping[str, Taken] | None) -> tuple[list[str], list[int]]:
+    """Names of the cameras, and the number of that of each image."""
+    cameras = list(dict.fromkeys(each.camera for each in taken.values())) if taken else [_CAMERA]
+    return cameras, [cameras.index(taken[name].camera) if taken else 0 for name in images]
 
 
 def _without_scale(result: Result) -> Failure | None:

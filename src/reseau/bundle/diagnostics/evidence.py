@@ -113,10 +113,6 @@ class Scores:
         Change of the reduced unknowns by the columns, if these are not taken into account.
     log_density : float
         Logarithm of the density that causes taken in before have already cost.
-
-    Notes
-    -----
-    `log_density` is that of :meth:`with_effects`.
     """
 
     g: Array
@@ -275,12 +271,8 @@ def scores(fit: BundleFit, effects: Sequence[Effect]) -> Scores:
     own = scipy.sparse.csr_array(-linear.misfits.reshape(-1, 1))
     c = scipy.sparse.hstack([*(effect.columns(root) for effect in effects), own], format="csr")
     a, b = _design(fit)
-    # Points as one dense matrix: the columns of an image meet all its points.
-    of_points = (b.T @ c).toarray()
-    turned = (a.T @ c).toarray()
+    turned, by = _reduced(fit, a, b, c)
     eliminated = np.flatnonzero(linear.system.pattern.eliminated == 1)
-    by = of_points.reshape(-1, 3, c.shape[1])
-    turned += cofactors.normal.reduced_sides(np.ascontiguousarray(by))
     z = cofactors.reduced if cofactors.referral is None else cofactors.referral.before
     solved = z.times(turned)
     m = (c.T @ c).toarray() - turned.T @ solved
@@ -295,18 +287,26 @@ def scores(fit: BundleFit, effects: Sequence[Effect]) -> Scores:
 
 def sensitivities(fit: BundleFit, effect: Effect, columns: Rows) -> Array:
     """Changes (k, groups · q) of reduced unknowns by effects that the adjustment does not know of."""
-    root, cofactors = fit.linear.system.seen.root, fit.cofactors
-    own = cofactors.reduced.rows(columns)
+    own = fit.cofactors.reduced.rows(columns)
     a, b = _design(fit)
     found, step = np.zeros((len(columns), effect.count)), _AT_ONCE * effect.slope.shape[2]
-    c = effect.columns(root).tocsc()
+    c = effect.columns(fit.linear.system.seen.root).tocsc()
     for begin in range(0, effect.count, step):
-        part = c[:, begin : begin + step]
-        turned = (a.T @ part).toarray()
-        by = (b.T @ part).toarray().reshape(-1, 3, part.shape[1])
-        turned += cofactors.normal.reduced_sides(np.ascontiguousarray(by))
-        found[:, begin : begin + step] = own @ turned
+        found[:, begin : begin + step] = own @ _reduced(fit, a, b, c[:, begin : begin + step])[0]
     return found
+
+
+def _reduced(
+    fit: BundleFit, a: scipy.sparse.csr_array, b: scipy.sparse.csr_array, c: scipy.sparse.sparray
+) -> tuple[Array, Array]:
+    """Products of the columns C and the design, with the points eliminated (u, k); and of points (p, 3, k).
+
+    Those of points are dense: the columns of an image meet all its points.
+    """
+    turned: Array = (a.T @ c).toarray()
+    by: Array = np.ascontiguousarray((b.T @ c).toarray().reshape(-1, 3, c.shape[1]))
+    turned += fit.cofactors.normal.reduced_sides(by)
+    return turned, by
 
 
 def used_rows(fit: BundleFit) -> Rows:

@@ -10,7 +10,7 @@ import numpy as np
 from ...core.data import Rows
 from ...core.errors import UsageError
 from ...core.failure import Failure
-from ...optics.cameras import convert
+from ...optics.cameras import camera_model, convert
 from ..diagnostics import Result
 from ..diagnostics.evidence import Scores
 from ..modelling.adjustment import problem_of
@@ -111,8 +111,6 @@ def _converted(camera: Camera, model: str) -> Camera | None:
     """The camera by another model with its usual parameters."""
     if camera.registered is None or camera.parallel or camera.additional is not None or camera.sigma:
         return None
-    from ...optics.cameras import camera_model
-
     registered = camera_model(model)
     free = registered.usual
     if model == "opencv_full":

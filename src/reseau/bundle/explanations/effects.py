@@ -11,7 +11,7 @@ import numpy as np
 from ...core.data import Array, Mask, Rows
 from ...optics import PlaneMapping
 from ..diagnostics import Result, camera_mapping
-from ..diagnostics.evidence import Effect, used_rows
+from ..diagnostics.evidence import Effect, places_seen, sigma_seen, used_rows
 from ..diagnostics.shared import smooth_effects
 
 __all__ = ["Family", "Sight", "camera_columns", "families", "lens_at"]
@@ -69,9 +69,13 @@ class Sight:
         self.image: Rows = network.image_of[self.rows]
         self.point: Rows = network.point_of[self.rows]
         self.camera: Rows = network.camera_of[self.image]
-        # Observed coordinates would give the noise itself as a displacement.
-        self.xy: Array = network.xy[self.rows] + result.residuals[self.rows]
-        self.sigma: Array = np.sqrt(np.trace(network.cov[self.rows], axis1=1, axis2=2) / 2)
+        self.xy: Array = places_seen(result.fit)
+        self.sigma: Array = sigma_seen(result.fit)
+
+    @property
+    def typical(self) -> float:
+        """Standard deviation of the image points, px, root mean square."""
+        return float(np.sqrt(np.mean(self.sigma**2)))
 
     @cached_property
     def mappings(self) -> list[PlaneMapping]:

@@ -19,7 +19,7 @@ from ...calibration.camera import by_rotation, places, projection_slopes, referr
 from ...core.data import Array, Rows
 from ...core.failure import Failure
 from ..diagnostics import Result, camera_mapping
-from ..diagnostics.evidence import Effect, Scores, scores, sigma_seen, too_large
+from ..diagnostics.evidence import Effect, Scores, scores, too_large
 from .alternatives import Alternative, alternatives, another_camera
 from .discrete import Chosen, gross_errors, log_choice, other_cameras
 from .effects import Family, Sight, families, lens_at
@@ -155,7 +155,7 @@ class Explanation:
         _, columns, _ = self._result.camera_columns(c)
         total = np.zeros((len(xy), 2, 2))
         for error in self._errors:
-            by = -slope @ error.scores.carried[columns]
+            by = -slope @ error.form.scores.carried[columns]
             own = error.at(c, xy)
             if own is not None:
                 by[known] += referred(turn[known], own[known])
@@ -191,7 +191,6 @@ class _Error:
     """Effects of a form, which may be there with the probability `weight`."""
 
     form: _Form
-    scores: Scores
     effects: Array
     covariance: Array
     weight: float
@@ -312,7 +311,7 @@ class _Comparison:
     def cause(self, code: str, probability: float, first: Scores, sight: Sight) -> Cause:
         """What a cause explains, and where."""
         chosen, form = self.chosen.get(code), self.best_form(code)
-        sigma = float(np.sqrt(np.mean(sight.sigma**2)))
+        sigma = sight.typical
         where, other = "", self.adjusted.get(code)
         if other is not None and chosen is not None:
             explained, name, where = other.explained, other.form, _where(code, chosen.rows, sight)
@@ -416,7 +415,6 @@ def _forms(family: Family, part: Scores, sight: Sight) -> list[_Form]:
     effect = family.effect
     groups, q = effect.groups, effect.slope.shape[2]
     rms = effect.rms(sight.sigma)
-    sigma = float(np.sqrt(np.mean(sight.sigma**2)))
     found = []
     for name, chosen in family.forms.items():
         if chosen.ndim == 1:
@@ -428,7 +426,7 @@ def _forms(family: Family, part: Scores, sight: Sight) -> list[_Form]:
             own = part.part(columns).scaled(units)
         else:
             columns, units = np.arange(groups * q), None
-            own = part.combined(groups, np.asarray(sigma * chosen, dtype=np.float64))
+            own = part.combined(groups, np.asarray(sight.typical * chosen, dtype=np.float64))
         found.append(_Form(family, name, columns, units, own, own.log_evidence(known=_KNOWN)))
     return found
 
@@ -483,7 +481,7 @@ def _error(form: _Form, weight: float, sight: Sight) -> _Error:
     )
     left = form.scores.square - form.scores.explained(size)
     variance = max(left / form.scores.redundancy, 0.0)
-    return _Error(form, form.scores, inverse @ form.scores.g, variance * inverse, weight, sight)
+    return _Error(form, inverse @ form.scores.g, variance * inverse, weight, sight)
 
 
 def _where(code: str, rows: Rows, sight: Sight) -> str:
@@ -517,8 +515,3 @@ def _of_names(misnamed: Misnamed, result: Result) -> Cause:
     share = len(misnamed.labels) / (len(result.network.xy) + len(misnamed.labels))
     return Cause(misnamed.code, f"{len(misnamed.labels)}", amount, share, 1.0, where,
                  advice(misnamed.code, f"{len(misnamed.labels)}"))  # fmt: skip
-
-
-def sigma_of(result: Result) -> float:
-    """Standard deviation of the image points, px, root mean square."""
-    return float(np.sqrt(np.mean(sigma_seen(result.fit) ** 2)))
