@@ -149,8 +149,8 @@ class SharedErrors:
         The same of displacements by principal distances.
     weights : ndarray (l,)
         Weights of the lengths; what is missing to one is that of no shared errors.
-    spread : ndarray (3, 3)
-        Covariance of the estimated variances: of image points, smooth fields and principal distances.
+    spread : float
+        Relative variance of the estimated variance factor.
     scores : Scores
         Of the parameters of the cameras, as effects of each image that was looked at.
     pulls : ndarray (i, q, q)
@@ -162,7 +162,7 @@ class SharedErrors:
     smooth: Array
     distance: float
     weights: Array
-    spread: Array
+    spread: float
     scores: Scores
     pulls: Array
 
@@ -213,7 +213,7 @@ class SharedErrors:
         )  # fmt: skip
         total = _not_below(parts.sum(axis=0), formal)
         # The size of all together is known as well as the likelihood says, that of each as its scores say.
-        spread = np.diag(np.concatenate([[self.spread[0, 0] / self.variance**2], relative]))
+        spread = np.diag(np.concatenate([[self.spread], relative]))
         return columns, total, parts, spread
 
     def _carried(self, columns: Rows) -> Array:
@@ -433,16 +433,13 @@ def _along(scores: Scores, near: float) -> tuple[float, float]:
     return (float(np.exp(x)), y) if y > nothing else (0.0, nothing)
 
 
-def _information(scores: Scores, count: int, smooth: float, distance: float) -> tuple[float, Array]:
-    """Variance factor, and covariance (3, 3) of the variances of the three parts."""
+def _information(scores: Scores, count: int, smooth: float, distance: float) -> tuple[float, float]:
+    """Variance factor, and its relative variance, with the sizes of shared errors as unknown as they are."""
     units = np.concatenate([np.full(count, smooth), np.full(len(scores.g) - count, distance)])
     used = np.flatnonzero(units > 0)
     r, m = scores.redundancy, scores.m[np.ix_(used, used)]
     if not len(used):
-        variance = scores.square / r
-        found = np.zeros((3, 3))
-        found[0, 0] = 2 * variance**2 / r
-        return variance, found
+        return scores.square / r, 2.0 / r
     s = np.linalg.inv(np.diag(1 / units[used] ** 2) + m)
     variance = (scores.square - float(scores.g[used] @ s @ scores.g[used])) / r
     sm = s @ m
@@ -455,11 +452,8 @@ def _information(scores: Scores, count: int, smooth: float, distance: float) -> 
         fisher[0, i + 1] = fisher[i + 1, 0] = np.trace(twice[np.ix_(a, a)])
         for j, b in enumerate(parts):
             fisher[i + 1, j + 1] = (left[np.ix_(a, b)] ** 2).sum()
-    fisher /= 2 * variance**2
     live = np.flatnonzero(np.diag(fisher) > 0)
-    found = np.zeros((3, 3))
-    found[np.ix_(live, live)] = np.linalg.inv(fisher[np.ix_(live, live)])
-    return variance, found
+    return variance, 2 * float(np.linalg.inv(fisher[np.ix_(live, live)])[0, 0])
 
 
 def _not_below(total: Array, formal: Array) -> Array:
