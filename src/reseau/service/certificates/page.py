@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
 import re
 import warnings
 from collections.abc import Callable
@@ -154,21 +155,30 @@ def pdf_of(certificate: Certificate, xml: Callable[[str], bytes]) -> tuple[bytes
     fonts = FontConfiguration()
     style = weasyprint.CSS(string=_style(), font_config=fonts)
     document = page.render(stylesheets=[style], font_config=fonts, pdf_variant=_VARIANT)
-    content = xml(pages_digest(_written(document), "certificate"))
+    content = xml(pages_digest(_written(document, certificate), "certificate"))
     document.metadata.attachments = [
         weasyprint.Attachment(
             string=content, name=NAME, description="Digital calibration certificate (DCC 3.3.0)",
             relationship="Alternative", created=_time(certificate), modified=_time(certificate),
         )
     ]  # fmt: skip
-    return _written(document), content
+    return _written(document, certificate), content
 
 
-def _written(document: Any) -> bytes:
-    with warnings.catch_warnings():
-        # WeasyPrint leaves the file of the colour profile to the garbage collector.
-        warnings.simplefilter("ignore", ResourceWarning)
-        found: bytes = document.write_pdf(pdf_variant=_VARIANT)
+def _written(document: Any, certificate: Certificate) -> bytes:
+    before = os.environ.get("SOURCE_DATE_EPOCH")
+    # Without HarfBuzz-Subset, fontTools makes the subsets of fonts, and writes the time into each.
+    os.environ["SOURCE_DATE_EPOCH"] = str(int(_time(certificate).timestamp()))
+    try:
+        with warnings.catch_warnings():
+            # WeasyPrint leaves the file of the colour profile to the garbage collector.
+            warnings.simplefilter("ignore", ResourceWarning)
+            found: bytes = document.write_pdf(pdf_variant=_VARIANT)
+    finally:
+        if before is None:
+            del os.environ["SOURCE_DATE_EPOCH"]
+        else:
+            os.environ["SOURCE_DATE_EPOCH"] = before
     return found
 
 
