@@ -13,6 +13,7 @@ cases of the list of failures and prints what was found.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 import warnings
 from collections import Counter
@@ -289,7 +290,11 @@ def main() -> int:
     add_options(parser, jobs=1)
     options = parser.parse_args()
     with executor_of(options) as executor:
-        found = list(outcomes(executor, done, jobs_of(options), together=8))
+        found = []
+        for each in outcomes(executor, done, jobs_of(options), together=8):
+            found.append(each)
+            if not each.right and not options.only:
+                print(f"{len(found):4} {each.job.label:36} {each.first}", file=sys.stderr, flush=True)
     if options.only:
         for e in found:
             print(f"{e.job.label}: {e.variant}, target {'flat' if e.flat else 'free'}, size {e.size:.3g}, "
