@@ -50,7 +50,6 @@ def test_normalised_errors_of_the_projection_have_mean_square_one_everywhere(
 
 
 def test_the_test_of_the_whole_field_has_its_significance_level(against_truth: list[FieldDifference]) -> None:
-    assert {d.degrees for d in against_truth} == {9}
     p = np.array([d.p for d in against_truth])
     # 5 % of 120 with a standard deviation of 2.4.
     assert (p < 0.05).sum() <= 6 + 3.5 * 2.4
@@ -63,7 +62,7 @@ def test_two_independent_calibrations_differ_as_their_covariances_predict() -> N
     found = [calibration_difference(a, b, 5) for a, b in zip(lenses[::2], lenses[1::2], strict=True)]
     assert squares(found).mean() == pytest.approx(1.0, abs=3.5 / np.sqrt(40))
     assert np.mean([d.statistic / d.degrees for d in found]) == pytest.approx(
-        1.0, abs=3.5 * np.sqrt(2 / 9 / 40)
+        1.0, abs=3.5 * np.sqrt(2 / min(d.degrees for d in found) / 40)
     )
 
 

@@ -21,7 +21,7 @@ from .camera import CameraMapping, by_rotation, places, referred, worst
 
 __all__ = ["FieldDifference", "calibration_difference"]
 
-# Singular values of the covariance root, relative to the largest, that are rounding errors.
+# Standard deviations, relative to the largest, that are rounding errors.
 _RANK = 1e-6
 _ROUNDS = 6
 
@@ -40,8 +40,9 @@ class FieldDifference:
         Covariances of the differences.
     rotation : ndarray (3,)
         Rotation vector (rad) by which the rays of the second were rotated.
-    statistic, degrees : float, int
-        χ² of the whole field, and its degrees of freedom.
+    statistic, degrees : float
+        χ² of the whole field, and its degrees of freedom: as many independent differences have the same
+        spread.
     dof : float
         Degrees of freedom of the covariances: their scale is an estimate.
 
@@ -58,7 +59,7 @@ class FieldDifference:
     cov: Array
     rotation: Array
     statistic: float
-    degrees: int
+    degrees: float
     dof: float = float("inf")
 
     @property
@@ -101,8 +102,9 @@ def calibration_difference(
 
     Notes
     -----
-    The test of the whole field compares the part of the difference that errors of the parameters can cause
-    with their covariances. Other parts, as between different models, are not tested.
+    The test of the whole field is that of the mean square of the differences, each in relation to its
+    variance. The parameters themselves are not compared: what many of them do together is known much better
+    than each, and where they are hardly determined they are no linear functions of the image points.
 
     Examples
     --------
@@ -124,23 +126,31 @@ def calibration_difference(
     xy, shape = places(first, across, down)
     uv = first.mapping.inverse(xy)
     known = np.isfinite(uv).all(axis=1) & np.isfinite(second.mapping(uv)).all(axis=1)
+    # Beyond the turning point of a distortion, the second has images of rays that are not the first's.
+    known[known] &= first.mapping.one_to_one(uv[known]) & second.mapping.one_to_one(uv[known])
     if known.sum() < 2:
         raise UsageError("image no ray in common", where="calibrations")
-    uv, turn = uv[known], np.eye(3)
-    for _ in range(_ROUNDS):
+    uv, turn, weight = uv[known], np.eye(3), np.ones(int(known.sum()))
+    here = first.mapping.derivatives(uv)
+    for k in range(_ROUNDS):
         turned, by_uv = _turned(turn, uv)
         there = second.mapping.derivatives(turned)
         g = there.d_xy @ by_rotation(turned, parallel)
         off = there.value - xy[known]
         if not (np.isfinite(g).all() and np.isfinite(off).all()):
             raise UsageError("do not image the same rays", where="calibrations")
-        step = -np.linalg.lstsq(g.reshape(-1, 3), off.ravel(), rcond=None)[0]
+        own = there.d_parameters[:, :, second.rows]
+        carried = there.d_xy @ by_uv @ np.linalg.inv(here.d_xy) @ here.d_parameters[:, :, first.rows]
+        by_first, by_second = referred(g, carried, weight), referred(g, own, weight)
+        root = _joint_root(first, second, by_first, by_second)
+        if k == 0 and root.size:
+            # Places that are known better say more of the rotation.
+            variance = np.einsum("gik,gik->g", root, root)
+            weight = 1 / np.sqrt(np.maximum(variance, _RANK**2 * variance.max() or 1.0))
+        each = np.repeat(weight, 2)
+        step = -np.linalg.lstsq(each[:, None] * g.reshape(-1, 3), each * off.ravel(), rcond=None)[0]
         turn = (_shifted(step) if parallel else rotation_matrix(step)) @ turn
-    here = first.mapping.derivatives(uv)
-    own = there.d_parameters[:, :, second.rows]
-    carried = there.d_xy @ by_uv @ np.linalg.inv(here.d_xy) @ here.d_parameters[:, :, first.rows]
-    root = _joint_root(first, second, referred(g, carried), referred(g, own))
-    statistic, degrees = _chi2(root.reshape(2 * len(root), root.shape[2]), off.ravel())
+    statistic, degrees = _statistic(root, off)
     difference, cov = np.full((len(xy), 2), np.nan), np.full((len(xy), 2, 2), np.nan)
     difference[known], cov[known] = off, root @ np.swapaxes(root, 1, 2)
     # The camera is rotated in the opposite sense to its rays.
@@ -149,11 +159,11 @@ def calibration_difference(
         angle[:2] = 0.0
     return FieldDifference(
         xy.reshape(*shape, 2), difference.reshape(*shape, 2), cov.reshape(*shape, 2, 2), angle, statistic,
-        degrees, _joint_dof(first, second, referred(g, carried), referred(g, own)),
+        degrees, _joint_dof(first, second, by_first, by_second),
     )  # fmt: skip
 
 
-def _tail(degrees: int, dof: float, statistic: Array) -> Array:
+def _tail(degrees: float, dof: float, statistic: Array) -> Array:
     """Probability of a larger sum of squares, by estimated variances of so many degrees of freedom."""
     if not np.isfinite(dof):
         return np.asarray(scipy.special.chdtrc(degrees, statistic))
@@ -204,10 +214,18 @@ def _root(covariance: Array) -> Array:
     return root
 
 
-def _chi2(root: Array, off: Array) -> tuple[float, int]:
-    """χ² of differences with the covariance L Lᵀ, in the space that this spans, and its dimension."""
-    if not root.size:
-        return 0.0, 0
-    u, s, _ = np.linalg.svd(root, full_matrices=False)
-    keep = s > _RANK * s[0]
-    return float((((u.T @ off)[keep] / s[keep]) ** 2).sum()), int(keep.sum())
+def _statistic(root: Array, off: Array) -> tuple[float, float]:
+    """χ² of differences (g, 2) with a root of their covariance (g, 2, k), and its degrees of freedom.
+
+    The mean of the squares, each in relation to the variance at its place, is a sum of squares of normal
+    deviates with weights; it is compared with the χ² of the same mean and variance (Box 1954, theorem 3.1).
+    """
+    variance = np.einsum("gik,gik->g", root, root)
+    known = variance > _RANK**2 * variance.max(initial=0.0)
+    if not known.any():
+        return 0.0, 0.0
+    size = np.sqrt(known.sum() * variance[known])
+    mean = float((off[known] ** 2 / size[:, None] ** 2).sum())
+    one = (root[known] / size[:, None, None]).reshape(-1, root.shape[2])
+    degrees = 1.0 / float((np.linalg.norm(one.T @ one)) ** 2)
+    return degrees * mean, degrees

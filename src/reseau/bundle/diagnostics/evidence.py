@@ -211,14 +211,12 @@ class Scores:
         """The most probable effects of this size (k,)."""
         return np.asarray(np.linalg.solve(self.m + np.eye(len(self.g)) / size**2, self.g), dtype=np.float64)
 
-    def log_evidence_at(self, effects: Array, sizes: Array = _SIZES, *, known: float = 0.5) -> float:
-        """As :meth:`log_evidence`, for scores at these effects (k,), which were taken into account."""
-        values, squares = self._spectrum
-        log_det = np.log1p(sizes[:, None] ** 2 * values).sum(axis=1)
-        small = np.divide(squares, values, out=np.zeros_like(values), where=values > 0).sum()
-        quad = self.square - small + float(effects @ effects) / sizes**2
-        each = self._log_density(quad, known) - 0.5 * log_det
-        return float(scipy.special.logsumexp(each) - np.log(len(sizes))) + self.log_density
+    def before(self, effects: Array) -> Scores:
+        """The scores without these effects (k,), which were taken into account when they were computed."""
+        more = self.m @ effects
+        return replace(
+            self, g=self.g + more, square=max(self.square + float(effects @ (2 * self.g + more)), 1e-300)
+        )
 
     def with_effects(self, columns: Rows, size: float | Array) -> Scores:
         """The scores after effects of this size, or these sizes (k,), were taken into account."""

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.data import Rows
 from ...core.errors import UsageError
 from ...core.failure import Failure
 from ...optics.cameras import camera_model, convert
@@ -15,17 +14,15 @@ from ..diagnostics import Result
 from ..diagnostics.evidence import Scores
 from ..modelling.adjustment import problem_of
 from ..modelling.calibration import with_estimates
-from ..network import Camera, Network, Shutter
+from ..network import Camera, Network
 
-__all__ = ["Alternative", "alternatives", "another_camera"]
+__all__ = ["Alternative", "alternatives"]
 
 _WIDER = ("opencv_full", "fisheye", "double_sphere")
 """Models that describe most lenses."""
 _STEPS = 25
 """Iterations, from the estimates of the network that is explained."""
 _TILT = ("tau_x", "tau_y")
-_LINE_S = 1e-5
-"""Time of a line with which motions are estimated; they are scaled by it."""
 
 
 class Alternative:
@@ -49,44 +46,12 @@ class Alternative:
 
 
 def alternatives(result: Result, known: float) -> Iterator[Alternative]:
-    """Yield richer models of the lenses, and motions during the read-out, as far as they can be adjusted."""
+    """Yield richer models of the lenses, as far as they can be adjusted."""
     network = with_estimates(result)
     for form, cameras in _lenses(network):
         found = _adjusted(result, replace(network, cameras=cameras), "lens", form, known)
         if found is not None:
             yield found
-    one = len(network.cameras) == 1 and network.rig is None and network.stage is None
-    camera = network.cameras[0]
-    if one and camera.shutter is None and camera.compiled_kind is not None and camera.additional is None:
-        try:
-            rolling = replace(camera, shutter=Shutter("rolling", _LINE_S))
-        except UsageError:
-            return
-        found = _adjusted(result, replace(network, cameras=(rolling,)), "rolling-shutter", "motion", known)
-        if found is not None:
-            yield found
-
-
-def another_camera(result: Result, images: Rows, known: float, choice: float) -> Alternative | None:
-    """Some images with a camera of their own; `choice` is the logarithm of the number of such choices."""
-    network = with_estimates(result)
-    c = int(network.camera_of[images[0]])
-    if network.rig is not None or network.refraction is not None:
-        return None
-    camera_of = network.camera_of.copy()
-    camera_of[images] = len(network.cameras)
-    # Few images do not determine a distortion of their own: that of the others is nearly theirs.
-    shared, model = network.cameras[c], network.cameras[c].registered
-    if model is None:
-        return None
-    free = tuple(name for name in shared.free if name in model.of_role("scale", "centre"))
-    other = replace(shared, id=f"{shared.id}, other", free=free)
-    both = replace(network, cameras=(*network.cameras, other), camera_of=camera_of)
-    form = f"{len(images)}"
-    found = _adjusted(result, both, "other-camera", form, known)
-    if found is not None:
-        found.log_evidence -= choice
-    return found
 
 
 def _lenses(network: Network) -> Iterator[tuple[str, tuple[Camera, ...]]]:

@@ -13,7 +13,7 @@ from ...core.data import Array, Rows
 from ..diagnostics.evidence import Effect, Scores, scores
 from .effects import Sight
 
-__all__ = ["Chosen", "gross_errors", "log_choice", "other_cameras"]
+__all__ = ["Chosen", "gross_errors", "other_cameras"]
 
 _SUSPECTS, _PATIENCE = 120, 6
 """Image points that are looked at as gross errors, and how many more are tried when one does not help."""
@@ -38,7 +38,7 @@ class Chosen:
         self.log_evidence, self.rows, self.explained = log_evidence, rows, explained
 
 
-def log_choice(n: int, k: int) -> float:
+def _log_choice(n: int, k: int) -> float:
     """Logarithm of the number of choices of k of n, for each of n numbers."""
     return float(
         scipy.special.gammaln(n + 1) - scipy.special.gammaln(k + 1) - scipy.special.gammaln(n - k + 1)
@@ -71,7 +71,7 @@ def gross_errors(sight: Sight, known: float) -> Chosen | None:
         left = left.with_effects(np.array([2 * at, 2 * at + 1]), far)
         columns = (2 * np.array(chosen)[:, None] + np.arange(2)).ravel()
         part = every.part(columns)
-        found = part.log_evidence(known=known) - log_choice(n, len(chosen))
+        found = part.log_evidence(known=known) - _log_choice(n, len(chosen))
         if best is None or found > best.log_evidence:
             best = Chosen(found, suspects[chosen], every.square - left.square)
         elif len(chosen) >= len(best.rows) + _PATIENCE:
@@ -93,38 +93,50 @@ def other_cameras(sight: Sight, part: Scores, known: float) -> Chosen | None:
     """
     network, images = sight.network, len(sight.network.images)
     used = np.bincount(sight.image, minlength=images) > 0
-    best, total = None, []
     units = _units(part)
     plain = part.scaled(units)
     off = (np.linalg.solve(plain.m + _RIDGE * np.eye(3 * images), plain.g) * units).reshape(-1, 3)
     only = part.part(3 * np.arange(images))
     first = _units(only)
     alone = np.linalg.solve(only.scaled(first).m + _RIDGE * np.eye(images), only.g * first) * first
+    found = dict[bytes, Chosen]()
+
+    def looked_at(rows: Rows, count: int) -> Chosen:
+        """Images with another camera, of all that could have it."""
+        member = np.zeros(images)
+        member[rows] = 1.0
+        key = member.tobytes()
+        if key not in found:
+            split = part.mapped(np.asarray(np.kron(member[:, None], np.eye(3)), dtype=np.float64))
+            split = split.scaled(_units(split))
+            forms = [split.part(columns) for columns in (np.arange(1), np.arange(1, 3), np.arange(3))]
+            each = [one.log_evidence(_INFORMATION, known=known) for one in forms]
+            best = forms[int(np.argmax(each))]
+            log = float(scipy.special.logsumexp(each)) - np.log(3.0) - _log_choice(count, len(rows))
+            found[key] = Chosen(log, np.flatnonzero(member), best.explained(best.best_size(_INFORMATION)))
+        return found[key]
+
     for c in range(len(network.cameras)):
         own = np.flatnonzero(used & (network.camera_of == c))
-        count, seen = len(own), set[bytes]()
+        count, best = len(own), None
         for along in (alone, *off.T) if count > 2 else ():
             order = own[np.argsort(along[own], kind="stable")]
             for k in np.unique(np.linspace(1, count - 1, min(_SPLITS, count - 1)).astype(int)):
-                rows = np.sort(order[:k] if k <= count - k else order[k:])
-                if rows.tobytes() in seen:
-                    continue
-                seen.add(rows.tobytes())
-                member = np.zeros(images)
-                member[rows] = 1.0
-                split = part.mapped(np.asarray(np.kron(member[:, None], np.eye(3)), dtype=np.float64))
-                split = split.scaled(_units(split))
-                for columns in (np.arange(1), np.arange(1, 3), np.arange(3)):
-                    one = split.part(columns)
-                    found = one.log_evidence(_INFORMATION, known=known)
-                    found -= log_choice(count, len(rows)) + np.log(3.0)
-                    total.append(found)
-                    if best is None or found > best.log_evidence:
-                        best = Chosen(found, rows, one.explained(one.best_size(_INFORMATION)))
-    if best is None:
+                one = looked_at(order[:k] if k <= count - k else order[k:], count)
+                best = one if best is None or one.log_evidence > best.log_evidence else best
+        while best is not None:
+            # One image more, or less.
+            others = [np.setxor1d(best.rows, [image]) for image in own]
+            tried = [looked_at(rows, count) for rows in others if 0 < len(rows) <= count / 2]
+            next_ = max(tried, key=lambda one: one.log_evidence, default=best)
+            if next_.log_evidence <= best.log_evidence:
+                break
+            best = next_
+    if not found:
         return None
-    best.log_evidence = float(scipy.special.logsumexp(total))
-    return best
+    most = max(found.values(), key=lambda one: one.log_evidence)
+    most.log_evidence = float(scipy.special.logsumexp([one.log_evidence for one in found.values()]))
+    return most
 
 
 def _units(scores: Scores) -> Array:

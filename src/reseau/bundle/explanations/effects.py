@@ -44,6 +44,8 @@ class Family:
         Shifts of the object points by one unit of each column, where these are what displaces image points.
     kind : str
         Of effects of a lens: radial, polynomial or coefficients.
+    alike : ndarray of int (q,), optional
+        Kinds of the columns: those of a kind have the same standard deviation. By default each is one.
     """
 
     code: str
@@ -51,6 +53,13 @@ class Family:
     forms: Mapping[str, Array | Rows]
     moves: Array | None = None
     kind: str = ""
+    alike: Rows | None = None
+
+    def seen_again(self, sight: Sight) -> Family:
+        """The same effects, at another adjustment."""
+        if self.moves is not None:
+            return replace(self, effect=replace(self.effect, slope=sight.by_point @ self.moves[sight.point]))
+        return next(one for one in families(sight) if (one.code, one.kind) == (self.code, self.kind))
 
 
 class Sight:
@@ -248,7 +257,8 @@ def _refocus(sight: Sight) -> Iterator[Family]:
     """Principal distance, and principal point, of each image."""
     effect = Effect(camera_columns(sight), sight.image, len(sight.network.images))
     forms = {"distance": [0], "distance and point": [0, 1, 2], "point": [1, 2]}
-    yield Family("refocus", effect, {name: np.array(columns) for name, columns in forms.items()})
+    forms_of = {name: np.array(columns) for name, columns in forms.items()}
+    yield Family("refocus", effect, forms_of, alike=np.array([0, 1, 1]))
 
 
 def _rolling(sight: Sight) -> Iterator[Family]:
@@ -262,7 +272,8 @@ def _rolling(sight: Sight) -> Iterator[Family]:
     turned = sight.by_place @ _cross(sight.in_camera)
     slope = np.concatenate([turned, sight.by_place], axis=2) * time[:, None, None]
     effect = Effect(slope, sight.image, len(network.images))
-    yield Family("rolling-shutter", effect, {"all": np.arange(6), "shift": np.arange(3, 6)})
+    forms = {"all": np.arange(6), "turn": np.arange(3), "shift": np.arange(3, 6)}
+    yield Family("rolling-shutter", effect, forms, alike=np.repeat([0, 1], 3))
 
 
 def _motion(sight: Sight) -> Iterator[Family]:
@@ -270,8 +281,9 @@ def _motion(sight: Sight) -> Iterator[Family]:
     network = sight.network
     if network.rig is None and network.stage is None:
         return
-    images = len(network.images)
-    yield Family("motion", Effect(sight.by_pose, sight.image, images), {"pose": np.arange(6)})
+    effect = Effect(sight.by_pose, sight.image, len(network.images))
+    forms = {"all": np.arange(6), "turn": np.arange(3), "shift": np.arange(3, 6)}
+    yield Family("motion", effect, forms, alike=np.repeat([0, 1], 3))
 
 
 def _target(sight: Sight) -> Iterator[Family]:
@@ -285,7 +297,7 @@ def _target(sight: Sight) -> Iterator[Family]:
     middle = xyz.mean(axis=0)
     _, size, axes = np.linalg.svd(xyz - middle, full_matrices=False)
     points = Effect(sight.by_point, np.searchsorted(seen, sight.point), len(seen))
-    yield Family("target-shape", points, {"points": np.arange(3)})
+    yield Family("target-shape", points, {"points": np.arange(3)}, None, "points", np.zeros(3, dtype=int))
     if size[2] > _PLANE * size[1]:
         return
     # The axes of the design: prints are stretched along them.

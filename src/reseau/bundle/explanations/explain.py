@@ -19,9 +19,9 @@ from ...calibration.camera import by_rotation, places, projection_slopes, referr
 from ...core.data import Array, Rows
 from ...core.failure import Failure
 from ..diagnostics import Result, camera_mapping
-from ..diagnostics.evidence import Effect, Scores, scores, too_large
-from .alternatives import Alternative, alternatives, another_camera
-from .discrete import Chosen, gross_errors, log_choice, other_cameras
+from ..diagnostics.evidence import Scores, scores, too_large, used_rows
+from .alternatives import Alternative, alternatives
+from .discrete import Chosen, gross_errors, other_cameras
 from .effects import Family, Sight, families, lens_at
 from .names import Misnamed
 from .sentences import advice, listed_places
@@ -38,6 +38,12 @@ _LACKS = 0.1
 there it is a doubt, not a finding."""
 _CAUSES = 3
 """Causes that are named at most."""
+_ROUNDS, _SMALL = 4, 0.01
+"""Adjustments with the effects of a cause, at most, and the relative change of these that is none."""
+_RATIOS = (0.25, 1.0, 4.0)
+"""Ratios of the displacements by two kinds of effects."""
+_PROMISING = 0.5
+"""Part of what the best cause explains from which others are adjusted, too."""
 _ALIKE = 0.05
 """Probability from which another explanation is named, too."""
 
@@ -168,7 +174,10 @@ class Explanation:
 
 @dataclass(frozen=True, eq=False)
 class _Form:
-    """One form of a cause: its family, columns in their units, scores and evidence."""
+    """One form of a cause: its family, columns in their units, scores and evidence.
+
+    Where it was adjusted: what it leaves, the scores of its family without it, and its effects.
+    """
 
     family: Family
     name: str
@@ -176,6 +185,7 @@ class _Form:
     units: Array | None
     scores: Scores
     log_evidence: float
+    adjusted: tuple[Sight, Scores, Array] | None = None
 
     @property
     def code(self) -> str:
@@ -238,7 +248,7 @@ def explain(result: Result, misnamed: Misnamed | None = None) -> Explanation:
     if not result.fit.cofactors.reduced.known or result.redundancy < 1 or not result.fit.cost > 0:
         return Explanation(tuple(before), {}, {})
     sight = Sight(result)
-    every = list(families(sight))
+    every: Sequence[Family] = list(families(sight))
     if too_large(result.fit, sum(family.effect.count for family in every)):
         return Explanation(tuple(before), {}, {})
     whole = scores(result.fit, [family.effect for family in every])
@@ -266,13 +276,15 @@ def explain(result: Result, misnamed: Misnamed | None = None) -> Explanation:
         if step or found[0].code != "lens":
             errors.append(_error(best, 1.0, sight))
         taken.add(found[0].code)
-        begin = _begins(every)[id(best.family)]
-        whole = whole.with_effects(begin + best.columns, best.size * best.units)
+        whole, every, sight = _after(best, whole, every, sight)
     if misnamed is not None:
         # What else deviates in these images has perhaps the same cause.
         alike = all(cause.code in ("noise", "blunders", "unknown") for cause in causes)
         causes = [*before, *causes] if alike else [*causes, *before]
-    each = {f"{form.code}: {form.name}": form.log_evidence for form in forms}
+    each = dict[str, float]()
+    for form in forms:
+        name = f"{form.code}: {form.name}"
+        each[name] = max(form.log_evidence, each.get(name, -np.inf))
     return Explanation(tuple(causes), log_evidence, each, tuple(errors), result)
 
 
@@ -313,9 +325,7 @@ class _Comparison:
         chosen, form = self.chosen.get(code), self.best_form(code)
         sigma = sight.typical
         where, other = "", self.adjusted.get(code)
-        if other is not None and chosen is not None:
-            explained, name, where = other.explained, other.form, _where(code, chosen.rows, sight)
-        elif other is not None:
+        if other is not None:
             explained, name = other.explained, other.form
         elif chosen is not None:
             explained, name, where = chosen.explained, f"{len(chosen.rows)}", _where(code, chosen.rows, sight)
@@ -339,10 +349,10 @@ def _compared(
     for family in every:
         if family.code in taken:
             continue
-        begin = _begins(every)[id(family)]
-        part = whole.part(slice(begin, begin + family.effect.count))
+        part = whole.part(_columns(family, every))
         parts[family.code] = part
-        forms += [_again(form, sight) for form in _forms(family, part, sight)]
+        forms += _forms(family, part, sight)
+    forms = _nearer(forms, sight, whole) if discrete else forms
     sound = whole.log_nothing(known=1.0)
     found = {"noise": whole.log_nothing(known=0.0) - sound}
     for code in dict.fromkeys(form.code for form in forms):
@@ -351,7 +361,9 @@ def _compared(
     chosen: dict[str, Chosen] = {}
     if discrete:
         gross = gross_errors(sight, _KNOWN)
-        other = other_cameras(sight, parts["refocus"], _KNOWN) if "refocus" in parts else None
+        refocused = [form.adjusted for form in forms if form.code == "refocus" and form.adjusted is not None]
+        near = refocused[0][:2] if refocused else (sight, parts.get("refocus"))
+        other = None if near[1] is None else other_cameras(near[0], near[1], _KNOWN)
         chosen = {
             code: one for code, one in (("blunders", gross), ("other-camera", other)) if one is not None
         }
@@ -359,105 +371,135 @@ def _compared(
     forms = [replace(form, log_evidence=form.log_evidence - sound) for form in forms]
     better: dict[str, Alternative] = {}
     if discrete and max(found.values()) > -np.log(_FALSE) and max(found, key=found.__getitem__) != "noise":
-        every_other: list[Alternative | None] = [*alternatives(sight.result, _KNOWN)]
-        if "other-camera" in chosen:
-            rows = chosen["other-camera"].rows
-            count = len(sight.network.images)
-            every_other.append(another_camera(sight.result, rows, _KNOWN, log_choice(count, len(rows))))
-        for one in every_other:
-            if one is None:
-                continue
-            if one.code != "lens":
-                one.log_evidence += _with_a_lens(one.result)
+        for one in alternatives(sight.result, _KNOWN):
             if one.log_evidence - sound > found.get(one.code, -np.inf):
                 found[one.code] = one.log_evidence - sound
                 better[one.code] = one
     return _Comparison(found, forms, chosen, better)
 
 
+def _nearer(forms: list[_Form], sight: Sight, whole: Scores) -> list[_Form]:
+    """The forms, of which the best of each promising cause is adjusted."""
+    nothing = max(whole.log_nothing(known=0.0), whole.log_nothing(known=1.0))
+    most = max((form.log_evidence for form in forms), default=nothing)
+    if most < nothing - np.log(_FALSE):
+        return forms
+    found = list(forms)
+    for family in dict.fromkeys(form.family for form in forms if form.units is not None):
+        own = [k for k, form in enumerate(forms) if form.family is family]
+        k = max(own, key=lambda k: forms[k].log_evidence)
+        if forms[k].log_evidence - nothing > _PROMISING * (most - nothing):
+            found[k] = _adjusted_with(forms[k], sight)
+    return found
+
+
 def _named_besides(now: _Comparison, whole: Scores, every: Sequence[Family], sight: Sight) -> str | None:
     """The cause that, with smooth fields of what it leaves, predicts better than these fields alone."""
-    fields = [family for family in every if family.code == "unknown"]
     alone = max(form.log_evidence for form in now.forms if form.code == "unknown")
     sound, best = whole.log_nothing(known=1.0), (alone - np.log(_FALSE / len(now.log_evidence)), "")
     for code in dict.fromkeys(form.code for form in now.forms):
         form = now.best_form(code)
         if code == "unknown" or form is None or form.units is None:
             continue
-        left = whole.with_effects(_begins(every)[id(form.family)] + form.columns, form.size * form.units)
-        for family in fields:
-            begin = _begins(every)[id(family)]
-            part = left.part(slice(begin, begin + family.effect.count))
-            both = max(each.log_evidence for each in _forms(family, part, sight)) - sound
-            best = max(best, (both, code))
+        left, others, seen = _after(form, whole, every, sight, only="unknown")
+        for family in others:
+            if family.code == "unknown":
+                part = left.part(_columns(family, others))
+                both = max(each.log_evidence for each in _forms(family, part, seen)) - sound
+                best = max(best, (both, code))
     return best[1] or None
 
 
-def _with_a_lens(result: Result) -> float:
-    """What the lens explains besides, as a logarithm; 0 where that is not more than by chance."""
-    sight = Sight(result)
-    every = [family for family in families(sight) if family.code == "lens"]
-    whole = scores(result.fit, [family.effect for family in every])
-    forms = _compared(whole, every, sight, set(), discrete=False).forms
-    each = [form.log_evidence for form in forms]
-    gain = float(scipy.special.logsumexp(each)) - np.log(len(each)) + whole.log_nothing(known=1.0)
-    return float(max(gain - whole.log_nothing(known=_KNOWN) + np.log(_FALSE), 0.0))
+def _after(
+    form: _Form, whole: Scores, every: Sequence[Family], sight: Sight, only: str = ""
+) -> tuple[Scores, Sequence[Family], Sight]:
+    """Scores of the causes, or of one of them, after the effects of a form were taken into account."""
+    assert form.units is not None
+    if form.adjusted is not None:
+        sight, _, effects = form.adjusted
+        every = [form.family, *(one for one in families(sight) if only in ("", one.code))]
+        whole = scores(sight.result.fit, [family.effect for family in every])
+        whole = whole.before(np.concatenate([effects, np.zeros(len(whole.g) - len(effects))]))
+    begin = _columns(form.family, every).start
+    return whole.with_effects(begin + form.columns, form.size * form.units), every, sight
 
 
-def _begins(every: Sequence[Family]) -> dict[int, int]:
-    """First column of each family."""
-    counts = np.cumsum([0, *(family.effect.count for family in every)])
-    return {id(family): int(at) for family, at in zip(every, counts, strict=False)}
+def _columns(family: Family, every: Sequence[Family]) -> slice:
+    """The columns of a family among those of all."""
+    k = next(k for k, one in enumerate(every) if one is family)
+    begin = sum(one.effect.count for one in every[:k])
+    return slice(begin, begin + family.effect.count)
 
 
 def _forms(family: Family, part: Scores, sight: Sight) -> list[_Form]:
     """The forms of a cause."""
     effect = family.effect
     groups, q = effect.groups, effect.slope.shape[2]
-    rms = effect.rms(sight.sigma)
+    square = effect.rms(sight.sigma) ** 2
+    number = np.bincount(effect.group[effect.group >= 0], minlength=groups)
+    total = number @ square / max(int(number.sum()), 1)
+    # Effects of one kind have one standard deviation in all groups; kinds displace image points alike, or two
+    # of them by some ratio.
+    alike = np.arange(q) if family.alike is None else family.alike
+    of_kind = np.array([total[alike == kind].sum() for kind in alike])
+    unit = np.where(of_kind > 0, 1.0 / np.sqrt(np.where(of_kind > 0, of_kind, 1.0)), 0.0)
     found = []
     for name, chosen in family.forms.items():
-        if chosen.ndim == 1:
-            # Each effect displaces the points of its group alike; together by one standard deviation.
-            each = np.where(rms > 0, 1.0 / np.where(rms > 0, rms, 1.0), 0.0) / np.sqrt(len(chosen))
-            columns = (np.arange(groups)[:, None] * q + chosen).ravel()
-            units: Array | None = each[:, chosen].ravel()
-            assert units is not None
-            own = part.part(columns).scaled(units)
-        else:
-            columns, units = np.arange(groups * q), None
+        if chosen.ndim > 1:
             own = part.combined(groups, np.asarray(sight.typical * chosen, dtype=np.float64))
-        found.append(_Form(family, name, columns, units, own, own.log_evidence(known=_KNOWN)))
+            columns = np.arange(groups * q)
+            found.append(_Form(family, name, columns, None, own, own.log_evidence(known=_KNOWN)))
+            continue
+        kinds = np.unique(alike[chosen])
+        columns = (np.arange(groups)[:, None] * q + chosen).ravel()
+        for ratio in _RATIOS if len(kinds) == 2 else (1.0,):
+            each = unit[chosen] * np.where(alike[chosen] == kinds[0], ratio, 1.0)
+            rms = np.sqrt((each**2 * total[chosen]).sum())
+            units = np.tile(each / (rms if rms > 0 else 1.0), groups)
+            own = part.part(columns).scaled(units)
+            found.append(_Form(family, name, columns, units, own, own.log_evidence(known=_KNOWN)))
     return found
 
 
-def _again(form: _Form, sight: Sight) -> _Form:
-    """The form with the evidence of a network whose points were moved; as it is where that was not needed.
+def _adjusted_with(form: _Form, sight: Sight) -> _Form:
+    """The form as an adjustment with its effects finds it; as it was where none is better.
 
-    Large shifts of object points displace image points by squares of them, too.
+    What large effects do to image points is not linear in them: they are taken out of the coordinates of the
+    image points, or added to those of the object points, and the adjustment is repeated from there.
     """
-    moves, result = form.family.moves, sight.result
-    gain = form.log_evidence - form.scores.log_nothing(known=_KNOWN)
-    if moves is None or form.units is None or gain < -np.log(_FALSE):
-        return form
-    moves = moves[:, :, form.columns] * form.units
-    size, fit, xyz = form.size, result.fit, result.fit.values.xyz
-    effects = form.scores.effects(size)
-    problem = fit.problem.continued(fit)
-    for _ in range(2):
-        moved = xyz + moves @ effects
-        network = replace(problem.network, xyz=moved)
-        start = replace(problem.start, xyz=moved)
-        again = replace(problem, network=network, start=start, rounds=0).adjusted()
-        if isinstance(again, Failure):
-            return form
-        seen = Sight(Result(network, again, result.rejected))
-        one = np.zeros(len(seen.rows), dtype=np.intp)
-        own = scores(again, [Effect(seen.by_point @ moves[seen.point], one, 1)])
-        effects = effects + own.effects(size)
-        problem = replace(problem, start=problem.continued(again).start)
-    log = own.log_evidence_at(effects, known=_KNOWN)
-    return form if log < form.log_evidence else replace(form, log_evidence=log)
+    network, fit, size, units = sight.network, sight.result.fit, form.size, form.units
+    assert units is not None
+    problem, seen, family = fit.problem.continued(fit), sight, form.family
+    effects, best = form.scores.effects(size), form
+    for _ in range(_ROUNDS):
+        every = np.zeros(family.effect.count)
+        every[form.columns] = units * effects
+        if family.moves is not None:
+            xyz = fit.values.xyz + family.moves @ every
+            moved = replace(network, xyz=xyz)
+            problem = replace(problem, network=moved, start=replace(problem.start, xyz=xyz))
+        else:
+            xy = network.xy.copy()
+            by_group = every.reshape(family.effect.groups, -1)[family.effect.group]
+            xy[seen.rows] -= (family.effect.slope @ by_group[:, :, None])[:, :, 0]
+            moved = replace(network, xy=xy)
+            problem = replace(problem, network=moved)
+        again = replace(problem, rounds=0).adjusted()
+        if isinstance(again, Failure) or len(used_rows(again)) != len(seen.rows):
+            return best
+        seen = Sight(Result(moved, again, sight.result.rejected))
+        family = family.seen_again(seen)
+        part = scores(again, [family.effect]).before(every)
+        own = part.part(form.columns).scaled(units)
+        log = own.log_evidence(known=_KNOWN)
+        if log > best.log_evidence:
+            best = replace(form, family=family, log_evidence=log, adjusted=(seen, part, every))
+        step = own.effects(size) - effects
+        effects = effects + step
+        if np.linalg.norm(step) < _SMALL * np.linalg.norm(effects):
+            break
+        problem = problem.continued(again)
+    return best
 
 
 def _possible(now: _Comparison, sight: Sight) -> list[_Error]:
