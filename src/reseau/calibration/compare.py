@@ -14,7 +14,7 @@ import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
-from ..core.data import Array
+from ..core.data import Array, Mask
 from ..core.errors import UsageError
 from ..optics.poses import rotation_matrix
 from .camera import CameraMapping, by_rotation, places, referred, worst
@@ -126,33 +126,34 @@ def calibration_difference(
     xy, shape = places(first, across, down)
     uv = first.mapping.inverse(xy)
     known = np.isfinite(uv).all(axis=1) & np.isfinite(second.mapping(uv)).all(axis=1)
-    # Beyond the turning point of a distortion, the second has images of rays that are not the first's.
-    known[known] &= first.mapping.one_to_one(uv[known]) & second.mapping.one_to_one(uv[known])
-    if known.sum() < 2:
-        raise UsageError("image no ray in common", where="calibrations")
-    uv, turn, weight = uv[known], np.eye(3), np.ones(int(known.sum()))
-    here = first.mapping.derivatives(uv)
+    rows, turn = np.flatnonzero(known), np.eye(3)
+    weight = np.ones(len(xy))
     for k in range(_ROUNDS):
-        turned, by_uv = _turned(turn, uv)
+        # Rays near a right angle to the axis may be turned out of what the second can image.
+        rows = rows[_ahead(turn, uv[rows])]
+        if len(rows) < 2:
+            raise UsageError("image no ray in common", where="calibrations")
+        here = first.mapping.derivatives(uv[rows])
+        turned, by_uv = _turned(turn, uv[rows])
         there = second.mapping.derivatives(turned)
         g = there.d_xy @ by_rotation(turned, parallel)
-        off = there.value - xy[known]
+        off = there.value - xy[rows]
         if not (np.isfinite(g).all() and np.isfinite(off).all()):
             raise UsageError("do not image the same rays", where="calibrations")
         own = there.d_parameters[:, :, second.rows]
         carried = there.d_xy @ by_uv @ np.linalg.inv(here.d_xy) @ here.d_parameters[:, :, first.rows]
-        by_first, by_second = referred(g, carried, weight), referred(g, own, weight)
+        by_first, by_second = referred(g, carried, weight[rows]), referred(g, own, weight[rows])
         root = _joint_root(first, second, by_first, by_second)
         if k == 0 and root.size:
             # Places that are known better say more of the rotation.
             variance = np.einsum("gik,gik->g", root, root)
-            weight = 1 / np.sqrt(np.maximum(variance, _RANK**2 * variance.max() or 1.0))
-        each = np.repeat(weight, 2)
+            weight[rows] = 1 / np.sqrt(np.maximum(variance, _RANK**2 * variance.max() or 1.0))
+        each = np.repeat(weight[rows], 2)
         step = -np.linalg.lstsq(each[:, None] * g.reshape(-1, 3), each * off.ravel(), rcond=None)[0]
         turn = (_shifted(step) if parallel else rotation_matrix(step)) @ turn
     statistic, degrees = _statistic(root, off)
     difference, cov = np.full((len(xy), 2), np.nan), np.full((len(xy), 2, 2), np.nan)
-    difference[known], cov[known] = off, root @ np.swapaxes(root, 1, 2)
+    difference[rows], cov[rows] = off, root @ np.swapaxes(root, 1, 2)
     # The camera is rotated in the opposite sense to its rays.
     angle = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
     if parallel:
@@ -195,6 +196,11 @@ def _shifted(step: NDArray[Any]) -> Array:
     """Shift and rotation of a plane, for homogeneous coordinates (3, 3)."""
     c, s = np.cos(step[2]), np.sin(step[2])
     return np.array([[c, -s, step[0]], [s, c, step[1]], [0.0, 0.0, 1.0]])
+
+
+def _ahead(turn: Array, uv: Array) -> Mask:
+    """Whether rays stay in front of the camera when they are turned."""
+    return np.asarray(uv @ turn[2, :2] + turn[2, 2] > 0)
 
 
 def _turned(turn: Array, uv: Array) -> tuple[Array, Array]:
