@@ -545,13 +545,14 @@ def _calibrated(
     wrong = left_out(network_of(measured, design, stand_in), cameras, sizes, of)
     if wrong is None:
         return _adjusted(measured, declined, sizes, notes, design, model, options, taken, None)
-    done = _adjusted(wrong.kept(measured), declined, sizes, notes, design, model, options, taken, wrong.found)
-    if isinstance(done, Failure):
-        return done
-    still = wrong.after(done.result)
-    if still is not None and len(still.found.rows) == len(wrong.found.rows):
-        return done
-    # By the adjusted camera some of them are in their own places.
+    # Which points are wrong is seen best with the target as designed: its own errors are small beside theirs.
+    more = options.target != "free" or options.control or options.heights or options.refraction
+    first = options if more else replace(options, target="flat")
+    done = _adjusted(wrong.kept(measured), declined, sizes, notes, design, model, first, taken, wrong.found)
+    still = wrong if isinstance(done, Failure) else wrong.after(done.result)
+    same = still is not None and np.array_equal(still.found.rows, wrong.found.rows)
+    if still is not None and same and more:
+        return done if isinstance(done, Failure) else replace(done, misnamed=still.found)
     kept, found = (measured, None) if still is None else (still.kept(measured), still.found)
     return _adjusted(kept, declined, sizes, notes, design, model, options, taken, found)
 
@@ -883,7 +884,15 @@ def first_camera(
     if model.registered.parallel:
         f = _scale(object_points, image_points)
     else:
-        f = float(cv2.initCameraMatrix2D(object_points, image_points, size, 1.0)[0, 0])
+        # Points of one line have no homography.
+        pairs = [
+            (plane, xy) for plane, xy in zip(object_points, image_points, strict=True)
+            if len(xy) >= 4 and cv2.findHomography(plane[:, :2], xy)[0] is not None
+        ]  # fmt: skip
+        f = 0.0
+        if pairs:
+            planes, seen = [plane for plane, _ in pairs], [xy for _, xy in pairs]
+            f = float(cv2.initCameraMatrix2D(planes, seen, size, 1.0)[0, 0])
         if not np.isfinite(f) or not 0.2 * max(size) < f < 100 * max(size):
             f = focal_px or 1.2 * max(size)
         if focal_px is not None and not focal_px / _FOCAL_OFF < f < _FOCAL_OFF * focal_px:

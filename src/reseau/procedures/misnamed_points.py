@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.spatial
 
 from ..bundle import Camera, Misnamed, Network, Result, camera_mapping, misnamed
-from ..core.data import ImagePoints, Mask
+from ..core.data import ImagePoints
 from ..optics import camera_model
 
 __all__ = ["LeftOut", "left_out"]
@@ -48,36 +47,18 @@ class LeftOut:
         return kept
 
     def after(self, result: Result) -> LeftOut | None:
-        """Those that still lie nearer to the place of another point after an adjustment without them."""
-        network, adjusted = self.network, result.network
-        image_of = {name: k for k, name in enumerate(adjusted.images)}
-        point_of = {name: k for k, name in enumerate(adjusted.points)}
-        values, rows = result.fit.values, self.found.rows
-        still: Mask = np.ones(len(rows), dtype=np.bool_)
-        for image in np.unique(network.image_of[rows]):
-            i = image_of.get(network.images[image])
-            if i is None or not result.fit.usable.images[i]:
-                continue
-            mapping = camera_mapping(result, int(adjusted.camera_of[i]), formal=True).mapping
-            at = (values.xyz - values.x0[i]) @ values.rotation[i].T
-            uv = at[:, :2] if mapping.parallel else at[:, :2] / at[:, 2:]
-            places = np.where(mapping.one_to_one(uv)[:, None], mapping(uv), np.nan)
-            known = np.flatnonzero(np.isfinite(places).all(axis=1))
-            tree = scipy.spatial.cKDTree(places[known])
-            for k in np.flatnonzero(network.image_of[rows] == image):
-                own = point_of.get(network.points[network.point_of[rows[k]]])
-                if own is None or not np.isfinite(places[own]).all():
-                    continue
-                gap = float(tree.query(places[own], k=2)[0][1])
-                still[k] = np.linalg.norm(places[own] - network.xy[rows[k]]) > 0.5 * gap
-        if not still.any():
-            return None
-        found = self.found
-        labels = tuple(label for label, keep in zip(found.labels, still, strict=True) if keep)
-        kept = replace(
-            found, rows=rows[still], point=found.point[still], off_px=found.off_px[still], labels=labels
-        )
-        return replace(self, found=kept)
+        """Those that still lie in other places by the cameras of an adjustment without them."""
+        adjusted = result.network
+        plain = all(camera.has_plane_mapping for camera in adjusted.cameras)
+        if adjusted.refraction is not None or not plain:
+            return self
+        by_name = {
+            camera.id: camera_mapping(result, c, formal=True).mapping
+            for c, camera in enumerate(adjusted.cameras)
+        }
+        lenses = [by_name[camera.id] for camera in self.network.cameras]
+        found = misnamed(self.network, lenses, self.found)
+        return None if found is None else replace(self, found=found)
 
 
 def left_out(

@@ -552,7 +552,8 @@ def _images(form: _Form, sight: Sight) -> str:
 
 def _of_names(misnamed: Misnamed, result: Result) -> Cause:
     """The cause of image points that were left out because they lie elsewhere."""
-    amount = float(np.sqrt(np.mean(misnamed.off_px**2)))
+    off = misnamed.off_px[np.isfinite(misnamed.off_px)]
+    amount = float(np.sqrt(np.mean(off**2))) if len(off) else 0.0
     where = listed_places(list(misnamed.labels), "point")
     share = len(misnamed.labels) / (len(result.network.xy) + len(misnamed.labels))
     return Cause(misnamed.code, f"{len(misnamed.labels)}", amount, share, 1.0, where,

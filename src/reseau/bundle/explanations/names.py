@@ -7,9 +7,9 @@ errors are found before they spoil one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ import scipy.spatial
 import scipy.special
 
 from ...core.data import Array, Mask, Rows
+from ...optics import PlaneMapping
 from ..network import Network
 
 __all__ = ["Misnamed", "misnamed"]
@@ -33,6 +34,10 @@ _CORNERS = (0.0, 45.0, 65.0, 85.0, 105.0)
 """Angles of the corners of the image to the axis, degrees, that are tried for wide lenses; 0 for others."""
 _WITHIN = 0.2
 """Distance of points that agree, in that of neighbours: names that are wrong by one do not agree halfway."""
+_NEAR = (1.0, 5.0)
+"""The same for names of near points: of the next one, and of corners of the same tag."""
+_FAR = 1e7
+"""Coordinate of what is not imaged."""
 _MOSTLY = 0.995
 """Part of the image points that agree from which no other projection is tried."""
 
@@ -48,7 +53,7 @@ class Misnamed:
     point : ndarray of int (k,)
         Points in whose places they lie; −1 where there is none.
     off_px : ndarray (k,)
-        Distances from their own places.
+        Distances from their own places; NaN where these are not known.
     log_odds : float
         Logarithm of the odds that names are wrong, not places.
     labels : tuple of str
@@ -108,13 +113,19 @@ class _Image:
     sense: float
 
 
-def misnamed(network: Network) -> Misnamed | None:
+def misnamed(
+    network: Network, lenses: Sequence[PlaneMapping] | None = None, before: Misnamed | None = None
+) -> Misnamed | None:
     """Find image points that lie in the places of other points, or in none.
 
     Parameters
     ----------
     network : Network
         With known coordinates of the points of a plane target; approximate values are enough.
+    lenses : sequence of PlaneMapping, optional
+        Of its cameras, where they are known.
+    before : Misnamed, optional
+        What was found without them.
 
     Returns
     -------
@@ -137,29 +148,42 @@ def misnamed(network: Network) -> Misnamed | None:
     plane = np.full((len(network.points), 2), np.nan)
     plane[known] = (xyz - xyz.mean(axis=0)) @ axes[:2].T / size[0] * np.sqrt(len(known))
     tree = scipy.spatial.cKDTree(plane[known])
-    cameras = network.cameras
-    found = dict[int, tuple[Rows, _Image]]()
+    cameras, guess = network.cameras, network.point_of.copy()
+    if before is not None:
+        guess[before.rows] = np.where(before.point < 0, guess[before.rows], before.point)
+    found = dict[int, tuple[Rows, _Image | None]]()
     for c in range(len(cameras)):
         images = np.flatnonzero(network.camera_of == c)
-        found |= _images(network, images, plane, known, tree)
-    if not found:
+        lens = None if lenses is None else _Calibrated(lenses[c])
+        found |= _images(network, images, plane, guess, known, tree, lens)
+    judged = [each for _, each in found.values() if each is not None]
+    if not judged:
         return None
     # A printed target is not seen from behind.
-    usual = float(np.sign(sum(each.sense for _, each in found.values())))
+    usual = float(np.sign(sum(each.sense for each in judged)))
     rows, points, off, odds = list[Rows](), list[Rows](), list[Array](), 0.0
     for own, best in found.values():
+        if best is None:
+            # Which of them are wrong is not seen without a camera.
+            rows.append(own)
+            points.append(np.full(len(own), -1, dtype=np.intp))
+            off.append(np.full(len(own), np.nan))
+            continue
         wrong: Mask = best.own > 0.5
         if usual and best.sense == -usual:
             wrong = np.ones(len(own), dtype=np.bool_)
             odds += np.inf
         if not wrong.any():
             continue
-        near = wrong & (best.nearest != network.point_of[own])
+        # No two image points are in one place.
+        taken = np.isin(best.nearest, network.point_of[own[~wrong]])
+        near = wrong & (best.nearest != network.point_of[own]) & ~taken
         rows.append(own[wrong])
         points.append(np.where(near, best.nearest, -1)[wrong].astype(np.intp))
         off.append(best.off[wrong])
         if usual != -best.sense:
-            odds += _log_odds(best.near[wrong], best.cell[wrong], best.spread)
+            distance = np.where(near, best.near, np.inf)[wrong]
+            odds += _log_odds(distance, best.cell[wrong], best.spread)
     if not rows:
         return None
     every = np.concatenate(rows)
@@ -182,8 +206,14 @@ def _log_odds(near: Array, cell: Array, spread: float) -> float:
 
 
 def _images(
-    network: Network, images: Rows, plane: Array, known: Rows, tree: scipy.spatial.cKDTree
-) -> dict[int, tuple[Rows, _Image]]:
+    network: Network,
+    images: Rows,
+    plane: Array,
+    guess: Rows,
+    known: Rows,
+    tree: scipy.spatial.cKDTree,
+    calibrated: _Calibrated | None,
+) -> dict[int, tuple[Rows, _Image | None]]:
     """Places of the points in the images of a camera, with the projection by which most names agree."""
     rays, parts = network.rays_of_images, dict[int, Rows]()
     for image in images.tolist():
@@ -196,12 +226,14 @@ def _images(
     camera = network.cameras[int(network.camera_of[images[0]])]
     size = np.array([camera.width, camera.height])
     total, best, most = sum(map(len, parts.values())), None, -1
-    for corner_deg in _CORNERS:
-        focal = np.hypot(*size) / 2 / np.radians(corner_deg) if corner_deg else 0.0
-        lens = _Lens((size - 1) / 2, float(np.hypot(*size)) / 2, focal)
+    half = float(np.hypot(*size)) / 2
+    focals = (half / np.radians(corner) if corner else 0.0 for corner in _CORNERS)
+    guesses = (_Lens((size - 1) / 2, half, focal) for focal in focals)
+    for first in guesses if calibrated is None else (calibrated,):
+        lens: _Projection = first
         views = {}
         for image, own in parts.items():
-            view = _view(network.xy[own], network.point_of[own], plane, tree, known, lens)
+            view = _view(network.xy[own], network.point_of[own], guess[own], plane, tree, known, lens)
             if view is not None:
                 views[image] = view
         for _ in range(_ROUNDS):
@@ -215,7 +247,26 @@ def _images(
             break
     assert best is not None
     views, lens = best
-    return {image: (parts[image], view.judged(lens, known)) for image, view in views.items()}
+    return {
+        image: (own, views[image].judged(lens, known) if image in views else None)
+        for image, own in parts.items()
+    }
+
+
+class _Projection(Protocol):
+    """How a camera images a plane, and whether that is known."""
+
+    @property
+    def known(self) -> bool: ...
+
+    def plane(self, xy: Array) -> Array:
+        """Places of pixels in the plane of a perspective image."""
+
+    def pixels(self, at: Array) -> Array:
+        """Pixels of places in that plane."""
+
+    def bent_by(self, views: Iterable[_View]) -> _Projection:
+        """The projection with what the agreeing points of all images have in common."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,6 +277,7 @@ class _Lens:
     half: float
     focal: float
     bend: Array | None = None
+    known: ClassVar[bool] = False
 
     def plane(self, xy: Array) -> Array:
         """Places of pixels in the plane of a perspective image, px."""
@@ -263,11 +315,42 @@ class _Lens:
         return np.stack([x**i * y**j for i, j in powers], axis=1)
 
 
+class _Calibrated:
+    """A camera that is known."""
+
+    known: ClassVar[bool] = True
+
+    def __init__(self, mapping: PlaneMapping) -> None:
+        self._mapping = mapping
+
+    def plane(self, xy: Array) -> Array:
+        """Directions of pixels; far away where there are none."""
+        return np.nan_to_num(self._mapping.inverse(xy), nan=_FAR)
+
+    def pixels(self, at: Array) -> Array:
+        """Pixels of directions; far away where there are none."""
+        known = np.flatnonzero(np.isfinite(at).all(axis=1))
+        known = known[self._mapping.one_to_one(at[known])]
+        xy = np.full(at.shape, _FAR)
+        xy[known] = np.nan_to_num(self._mapping(at[known]), nan=_FAR)
+        return xy
+
+    def bent_by(self, views: Iterable[_View]) -> _Calibrated:
+        """Itself."""
+        return self
+
+
 class _View:
     """One image: its points as they are named, or as if the target were turned, and their homography."""
 
     def __init__(
-        self, xy: Array, names: Rows, guess: Rows, plane: Array, lens: _Lens, within: float = _WITHIN
+        self,
+        xy: Array,
+        names: Rows,
+        guess: Rows,
+        plane: Array,
+        lens: _Projection,
+        within: float = _WITHIN,
     ) -> None:
         self.xy, self.names, self.plane, self.design = xy, names, plane, plane[guess]
         self.step, uv = _spacing(xy), lens.plane(xy)
@@ -283,7 +366,7 @@ class _View:
         """Number of points that agree."""
         return int(self.mask.sum())
 
-    def fit(self, lens: _Lens) -> None:
+    def fit(self, lens: _Projection) -> None:
         """Fit the homography to the points that agree, and look which these are."""
         for _ in range(2):
             if self.mask.sum() < 6:
@@ -296,12 +379,19 @@ class _View:
             self.off = np.linalg.norm(lens.pixels(_mapped(h, self.design)) - self.xy, axis=1)
             self.mask = self.off < _WITHIN * self.step
 
-    def renamed(self, known: Rows, lens: _Lens) -> Rows:
+    def renamed(self, known: Rows, lens: _Projection) -> Rows:
         """The points in whose places the image points lie."""
         places = lens.pixels(_mapped(self.h, self.plane[known]))
         return np.asarray(known[scipy.spatial.cKDTree(places).query(self.xy)[1]])
 
-    def judged(self, lens: _Lens, known: Rows) -> _Image:
+    def placed(self, known: Rows, lens: _Projection) -> tuple[int, int]:
+        """Numbers of image points in the places of points, and of those in their own places."""
+        if self.h is None or not self.mask.any():
+            return 0, 0
+        found = self.judged(lens, known)
+        return int((found.near < _WITHIN * self.step).sum()), int((found.own < _WITHIN).sum())
+
+    def judged(self, lens: _Projection, known: Rows) -> _Image:
         """Where the points lie, and whether in the places of their names."""
         places = np.full(self.plane.shape, np.nan)
         places[known] = lens.pixels(_mapped(self.h, self.plane[known]))
@@ -319,23 +409,48 @@ class _View:
 
 
 def _view(
-    xy: Array, names: Rows, plane: Array, tree: scipy.spatial.cKDTree, known: Rows, lens: _Lens
+    xy: Array,
+    names: Rows,
+    guess: Rows,
+    plane: Array,
+    tree: scipy.spatial.cKDTree,
+    known: Rows,
+    lens: _Projection,
 ) -> _View | None:
-    """The view of an image in which most names agree, if the target is as named, turned or mirrored."""
-    views = []
-    for turned in _turned(plane):
-        view = _View(xy, names, known[tree.query(turned[names])[1]], plane, lens)
-        views.append(view)
-        if view.agree > _AGREE * len(names):
-            break
-    best = max(views, key=lambda view: view.agree)
-    if 6 <= best.agree < _AGREE * len(names):
-        # The names are perhaps those of near points: once more with the points in whose places these lie.
-        for view in (best, _View(xy, names, names, plane, lens, 1.0)):
-            if view.h is not None:
-                again = _View(xy, names, view.renamed(known, lens), plane, lens)
-                best = max(best, again, key=lambda view: view.agree)
+    """The view of an image in which most names agree, if the target is as named, turned or mirrored.
+
+    `guess` are the points that are perhaps seen.
+    """
+    designs = [guess, *(known[tree.query(turned[names])[1]] for turned in _turned(plane))]
+    best = _View(xy, names, names, plane, lens)
+    for within in (_WITHIN, *_NEAR):
+        # Where few agree, the names are perhaps those of near points: they are taken from the places.
+        for design in designs if best.agree <= _AGREE * len(names) else ():
+            view = _View(xy, names, design, plane, lens, within)
+            if within > _WITHIN and view.h is not None:
+                view = _View(xy, names, view.renamed(known, lens), plane, lens)
+            best = max(best, view, key=lambda view: view.agree)
+            if best.agree > _AGREE * len(names):
+                break
+    if lens.known and best.mask.any() and best.agree < len(names):
+        # What is named one place further agrees with itself, too, but for the points at the ends of the rows.
+        seen = plane[best.renamed(known, lens)]
+        shifted = (known[tree.query(seen + step)[1]] for step in _steps(plane[known], tree))
+        views = [best, *(_View(xy, names, design, plane, lens) for design in shifted)]
+        best = max(views, key=lambda view: view.placed(known, lens))
+        return best if best.placed(known, lens)[0] > _AGREE * len(names) else None
     return best if best.agree > _AGREE * len(names) else None
+
+
+def _steps(plane: Array, tree: scipy.spatial.cKDTree) -> Array:
+    """The usual differences of neighbouring points, and the opposite ones (k, 2)."""
+    off = plane[tree.query(plane, k=3)[1][:, 1:]] - plane[:, None]
+    off = off.reshape(-1, 2)
+    off = off[np.linalg.norm(off, axis=1) < 1.5 * np.median(np.linalg.norm(off, axis=1))]
+    across = np.abs(off[:, 0]) > np.abs(off[:, 1])
+    kinds = [np.median(np.abs(part), axis=0) * along for part, along in (
+        (off[across], [1, 0]), (off[~across], [0, 1])) if len(part)]  # fmt: skip
+    return np.array([sign * kind for kind in kinds for sign in (1.0, -1.0)]).reshape(-1, 2)
 
 
 def _turned(plane: Array) -> Iterator[Array]:
