@@ -12,6 +12,7 @@ import pytest
 from reseau.bundle import BundleFit
 from reseau.bundle.solver.noise import determined_by_noise, part_by_noise
 from reseau.bundle.solver.orthogonal import cofactors_from_rows
+from reseau.bundle.solver.problem import expected_variance
 from reseau.core.failure import Code, Failure
 
 from . import networks
@@ -130,3 +131,16 @@ def found_again(fit: BundleFit) -> Any:
 def number(fit: BundleFit) -> int:
     """Number of unknowns."""
     return fit.counts[1] - fit.counts[2]
+
+
+@pytest.mark.parametrize("redundancy", [1, 2, 10, 40])
+def test_intervals_hold_with_few_redundant_observations(redundancy: int) -> None:
+    rng = np.random.default_rng(redundancy)
+    square, error = rng.chisquare(redundancy, 2000), rng.normal(size=2000)
+    variance = np.array([expected_variance(each, redundancy) for each in square])
+    # 95 % of 2000 with a standard deviation of 0.5 %.
+    assert np.mean(np.abs(error) < 1.96 * np.sqrt(variance)) == pytest.approx(0.95, abs=3.5 * 0.005)
+
+
+def test_input_sigmas_far_from_the_truth_do_not_count_from_a_redundancy_of_five_on() -> None:
+    assert expected_variance(5 * 0.02**2, 5) == pytest.approx(0.02**2, rel=0.1)

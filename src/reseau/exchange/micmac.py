@@ -35,8 +35,7 @@ from .markup import Node, read_markup
 __all__ = ["is_micmac", "read_micmac"]
 
 _PATTERN = "Orientation-*.xml"
-# Estimated parameters, and width of the sensor (mm), of which the files say nothing.
-_FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
+# Width of the sensor (mm), of which the files say nothing.
 _SENSOR = 36.0
 # Powers of a length in the denominator of the coefficients.
 _POWER = {"P1": 1, "P2": 1} | {f"K{k}": 2 * k for k in range(1, 6)}
@@ -156,7 +155,7 @@ def _interior_file(folder: Path, named: str, by: Path) -> Path:
 
 
 def _camera(inside: Node, name: str) -> Camera:
-    """Brown's camera, with a pixel size for the width of a usual sensor."""
+    """Brown's camera, held as Campari does, with a pixel size for the width of a usual sensor."""
     convention = inside.need("KnownConv").text
     if convention not in _SIDES:
         raise FormatError(f"has the convention {convention!r}", where=inside.where)
@@ -170,9 +169,8 @@ def _camera(inside: Node, name: str) -> Camera:
     for element in inside.all("CalibDistortion"):
         values |= {name: value / pitch ** _POWER.get(name, 0) for name, value in _distortion(element).items()}
     model = camera_model("brown_higher" if values.get("K4", 0.0) or values.get("K5", 0.0) else "brown")
-    more = ("K4",) if values.get("K4", 0.0) else ()
     column, options = np.array([values.get(key, 0.0) for key in model.names]), {"side": _SIDES[convention]}
-    return Camera(name, width, height, (pitch, pitch), model.name, column, (*_FREE, *more), options)
+    return Camera(name, width, height, (pitch, pitch), model.name, column, (), options)
 
 
 def _distortion(element: Node) -> dict[str, float]:

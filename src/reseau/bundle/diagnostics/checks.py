@@ -182,8 +182,9 @@ def _global(result: Result) -> list[Remark]:
                 Code.NO_REDUNDANCY,
             )
         ]
+    few = _few(result)
     if test.passed:
-        return []
+        return few
     why = (
         "input sigmas are too small, or the model does not fit"
         if test.statistic > test.upper
@@ -193,6 +194,21 @@ def _global(result: Result) -> list[Remark]:
         Remark(
             f"global test: residuals are {_times(result.sigma0)} what input sigmas say (sigma0 "
             f"{result.sigma0:.4g}), which chance does not explain: {why}",
+            Code.SIGMAS_DOUBTFUL,
+        ),
+        *few,
+    ]
+
+
+def _few(result: Result) -> list[Remark]:
+    """That few redundant observations do not say how large sigma0 is, where that matters."""
+    if not result.fit.variance > 1.1 * result.sigma0**2:
+        return []
+    return [
+        Remark(
+            f"redundancy {result.redundancy} hardly shows how large residuals are (sigma0 "
+            f"{result.sigma0:.3g}): input sigmas count too, and uncertainties are those of sigma0 "
+            f"{np.sqrt(result.fit.variance):.2g}",
             Code.SIGMAS_DOUBTFUL,
         )
     ]

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
+import scipy.special
 from numpy.typing import ArrayLike, NDArray
 
 from ...adjust import AdjustmentFailure
@@ -69,6 +70,8 @@ _WEAK = (
 )
 # Iterations after which poorly determined points of an adjustment that has not converged are left out.
 _SLOW = 50
+# Redundancy from which sigma0, uncertain by a tenth, is taken as it is.
+_FEW = 50
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -326,8 +329,27 @@ class BundleFit(Fitted, Display):
 
     @property
     def variance(self) -> float:
-        """Variance factor of covariances: sigma0² a posteriori, one a priori."""
-        return self.sigma0**2 if self.scale == "a-posteriori" else 1.0
+        """Variance factor of covariances: sigma0² a posteriori, one a priori.
+
+        A few observations do not say how large sigma0 is: what is known beforehand counts, too.
+        """
+        if self.scale != "a-posteriori":
+            return 1.0
+        return expected_variance(self.cost, self.redundancy) if 0 < self.redundancy < _FEW else self.sigma0**2
+
+
+def expected_variance(square: float, redundancy: int) -> float:
+    """Expected variance factor, never below sigma0².
+
+    Standard deviations of the observations are known to a third (an inverse gamma distribution), or with one
+    in a hundred not at all (a factor from a ten-thousandth to ten thousand).
+    """
+    n, r, square = 2.0 / 0.6**2, float(redundancy), max(square, 1e-300)
+    gamma = scipy.special.gammaln
+    known = gamma((n + r) / 2) - gamma(n / 2) + n / 2 * np.log(n / 2) - (n + r) / 2 * np.log((n + square) / 2)
+    unknown = gamma(r / 2) - r / 2 * np.log(square / 2) - np.log(4 * np.log(1e4))
+    share = float(scipy.special.expit(known - unknown + np.log(99.0)))
+    return max(share * (n + square) / (n + r) + (1 - share) * square / r, square / r)
 
 
 class _Run:
