@@ -1,11 +1,12 @@
 """Whether intervals of a calibration hold where the points of an image have errors in common.
 
 Run from the checkout: ``python benchmarks/intervals.py [--seeds 200] [--seed 1] [--images 6 10 20 40]
-[--errors 0 1 5] [--kinds smooth focal] [--free] [--jobs 1]``. A camera (k1, k2, p1, p2) is adjusted from
-images of a flat board, drawn with OpenCV, with noise of 0.03 px, and errors that the points of an image have
-in common, of 0, 1 and 5 times the noise (root mean square over the points): ``smooth`` is a field over the
-image, another in each image: a polynomial, a few cosines, or a Gaussian process; ``focal`` is a principal
-distance of each image. Printed is how often intervals of 95 % contain the true principal distances, the
+[--errors 0 1 5] [--kinds smooth focal paper] [--free] [--jobs 1]``. A camera (k1, k2, p1, p2) is adjusted
+from images of a flat board, drawn with OpenCV, with noise of 0.03 px, and errors that the points of an image
+have in common, of 0, 1 and 5 times the noise (root mean square over the points): ``smooth`` is a field over
+the image, another in each image: a polynomial, a few cosines, or a Gaussian process; ``focal`` is a principal
+distance of each image; ``paper``, which is not drawn unless asked for, shifts the points of the board.
+Printed is how often intervals of 95 % contain the true principal distances, the
 principal point, and the projections at the centre and in the corners, these after the rotation that fits best
 over the image; the median of the sigmas over the formal ones, and their root mean square over that of
 the errors.
@@ -24,7 +25,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from drawn_networks import USUAL, Lens, Scene, SetUp, Target, draw_scene, network
+from drawn_networks import USUAL, Lens, Scene, SetUp, Target, World, draw_scene, network
 from figures import record
 from parts import add_options, executor_of, main_of, outcomes
 from scipy.stats import t as student
@@ -42,6 +43,7 @@ TRUE = Lens(
 BOARDS = ((9, 6, 30.0, True), (8, 11, 25.0, False), (11, 8, 25.0, True))
 ACROSS, DOWN = 9, 7
 CENTRE, CORNERS = [(3, 4)], [(0, 0), (0, 8), (6, 0), (6, 8)]
+KINDS = ("smooth", "focal", "paper")
 GROUPS = ("distance", "point", "centre", "corners")
 ASKED_POOLED, ASKED_CELL = (0.94, 0.96), (0.91, 0.98)
 ASKED_P05, ASKED_P01 = (0.03, 0.07), 0.02
@@ -115,6 +117,8 @@ def drawn(job: Job, rng: np.random.Generator) -> Iterator[tuple[Scene, dict[str,
     rows = rng.choice(POOL, job.images * (1 + job.pair), replace=False)
     for half in np.split(rows, 1 + job.pair):
         scene = part_of(every, half)
+        if job.kind == "paper":
+            scene = replace(scene, world=printed(scene, job.error * SIGMA, rng))
         exact = scene.exact()
         measured = {}
         errors = common(job, field, exact, rng)
@@ -139,12 +143,21 @@ def part_of(every: Scene, rows: Rows) -> Scene:
     )  # fmt: skip
 
 
+def printed(scene: Scene, size: float, rng: np.random.Generator) -> World:
+    """The world with points of the target that displace image points by so much (px)."""
+    off, world = rng.normal(size=scene.world.xyz.shape), scene.world
+    step = 1e-3 * scene.target.diagonal
+    moved = np.concatenate(scene.exact(replace(world, xyz=world.xyz + step * off)))
+    each = np.sqrt(np.mean((moved - np.concatenate(scene.exact())) ** 2)) / step
+    return replace(world, xyz=world.xyz + size / each * off)
+
+
 def common(job: Job, field: str, exact: list[Array], rng: np.random.Generator) -> Iterator[Array]:
     """Errors that the points of each image have in common, px."""
     middle = np.array([TRUE.cx, TRUE.cy])
     spread = np.sqrt(np.mean((np.concatenate(exact) - middle) ** 2))
     for xy in exact:
-        if not job.error:
+        if not job.error or job.kind == "paper":
             yield np.zeros_like(xy)
         elif job.kind == "focal":
             yield job.error * SIGMA / spread * rng.normal() * (xy - middle)
@@ -213,8 +226,7 @@ def adjusted(job: Job, scene: Scene, measured: dict[str, ImagePoints]) -> Result
 
 def done(job: Job) -> Done:
     """Adjust a network, or a pair, and compare it with the truth, or with each other."""
-    kinds = ("smooth", "focal")
-    key = [job.seed, job.images, int(1000 * job.error), kinds.index(job.kind), int(job.pair)]
+    key = [job.seed, job.images, int(1000 * job.error), KINDS.index(job.kind), int(job.pair)]
     rng, begun = np.random.default_rng(key), time.process_time()
     none, few = np.full(14, np.nan), np.full(4, np.nan)
     results = [adjusted(job, *each) for each in drawn(job, rng)]
@@ -336,7 +348,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1, help="of the whole run")
     parser.add_argument("--images", nargs="*", type=int, default=[6, 10, 20, 40])
     parser.add_argument("--errors", nargs="*", type=float, default=[0.0, 1.0, 5.0])
-    parser.add_argument("--kinds", nargs="*", default=["smooth", "focal"], choices=("smooth", "focal"))
+    parser.add_argument("--kinds", nargs="*", default=list(KINDS[:2]), choices=KINDS)
     parser.add_argument("--free", action="store_true", help="points of the target are unknowns")
     parser.add_argument("--halves", action="store_true", help="compare pairs of calibrations")
     parser.add_argument("--pairs", type=int, default=200, help="pairs of each cell")

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import scipy.special
 
-from reseau.bundle import Network, Result
+from reseau.bundle import Network, Result, held_as_designed
 from reseau.core.data import Array
 
 from . import networks
 
 RUNS = 25
+WORLD = networks.world(images=16, points=40, datum="free", control=0)
 
 
 def adjusted(world: networks.World, network: Network) -> Result:
-    fit = world.problem(network).adjusted().required()
+    problem = world.problem(network)
+    if network.held.all():
+        problem = replace(problem, start=replace(problem.start, xyz=network.xyz))
+    fit = problem.adjusted().required()
     return Result(network, fit, np.zeros(len(network.xy), dtype=bool))
 
 
@@ -27,13 +32,18 @@ def refocused(network: Network, size: float, seed: int) -> Network:
     return replace(network, xy=(network.xy - middle) * factor[network.image_of, None] + middle)
 
 
-def drawn(size: float) -> tuple[Array, Array, Array]:
+def printed(network: Network, size: float, seed: int) -> Network:
+    """The points held elsewhere than they are, as on a print."""
+    off = np.random.default_rng(seed).normal(size=network.xyz.shape)
+    return held_as_designed(replace(network, xyz=WORLD.xyz + size * off))
+
+
+def drawn(size: float, change: Callable[[Network, float, int], Network]) -> tuple[Array, Array, Array]:
     """σ over the formal σ, and errors of c over σ, and over the formal one, by Student's factor of 95 %."""
-    world = networks.world(images=16, points=40, datum="free", control=0)
-    camera = world.network.cameras[0]
+    camera = WORLD.network.cameras[0]
     ratios, holding, formal = [], [], []
     for seed in range(RUNS):
-        found = adjusted(world, refocused(world.noisy(seed), size, 1000 + seed)).camera(0)
+        found = adjusted(WORLD, change(WORLD.noisy(seed), size, 1000 + seed)).camera(0)
         assert found.dof is not None
         ratios.append(found.sigma / found.sigma_formal)
         k = found.parameters.index("c")
@@ -45,7 +55,7 @@ def drawn(size: float) -> tuple[Array, Array, Array]:
 
 
 def test_for_noise_it_is_the_formal_sigma() -> None:
-    ratio, holding, _ = drawn(0.0)
+    ratio, holding, _ = drawn(0.0, refocused)
     assert (np.median(ratio, axis=0) < 1.05).all()
     assert (ratio >= 1 - 1e-9).all()
     # Of 25 intervals of 95 %, five or more miss with a probability of 0.7 %.
@@ -53,7 +63,13 @@ def test_for_noise_it_is_the_formal_sigma() -> None:
 
 
 def test_it_covers_a_camera_that_refocuses_where_the_formal_one_does_not() -> None:
-    _, holding, formal = drawn(2e-3)
+    _, holding, formal = drawn(2e-3, refocused)
+    assert (holding > 1).sum() <= 4
+    assert (formal > 1).sum() > 6
+
+
+def test_it_covers_a_print_that_is_held_where_the_formal_one_does_not() -> None:
+    _, holding, formal = drawn(2e-3, printed)
     assert (holding > 1).sum() <= 4
     assert (formal > 1).sum() > 6
 

@@ -4,7 +4,8 @@ Paper that bends, motion, a lens that focuses anew, or what the model leaves of 
 of an image together. They are described by random effects of each image: a smooth field with the covariance
 τ² exp(−d²/2ℓ²) over distances d in the image, and a change of the principal distance. The variances are
 those of the largest restricted likelihood (Patterson & Thompson 1971, *Biometrika* 58), weighted over
-several lengths ℓ. With the sensitivities H = Q Aᵀ P C of the estimates to the effects θ ~ N(0, T), the
+several lengths ℓ. Points that are held displace the images of all photographs together: their shifts are a
+component of their own. With the sensitivities H = Q Aᵀ P C of the estimates to the effects θ ~ N(0, T), the
 covariance of the estimates is
 
     σ² Q + H T Hᵀ,
@@ -15,7 +16,8 @@ follow from the information on the variances (Satterthwaite 1946; Fai & Corneliu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +25,7 @@ import scipy.linalg
 
 from ...core.data import Array, Rows
 from ..solver import BundleFit
+from ..solver.system import residuals
 from .evidence import (
     Effect,
     Scores,
@@ -94,6 +97,21 @@ def distance_effects(fit: BundleFit) -> Effect:
     return Effect(slope, image, len(network.images))
 
 
+def point_effects(fit: BundleFit) -> Effect | None:
+    """Displacements of image points by shifts of object points; None where these are unknowns."""
+    network, rows = fit.problem.network, used_rows(fit)
+    seen, group = np.unique(network.point_of[rows], return_inverse=True)
+    if not network.held[seen].all():
+        return None
+    slope = np.zeros((len(rows), 2, 3))
+    step = 1e-4 * float(np.ptp(fit.values.xyz[seen], axis=0).max())
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            moved = replace(fit.values, xyz=fit.values.xyz + sign * step * np.eye(3)[axis])
+            slope[:, :, axis] += sign * residuals(network, fit.unknowns, rows, moved) / (2 * step)
+    return Effect(slope, group, len(seen))
+
+
 def _polynomials(at: Array) -> Array:
     """Products of Legendre polynomials, orthonormal over the square from −1 to 1 (n, k)."""
     x, y = (np.polynomial.legendre.legvander(np.clip(axis, -1.5, 1.5), _DEGREE) for axis in at.T)
@@ -145,8 +163,8 @@ class SharedErrors:
         Variance factor of single image points.
     smooth : ndarray (l,)
         Standard deviations of the smooth fields, in those of image points, by their length.
-    distance : float
-        The same of displacements by principal distances.
+    distance, points : float
+        The same of displacements by principal distances, and by points of the target.
     weights : ndarray (l,)
         Weights of the lengths; what is missing to one is that of no shared errors.
     spread : float
@@ -161,6 +179,7 @@ class SharedErrors:
     variance: float
     smooth: Array
     distance: float
+    points: float
     weights: Array
     spread: float
     scores: Scores
@@ -169,7 +188,7 @@ class SharedErrors:
     @property
     def size(self) -> float:
         """Displacement that the points of an image have in common, in their standard deviations."""
-        return float(np.sqrt(self.weights @ self.smooth**2 + self.distance**2))
+        return float(np.sqrt(self.weights @ self.smooth**2 + self.distance**2 + self.points**2))
 
     def uncertainty(self, columns: Rows) -> Uncertainty:
         """The uncertainty of parameters of cameras (k,), by their columns among the reduced unknowns."""
@@ -195,8 +214,8 @@ class SharedErrors:
         columns = _camera_columns(fit)
         q = fit.cofactors.reduced.block(columns, columns)
         formal = q * fit.variance
-        shared = self._carried(columns)
-        if not len(columns) or not np.trace(shared) > 0:
+        shared, target = self._carried(columns), self._by_target(columns)
+        if not len(columns) or not np.trace(shared + target) > 0:
             spread = np.array([[2.0 / fit.redundancy]])
             return columns, formal, formal[None], spread
         size = np.sqrt(np.maximum(np.diag(q), 0.0))
@@ -208,16 +227,17 @@ class SharedErrors:
         sizes, relative = self._factors(columns, directions, unknowns.camera, unknowns.count)
         own = sizes**2 * b
         parts = np.concatenate(
-            [self.variance * q[None], self.variance * own[:, None, None]
+            [self.variance * q[None], target[None], self.variance * own[:, None, None]
              * directions.T[:, :, None] * directions.T[:, None, :]]
         )  # fmt: skip
         total = _not_below(parts.sum(axis=0), formal)
         # The size of all together is known as well as the likelihood says, that of each as its scores say.
-        spread = np.diag(np.concatenate([[self.spread], relative]))
+        count = max(len(np.unique(fit.problem.network.point_of[used_rows(fit)])), 1)
+        spread = np.diag(np.concatenate([[self.spread, 2.0 / (3 * count)], relative]))
         return columns, total, parts, spread
 
     def _carried(self, columns: Rows) -> Array:
-        """Covariance (k, k) of parameters by shared errors, for a variance factor of one."""
+        """Covariance (k, k) of parameters by what images share, for a variance factor of one."""
         fit, k = self.fit, len(columns)
         found = np.zeros((k, k))
         sigma = sigma_seen(fit)
@@ -234,6 +254,14 @@ class SharedErrors:
             own = sensitivities(fit, distance, columns) * _inverse(distance.rms(sigma)).ravel()
             found += self.distance**2 * (own @ own.T)
         return found
+
+    def _by_target(self, columns: Rows) -> Array:
+        """Covariance (k, k) of parameters by errors of the points of the target."""
+        effect = point_effects(self.fit) if self.points else None
+        if effect is None:
+            return np.zeros((len(columns), len(columns)))
+        own = sensitivities(self.fit, effect, columns) * _one_unit(effect, sigma_seen(self.fit))
+        return np.asarray(self.variance * self.points**2 * (own @ own.T))
 
     def _factors(self, columns: Rows, directions: Array, camera: Rows, count: Rows) -> tuple[Array, Array]:
         """Factors on the shared errors in each direction (k,), and relative variances of their squares."""
@@ -305,52 +333,62 @@ def shared_errors(fit: BundleFit) -> SharedErrors | None:
     images = _looked_at(fit)
     if len(images) < _LEAST or fit.redundancy < 1 or not fit.sigma0 > 0:
         return None
-    (smooth, forms), distance = smooth_effects(fit), distance_effects(fit)
+    (smooth, forms), distance, points = smooth_effects(fit), distance_effects(fit), point_effects(fit)
     place = np.full(len(network.images), -1, dtype=np.intp)
     place[images] = np.arange(len(images))
     some = [
         Effect(effect.slope, np.where(effect.group >= 0, place[effect.group], -1), len(images))
         for effect in (smooth, distance)
     ]
+    if points is not None and not too_large(fit, sum(effect.count for effect in (*some, points))):
+        some.append(points)
     if too_large(fit, sum(effect.count for effect in some)) or not len(_camera_columns(fit)):
         return None
     own = _camera_effects(fit, place, len(images))
     every = scores(fit, [*some, own])
     sigma = sigma_seen(fit)
     typical = float(np.sqrt(np.mean(sigma**2)))
-    count = some[0].count
-    end = count + some[1].count
+    ends = np.cumsum([effect.count for effect in some])
+    parts = [slice(int(end) - effect.count, int(end)) for end, effect in zip(ends, some, strict=True)]
+    count, end = some[0].count, int(ends[-1])
     unit = _inverse(some[1].rms(sigma)).ravel()
-    focal = every.part(slice(count, end)).scaled(unit)
+    if len(some) > 2:
+        unit = np.concatenate([unit, np.full(some[2].count, _one_unit(some[2], sigma))])
+    others = every.part(slice(count, end)).scaled(unit)
     cross = every.m[:count, count:end] * unit
     fits = []
     for root in forms.values():
         field = every.part(slice(0, count)).combined(len(images), typical * root[images])
         between = _across(cross, typical * root[images])
-        m = np.block([[field.m, between], [between.T, focal.m]])
-        joint = Scores(np.concatenate([field.g, focal.g]), m, every.square, every.redundancy, m[:0])
+        m = np.block([[field.m, between], [between.T, others.m]])
+        joint = Scores(np.concatenate([field.g, others.g]), m, every.square, every.redundancy, m[:0])
         seen = np.concatenate(
             [_across(every.m[:count, end:], typical * root[images]), unit[:, None] * every.m[count:end, end:]]
         )
-        fits.append((_largest(joint, count), joint, seen))
-    # Each component pays for itself as a parameter with as many observations as there are images (Schwarz).
-    log = np.array([found[2] - 0.5 * np.log(len(images)) * np.count_nonzero(found[:2]) for found, *_ in fits])
+        fits.append((*_largest(joint, parts), joint, seen))
+    # Each component pays for itself as a parameter with as many observations as it has groups (Schwarz 1978).
+    price = 0.5 * np.log([effect.groups for effect in some])
+    log = np.array([log - price @ (sizes > 0) for sizes, log, *_ in fits])
     nothing = -0.5 * every.redundancy * np.log(every.square / every.redundancy)
     weights = np.exp(log - max(float(log.max()), nothing))
     weights /= weights.sum() + len(weights) * np.exp(nothing - max(float(log.max()), nothing))
-    (size, focal_size, _), joint, _ = fits[int(np.argmax(log))]
-    variance, spread = _information(joint, count, size, focal_size)
-    sizes = np.array([found[0] for found, *_ in fits])
-    focals = np.array([found[1] for found, *_ in fits])
+    best, _, joint, _ = fits[int(np.argmax(log))]
+    variance, spread = _information(joint, parts, best)
+    every_size = np.array([sizes for sizes, *_ in fits])
     width = own.slope.shape[2]
     pulls = np.zeros((len(images), width, width))
     k = np.arange(len(images))
-    for weight, a, b, (_, _, seen) in zip(weights, sizes, focals, fits, strict=True):
-        half = (np.repeat([a, b], [count, end - count])[:, None] * seen).reshape(end, len(images), width)
+    by_image = parts[1].stop
+    for weight, sizes, (*_, seen) in zip(weights, every_size, fits, strict=True):
+        half = np.repeat(sizes[:2], [count, by_image - count])[:, None] * seen[:by_image]
+        half = half.reshape(by_image, len(images), width)
         pulls += weight * np.einsum("niq,nir->iqr", half, half)[k]
-    distance_size = float(np.sqrt(weights @ focals**2))
+    distance_size = float(np.sqrt(weights @ every_size[:, 1] ** 2))
+    points_size = float(np.sqrt(weights @ every_size[:, 2] ** 2)) if len(some) > 2 else 0.0
     by_camera = every.part(slice(end, None))
-    return SharedErrors(fit, variance, sizes, distance_size, weights, spread, by_camera, pulls)
+    return SharedErrors(
+        fit, variance, every_size[:, 0], distance_size, points_size, weights, spread, by_camera, pulls
+    )
 
 
 def _camera_effects(fit: BundleFit, place: Rows, count: int) -> Effect:
@@ -380,24 +418,40 @@ def _across(cross: Array, roots: Array) -> Array:
     return np.asarray((np.swapaxes(roots, 1, 2) @ cross.reshape(groups, q, -1)).reshape(groups * k, -1))
 
 
+def _one_unit(effect: Effect, sigma: Array) -> float:
+    """Size of all effects with which they displace the image points by their sigma, root mean square."""
+    number = np.bincount(effect.group[effect.group >= 0], minlength=effect.groups)
+    square = float(number @ (effect.rms(sigma) ** 2).sum(axis=1)) / max(int(number.sum()), 1)
+    return 1 / np.sqrt(square) if square > 0 else 0.0
+
+
 def _inverse(rms: Array) -> Array:
     return np.divide(1.0, rms, out=np.zeros_like(rms), where=rms > 0)
 
 
-def _largest(scores: Scores, count: int) -> tuple[float, float, float]:
-    """Sizes of smooth fields and of principal distances of the largest restricted likelihood, and its log."""
-    fields, focal = np.arange(count), np.arange(count, len(scores.g))
-    smooth, best = _along(scores.part(fields), 0.0)
-    distance = 0.0
+def _largest(scores: Scores, parts: Sequence[slice]) -> tuple[Array, float]:
+    """Sizes of the components with the largest restricted likelihood, and its logarithm."""
+    columns = [np.arange(part.start, part.stop) for part in parts]
+    sizes = np.zeros(len(parts))
+    sizes[0], best = _along(scores.part(columns[0]), 0.0)
     for _ in range(2):
-        left = scores.with_effects(fields, smooth) if smooth else scores
-        log = left.part(focal).log_profile(_FINE)
-        k = int(np.argmax(log))
-        if log[k] <= best + _CONVERGED:
+        before = best
+        for k in range(1, len(parts)):
+            log = _without(scores, columns, sizes, k).part(columns[k]).log_profile(_FINE)
+            at = int(np.argmax(log))
+            if log[at] > best + _CONVERGED:
+                sizes[k], best = float(_FINE[at]), float(log[at])
+        if best <= before + _CONVERGED:
             break
-        distance = float(_FINE[k])
-        smooth, best = _along(scores.with_effects(focal, distance).part(fields), smooth)
-    return smooth, distance, best
+        sizes[0], best = _along(_without(scores, columns, sizes, 0).part(columns[0]), sizes[0])
+    return sizes, best
+
+
+def _without(scores: Scores, columns: Sequence[Rows], sizes: Array, k: int) -> Scores:
+    """The scores after all components but one were taken into account."""
+    for own, size in [*zip(columns, sizes, strict=True)][:k] + [*zip(columns, sizes, strict=True)][k + 1 :]:
+        scores = scores.with_effects(own, float(size)) if size else scores
+    return scores
 
 
 def _along(scores: Scores, near: float) -> tuple[float, float]:
@@ -433,9 +487,9 @@ def _along(scores: Scores, near: float) -> tuple[float, float]:
     return (float(np.exp(x)), y) if y > nothing else (0.0, nothing)
 
 
-def _information(scores: Scores, count: int, smooth: float, distance: float) -> tuple[float, float]:
+def _information(scores: Scores, parts: Sequence[slice], sizes: Array) -> tuple[float, float]:
     """Variance factor, and its relative variance, with the sizes of shared errors as unknown as they are."""
-    units = np.concatenate([np.full(count, smooth), np.full(len(scores.g) - count, distance)])
+    units = np.repeat(sizes, [part.stop - part.start for part in parts])
     used = np.flatnonzero(units > 0)
     r, m = scores.redundancy, scores.m[np.ix_(used, used)]
     if not len(used):
@@ -445,12 +499,12 @@ def _information(scores: Scores, count: int, smooth: float, distance: float) -> 
     sm = s @ m
     left = m - m @ sm
     twice = (np.eye(len(used)) - m @ s) @ left
-    parts = [np.flatnonzero(used < count), np.flatnonzero(used >= count)]
-    fisher = np.zeros((3, 3))
+    each = [np.flatnonzero((used >= part.start) & (used < part.stop)) for part in parts]
+    fisher = np.zeros((1 + len(parts), 1 + len(parts)))
     fisher[0, 0] = r - 2 * np.trace(sm) + np.einsum("ij,ji->", sm, sm)
-    for i, a in enumerate(parts):
+    for i, a in enumerate(each):
         fisher[0, i + 1] = fisher[i + 1, 0] = np.trace(twice[np.ix_(a, a)])
-        for j, b in enumerate(parts):
+        for j, b in enumerate(each):
             fisher[i + 1, j + 1] = (left[np.ix_(a, b)] ** 2).sum()
     live = np.flatnonzero(np.diag(fisher) > 0)
     return variance, 2 * float(np.linalg.inv(fisher[np.ix_(live, live)])[0, 0])
