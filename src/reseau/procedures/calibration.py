@@ -492,11 +492,8 @@ def calibrate_camera(
     measured, declined, sizes = _measured(photographs, size, taken)
     measured = _without(measured, options.without)
     notes = tuple(note for each in photographs for note in each.notes)
-
-    def calibrated(points: dict[str, ImagePoints]) -> Calibrated | Failure:
-        return _calibrated(points, declined, sizes, notes, design, model, options, taken)
-
-    done = calibrated(measured)
+    job = _Job(declined, sizes, notes, design, model, options, taken)
+    done = job.calibrated(measured)
     if isinstance(design, BoardDesign) and ways_to_turn(design) and options.control is None:
         # A better camera tells better which photographs name the points in another way.
         for _ in range(_RENAMED):
@@ -509,120 +506,119 @@ def calibrate_camera(
             alike = named_alike(done.measured, design, lenses)
             if all(points.names == done.measured[image].names for image, points in alike.items()):
                 break
-            again = calibrated(alike)
+            again = job.calibrated(alike)
             if isinstance(again, Failure) or again.sigma0 > _BETTER * done.sigma0:
                 break
             done = again
     return done
 
 
-def _calibrated(
-    measured: dict[str, ImagePoints],
-    declined: dict[str, str],
-    sizes: Mapping[str, tuple[int, int]],
-    notes: tuple[str, ...],
-    design: PlaneDesign,
-    model: CameraOptions | None,
-    options: CalibrationOptions,
-    taken: Mapping[str, Taken] | None,
-) -> Calibrated | Failure:
-    """Calibrate from the points of photographs."""
-    cameras, of = _cameras_of(measured, taken)
-    for c, name in enumerate(cameras):
-        if of.count(c) < _LEAST_IMAGES:
-            which = f" of camera {name}" if taken else ""
-            why = "".join(f"; {images}: {reason}" for reason, images in _by_reason(declined).items())
-            show = f"image{which} shows" if of.count(c) == 1 else f"images{which} show"
-            return Failure(
-                f"{of.count(c)} {show} the target, {_LEAST_IMAGES} are needed, 10 are good{why}",
-                Code.TOO_FEW_IMAGES,
-            )
-    if not all(name in sizes for name in cameras):
-        raise UsageError(
-            "is not known without a photograph", where="size of the images", do="give width and height"
-        )
-    stand_in = Camera(_CAMERA, 1, 1, (1.0, 1.0), "opencv", np.zeros(len(camera_model("opencv").names)))
-    wrong = left_out(network_of(measured, design, stand_in), cameras, sizes, of)
-    if wrong is None:
-        return _adjusted(measured, declined, sizes, notes, design, model, options, taken, None)
-    # Which points are wrong is seen best with the target as designed: its own errors are small beside theirs.
-    more = options.target != "free" or options.control or options.heights or options.refraction
-    first = options if more else replace(options, target="flat")
-    done = _adjusted(wrong.kept(measured), declined, sizes, notes, design, model, first, taken, wrong.found)
-    still = wrong if isinstance(done, Failure) else wrong.after(done.result)
-    same = still is not None and np.array_equal(still.found.rows, wrong.found.rows)
-    if still is not None and same and more:
-        return done if isinstance(done, Failure) else replace(done, misnamed=still.found)
-    kept, found = (measured, None) if still is None else (still.kept(measured), still.found)
-    return _adjusted(kept, declined, sizes, notes, design, model, options, taken, found)
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """All that a calibration is of, but the image points: some of these are found to be wrong."""
 
+    declined: dict[str, str]
+    sizes: Mapping[str, tuple[int, int]]
+    notes: tuple[str, ...]
+    design: PlaneDesign
+    model: CameraOptions | None
+    options: CalibrationOptions
+    taken: Mapping[str, Taken] | None
 
-def _adjusted(
-    measured: dict[str, ImagePoints],
-    declined: dict[str, str],
-    sizes: Mapping[str, tuple[int, int]],
-    notes: tuple[str, ...],
-    design: PlaneDesign,
-    model: CameraOptions | None,
-    options: CalibrationOptions,
-    taken: Mapping[str, Taken] | None,
-    wrong: Misnamed | None,
-) -> Calibrated | Failure:
-    """Adjust the points of photographs, of which those that are wrong were left out."""
-    measured = {name: points for name, points in measured.items() if len(points) >= _LEAST_POINTS}
-    cameras, of = _cameras_of(measured, taken)
-    refraction = None
-    if options.refraction is not None:
-        refraction = options.refraction.refraction(tuple(measured), tuple(cameras[c] for c in of))
-    model, larger = model or CameraOptions("auto"), _magnification(refraction)
-    said = Exif(focal_35_mm=options.focal_35_mm)
-    entries = []
-    for c, name in enumerate(cameras):
-        own = {image: points for (image, points), at in zip(measured.items(), of, strict=True) if at == c}
-        entries.append(
-            replace(
-                first_camera(own, design, sizes[name], model, larger, said.focal_px(*sizes[name])), id=name
+    def calibrated(self, measured: dict[str, ImagePoints]) -> Calibrated | Failure:
+        """Calibrate from the points of photographs."""
+        design, sizes, options, taken = self.design, self.sizes, self.options, self.taken
+        cameras, of = _cameras_of(measured, taken)
+        for c, name in enumerate(cameras):
+            if of.count(c) < _LEAST_IMAGES:
+                which = f" of camera {name}" if taken else ""
+                why = "".join(f"; {images}: {reason}" for reason, images in _by_reason(self.declined).items())
+                show = f"image{which} shows" if of.count(c) == 1 else f"images{which} show"
+                return Failure(
+                    f"{of.count(c)} {show} the target, {_LEAST_IMAGES} are needed, 10 are good{why}",
+                    Code.TOO_FEW_IMAGES,
+                )
+        if not all(name in sizes for name in cameras):
+            raise UsageError(
+                "is not known without a photograph", where="size of the images", do="give width and height"
             )
-        )
-    network = replace(network_of(measured, design, entries[0]), refraction=refraction)
-    if taken:
-        network = _fixed_to_each_other(network, entries, of, [taken[name].exposure for name in measured])
-    if options.turntable is not None:
-        network = _turned(
-            network, options.turntable, [taken[name].exposure for name in measured] if taken else None
-        )
-    if options.heights is not None:
-        network = options.heights.lifted(network)
-    if options.control is not None:
-        network = _controlled(network, options.control)
-    elif refraction is not None:
-        network = _scaled(network)
-    if options.sigma_px is not None:
-        network = replace(network, cov=np.tile(np.eye(2) * options.sigma_px**2, (len(network.xy), 1, 1)))
-    if options.target == "flat":
-        network = held_as_designed(network)
-    choices = dict[str, ModelChoice]()
-    if model.automatic:
-        chosen = choose_models(network, options=options.adjustment)
-        if isinstance(chosen, Failure):
-            notes = (*notes, f"camera model {model.registered.name}, none could be chosen: {chosen.reason}")
-        else:
-            network = replace(network, cameras=tuple(each.camera for each in chosen))
-            choices = dict(zip(cameras, chosen, strict=True))
-    board = None
-    if options.target == "auto":
-        bent = choose_board(network, options.adjustment)
-        if isinstance(bent, Failure):
-            return bent
-        board, network = bent, bent.network
-    found = search_model(network, options.adjustment, options.components, options.level)
-    if isinstance(found, Failure):
-        if found.code is Code.NOT_CONVERGED:
-            return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
-        return found
-    calibrated = Calibrated(found, measured, declined, choices, board, notes, wrong)
-    loose = _without_scale(calibrated.result)
-    return calibrated if loose is None else loose
+        stand_in = Camera(_CAMERA, 1, 1, (1.0, 1.0), "opencv", np.zeros(len(camera_model("opencv").names)))
+        wrong = left_out(network_of(measured, design, stand_in), cameras, sizes, of)
+        if wrong is None:
+            return self._adjusted(measured, None)
+        # Which points are wrong is seen best with the target as designed: its errors are small beside theirs.
+        more = options.target != "free" or options.control or options.heights or options.refraction
+        first = self if more else replace(self, options=replace(options, target="flat"))
+        done = first._adjusted(wrong.kept(measured), wrong.found)
+        still = wrong if isinstance(done, Failure) else wrong.after(done.result)
+        same = still is not None and np.array_equal(still.found.rows, wrong.found.rows)
+        if still is not None and same and more:
+            return done if isinstance(done, Failure) else replace(done, misnamed=still.found)
+        kept, found = (measured, None) if still is None else (still.kept(measured), still.found)
+        return self._adjusted(kept, found)
+
+    def _adjusted(self, measured: dict[str, ImagePoints], wrong: Misnamed | None) -> Calibrated | Failure:
+        """Adjust the points of photographs, of which those that are wrong were left out."""
+        design, sizes, options, taken = self.design, self.sizes, self.options, self.taken
+        notes = self.notes
+        measured = {name: points for name, points in measured.items() if len(points) >= _LEAST_POINTS}
+        cameras, of = _cameras_of(measured, taken)
+        refraction = None
+        if options.refraction is not None:
+            refraction = options.refraction.refraction(tuple(measured), tuple(cameras[c] for c in of))
+        model, larger = self.model or CameraOptions("auto"), _magnification(refraction)
+        said = Exif(focal_35_mm=options.focal_35_mm)
+        entries = []
+        for c, name in enumerate(cameras):
+            own = {image: points for (image, points), at in zip(measured.items(), of, strict=True) if at == c}
+            entries.append(
+                replace(
+                    first_camera(own, design, sizes[name], model, larger, said.focal_px(*sizes[name])),
+                    id=name,
+                )
+            )
+        network = replace(network_of(measured, design, entries[0]), refraction=refraction)
+        if taken:
+            network = _fixed_to_each_other(network, entries, of, [taken[name].exposure for name in measured])
+        if options.turntable is not None:
+            network = _turned(
+                network, options.turntable, [taken[name].exposure for name in measured] if taken else None
+            )
+        if options.heights is not None:
+            network = options.heights.lifted(network)
+        if options.control is not None:
+            network = _controlled(network, options.control)
+        elif refraction is not None:
+            network = _scaled(network)
+        if options.sigma_px is not None:
+            network = replace(network, cov=np.tile(np.eye(2) * options.sigma_px**2, (len(network.xy), 1, 1)))
+        if options.target == "flat":
+            network = held_as_designed(network)
+        choices = dict[str, ModelChoice]()
+        if model.automatic:
+            chosen = choose_models(network, options=options.adjustment)
+            if isinstance(chosen, Failure):
+                notes = (
+                    *notes,
+                    f"camera model {model.registered.name}, none could be chosen: {chosen.reason}",
+                )
+            else:
+                network = replace(network, cameras=tuple(each.camera for each in chosen))
+                choices = dict(zip(cameras, chosen, strict=True))
+        board = None
+        if options.target == "auto":
+            bent = choose_board(network, options.adjustment)
+            if isinstance(bent, Failure):
+                return bent
+            board, network = bent, bent.network
+        found = search_model(network, options.adjustment, options.components, options.level)
+        if isinstance(found, Failure):
+            if found.code is Code.NOT_CONVERGED:
+                return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
+            return found
+        calibrated = Calibrated(found, measured, self.declined, choices, board, notes, wrong)
+        loose = _without_scale(calibrated.result)
+        return calibrated if loose is None else loose
 
 
 def _cameras_of(images: Iterable[str], taken: Mapping[str, Taken] | None) -> tuple[list[str], list[int]]:
