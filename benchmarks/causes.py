@@ -220,8 +220,8 @@ def totals(found: list[Done]) -> None:
             own = [e for e in large if e.job.cause == cause]
             if own:
                 said(f"  {cause}", sum(e.right for e in own), len(own), ASKED_EACH)
-        second = sum(not e.right and e.job.cause in e.codes[1:] for e in large)
-        print(f"  right code named, but not first: {second}")
+        second = sum(not e.right and e.job.cause in e.codes[1:] for e in cases)
+        print(f"  right code named, but not first, all sizes: {second}")
     for level, size in enumerate(SIZES):
         own = [e for e in cases if e.job.level == level]
         if own:
