@@ -15,8 +15,9 @@ from ..diagnostics.evidence import Scores
 from ..modelling.adjustment import problem_of
 from ..modelling.calibration import with_estimates
 from ..network import Camera, Network
+from .discrete import Single
 
-__all__ = ["Alternative", "alternatives"]
+__all__ = ["alternatives"]
 
 _WIDER = ("opencv_full", "fisheye", "double_sphere")
 """Models that describe most lenses."""
@@ -25,31 +26,11 @@ _STEPS = 25
 _TILT = ("tau_x", "tau_y")
 
 
-class Alternative:
-    """Another network of the same image points, adjusted.
-
-    Parameters
-    ----------
-    code, form : str
-        The cause that it stands for.
-    log_evidence : float
-        Logarithm of the density of the image points.
-    result : Result
-        Its adjustment.
-    explained : float
-        Decrease of the sum of squares.
-    """
-
-    def __init__(self, code: str, form: str, log_evidence: float, result: Result, explained: float) -> None:
-        self.code, self.form, self.log_evidence = code, form, log_evidence
-        self.result, self.explained = result, explained
-
-
-def alternatives(result: Result, known: float) -> Iterator[Alternative]:
+def alternatives(result: Result, known: float) -> Iterator[Single]:
     """Yield richer models of the lenses, as far as they can be adjusted."""
     network = with_estimates(result)
     for form, cameras in _lenses(network):
-        found = _adjusted(result, replace(network, cameras=cameras), "lens", form, known)
+        found = _adjusted(result, replace(network, cameras=cameras), form, known)
         if found is not None:
             yield found
 
@@ -90,7 +71,7 @@ def _converted(camera: Camera, model: str) -> Camera | None:
     )  # fmt: skip
 
 
-def _adjusted(result: Result, network: Network, code: str, form: str, known: float) -> Alternative | None:
+def _adjusted(result: Result, network: Network, form: str, known: float) -> Single | None:
     """Adjust another network of the same image points, and compare it."""
     fit = result.fit
     problem, _ = problem_of(network)
@@ -108,7 +89,4 @@ def _adjusted(result: Result, network: Network, code: str, form: str, known: flo
     # A parameter costs half the logarithm of the number of observations (Schwarz 1978).
     plain = Scores(np.zeros(0), np.zeros((0, 0)), again.cost, result.redundancy, np.zeros((0, 0)))
     log = plain.log_nothing(known=known) - 0.5 * more * np.log(result.redundancy)
-    adjusted = Result(
-        network, again, np.asarray(again.rejected[: 2 * len(network.xy)].reshape(-1, 2).any(axis=1))
-    )
-    return Alternative(code, form, log, adjusted, fit.cost - again.cost)
+    return Single("lens", form, log, fit.cost - again.cost)

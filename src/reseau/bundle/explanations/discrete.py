@@ -6,6 +6,8 @@ images accordingly.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
+
 import numpy as np
 import scipy.special
 
@@ -13,7 +15,7 @@ from ...core.data import Array, Rows
 from ..diagnostics.evidence import Effect, Scores, scores
 from .effects import Sight
 
-__all__ = ["Chosen", "gross_errors", "other_cameras"]
+__all__ = ["Single", "gross_errors", "other_cameras"]
 
 _SUSPECTS, _PATIENCE = 120, 6
 """Image points that are looked at as gross errors, and how many more are tried when one does not help."""
@@ -21,21 +23,27 @@ _SPLITS = 60
 """Divisions of the images by their principal distances that are compared."""
 
 
-class Chosen:
-    """A choice with the logarithm of its evidence.
+@dataclass(frozen=True, eq=False)
+class Single:
+    """An explanation that is no form of effects: a choice, or another network.
 
     Parameters
     ----------
+    code, form : str
+        The cause, and its form.
     log_evidence : float
-        Of the image points, with the probability of the choice.
-    rows : ndarray of int
-        Used image points, or images, that were chosen.
+        Logarithm of the density of the image points, with the probability of the choice.
     explained : float
         Decrease of the sum of squares.
+    rows : ndarray of int
+        Used image points, or images, that were chosen.
     """
 
-    def __init__(self, log_evidence: float, rows: Rows, explained: float) -> None:
-        self.log_evidence, self.rows, self.explained = log_evidence, rows, explained
+    code: str
+    form: str
+    log_evidence: float
+    explained: float
+    rows: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
 
 def _log_choice(n: int, k: int) -> float:
@@ -46,7 +54,7 @@ def _log_choice(n: int, k: int) -> float:
     )  # fmt: skip
 
 
-def gross_errors(sight: Sight, known: float) -> Chosen | None:
+def gross_errors(sight: Sight, known: float) -> Single | None:
     """Single image points that are wrong, found one after the other."""
     result, n = sight.result, len(sight.rows)
     w = np.nan_to_num(np.abs(result.test_values[sight.rows]).max(axis=1))
@@ -57,7 +65,7 @@ def gross_errors(sight: Sight, known: float) -> Chosen | None:
     group[suspects] = np.arange(len(suspects))
     slope = np.tile(np.eye(2), (n, 1, 1)) * sight.sigma[:, None, None]
     every = scores(result.fit, [Effect(slope, group, len(suspects))])
-    best: Chosen | None = None
+    best: Single | None = None
     chosen, left = list[int](), every
     far = 1e4
     for _ in range(len(suspects)):
@@ -73,13 +81,14 @@ def gross_errors(sight: Sight, known: float) -> Chosen | None:
         part = every.part(columns)
         found = part.log_evidence(known=known) - _log_choice(n, len(chosen))
         if best is None or found > best.log_evidence:
-            best = Chosen(found, suspects[chosen], every.square - left.square)
+            less = every.square - left.square
+            best = Single("blunders", f"{len(chosen)}", found, less, suspects[chosen])
         elif len(chosen) >= len(best.rows) + _PATIENCE:
             break
     return best
 
 
-def other_cameras(sight: Sight, part: Scores, known: float) -> Chosen | None:
+def other_cameras(sight: Sight, part: Scores, known: float) -> Single | None:
     """Images that have another principal distance and point than the others, the same among themselves.
 
     Parameters
@@ -99,9 +108,9 @@ def other_cameras(sight: Sight, part: Scores, known: float) -> Chosen | None:
     only = part.part(3 * np.arange(images))
     first = _units(only)
     alone = np.linalg.solve(only.scaled(first).m + _RIDGE * np.eye(images), only.g * first) * first
-    found = dict[bytes, Chosen]()
+    found = dict[bytes, Single]()
 
-    def looked_at(rows: Rows, count: int) -> Chosen:
+    def looked_at(rows: Rows, count: int) -> Single:
         """Images with another camera, of all that could have it."""
         member = np.zeros(images)
         member[rows] = 1.0
@@ -113,7 +122,8 @@ def other_cameras(sight: Sight, part: Scores, known: float) -> Chosen | None:
             each = [one.log_evidence(_INFORMATION, known=known) for one in forms]
             best = forms[int(np.argmax(each))]
             log = float(scipy.special.logsumexp(each)) - np.log(3.0) - _log_choice(count, len(rows))
-            found[key] = Chosen(log, np.flatnonzero(member), best.explained(best.best_size(_INFORMATION)))
+            explained = best.explained(best.best_size(_INFORMATION))
+            found[key] = Single("other-camera", f"{len(rows)}", log, explained, np.flatnonzero(member))
         return found[key]
 
     for c in range(len(network.cameras)):
@@ -135,8 +145,8 @@ def other_cameras(sight: Sight, part: Scores, known: float) -> Chosen | None:
     if not found:
         return None
     most = max(found.values(), key=lambda one: one.log_evidence)
-    most.log_evidence = float(scipy.special.logsumexp([one.log_evidence for one in found.values()]))
-    return most
+    every = float(scipy.special.logsumexp([one.log_evidence for one in found.values()]))
+    return replace(most, log_evidence=every)
 
 
 def _units(scores: Scores) -> Array:

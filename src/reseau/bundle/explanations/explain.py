@@ -20,8 +20,8 @@ from ...core.data import Array, Rows
 from ...core.failure import Failure
 from ..diagnostics import Result, camera_mapping
 from ..diagnostics.evidence import Scores, scores, too_large, used_rows
-from .alternatives import Alternative, alternatives
-from .discrete import Chosen, gross_errors, other_cameras
+from .alternatives import alternatives
+from .discrete import Single, gross_errors, other_cameras
 from .effects import Family, Sight, families, lens_at
 from .names import Misnamed
 from .sentences import advice, listed_places
@@ -270,8 +270,8 @@ def explain(result: Result, misnamed: Misnamed | None = None) -> Explanation:
                 found = [now.cause(named, found[0].probability, first, sight)]
         causes += found
         best = now.best_form(found[0].code)
-        large = found[0].code in now.adjusted
-        if found[0].code in ("noise", "unknown") or best is None or best.units is None or large:
+        alone = found[0].code in ("noise", "unknown") or found[0].code in now.single
+        if alone or best is None or best.units is None:
             break
         if step or found[0].code != "lens":
             errors.append(_error(best, 1.0, sight))
@@ -294,8 +294,7 @@ class _Comparison:
 
     log_evidence: dict[str, float]
     forms: list[_Form]
-    chosen: dict[str, Chosen]
-    adjusted: dict[str, Alternative]
+    single: dict[str, Single]
 
     def best_form(self, code: str) -> _Form | None:
         """The best form of a cause."""
@@ -322,13 +321,9 @@ class _Comparison:
 
     def cause(self, code: str, probability: float, first: Scores, sight: Sight) -> Cause:
         """What a cause explains, and where."""
-        chosen, form = self.chosen.get(code), self.best_form(code)
-        sigma = sight.typical
-        where, other = "", self.adjusted.get(code)
-        if other is not None:
-            explained, name = other.explained, other.form
-        elif chosen is not None:
-            explained, name, where = chosen.explained, f"{len(chosen.rows)}", _where(code, chosen.rows, sight)
+        single, form, sigma = self.single.get(code), self.best_form(code), sight.typical
+        if single is not None:
+            explained, name, where = single.explained, single.form, _where(code, single.rows, sight)
         elif form is not None:
             explained, name = form.scores.explained(form.size), form.name
             where = _images(form, sight)
@@ -358,24 +353,21 @@ def _compared(
     for code in dict.fromkeys(form.code for form in forms):
         each = [form.log_evidence for form in forms if form.code == code]
         found[code] = float(scipy.special.logsumexp(each)) - np.log(len(each)) - sound
-    chosen: dict[str, Chosen] = {}
+    forms = [replace(form, log_evidence=form.log_evidence - sound) for form in forms]
+    single: dict[str, Single] = {}
     if discrete:
-        gross = gross_errors(sight, _KNOWN)
         refocused = [form.adjusted for form in forms if form.code == "refocus" and form.adjusted is not None]
         near = refocused[0][:2] if refocused else (sight, parts.get("refocus"))
-        other = None if near[1] is None else other_cameras(near[0], near[1], _KNOWN)
-        chosen = {
-            code: one for code, one in (("blunders", gross), ("other-camera", other)) if one is not None
-        }
-        found |= {code: one.log_evidence - sound for code, one in chosen.items()}
-    forms = [replace(form, log_evidence=form.log_evidence - sound) for form in forms]
-    better: dict[str, Alternative] = {}
+        others = [gross_errors(sight, _KNOWN)]
+        others += [] if near[1] is None else [other_cameras(near[0], near[1], _KNOWN)]
+        single = {one.code: one for one in others if one is not None}
+        found |= {code: one.log_evidence - sound for code, one in single.items()}
     if discrete and max(found.values()) > -np.log(_FALSE) and max(found, key=found.__getitem__) != "noise":
         for one in alternatives(sight.result, _KNOWN):
             if one.log_evidence - sound > found.get(one.code, -np.inf):
                 found[one.code] = one.log_evidence - sound
-                better[one.code] = one
-    return _Comparison(found, forms, chosen, better)
+                single[one.code] = one
+    return _Comparison(found, forms, single)
 
 
 def _nearer(forms: list[_Form], sight: Sight, whole: Scores) -> list[_Form]:
@@ -529,6 +521,8 @@ def _error(form: _Form, weight: float, sight: Sight) -> _Error:
 def _where(code: str, rows: Rows, sight: Sight) -> str:
     """Image points, or images, that were chosen."""
     network = sight.network
+    if not len(rows):
+        return ""
     if code == "other-camera":
         return listed_places([network.images[i] for i in rows], "image")
     at = sight.rows[rows]
