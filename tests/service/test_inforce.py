@@ -100,7 +100,7 @@ def started(archive: Archive) -> tuple[Configurations, str]:
         (camera(c=8.0005, scale=5.0), "accepted", None),
         (camera(c=8.005), "accepted with warning", "image"),
         (camera(c=8.05), "rejected", "image"),
-        (camera(c=8.02, scale=60.0), "needs review", "image"),
+        (camera(c=8.012, scale=60.0), "needs review", "image"),
         (camera(scale=1500.0), "needs review", "resolution"),
         (camera(redundancy=3), "rejected", "redundancy"),
         (camera(extent=(200.0, 10.0, 500.0, 470.0)), "rejected", "coverage"),

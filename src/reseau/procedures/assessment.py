@@ -99,7 +99,7 @@ class Assessment:
     --------
     >>> from reseau.bundle import adjust_network, example_network
     >>> print(assess(adjust_network(example_network())).lines[0])  # doctest: +ELLIPSIS
-    usable to remove visible distortion only: 0.016 px at the centre, 0.49 px in the corners...
+    usable to remove visible distortion only: 0.016 px at the centre, 0.48 px in the corners...
     """
 
     use: Use
