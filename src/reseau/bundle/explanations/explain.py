@@ -373,7 +373,7 @@ def _compared(
 def _nearer(forms: list[_Form], sight: Sight, whole: Scores) -> list[_Form]:
     """The forms, of which the best of each promising cause is adjusted."""
     nothing = max(whole.log_nothing(known=0.0), whole.log_nothing(known=1.0))
-    most = max((form.log_evidence for form in forms), default=nothing)
+    most = max((form.log_evidence for form in forms if form.units is not None), default=nothing)
     if most < nothing - np.log(_FALSE):
         return forms
     found = list(forms)
