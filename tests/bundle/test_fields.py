@@ -50,6 +50,8 @@ def test_normalised_errors_of_the_projection_have_mean_square_one_everywhere(
 
 
 def test_the_test_of_the_whole_field_has_its_significance_level(against_truth: list[FieldDifference]) -> None:
+    # As many as nine parameters, or fewer, as they do not contribute alike.
+    assert all(1 <= d.degrees <= 9 for d in against_truth)
     p = np.array([d.p for d in against_truth])
     # 5 % of 120 with a standard deviation of 2.4.
     assert (p < 0.05).sum() <= 6 + 3.5 * 2.4

@@ -140,10 +140,11 @@ def calibration_difference(
         off = there.value - xy[rows]
         if not (np.isfinite(g).all() and np.isfinite(off).all()):
             raise UsageError("do not image the same rays", where="calibrations")
-        own = there.d_parameters[:, :, second.rows]
-        carried = there.d_xy @ by_uv @ np.linalg.inv(here.d_xy) @ here.d_parameters[:, :, first.rows]
-        by_first, by_second = referred(g, carried, weight[rows]), referred(g, own, weight[rows])
-        root = _joint_root(first, second, by_first, by_second)
+        if k in (0, _ROUNDS - 1):
+            own = there.d_parameters[:, :, second.rows]
+            carried = there.d_xy @ by_uv @ np.linalg.inv(here.d_xy) @ here.d_parameters[:, :, first.rows]
+            by_first, by_second = referred(g, carried, weight[rows]), referred(g, own, weight[rows])
+            root = _joint_root(first, second, by_first, by_second)
         if k == 0 and root.size:
             # Places that are known better say more of the rotation.
             variance = np.einsum("gik,gik->g", root, root)

@@ -83,6 +83,11 @@ class Effect:
         number = 2 * np.bincount(self.group[own], minlength=self.groups)
         return np.asarray(np.sqrt(total / np.maximum(number, 1)[:, None]))
 
+    def mean_square(self, sigma: Array) -> Array:
+        """Mean square of the same over the points of all groups (q,)."""
+        number = np.bincount(self.group[self.group >= 0], minlength=self.groups)
+        return np.asarray(number @ self.rms(sigma) ** 2 / max(int(number.sum()), 1))
+
     def columns(self, root: Array) -> scipy.sparse.csr_array:
         """Weighted columns (2n, groups · q), sparse."""
         n, _, q = self.slope.shape

@@ -377,12 +377,11 @@ def shared_errors(fit: BundleFit) -> SharedErrors | None:
     every_size = np.array([sizes for sizes, *_ in fits])
     width = own.slope.shape[2]
     pulls = np.zeros((len(images), width, width))
-    k = np.arange(len(images))
     by_image = parts[1].stop
     for weight, sizes, (*_, seen) in zip(weights, every_size, fits, strict=True):
         half = np.repeat(sizes[:2], [count, by_image - count])[:, None] * seen[:by_image]
         half = half.reshape(by_image, len(images), width)
-        pulls += weight * np.einsum("niq,nir->iqr", half, half)[k]
+        pulls += weight * np.einsum("niq,nir->iqr", half, half)
     distance_size = float(np.sqrt(weights @ every_size[:, 1] ** 2))
     points_size = float(np.sqrt(weights @ every_size[:, 2] ** 2)) if len(some) > 2 else 0.0
     by_camera = every.part(slice(end, None))
@@ -420,8 +419,7 @@ def _across(cross: Array, roots: Array) -> Array:
 
 def _one_unit(effect: Effect, sigma: Array) -> float:
     """Size of all effects with which they displace the image points by their sigma, root mean square."""
-    number = np.bincount(effect.group[effect.group >= 0], minlength=effect.groups)
-    square = float(number @ (effect.rms(sigma) ** 2).sum(axis=1)) / max(int(number.sum()), 1)
+    square = float(effect.mean_square(sigma).sum())
     return 1 / np.sqrt(square) if square > 0 else 0.0
 
 
@@ -449,8 +447,9 @@ def _largest(scores: Scores, parts: Sequence[slice]) -> tuple[Array, float]:
 
 def _without(scores: Scores, columns: Sequence[Rows], sizes: Array, k: int) -> Scores:
     """The scores after all components but one were taken into account."""
-    for own, size in [*zip(columns, sizes, strict=True)][:k] + [*zip(columns, sizes, strict=True)][k + 1 :]:
-        scores = scores.with_effects(own, float(size)) if size else scores
+    for j, (own, size) in enumerate(zip(columns, sizes, strict=True)):
+        if j != k and size:
+            scores = scores.with_effects(own, float(size))
     return scores
 
 

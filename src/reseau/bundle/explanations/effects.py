@@ -43,7 +43,7 @@ class Family:
     moves : ndarray (p, 3, q), optional
         Shifts of the object points by one unit of each column, where these are what displaces image points.
     kind : str
-        Of effects of a lens: radial, polynomial or coefficients.
+        Of several families of a cause: radial, polynomial or coefficients of a lens, points of a target.
     alike : ndarray of int (q,), optional
         Kinds of the columns: those of a kind have the same standard deviation. By default each is one.
     """
@@ -59,7 +59,7 @@ class Family:
         """The same effects, at another adjustment."""
         if self.moves is not None:
             return replace(self, effect=replace(self.effect, slope=sight.by_point @ self.moves[sight.point]))
-        return next(one for one in families(sight) if (one.code, one.kind) == (self.code, self.kind))
+        return next(one for one in families(sight, self.code) if one.kind == self.kind)
 
 
 class Sight:
@@ -164,14 +164,19 @@ def _cross(at: Array) -> Array:
     return np.stack(rows).transpose(2, 0, 1)
 
 
-def families(sight: Sight) -> Iterator[Family]:
-    """Yield the causes that the network can have."""
-    yield from _lens(sight)
-    if sight.simple:
-        yield from _refocus(sight)
-        yield from _rolling(sight)
-        yield from _motion(sight)
-        yield from _target(sight)
+def families(sight: Sight, only: str = "") -> Iterator[Family]:
+    """Yield the causes that the network can have, or one of them."""
+    simple = [
+        (_refocus, ("refocus",)), (_rolling, ("rolling-shutter",)), (_motion, ("motion",)),
+        (_target, ("target-shape", "target-scale")),
+    ]  # fmt: skip
+    for made, codes in [(_lens, ("lens",)), *(simple if sight.simple else []), (_unknown, ("unknown",))]:
+        if not only or only in codes:
+            yield from (family for family in made(sight) if not only or family.code == only)
+
+
+def _unknown(sight: Sight) -> Iterator[Family]:
+    """What none of the others explains: a smooth field in each image."""
     effect, roots = smooth_effects(sight.result.fit)
     yield Family("unknown", effect, {f"smooth in each image, {name}": root for name, root in roots.items()})
 

@@ -409,7 +409,7 @@ def _after(
     assert form.units is not None
     if form.adjusted is not None:
         sight, _, effects = form.adjusted
-        every = [form.family, *(one for one in families(sight) if only in ("", one.code))]
+        every = [form.family, *families(sight, only)]
         whole = scores(sight.result.fit, [family.effect for family in every])
         whole = whole.before(np.concatenate([effects, np.zeros(len(whole.g) - len(effects))]))
     begin = _columns(form.family, every).start
@@ -427,9 +427,7 @@ def _forms(family: Family, part: Scores, sight: Sight) -> list[_Form]:
     """The forms of a cause."""
     effect = family.effect
     groups, q = effect.groups, effect.slope.shape[2]
-    square = effect.rms(sight.sigma) ** 2
-    number = np.bincount(effect.group[effect.group >= 0], minlength=groups)
-    total = number @ square / max(int(number.sum()), 1)
+    total = effect.mean_square(sight.sigma)
     # Effects of one kind have one standard deviation in all groups; kinds displace image points alike, or two
     # of them by some ratio.
     alike = np.arange(q) if family.alike is None else family.alike
