@@ -37,7 +37,6 @@ from .common import (
     Channel,
     ClusterAddress,
     Jobs,
-    Out,
     SensorFile,
     Store,
     overlay_files,
@@ -91,19 +90,20 @@ LeaveOut = Annotated[
 
 
 def calibrate(
+    images: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Photographs of the target, folders of them, or measured image coordinates."),
+    ] = None,
     design: Annotated[
         Path,
         typer.Option(
             "--design",
             "-d",
-            help="Design of the testfield, board or reseau; `auto` looks for it: among designs beside the "
-            "photographs, in the folder above and the current one, and those that `reseau design` draws.",
+            help="Design of the testfield, board or reseau; by default it is looked for, among designs "
+            "beside the photographs, in the folder above and the current one, and those that `reseau design` "
+            "draws.",
         ),
-    ],
-    images: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Photographs of the target, folders of them, or measured image coordinates."),
-    ] = None,
+    ] = Path("auto"),
     camera: Annotated[
         list[str] | None,
         typer.Option(
@@ -113,7 +113,16 @@ def calibrate(
             "last number in it, were taken at once.",
         ),
     ] = None,
-    out: Out = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder to write: report, calibrations, files for OpenCV, ROS and COLMAP, and undistorted "
+            "samples; by default, without --json, beside that of the photographs, which is called photos: "
+            "photos-calibration. With the suffix .json the file of the calibration alone.",
+        ),
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
     overlay: Annotated[
         Path | None,
@@ -199,15 +208,21 @@ def calibrate(
     executor = _executor(files, jobs, cluster, store)
     if overlay is not None and not executor.local:
         raise UsageError("is drawn by this machine only", where="--overlay", do="leave out --cluster")
+    import numpy as np
+
     from ..core.provenance import sha256_of
     from ..exchange import read_target
     from ..execution import Outputs
+    from ..io import write_whole
     from ..measure import TestfieldOptions
     from ..procedures.calibration import calibrate_camera, measurer_of
     from ..procedures.exposures import photograph_reader, photographs_of
     from ..procedures.target_measurement import drawing_overlays
+    from ..report.bundle import bundle_report
+    from ..report.calibration_folder import calibration_folder
 
-    outputs(out, report)
+    folder = _folder(out, files, as_json)
+    outputs(None if folder else out, report)
     drawn = {} if overlay is None else overlay_files(overlay, files)
     distance = positive(distance)
     kind, automatic = component_kind(components), str(design) == "auto"
@@ -255,17 +270,42 @@ def calibrate(
         done.calibration(entry.id if taken else target.name, provenance.to_dict(), entry.id)
         for entry in done.result.network.cameras
     ]
+    if report is not None or folder is not None:
+        page = bundle_report(
+            done.result, title=f"Calibration with {target.name}", provenance=provenance, against=differences,
+            distances=distance, assessments=done.assessments, photograph=_pictures(photographs, channel),
+            declined=done.declined,
+        )  # fmt: skip
     if report is not None:
-        pictures = _pictures(photographs, channel)
-        title = f"Calibration with {target.name}"
-        _write_report(report, done, title, provenance, differences, distance, pictures)
-    if out is not None:
+        write_whole(report, page)
+    written = list[tuple[str, str]]()
+    if folder is not None:
+        with progress("writing", 0) as step:
+            network = done.result.network
+            used = {
+                entry.id: [photographs[network.images[i]] for i in np.flatnonzero(network.camera_of == c)]
+                for c, entry in enumerate(network.cameras)
+            }
+            written = calibration_folder(folder, calibrations, page, used, step)
+    elif out is not None:
         for calibration, path in zip(calibrations, done.files(out).values(), strict=True):
             calibration.write(path)
     if as_json:
         say("".join(calibration.to_json() for calibration in calibrations))
     else:
         _say(done, differences, distance or [])
+    if folder is not None and not as_json:
+        say(f"written: {folder}\n")
+        say("".join(f"  {name:26} {what}\n" for name, what in written))
+
+
+def _folder(out: Path | None, files: list[Path], as_json: bool) -> Path | None:
+    """The folder for all results, made before anything is computed; None where one file or none is wanted."""
+    from ..report.calibration_folder import folder_beside, made_folder
+
+    if out is None:
+        return None if as_json else made_folder(folder_beside(files))
+    return made_folder(out) if out.is_dir() or not out.suffix else None
 
 
 def _found_target(
@@ -377,25 +417,6 @@ def _shown(photographs: Iterator[Photograph], step: Callable[[str], None]) -> It
     for each in photographs:
         step(f"measuring {each[0] if isinstance(each, tuple) else each.name}")
         yield each
-
-
-def _write_report(
-    path: Path,
-    done: Calibrated,
-    title: str,
-    provenance: Provenance,
-    differences: dict[str, FieldDifference],
-    distances: list[float] | None,
-    pictures: Callable[[str], Frame | None],
-) -> None:
-    from ..io import write_whole
-    from ..report.bundle import bundle_report
-
-    page = bundle_report(
-        done.result, title=title, provenance=provenance, against=differences, distances=distances or (),
-        assessments=done.assessments, photograph=pictures, declined=done.declined,
-    )  # fmt: skip
-    write_whole(path, page)
 
 
 def _pictures(photographs: Mapping[str, Path], channel: Channel) -> Callable[[str], Frame | None]:

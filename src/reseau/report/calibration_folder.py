@@ -1,0 +1,153 @@
+"""The folder in which a calibration ends: all that its user needs, in files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from os.path import commonpath
+from pathlib import Path
+
+import numpy as np
+
+from ..calibration import Calibration, CameraMapping, CorrectedImage, write_corrected
+from ..calibration.raster import planes_of
+from ..core.errors import InputError
+from ..exchange import export_calibration, export_rig
+from ..exchange.calibrations import formats_holding
+from ..io import is_points, write_whole
+from ..io.images import open_scan
+
+__all__ = ["calibration_folder", "folder_beside", "made_folder"]
+
+_FILES = {"opencv": "opencv.yml", "ros": "ros.yaml", "colmap": "colmap.txt"}
+"""Files for other programs, by their formats."""
+_NAMES = {"opencv": "OpenCV", "ros": "ROS", "colmap": "COLMAP"}
+_SAMPLES = 3
+"""Undistorted photographs of each camera."""
+_HOLDING = {"uint8": ".jpg", "uint16": ".png"}
+"""Suffixes of images by the type of their grey values; those of other types are TIFF."""
+
+
+def folder_beside(photographs: Sequence[Path]) -> Path:
+    """Folder of the results of photographs, beside the one that holds all of them.
+
+    Examples
+    --------
+    >>> folder_beside([Path("/bench/photos/1.jpg"), Path("/bench/photos/2.jpg")]).as_posix()
+    '/bench/photos-calibration'
+    """
+    parents = {path.parent for path in photographs}
+    shared = parents.pop() if len(parents) == 1 else Path(commonpath([path.resolve() for path in parents]))
+    named = shared if shared.name else shared.resolve()
+    return named.with_name(f"{named.name}-calibration")
+
+
+def made_folder(folder: Path) -> Path:
+    """Make the folder, before anything is computed.
+
+    Raises
+    ------
+    InputError
+        When files cannot be written there.
+
+    Examples
+    --------
+    >>> made_folder(Path("README.md"))
+    Traceback (most recent call last):
+    ...
+    reseau.core.errors.InputError: README.md: cannot be written (File exists); choose another folder by --out
+    """
+    try:
+        folder.mkdir(exist_ok=True)
+        probe = folder / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(
+            f"cannot be written ({error.strerror})", where=folder, do="choose another folder by --out"
+        ) from None
+    return folder
+
+
+def calibration_folder(
+    folder: Path,
+    calibrations: Sequence[Calibration],
+    page: str,
+    photographs: Mapping[str, Sequence[Path]],
+    step: Callable[[str], None] = lambda _: None,
+) -> list[tuple[str, str]]:
+    """Write the calibrations of one camera, or of several that are fixed to each other.
+
+    The report, each calibration, its files for OpenCV, ROS and COLMAP where these have its model, those of
+    the rig for Kalibr, and three undistorted photographs of each camera.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder, see :func:`made_folder`. Files of the same name are replaced.
+    calibrations : sequence of Calibration
+        The cameras; of several the first is the reference of the rig.
+    page : str
+        The report.
+    photographs : mapping of str to sequence of Path
+        Photographs from which each camera was calibrated, or measured image coordinates, by its name.
+    step : callable
+        Is called with what is written next.
+
+    Returns
+    -------
+    list of (str, str)
+        Files, relative to the folder, and what they are, or why they are not written.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be written.
+    """
+    written = [("report.html", "report")]
+    step("report")
+    write_whole(folder / "report.html", page)
+    for calibration, (name, files) in zip(calibrations, photographs.items(), strict=True):
+        before = f"{name}-" if len(calibrations) > 1 else ""
+        own = f"{name}.json" if before else "camera.json"
+        calibration.write(folder / own)
+        written.append((own, "calibration with its uncertainty"))
+        holding = formats_holding(calibration)
+        for to, file in _FILES.items():
+            if to in holding:
+                export_calibration(calibration, to, folder / f"{before}{file}")
+                written.append((f"{before}{file}", f"camera for {_NAMES[to]}"))
+        lacking = [_NAMES[to] for to in _FILES if to not in holding]
+        if lacking:
+            written.append(("", f"not for {' and '.join(lacking)}, which lack its model: see reseau export"))
+        lens = calibration.mapping()
+        if isinstance(lens, CameraMapping):
+            written += _samples(folder, before, lens, files, step)
+    if len(calibrations) > 1:
+        written += _rig(folder, calibrations)
+    return written
+
+
+def _samples(
+    folder: Path, before: str, lens: CameraMapping, files: Sequence[Path], step: Callable[[str], None]
+) -> list[tuple[str, str]]:
+    """Undistorted photographs, spread over all."""
+    photographs = [path for path in files if not is_points(path)]
+    chosen = sorted(set(np.linspace(0, len(photographs) - 1, _SAMPLES).astype(int))) if photographs else []
+    raster, names = CorrectedImage.undistorted(lens, "keep"), list[str]()
+    for path in (photographs[k] for k in chosen):
+        step(f"undistorting {path.name}")
+        planes = planes_of(open_scan(path))
+        lens.check_size(planes[0].shape[1], planes[0].shape[0], path)
+        suffix = _HOLDING.get(str(planes[0].dtype), ".tif")
+        name = f"{before}undistorted-{path.stem}{suffix}"
+        write_corrected(folder / name, planes, raster)
+        names.append(name)
+    return [(", ".join(names), "undistorted photographs")] if names else []
+
+
+def _rig(folder: Path, calibrations: Sequence[Calibration]) -> list[tuple[str, str]]:
+    """The cameras together, where Kalibr has their models."""
+    if any("kalibr" not in formats_holding(each) for each in calibrations):
+        return []
+    export_rig(calibrations, "kalibr", folder / "camchain.yaml")
+    return [("camchain.yaml", "cameras for Kalibr")]

@@ -1,0 +1,77 @@
+"""`reseau calibrate photos/`: without any option, from photographs to a folder of results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from reseau.calibration import Calibration, CameraMapping
+from reseau.designs import board
+from reseau.exchange import import_calibration
+from reseau.io.images import write_image
+
+from ..measure.board_pictures import picture
+
+Run = Callable[..., tuple[int, str, str]]
+
+VIEWS = ((-30, 0), (30, 10), (-25, 90), (25, 95), (-32, 200), (28, 290))
+"""Tilts and turns of a board, degrees."""
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("one-command") / "photos"
+    folder.mkdir()
+    design = board("charuco", 7, 10, 23.0)
+    for k, (tilt, turn) in enumerate(VIEWS):
+        write_image(folder / f"{k}.png", picture(design, tilt, turn, 300.0, seed=k)[0].pixels)
+    return folder
+
+
+def test_photographs_end_in_a_folder_with_all_that_is_needed(reseau: Run, photos: Path) -> None:
+    status, out, err = reseau("calibrate", photos, "--jobs", 1)
+    folder = photos.with_name("photos-calibration")
+    assert status == 0, err
+    assert f"written: {folder}\n" in out
+    names = {path.name for path in folder.iterdir()}
+    assert {"report.html", "camera.json", "opencv.yml", "ros.yaml", "colmap.txt"} < names
+    assert {f"undistorted-{k}.jpg" for k in (0, 2, 5)} < names
+    assert all(name in out for name in names)
+    lens = Calibration.read(folder / "camera.json").mapping()
+    assert isinstance(lens, CameraMapping)
+    uv = np.array([[0.1, 0.05], [-0.2, 0.1]])
+    for name in ("opencv.yml", "ros.yaml", "colmap.txt"):
+        other = import_calibration(folder / name).mapping()
+        assert isinstance(other, CameraMapping)
+        assert other.mapping(uv) == pytest.approx(lens.mapping(uv), abs=1e-3)
+    sample = cv2.imread(str(folder / "undistorted-0.jpg"), cv2.IMREAD_UNCHANGED)
+    assert sample is not None
+    assert sample.shape == (400, 480)
+
+
+def test_one_file_is_written_where_one_is_wanted_and_none_beside_the_document_on_the_output(
+    reseau: Run, photos: Path, tmp_path: Path
+) -> None:
+    for path in photos.iterdir():
+        (tmp_path / "b").mkdir(exist_ok=True)
+        (tmp_path / "b" / path.name).write_bytes(path.read_bytes())
+    status, out, _ = reseau("calibrate", tmp_path / "b", "--jobs", 1, "-o", tmp_path / "K.json", "--json")
+    assert status == 0
+    assert (tmp_path / "K.json").read_text() == out
+    assert {path.name for path in tmp_path.iterdir()} == {"b", "K.json"}
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(
+    reseau: Run, photos: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "taken").touch()
+    status, out, err = reseau("calibrate", photos, "-o", tmp_path / "taken")
+    assert (status, out) == (2, "")
+    assert "taken: cannot be written (File exists); choose another folder by --out" in err
+    status, _, err = reseau("calibrate", photos, "-o", tmp_path / "none" / "results")
+    assert status == 2
+    assert "results: cannot be written (No such file or directory)" in err
