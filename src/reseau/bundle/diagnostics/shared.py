@@ -278,19 +278,23 @@ class SharedErrors:
         g = np.einsum("iq,iqk->ik", self.scores.g.reshape(groups, width), turned) ** 2 / self.variance
         k = np.arange(groups)
         m = self.scores.m.reshape(groups, width, groups, width)[k, :, k, :]
-        own = np.einsum("iqk,iqr,irk->ik", turned, m, turned)
+        # Cameras without any of the images that were looked at have no score at all.
+        own = np.maximum(np.einsum("iqk,iqr,irk->ik", turned, m, turned), 1e-100)
         shared = np.einsum("iqk,iqr,irk->ik", turned, self.pulls, turned)
         grid = np.linspace(np.log(0.05), np.log(5.0), 160)
-        var = np.maximum(own + np.exp(2 * grid)[:, None, None] * shared, 1e-300)
-        log = -0.5 * (np.log(var) + g / var).sum(axis=1)
+        # The sum over the images is what the parameters are pulled by: as many squares as are about equal.
+        squares = g.sum(axis=0)
+        many = (own + shared).sum(axis=0) ** 2 / ((own + shared) ** 2).sum(axis=0)
+        var = own.sum(axis=0) + np.exp(2 * grid)[:, None] * shared.sum(axis=0)
+        log = -0.5 * many * (np.log(var) + squares / var)
         together = grid[int(np.argmax(log.sum(axis=1)))]
         log = log - 0.5 * ((grid[:, None] - together) / _SHAPE) ** 2
         weight = np.exp(log - log.max(axis=0))
         weight /= weight.sum(axis=0)
         # The mean of the variance over what the scores leave possible.
-        mean = (weight * np.exp(2 * grid)[:, None]).sum(axis=0)
-        square = (weight * np.exp(4 * grid)[:, None]).sum(axis=0)
-        return np.sqrt(mean), square / mean**2 - 1
+        size = np.sqrt((weight * np.exp(2 * grid)[:, None]).sum(axis=0))
+        log_mean = (weight * grid[:, None]).sum(axis=0)
+        return size, 4 * (weight * (grid[:, None] - log_mean) ** 2).sum(axis=0)
 
 
 def _degrees(parts: Array, spread: Array) -> Array:
