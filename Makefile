@@ -34,7 +34,7 @@ rig: $(VENV)/.test
 	$(BIN)/python -m tests.rig.machine
 
 # All comparisons with peers that are installed; an interrupted run continues where it ended. The tables and
-# pictures of docs/benchmarks.md are written. AquaCal asks for an OpenCV before 5, and works with that, too.
+# pictures of docs/benchmarks/peers.md are written. AquaCal asks for an OpenCV before 5, and works with that, too.
 bench: $(VENV)/.test
 	@$(PIP) -e '.[peers]' || echo "without peers of PyPI"
 	@$(PIP) natsort pandas pyyaml requests tqdm && $(PIP) --no-deps aquacal || echo "without AquaCal"

@@ -8,9 +8,9 @@ ended well for this code is not run again, so that an interrupted run continues 
 has all that was printed, with the versions of the peers that are installed, the times that the entries took,
 and what is missing: peers, and files of $RESEAU_DATA.
 
-With `--write` the figures go to `benchmarks/figures.json`, and from there the tables to docs/benchmarks.md
-and the pictures to docs/images. Entries that were skipped or have failed keep there what was recorded
-before. With `--list` nothing is run.
+With `--write` the figures go to `benchmarks/figures.json`, and from there the tables to the pages
+docs/benchmarks/peers*.md and the pictures to docs/images. Entries that were skipped or have failed keep there
+what was recorded before. With `--list` nothing is run.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -34,8 +34,7 @@ from figures import BOUND, ORIGIN, RECORDED, Figure, markdown, read, recorded
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("RESEAU_DATA", ROOT.parent / "shared" / "data"))
-PAGE = ROOT / "docs" / "benchmarks.md"
-BEGIN, END = "<!-- written by benchmarks/all.py -->", "<!-- end of what benchmarks/all.py writes -->"
+PAGES = ROOT / "docs" / "benchmarks"
 CODE = ("src", "sims", "drivers", "benchmarks", *(f":!benchmarks/{each}" for each in (
     "figures.json", "history.jsonl", "explained.toml")))  # fmt: skip
 """What the figures depend on: when only something else changes, entries are not run again."""
@@ -123,6 +122,19 @@ ENTRIES = (
     Entry("gige", "GigE Vision", "gige.py --frames 100 --rounds 3", ("Aravis",)),
     Entry("transfer", "Pictures of an oscilloscope's screen", "transfer.py", ("lxi", "pyvisa-py")),
 )  # fmt: skip
+
+SUBJECTS = {
+    "peers-cameras": ("Cameras and networks, beside peers", (
+        "bundle", "cameras", "calibrations", "causes", "intervals", "halves", "model-choice",
+        "next-photograph", "stereo", "refraction", "water", "nist")),
+    "peers-targets": ("Targets and boards, beside peers", (
+        "disks", "testfield", "boards", "other-boards", "drawn-boards", "reseau-simulated", "reseau",
+        "edges", "blurred", "rays")),
+    "peers-pictures": ("Film, screens and frames of instruments, beside peers", (
+        "vidicon", "hough", "film", "oscilloscope-simulated", "oscilloscope", "pins")),
+    "peers-instruments": ("Instruments and archive, beside peers", ("archive", "gige", "transfer")),
+}  # fmt: skip
+"""Pages of the entries: title, and names of the entries."""
 
 
 def found(peer: str) -> str:
@@ -222,8 +234,8 @@ def keep(folder: Path, path: Path = RECORDED) -> None:
     path.write_text("{\n" + ",\n".join(lines) + "\n}\n")
 
 
-def page(path: Path = RECORDED) -> str:
-    """The part of docs/benchmarks.md that shows what was recorded."""
+def overview(path: Path = RECORDED) -> str:
+    """The first page of what was recorded: what is missing, and the figures that all have in common."""
     entries: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     minutes = sum(each["seconds"] for each in entries.values()) / 60
     known = [each for each in ENTRIES if each.name in entries]
@@ -239,14 +251,21 @@ def page(path: Path = RECORDED) -> str:
                 absent.append(f"{peer} in “{entry.title}”: {PEERS[peer]} was not installed")
     if absent:
         lines += ["Missing:", "", *(f"- {each}" for each in absent), ""]
-    lines += ["### Errors of clean targets beside the bound", "", _beside_the_bound(path)]
-    lines += [_TARGETS, "", "### Images of independent origin beside the simulator's", "", _ORIGINS, ""]
+    lines += ["## Errors of clean targets beside the bound", "", _beside_the_bound(path)]
+    lines += [_TARGETS, "", "## Images of independent origin beside the simulator's", "", _ORIGINS, ""]
     origins = sorted(recorded(ORIGIN, path), key=lambda each: each.column.startswith("independent"))
     lines += [markdown(origins, "what"), _PICTURE, ""]
-    for entry in known:
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def page(names: Collection[str], path: Path = RECORDED) -> str:
+    """The tables of entries, with the versions of their peers."""
+    entries: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    lines: list[str] = []
+    for entry in (each for each in ENTRIES if each.name in entries and each.name in names):
         document = entries[entry.name]
         peers = ", ".join(f"{peer} {number}" for peer, number in document["peers"].items() if number)
-        lines += [f"### {entry.title}", ""]
+        lines += [f"## {entry.title}", ""]
         lines += [
             f"`python benchmarks/{entry.command}`, {document['seconds']} s" + f"; {peers}" * bool(peers),
             "",
@@ -260,9 +279,17 @@ def page(path: Path = RECORDED) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
+def pages(path: Path = RECORDED) -> dict[str, str]:
+    """All pages of what was recorded, by the names of their files."""
+    found = {"peers.md": f"# Beside peers, and on images of independent origin\n\n{overview(path)}"}
+    for name, (title, names) in SUBJECTS.items():
+        found[f"{name}.md"] = f"# {title}\n\n{page(names, path)}"
+    return {name: f"<!-- written by benchmarks/all.py -->\n\n{text}" for name, text in found.items()}
+
+
 _TARGETS = (
     "![Errors of image coordinates of several targets on a logarithmic scale: reseau beside the bound, other "
-    "programs mostly some times above](images/targets-beside-others.png)"
+    "programs mostly some times above](../images/targets-beside-others.png)"
 )
 _ORIGINS = (
     "Found, and errors ÷ sigmas, with images of the project's own simulators and with images of another "
@@ -270,7 +297,7 @@ _ORIGINS = (
 )
 _PICTURE = (
     "![Errors over sigmas of the simulator's images and of independent ones for each kind of target]"
-    "(images/independent-beside-simulator.png)"
+    "(../images/independent-beside-simulator.png)"
 )
 
 
@@ -292,10 +319,9 @@ def _beside_the_bound(path: Path) -> str:
 
 
 def write() -> None:
-    """Put the tables into the page, and draw the pictures from the same figures."""
-    before, rest = PAGE.read_text().split(BEGIN, 1)
-    after = rest.split(END, 1)[1]
-    PAGE.write_text(f"{before}{BEGIN}\n\n{page()}\n{END}{after}")
+    """Write the pages, and draw the pictures from the same figures."""
+    for name, text in pages().items():
+        (PAGES / name).write_text(text)
     subprocess.run([sys.executable, str(ROOT / "docs" / "benchmark_figures.py")], check=True, cwd=ROOT)
 
 
@@ -333,7 +359,7 @@ def main() -> int:
     if given.write:
         keep(given.out)
         write()
-        print(PAGE)
+        print(PAGES / "peers.md")
     return 1 if failed else 0
 
 

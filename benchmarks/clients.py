@@ -2,7 +2,7 @@
 
 Runs the tests that carry the marker ``client``: each lets a program by others operate simulators, compares
 what it received with what they show, and asserts that they saw no violation of their protocol. Clients that
-are not installed are named. ``--write`` puts the table into docs/benchmarks.md.
+are not installed are named. ``--write`` puts the table into docs/benchmarks/instruments.md.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "docs" / "benchmarks" / "instruments.md"
 BEGIN, END = "<!-- written by benchmarks/clients.py -->", "<!-- end -->"
 TESTS = ("tests/drivers", "tests/sims/test_laboratory.py")
 COMMANDS = {
@@ -101,7 +101,7 @@ class Table:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true", help="Put the table into docs/benchmarks.md.")
+    parser.add_argument("--write", action="store_true", help="Put the table into its page.")
     write = parser.parse_args().write
     table = Table()
     tests = [str(ROOT / path) for path in TESTS]

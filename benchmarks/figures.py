@@ -2,7 +2,7 @@
 
 A benchmark calls `record` where it prints a row. `all.py` names a file in ``RESEAU_FIGURES``, to which each
 figure is appended as a line of JSON; without it nothing is kept. `benchmarks/figures.json` has those of the
-last `make bench`, and docs/benchmarks.md and its pictures show them.
+last `make bench`, and docs/benchmarks/peers.md and its pictures show them.
 """
 
 from __future__ import annotations

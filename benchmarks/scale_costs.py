@@ -1,4 +1,4 @@
-"""What single things cost, for estimates of more than can be run here: `docs/benchmarks.md`.
+"""What single things cost, for estimates of more than can be run here: `docs/scale.md`.
 
 Run as ``python benchmarks/scale.py --part costs [--frames 10000 100000 1000000]``. Measured are an index
 (SQLite) with that many frames, in sessions of 36 with a verdict for each frame and two results for each

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/benchmarks.md from the figures of the last `make bench`.
+"""Draws the pictures of docs/benchmarks/peers.md from the figures of the last `make bench`.
 
 That of docs/scale.md is drawn from the tables there, whose networks take hours.
 

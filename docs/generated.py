@@ -144,7 +144,7 @@ def documents_page() -> str:
         "# Schemas of all documents",
         "",
         "Generated from the models that read and write the files; `reseau schema NAME` prints the "
-        "same. What the keys mean is in [file formats](../../formats.md).",
+        "same. What the keys mean is in [file formats](../../formats/index.md).",
         "",
         "| schema | JSON Schema | |",
         "|---|---|---|",

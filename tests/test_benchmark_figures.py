@@ -125,23 +125,27 @@ def test_the_page_names_versions_and_what_is_missing(
     bench.run(one, folder, "abc")
     bench.keep(folder, recorded)
     version = bench.found("SciPy")
-    text = bench.page(recorded)
+    text = bench.page({"small"}, recorded)
     assert f"s; SciPy {version}\n" in text
     assert "| network | 2 s (1 to 3) |" in text
-    assert "Missing" not in text
+    assert "Missing" not in bench.overview(recorded)
     monkeypatch.setattr(bench, "found", lambda peer: "")
     monkeypatch.setattr(bench, "ENTRIES", (one, bench.Entry("other", "Another", "other.py")))
     bench.run(one, folder, "def")
     bench.keep(folder, recorded)
-    text = bench.page(recorded)
+    text = bench.overview(recorded)
     assert "- SciPy in “A small one”: scipy was not installed" in text
     assert "- Another: not recorded" in text
 
 
 def test_docs_show_the_figures_that_were_recorded() -> None:
-    text = bench.PAGE.read_text("utf-8")
-    shown = text.split(bench.BEGIN)[1].split(bench.END)[0]
-    assert shown == f"\n\n{bench.page()}\n", "python benchmarks/all.py --list --write"
+    shown = {name: (bench.PAGES / name).read_text("utf-8") for name in bench.pages()}
+    assert shown == bench.pages(), "python benchmarks/all.py --list --write"
+
+
+def test_every_entry_is_on_one_page() -> None:
+    on_pages = [name for _, names in bench.SUBJECTS.values() for name in names]
+    assert sorted(on_pages) == sorted(entry.name for entry in bench.ENTRIES)
 
 
 def test_every_recorded_entry_is_one_of_make_bench() -> None:

@@ -589,7 +589,7 @@ def adjust_network(
     Parameters
     ----------
     network : str, Path or Network
-        A network, or its file: ``reseau-network/1``, or that of another program (docs/formats.md).
+        A network, or its file: ``reseau-network/1``, or that of another program (docs/formats/networks.md).
     options : reseau.bundle.Options, optional
         Options of the adjustment.
 

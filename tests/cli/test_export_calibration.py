@@ -17,7 +17,7 @@ Run = Callable[..., tuple[int, str, str]]
 def test_the_command_writes_and_reads_all_of_them(reseau: Run, tmp_path: Path) -> None:
     calibration("five").write(tmp_path / "K.json")
     status, out, _ = reseau("export", tmp_path / "K.json", "--to", "ros", "-o", tmp_path / "K.yaml")
-    assert (status, out) == (0, f"{tmp_path / 'K.yaml'}: opencv\n")
+    assert (status, out) == (0, f"{tmp_path / 'K.yaml'}: ros, model opencv\n")
     status, out, _ = reseau("export", tmp_path / "K.yaml", "--to", "colmap", "-o", tmp_path / "cameras.txt")
     assert status == 0
     assert reseau("export", tmp_path / "cameras.txt", "--to", "reseau", "-o", tmp_path / "again.json")[0] == 0

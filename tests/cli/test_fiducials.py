@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from reseau.exchange import read_micmac
+from reseau.io import FiducialDesign
 from reseau.io.images import read_image, write_image
 
 from ..measure.photographs import UNEVEN, camera, photograph
@@ -93,3 +94,18 @@ def test_an_oriented_scan_is_exported_to_micmac_and_metashape(files, tmp_path: P
     status, _, err = reseau("export", tmp_path / "photo.json")
     assert status == 2
     assert "--micmac" in err
+
+
+def test_a_camera_is_known_by_its_name_and_written_to_be_edited(files, tmp_path: Path, reseau: Run) -> None:
+    status, out, _ = reseau("design", "fiducials")
+    assert status == 0
+    assert "zeiss-rmk-top      Zeiss RMK TOP" in out
+    assert reseau("design", "fiducials", "wild-rc10", "-o", tmp_path / "rc10.json")[0] == 0
+    assert FiducialDesign.read(tmp_path / "rc10.json").ids == tuple("12345678")
+    # The test's own camera has none of its marks.
+    status, _, err = reseau("measure", "fiducials", files[0], "-d", "zeiss-rmk-top")
+    assert status == 1
+    assert "'Zeiss RMK TOP: dots in circles with crosses'" in err
+    status, _, err = reseau("measure", "fiducials", files[0], "-d", "wild-rc11")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "no camera has the name 'wild-rc11'; known are" in err

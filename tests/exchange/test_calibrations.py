@@ -123,6 +123,18 @@ def test_a_model_that_a_format_lacks_is_converted_with_its_differences(
     assert difference[inside].max() < 1.1 * done.greatest_px
 
 
+@pytest.mark.parametrize("form", ["opencv", "kalibr", "mrcal", "dbat"])
+def test_a_camera_with_parallel_rays_is_refused_by_the_name_of_the_format(form: str, tmp_path: Path) -> None:
+    given = calibration("photo")
+    model = given.model | {"model": "telecentric", "side": "object"}
+    values = {"m": 0.2, "x0": 0.0, "y0": 0.0}
+    parameters = {k: Quantity(value=v, sigma=0.0, unit=unit_of(k, "telecentric")) for k, v in values.items()}
+    given = given.model_copy(update={"model": model, "parameters": parameters})
+    with pytest.raises(UsageError, match=f"as {form}: its rays are parallel, which no model of the format"):
+        export_calibration(given, form, file(tmp_path, form))
+    assert not file(tmp_path, form).exists()
+
+
 WIDE = CENTRE | {"fx": 500.0, "fy": 503.0, "k1": 0.03, "k2": -0.004, "k3": 1e-3, "k4": -2e-4}
 
 

@@ -240,8 +240,8 @@ def test_a_vacuum_is_air_without_pressure() -> None:
 
 
 def test_the_example_of_the_documentation_is_a_lens() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text("utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "formats" / "lens.md").read_text("utf-8")
     example = text[text.index('    schema = "lens/1"') : text.index("Lengths are millimetres (`unit")]
-    document = LensDocument.parse(dedent(example), where="formats.md")
+    document = LensDocument.parse(dedent(example), where="lens.md")
     assert Paraxial(document.prescription()).focal_length == pytest.approx(document.focal_length, rel=0.001)
     assert document.sensor is not None

@@ -12,6 +12,7 @@ from reseau.io import FiducialDesign, FiducialMark, FiducialOrientation, MarkPar
 from reseau.io.scans import scan_of
 from reseau.measure.fiducials import FiducialOptions, FiducialResult, measure_fiducials
 from reseau.measure.fiducials.forms import contours_of
+from reseau.optics.formation import Outline, draw, mark_outline
 
 from .photographs import PLACES, UNEVEN, camera, photograph
 
@@ -115,3 +116,21 @@ def test_a_wrong_resolution_of_the_file_is_said() -> None:
     assert not isinstance(found, Failure)
     assert Code.INCONSISTENT in [note.code for note in found.notes]
     assert np.abs(found.xy - places).max() < 0.05  # px
+
+
+def test_the_overview_shows_the_thin_lines_of_large_marks(monkeypatch: pytest.MonkeyPatch) -> None:
+    cross = FiducialMark(
+        polarity="bright", parts=(MarkPart(shape="cross", size=3.9, line_width=0.1),), margin=0.6
+    )
+    thin, k, size = camera().model_copy(update={"marks": {"x": cross}}), 30.0, (1350, 1650)
+    places = thin.xy * [k, -k] + [size[1] / 2, size[0] / 2]
+    lines = mark_outline("cross", 3.9 * k, 0.1 * k, 0.5)
+    light = draw(Outline(lines.xy + places[:, None], np.tile(lines.dxy, (4, 1, 1))), size, 1.0)
+    grey = 40 + 25 * light + np.random.default_rng(0).normal(0, 4, light.shape)
+    scan, sizes = scan_of(grey.astype(np.uint8), dpi=25.4 * k), []
+    whole = type(scan).overview
+    monkeypatch.setattr(type(scan), "overview", lambda self, n: (sizes.append(n), whole(self, n))[1])
+    found = measure_fiducials(scan, thin)
+    assert not isinstance(found, Failure), found
+    assert np.abs(found.xy - places).max() < 0.2  # px
+    assert 0.1 * k * sizes[0] / size[1] >= 1.0  # px in a line

@@ -167,6 +167,29 @@ def n_wires(
     _write(design, None, None, out, Paper.OWN, f"{layers} layers of {width:g} mm, {spacing:g} mm apart")
 
 
+@app.command()
+def fiducials(
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="Name of a camera; by default all are listed.")
+    ] = None,
+    out: Design = None,
+) -> None:
+    """Write the fiducial marks of an aerial camera that is known by name, to be edited to its report."""
+    from ..designs import aerial_camera, aerial_cameras
+
+    if name is None:
+        for each, design in aerial_cameras().items():
+            say(f"{each:18} {design.name}\n")
+        return
+    design = aerial_camera(name)
+    if out is None or str(out) == "-":
+        say(design.to_json())
+    else:
+        suffix_of(writable(out), (".json",))
+        design.write(out)
+        say(f"{out}: {design.name}, {len(design.points)} marks; {design.source}\n")
+
+
 @app.command("testfield")
 def coded_field(
     columns: Annotated[int, typer.Option(help="Number of squares in a row.")] = 8,

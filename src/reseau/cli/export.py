@@ -96,7 +96,7 @@ def _calibration(files: list[Path], to: str | None, out: Path | None) -> None:
         written = (export_calibration(calibration, to, out),)
     for done in written:
         name = f" {done.camera.name}" if len(written) > 1 else ""
-        say(f"{out}:{name} {done.camera.model}\n")
+        say(f"{out}:{name} {to}, model {done.camera.model}\n")
         if done.greatest_px > _SAME:
             rms, most = plain(done.rms_px, 2), plain(done.greatest_px, 2)
             say(f"  differs from the calibration by {rms} px rms, {most} at most")

@@ -29,7 +29,14 @@ class Rotation(StrEnum):
 def fiducials(
     scan: Annotated[Path, typer.Argument(help="Scanned photograph with its borders: TIFF, PNG, JPEG.")],
     design: Annotated[
-        Path, typer.Option("--design", "-d", help="Fiducial marks of the camera (fiducial-design/1).")
+        Path,
+        typer.Option(
+            "--design",
+            "-d",
+            metavar="FILE|NAME",
+            help="Fiducial marks of the camera (fiducial-design/1), or the name of a camera that "
+            "`reseau design fiducials` lists.",
+        ),
     ],
     out: Out = None,
     overlay: Overlay = None,
@@ -64,13 +71,15 @@ def fiducials(
     """
     from ..core.failure import Failure
     from ..core.provenance import sha256_of
+    from ..designs import aerial_camera
     from ..io import FiducialDesign, write_whole
     from ..io.images import open_scan, read_image
     from ..measure.fiducials import FiducialOptions, measure_fiducials
 
     suffix = ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
     drawn = None if overlay is None else overlay_files(overlay, [scan])[scan]
-    camera = FiducialDesign.read(design)
+    named = design.parent == Path() and not design.suffix and not design.exists()
+    camera = aerial_camera(design.name) if named else FiducialDesign.read(design)
     options = FiducialOptions(
         dpi, None if rotation is None else int(rotation.value), mirrored, transform.value
     )

@@ -1,5 +1,6 @@
-"""Targets as designed: reseaus, an ultrasonic test object, coded testfields, space frames, and drawings."""
+"""Targets as designed: reseaus, a test object, testfields, space frames, aerial cameras; their drawings."""
 
+from .aerial import aerial_camera, aerial_cameras
 from .boards import board
 from .frames import space_frame
 from .reseaus import coded_sheet, n_wire_phantom, regular_reseau, standard_reseau, test_object
@@ -10,6 +11,8 @@ __all__ = [
     "HIDDEN",
     "Decoded",
     "TopologicalCode",
+    "aerial_camera",
+    "aerial_cameras",
     "board",
     "coded_sheet",
     "coded_testfield",

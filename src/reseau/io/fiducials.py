@@ -139,6 +139,8 @@ class FiducialDesign(Document):
     ----------
     name : str
         The camera.
+    source : str, optional
+        Where the coordinates come from.
     unit : {"mm"}
         Unit of all lengths.
     marks : dict of str to FiducialMark
@@ -161,6 +163,7 @@ class FiducialDesign(Document):
 
     SCHEMA: ClassVar[str] = "fiducial-design/1"
     name: str
+    source: str | None = None
     unit: Literal["mm"] = "mm"
     marks: dict[str, FiducialMark] = Field(min_length=1)
     points: tuple[FiducialPoint, ...] = Field(min_length=3, max_length=24)

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..bundle import Cause, Explanation, Result, camera_mapping, explain
 from ..bundle.explanations import described
-from ..calibration import CameraMapping, projection_field
+from ..calibration import CameraMapping, ProjectionField, projection_field
 from ..calibration.camera import worst
 from ..core.data import Array, Mask
 from ..core.failure import Code, Remark
@@ -74,6 +74,8 @@ class Assessment:
     centre_px, corners_px : float
         Standard error of the projection in the middle, and in the worst of the corners; of a circular image,
         in the worst place.
+    total : ProjectionField
+        This standard error over the image, with its covariances; the verdict is that of its worst corner.
     circular_deg : float
         Angle from the axis up to which a circular image has rays; 0 where the image fills the frame.
     focal_px : float
@@ -105,6 +107,7 @@ class Assessment:
     use: Use
     centre_px: float
     corners_px: float
+    total: ProjectionField
     circular_deg: float
     focal_px: float
     causes: tuple[Cause, ...]
@@ -245,8 +248,8 @@ def assess(result: Result, camera: int = 0, explanation: Explanation | None = No
     images = int((result.fit.usable.images & (result.network.camera_of == camera)).sum())
     tilt = _tilted(result, camera)
     return Assessment(
-        use, centre, corners, circular, focal, causes, images, tilt, float(seen[lit].mean()), uncovered, then,
-        important, tests,
+        use, centre, corners, total, circular, focal, causes, images, tilt, float(seen[lit].mean()),
+        uncovered, then, important, tests,
     )  # fmt: skip
 
 

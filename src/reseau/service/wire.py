@@ -2,7 +2,7 @@
 
 A message is two lengths (4 bytes each, most significant first), a header in JSON, and bytes. Requests have
 `id` and `do`; answers have the same `id`, and `value` or `error`; events have `event`. The protocol is
-described in `docs/formats.md`, ``reseau-worker/1``.
+described in `docs/formats/service.md`, ``reseau-worker/1``.
 """
 
 from __future__ import annotations

@@ -393,9 +393,12 @@ def exported_lens(
     width, height = lens.size
     pitch_mm = float(stored["pitch_mm"][0])
     best: Exported | None = None
-    why = "no model of the format describes it"
+    rays = "parallel" if lens.mapping.parallel else "central"
+    why = f"its rays are {rays}, which no model of the format describes"
     splined = ((_splined(lens), ()),) if form.splined else ()
     for wanted, names in (*form.models, *splined):
+        if camera_model(wanted).parallel != lens.mapping.parallel:
+            continue
         if not names and best is not None and best.greatest_px < _POOR:
             break
         pitch = _pitch(lens, pitch_mm) if camera_model(wanted).needs_pitch else (1.0, 1.0)
@@ -404,7 +407,7 @@ def exported_lens(
                 lens.mapping, PixelGrid(width, height, pitch), wanted, _options(wanted), free=names
             )
         except UsageError as error:
-            why = str(error)
+            why = error.reason
             continue
         values = dict(zip(done.mapping.names, done.mapping.values.tolist(), strict=True))
         held = {key: values[key] for key in names or values if key in values}

@@ -19,7 +19,7 @@ from ...io import FiducialMark, MarkPart
 from ...optics.formation import Outline, coverage, coverage_derivatives, side_rule
 from ..matching import Window
 
-__all__ = ["MovedOutline", "contours_of", "margin_of", "outlined", "reach_of"]
+__all__ = ["MovedOutline", "boldest_of", "contours_of", "margin_of", "outlined", "reach_of"]
 
 _SIDES = 72
 """Sides of the polygon of a circle."""
@@ -34,6 +34,11 @@ def margin_of(mark: FiducialMark) -> float:
 def reach_of(mark: FiducialMark) -> float:
     """Largest distance of a mark's outline from its point, mm; of a notch, its tooth."""
     return max(float(np.hypot(*part.at)) + _half(part) for part in mark.parts)
+
+
+def boldest_of(mark: FiducialMark) -> float:
+    """Width of the boldest part of a mark, mm: of its lines, or its size."""
+    return max(part.line_width or part.size for part in mark.parts)
 
 
 def _half(part: MarkPart) -> float:

@@ -18,15 +18,16 @@ from ...optics import RationalPolynomial
 from ..film import Kind
 from ..fitting import fit_mapping
 from ..points import Reason
-from .forms import margin_of, reach_of
+from .forms import boldest_of, margin_of, reach_of
 from .result import FiducialResult
 from .search import Attitude, Pattern, attitudes, find_patterns, formed_mark, least_scales
 from .windows import match_marks, tracked
 
 __all__ = ["FiducialOptions", "measure_fiducials"]
 
-_MARK_PX, _LONGEST = 24.0, 3000
-"""Size of the smallest mark with its surroundings in the overview, and largest longer side of that."""
+_MARK_PX, _BOLD_PX, _LONGEST = 24.0, 1.0, 3000
+"""Size of the smallest mark with its surroundings, and width of its boldest part, in the overview; largest
+longer side of that."""
 _STATED, _UNKNOWN = 0.03, 0.08
 """Relative uncertainty of the scale that a file states, and of one step of those that are tried."""
 _NO_TAG = (72.0, 96.0)
@@ -216,8 +217,12 @@ def _at_scale(
     scan: Scan, design: FiducialDesign, options: FiducialOptions, scale: float, within: float
 ) -> list[tuple[Pattern, float]]:
     """Patterns at one scale: those of the best attitude, and of others as good."""
-    smallest = min(2 * (reach_of(mark) + margin_of(mark)) for mark in design.marks.values())
-    r = max(1.0, smallest * scale / _MARK_PX, max(scan.width, scan.height) / _LONGEST)
+    # Thin lines of large marks would vanish in an overview in which the marks are just large enough.
+    smallest = min(
+        min(2 * (reach_of(mark) + margin_of(mark)) / _MARK_PX, boldest_of(mark) / _BOLD_PX)
+        for mark in design.marks.values()
+    )
+    r = max(1.0, smallest * scale, max(scan.width, scan.height) / _LONGEST)
     overview, reduction = scan.overview(int(np.ceil(max(scan.width, scan.height) / r)))
     grey = np.ascontiguousarray(overview.mean(axis=2))
     patterns = find_patterns(
