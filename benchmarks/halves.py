@@ -49,13 +49,10 @@ from reseau.core.failure import Failure
 from reseau.io import BoardDesign
 from reseau.optics import OpenCV
 from reseau.optics.poses import rotation_matrix
-from reseau.procedures.calibration import (
-    Calibrated,
-    CalibrationOptions,
-    CameraOptions,
-    calibrate_camera,
-    measurer_of,
-)
+from reseau.procedures.calibrated import Calibrated
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.calibration_options import CalibrationOptions, CameraOptions
+from reseau.procedures.target_measurement import measurer_of
 
 FOLDER = Path(__file__).parent / "corpus"
 PHOTOGRAPHS = Path(os.environ.get("RESEAU_CORPUS", ""))

@@ -35,7 +35,9 @@ from reseau.calibration import projection_field
 from reseau.core.data import Array, ImagePoints
 from reseau.core.failure import Failure
 from reseau.designs import board
-from reseau.procedures.calibration import Calibrated, CalibrationOptions, CameraOptions, calibrate_camera
+from reseau.procedures.calibrated import Calibrated
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.calibration_options import CalibrationOptions, CameraOptions
 
 FREE = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 HABITS = {

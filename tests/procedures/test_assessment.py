@@ -15,7 +15,9 @@ from reseau.core.failure import Code
 from reseau.designs import coded_sheet
 from reseau.optics import OpenCV
 from reseau.procedures.assessment import Use
-from reseau.procedures.calibration import Calibrated, CalibrationOptions, CameraOptions, calibrate_camera
+from reseau.procedures.calibrated import Calibrated
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.calibration_options import CalibrationOptions, CameraOptions
 
 DESIGN = coded_sheet(9, 8, 20.0)
 SIZE = (800, 600)

@@ -57,7 +57,8 @@ if TYPE_CHECKING:
     from ..core.provenance import Provenance
     from ..execution import Executor
     from ..io import BoardDesign, ReseauDesign, TestfieldDesign
-    from ..procedures.calibration import Calibrated, CalibrationOptions, CameraOptions
+    from ..procedures.calibrated import Calibrated
+    from ..procedures.calibration_options import CalibrationOptions, CameraOptions
     from ..procedures.exposures import Taken
     from ..procedures.target_measurement import Photograph
 
@@ -203,9 +204,9 @@ def calibrate(
     from ..exchange import read_target
     from ..execution import Outputs
     from ..measure import TestfieldOptions
-    from ..procedures.calibration import calibrate_camera, measurer_of
+    from ..procedures.calibration import calibrate_camera
     from ..procedures.exposures import photograph_reader, photographs_of
-    from ..procedures.target_measurement import drawing_overlays
+    from ..procedures.target_measurement import drawing_overlays, measurer_of
 
     outputs(out, report)
     drawn = {} if overlay is None else overlay_files(overlay, files)
@@ -343,7 +344,7 @@ def _options(
     from ..bundle import Options
     from ..exchange import read_control, read_turntable
     from ..io.refraction import RefractionFile
-    from ..procedures.calibration import CalibrationOptions
+    from ..procedures.calibration_options import CalibrationOptions
 
     pairs = []
     for text in leave_out:
@@ -415,7 +416,7 @@ def _camera(
 ) -> CameraOptions:  # fmt: skip
     """Camera model and parameters from the options of the command."""
     from ..bundle import Shutter
-    from ..procedures.calibration import CameraOptions
+    from ..procedures.calibration_options import CameraOptions
 
     options: dict[str, str | float] = {} if side is None else {"side": side}
     for text in more:
