@@ -465,11 +465,8 @@ def _uncertainty(field: ProjectionField) -> str:
 
 
 def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: list[float]) -> None:
-    import numpy as np
-
-    from ..bundle import camera_mapping, projection_field_at
-    from ..calibration import projection_field
-    from ..procedures.assessment import sorted_remarks
+    from ..bundle import projection_field_at
+    from ..calibration.assessment import two_digits
 
     result = done.result
     for name, assessed in done.assessments.items():
@@ -481,17 +478,17 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
         _say_board(done.board, result.network.unit)
     count = sum(len(points) for points in done.measured.values())
     say(f"{len(done.measured)} images, {count} image points, redundancy {result.redundancy}\n")
-    say(f"sigma0 {result.sigma0:.4g}")
-    v = result.residuals[~result.rejected]
-    v = v[np.isfinite(v).all(axis=1)]
-    say(f", residuals {np.sqrt((v**2).mean()):.3g} px rms, {int(result.rejected.sum())} left out\n")
+    say(f"sigma0 {result.sigma0:.4g}, residuals {done.rms:.3g} px rms, ")
+    say(f"{int(result.rejected.sum())} left out\n")
     for c, entry in enumerate(result.network.cameras):
         if len(result.network.cameras) > 1:
             say(f"camera {entry.id}\n")
         say_parameters(result.camera(c))
         say_priors(result.priors(c))
-        field = _uncertainty(projection_field(camera_mapping(result, c)))
-        say(f"uncertainty of the projection: {field.replace(',', ' over the image,')}\n")
+        verdict = done.assessments.get(entry.id)
+        if verdict is not None and verdict.errors is not None:
+            most, usual = two_digits(verdict.errors.greatest_px), two_digits(verdict.errors.median_px)
+            say(f"error of the projection: median {usual} px over the image, at most {most} px\n")
         for away in distances:
             say(
                 f"  at {away:g} {result.network.unit}: {_uncertainty(projection_field_at(result, c, away))}\n"
@@ -511,8 +508,7 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     say_left_out(result)
     for name, why in done.declined.items():
         say(f"left out: {name}: {why}\n")
-    warnings, tests = sorted_remarks(result, done.assessments.values())
-    say("".join(f"{line}\n" for line in remark_lines(warnings, tests)))
+    say("".join(f"{line}\n" for line in remark_lines(done.warnings, done.tests)))
 
 
 def _say_board(choice: BoardChoice, unit: str) -> None:
