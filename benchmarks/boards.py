@@ -42,7 +42,8 @@ from reseau.execution import Executor
 from reseau.io import parse_design
 from reseau.io.images import read_image
 from reseau.measure import ReseauOptions, measure_reseau, measure_testfield
-from reseau.procedures.calibration import calibrate_camera, measurer_of
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.target_measurement import measurer_of
 
 DESIGNS = {"tf": "testfield.design.json", "sheet": "sheet.design.json"}
 DECLINED = {"defoc3", "mirror"}

@@ -21,7 +21,7 @@ from reseau.capture import Step, paper_steps, spread
 from reseau.core.data import Frame
 from reseau.designs import coded_testfield
 from reseau.measure import TestfieldOptions
-from reseau.procedures.calibration import CameraOptions
+from reseau.procedures.calibration_options import CameraOptions
 from reseau.procedures.target_measurement import measurer_of
 from reseau.procedures.testfield import TestfieldProcedure
 from reseau_sims import FieldBench, Station

@@ -45,7 +45,8 @@ from reseau.designs import board
 from reseau.execution import Executor
 from reseau.io import BoardDesign
 from reseau.measure import measure_board
-from reseau.procedures.calibration import calibrate_camera, measurer_of
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.target_measurement import measurer_of
 
 WRONG_PX, WRONG_SIGMA, NORMALISED, SPREAD = 0.15, 5.0, (0.85, 1.2), 0.001
 APRIL, ARUCO = "DICT_APRILTAG_36h11", "DICT_4X4_100"

@@ -24,14 +24,9 @@ from scipy.optimize import linear_sum_assignment
 from reseau.bundle import Camera, Network, Options, Rig, adjust_network, held_as_designed, problem_of
 from reseau.core.data import Array, ImagePoints, Rows
 from reseau.core.failure import Failure
-from reseau.procedures.calibration import (
-    Calibrated,
-    CalibrationOptions,
-    CameraOptions,
-    calibrate_camera,
-    first_camera,
-    network_of,
-)
+from reseau.procedures.calibrated import Calibrated
+from reseau.procedures.calibration import calibrate_camera, first_camera, network_of
+from reseau.procedures.calibration_options import CalibrationOptions, CameraOptions
 from reseau.procedures.exposures import Taken
 
 __all__ = [

@@ -49,13 +49,10 @@ from reseau.core.failure import Failure
 from reseau.io import BoardDesign
 from reseau.optics import OpenCV
 from reseau.optics.poses import rotation_matrix
-from reseau.procedures.calibration import (
-    Calibrated,
-    CalibrationOptions,
-    CameraOptions,
-    calibrate_camera,
-    measurer_of,
-)
+from reseau.procedures.calibrated import Calibrated
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.calibration_options import CalibrationOptions, CameraOptions
+from reseau.procedures.target_measurement import measurer_of
 
 FOLDER = Path(__file__).parent / "corpus"
 PHOTOGRAPHS = Path(os.environ.get("RESEAU_CORPUS", ""))
@@ -142,17 +139,7 @@ def model_of(done: Calibrated) -> CameraOptions:
 
 def causes_of(done: Calibrated) -> str:
     """What the verdict says is wrong."""
-    found = dict(done.calibration().validity.get("assessment", {}))
-    if "causes" in found:
-        return ", ".join(f"{each['code']} {each.get('amount_px') or 0:.2g} px" for each in found["causes"])
-    causes = []
-    if not found.get("fits", True):
-        causes.append(f"misfit {found['misfit_px']:.2g} px")
-    if found.get("lacks"):
-        causes.append(f"lacks {found['lacks']} {found['lacks_px']:.2g} px")
-    if found.get("scatter", 1.0) > 1.5:
-        causes.append(f"images scatter {found['scatter']:.1f}×")
-    return ", ".join(causes)
+    return ", ".join(f"{each.code} {each.amount_px:.2g} px" for each in done.explanation.causes)
 
 
 # Sets

@@ -105,7 +105,8 @@ def film() -> Callable[[], Accuracy]:
 def calibration() -> Callable[[], Accuracy]:
     """Calibrate a camera from measured points of 36 images."""
     from reseau.core.data import ImagePoints
-    from reseau.procedures.calibration import CameraOptions, calibrate_camera
+    from reseau.procedures.calibration import calibrate_camera
+    from reseau.procedures.calibration_options import CameraOptions
     from reseau.procedures.target_measurement import measurer_of
     from reseau_sims import FieldBench, paper_stations
 

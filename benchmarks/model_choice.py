@@ -23,7 +23,10 @@ from worlds import lenses
 from reseau.bundle import camera_mapping
 from reseau.core.data import Array, ImagePoints
 from reseau.designs import board
-from reseau.procedures.calibration import Calibrated, CameraOptions, calibrate_camera, measurer_of
+from reseau.procedures.calibrated import Calibrated
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.calibration_options import CameraOptions
+from reseau.procedures.target_measurement import measurer_of
 
 NOISE, VIEWS, SIZE, PITCH_MM = 0.05, 15, (1280, 960), 0.004
 FRAME, BROWN = ("fx", "fy", "cx", "cy"), ("c", "x0", "y0")

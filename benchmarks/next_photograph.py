@@ -35,7 +35,9 @@ from reseau.calibration import projection_field
 from reseau.core.data import Array, ImagePoints
 from reseau.core.failure import Failure
 from reseau.designs import board
-from reseau.procedures.calibration import Calibrated, CalibrationOptions, CameraOptions, calibrate_camera
+from reseau.procedures.calibrated import Calibrated
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.calibration_options import CalibrationOptions, CameraOptions
 
 FREE = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 HABITS = {
@@ -263,6 +265,7 @@ def as_taken(world: World, done: Calibrated) -> Taken:
     """The proposed pose, in the system of the true coordinates."""
     then = done.assessments["camera"].next_photograph
     assert then is not None
+    assert then.pose is not None
     names, points = list(done.result.network.points), done.result.fit.values.xyz
     ours = np.array([points[names.index(name)] for name in world.names if name in names])
     true = np.array([xyz for name, xyz in zip(world.names, world.xyz, strict=True) if name in names])
@@ -346,7 +349,7 @@ def judged(target: str, seed: int) -> Row | str:
     corners = camera_mapping(again.result, 0)
     return Row(
         seed, world.habit, len(photographs), judge.before, best, median, judge.after(pose), then.worst_px,
-        float(projection_field(corners, 13).worst_px), judge.error(done), judge.error(again), then.words,
+        float(projection_field(corners, 13).worst_px), judge.error(done), judge.error(again), then.text,
         world.can_be_taken(pose), seconds,
     )  # fmt: skip
 

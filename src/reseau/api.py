@@ -42,7 +42,9 @@ from .measure import (
 )
 from .measure.points import Measured
 from .procedures import oscilloscope as _procedure
-from .procedures.calibration import Calibrated, CalibrationOptions, CameraOptions, calibrate_camera
+from .procedures.calibrated import Calibrated
+from .procedures.calibration import calibrate_camera
+from .procedures.calibration_options import CalibrationOptions, CameraOptions
 from .procedures.exposures import photograph_reader, photographs_of
 from .procedures.film_frame import FrameOptions, FrameResult, orient_scan
 from .procedures.oscilloscope import PhotoI, PhotoII, PhotoIII

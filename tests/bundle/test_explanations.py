@@ -11,7 +11,9 @@ import pytest
 from reseau.bundle import explain, misnamed
 from reseau.core.data import Array, ImagePoints
 from reseau.designs import coded_sheet
-from reseau.procedures.calibration import Calibrated, CalibrationOptions, CameraOptions, calibrate_camera
+from reseau.procedures.calibrated import Calibrated
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.calibration_options import CalibrationOptions, CameraOptions
 
 DESIGN = coded_sheet(9, 7, 20.0)
 SIZE, SIGMA = (800, 600), 0.03

@@ -20,7 +20,7 @@ from reseau.designs import coded_testfield
 from reseau.instruments import AxisState, BScan, Deadline, Device, Settings, Status
 from reseau.io import TestfieldDesign
 from reseau.measure import TestfieldOptions
-from reseau.procedures.calibration import CameraOptions
+from reseau.procedures.calibration_options import CameraOptions
 from reseau.procedures.target_measurement import measurer_of
 from reseau.procedures.testfield import TestfieldProcedure
 from reseau_sims import FieldBench, Station

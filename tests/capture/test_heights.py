@@ -11,7 +11,7 @@ import pytest
 from reseau.archive import Archive, Session
 from reseau.capture import Step, at_heights, carry_out, plans, rerun
 from reseau.core.errors import EstimationError
-from reseau.procedures.calibration import Calibrated
+from reseau.procedures.calibrated import Calibrated
 from reseau_sims import FieldBench
 
 from .fieldrig import AXES, FieldRig

@@ -15,7 +15,8 @@ from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry, Step,
 from reseau.capture.bench import built
 from reseau.designs import coded_testfield
 from reseau.instruments import Instrument
-from reseau.procedures.calibration import CalibrationOptions, CameraOptions, calibrate_camera
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.calibration_options import CalibrationOptions, CameraOptions
 from reseau.procedures.target_measurement import measurer_of
 from reseau_drivers.camera import v4l2
 from reseau_sims import Water

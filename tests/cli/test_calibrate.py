@@ -57,7 +57,7 @@ def test_the_calibration_is_within_its_sigmas_of_the_truth(
     assert (status, err) == (0, "")
     assert out.startswith("usable for ")
     assert "\n12 images, " in out
-    assert "uncertainty of the projection: median" in out
+    assert "error of the projection: median" in out
     found = Calibration.read(tmp_path / "K.json")
     assert found.sigma0 == pytest.approx(1.0, abs=0.05)
     true = dict(zip(BENCH.camera.names, BENCH.camera.values, strict=True))

@@ -23,7 +23,7 @@ from reseau.core.failure import Code, Failure
 from reseau.designs import board
 from reseau.io.images import write_image
 from reseau.optics import OpenCV, Pose, project
-from reseau.procedures.calibration import CameraOptions
+from reseau.procedures.calibration_options import CameraOptions
 from reseau.procedures.watching import Seen, Watching
 from reseau.service.live import LivePage
 from reseau_sims.serving import SimulatedCamera, StillScene, VideoCamera, View
@@ -281,7 +281,7 @@ def test_a_signal_at_any_moment_loses_no_frame_and_ends_with_what_was_taken(
         at("write")
 
     monkeypatch.setattr("reseau.cli.watch._bench", lambda *_: Alone())
-    monkeypatch.setattr("reseau.procedures.calibration.measurer_of", lambda _: measured)
+    monkeypatch.setattr("reseau.procedures.target_measurement.measurer_of", lambda _: measured)
     monkeypatch.setattr("reseau.io.images.write_image", written)
     shown = LivePage.show
     monkeypatch.setattr(LivePage, "show", lambda *given: (at("show"), shown(*given)))

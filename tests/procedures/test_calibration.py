@@ -9,7 +9,9 @@ from reseau.core.data import Frame
 from reseau.core.errors import UsageError
 from reseau.core.failure import Code, Failure
 from reseau.measure.points import Measured
-from reseau.procedures.calibration import Calibrated, CameraOptions, calibrate_camera
+from reseau.procedures.calibrated import Calibrated
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.calibration_options import CameraOptions
 from reseau_sims import FieldBench, Station
 
 BENCH = FieldBench(seed=8, bend_mm=0.0)

@@ -12,7 +12,9 @@ from reseau.core.failure import Code, Failure
 from reseau.designs import coded_testfield
 from reseau.optics import Brown, PixelGrid, Pose, project
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
-from reseau.procedures.calibration import Calibrated, CalibrationOptions, CameraOptions, calibrate_camera
+from reseau.procedures.calibrated import Calibrated
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.calibration_options import CalibrationOptions, CameraOptions
 from reseau.procedures.z_stage import Heights
 
 DESIGN = coded_testfield()

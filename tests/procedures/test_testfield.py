@@ -9,7 +9,8 @@ from reseau.core.data import Frame
 from reseau.core.errors import ImageError, UsageError
 from reseau.core.failure import Code, Failure
 from reseau.measure import TestfieldOptions
-from reseau.procedures.calibration import CameraOptions, calibrate_camera
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.calibration_options import CameraOptions
 from reseau.procedures.target_measurement import measured_in_order, measurer_of
 from reseau_sims import FieldBench, Station
 

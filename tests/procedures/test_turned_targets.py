@@ -9,7 +9,9 @@ import pytest
 from reseau.core.data import ImagePoints
 from reseau.designs import board
 from reseau.io import BoardDesign
-from reseau.procedures.calibration import Calibrated, CameraOptions, calibrate_camera
+from reseau.procedures.calibrated import Calibrated
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.calibration_options import CameraOptions
 from reseau.procedures.turned_targets import ways_to_turn
 
 SIGMA, TRUE = 0.01, {"fx": 700.0, "fy": 702.0, "cx": 402.0, "cy": 297.0}

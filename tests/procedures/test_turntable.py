@@ -10,7 +10,8 @@ from reseau.core.data import Array, ImagePoints
 from reseau.core.failure import Code, Failure
 from reseau.optics import Brown, PixelGrid
 from reseau.optics.poses import project
-from reseau.procedures.calibration import CameraOptions, calibrate_camera
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.calibration_options import CameraOptions
 from reseau.procedures.turntable import Mount
 
 SIGMA = 0.006

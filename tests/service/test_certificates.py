@@ -16,7 +16,7 @@ import pytest
 
 from reseau.adjust import validate
 from reseau.archive import Archive
-from reseau.calibration import Calibration
+from reseau.calibration import Assessment, Calibration, Use
 from reseau.cli import run
 from reseau.core.data import ImagePoints
 from reseau.core.errors import FormatError, UsageError
@@ -74,14 +74,16 @@ FULL = BARE | {
 }  # fmt: skip
 
 
+VERDICT = Assessment(use=Use.MEASUREMENT, lines=(), centre_px=0.004, corners_px=0.02)
+
+
 def calibration(**values: float) -> Calibration:
     made = camera(begun=BEGUN, **values)
     more = {
         "sigma_between_images": {"c": 1.5e-4, "x0": 1.2e-4, "y0": 0.9e-4, "K1": 2.2e-6},
         "images": 12,
-        "assessment": {"use": "measurement", "misfit_px": 0.004},
     }
-    return made.model_copy(update={"validity": made.validity | more})
+    return made.model_copy(update={"validity": made.validity | more, "assessment": VERDICT})
 
 
 def certificate(data: dict[str, Any] = FULL, **options: Any) -> Certificate:

@@ -92,7 +92,7 @@ class Elimination:
     criterion: str
     alpha: float
 
-    def __bool__(self) -> bool:
+    def __bool__(self) -> Literal[True]:
         return True
 
     @property

@@ -8,7 +8,7 @@ adjusted observations, block by block.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,7 +37,7 @@ class Fitted:
     scale: str
     solution: Any
 
-    def __bool__(self) -> bool:
+    def __bool__(self) -> Literal[True]:
         return True
 
     def required(self) -> Self:

@@ -60,7 +60,7 @@ class Robust(Generic[F]):
     scale: float
     iterations: int
 
-    def __bool__(self) -> bool:
+    def __bool__(self) -> Literal[True]:
         return True
 
     def required(self) -> Robust[F]:
@@ -257,7 +257,7 @@ class Rejection(Generic[F]):
     steps: tuple[SnoopingStep, ...]
     rounds: int
 
-    def __bool__(self) -> bool:
+    def __bool__(self) -> Literal[True]:
         return True
 
     def required(self) -> Rejection[F]:

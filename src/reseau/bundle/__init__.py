@@ -23,7 +23,7 @@ from .diagnostics import (
     regularised,
 )
 from .document import ResultDocument, model_search_entries
-from .explanations import Cause, Explanation, Misnamed, explain, misnamed
+from .explanations import Explanation, Misnamed, explain, misnamed
 from .modelling import (
     BoardChoice,
     BoardModel,
@@ -72,7 +72,6 @@ __all__ = [
     "Camera",
     "CameraEstimate",
     "Candidate",
-    "Cause",
     "CommonPattern",
     "Compared",
     "ControlPoints",

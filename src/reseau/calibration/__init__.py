@@ -1,5 +1,6 @@
 """The calibration: one document and one reader, which gives a mapping with covariance; apply, compare."""
 
+from .assessment import Assessment, Cause, ErrorMap, NextPhotograph, Use, required_use
 from .camera import CameraMapping, ProjectionField, projection_field
 from .compare import FieldDifference, calibration_difference
 from .conversion import in_model_of
@@ -16,23 +17,28 @@ from .sensor import Fields, SensorCorrection
 from .tables import remap_tables, undistort_video, write_tables
 
 __all__ = [
+    "Assessment",
     "CalibratedMapping",
     "Calibration",
     "CameraCorrection",
     "CameraMapping",
+    "Cause",
     "CorrectedImage",
     "Covariance",
     "Datum",
+    "ErrorMap",
     "FiducialMapping",
     "FieldDifference",
     "Fields",
     "FilmFrameMapping",
     "InstrumentCorrection",
     "LocalModel",
+    "NextPhotograph",
     "ObjectPlane",
     "ProjectionField",
     "Quantity",
     "SensorCorrection",
+    "Use",
     "calibration_difference",
     "calibration_of_fiducials",
     "calibration_of_frame",
@@ -42,6 +48,7 @@ __all__ = [
     "projection_field",
     "read_calibration",
     "remap_tables",
+    "required_use",
     "scan_coordinates",
     "scan_pixels",
     "undistort_video",

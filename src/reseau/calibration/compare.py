@@ -8,26 +8,33 @@ Two calibrations are compared after the rotation that brings the rays of one nea
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
 from ..core.data import Array, Mask
+from ..core.display import Display
 from ..core.errors import UsageError
 from ..optics.poses import rotation_matrix
 from .camera import CameraMapping, by_rotation, places, referred, worst
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["FieldDifference", "calibration_difference"]
 
 # Standard deviations, relative to the largest, that are rounding errors.
 _RANK = 1e-6
 _ROUNDS = 6
+_ARROWS = 13
+_SURE = 0.01
+"""Level at which the difference at a single place is marked as significant."""
 
 
-@dataclass(frozen=True, eq=False)
-class FieldDifference:
+@dataclass(frozen=True, eq=False, repr=False)
+class FieldDifference(Display):
     """Difference of two independent calibrations over the image.
 
     Parameters
@@ -50,8 +57,10 @@ class FieldDifference:
     --------
     >>> one = np.array([[[[0.04, 0.0], [0.0, 0.04]]]])
     >>> found = FieldDifference(np.zeros((1, 1, 2)), np.full((1, 1, 2), 0.2), one, np.zeros(3), 2.0, 2)
-    >>> round(found.p, 3), found.p_at.round(3)
-    (0.368, array([[0.368]]))
+    >>> found
+    <FieldDifference: 0.28 px rms, 0.28 px at most, probability if it is one camera 0.37>
+    >>> found.p_at.round(3)
+    array([[0.368]])
     """
 
     xy: Array
@@ -61,6 +70,28 @@ class FieldDifference:
     statistic: float
     degrees: float
     dof: float = float("inf")
+
+    @property
+    def size(self) -> Array:
+        """Lengths (rows, columns) of the differences, px."""
+        return np.asarray(np.hypot(*np.moveaxis(self.difference, 2, 0)))
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the lengths of the differences."""
+        return float(np.sqrt(np.nanmean(self.size**2)))
+
+    @property
+    def greatest_px(self) -> float:
+        """The longest difference."""
+        return float(np.nanmax(self.size))
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
+            (f"{self.rms_px:.2g} px rms", ""),
+            (f"{self.greatest_px:.2g} px at most", ""),
+            ("probability if it is one camera", f"{self.p:.2g}"),
+        ]
 
     @property
     def sigma(self) -> Array:
@@ -81,6 +112,39 @@ class FieldDifference:
         square = np.einsum("ni,ni->n", d, np.linalg.solve(self.cov[known], d[:, :, None])[:, :, 0])
         p[known] = _tail(2, self.dof, square)
         return p
+
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the differences, enlarged, over their standard deviation with matplotlib.
+
+        Those that are significant at 1 % are in red.
+
+        Parameters
+        ----------
+        axes : matplotlib Axes, optional
+            Axes to draw into; by default those of a new figure.
+        """
+        from ..core.figures import ACCENT, INK, draw_contours, image_axes, new_axes, nice
+
+        axes = new_axes(axes)
+        if np.nanmax(self.sigma) > 0:
+            draw_contours(axes, self.xy, self.sigma)
+        step = max(1, self.xy.shape[1] // _ARROWS)
+        part = (slice(step // 2, None, step), slice(step // 2, None, step))
+        xy, d = (values[part].reshape(-1, 2) for values in (self.xy, self.difference))
+        p, size = self.p_at[part].ravel(), self.size[part].ravel()
+        typical = float(np.nanquantile(size, 0.8))
+        pitch = float(self.xy[0, step, 0] - self.xy[0, 0, 0])
+        enlarged = nice(pitch / typical) if typical > 0 else 1.0
+        for sure, colour in ((False, INK), (True, ACCENT)):
+            chosen = np.isfinite(size) & ((p < _SURE) == sure)
+            axes.quiver(
+                *xy[chosen].T, *(enlarged * d[chosen]).T, color=colour, angles="xy", scale_units="xy",
+                scale=1, width=0.003, zorder=4,
+            )  # fmt: skip
+        title = f"difference × {enlarged:g} over its σ / px; longest {np.nanmax(size):.2g} px"
+        width, height = (self.xy[-1, -1] + 1).tolist()
+        image_axes(axes, width, height, title)
+        return axes
 
 
 def calibration_difference(

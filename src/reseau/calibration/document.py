@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NotRequired, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator, with_config
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from ..core.data import Array
 from ..core.display import data_frame
-from ..core.errors import FormatError
+from ..core.errors import FormatError, UsageError
+from ..core.lazy import above
 from ..core.numbers import measured
 from ..io import Document, Strict
+from ..optics.cameras import opencv_coefficients
+from .assessment import Assessment, required_use
 from .mapping import CalibratedMapping
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from ..exchange.calibrations import Exported
+    from .compare import FieldDifference
 
 __all__ = [
     "Calibration",
@@ -64,12 +73,28 @@ class Covariance(Strict):
 
     Examples
     --------
-    >>> Covariance(names=("c",), matrix=((1.6e-7,),)).names
-    ('c',)
+    >>> found = Covariance(names=("c",), matrix=((1.6e-7,),))
+    >>> found.names, np.sqrt(np.diag(found))
+    (('c',), array([0.0004]))
     """
 
     names: tuple[str, ...]
     matrix: tuple[tuple[float, ...], ...]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+        """The matrix (u, u), for ``numpy.asarray``."""
+        return np.array(self.matrix, dtype=dtype).reshape(len(self.names), len(self.names))
+
+    def to_dataframe(self) -> Any:
+        """Return the matrix as a pandas data frame with the names of the parameters on both sides.
+
+        Raises
+        ------
+        UsageError
+            When pandas is not installed.
+        """
+        frame = data_frame(dict(zip(self.names, np.asarray(self).T.tolist(), strict=True)))
+        return frame.set_axis(list(self.names), axis=0)
 
 
 class Place(Strict):
@@ -206,7 +231,8 @@ def _table(calibration: Calibration) -> str:
         for name, q in calibration.parameters.items()
     }
     rows = "".join(f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>" for name, text in shown.items())
-    return f"<table><caption>{escape(calibration.kind)} {escape(calibration.name)}</caption>{rows}</table>"
+    table = f"<table><caption>{escape(calibration.kind)} {escape(calibration.name)}</caption>{rows}</table>"
+    return table if calibration.assessment is None else calibration.assessment._repr_html_() + table
 
 
 class Calibration(Document):
@@ -214,6 +240,7 @@ class Calibration(Document):
 
     `kind` says what was calibrated, `model` what the parameters belong to; :meth:`mapping` gives both as a
     mapping of points, images or frames. `place` is that of a camera on a rig.
+    `assessment` is the verdict on that of a camera; imported ones have none.
     `times` alone holds clock times: without it, the same inputs give the same bytes. Files of earlier
     versions are read too: the kind of a sensor was ``camera``, that of a film frame ``frame``.
 
@@ -240,8 +267,22 @@ class Calibration(Document):
     place: Place | None = None
     tests: tuple[dict[str, Any], ...] = ()
     validity: dict[str, Any] = Field(default_factory=dict)
+    assessment: Assessment | None = None
     provenance: dict[str, Any] = Field(default_factory=dict)
     times: dict[str, str] = Field(default_factory=dict)
+
+    @classmethod
+    def from_content(cls, content: Any, *, where: object) -> Self:
+        """As for every document; earlier versions had the assessment, with other keys, in the validity."""
+        validity = content.get("validity") if isinstance(content, dict) else None
+        if isinstance(validity, dict) and isinstance(validity.get("assessment"), dict):
+            found = validity["assessment"]
+            kept = {key: found[key] for key in Assessment.model_fields if key in found}
+            content = content | {
+                "validity": {key: value for key, value in validity.items() if key != "assessment"},
+                "assessment": kept,
+            }
+        return super().from_content(content, where=where)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -276,7 +317,8 @@ class Calibration(Document):
     def __repr__(self) -> str:
         estimated = f"{len(self.covariance.names)} of {len(self.parameters)} parameters estimated"
         sigma0 = "" if self.sigma0 is None else f", sigma0 {self.sigma0:.3f}"
-        return f"<Calibration: {self.kind} {self.name!r}, {estimated}{sigma0}>"
+        verdict = "" if self.assessment is None else f", {self.assessment.short}"
+        return f"<Calibration: {self.kind} {self.name!r}{verdict}, {estimated}{sigma0}>"
 
     def _repr_html_(self) -> str:
         return _table(self)
@@ -292,17 +334,33 @@ class Calibration(Document):
         rows = [(name, q.value, q.sigma, q.unit) for name, q in self.parameters.items()]
         return data_frame(dict(zip(("name", "value", "sigma", "unit"), zip(*rows, strict=True), strict=True)))
 
-    def plot(self, axes: Axes | None = None) -> Axes:
-        """Draw the uncertainty of the calibration over the image with matplotlib.
+    def summary(self) -> str:
+        """What it is good for, and its parameters with their standard deviations, in lines of text."""
+        verdict = (
+            ("no verdict",) if self.assessment is None else self.assessment.lines or (self.assessment.short,)
+        )
+        rows = (f"  {name:8} {measured(q.value, q.sigma, q.unit)}" for name, q in self.parameters.items())
+        return "\n".join((f"{self.kind} {self.name}", *verdict, *rows))
 
-        See :meth:`CalibratedMapping.plot`.
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw the error of the projection over the image with matplotlib.
+
+        With a verdict that has a map, it is the total error; in a new figure the formal standard deviation
+        is drawn beside it. Otherwise it is the standard deviation, see :meth:`CalibratedMapping.plot`.
 
         Parameters
         ----------
         axes : matplotlib Axes, optional
             Axes to draw into; by default those of a new figure.
+
+        Returns
+        -------
+        matplotlib Axes
+            Those of the first map.
         """
-        return self.mapping().plot(axes)
+        if self.assessment is None or self.assessment.errors is None:
+            return self.mapping().plot(axes)
+        return self.assessment.plot(axes)
 
     def mapping(self) -> CalibratedMapping:
         """The mapping that this calibration describes.
@@ -320,3 +378,157 @@ class Calibration(Document):
         if self.kind not in _READERS:
             raise FormatError(f"of the kind {self.kind!r} has no mapping", where=f"calibration {self.name}")
         return _READERS[self.kind](self)
+
+    @property
+    def camera_matrix(self) -> Array:
+        """OpenCV's camera matrix (3, 3).
+
+        Raises
+        ------
+        UsageError
+            When the model is not one of OpenCV.
+        """
+        fx, fy, cx, cy = (self._of_opencv("camera_matrix")[name] for name in ("fx", "fy", "cx", "cy"))
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def dist_coeffs(self) -> Array:
+        """OpenCV's coefficients of distortion: 5, 8, 12 or 14; of a ``fisheye`` the 4 of ``cv2.fisheye``.
+
+        Raises
+        ------
+        UsageError
+            When the model is not one of OpenCV.
+        """
+        values = self._of_opencv("dist_coeffs")
+        if self._named_model == "fisheye":
+            return np.array([values.get(f"k{i}", 0.0) for i in range(1, 5)])
+        return np.array(opencv_coefficients(values))
+
+    @property
+    def _named_model(self) -> str:
+        return str(self.model.get("model", self.kind))
+
+    def _of_opencv(self, asked: str) -> dict[str, float]:
+        """The values of a model of OpenCV."""
+        if self.kind != "camera":
+            raise UsageError(self.not_of("camera"), where=f"calibration {self.name}")
+        if self._named_model not in ("opencv", "opencv_full", "fisheye") or "additional" in self.model:
+            raise UsageError(
+                f"the model {self._named_model} has none in the sense of OpenCV",
+                where=f"{asked} of calibration {self.name}",
+                do='export(path, to="opencv") converts it, and states the difference',
+            )
+        return self.values()
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals of an image coordinate, px; NaN where it is not known."""
+        return float(self.validity.get("rms_px", float("nan")))
+
+    def undistort(
+        self,
+        image: NDArray[Any],
+        fov: Literal["keep", "all"] | float = "keep",
+        *,
+        scale: float = 1.0,
+        alpha: float | None = None,
+        anyway: bool = False,
+    ) -> NDArray[Any]:
+        """Return an image of the camera without distortion.
+
+        Parameters
+        ----------
+        image : ndarray (h, w) or (h, w, channels)
+            The image, with channels in any order.
+        fov, scale, alpha
+            Field of view and resolution, as for :meth:`reseau.calibration.CorrectedImage.undistorted`.
+        anyway : bool
+            Whether to go on with a calibration that is usable for nothing.
+
+        Raises
+        ------
+        UsageError
+            When the calibration is not that of a camera or, unless `anyway`, usable for nothing, or the image
+            has another size.
+        """
+        self._usable("applied", anyway)
+        done: NDArray[Any] = above("reseau.calibration.raster:undistort")(
+            image, self, fov, scale=scale, alpha=alpha
+        )
+        return done
+
+    def compare(self, other: Calibration) -> FieldDifference:
+        """Return the difference of another, independent calibration of the camera over the image.
+
+        Parameters
+        ----------
+        other : Calibration
+            Calibration of images of the same size; its model may be another one.
+
+        Raises
+        ------
+        UsageError
+            When one is not that of a camera, or the images differ in size.
+        """
+        for each in (self, other):
+            if each.kind != "camera":
+                raise UsageError(each.not_of("camera"), where=f"calibration {each.name}")
+        found: FieldDifference = above("reseau.calibration.compare:calibration_difference")(
+            self.mapping(), other.mapping()
+        )
+        return found
+
+    def export(self, path: Path | str, *, to: str, anyway: bool = False) -> Exported:
+        """Write the calibration of a camera for another program.
+
+        Parameters
+        ----------
+        path : path
+            File to write.
+        to : str
+            Name of the format, as ``opencv``, ``ros`` or ``colmap``; see
+            :func:`reseau.exchange.calibrations.calibration_formats`.
+        anyway : bool
+            Whether to go on with a calibration that is usable for nothing.
+
+        Returns
+        -------
+        Exported
+            The camera as it was written, and how much that differs from the calibration.
+
+        Raises
+        ------
+        UsageError
+            When the format is not known, the calibration is not that of a camera or, unless `anyway`, usable
+            for nothing.
+        InputError
+            When the file cannot be written.
+        """
+        done: Exported = above("reseau.exchange.calibrations:export_calibration")(
+            self, to, path, anyway=anyway
+        )
+        for line in done.notes:
+            warnings.warn(line, stacklevel=2)
+        return done
+
+    def _usable(self, doing: str, anyway: bool) -> None:
+        """Refuse what is usable for nothing; warn of what is usable for less than measurement."""
+        for line in required_use([(self.name, self.assessment)], doing, anyway=anyway):
+            warnings.warn(line, stacklevel=3)
+
+    def write(self, path: Path | str) -> None:
+        """Write the calibration, ``reseau-calibration/1``.
+
+        Raises
+        ------
+        UsageError
+            When the suffix is that of another format; :meth:`export` writes those.
+        InputError
+            When the file cannot be written.
+        """
+        if Path(path).suffix.lower() not in ("", ".json"):
+            raise UsageError(
+                "is not .json", where=path, do='export(path, to="opencv") writes the files of other programs'
+            )
+        super().write(path)

@@ -6,7 +6,7 @@ Equations (5a, b) of Wishahy's paper as they are applied and stored; :mod:`resea
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Protocol, Self, cast
+from typing import Any, ClassVar, Final, Literal, Protocol, Self, cast
 
 import numpy as np
 
@@ -139,7 +139,7 @@ class CameraCorrection(CalibratedMapping):
     size: tuple[int, int] | None = None
     datum: Datum | None = None
 
-    def __bool__(self) -> bool:
+    def __bool__(self) -> Literal[True]:
         return True
 
     def required(self) -> Self:

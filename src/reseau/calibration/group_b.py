@@ -6,7 +6,7 @@ Equations (7a, b) of Wishahy's paper as they are applied and stored; :mod:`resea
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self, cast
+from typing import Any, ClassVar, Literal, Self, cast
 
 import numpy as np
 
@@ -123,7 +123,7 @@ class InstrumentCorrection(CalibratedMapping):
     local: LocalModel | None = None
     fit: FitRecord | None = None
 
-    def __bool__(self) -> bool:
+    def __bool__(self) -> Literal[True]:
         return True
 
     def required(self) -> Self:

@@ -24,7 +24,7 @@ from .film import FilmFrameMapping
 from .group_a import CameraCorrection
 from .mapping import BEYOND, CalibratedMapping
 
-__all__ = ["CorrectedImage", "planes_of", "undistorted_camera", "write_corrected"]
+__all__ = ["CorrectedImage", "planes_of", "undistort", "undistorted_camera", "write_corrected"]
 
 _BAND = 256
 _ROUNDING = 1e-6
@@ -340,6 +340,10 @@ def undistorted_camera(
         sigma0=None,
         redundancy=0,
         validity=validity,
+        # It is as accurate as that which it comes from; places and photographs are those of the other image.
+        assessment=None
+        if calibration.assessment is None
+        else calibration.assessment.model_copy(update={"errors": None, "next_photograph": None}),
         provenance=provenance or {},
     )
 
@@ -409,20 +413,59 @@ def write_corrected(
         raise ImageError(f"cannot hold grey values of type {dtype}", where=path, do="use .tif")
     shape = (raster.height, raster.width)
 
-    def bands() -> Iterator[NDArray[Any]]:
-        parts = (resample(plane, raster.to_source, shape, band=_BAND) for plane in planes)
-        for channels in zip(*parts, strict=True):
-            yield channels[0] if len(channels) == 1 else np.stack(channels, axis=-1)
-            step()
-
-    full = shape if len(planes) == 1 else (*shape, len(planes))
+    bands = _bands(planes, raster, step)
     if suffix in (".tif", ".tiff"):
-        _write_tiff(path, bands(), raster, full, dtype)
-        return
-    whole = np.empty(full, dtype=dtype)
-    for k, band in enumerate(bands()):
-        whole[k * _BAND : k * _BAND + len(band)] = band
-    write_image(path, whole)
+        full = shape if len(planes) == 1 else (*shape, len(planes))
+        _write_tiff(path, bands, raster, full, dtype)
+    else:
+        write_image(path, np.concatenate(list(bands)))
+
+
+def _bands(
+    planes: Sequence[NDArray[Any]], raster: CorrectedImage, step: Callable[[], None] = lambda: None
+) -> Iterator[NDArray[Any]]:
+    """The corrected image band by band."""
+    shape = (raster.height, raster.width)
+    parts = (resample(plane, raster.to_source, shape, band=_BAND) for plane in planes)
+    for channels in zip(*parts, strict=True):
+        yield channels[0] if len(channels) == 1 else np.stack(channels, axis=-1)
+        step()
+
+
+def undistort(
+    image: NDArray[Any],
+    calibration: Calibration,
+    fov: Literal["keep", "all"] | float = "keep",
+    *,
+    scale: float = 1.0,
+    alpha: float | None = None,
+) -> NDArray[Any]:
+    """Return an image without the distortion of a camera.
+
+    Parameters
+    ----------
+    image : ndarray (h, w) or (h, w, channels)
+        The image, with channels in any order.
+    calibration : Calibration
+        That of the camera.
+    fov, scale, alpha
+        As for :meth:`CorrectedImage.undistorted`.
+
+    Raises
+    ------
+    UsageError
+        When the calibration is of another kind, or the image of another size.
+    """
+    lens = calibration.mapping()
+    if not isinstance(lens, CameraMapping):
+        raise UsageError(calibration.not_of("camera"), where=f"calibration {calibration.name}")
+    if image.ndim not in (2, 3):
+        raise UsageError(
+            f"has the shape {image.shape}", where="image", do="give (height, width), or with channels last"
+        )
+    lens.check_size(image.shape[1], image.shape[0], "image")
+    planes = [image] if image.ndim == 2 else list(np.moveaxis(image, 2, 0))
+    return np.concatenate(list(_bands(planes, CorrectedImage.undistorted(lens, fov, scale, alpha))))
 
 
 def _write_tiff(

@@ -10,6 +10,7 @@ import typer
 from ..core.errors import UsageError
 from .calibrations import time_of
 from .common import (
+    Anyway,
     AsJson,
     ObjectsPlace,
     Out,
@@ -112,6 +113,7 @@ def apply(
         str | None,
         typer.Option(help="With --archive: when the image was taken, such as 2026-03-29T08:00Z."),
     ] = None,
+    anyway: Anyway = False,
     as_json: AsJson = False,
 ) -> None:
     """Apply a calibration to points or to an image.
@@ -120,7 +122,7 @@ def apply(
     resampled: without distortion (camera), in the system of the reseau (oscilloscope), or in millimetres of
     the frame (film frame, fiducial marks). With the calibration of a sensor, the grey values are corrected.
     """
-    from ..calibration import SensorCorrection, read_calibration
+    from ..calibration import SensorCorrection, read_calibration, required_use
     from ..core.provenance import sha256_of
     from ..io import is_points
     from ..io.stacks import VIDEOS
@@ -135,6 +137,9 @@ def apply(
         stored, origin = read_calibration(calibration), {calibration.name: sha256_of(calibration)}
     else:
         stored, origin = _in_force(archive, objects, str(calibration), at)
+    if stored.kind == "camera":
+        for line in required_use([(stored.name, stored.assessment)], "applied", anyway=anyway):
+            typer.echo(f"note: {line}", err=True)
     view = _View(_fov(fov), scale, alpha)
     if alpha is not None and fov != "keep":
         raise UsageError("cannot be combined", where="--fov and --alpha")

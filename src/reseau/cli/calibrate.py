@@ -56,7 +56,8 @@ if TYPE_CHECKING:
     from ..core.provenance import Provenance
     from ..execution import Executor
     from ..io import BoardDesign, ReseauDesign, TestfieldDesign
-    from ..procedures.calibration import Calibrated, CalibrationOptions, CameraOptions
+    from ..procedures.calibrated import Calibrated
+    from ..procedures.calibration_options import CalibrationOptions, CameraOptions
     from ..procedures.exposures import Taken
     from ..procedures.target_measurement import Photograph
 
@@ -215,9 +216,9 @@ def calibrate(
     from ..execution import Outputs
     from ..io import write_whole
     from ..measure import TestfieldOptions
-    from ..procedures.calibration import calibrate_camera, measurer_of
+    from ..procedures.calibration import calibrate_camera
     from ..procedures.exposures import photograph_reader, photographs_of
-    from ..procedures.target_measurement import drawing_overlays
+    from ..procedures.target_measurement import drawing_overlays, measurer_of
     from ..report.bundle import bundle_report
     from ..report.calibration_folder import calibration_folder
 
@@ -383,7 +384,7 @@ def _options(
     from ..bundle import Options
     from ..exchange import read_control, read_turntable
     from ..io.refraction import RefractionFile
-    from ..procedures.calibration import CalibrationOptions
+    from ..procedures.calibration_options import CalibrationOptions
 
     pairs = []
     for text in leave_out:
@@ -436,7 +437,7 @@ def _camera(
 ) -> CameraOptions:  # fmt: skip
     """Camera model and parameters from the options of the command."""
     from ..bundle import Shutter
-    from ..procedures.calibration import CameraOptions
+    from ..procedures.calibration_options import CameraOptions
 
     options: dict[str, str | float] = {} if side is None else {"side": side}
     for text in more:
@@ -485,11 +486,8 @@ def _uncertainty(field: ProjectionField) -> str:
 
 
 def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: list[float]) -> None:
-    import numpy as np
-
-    from ..bundle import camera_mapping, projection_field_at
-    from ..calibration import projection_field
-    from ..procedures.assessment import sorted_remarks
+    from ..bundle import projection_field_at
+    from ..calibration.assessment import two_digits
 
     result = done.result
     for name, assessed in done.assessments.items():
@@ -501,17 +499,17 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
         _say_board(done.board, result.network.unit)
     count = sum(len(points) for points in done.measured.values())
     say(f"{len(done.measured)} images, {count} image points, redundancy {result.redundancy}\n")
-    say(f"sigma0 {result.sigma0:.4g}")
-    v = result.residuals[~result.rejected]
-    v = v[np.isfinite(v).all(axis=1)]
-    say(f", residuals {np.sqrt((v**2).mean()):.3g} px rms, {int(result.rejected.sum())} left out\n")
+    say(f"sigma0 {result.sigma0:.4g}, residuals {done.rms:.3g} px rms, ")
+    say(f"{int(result.rejected.sum())} left out\n")
     for c, entry in enumerate(result.network.cameras):
         if len(result.network.cameras) > 1:
             say(f"camera {entry.id}\n")
         say_parameters(result.camera(c))
         say_priors(result.priors(c))
-        field = _uncertainty(projection_field(camera_mapping(result, c)))
-        say(f"uncertainty of the projection: {field.replace(',', ' over the image,')}\n")
+        verdict = done.assessments.get(entry.id)
+        if verdict is not None and verdict.errors is not None:
+            most, usual = two_digits(verdict.errors.greatest_px), two_digits(verdict.errors.median_px)
+            say(f"error of the projection: median {usual} px over the image, at most {most} px\n")
         for away in distances:
             say(
                 f"  at {away:g} {result.network.unit}: {_uncertainty(projection_field_at(result, c, away))}\n"
@@ -531,8 +529,7 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     say_left_out(result)
     for name, why in done.declined.items():
         say(f"left out: {name}: {why}\n")
-    warnings, tests = sorted_remarks(result, done.assessments.values())
-    say("".join(f"{line}\n" for line in remark_lines(warnings, tests)))
+    say("".join(f"{line}\n" for line in remark_lines(done.warnings, done.tests)))
 
 
 def _say_board(choice: BoardChoice, unit: str) -> None:

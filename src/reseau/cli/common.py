@@ -34,6 +34,9 @@ class Channel(StrEnum):
     BLUE = "blue"
 
 
+Anyway = Annotated[
+    bool, typer.Option("--anyway", help="Go on with a calibration that is usable for nothing.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Write the result as JSON to standard output.")]
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
 Overlay = Annotated[

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ..core.errors import UsageError
-from .common import Out, say, suffix_of, writable
+from .common import Anyway, Out, say, suffix_of, writable
 
 __all__ = ["export"]
 
@@ -41,13 +41,14 @@ def export(
     metashape: Annotated[
         Path | None, typer.Option(help="Script to write, which defines the marks in Metashape (.py).")
     ] = None,
+    anyway: Anyway = False,
     design: Annotated[
         Path | None, typer.Option("--design", "-d", help="Design of the reseau, for its measurements.")
     ] = None,
 ) -> None:
     """Write a calibration for another program, or marks of scanned film with their coordinates."""
     if to is not None or out is not None:
-        _calibration(files, to, out)
+        _calibration(files, to, out, anyway)
         if micmac is None and metashape is None:
             return
     scans = files
@@ -70,30 +71,23 @@ def export(
         say(f"{metashape}: {len(marks)} scans\n")
 
 
-def _calibration(files: list[Path], to: str | None, out: Path | None) -> None:
+def _calibration(files: list[Path], to: str | None, out: Path | None, anyway: bool) -> None:
     """Write a calibration, or those of a rig, in a format."""
-    from ..calibration import Calibration
     from ..core.numbers import plain
-    from ..exchange import export_calibration, export_rig, import_calibration
+    from ..exchange import any_calibration, export_calibrations
     from ..exchange.calibrations import calibration_formats, formats_holding
-    from ..io import read_text
 
     if to is None or out is None:
         raise UsageError("are both required", where="--to FORMAT and --out FILE")
-    calibrations = []
-    for source in files:
-        ours = source.suffix.lower() == ".json" and '"reseau-calibration/' in read_text(source)[:4096]
-        calibrations.append(Calibration.read(source) if ours else import_calibration(source))
+    calibrations = [any_calibration(source) for source in files]
     writable(out)
-    calibration = calibrations[0]
-    if len(calibrations) > 1:
-        written = export_rig(calibrations, to, out)
-    elif to == "reseau":
-        calibration.write(out)
-        say(f"{out}: {calibration.model.get('model', calibration.kind)}\n")
+    if to == "reseau" and len(calibrations) == 1:
+        calibrations[0].write(out)
+        say(f"{out}: {calibrations[0].model.get('model', calibrations[0].kind)}\n")
         return
-    else:
-        written = (export_calibration(calibration, to, out),)
+    written = export_calibrations(calibrations, to, out, anyway=anyway)
+    for line in written[0].notes:
+        typer.echo(f"note: {line}", err=True)
     for done in written:
         name = f" {done.camera.name}" if len(written) > 1 else ""
         say(f"{out}:{name} {to}, model {done.camera.model}\n")

@@ -64,8 +64,9 @@ def watch(
     from ..exchange import read_target
     from ..instruments import Camera
     from ..io.images import read_image, write_image
-    from ..procedures.calibration import CameraOptions, measurer_of
+    from ..procedures.calibration_options import CameraOptions
     from ..procedures.exposures import photographs_in
+    from ..procedures.target_measurement import measurer_of
     from ..procedures.watching import Watching
     from ..service.live import LivePage
 

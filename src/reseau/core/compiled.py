@@ -92,6 +92,10 @@ class Kernel(Generic[P, R]):
         """Module and name of the function."""
         return f"{self.function.__module__}:{self.function.__qualname__}"
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the name: results that hold compiled functions are copied, and sent to processes."""
+        return _found, (self.name,)
+
 
 class Compiled(Kernel[P, R]):
     """A function that is compiled when it is called first.
@@ -113,6 +117,11 @@ class Compiled(Kernel[P, R]):
         super().__init__(function, fastmath)
         self.slots = dict(slots or {})
         self._dispatcher: Any = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the names of the function and of the kernels in its slots."""
+        slots = {slot: each.name for slot, each in self.slots.items()}
+        return (named, (self.name, slots)) if slots else super().__reduce__()
 
     @property
     def dispatcher(self) -> Any:

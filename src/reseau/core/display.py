@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from typing import Any, Self
 
 from .errors import UsageError
 
-__all__ = ["Display", "data_frame"]
+__all__ = ["Display", "Table", "data_frame"]
 
 Facts = Sequence[tuple[str, str]]
 Columns = Mapping[str, Sequence[Any]]
@@ -60,6 +61,60 @@ class Display:
             When the result has no rows, or pandas is not installed.
         """
         return data_frame(self._columns())
+
+
+_SHOWN = 20
+"""Rows of a table that a notebook shows."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Table(Display):
+    """Columns of equal length, by their names.
+
+    Parameters
+    ----------
+    name : str
+        What the rows are.
+    columns : mapping of str to sequence
+        The columns, with the unit in the name.
+
+    Examples
+    --------
+    >>> found = Table("images", {"image": ["a.jpg", "b.jpg"], "rms_px": [0.041, 0.052]})
+    >>> found
+    <Table: 2 images, columns image, rms_px>
+    >>> found["rms_px"]
+    [0.041, 0.052]
+    """
+
+    name: str
+    columns: Mapping[str, Sequence[Any]]
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    def __getitem__(self, column: str) -> Sequence[Any]:
+        return self.columns[column]
+
+    def _facts(self) -> Facts:
+        return [(f"{len(self)} {self.name}", ""), ("columns", ", ".join(self.columns))]
+
+    def _columns(self) -> Columns:
+        return self.columns
+
+    def _repr_html_(self) -> str:
+        head = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
+        rows = "".join(
+            f"<tr>{''.join(f'<td>{escape(_cell(value))}</td>' for value in row)}</tr>"
+            for row in list(zip(*self.columns.values(), strict=True))[:_SHOWN]
+        )
+        more = len(self) - _SHOWN
+        rest = f"<tr><td colspan={len(self.columns)}>… {more} more</td></tr>" if more > 0 else ""
+        return f"<table><caption>{len(self)} {escape(self.name)}</caption><tr>{head}</tr>{rows}{rest}</table>"
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def data_frame(columns: Columns) -> Any:

@@ -366,7 +366,7 @@ def draw_picture(axes: Axes, pixels: NDArray[Any]) -> None:
     )
 
 
-def draw_contours(axes: Axes, xy: Array, sigma: Array) -> None:
+def draw_contours(axes: Axes, xy: Array, sigma: Array, scale: Array | None = None) -> None:
     """Draw contours of positive values over an image, y down, at rounded levels in geometric steps.
 
     Parameters
@@ -377,9 +377,11 @@ def draw_contours(axes: Axes, xy: Array, sigma: Array) -> None:
         Places, pixels.
     sigma : ndarray (rows, columns)
         Values; NaN where there is none.
+    scale : ndarray, optional
+        Values whose levels are taken, those of another map beside it.
     """
     x, y = xy[0, :, 0], xy[:, 0, 1]
-    levels, digits = _levels(sigma)
+    levels, digits = _levels(sigma if scale is None else scale)
     shown = np.ma.masked_invalid(sigma)
     axes.contourf(x, y, shown, levels=levels, cmap=_SHADES, extend="both")
     lines = axes.contour(x, y, shown, levels=levels, colors=INK, linewidths=0.5)

@@ -7,7 +7,28 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
-__all__ = ["lazily"]
+__all__ = ["above", "lazily"]
+
+
+def above(place: str) -> Any:
+    """Return what a method of a result needs of a module above its own, imported at the call.
+
+    Layers hold for what modules import, and what a result is does not depend on the packages above it. That
+    ``result.report(path)`` can be written where the function is ``reseau.report``'s is for the user's
+    convenience. It is for methods of results alone.
+
+    Parameters
+    ----------
+    place : str
+        Module and name, ``module:name``.
+
+    Examples
+    --------
+    >>> above("reseau.core.data:Frame").__name__
+    'Frame'
+    """
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
 
 
 def lazily(package: str, places: Mapping[str, str]) -> Callable[[str], Any]:

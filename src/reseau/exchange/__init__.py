@@ -5,7 +5,13 @@ from __future__ import annotations
 from .bal import read_bal, write_bal
 from .boards import read_board, read_target
 from .bundler import read_bundler
-from .calibrations import export_calibration, export_rig, import_calibration
+from .calibrations import (
+    any_calibration,
+    export_calibration,
+    export_calibrations,
+    export_rig,
+    import_calibration,
+)
 from .codev import read_codev
 from .colmap import read_colmap, write_colmap
 from .control import read_control
@@ -23,8 +29,10 @@ from .zemax import read_zemax
 __all__ = [
     "FilmMarks",
     "Lens",
+    "any_calibration",
     "calibration_files",
     "export_calibration",
+    "export_calibrations",
     "export_rig",
     "import_calibration",
     "metashape_script",

@@ -10,73 +10,48 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
 from ..bundle import (
-    BoardChoice,
     Camera,
-    CameraEstimate,
     ControlPoints,
-    Explanation,
-    ImageEstimates,
-    Kind,
     Misnamed,
     ModelChoice,
     Network,
-    Options,
-    PointEstimates,
     Result,
     Rig,
-    Shutter,
-    calibration_of,
     camera_mapping,
     choose_board,
     choose_models,
-    explain,
     held_as_designed,
-    model_search_entries,
     search_model,
 )
 from ..bundle.network import stage_of_turntable
-from ..calibration import Calibration, CameraMapping
-from ..core.data import Array, Frame, ImagePoints
-from ..core.display import Display
+from ..calibration import CameraMapping
+from ..core.data import Array, ImagePoints
 from ..core.errors import UsageError
-from ..core.failure import Code, Failure, Remark
+from ..core.failure import Code, Failure
 from ..execution import Executor, Outputs
 from ..io import BoardDesign
 from ..io.network import TurntableEntry
 from ..io.photographs import Exif
-from ..io.refraction import RefractionEntry
-from ..optics import CameraModel, PixelGrid, camera_model
-from ..optics.cameras import default_camera_model
+from ..optics import PixelGrid, camera_model
 from ..optics.refraction import RefractedRays, Refraction
-from .assessment import Assessment, assess
+from .calibrated import ONE_CAMERA, Calibrated
+from .calibration_options import CalibrationOptions, CameraOptions, PlaneDesign
 from .exposures import Taken
 from .misnamed_points import left_out
-from .target_measurement import MeasuredPhotograph, Measurer, Photograph, measured_in_order, measurer_of
+from .target_measurement import MeasuredPhotograph, Measurer, Photograph, measured_in_order
 from .turned_targets import named_alike, ways_to_turn
-from .z_stage import Heights
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
-__all__ = [
-    "Calibrated",
-    "CalibrationOptions",
-    "CameraOptions",
-    "Measurer",
-    "calibrate_camera",
-    "first_camera",
-    "measurer_of",
-    "network_of",
-]
+__all__ = ["calibrate_camera", "first_camera", "network_of"]
 
 _LEAST_POINTS = 8
 _LEAST_IMAGES = 3
@@ -88,353 +63,9 @@ _CONTRADICTED, _BETTER, _RENAMED = 1.5, 0.7, 3
 """Standard deviation of unit weight from which photographs may name the points of a regular target
 differently; share of it to which the same names must lower it; most attempts."""
 _MORE_TILTED = "add images with the camera tilted by 20 to 40 degrees in different directions"
-_CAMERA = "camera"
-"""Name of a camera that is alone."""
 # Relative standard deviation of a diagonal of the target.
 _PRINTED = 1e-4
 _NARROW = 1e-3
-
-
-class PlaneDesign(Protocol):
-    """A plane target: names and coordinates of its points."""
-
-    @property
-    def ids(self) -> tuple[str, ...]:
-        """Names of the points (p)."""
-
-    @property
-    def xy(self) -> Array:
-        """Coordinates (p, 2), x right and y up."""
-
-    @property
-    def unit(self) -> str:
-        """Unit of the coordinates; a label."""
-
-
-@dataclass(frozen=True)
-class CameraOptions:
-    """Camera model of a calibration, and the parameters to estimate.
-
-    Parameters
-    ----------
-    model : str, optional
-        Name of a registered model, see :func:`reseau.optics.camera_models`, or ``auto``: it is chosen for
-        each camera, see :func:`reseau.bundle.choose_models`. By default ``brown`` if the pixel size is given,
-        otherwise ``opencv``.
-    free : tuple of str
-        Parameters to estimate; by default the usual ones of the model.
-    pitch_mm : (float, float), optional
-        Pixel size; required for models whose parameters are in millimetres.
-    options : mapping of str to str or float
-        Options of the model, such as the side of Brown's distortion.
-    shutter : Shutter, optional
-        For images that are read line by line while the camera moves; of the mode ``rolling``.
-
-    Raises
-    ------
-    UsageError
-        When the shutter is that of a line camera, the model, a parameter or an option is unknown, or the
-        pixel size is missing.
-
-    Examples
-    --------
-    >>> CameraOptions().model, CameraOptions(pitch_mm=(0.005, 0.005)).chosen
-    ('opencv', ('c', 'x0', 'y0', 'K1', 'K2', 'P1', 'P2'))
-    """
-
-    model: str = ""
-    free: tuple[str, ...] = ()
-    pitch_mm: tuple[float, float] | None = None
-    options: Mapping[str, str | float] = field(default_factory=dict)
-    shutter: Shutter | None = None
-
-    def __post_init__(self) -> None:
-        if not self.model:
-            object.__setattr__(self, "model", default_camera_model(self.pitch_mm is not None).name)
-        model = self.registered
-        if self.shutter is not None and self.shutter.mode == "line":
-            # Approximate values of a line camera need points that are not in one plane.
-            raise UsageError(
-                "cannot be calibrated with a plane target", where="a line camera", do="adjust a network of it"
-            )
-        if self.automatic and (self.free or self.options):
-            raise UsageError("has no parameters or options of its own", where="camera model auto")
-        if model.needs_pitch and self.pitch_mm is None:
-            raise UsageError("requires the pixel size", where=model.name)
-        unknown = [name for name in self.free if name not in model.names]
-        if unknown:
-            raise UsageError(f"is not one of {', '.join(model.names)}", where=unknown[0])
-        if not self.automatic:
-            object.__setattr__(self, "options", model.checked_options(self.options))
-
-    @property
-    def automatic(self) -> bool:
-        """Whether the model is to be chosen."""
-        return self.model == "auto"
-
-    @property
-    def registered(self) -> CameraModel:
-        """The registered model; the default one where it is to be chosen."""
-        return default_camera_model(self.pitch_mm is not None) if self.automatic else camera_model(self.model)
-
-    @property
-    def chosen(self) -> tuple[str, ...]:
-        """Parameters to be estimated."""
-        return self.free or self.registered.usual
-
-
-@dataclass(frozen=True, eq=False)
-class CalibrationOptions:
-    """Options of a camera calibration.
-
-    Parameters
-    ----------
-    adjustment : Options
-        Options of the adjustment.
-    sigma_px : float, optional
-        Standard deviation of all image coordinates. Replaces the measured ones where the residuals are
-        larger, because the target or the lens deviates from its model.
-    control : ControlPoints, optional
-        Control points for the datum; by default inner constraints over all points.
-    without : tuple of (str, str)
-        Image points to leave out, by image and point.
-    components : {"axes", "images", "cameras"}, optional
-        Groups with separate factors on their standard deviations; see :func:`reseau.bundle.search_model`.
-    level : float, optional
-        Significance level of the tests by which distortion parameters are dropped.
-    heights : Heights, optional
-        Heights of the target on a z-stage.
-    refraction : RefractionEntry, optional
-        Windows and media between the camera, whose name is ``camera`` if it is alone, and the target. The
-        calibration is that of the camera in air. Without control points the diagonals of the target are
-        distances of the design, known to a ten-thousandth: windows have dimensions, and the scale is not
-        free.
-    focal_35_mm : float, optional
-        Approximate focal length as the camera says, for the format of 36 × 24 mm: taken for the start where
-        that of the homographies is far from it.
-    turntable : TurntableEntry, optional
-        Turntable that carried the target, or the cameras; the axis is estimated. Photographs that are not in
-        it were taken without.
-    target : {"free", "flat", "auto"}
-        Whether all points of the target are unknowns, or are held as designed; ``auto`` holds them where
-        :func:`reseau.bundle.choose_board` finds the target flat and as designed.
-
-    Raises
-    ------
-    UsageError
-        When the target is not one of these, or is defined otherwise.
-    """
-
-    adjustment: Options = field(default_factory=Options)
-    sigma_px: float | None = None
-    control: ControlPoints | None = None
-    without: tuple[tuple[str, str], ...] = ()
-    components: Kind | None = None
-    level: float | None = None
-    heights: Heights | None = None
-    refraction: RefractionEntry | None = None
-    focal_35_mm: float | None = None
-    turntable: TurntableEntry | None = None
-    target: Literal["free", "flat", "auto"] = "free"
-
-    def __post_init__(self) -> None:
-        if self.target not in ("free", "flat", "auto"):
-            raise UsageError(f"is {self.target!r}, not `free`, `flat` or `auto`", where="target")
-        if self.turntable is not None and self.heights is not None:
-            raise UsageError("cannot be combined with heights", where="turntable")
-        if self.target != "free" and (self.control or self.heights or self.refraction):
-            raise UsageError(
-                f"cannot be {self.target!r} with control points, heights, or windows and media",
-                where="target",
-            )
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Calibrated(Display):
-    """A camera calibration with its measurements; truthy.
-
-    Parameters
-    ----------
-    result : Result
-        Result of the adjustment; a camera that is alone has the name ``camera``.
-    measured : dict
-        Measured image points, by image.
-    declined : dict
-        Reasons why images were left out, by image.
-    choices : mapping of str to ModelChoice
-        How the models of the cameras were chosen, by their names; empty where the model was given.
-    board : BoardChoice, optional
-        How the model of the target was chosen.
-    notes : tuple of str
-        How photographs were read.
-    misnamed : Misnamed, optional
-        Image points that were left out because they lie elsewhere than the others of their image say.
-    """
-
-    result: Result
-    measured: dict[str, ImagePoints]
-    declined: dict[str, str]
-    choices: Mapping[str, ModelChoice] = field(default_factory=dict)
-    board: BoardChoice | None = None
-    notes: tuple[str, ...] = ()
-    misnamed: Misnamed | None = None
-
-    def __bool__(self) -> bool:
-        return True
-
-    def required(self) -> Calibrated:
-        """Return the calibration itself; see :meth:`~reseau.core.failure.Failure.required`."""
-        return self
-
-    @property
-    def choice(self) -> ModelChoice | None:
-        """How the model of the only camera was chosen; None where it was given."""
-        return self.choices.get(_CAMERA)
-
-    @property
-    def sigma0(self) -> float:
-        """Standard deviation of unit weight; NaN without redundancy."""
-        return self.result.sigma0
-
-    @property
-    def warnings(self) -> tuple[Remark, ...]:
-        """Warnings about the adjustment."""
-        return self.result.warnings
-
-    @property
-    def cameras(self) -> dict[str, CameraEstimate]:
-        """Estimated parameters of the cameras, by their names; one that is alone is called ``camera``."""
-        return self.result.cameras
-
-    @cached_property
-    def explanation(self) -> Explanation:
-        """What is wrong, if anything."""
-        return explain(self.result, self.misnamed)
-
-    @cached_property
-    def assessments(self) -> dict[str, Assessment]:
-        """What the calibration of each camera is good for; of those with one set of parameters."""
-        network = self.result.network
-        one = {c for c, entry in enumerate(network.cameras) if entry.has_plane_mapping}
-        return {
-            entry.id: assess(self.result, c, self.explanation)
-            for c, entry in enumerate(network.cameras)
-            if c in one and (entry.additional is None or entry.additional.per == "camera")
-        }
-
-    @property
-    def images(self) -> ImageEstimates:
-        """Exterior orientations."""
-        return self.result.images
-
-    @property
-    def points(self) -> PointEstimates:
-        """Points of the target."""
-        return self.result.points
-
-    def calibration(
-        self,
-        name: str = "camera",
-        provenance: Mapping[str, Any] | None = None,
-        camera: str | None = None,
-    ) -> Calibration:
-        """Return the calibration of a camera as a document, with how its model was found.
-
-        Parameters
-        ----------
-        name : str
-            Name of the calibration.
-        provenance : mapping, optional
-            Inputs and options, see :class:`reseau.core.provenance.Provenance`.
-        camera : str, optional
-            Name of the camera; required with several.
-
-        Raises
-        ------
-        UsageError
-            When there is no such camera.
-        """
-        found = calibration_of(self.result, camera or _CAMERA, name=name, provenance=provenance)
-        more = model_search_entries(self.result)
-        assessed = self.assessments.get(camera or _CAMERA)
-        if assessed is not None:
-            more |= {"assessment": assessed.entries()}
-        if (camera or _CAMERA) in self.choices:
-            more |= {"camera_models": self.choices[camera or _CAMERA].entries()}
-        if self.board is not None:
-            more |= {"target": self.board.entries()}
-        return found.model_copy(update={"validity": found.validity | more}) if more else found
-
-    def write(self, path: Path | str) -> None:
-        """Write the calibration, ``reseau-calibration/1``; of several cameras one file each.
-
-        With several cameras their names are appended to that of the file: ``rig.json`` becomes
-        ``rig-left.json`` and ``rig-right.json``.
-
-        Raises
-        ------
-        InputError
-            When a file cannot be written.
-        """
-        for camera, file in self.files(Path(path)).items():
-            self.calibration(file.stem, camera=camera).write(file)
-
-    def files(self, path: Path) -> dict[str, Path]:
-        """Return the file of each camera, for the path given to all; see :meth:`write`."""
-        names = [entry.id for entry in self.result.network.cameras]
-        if len(names) == 1:
-            return {names[0]: path}
-        return {name: path.with_name(f"{path.stem}-{name}{path.suffix}") for name in names}
-
-    def plot(self, photo: Frame | None = None) -> Sequence[Axes]:
-        """Draw residuals over the image and the uncertainty of the projection side by side, with matplotlib.
-
-        Parameters
-        ----------
-        photo : Frame, optional
-            One of the photographs; drawn first, with the points measured in it.
-
-        Returns
-        -------
-        sequence of matplotlib Axes
-            Of the panels: one for each camera, one or two before them.
-        """
-        import matplotlib.pyplot as plt
-
-        from ..core.figures import BLUE
-
-        cameras = len(self.cameras)
-        count = cameras + (1 if photo is None else 2)
-        _, row = plt.subplots(1, count, figsize=(4.6 * count, 3.9), layout="constrained")
-        panels = list(row)
-        if photo is not None:
-            photo.plot(panels[0])
-            points = self.measured.get(photo.name)
-            if points is not None:
-                panels[0].plot(*points.xy.T, "o", color=BLUE, markerfacecolor="none", markersize=4)
-                panels[0].set_title(f"{photo.name}: {len(points)} points", loc="left")
-        self.result.plot(panels[-1 - cameras])
-        for c, axes in enumerate(panels[-cameras:]):
-            camera_mapping(self.result, c).plot(axes)
-        return panels
-
-    def _facts(self) -> list[tuple[str, str]]:
-        count = sum(len(points) for points in self.measured.values())
-        return [
-            (f"{len(self.measured)} images", ""),
-            (f"{count} image points", ""),
-            (f"{len(self.declined)} declined", ""),
-            ("sigma0", f"{self.sigma0:.3f}"),
-            *(fact for camera in self.cameras.values() for fact in camera._facts()[len(self.cameras) == 1 :]),
-        ]
-
-    def _columns(self) -> dict[str, list[object]]:
-        each = [camera._columns() for camera in self.cameras.values()]
-        columns = {key: [value for one in each for value in one[key]] for key in each[0]}
-        if len(each) == 1:
-            return columns
-        names = [name for name, one in zip(self.cameras, each, strict=True) for _ in next(iter(one.values()))]
-        return {"camera": [*names], **columns}
 
 
 def calibrate_camera(
@@ -542,7 +173,7 @@ class _Job:
             raise UsageError(
                 "is not known without a photograph", where="size of the images", do="give width and height"
             )
-        stand_in = Camera(_CAMERA, 1, 1, (1.0, 1.0), "opencv", np.zeros(len(camera_model("opencv").names)))
+        stand_in = Camera(ONE_CAMERA, 1, 1, (1.0, 1.0), "opencv", np.zeros(len(camera_model("opencv").names)))
         wrong = left_out(network_of(measured, design, stand_in), cameras, sizes, of)
         if wrong is None:
             return self._adjusted(measured, None)
@@ -623,7 +254,7 @@ class _Job:
 
 def _cameras_of(images: Iterable[str], taken: Mapping[str, Taken] | None) -> tuple[list[str], list[int]]:
     """Names of the cameras, and the number of that of each image."""
-    cameras = list(dict.fromkeys(each.camera for each in taken.values())) if taken else [_CAMERA]
+    cameras = list(dict.fromkeys(each.camera for each in taken.values())) if taken else [ONE_CAMERA]
     return cameras, [cameras.index(taken[name].camera) if taken else 0 for name in images]
 
 
@@ -703,7 +334,7 @@ def _measured(
     taken: Mapping[str, Taken] | None,
 ) -> tuple[dict[str, ImagePoints], dict[str, str], dict[str, tuple[int, int]]]:
     """Return the image points of each photograph, reasons of declined ones, and image sizes by camera."""
-    every = {each.camera for each in taken.values()} if taken else {_CAMERA}
+    every = {each.camera for each in taken.values()} if taken else {ONE_CAMERA}
     seen: dict[str, tuple[int, int]] = {}
     measured: dict[str, ImagePoints] = {}
     declined: dict[str, str] = {}
@@ -736,7 +367,7 @@ def _measured(
 
 
 def _camera_of(name: str, taken: Mapping[str, Taken] | None) -> str:
-    return taken[name].camera if taken else _CAMERA
+    return taken[name].camera if taken else ONE_CAMERA
 
 
 def _by_reason(declined: Mapping[str, str]) -> dict[str, str]:
@@ -897,7 +528,7 @@ def first_camera(
     pitch = model.pitch_mm or (1.0, 1.0)
     values = model.registered.start_values(f, PixelGrid(*size, pitch))
     return Camera(
-        _CAMERA, *size, pitch, model.registered.name, values, model.chosen, model.options,
+        ONE_CAMERA, *size, pitch, model.registered.name, values, model.chosen, model.options,
         sigma=model.registered.priors(model.chosen), shutter=model.shutter,
     )  # fmt: skip
 

@@ -20,13 +20,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..bundle import Network, Result, Stage, camera_mapping
-from ..calibration import CameraMapping
+from ..calibration import CameraMapping, NextPhotograph
 from ..calibration.camera import by_rotation, places, projection_slopes, worst
 from ..core.data import Array, Mask, Rows
 from ..optics import Pose
 from ..optics.poses import matrix_to_vector, rotation_matrix
 
-__all__ = ["PREDICTED", "NextPose", "next_photograph", "with_image"]
+__all__ = ["PREDICTED", "next_photograph", "with_image"]
 
 _MARGIN_PX = 6.0
 """Points closer to the edge of the image are not expected to be measured."""
@@ -70,37 +70,6 @@ _TOWARDS = {
     (-1, -1): "upper left", (1, -1): "upper right", (-1, 1): "lower left", (1, 1): "lower right",
 }  # fmt: skip
 _ROLLS = {0: "", 90: ", the camera turned by 90°"}
-
-
-@dataclass(frozen=True, eq=False)
-class NextPose:
-    """A pose for the next photograph.
-
-    Parameters
-    ----------
-    pose : Pose
-        Of the camera.
-    words : str
-        How the photograph looks.
-    outline : ndarray (k, 2)
-        The images of the target's corners, pixels, in the order of its outline.
-    xy : ndarray (p, 2)
-        Those of its points inside the image.
-    worst_px : float
-        Largest standard deviation of the projection over the image with the photograph, px.
-
-    Examples
-    --------
-    >>> pose = Pose(np.zeros(3), np.zeros(3))
-    >>> NextPose(pose, "the target fills the image", np.zeros((4, 2)), np.zeros((0, 2)), 0.02).worst_px
-    0.02
-    """
-
-    pose: Pose
-    words: str
-    outline: Array
-    xy: Array
-    worst_px: float
 
 
 def with_image(
@@ -161,7 +130,7 @@ def _inside(lens: CameraMapping, uv: Array) -> tuple[Array, Mask]:
     return seen, inside
 
 
-def next_photograph(result: Result, empty: Mask) -> NextPose | None:
+def next_photograph(result: Result, empty: Mask) -> NextPhotograph | None:
     """Choose the pose whose photograph lowers the largest uncertainty of the projection most.
 
     Parameters
@@ -174,7 +143,7 @@ def next_photograph(result: Result, empty: Mask) -> NextPose | None:
 
     Returns
     -------
-    NextPose or None
+    NextPhotograph or None
         None when no photograph lowers it by 3 %, or where the network is another one.
     """
     network = result.network
@@ -197,7 +166,7 @@ def next_photograph(result: Result, empty: Mask) -> NextPose | None:
     if not after < _WORTH * information.before:
         return None
     outline = lens.to_pixels(_directions(target.outline, pose))
-    return NextPose(pose, _words(view, outline, lens.size), outline, xy[inside], after)
+    return NextPhotograph.of(pose, _words(view, outline, lens.size), outline, xy[inside], after)
 
 
 class _View(NamedTuple):

@@ -30,7 +30,9 @@ from ..io.refraction import RefractionEntry
 from ..optics import Pose
 from ..optics.poses import rotation_matrix
 from ..optics.refraction import RefractedRays
-from .calibration import Calibrated, CalibrationOptions, CameraOptions, PlaneDesign, calibrate_camera
+from .calibrated import Calibrated
+from .calibration import calibrate_camera
+from .calibration_options import CalibrationOptions, CameraOptions, PlaneDesign
 from .exposures import Taken
 from .next_pose import PREDICTED, with_image
 from .target_measurement import Measurer
@@ -94,7 +96,8 @@ class TestfieldProcedure:
         normal of the target (rad), and of the coordinates of the design (mm). With `sigmas`, consecutive
         frames that differ only in height have one orientation; without, each frame has its own.
     refraction : RefractionEntry, optional
-        Windows and media before the camera; see :class:`~reseau.procedures.calibration.CalibrationOptions`.
+        Windows and media before the camera; see
+        :class:`~reseau.procedures.calibration_options.CalibrationOptions`.
 
     Examples
     --------

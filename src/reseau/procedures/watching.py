@@ -16,7 +16,7 @@ from ..core.data import Array, Frame, ImagePoints, Mask
 from ..core.errors import ImageError
 from ..core.failure import Code, Failure
 from ..measure.points import Measured
-from .calibration import CameraOptions, PlaneDesign
+from .calibration_options import CameraOptions, PlaneDesign
 from .target_measurement import Measurer
 from .testfield import TestfieldProcedure
 

@@ -14,6 +14,7 @@ coefficients.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import scipy.special
@@ -75,7 +76,7 @@ class StandardTest:
     same_object: bool
     alpha: float
 
-    def __bool__(self) -> bool:
+    def __bool__(self) -> Literal[True]:
         return True
 
     @property

@@ -10,15 +10,15 @@ from markupsafe import Markup
 
 from ..bundle import Result, camera_mapping, projection_field_at
 from ..bundle.network.shutter import MOTION
-from ..calibration import CameraMapping, FieldDifference, projection_field
+from ..calibration import Assessment, CameraMapping, FieldDifference, projection_field
 from ..core.data import Frame, Rows
 from ..core.figures import nice
 from ..core.numbers import aligned, at_power, measured, plain, power
 from ..core.provenance import Provenance
-from ..procedures.assessment import Assessment, sorted_remarks
+from ..procedures.assessment import sorted_remarks
 from .bundle_figures import distortion_figure, network_figure, next_figure, residual_figure
 from .bundle_tables import components_table, dropped_table, images_table, left_out_table, worst_points
-from .fields import difference_figure, uncertainty_figure
+from .fields import difference_figure, errors_figure, uncertainty_figure
 from .overlay import Marks, frame_overlay
 from .patterns import patterns_of
 from .tables import unit_text
@@ -72,13 +72,17 @@ def bundle_report(
     str
         An HTML page without any external resource and without clock times.
     """
-    cameras = [_camera(result, c, distances) for c in _shown(result)[:_CAMERAS]]
-    warnings, tests = sorted_remarks(result, (assessments or {}).values())
+    assessments = assessments or {}
+    cameras = [
+        _camera(result, c, distances, assessments.get(result.network.cameras[c].id))
+        for c in _shown(result)[:_CAMERAS]
+    ]
+    warnings, tests = sorted_remarks(result.warnings, assessed=bool(assessments))
     return rendered(
         "bundle.html.j2",
         title=title,
         summary=_summary(result),
-        verdicts=[_verdict(result, name, each) for name, each in (assessments or {}).items()],
+        verdicts=[_verdict(result, name, each) for name, each in assessments.items()],
         warnings=warnings,
         tests=tests,
         network=Markup(network_figure(result)),
@@ -112,8 +116,11 @@ def _verdict(result: Result, name: str, assessed: Assessment) -> dict[str, Any]:
         "camera": name if len(result.network.cameras) > 1 else "",
         "lines": assessed.lines,
         "use": assessed.use.value,
+        "errors": None
+        if assessed.errors is None
+        else Markup(errors_figure(assessed.errors, result.network.xy[_rows(result, c)])),
         "figure": None if drawn is None else Markup(drawn),
-        "next": "" if assessed.next_photograph is None else assessed.next_photograph.words,
+        "next": "" if assessed.next_photograph is None else assessed.next_photograph.text,
     }
 
 
@@ -196,7 +203,9 @@ def _reliability(result: Result) -> list[tuple[str, str, str]]:
     ]
 
 
-def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any]:
+def _camera(
+    result: Result, c: int, distances: Sequence[float], assessed: Assessment | None
+) -> dict[str, Any]:
     """Table and figures of one camera."""
     camera = result.network.cameras[c]
     found = result.camera(c)
@@ -219,12 +228,12 @@ def _camera(result: Result, c: int, distances: Sequence[float]) -> dict[str, Any
         )
     at = _rows(result, c)
     lens = _lens(result, c)
-    profile = None if lens is None else distortion_figure(lens)
+    profile = None if lens is None else distortion_figure(lens, None if assessed is None else assessed.errors)
     return {
         "title": camera.label[0].upper() + camera.label[1:],
         "rows": rows,
         "residuals": Markup(residual_figure(result, c, at)),
-        "fields": [] if lens is None else _fields(result, c, lens, at, distances),
+        "fields": [] if lens is None else _fields(result, c, lens, at, distances, assessed is None),
         "profile": None if profile is None else Markup(profile[0]),
         "profile_of": "" if profile is None else profile[1],
     }
@@ -338,13 +347,14 @@ def _lens(result: Result, c: int) -> CameraMapping | None:
 
 
 def _fields(
-    result: Result, c: int, lens: CameraMapping, rows: Rows, distances: Sequence[float]
+    result: Result, c: int, lens: CameraMapping, rows: Rows, distances: Sequence[float], directions: bool
 ) -> list[tuple[str, Markup]]:
     """Uncertainty of the projection of directions and at distances: description and figure of each."""
     network, values = result.network, result.fit.values
     away = values.xyz[network.point_of[rows]] - values.x0[network.image_of[rows]]
     usual = float(np.median(np.linalg.norm(away, axis=1)))
-    fields = [("directions", projection_field(lens, _PLACES))]
+    # With a verdict, its map is that of directions.
+    fields = [("directions", projection_field(lens, _PLACES))] if directions else []
     if network.behind_windows(c) or network.cameras[c].parallel:
         distances, usual = [], 0.0
     fields += [

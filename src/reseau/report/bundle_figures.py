@@ -8,11 +8,10 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from ..bundle import Result
-from ..calibration import CameraMapping
+from ..calibration import Assessment, CameraMapping, ErrorMap
 from ..core.data import Array, Rows
 from ..core.figures import ACCENT, BLUE, FAINT, INK, PALE, drawing, image_axes, nice, to_svg
 from ..optics.cameras import distortion_names
-from ..procedures.assessment import Assessment
 
 __all__ = ["distortion_figure", "network_figure", "next_figure", "residual_figure"]
 
@@ -126,15 +125,17 @@ def next_figure(result: Result, c: int, rows: Rows, assessed: Assessment) -> str
         figure = Figure(figsize=(4.6, 0.9 + 4.0 * camera.height / camera.width), layout="constrained")
         axes = figure.subplots()
         axes.plot(*xy.T, ".", color=FAINT, markersize=2.5, label="points so far")
-        axes.fill(*then.outline.T, facecolor=BLUE, alpha=0.15)
-        axes.plot(*np.vstack([then.outline, then.outline[:1]]).T, color=BLUE, lw=1.2)
-        axes.plot(*then.xy.T, ".", color=BLUE, markersize=3.5, label="in the next photograph")
+        outline = np.array(then.outline_px)
+        axes.fill(*outline.T, facecolor=BLUE, alpha=0.15)
+        axes.plot(*np.vstack([outline, outline[:1]]).T, color=BLUE, lw=1.2)
+        expected = np.array(then.points_px).reshape(-1, 2)
+        axes.plot(*expected.T, ".", color=BLUE, markersize=3.5, label="in the next photograph")
         image_axes(axes, camera.width, camera.height)
         figure.legend(loc="outside upper left", ncols=2, frameon=False, fontsize=8.5)
         return to_svg(figure)
 
 
-def distortion_figure(lens: CameraMapping) -> tuple[str, str] | None:
+def distortion_figure(lens: CameraMapping, errors: ErrorMap | None = None) -> tuple[str, str] | None:
     """Draw the radial distortion with its confidence band, and its standard deviation.
 
     Of a wide lens, whose distortion against a central projection has no limit, the radius in the image is
@@ -144,6 +145,8 @@ def distortion_figure(lens: CameraMapping) -> tuple[str, str] | None:
     ----------
     lens : CameraMapping
         A calibrated camera.
+    errors : ErrorMap, optional
+        Errors of the projection, drawn beside in place of the standard deviation of the distortion alone.
 
     Returns
     -------
@@ -170,13 +173,29 @@ def distortion_figure(lens: CameraMapping) -> tuple[str, str] | None:
         left.set_ylabel("radius / px" if by_angle else "px")
         for axes in (left, right):
             axes.set_xlabel("angle to the axis / °" if by_angle else "radius / px")
-        right.fill_between(at, 0, _BAND * sigma, color=PALE, linewidth=0)
-        right.plot(at, sigma, color=ACCENT, linewidth=1)
+        if errors is None:
+            right.fill_between(at, 0, _BAND * sigma, color=PALE, linewidth=0)
+            right.plot(at, sigma, color=ACCENT, linewidth=1)
+            right.set_title(f"its σ; up to {_BAND:g} σ in grey", loc="left")
+        else:
+            _draw_profile(right, lens, errors, by_angle)
         right.set_ylim(bottom=0)
-        right.set_title(f"its σ; up to {_BAND:g} σ in grey", loc="left")
         right.set_ylabel("px")
         what = "Radius in the image by the angle of the ray (dashed: proportional to it)"
         return to_svg(figure), what if by_angle else "Radial distortion"
+
+
+def _draw_profile(axes: Axes, lens: CameraMapping, errors: ErrorMap, by_angle: bool) -> None:
+    """Draw errors of the projection by the radius, or by the angle to the axis, in degrees."""
+    xy = errors.xy.reshape(-1, 2)
+    if by_angle:
+        at = np.degrees(np.arctan(np.hypot(*lens.mapping.inverse(xy).T)))
+    else:
+        at = np.hypot(*(xy - lens.mapping(np.zeros((1, 2)))).T)
+    axes.plot(at, errors.formal.ravel(), ".", color=FAINT, markersize=3, label="formal σ")
+    axes.plot(at, errors.total.ravel(), ".", color=ACCENT, markersize=3, label="total")
+    axes.legend(loc="upper left", frameon=False, fontsize=8.5)
+    axes.set_title("error of the projection over the image", loc="left")
 
 
 def _radial(lens: CameraMapping) -> tuple[Array, Array, Array, Array | None] | None:

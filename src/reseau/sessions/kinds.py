@@ -321,14 +321,11 @@ def _calibration_results(procedure: TestfieldProcedure, session: Session) -> dic
 
 
 def _calibration_verdict(procedure: TestfieldProcedure) -> dict[str, list[str]]:
-    from ..procedures.assessment import sorted_remarks
-
     found = procedure.calibrated().required()
-    warnings, tests = sorted_remarks(found.result, found.assessments.values())
     return {
         "lines": [line for each in found.assessments.values() for line in each.lines],
-        "warnings": [str(each) for each in warnings],
-        "tests": [str(each) for each in tests],
+        "warnings": [str(each) for each in found.warnings],
+        "tests": [str(each) for each in found.tests],
     }
 
 

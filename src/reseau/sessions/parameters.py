@@ -20,7 +20,7 @@ from ..instruments import Camera, CameraRig, EnvironmentSensor, Turntable
 from ..io import Document
 
 if TYPE_CHECKING:
-    from ..procedures.calibration import CameraOptions
+    from ..procedures.calibration_options import CameraOptions
     from ..procedures.film_frame import FrameOptions
 
 __all__ = [
@@ -426,7 +426,7 @@ class TestfieldParameters(SessionParameters):
 
     def camera_options(self) -> CameraOptions:
         """Return the camera model and the parameters to estimate."""
-        from ..procedures.calibration import CameraOptions
+        from ..procedures.calibration_options import CameraOptions
 
         pitch = None if self.pitch is None else (self.pitch, self.pitch)
         return CameraOptions(free=self.free, pitch_mm=pitch)
@@ -519,7 +519,7 @@ class PhotographsParameters(SessionParameters):
         UsageError
             If the model or a parameter is unknown, or the size of a pixel is missing.
         """
-        from ..procedures.calibration import CameraOptions
+        from ..procedures.calibration_options import CameraOptions
 
         pitch = None if self.pitch is None else (self.pitch, self.pitch)
         return CameraOptions(self.model, self.free, pitch)

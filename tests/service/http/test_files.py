@@ -76,7 +76,7 @@ def test_photographs_become_a_calibration_with_a_verdict_that_is_computed_again(
     calibration = client.get(f"/api/1/sessions/dropped/results/{result['id']}/file").json()
     c = calibration["parameters"]["c"]
     assert abs(c["value"] - 57.5) < 4 * c["sigma"] + 1e-3
-    assert "usable" in calibration["validity"]["assessment"]["lines"][0]
+    assert "usable" in calibration["assessment"]["lines"][0]
     page = one.client().get("/sessions/dropped").text
     assert "sable for" in page
     again = client.post("/api/1/sessions/dropped/rerun")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from ...adjust import VarianceComponents
 from ...adjust.outliers import SnoopingStep
 from ...adjust.significance import CoefficientTest, GlobalTest, ratio_test
 from ...core.data import Array, Mask, Rows
-from ...core.display import Display
+from ...core.display import Display, Table
 from ...core.errors import UsageError
 from ...core.failure import Remark
 from ...optics.cameras import distortion_names
@@ -118,7 +118,7 @@ class Result(Display):
     eliminated: tuple[Eliminated, ...] | None = None
     validation: tuple[float, float] | None = None
 
-    def __bool__(self) -> bool:
+    def __bool__(self) -> Literal[True]:
         return True
 
     def required(self) -> Result:
@@ -155,7 +155,7 @@ class Result(Display):
         columns: dict[str, list[object]] = {
             "image": [network.images[i] for i in network.image_of],
             "point": [network.points[j] for j in network.point_of],
-        }
+        } | {f"{axis}_px": network.xy[:, k].tolist() for k, axis in enumerate("xy")}
         for name, values in (("v", self.residuals), ("r", self.redundancy_numbers), ("w", self.test_values)):
             unit = "_px" if name == "v" else ""
             columns |= {f"{name}{axis}{unit}": values[:, k].tolist() for k, axis in enumerate("xy")}
@@ -174,8 +174,7 @@ class Result(Display):
         from ...core.figures import ACCENT, FAINT, image_axes, new_axes, nice
 
         network, entry = self.network, self.network.cameras[camera]
-        seen = network.camera_of[network.image_of] == camera
-        rows = np.flatnonzero(seen & np.isfinite(self.residuals).all(axis=1) & ~self.rejected)
+        rows = np.flatnonzero(self._kept & self._of_camera(camera))
         xy, v = network.xy[rows], self.residuals[rows]
         axes = new_axes(axes)
         axes.plot(*xy.T, ".", color=FAINT, markersize=1.5)
@@ -192,8 +191,9 @@ class Result(Display):
             color=ACCENT,
             width=0.002,
         )
-        rms = float(np.sqrt((v**2).mean())) if len(v) else float("nan")
-        image_axes(axes, entry.width, entry.height, f"residuals × {enlarged:g}, rms {rms:.2g} px")
+        image_axes(
+            axes, entry.width, entry.height, f"residuals × {enlarged:g}, rms {self.rms_px(camera):.2g} px"
+        )
         return axes
 
     # -- estimates in columns
@@ -552,6 +552,40 @@ class Result(Display):
         return covariance
 
     # -- observations
+
+    def rms_px(self, camera: int | None = None) -> float:
+        """Root mean square of the residuals of an image coordinate, px, without points that were left out.
+
+        The figure of OpenCV is that of the distances, larger by the root of 2. `camera` is the row of one
+        camera; by default all.
+        """
+        v = self.residuals[self._kept if camera is None else self._kept & self._of_camera(camera)]
+        return float(np.sqrt((v**2).mean())) if len(v) else float("nan")
+
+    @property
+    def _kept(self) -> Mask:
+        """Image points (n,) that were adjusted."""
+        return np.asarray(np.isfinite(self.residuals).all(axis=1) & ~self.rejected)
+
+    def _of_camera(self, camera: int) -> Mask:
+        return np.asarray(self.network.camera_of[self.network.image_of] == camera)
+
+    def residuals_by_image(self) -> Table:
+        """Residuals of each image: its camera, points, those left out, root mean square and largest, px."""
+        network, rows = self.network, self.network.image_of
+        count = np.bincount(rows[self._kept], minlength=len(network.images))
+        squares = np.where(self._kept[:, None], np.nan_to_num(self.residuals) ** 2, 0.0).sum(axis=1)
+        largest = np.zeros(len(network.images))
+        np.maximum.at(largest, rows, np.sqrt(squares))
+        total = np.bincount(rows, squares, len(network.images))
+        rms = np.sqrt(np.divide(total, 2 * count, out=np.full(len(count), np.nan), where=count > 0))
+        left_out = np.bincount(rows[self.rejected], minlength=len(network.images))
+        return Table(
+            "images",
+            {"image": list(network.images), "camera": [network.cameras[c].id for c in network.camera_of],
+             "points": count.tolist(), "left_out": left_out.tolist(), "rms_px": rms.tolist(),
+             "largest_px": np.where(count > 0, largest, np.nan).tolist()},
+        )  # fmt: skip
 
     @property
     def residuals(self) -> Array:

@@ -1,7 +1,7 @@
 """What is wrong in an adjusted network: explanations that compete for the same residuals."""
 
-from .explain import Cause, Explanation, explain
+from .explain import Explanation, explain
 from .names import Misnamed, misnamed
 from .sentences import described
 
-__all__ = ["Cause", "Explanation", "Misnamed", "described", "explain", "misnamed"]
+__all__ = ["Explanation", "Misnamed", "described", "explain", "misnamed"]

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.special
 
+from ...calibration import Cause
 from ...calibration.camera import by_rotation, places, projection_slopes, referred
 from ...core.data import Array, Rows
 from ...core.failure import Failure
@@ -26,7 +27,7 @@ from .effects import Family, Sight, families, lens_at
 from .names import Misnamed
 from .sentences import advice, listed_places
 
-__all__ = ["Cause", "Explanation", "explain"]
+__all__ = ["Explanation", "explain"]
 
 _FALSE = 0.01
 """Probability that something is wrong, before the observations are seen. By Markov's inequality sound
@@ -46,60 +47,6 @@ _PROMISING = 0.5
 """Part of what the best cause explains from which others are adjusted, too."""
 _ALIKE = 0.05
 """Probability from which another explanation is named, too."""
-
-
-@dataclass(frozen=True)
-class Cause:
-    """One explanation of what an adjustment leaves.
-
-    Parameters
-    ----------
-    code : str
-        ``lens``, ``refocus``, ``other-camera``, ``rolling-shutter``, ``motion``, ``target-shape``,
-        ``target-scale``, ``names``, ``blunders``, ``noise`` or ``unknown``.
-    form : str
-        Its form.
-    amount_px : float
-        What it explains in the image points, root mean square.
-    share : float
-        Its part of the sum of squares of the residuals.
-    probability : float
-        Among all explanations that were compared.
-    where : str
-        Images, points or cameras concerned; empty where it is all of them.
-    do : str
-        What to do.
-    instead : bool
-        Whether it explains the same as the cause before it.
-
-    Examples
-    --------
-    >>> Cause("lens", "radial", 0.12, 0.9, 1.0, "", "estimate more coefficients").code
-    'lens'
-    """
-
-    code: str
-    form: str
-    amount_px: float
-    share: float
-    probability: float
-    where: str = ""
-    do: str = ""
-    instead: bool = False
-
-    def entries(self) -> dict[str, object]:
-        """Entries for a document.
-
-        Examples
-        --------
-        >>> list(Cause("lens", "radial", 0.12, 0.9, 1.0).entries())
-        ['code', 'form', 'amount_px', 'share', 'probability', 'where', 'do', 'instead']
-        """
-        return {
-            "code": self.code, "form": self.form, "amount_px": float(self.amount_px),
-            "share": float(self.share), "probability": float(self.probability), "where": self.where,
-            "do": self.do, "instead": self.instead,
-        }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,8 +76,6 @@ def calibration_of(
     xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
     targets = covariance_by_targets(result, c)
     by_targets = {} if targets is None else {"covariance_of_targets": targets.tolist()}
-    place = _place(result, camera)
-    more = {} if place is None else {"place": place}
     return Calibration(
         kind="camera",
         name=name,
@@ -86,16 +84,16 @@ def calibration_of(
         covariance=Covariance(names=names, matrix=tuple(tuple(row) for row in covariance.tolist())),
         sigma0=result.sigma0 if result.redundancy > 0 else None,
         redundancy=result.redundancy,
+        place=_place(result, camera),
         tests=tuple(vars(test) for test in result.camera_tests(c)),
         validity={"extent": [*xy.min(axis=0).tolist(), *xy.max(axis=0).tolist()], "unit": "px",
                   "sigma_formal": dict(zip(names, found.sigma_formal.tolist(), strict=True)), **dof,
                   "images": int(np.count_nonzero(result.fit.usable.images & (result.network.camera_of == c))),
-                  **by_targets,
+                  **by_targets, "rms_px": result.rms_px(c),
                   "warnings": [remark.text for remark in result.warnings],
                   "warning_codes": [remark.code.value for remark in result.warnings]},
         provenance=dict(provenance or {}),
         times=dict(times or {}),
-        **more,
     )  # fmt: skip
 
 

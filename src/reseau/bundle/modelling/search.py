@@ -198,7 +198,7 @@ class Selection:
     result: Result
     steps: tuple[Eliminated, ...]
 
-    def __bool__(self) -> bool:
+    def __bool__(self) -> Literal[True]:
         return True
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from ...calibration import Calibration, CameraMapping
+from ...calibration import Calibration, CameraMapping, read_calibration, required_use
 from ...calibration.document import CameraModel, Covariance, Quantity
 from ...core.errors import FormatError, UsageError
 from ...core.provenance import Provenance, sha256_of
@@ -23,8 +23,10 @@ from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, Mounted, Pla
 __all__ = [
     "CalibrationFormat",
     "Exported",
+    "any_calibration",
     "calibration_formats",
     "export_calibration",
+    "export_calibrations",
     "export_rig",
     "exported_lens",
     "formats_holding",
@@ -71,6 +73,8 @@ class CalibrationFormat:
         Camera of a text.
     beside : mapping of str to callable
         Texts of further files, by the suffixes with which they lie beside the first.
+    comment : callable, optional
+        Puts a comment of one line into a text; None where the format has no comments.
     splined : bool
         Whether it also holds cameras with a spline surface, which describe every lens.
 
@@ -88,6 +92,7 @@ class CalibrationFormat:
     read: Callable[[str, Path], PlainCamera]
     beside: Mapping[str, Callable[[PlainCamera], str]] = field(default_factory=dict)
     splined: bool = False
+    comment: Callable[[str, str], str] | None = None
 
 
 def calibration_formats() -> dict[str, CalibrationFormat]:
@@ -103,39 +108,42 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
         CalibrationFormat(
             "opencv", (".yml", ".yaml", ".xml", ".json"),
             (*wide, ("opencv_full", _TWELVE), ("opencv_full", (*_CENTRE, *TILTED)), fisheye),
-            opencv.write, opencv.recognises, opencv.read,
+            opencv.write, opencv.recognises, opencv.read, comment=_after_head,
         ),
         CalibrationFormat(
-            "ros", (".yaml",), (*wide, fisheye), yamls.write_ros, yamls.is_ros, yamls.read_ros
+            "ros", (".yaml",), (*wide, fisheye), yamls.write_ros, yamls.is_ros, yamls.read_ros,
+            comment=_hash,
         ),
         CalibrationFormat(
             "kalibr", (".yaml",),
             (("opencv", _RADTAN), fisheye, ("omni", (*_RADTAN, "xi")),
              ("double_sphere", (*_CENTRE, "xi", "alpha"))),
-            yamls.write_kalibr, yamls.is_kalibr, yamls.read_kalibr,
+            yamls.write_kalibr, yamls.is_kalibr, yamls.read_kalibr, comment=_hash,
         ),
         CalibrationFormat(
             "colmap", (".txt",), (("opencv", _RADTAN), ("opencv", _EIGHT), fisheye),
-            colmap.write, colmap.recognises, colmap.read,
+            colmap.write, colmap.recognises, colmap.read, comment=_hash,
         ),
         CalibrationFormat(
             "mrcal", (".cameramodel",),
             (("opencv", _RADTAN), *wide, ("opencv_full", _TWELVE), ("stereographic", _CENTRE)), mrcal.write,
-            mrcal.recognises, mrcal.read, splined=True,
+            mrcal.recognises, mrcal.read, splined=True, comment=_hash,
         ),
         CalibrationFormat(
             "metashape", (".xml",), (("opencv", _FIVE), fisheye),
-            metashape.write, metashape.recognises, metashape.read,
+            metashape.write, metashape.recognises, metashape.read, comment=_after_head,
         ),
         CalibrationFormat(
             "photomodeler", (".txt",), (("brown", brown.BROWN),),
             brown.write_photomodeler, brown.is_photomodeler, brown.read_photomodeler,
         ),
         CalibrationFormat(
-            "dbat", (".xml",), (("brown", brown.BROWN),), brown.write_dbat, brown.is_dbat, brown.read_dbat
+            "dbat", (".xml",), (("brown", brown.BROWN),), brown.write_dbat, brown.is_dbat, brown.read_dbat,
+            comment=_after_head,
         ),
         CalibrationFormat(
-            "matlab", (".m",), (("opencv", _FIVE),), matlab.write, matlab.recognises, matlab.read
+            "matlab", (".m",), (("opencv", _FIVE),), matlab.write, matlab.recognises, matlab.read,
+            comment=_percent,
         ),
         CalibrationFormat(
             "openptv", (".ori",), (("openptv", openptv.OPENPTV),),
@@ -143,6 +151,24 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
         ),
     )  # fmt: skip
     return {entry.name: entry for entry in formats}
+
+
+def _hash(text: str, comment: str) -> str:
+    return f"# {comment}\n{text}"
+
+
+def _percent(text: str, comment: str) -> str:
+    return f"% {comment}\n{text}"
+
+
+def _after_head(text: str, comment: str) -> str:
+    """A comment after the first line of XML, or the two of the YAML of OpenCV."""
+    if text.lstrip().startswith("<"):
+        head, _, rest = text.partition("\n")
+        # Two hyphens would end a comment of XML.
+        return f"{head}\n<!-- {comment.replace('--', '- -')} -->\n{rest}"
+    head, mark, rest = text.partition("---\n")
+    return f"{head}{mark}# {comment}\n{rest}"
 
 
 class Exported(NamedTuple):
@@ -157,6 +183,8 @@ class Exported(NamedTuple):
         the same.
     share : float
         Share of the image where the calibration has directions; the rest was not compared.
+    notes : tuple of str
+        That it has no verdict, or is usable for less than measurement.
 
     Examples
     --------
@@ -168,9 +196,12 @@ class Exported(NamedTuple):
     rms_px: float
     greatest_px: float
     share: float
+    notes: tuple[str, ...] = ()
 
 
-def export_calibration(calibration: Calibration, to: str, path: Path | str) -> Exported:
+def export_calibration(
+    calibration: Calibration, to: str, path: Path | str, *, anyway: bool = False
+) -> Exported:
     """Write the calibration of a camera in the format of another program.
 
     A model that the format lacks is converted: of the models that it has, the simplest that differs by less
@@ -183,12 +214,15 @@ def export_calibration(calibration: Calibration, to: str, path: Path | str) -> E
     to : str
         Name of the format; see :func:`calibration_formats`.
     path : path
-        File to write.
+        File to write; its verdict is in a comment where the format has comments.
+    anyway : bool
+        Whether to go on with a calibration that is usable for nothing.
 
     Raises
     ------
     UsageError
-        When the format is unknown, the calibration is not that of a camera, or no model describes it.
+        When the format is unknown, the calibration is not that of a camera or, unless `anyway`, usable for
+        nothing, or no model describes it.
     InputError
         When the file cannot be written.
 
@@ -209,19 +243,50 @@ def export_calibration(calibration: Calibration, to: str, path: Path | str) -> E
     lens = calibration.mapping()
     if not isinstance(lens, CameraMapping):
         raise UsageError(calibration.not_of("camera"), where=calibration.name)
-    found = _in_a_model_of(formats[to], calibration, lens)
+    form = formats[to]
+    notes = _notes([calibration], anyway)
+    found = _in_a_model_of(form, calibration, lens)._replace(notes=notes)
     path = Path(path)
-    for suffix, write in formats[to].beside.items():
+    for suffix, write in form.beside.items():
         if path.suffix == suffix:
-            raise UsageError(
-                f"has the suffix of the file beside it, use {formats[to].suffixes[0]}", where=path
-            )
+            raise UsageError(f"has the suffix of the file beside it, use {form.suffixes[0]}", where=path)
         write_whole(path.with_suffix(suffix), write(found.camera))
-    write_whole(path, formats[to].write(found.camera))
+    write_whole(path, _commented(form, form.write(found.camera), [calibration]))
     return found
 
 
-def export_rig(calibrations: Sequence[Calibration], to: str, path: Path | str) -> tuple[Exported, ...]:
+def _notes(calibrations: Sequence[Calibration], anyway: bool) -> tuple[str, ...]:
+    return required_use([(each.name, each.assessment) for each in calibrations], "exported", anyway=anyway)
+
+
+def _commented(form: CalibrationFormat, text: str, calibrations: Sequence[Calibration]) -> str:
+    """The text with the verdicts in a comment."""
+    said = [f"{each.name}: {each.assessment.short}" for each in calibrations if each.assessment is not None]
+    if form.comment is None or not said:
+        return text
+    return form.comment(text, " ".join("; ".join(said).split()))
+
+
+def export_calibrations(
+    calibrations: Sequence[Calibration], to: str, path: Path | str, *, anyway: bool = False
+) -> tuple[Exported, ...]:
+    """Write one calibration as :func:`export_calibration` does, and several as :func:`export_rig`.
+
+    Examples
+    --------
+    >>> export_calibrations([], "kalibr", "chain.yaml")
+    Traceback (most recent call last):
+    ...
+    reseau.core.errors.UsageError: calibrations: are not those of one rig: 0 have no place; give ...
+    """
+    if len(calibrations) == 1:
+        return (export_calibration(calibrations[0], to, path, anyway=anyway),)
+    return export_rig(calibrations, to, path, anyway=anyway)
+
+
+def export_rig(
+    calibrations: Sequence[Calibration], to: str, path: Path | str, *, anyway: bool = False
+) -> tuple[Exported, ...]:
     """Write the calibrations of cameras that are fixed to each other in one file of another program.
 
     Parameters
@@ -232,6 +297,8 @@ def export_rig(calibrations: Sequence[Calibration], to: str, path: Path | str) -
         ``opencv``, for two cameras, or ``kalibr``.
     path : path
         File to write; OpenCV's translation is in mm, Kalibr's in m.
+    anyway : bool
+        Whether to go on with a calibration that is usable for nothing.
 
     Returns
     -------
@@ -241,7 +308,8 @@ def export_rig(calibrations: Sequence[Calibration], to: str, path: Path | str) -
     Raises
     ------
     UsageError
-        When the format has no rigs, or the calibrations are not those of one rig.
+        When the format has no rigs, the calibrations are not those of one rig, or, unless `anyway`, one is
+        usable for nothing.
     InputError
         When the file cannot be written.
 
@@ -266,6 +334,7 @@ def export_rig(calibrations: Sequence[Calibration], to: str, path: Path | str) -
         raise UsageError(f"have places in {', '.join(sorted(units))}, not in mm", where="calibrations")
     if to == "opencv" and len(placed) > 1:
         raise UsageError("holds two cameras", where=to, do="use kalibr, or write pairs")
+    notes = _notes(calibrations, anyway)
     form, done, rig = calibration_formats()[to], list[Exported](), list[Mounted]()
     for each in (*first, *placed):
         lens = each.mapping()
@@ -276,8 +345,8 @@ def export_rig(calibrations: Sequence[Calibration], to: str, path: Path | str) -
         turn = np.eye(3) if place is None else rotation_matrix(np.array(place.rotation))
         rig.append(Mounted(done[-1].camera, turn, np.zeros(3) if place is None else np.array(place.base)))
     text = opencv.write_pair(rig[0], rig[1]) if to == "opencv" else yamls.write_kalibr_rig(rig)
-    write_whole(Path(path), text)
-    return tuple(done)
+    write_whole(Path(path), _commented(form, text, calibrations))
+    return (done[0]._replace(notes=notes), *done[1:])
 
 
 def _in_a_model_of(form: CalibrationFormat, calibration: Calibration, lens: CameraMapping) -> Exported:
@@ -461,6 +530,27 @@ def import_calibration(path: Path | str) -> Calibration:
             return _calibration(form.read(text, path), source.to_dict())
     known = ", ".join(calibration_formats())
     raise FormatError(f"is not a calibration of one of the formats {known}", where=path)
+
+
+def any_calibration(path: Path | str) -> Calibration:
+    """Read a calibration: ours of any kind, or that of a camera in a file of another program.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is of no known format, or incomplete.
+
+    Examples
+    --------
+    >>> any_calibration("missing.json")
+    Traceback (most recent call last):
+    reseau.core.errors.InputError: missing.json: cannot be read (No such file or directory)
+    """
+    path = Path(path)
+    ours = path.suffix.lower() == ".json" and '"reseau-' in read_text(path)[:4096]
+    return read_calibration(path) if ours else import_calibration(path)
 
 
 def _calibration(camera: PlainCamera, provenance: dict[str, Any]) -> Calibration:

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 
 from ...core.errors import FormatError
-from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, Mounted, PlainCamera, opencv_camera
+from ...optics.cameras import opencv_coefficients
+from .plain import Mounted, PlainCamera, opencv_camera
 
 __all__ = ["coefficients", "read", "recognises", "write", "write_pair"]
 
@@ -53,10 +54,7 @@ def coefficients(camera: PlainCamera) -> list[float]:
     """Return the shortest list of OpenCV's coefficients that holds the camera."""
     if camera.model == "fisheye":
         return camera.of("k1", "k2", "k3", "k4")
-    for names in ((*RADIAL_TANGENTIAL, "k3"), RATIONAL, THIN_PRISM):
-        if all(camera.values.get(name, 0.0) == 0.0 for name in TILTED if name not in names):
-            return camera.of(*names)
-    return camera.of(*TILTED)
+    return opencv_coefficients(camera.values)
 
 
 def recognises(text: str) -> bool:

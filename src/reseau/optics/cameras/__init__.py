@@ -11,7 +11,7 @@ registry.
 
 # The order of the imports is the order of the registry.
 from .brown import Brown, BrownDistortion, BrownWithAdditional  # isort: skip
-from .opencv import OpenCV  # isort: skip
+from .opencv import OpenCV, opencv_coefficients  # isort: skip
 from .projections import (  # isort: skip
     Division,
     DoubleSphere,
@@ -78,6 +78,7 @@ __all__ = [
     "convert",
     "default_camera_model",
     "distortion_names",
+    "opencv_coefficients",
     "register_additional",
     "register_camera",
     "roughly",

@@ -20,7 +20,7 @@ from .kernels import CameraColumns
 from .radial import Radial, first_root
 from .registry import CameraModel, Parameter, register_camera
 
-__all__ = ["OpenCV"]
+__all__ = ["OpenCV", "opencv_coefficients"]
 
 PARAMETERS = (
     Parameter("fx", "px", "scale", usual=True, required=True),
@@ -47,6 +47,18 @@ FX, FY, CX, CY, K1, K2, P1, P2, K3, K4, K5, K6, S1, S2, S3, S4, TAU_X, TAU_Y = r
 _PLAIN, _RATIONAL, _FULL = 9, len(PARAMETERS), len(FULL_PARAMETERS)
 # Radial terms of numerator and denominator, by ascending powers of r².
 _RADIAL = ((K1, K4), (K2, K5), (K3, K6))
+
+
+def opencv_coefficients(values: Named[str, float]) -> list[float]:
+    """The shortest list of coefficients (5, 8, 12 or 14), in the order of OpenCV; those missing are 0.
+
+    Examples
+    --------
+    >>> opencv_coefficients({"fx": 800.0, "k1": -0.2, "k2": 0.05})
+    [-0.2, 0.05, 0.0, 0.0, 0.0]
+    """
+    every = [float(values.get(each.name, 0.0)) for each in FULL_PARAMETERS[K1:]]
+    return every[: next(count for count in (5, 8, 12, 14) if not any(every[count:]))]
 
 
 @dataclass(frozen=True, eq=False)

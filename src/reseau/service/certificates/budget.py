@@ -21,9 +21,10 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+from scipy.interpolate import RegularGridInterpolator
 
 from ...adjust import Contribution, Simulated, UncertaintyBudget, propagate, simulate
-from ...calibration import Calibration, CameraMapping
+from ...calibration import Calibration, CameraMapping, projection_field
 from ...core.data import Array, ImagePoints
 from ...core.errors import UsageError
 from .data import CertificateData
@@ -432,6 +433,19 @@ def _inputs(uncertainty: CalibrationUncertainty, points: ImagePoints) -> Array:
     return np.concatenate([points.xy.ravel(), uncertainty.values])
 
 
+def _lacking(calibration: Calibration, xy: Array) -> Array:
+    """Variances (n,) of points, px², that the verdict has beyond those of the calibration."""
+    lens, assessed = calibration.mapping(), calibration.assessment
+    if not isinstance(lens, CameraMapping) or assessed is None or assessed.errors is None:
+        return np.zeros(len(xy))
+    errors = assessed.errors
+    own = projection_field(lens, len(errors.x), len(errors.y)).sigma
+    beyond = np.nan_to_num(np.maximum(errors.total**2 - own**2, 0.0))
+    at = np.clip(xy, 0.0, [errors.x[-1], errors.y[-1]])
+    found: Array = RegularGridInterpolator((errors.y, errors.x), beyond)(at[:, ::-1])
+    return found
+
+
 def _of_measurement(uncertainty: CalibrationUncertainty, points: ImagePoints) -> list[Contribution]:
     """Contributions to points and parameters."""
     n, u = len(points), len(uncertainty.values)
@@ -442,10 +456,9 @@ def _of_measurement(uncertainty: CalibrationUncertainty, points: ImagePoints) ->
         return full
 
     found = [Contribution("grey values of the measurement", placed(scipy.linalg.block_diag(*points.cov), 0))]
-    assessed: dict[str, Any] = uncertainty.calibration.validity.get("assessment") or {}
-    misfit = assessed.get("misfit_px")
-    if misfit:
-        found.append(Contribution("model: misfit", placed(float(misfit) ** 2 * np.eye(2 * n), 0)))
+    lacking = _lacking(uncertainty.calibration, points.xy)
+    if lacking.any():
+        found.append(Contribution("model of the lens", placed(np.diag(np.repeat(lacking, 2)), 0)))
     for each in uncertainty.contributions:
         name = f"calibration: {each.name}"
         cov = placed(each.covariance, 2 * n)

@@ -9,7 +9,7 @@ from datetime import date, datetime
 import numpy as np
 
 from ...adjust import UncertaintyBudget
-from ...calibration import Calibration, CameraMapping
+from ...calibration import Calibration, CameraMapping, Use
 from ...core.data import ImagePoints
 from ...core.errors import UsageError
 from ..inforce import Decision, key_of
@@ -166,8 +166,7 @@ def certify(
             where=f"{configuration} {decision.key}",
             do="review it first" if decision.outcome == "needs review" else None,
         )
-    assessed = calibration.validity.get("assessment") or {}
-    if assessed.get("use") == "nothing":
+    if calibration.assessment is not None and calibration.assessment.use is Use.NOTHING:
         raise UsageError("is usable for nothing by its own assessment, and gets no certificate", where=where)
     if not 0.683 <= probability < 1.0:
         raise UsageError(f"{probability:g} is not from 0.683 to below 1", where="coverage probability")

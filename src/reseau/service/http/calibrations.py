@@ -14,6 +14,7 @@ from urllib.parse import quote
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import AwareDatetime, ConfigDict, Field
 
+from ...calibration import Assessment
 from ...core.errors import ReseauError, UsageError
 from .access import Administering, Here, NotFound, Operating, Reading
 from .answers import Answer, Done, refusals
@@ -136,7 +137,7 @@ class CalibrationDetail(Answer):
     """A calibration and the decision on it; `verdict` says what it is good for."""
 
     verdict: list[str]
-
+    assessment: Assessment | None
     configuration: str
     decision: DecisionRow
     kind: str
@@ -353,8 +354,7 @@ def configuration_detail(service: Service, name: str) -> ConfigurationDetail:
 
 def verdict_of(calibration: Calibration) -> list[str]:
     """Return what a calibration is good for, in words; nothing if it does not say."""
-    found = calibration.validity.get("assessment", {}).get("lines", [])
-    return [str(each) for each in found]
+    return [] if calibration.assessment is None else list(calibration.assessment.lines)
 
 
 def rules_of(service: Service, name: str) -> dict[str, Any] | None:
@@ -379,7 +379,7 @@ def calibration_detail(service: Service, name: str, key: str) -> CalibrationDeta
                 pairs.append((names[j], first, matrix[i][j] / scale))
     pairs.sort(key=lambda pair: -abs(pair[2]))
     return CalibrationDetail(
-        verdict=verdict_of(found),
+        verdict=verdict_of(found), assessment=found.assessment,
         configuration=name, decision=_row(service, decision), kind=found.kind, name=found.name,
         sigma0=found.sigma0, redundancy=found.redundancy,
         parameters=[
@@ -569,12 +569,13 @@ def figure(
 def _drawn(calibration: Calibration, figure: str) -> str:
     from ...calibration import CameraMapping, projection_field
     from ...report.bundle_figures import distortion_figure
-    from ...report.fields import uncertainty_figure
+    from ...report.fields import errors_figure, uncertainty_figure
 
     lens = CameraMapping.from_calibration(calibration)
+    errors = None if calibration.assessment is None else calibration.assessment.errors
     if figure == "uncertainty":
-        return uncertainty_figure(projection_field(lens))
-    drawn = distortion_figure(lens)
+        return uncertainty_figure(projection_field(lens)) if errors is None else errors_figure(errors)
+    drawn = distortion_figure(lens, errors)
     if drawn is None:
         raise NotFound("has no distortion", where=calibration.name)
     return drawn[0]
