@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from enum import StrEnum
@@ -238,7 +239,7 @@ def calibrate(
         found = calibrate_camera(
             _shown(frames, step), target, measure, _size(size), lens, options, taken or None, executor, kept
         )
-        done = required(found, design)
+        done = required(found, _common_folder(files))
     for note in done.notes:
         typer.echo(f"note: {note}", err=True)
     named = (None if automatic else design, control, refraction, turntable, sensor)
@@ -266,6 +267,11 @@ def calibrate(
         say("".join(calibration.to_json() for calibration in calibrations))
     else:
         _say(done, differences, distance or [])
+
+
+def _common_folder(files: list[Path]) -> Path:
+    """The folder of the photographs, or the only one of them."""
+    return files[0] if len(files) == 1 else Path(os.path.commonpath([path.absolute() for path in files]))
 
 
 def _found_target(
@@ -469,6 +475,7 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     from ..bundle import camera_mapping, projection_field_at
     from ..calibration import projection_field
     from ..procedures.assessment import sorted_remarks
+    from ..procedures.target_measurement import by_reason
 
     result = done.result
     for name, assessed in done.assessments.items():
@@ -508,8 +515,8 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     for name, found in differences.items():
         say_difference(name, found)
     say_left_out(result)
-    for name, why in done.declined.items():
-        say(f"left out: {name}: {why}\n")
+    for why, names in by_reason(done.declined).items():
+        say(f"left out: {', '.join(names)}: {why}\n")
     warnings, tests = sorted_remarks(result, done.assessments.values())
     say("".join(f"{line}\n" for line in remark_lines(warnings, tests)))
 
