@@ -285,7 +285,8 @@ def test_the_size_of_a_target_that_was_found_is_not_known(
 def test_too_few_images_are_refused_with_their_reasons(reseau: Run, measured: tuple[Path, ...]) -> None:
     status, _, err = reseau("calibrate", *measured[1:3], "-d", measured[0], "--size", "240x240")
     assert status == 1
-    assert "2 images show the target, 3 are needed" in err
+    names = ", ".join(path.name for path in measured[1:3])
+    assert f"error: {measured[1].parent}: 2 images ({names}) show the target, 3 are needed" in err
     assert err.count("\n") == 1
 
 

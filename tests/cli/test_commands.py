@@ -187,7 +187,7 @@ def test_a_board_file_is_read_and_its_unit_is_asked_for(reseau: Run, tmp_path: P
     (tmp_path / "opencv.yml").write_text(storage + "dictionary: 5\n")
     status, _, err = reseau("design", "board", "--from", tmp_path / "opencv.yml", "--json", file)
     assert status == 0
-    assert "note: the pitch is 0.024 mm; if opencv.yml is in metres, give --pitch" in err
+    assert "is 0.024 mm (24 µm): is it 0.024 m, which is 24 mm? Lengths depend on it: give --pitch" in err
     # A pitch of zero is no pitch that was not given.
     for target in ("board", "sheet", "testfield"):
         status, out, err = reseau("design", target, "--pitch", 0)

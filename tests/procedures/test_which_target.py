@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from reseau.core.data import Frame
-from reseau.core.failure import Code, Failure
+from reseau.core.failure import Failure
 from reseau.designs import board, coded_sheet, coded_testfield
 from reseau.designs.dots import dot_signs
 from reseau.designs.known import known_designs
@@ -37,7 +37,18 @@ def test_a_charuco_board_is_found_among_other_targets() -> None:
     assert not isinstance(found, Failure)
     assert found[0] == "mine"
     assert isinstance(found[1], BoardDesign)
-    assert not which_target([frame], {"sheet": candidates["sheet"]})
+    # One that is not among the candidates is described, without its size.
+    found = which_target([frame], {"sheet": candidates["sheet"]})
+    assert not isinstance(found, Failure)
+    assert found[0] == "a ChArUco board of 7 × 6 squares with markers of DICT_5X5_50"
+
+
+def test_a_lattice_that_few_photographs_show_is_said_where_no_target_is_found() -> None:
+    frame, _ = picture(board("chess", 7, 6, 24.0))
+    wall = Frame(np.random.default_rng(0).normal(100, 2, (200, 300)), 255.0)
+    found = which_target([wall, frame, wall], {})
+    assert isinstance(found, Failure)
+    assert "seen; the photographs show a lattice of 7 × 6 squares without markers; describe" in found.reason
 
 
 def test_lines_are_not_looked_for_where_markers_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,8 +130,8 @@ def test_parts_of_a_larger_chessboard_are_not_taken_for_a_smaller_one() -> None:
     assert which_target([part, part, part], {"smaller": smaller}) == ("smaller", smaller)
     # Of three photographs that show a part of it, and others, also those after the first three tell.
     found = which_target([part, part, part, frame, frame], {"smaller": smaller})
-    assert isinstance(found, Failure)
-    assert found.code is Code.NOT_FOUND
+    assert not isinstance(found, Failure)
+    assert found[0] == "a chessboard of 9 × 8 squares"
     assert which_target([part, part, part, frame], {"smaller": smaller, "larger": larger})
 
 

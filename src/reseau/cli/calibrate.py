@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from enum import StrEnum
@@ -254,7 +255,7 @@ def calibrate(
         found = calibrate_camera(
             _shown(frames, step), target, measure, _size(size), lens, options, taken or None, executor, kept
         )
-        done = required(found, design)
+        done = required(found, _common_folder(files))
     for note in done.notes:
         typer.echo(f"note: {note}", err=True)
     named = (None if automatic else design, control, refraction, turntable, sensor)
@@ -307,6 +308,11 @@ def _folder(out: Path | None, files: list[Path], as_json: bool) -> Path | None:
     if out is None:
         return None if as_json else made_folder(folder_beside(files))
     return made_folder(out) if out.is_dir() or not out.suffix else None
+
+
+def _common_folder(files: list[Path]) -> Path:
+    """The folder of the photographs, or the only one of them."""
+    return files[0] if len(files) == 1 else Path(os.path.commonpath([path.absolute() for path in files]))
 
 
 def _found_target(
@@ -488,6 +494,7 @@ def _uncertainty(field: ProjectionField) -> str:
 def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: list[float]) -> None:
     from ..bundle import projection_field_at
     from ..calibration.assessment import two_digits
+    from ..procedures.target_measurement import by_reason
 
     result = done.result
     for name, assessed in done.assessments.items():
@@ -527,8 +534,8 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
     for name, found in differences.items():
         say_difference(name, found)
     say_left_out(result)
-    for name, why in done.declined.items():
-        say(f"left out: {name}: {why}\n")
+    for why, names in by_reason(done.declined).items():
+        say(f"left out: {', '.join(names)}: {why}\n")
     say("".join(f"{line}\n" for line in remark_lines(done.warnings, done.tests)))
 
 

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["app"]
 
-_SMALL_MM = 1.0
-"""Pitch below which a file of OpenCV, which has no unit, is rather in metres."""
 
 app = typer.Typer(
     help="Draw a target for printing in true size, and write its coordinates.", no_args_is_help=True
@@ -287,6 +285,7 @@ def board(
     first_id: Annotated[int, typer.Option(min=0, help="Number of the first marker.")] = 0,
     border_bits: Annotated[int, typer.Option(help="Width of the border of a marker (bits).")] = 1,
     legacy: Annotated[bool, typer.Option("--legacy", help="ChArUco layout of OpenCV before 4.6.")] = False,
+    polarity: Annotated[Polarity, typer.Option(help="Dark or bright circles.")] = Polarity.DARK,
     asymmetric: Annotated[
         bool, typer.Option("--asymmetric", help="Shift every second row of circles by half a step.")
     ] = False,
@@ -312,6 +311,8 @@ def board(
     out: Design = None,
 ) -> None:
     """Design a chessboard, PuzzleBoard, deltille, ChArUco board, circle grid or grid of tags."""
+    from ..designs.boards import unusual_size
+
     if given is not None:
         from ..exchange import read_board
         from ..io import BoardDesign as Board
@@ -319,12 +320,6 @@ def board(
         design = read_board(given)
         other = {key: value for key, value in (("pitch", pitch), ("size", size)) if value is not None}
         design = Board.from_content(design.to_dict() | other, where=given)
-        if design.pitch < _SMALL_MM:
-            typer.echo(
-                f"note: the pitch is {design.pitch:g} mm; if {given.name} is in metres, give --pitch and "
-                "--size in mm",
-                err=True,
-            )
     else:
         from ..designs import board as board_of
 
@@ -333,11 +328,13 @@ def board(
         def of(pitch: float, size: float | None = None) -> BoardDesign:
             return board_of(
                 kind.value, columns, rows, pitch, size=size, dictionary=dictionary, first_id=first_id,
-                border_bits=border_bits, legacy=legacy, asymmetric=asymmetric, dots=marked,
-                start=start, name=name,
+                border_bits=border_bits, legacy=legacy, polarity=polarity.value,
+                asymmetric=asymmetric, dots=marked, start=start, name=name,
             )  # fmt: skip
 
         design = of(_filling(of, paper) if pitch is None else pitch, size)
+    if asked := unusual_size(design):
+        typer.echo(f"note: {asked}: give --pitch and --size in mm", err=True)
     what = f"{design.kind}, {design.columns} × {design.rows}, pitch {design.pitch:g} mm"
     _write(design, svg, pdf, out, paper, what)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -13,10 +14,20 @@ from ..core.errors import UsageError
 from ..io.board import BoardDesign, BoardKind
 from .dots import dotted_squares
 
-__all__ = ["board", "board_figures", "dictionary_name", "marker_cells", "marker_dictionary"]
+__all__ = [
+    "board",
+    "board_figures",
+    "dictionary_cells",
+    "dictionary_name",
+    "marker_cells",
+    "marker_dictionary",
+    "unusual_size",
+]
 
 _SIZES = {"puzzle": 1 / 3, "charuco": 0.75, "circles": 0.5, "aprilgrid": 1 / 1.3, "markers": 0.8}
 """Sizes of dots, markers, circles and tags in pitches, where none is given; tags are 0.3 of a side apart."""
+_USUAL_MM, _UNITS = 25.0, {"mm": 1.0, "m": 1000.0, "µm": 0.001}
+"""Usual pitch of boards that are photographed; units that are mistaken for each other, in mm."""
 _DICTIONARIES = {
     "charuco": "DICT_5X5_100",
     "aprilgrid": "DICT_APRILTAG_36h11",
@@ -79,14 +90,29 @@ def board(
         what = str(first["msg"]).removeprefix("Value error, ")
         raise UsageError(what, where=".".join(map(str, first["loc"])) or "board") from None
     if design.dictionary is not None:
-        available = len(marker_dictionary(design.dictionary).bytesList)
-        needed = int(design.markers[0].max()) + 1
-        if needed > available:
-            raise UsageError(
-                f"has {available} markers, {needed} are needed", where=design.dictionary,
-                do="take a larger dictionary or fewer squares",
-            )  # fmt: skip
+        marker_cells(design)
     return design
+
+
+def unusual_size(design: BoardDesign) -> str:
+    """Ask for the unit of a board whose size is more usual in another unit; empty where it is not.
+
+    Examples
+    --------
+    >>> unusual_size(board("chess", 7, 10, 23.0))
+    ''
+    >>> unusual_size(board("chess", 7, 10, 0.025))
+    'the pitch of the board is 0.025 mm (25 µm): is it 0.025 m, which is 25 mm? Lengths depend on it'
+    """
+    # Of two units the one in which the logarithm of the length is nearer to that of usual boards.
+    away = {unit: abs(np.log(design.pitch * mm / _USUAL_MM)) for unit, mm in _UNITS.items()}
+    unit = min(away, key=lambda each: away[each])
+    if unit == "mm":
+        return ""
+    pitch, mm = design.pitch, design.pitch * _UNITS[unit]
+    also = f" ({1000 * pitch:g} µm)" if pitch < 1 else f" ({pitch / 1000:g} m)"
+    asked = f"is it {pitch:g} {unit}, which is {mm:g} mm? Lengths depend on it"
+    return f"the pitch of the board is {pitch:g} mm{also}: {asked}"
 
 
 def marker_dictionary(name: str) -> Any:
@@ -140,6 +166,11 @@ def dictionary_name(number: int) -> str:
 def marker_cells(design: BoardDesign) -> tuple[Array, NDArray[np.bool_]]:
     """Markers of a board: their corners (m, 4, 2) and their black cells (m, n, n), rows downwards.
 
+    Raises
+    ------
+    UsageError
+        When the dictionary has too few markers, or OpenCV has no such dictionary.
+
     Examples
     --------
     >>> corners, black = marker_cells(board("charuco", 4, 3, 20.0))
@@ -148,12 +179,32 @@ def marker_cells(design: BoardDesign) -> tuple[Array, NDArray[np.bool_]]:
     """
     numbers, corners = design.markers
     assert design.dictionary is not None
-    dictionary = marker_dictionary(design.dictionary)
-    side = dictionary.markerSize + 2 * design.border_bits
-    images = [dictionary.generateImageMarker(int(k), side, None, design.border_bits) for k in numbers]
+    black = dictionary_cells(design.dictionary, design.border_bits, turned=design.kind == "aprilgrid")
+    if (needed := int(numbers.max()) + 1) > len(black):
+        raise UsageError(
+            f"has {len(black)} markers, {needed} are needed", where=design.dictionary,
+            do="take a larger dictionary or fewer squares",
+        )  # fmt: skip
+    return corners, black[numbers]
+
+
+@lru_cache(maxsize=64)
+def dictionary_cells(name: str, border_bits: int = 1, *, turned: bool = False) -> NDArray[np.bool_]:
+    """Black cells (m, n, n) of all markers of a dictionary, rows downwards.
+
+    OpenCV has the words of AprilTags `turned` by 180° against those of their authors, whom Kalibr follows.
+
+    Examples
+    --------
+    >>> dictionary_cells("DICT_APRILTAG_36h11", 2).shape
+    (587, 10, 10)
+    """
+    dictionary = marker_dictionary(name)
+    side = dictionary.markerSize + 2 * border_bits
+    count = len(dictionary.bytesList)
+    images = [dictionary.generateImageMarker(k, side, None, border_bits) for k in range(count)]
     black = np.stack(images) == 0
-    # OpenCV has the words of AprilTags turned by 180° against those of their authors, whom Kalibr follows.
-    return corners, np.rot90(black, 2, axes=(1, 2)) if design.kind == "aprilgrid" else black
+    return np.rot90(black, 2, axes=(1, 2)) if turned else black
 
 
 def board_figures(design: BoardDesign) -> tuple[list[Array], Array]:

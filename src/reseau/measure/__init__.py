@@ -1,6 +1,14 @@
 """One frame to image coordinates: marks of a reseau, a testfield or a sheet, pins, edges of film frames."""
 
-from .boards import BoardOptions, BoardResult, PuzzlePart, measure_board, measure_tags, puzzle_part
+from .boards import (
+    BoardOptions,
+    BoardResult,
+    PuzzlePart,
+    boards_shown,
+    measure_board,
+    measure_tags,
+    puzzle_part,
+)
 from .fitting import fit_mapping, mapping_problem, reduce_mapping
 from .matching import Matches, MatchOptions, match
 from .pins import (
@@ -33,6 +41,7 @@ __all__ = [
     "TestfieldOptions",
     "TestfieldResult",
     "Wires",
+    "boards_shown",
     "find_pins",
     "fit_mapping",
     "lay_wires",

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -43,13 +43,12 @@ from ..optics import PixelGrid, camera_model
 from ..optics.refraction import RefractedRays, Refraction
 from .calibrated import ONE_CAMERA, Calibrated
 from .calibration_options import CalibrationOptions, CameraOptions, PlaneDesign
+from .copies import copies_among, said_of_copies
 from .exposures import Taken
 from .misnamed_points import left_out
-from .target_measurement import MeasuredPhotograph, Measurer, Photograph, measured_in_order
+from .target_measurement import MeasuredPhotograph, Measurer, Photograph, by_reason, few_of
+from .told_target import measured_as_shown
 from .turned_targets import named_alike, ways_to_turn
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["calibrate_camera", "first_camera", "network_of"]
 
@@ -119,11 +118,15 @@ def calibrate_camera(
         out was not measured, or windows and media contradict each other.
     """
     options = options or CalibrationOptions()
-    photographs = list(measured_in_order(_checked(frames, taken), measure, executor, outputs))
+    seen = measured_as_shown(_checked(frames, taken), design, measure, executor, outputs)
+    design, photographs = seen.corrected or design, seen.photographs
     measured, declined, sizes = _measured(photographs, size, taken)
+    copies = copies_among(measured)
+    measured = {name: points for name, points in measured.items() if name not in copies}
+    declined |= {name: f"a copy of {original}" for name, original in copies.items()}
     measured = _without(measured, options.without)
-    notes = tuple(note for each in photographs for note in each.notes)
-    job = _Job(declined, sizes, notes, design, model, options, taken)
+    notes = (*seen.notes, *said_of_copies(copies), *(note for each in photographs for note in each.notes))
+    job = _Job(declined, sizes, notes, design, model, options, taken, seen.shown)
     done = job.calibrated(measured)
     if isinstance(design, BoardDesign) and ways_to_turn(design) and options.control is None:
         # A better camera tells better which photographs name the points in another way.
@@ -155,6 +158,8 @@ class _Job:
     model: CameraOptions | None
     options: CalibrationOptions
     taken: Mapping[str, Taken] | None
+    shown: str = ""
+    """What photographs show in place of the target, in words."""
 
     def calibrated(self, measured: dict[str, ImagePoints]) -> Calibrated | Failure:
         """Calibrate from the points of photographs."""
@@ -162,11 +167,15 @@ class _Job:
         cameras, of = _cameras_of(measured, taken)
         for c, name in enumerate(cameras):
             if of.count(c) < _LEAST_IMAGES:
+                own = [image for image, at in zip(measured, of, strict=True) if at == c]
                 which = f" of camera {name}" if taken else ""
-                why = "".join(f"; {images}: {reason}" for reason, images in _by_reason(self.declined).items())
-                show = f"image{which} shows" if of.count(c) == 1 else f"images{which} show"
+                which += f" ({', '.join(own)})" if own else ""
+                why = f"; {self.shown}" if self.shown else ""
+                for reason, images in by_reason(self.declined).items():
+                    why += f"; {few_of(images)}: {reason}"
+                show = f"image{which} shows" if len(own) == 1 else f"images{which} show"
                 return Failure(
-                    f"{of.count(c)} {show} the target, {_LEAST_IMAGES} are needed, 10 are good{why}",
+                    f"{len(own)} {show} the target, {_LEAST_IMAGES} are needed, 10 are good{why}",
                     Code.TOO_FEW_IMAGES,
                 )
         if not all(name in sizes for name in cameras):
@@ -368,17 +377,6 @@ def _measured(
 
 def _camera_of(name: str, taken: Mapping[str, Taken] | None) -> str:
     return taken[name].camera if taken else ONE_CAMERA
-
-
-def _by_reason(declined: Mapping[str, str]) -> dict[str, str]:
-    """Each reason with the images to which it applies, of more than three the first and their number."""
-    found: dict[str, list[str]] = {}
-    for image, reason in declined.items():
-        found.setdefault(reason, []).append(image)
-    return {
-        reason: ", ".join(images) if len(images) < 4 else f"{images[0]} and {len(images) - 1} others"
-        for reason, images in found.items()
-    }
 
 
 def _without(

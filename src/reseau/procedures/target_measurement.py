@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -29,11 +30,16 @@ __all__ = [
     "Measurer",
     "Photograph",
     "Unread",
+    "by_reason",
     "drawing_overlays",
+    "few_of",
     "measured_in_order",
     "measurer_of",
+    "measurer_with",
 ]
 
+_COUNTS = re.compile(r"(?<![\w.×-])\d+(?![\w.×-])")
+"""Numbers in a reason, but those in names of files and in sizes of images."""
 Measurer = Callable[[Frame], Measured | Failure]
 """A function that measures a target in a frame."""
 
@@ -113,6 +119,24 @@ def measurer_of(
         options = BoardOptions(row_jitter_px=same.row_jitter_px, fill=same.fill)
         return partial(measure_board, design=design, options=options)
     return partial(measure_reseau, design=design)
+
+
+def measurer_with(measure: Measurer, design: BoardDesign) -> Measurer | None:
+    """Return a measurer of :func:`measurer_of` or :func:`drawing_overlays` for another board; none of others.
+
+    Examples
+    --------
+    >>> from reseau.designs import board
+    >>> other = measurer_with(measurer_of(board("chess", 9, 6, 25.0)), board("chess", 10, 7, 25.0))
+    >>> other.keywords["design"].columns
+    10
+    """
+    if not isinstance(measure, partial):
+        return None
+    if measure.func is _drawn:
+        inner = measurer_with(measure.args[0], design)
+        return None if inner is None else partial(_drawn, inner, *measure.args[1:])
+    return partial(measure.func, **{**measure.keywords, "design": design})
 
 
 def drawing_overlays(measure: Measurer, files: Mapping[str, Path]) -> Measurer:
@@ -215,3 +239,28 @@ def _document(photograph: MeasuredPhotograph) -> bytes:
 def _of_document(name: str, data: bytes) -> MeasuredPhotograph:
     document = PhotographPoints.parse(data.decode(), where=name)
     return MeasuredPhotograph(name, document.image_points(name), document.size, document.notes)
+
+
+def by_reason(declined: Mapping[str, str]) -> dict[str, list[str]]:
+    """Each reason once, as the first photograph has it, with all to which it applies; counts may differ.
+
+    Examples
+    --------
+    >>> by_reason({"a.png": "4 points are too few", "b.png": "5 points are too few"})
+    {'4 points are too few': ['a.png', 'b.png']}
+    """
+    found: dict[str, tuple[str, list[str]]] = {}
+    for image, reason in declined.items():
+        found.setdefault(_COUNTS.sub("#", reason), (reason, []))[1].append(image)
+    return dict(found.values())
+
+
+def few_of(names: Sequence[str]) -> str:
+    """Names, of more than three the first and the number of the others.
+
+    Examples
+    --------
+    >>> few_of(["a", "b"]), few_of(["a", "b", "c", "d"])
+    ('a, b', 'a and 3 others')
+    """
+    return ", ".join(names) if len(names) < 4 else f"{names[0]} and {len(names) - 1} others"

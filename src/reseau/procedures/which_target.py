@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, islice
 from pathlib import Path
@@ -18,10 +18,10 @@ from ..designs import board
 from ..designs.known import known_designs
 from ..exchange import read_target
 from ..io import BoardDesign, ReseauDesign, TestfieldDesign
-from ..measure import PuzzlePart, puzzle_part
+from ..measure import PuzzlePart, boards_shown, puzzle_part
 from .target_measurement import measurer_of
 
-__all__ = ["designs_beside", "which_target"]
+__all__ = ["corrected", "described", "designs_beside", "which_target"]
 
 Design = ReseauDesign | TestfieldDesign | BoardDesign
 _DESIGNS = (".json", ".yaml", ".yml", ".xml")
@@ -35,6 +35,15 @@ _APART = 10
 _MORE, _LARGER = 6, 1 / 3
 """Further photographs in which a plain pattern is looked for; the most that may show a larger lattice, as a
 share of those that show it: something beside a board may continue it by chance."""
+_KINDS = {
+    "chess": "a chessboard",
+    "puzzle": "a PuzzleBoard",
+    "deltille": "a deltille",
+    "charuco": "a ChArUco board",
+    "circles": "a grid",
+    "aprilgrid": "an AprilGrid",
+    "markers": "a grid",
+}
 _CODED, _PLAIN, _LINED = range(3)
 """Kinds of targets in the order in which they are looked for."""
 
@@ -82,35 +91,168 @@ def which_target(
     >>> which_target([], {}).code
     <Code.NOT_FOUND: 'not-found'>
     """
-    others = iter(frames)
-    full = list(islice(others, tried))
-    small = [_reduced(frame) for frame in full]
+    photographs = _Photographs(frames, tried)
     usual = next((d for d in designs.values() if isinstance(d, BoardDesign) and d.kind == "puzzle"), None)
-    puzzle = _puzzle_of(small, usual)
+    puzzle = _puzzle_of(photographs.small, usual)
     candidates = designs if puzzle is None else {**designs, puzzle[0]: puzzle[1]}
-    points = _counted(small, candidates)
-    if not any(points.values()) and any(a is not b for a, b in zip(full, small, strict=True)):
-        points = _counted(full, candidates)
-    order = sorted(candidates, key=lambda name: _plain(candidates[name]))
-    further: list[Frame] | None = None
-    while most := max(points.values(), default=0):
-        name = next(name for name in order if points[name] >= _ENOUGH * most)
-        if puzzle is not None and name == puzzle[0]:
-            # Those tried may show a part of it.
-            return _puzzle_of(chain(small, map(_reduced, others)), usual) or puzzle
-        if not _plain(candidates[name]):
-            return name, candidates[name]
-        if further is None:
-            further = [*full, *islice(others, _MORE)]
-        if not _is_part_of_another(further, candidates[name]):
-            return name, candidates[name]
-        pattern = _pattern(candidates[name])
-        points |= {name: 0 for name, design in candidates.items() if _pattern(design) == pattern}
+    found = photographs.explained_by(candidates)
+    if found is not None and puzzle is not None and found[0] == puzzle[0]:
+        # Those tried may show a part of it.
+        return _puzzle_of(photographs.every(), usual) or puzzle
+    if found is not None:
+        return found
+    shown = {described(design): design for design in photographs.boards()}
+    found = photographs.explained_by(shown)
+    if found is not None:
+        return found
+    also = f"; {_shown_words(list(shown.values()))}" if shown else ""
     return Failure(
-        "none of the known targets is seen; describe yours with `reseau design board --json board.json`, and "
-        "give that file",
+        f"none of the known targets is seen{also}; describe yours with `reseau design board --json "
+        "board.json`, and give that file",
         Code.NOT_FOUND,
     )
+
+
+def corrected(frames: Iterable[Frame], told: BoardDesign, tried: int = 3) -> BoardDesign | Failure:
+    """Find the board that photographs show, of the kind of one that they contradict.
+
+    The boards that the photographs show, with what else is known of the one that was told, compete with it:
+    that is taken which has most points in all of them.
+
+    Parameters
+    ----------
+    frames : iterable of Frame
+        Photographs.
+    told : BoardDesign
+        The design that was given.
+    tried : int
+        Number of photographs in which points are counted.
+
+    Returns
+    -------
+    BoardDesign or Failure
+        A failure (falsy) that says what the photographs show, if it is no other board of this kind.
+
+    Examples
+    --------
+    >>> corrected([], board("chess", 7, 10, 23.0)).code
+    <Code.NOT_FOUND: 'not-found'>
+    """
+    photographs = _Photographs(frames, tried)
+    shown = photographs.boards()
+    variants = {described(told): told}
+    for design in (one for each in shown for one in _as_told(each, told)):
+        variants.setdefault(repr(_pattern(design)), design)
+    found = photographs.explained_by(variants) if len(variants) > 1 else None
+    if found is not None and found[1] is not told:
+        assert isinstance(found[1], BoardDesign)
+        return found[1]
+    return Failure(_shown_words(shown) if shown else "", Code.NOT_FOUND)
+
+
+def _as_told(shown: BoardDesign, told: BoardDesign) -> list[BoardDesign]:
+    """A board that photographs show, with what else is known of one of its kind that was told; or none."""
+    if shown.kind != told.kind:
+        return []
+    counts, turned = (shown.columns, shown.rows), (told.columns < told.rows) != (shown.columns < shown.rows)
+    if turned and shown.kind in ("chess", "circles") and not shown.asymmetric:
+        counts = counts[::-1]
+    layout: dict[str, object] = {"columns": counts[0], "rows": counts[1], "dots": ()}
+    for name in ("dictionary", "border_bits", "legacy", "asymmetric", "polarity", "first_id"):
+        layout[name] = getattr(shown, name)
+    if shown.dictionary is not None and told.dictionary is not None:
+        (series, _, least), (of_told, _, count) = (
+            d.rpartition("_") for d in (shown.dictionary, told.dictionary)
+        )
+        if series == of_told and (count == least or int(count) >= int(least)):
+            # A larger dictionary of one series has the same markers.
+            layout["dictionary"] = told.dictionary
+    same = told.model_copy(update=layout)
+    if shown.size is None or told.size is None:
+        return [same]
+    share = shown.size / shown.pitch
+    # A tag is measured with a ruler, the gap beside it is not.
+    other = {"pitch": told.size / share} if told.kind == "aprilgrid" else {"size": told.pitch * share}
+    return [same, same.model_copy(update={key: float(f"{value:.3g}") for key, value in other.items()})]
+
+
+def described(design: BoardDesign) -> str:
+    """A board in words, without its size.
+
+    Examples
+    --------
+    >>> described(board("chess", 7, 10, 23.0)), described(board("charuco", 7, 10, 23.0))
+    ('a chessboard of 7 × 10 squares', 'a ChArUco board of 7 × 10 squares with markers of DICT_5X5_100')
+    """
+    text = f"{_KINDS[design.kind]} of {design.columns} × {design.rows} "
+    text += {"circles": f"{design.polarity} circles", "aprilgrid": "tags", "markers": "markers"}.get(
+        design.kind, "corners" if design.kind == "deltille" else "squares"
+    )
+    if design.kind == "charuco":
+        text += f" with markers of {design.dictionary}"
+    elif design.dictionary is not None:
+        text += f" of {design.dictionary}"
+    if design.border_bits > 1:
+        text += f" with borders of {design.border_bits} bits"
+    text += " in the layout before OpenCV 4.6" if design.legacy else ""
+    return text + (", every second row shifted" if design.asymmetric else "")
+
+
+def _shown_words(shown: Sequence[BoardDesign]) -> str:
+    """What photographs show, in words: that which most of them show."""
+    return f"the photographs show {Counter(map(_unturned, shown)).most_common(1)[0][0]}"
+
+
+def _unturned(design: BoardDesign) -> str:
+    """A board in words; of a lattice without markers nothing tells columns from rows."""
+    if design.kind != "chess":
+        return described(design)
+    low, high = sorted((design.columns, design.rows))
+    return f"a lattice of {high} × {low} squares without markers"
+
+
+class _Photographs:
+    """Photographs in which targets are looked for, the first ones at once, others where they tell more."""
+
+    def __init__(self, frames: Iterable[Frame], tried: int) -> None:
+        self.others = iter(frames)
+        self.full = list(islice(self.others, tried))
+        self.small = [_reduced(frame) for frame in self.full]
+
+    def every(self) -> Iterator[Frame]:
+        """All of them, reduced."""
+        return chain(self.small, map(_reduced, self.others))
+
+    def explained_by(self, candidates: Mapping[str, Design]) -> tuple[str, Design] | None:
+        """The candidate with most points, with its name; none where something larger is seen instead."""
+        points = _counted(self.small, candidates)
+        if not any(points.values()) and any(a is not b for a, b in zip(self.full, self.small, strict=True)):
+            points = _counted(self.full, candidates)
+        order = sorted(candidates, key=lambda name: _plain(candidates[name]))
+        while most := max(points.values(), default=0):
+            name = next(name for name in order if points[name] >= _ENOUGH * most)
+            design = candidates[name]
+            if not _plain(design) or not _is_part_of_another(self.further(), design):
+                return name, design
+            pattern = _pattern(design)
+            points |= {name: 0 for name, each in candidates.items() if _pattern(each) == pattern}
+        return None
+
+    def further(self) -> list[Frame]:
+        """Those tried, and some more."""
+        self.full += islice(self.others, max(0, _MORE + len(self.small) - len(self.full)))
+        return self.full
+
+    def boards(self) -> list[BoardDesign]:
+        """Boards that the photographs show; with markers, of the first ones that show any."""
+        found, showing = list[BoardDesign](), 0
+        for frame in self.further():
+            shown = boards_shown(_reduced(frame))
+            found += shown
+            showing += any(not _plain(each) for each in shown)
+            if showing >= len(self.small):
+                break
+        return found
 
 
 def _is_part_of_another(frames: Iterable[Frame], design: Design) -> bool:

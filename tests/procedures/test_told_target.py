@@ -1,0 +1,111 @@
+"""Boards that were told otherwise than photographs show them: corrected, with a note, or refused in words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+
+from reseau.core.data import Frame
+from reseau.core.failure import Code, Failure
+from reseau.designs import board
+from reseau.io import BoardDesign
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.target_measurement import drawing_overlays, measurer_of
+from reseau.procedures.told_target import TargetMeasured, measured_as_shown
+
+from ..measure.board_pictures import picture
+
+CHESS = board("chess", 7, 6, 24.0)
+CHARUCO = board("charuco", 7, 6, 24.0)
+LEGACY = board("charuco", 7, 6, 24.0, legacy=True)
+APRIL = board("aprilgrid", 5, 4, 30.0, border_bits=2)
+CIRCLES = board("circles", 7, 5, 24.0)
+
+
+@cache
+def photographs(design: BoardDesign) -> tuple[Frame, ...]:
+    """Three photographs of a board."""
+    dark = design.model_copy(update={"polarity": "dark"})
+    frames = []
+    for k, (tilt, turn) in enumerate(((10.0, 5.0), (25.0, 100.0), (30.0, 190.0))):
+        frame = picture(dark, tilt, turn, seed=k)[0]
+        pixels = frame.pixels if design is dark or design.polarity == "dark" else 255 - frame.pixels
+        frames.append(replace(frame, pixels=pixels, name=f"{k}.png"))
+    return tuple(frames)
+
+
+def measured(printed: BoardDesign, told: BoardDesign) -> TargetMeasured:
+    return measured_as_shown(photographs(printed), told, measurer_of(told))
+
+
+@pytest.mark.parametrize(
+    ("printed", "told", "said"),
+    [
+        (CHESS, {"columns": 6, "rows": 5}, "columns 7 in place of 6, rows 6 in place of 5"),
+        (CHESS, {"columns": 8, "rows": 7}, "columns 7 in place of 8, rows 6 in place of 7"),
+        (CHARUCO, {"columns": 6, "rows": 7}, "columns 7 in place of 6, rows 6 in place of 7; calibrated"),
+        (CHARUCO, {"dictionary": "DICT_4X4_50"}, "dictionary DICT_5X5_50 in place of DICT_4X4_50"),
+        (LEGACY, {"legacy": False}, "legacy True in place of False"),
+        (APRIL, {"pitch": 40.0}, "pitch 30.0 in place of 40.0"),
+        (CIRCLES.model_copy(update={"polarity": "bright"}), {"polarity": "dark"}, "bright in place of dark"),
+    ],
+)  # fmt: skip
+def test_the_board_that_photographs_show_is_measured_in_place_of_the_told_one(
+    printed: BoardDesign, told: dict[str, object], said: str
+) -> None:
+    found = measured(printed, printed.model_copy(update=told))
+    assert found.corrected is not None
+    for key in ("columns", "rows", "legacy", "polarity", "border_bits"):
+        assert getattr(found.corrected, key) == getattr(printed, key)
+    assert found.corrected.pitch == pytest.approx(printed.pitch, rel=0.01)
+    assert len(found.notes) == 1
+    assert said in found.notes[0]
+    for each in found.photographs:
+        assert not isinstance(each.found, Failure)
+        assert len(each.found) > 0.9 * len(printed.ids)
+
+
+def test_a_right_design_is_compared_with_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("reseau.procedures.told_target.corrected", None)
+    turned = CHESS.model_copy(update={"columns": 6, "rows": 7})
+    for design in (CHESS, turned):
+        found = measured(CHESS, design)
+        assert found.corrected is None
+        assert not found.notes
+        assert all(not isinstance(each.found, Failure) for each in found.photographs)
+
+
+def test_what_photographs_show_in_place_of_another_kind_of_board_is_said() -> None:
+    found = calibrate_camera(photographs(CHESS), CHARUCO, measurer_of(CHARUCO))
+    assert isinstance(found, Failure)
+    assert found.code is Code.TOO_FEW_IMAGES
+    assert "; the photographs show a lattice of 7 × 6 squares without markers; " in found.reason
+    # All are declined for one reason, which is said once.
+    assert found.reason.count("no marker of the board was read") == 1
+    assert "; 0.png, 1.png, 2.png: board" in found.reason
+
+
+def test_photographs_that_show_a_target_are_named_where_there_are_too_few() -> None:
+    frames = photographs(CHESS)
+    wall = replace(frames[0], pixels=frames[0].pixels // 8 + 90, name="wall.png")
+    found = calibrate_camera(
+        [*frames[:2], replace(wall, pixels=wall.pixels[:60, :60])], CHESS, measurer_of(CHESS)
+    )
+    assert isinstance(found, Failure)
+    assert found.reason.startswith("2 images (0.png, 1.png) show the target, 3 are needed")
+    assert "; wall.png: " in found.reason
+
+
+def test_a_size_in_another_unit_is_asked_about() -> None:
+    told = CHESS.model_copy(update={"pitch": 0.024})
+    (note,) = measured(CHESS, told).notes
+    assert "0.024 mm (24 µm): is it 0.024 m, which is 24 mm?" in note
+
+
+def test_a_measurer_that_draws_overlays_draws_the_corrected_board(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    told = CHESS.model_copy(update={"columns": 6, "rows": 5})
+    measure = drawing_overlays(measurer_of(told), {"0.png": tmp_path / "0.png"})
+    assert measured_as_shown(photographs(CHESS), told, measure).corrected is not None
+    assert (tmp_path / "0.png").is_file()
