@@ -19,7 +19,11 @@ _SURE = 0.01
 """Level at which the difference at a single place is marked as significant."""
 
 
-def uncertainty_figure(field: ProjectionField, points: Array | None = None) -> str:
+def uncertainty_figure(
+    field: ProjectionField,
+    points: Array | None = None,
+    title: str = "σ of the projection in the worst direction [px]",
+) -> str:
     """Draw the standard deviation of the projection in its worst direction, as contours.
 
     Parameters
@@ -28,6 +32,8 @@ def uncertainty_figure(field: ProjectionField, points: Array | None = None) -> s
         The uncertainty.
     points : ndarray (n, 2), optional
         Image points used in the calibration.
+    title : str
+        What the map shows.
 
     Returns
     -------
@@ -40,7 +46,7 @@ def uncertainty_figure(field: ProjectionField, points: Array | None = None) -> s
         if points is not None:
             axes.plot(*points[:: max(1, len(points) // 4000)].T, ",", color=FAINT, alpha=0.6, zorder=3)
         draw_contours(axes, field.xy, field.sigma)
-        _label_axes(axes, field.xy, "σ of the projection in the worst direction [px]")
+        _label_axes(axes, field.xy, title)
         return to_svg(figure)
 
 
