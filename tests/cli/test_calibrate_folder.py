@@ -53,18 +53,6 @@ def test_photographs_end_in_a_folder_with_all_that_is_needed(reseau: Run, photos
     assert sample.shape == (400, 480)
 
 
-def test_one_file_is_written_where_one_is_wanted_and_none_beside_the_document_on_the_output(
-    reseau: Run, photos: Path, tmp_path: Path
-) -> None:
-    for path in photos.iterdir():
-        (tmp_path / "b").mkdir(exist_ok=True)
-        (tmp_path / "b" / path.name).write_bytes(path.read_bytes())
-    status, out, _ = reseau("calibrate", tmp_path / "b", "--jobs", 1, "-o", tmp_path / "K.json", "--json")
-    assert status == 0
-    assert (tmp_path / "K.json").read_text() == out
-    assert {path.name for path in tmp_path.iterdir()} == {"b", "K.json"}
-
-
 def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(
     reseau: Run, photos: Path, tmp_path: Path
 ) -> None:

@@ -42,6 +42,7 @@ SHIFTED = board("circles", 5, 9, 12.0, size=9.0, asymmetric=True)
 APRIL_FAMILY = "DICT_APRILTAG_36h11"
 CHARUCO_PRINT = prints.charuco(9, 6, 30.0, 22.0, "DICT_4X4_100")
 STEREO = Path(os.environ.get("RESEAU_DATA", "/nowhere")) / "chessboard_stereo"
+CASES = Path(os.environ.get("RESEAU_DATA", "/nowhere")) / "cases" / "reports1"
 DATA = Path(os.environ.get("RESEAU_DATA", "/nowhere")) / "independent" / "boards"
 
 
@@ -683,6 +684,46 @@ def test_points_beside_a_reflection_have_the_sigmas_of_their_errors(design: Boar
     inside = ((truth > 8) & (truth < [471, 391])).all(axis=1)
     assert found.ok[away & inside].all()
     assert np.abs(in_sigmas(found, renamed(found, truth))).max() < 4.5
+
+
+@pytest.mark.parametrize(
+    ("printed", "told"),
+    [
+        (board("chess", 7, 6, 24.0), board("chess", 8, 6, 24.0)),
+        (board("chess", 7, 6, 24.0), board("chess", 8, 7, 24.0)),
+        (board("charuco", 7, 6, 24.0), board("charuco", 7, 7, 24.0)),
+        (board("aprilgrid", 5, 4, 30.0), board("aprilgrid", 5, 5, 30.0)),
+    ],
+)
+def test_a_board_told_too_large_has_no_points_that_do_not_exist(
+    printed: BoardDesign, told: BoardDesign
+) -> None:
+    frame, truth = picture(printed, 35.0, 70.0)
+    found = measure_board(frame, told)
+    if isinstance(found, Failure):
+        assert found.code is Code.OTHER_DESIGN
+    else:
+        # The corners of no square are taken for those of two.
+        assert found.found == len(truth)
+        assert np.abs(renamed(found, truth)).max() < 0.5
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="RESEAU_DATA has no cases/reports1")
+def test_corners_of_a_photograph_with_fewer_squares_than_told_are_declined() -> None:
+    case = CASES / "board-with-more-squares-told"
+    frame = read_image(case / "photo.png")
+    found = measure_board(frame, board("chess", 11, 8, 25.0))
+    assert isinstance(found, Failure)
+    assert found.code is Code.OTHER_DESIGN
+    assert measured(frame, board("chess", 10, 7, 25.0)).found == 54
+
+
+def test_bright_circles_on_dark_ground_are_measured() -> None:
+    dark, truth = picture(CIRCLES)
+    bright = replace(dark, pixels=255 - dark.pixels)
+    same = measured(bright, CIRCLES.model_copy(update={"polarity": "bright"}))
+    assert same.found == len(truth)
+    assert np.sqrt((renamed(same, truth) ** 2).mean()) < 0.012
 
 
 @pytest.mark.parametrize("legacy", [False, True])

@@ -72,7 +72,7 @@ def test_a_covered_and_accurate_calibration_is_usable_for_measurement() -> None:
     assert found.centre_px < found.corners_px < 0.05
     assert found.total.worst_px == found.corners_px
     assert found.lines[0].startswith("usable for measurement: 0.00")
-    assert 29.0 < found.tilt_deg < 31.0
+    assert 29.0 < found.tilts_deg[1] <= found.tilts_deg[0] < 31.0
     assert "straight" not in found.lines[1]
     assert found.covered > 0.8
     assert found.lines[1].startswith(f"points are in {int(100 * found.covered)} % of the image; ")
@@ -204,6 +204,12 @@ def test_a_target_seen_nearly_straight_is_to_be_tilted() -> None:
     assert then is not None
     assert "45° towards the camera" in then.words
     assert then.worst_px < 0.3 * found.corners_px
+
+
+def test_the_one_photograph_that_is_tilted_is_counted() -> None:
+    images = measured(6, tilt=0.5)[:5] + measured(6, tilt=38.0)[5:]
+    line = calibrated(images).assessments["camera"].lines[1]
+    assert "nearly straight, tilted by 38° in one photograph and by 0° at most in the others: tilt" in line
 
 
 def test_the_verdict_on_a_circular_image_does_not_speak_of_its_dark_corners() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -171,12 +172,14 @@ def writable(path: Path) -> Path:
     Raises
     ------
     InputError
-        If the folder does not exist.
+        If the folder does not exist, or nothing can be written there.
     """
     if not path.parent.is_dir():
         raise InputError("its folder does not exist", where=path, do="create the folder first")
     if path.is_dir():
         raise InputError("is a folder", where=path, do="give the name of a file")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError("its folder is write-protected", where=path, do="choose another one")
     return path
 
 

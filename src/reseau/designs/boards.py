@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ def board(
     first_id: int = 0,
     border_bits: int = 1,
     legacy: bool = False,
+    polarity: Literal["dark", "bright"] = "dark",
     asymmetric: bool = False,
     dots: tuple[tuple[int, int], ...] = (),
     start: tuple[int, int] = (0, 0),
@@ -50,7 +51,7 @@ def board(
         Number of squares, circles, corners of a deltille, or tags.
     pitch : float
         Distance between squares, rows of circles or tags, mm.
-    size, dictionary, first_id, border_bits, legacy, asymmetric, dots, start, name
+    size, dictionary, first_id, border_bits, legacy, polarity, asymmetric, dots, start, name
         See :class:`reseau.io.BoardDesign`.
 
     Raises
@@ -70,8 +71,8 @@ def board(
         design = BoardDesign(
             name=name, unit="mm", kind=kind, columns=columns, rows=rows, pitch=float(pitch),
             size=None if size is None else float(size), dictionary=dictionary or _DICTIONARIES.get(kind),
-            first_id=first_id, border_bits=border_bits, legacy=legacy, asymmetric=asymmetric, dots=dots,
-            start=start,
+            first_id=first_id, border_bits=border_bits, legacy=legacy, polarity=polarity,
+            asymmetric=asymmetric, dots=dots, start=start,
         )  # fmt: skip
     except ValidationError as error:
         first = error.errors()[0]
@@ -156,7 +157,7 @@ def marker_cells(design: BoardDesign) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def board_figures(design: BoardDesign) -> tuple[list[Array], Array]:
-    """Black polygons of a board, and its circles (n, 3) with x, y and radius; millimetres, y up.
+    """Polygons of a board, and its circles (n, 3) with x, y and radius, in the ink of its polarity; mm, y up.
 
     Cells of markers that touch are covered twice, by strips along both axes, so that no gap shows between
     them however a drawing is rendered.

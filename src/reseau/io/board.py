@@ -59,6 +59,8 @@ class BoardDesign(Document):
     legacy : bool
         Whether a ChArUco board has the layout of OpenCV before 4.6: with an even number of rows, its upper
         left square is white.
+    polarity : {"dark", "bright"}
+        Whether circles are dark on bright ground, or bright on dark ground, as holes before a lamp.
     asymmetric : bool
         Whether every second row of circles is shifted by half a step; `pitch` is half their distance in a
         row, as in OpenCV.
@@ -90,6 +92,7 @@ class BoardDesign(Document):
     first_id: Annotated[int, Field(ge=0)] = 0
     border_bits: Annotated[int, Field(ge=1, le=4)] = 1
     legacy: bool = False
+    polarity: Literal["dark", "bright"] = "dark"
     asymmetric: bool = False
     dots: tuple[tuple[int, int], ...] = ()
     start: tuple[int, int] = (0, 0)
@@ -111,6 +114,8 @@ class BoardDesign(Document):
             raise ValueError("`legacy` is for ChArUco boards")
         if self.asymmetric and self.kind != "circles":
             raise ValueError("`asymmetric` is for circles")
+        if self.polarity != "dark" and self.kind != "circles":
+            raise ValueError("`polarity` is for circles")
         if self.dots and self.kind != "chess":
             raise ValueError("`dots` are for chessboards")
         for column, row in self.dots:
@@ -133,11 +138,6 @@ class BoardDesign(Document):
         fresh = {key: field.default for key, field in type(self).model_fields.items()}
         plain = {key: list(v) if isinstance(v, tuple) else v for key, v in fresh.items()}
         return {k: v for k, v in content.items() if k not in plain or v != plain[k]}
-
-    @property
-    def polarity(self) -> Literal["dark", "bright"]:
-        """Of circles: dark."""
-        return "dark"
 
     @property
     def staggered(self) -> bool:

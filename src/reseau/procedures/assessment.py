@@ -84,8 +84,9 @@ class Assessment:
         What is wrong, the most probable first; empty where nothing is.
     images : int
         Number of photographs.
-    tilt_deg : float
-        Largest angle at which a plane target was seen, but for one photograph; NaN where it is not plane.
+    tilts_deg : (float, float)
+        Angles at which the most tilted photographs of a plane target were taken, the largest first; NaN where
+        the target is not plane.
     covered : float
         Share of the image, in cells of a twelfth of its width and height, with points.
     uncovered : tuple of str
@@ -112,7 +113,7 @@ class Assessment:
     focal_px: float
     causes: tuple[Cause, ...]
     images: int
-    tilt_deg: float
+    tilts_deg: tuple[float, float]
     covered: float
     uncovered: tuple[str, ...]
     next_photograph: NextPose | None
@@ -155,8 +156,13 @@ class Assessment:
             second += f", and few are in the {_listed(self.uncovered)}: the result is extrapolated there"
         if self.images < _ENOUGH:
             second += f"; {self.images} photographs are few, take 10 or more"
-        if self.tilt_deg < _STRAIGHT:
-            second += f"; the target is seen nearly straight, tilted by {self.tilt_deg:.0f}° at most: tilt it"
+        most, next_most = self.tilts_deg
+        # One tilted photograph is not checked by another.
+        if next_most < _STRAIGHT:
+            tilted = f"{most:.0f}° at most"
+            if most >= _STRAIGHT:
+                tilted = f"{most:.0f}° in one photograph and by {next_most:.0f}° at most in the others"
+            second += f"; the target is seen nearly straight, tilted by {tilted}: tilt it"
         if self.next_photograph is not None:
             then = self.next_photograph
             enough = self.use is Use.MEASUREMENT and not self.uncovered and self.images >= _ENOUGH
@@ -246,9 +252,9 @@ def assess(result: Result, camera: int = 0, explanation: Explanation | None = No
     slope = lens.mapping.derivatives(np.zeros((1, 2))).d_xy[0]
     focal = float("nan") if lens.mapping.parallel else float(np.sqrt(abs(np.linalg.det(slope))))
     images = int((result.fit.usable.images & (result.network.camera_of == camera)).sum())
-    tilt = _tilted(result, camera)
+    tilts = _tilts(result, camera)
     return Assessment(
-        use, centre, corners, total, circular, focal, causes, images, tilt, float(seen[lit].mean()),
+        use, centre, corners, total, circular, focal, causes, images, tilts, float(seen[lit].mean()),
         uncovered, then, important, tests,
     )  # fmt: skip
 
@@ -267,18 +273,20 @@ def _because(causes: tuple[Cause, ...]) -> str:
     return f"{text}: {first.do}"
 
 
-def _tilted(result: Result, camera: int) -> float:
-    """Second largest angle between the camera's axis and the normal of a plane target, degrees."""
+def _tilts(result: Result, camera: int) -> tuple[float, float]:
+    """The two largest angles between the camera's axis and the normal of a plane target, degrees."""
+    unknown = float("nan"), float("nan")
     used = result.fit.usable.images & (result.network.camera_of == camera)
     values = result.fit.values
     points = values.xyz[np.isfinite(values.xyz).all(axis=1)]
     if len(points) < 4 or used.sum() < 2 or camera_mapping(result, camera).mapping.parallel:
-        return float("nan")
+        return unknown
     _, size, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
     if size[2] > _PLANE * size[1]:
-        return float("nan")
-    cosines = np.abs(values.rotation[used, 2] @ axes[2])
-    return float(np.degrees(np.arccos(np.clip(np.sort(cosines)[1], 0.0, 1.0))))
+        return unknown
+    cosines = np.sort(np.abs(values.rotation[used, 2] @ axes[2]))[:2]
+    most, next_most = np.degrees(np.arccos(np.clip(cosines, 0.0, 1.0))).tolist()
+    return most, next_most
 
 
 def sorted_remarks(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
-from os.path import commonpath
 from pathlib import Path
 
 import numpy as np
@@ -35,10 +35,9 @@ def folder_beside(photographs: Sequence[Path]) -> Path:
     >>> folder_beside([Path("/bench/photos/1.jpg"), Path("/bench/photos/2.jpg")]).as_posix()
     '/bench/photos-calibration'
     """
-    parents = {path.parent for path in photographs}
-    shared = parents.pop() if len(parents) == 1 else Path(commonpath([path.resolve() for path in parents]))
-    named = shared if shared.name else shared.resolve()
-    return named.with_name(f"{named.name}-calibration")
+    shared = Path(os.path.commonpath([path.resolve().parent for path in photographs]))
+    found = shared.with_name(f"{shared.name}-calibration")
+    return found.relative_to(Path.cwd()) if found.is_relative_to(Path.cwd()) else found
 
 
 def made_folder(folder: Path) -> Path:
@@ -56,15 +55,13 @@ def made_folder(folder: Path) -> Path:
     ...
     reseau.core.errors.InputError: README.md: cannot be written (File exists); choose another folder by --out
     """
+    do = "choose another folder by --out"
     try:
         folder.mkdir(exist_ok=True)
-        probe = folder / ".writable"
-        probe.touch()
-        probe.unlink()
     except OSError as error:
-        raise InputError(
-            f"cannot be written ({error.strerror})", where=folder, do="choose another folder by --out"
-        ) from None
+        raise InputError(f"cannot be written ({error.strerror})", where=folder, do=do) from None
+    if not os.access(folder, os.W_OK):
+        raise InputError("cannot be written (Permission denied)", where=folder, do=do)
     return folder
 
 

@@ -31,10 +31,12 @@ __all__ = [
     "along",
     "bright_between",
     "crossed",
+    "ended",
     "find_saddles",
     "first_mapping",
     "grown",
     "grown_through",
+    "levels_at",
     "sector_levels",
     "seeds",
 ]
@@ -363,21 +365,39 @@ def _led(nodes: Array, excess: Array, beside: Array) -> Array:
 def sector_levels(grey: NDArray[np.float32], mapping: Chain, nodes: Array, share: float = _DIAGONAL) -> Array:
     """Grey values (n, 4) in the sectors around nodes of a lattice: after, before, and beside both steps."""
     around = share * np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]])
-    at = images_of(mapping, (nodes[:, None] + around).reshape(-1, 2)).astype(np.float32)
+    return levels_at(grey, images_of(mapping, (nodes[:, None] + around).reshape(-1, 2)).reshape(-1, 4, 2))
+
+
+def levels_at(grey: NDArray[np.float32], xy: Array) -> Array:
+    """Grey values (n, k) at image points (n, k, 2), linear between pixels."""
     # Beside the border of the frame a sector is seen up to there.
-    at = np.clip(np.nan_to_num(at), 0, np.array([grey.shape[1] - 1, grey.shape[0] - 1], np.float32))
+    at = np.clip(
+        np.nan_to_num(xy.astype(np.float32)), 0, np.array([grey.shape[1] - 1, grey.shape[0] - 1], np.float32)
+    )
     # Fewer than 32768 pixels along an axis of the map are allowed.
-    values = cv2.remap(grey, at[:, 0].reshape(-1, 4), at[:, 1].reshape(-1, 4), cv2.INTER_LINEAR)
-    return np.asarray(values, dtype=np.float64)
+    x, y = (np.ascontiguousarray(at[..., k]) for k in range(2))
+    return np.asarray(cv2.remap(grey, x, y, cv2.INTER_LINEAR), dtype=np.float64)
 
 
 def crossed(levels: Array, bright: Mask) -> Mask:
     """Whether both bright sectors (n, 4) are brighter than both dark ones by a share of the contrast."""
-    first, second = levels[:, :2], levels[:, 2:]
-    lit = np.where(bright[:, None], first, second)
-    unlit = np.where(bright[:, None], second, first)
+    lit, unlit = _lit_and_unlit(levels, bright)
     contrast = lit.mean(axis=1) - unlit.mean(axis=1)
     return np.asarray(lit.min(axis=1) - unlit.max(axis=1) > _CROSSED * np.maximum(contrast, 1e-9))
+
+
+def ended(levels: Array, bright: Mask) -> Mask:
+    """Whether one of the dark sectors of (n, 4) is paper: corners of single squares, where a pattern ends."""
+    lit, unlit = _lit_and_unlit(levels, bright)
+    contrast = lit.mean(axis=1) - unlit.min(axis=1)
+    # Each level is that of paper or of ink, whichever is nearer.
+    return np.asarray((np.ptp(unlit, axis=1) > contrast / 2) & (np.ptp(lit, axis=1) < contrast / 2))
+
+
+def _lit_and_unlit(levels: Array, bright: Mask) -> tuple[Array, Array]:
+    """Levels (n, 2) of the sectors that should be bright, and of those that should be dark."""
+    first, second = levels[:, :2], levels[:, 2:]
+    return np.where(bright[:, None], first, second), np.where(bright[:, None], second, first)
 
 
 def bright_between(edges: Array, slopes: Array) -> Mask:

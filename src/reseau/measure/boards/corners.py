@@ -28,6 +28,7 @@ from ..reseau.plane_marks import PlaneMarks, intact
 from ..response import sharpened_from_px
 from ..screening import Screened
 from ..testfield.lattice_mapping import images_of, second_order
+from .candidates import ended, levels_at
 from .compiled_corners import add_images, pixels_around
 
 __all__ = ["BORDER_PX", "CornerMarks", "CornerShape", "DeltilleMarks", "Sectors"]
@@ -68,6 +69,8 @@ _FLAT = 0.35
 """Least sine of the angle between the edges of a corner."""
 _FAR_PX, _FIGURES_PX = 1e5, 24
 """Coordinates from which a mapping is not used; step of the window sizes of figures."""
+_BRIGHT_AT, _DARK_AT = 0.2, 0.6
+"""Where bright and dark sectors are looked at, as shares of the reach along both edges."""
 _NODES_PX = 1.1
 """Distance of nodes on an outline, in widths of the point-spread function."""
 
@@ -376,7 +379,25 @@ class CornerMarks(PlaneMarks):
         unseen = part.copy()
         unseen[part] = self._edges_seen(rows[part], found.select(part)).min(axis=1) < _LEAST_EDGE
         hidden = Reason("an edge is hidden or saturated", Code.HIDDEN)
-        return [border, (unseen, hidden), *super()._objections(rows, found), (flat, seen)]
+        beyond_pattern = Reason(
+            "the pattern ends there: paper is where a dark square should be", Code.OTHER_DESIGN
+        )
+        outer = (self._single(rows), beyond_pattern)
+        return [border, outer, (unseen, hidden), *super()._objections(rows, found), (flat, seen)]
+
+    def _single(self, rows: Rows) -> Mask:
+        """Which corners, not found before, are those of a single square where two should meet."""
+        single: Mask = ~self.found[rows] & self.sectors.opposite[rows]
+        if self.sectors.normal.shape[1] != 2 or not single.any():
+            return np.zeros(len(rows), dtype=bool)
+        one, two = np.moveaxis(self.sectors.normal[rows[single]], 1, 0)
+        # Markers lie in bright squares, at some distance from their corners.
+        shares = np.array([_BRIGHT_AT, _BRIGHT_AT, _DARK_AT, _DARK_AT])[:, None, None] * self.sectors.reach
+        around = shares * np.stack([one - two, two - one, one + two, -one - two])
+        at = self.at[rows[single]] + around @ self.frame.T
+        levels = levels_at(self.screened.grey, images_of(self.mapping, at.reshape(-1, 2)).reshape(at.shape))
+        single[single] = ended(levels.T, np.ones(levels.shape[1], dtype=bool))
+        return single
 
     def _edge_seen(self, rows: Rows, found: Matches) -> Array:
         """See :class:`PlaneMarks`."""

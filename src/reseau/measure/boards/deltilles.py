@@ -26,7 +26,7 @@ from ...core.failure import Failure
 from ...io.board import BoardDesign
 from ...optics import Chain
 from ..testfield.lattice_mapping import images_of
-from .candidates import first_mapping, grown_through
+from .candidates import first_mapping, grown_through, levels_at
 from .placement import Placed, cost_of, failed, numbered
 
 __all__ = ["find_deltille"]
@@ -314,11 +314,9 @@ def _levels(grey: NDArray[np.float32], mapping: Chain, nodes: Array, part: float
     They are those of the middles, or of places on the way to these, at a part of it.
     """
     third = np.array([[1, 1], [-2, 1], [1, -2], [-1, -1], [2, -1], [-1, 2]]) / 3
-    at = images_of(mapping, (nodes[:, None] + part * third).reshape(-1, 2)).astype(np.float32)
-    # Beside the border of the frame a sector is seen up to there.
-    at = np.clip(np.nan_to_num(at), 0, np.array([grey.shape[1] - 1, grey.shape[0] - 1], np.float32))
-    values = cv2.remap(grey, at[:, 0].reshape(-1, 6), at[:, 1].reshape(-1, 6), cv2.INTER_LINEAR)
-    return np.asarray(values, dtype=np.float64)
+    return levels_at(
+        grey, images_of(mapping, (nodes[:, None] + part * third).reshape(-1, 2)).reshape(-1, 6, 2)
+    )
 
 
 def _crossed(levels: Array) -> Mask:

@@ -236,10 +236,10 @@ def _measured(frame: Frame, design: BoardDesign, options: BoardOptions) -> Board
 
 def _placed(frame: Frame, screened: Screened, design: BoardDesign) -> Placed | Failure:
     """Where the points of the board are, approximately."""
-    shape = (frame.height, frame.width)
     if design.kind == "circles":
-        disks = find_disks(screened.grey, screened.valid, screened.noise)
-        found = lay_circles(disks, design, shape)
+        grey = screened.grey if design.polarity == "dark" else -screened.grey
+        disks = find_disks(grey, screened.valid, screened.noise)
+        found = lay_circles(grey, disks, design)
         return replace(found, places=disks.xy) if isinstance(found, Failure) else found
     if design.kind == "deltille":
         found, places = find_deltille(screened.grey, screened.noise, design)

@@ -36,6 +36,7 @@ from .candidates import (
     along,
     bright_between,
     crossed,
+    ended,
     first_mapping,
     grown,
     sector_levels,
@@ -93,6 +94,8 @@ _EVEN = 0.5
 """Largest difference of two dark sectors, as a share of their contrast to the paper."""
 _PUZZLE = 40
 """Largest number of corners of a PuzzleBoard of unknown size, along an axis from any of them."""
+_AROUND = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, 0.5], [-0.5, -0.5]])
+"""Middles of the squares that meet in a node."""
 _THIRD = np.array([[-1, -1], [1, 0]])
 """A turn of a lattice of triangles, whose steps are at 60°."""
 
@@ -148,15 +151,20 @@ def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDes
     even = nodes.sum(axis=1) % 2 == 0
     odd = (bright == even).mean() > 0.5
 
+    def seen(nodes: Array) -> tuple[Array, Mask]:
+        return sector_levels(grey, mapping, nodes), (nodes.sum(axis=1) % 2 == 0) == odd
+
     def cost(missing: Array) -> Array:
-        levels = sector_levels(grey, mapping, missing)
-        return each(levels, crossed(levels, (missing.sum(axis=1) % 2 == 0) == odd))
+        levels, bright = seen(missing)
+        return each(levels, crossed(levels, bright))
 
     coded = design.kind == "puzzle" or bool(design.dots)
     bits = read_bits(grey, mapping, nodes.astype(np.intp), design.kind == "puzzle") if coded else None
     known = nodes.astype(np.intp), saddles.xy[rows], mapping, shape, (dark, ~bright)
     # The dots of a PuzzleBoard tell more than nodes that were not found.
-    placed = numbered(design, *known, None if design.kind == "puzzle" else cost, bits)
+    plain = design.kind != "puzzle"
+    ends = (lambda nodes: ended(*seen(nodes))) if plain else None
+    placed = numbered(design, *known, cost if plain else None, bits, ends)
     if isinstance(placed, Failure) and design.kind == "puzzle" and bits is not None:
         part = part_of_code(known[0], bits, _mirrored(mapping))
         if not isinstance(part, Failure):
@@ -227,8 +235,12 @@ def numbered(
     dark: tuple[Mask, Mask] | None,
     cost: Callable[[Array], Array] | None = None,
     bits: Bits | None = None,
+    ends: Callable[[Array], Mask] | None = None,
 ) -> Placed | Failure:
-    """Lay the lattice found on the design; `cost` of nodes not found, `bits` what dots tell."""
+    """Lay the lattice found on the design; `cost` of nodes not found, `bits` what dots tell.
+
+    `ends` says at which nodes nothing is seen that the design has there.
+    """
     # Diagonals of a staggered grid are halved: its nodes have columns and rows that are both even or odd.
     matrix = _lattice_of(design)
     numbers = design.nodes @ matrix.T // (2 if design.staggered else 1)
@@ -301,11 +313,37 @@ def numbered(
     inside = ((place >= 0) & (place < size)).all(axis=1)
     of = np.where(inside, index[tuple(np.where(inside[:, None], place, 0).T)], -1)
     there = of >= 0
+    if ends is not None:
+        inverse = np.rint(np.linalg.inv(turn)).astype(np.intp)
+        for line in _lines_beside(design, of[there]):
+            beside = ((numbers[line] - moved) @ inverse.T).astype(np.float64)
+            # With all that surrounds them.
+            where = images_of(mapping, (beside[:, None] + _AROUND).reshape(-1, 2)).reshape(-1, 4, 2)
+            beside = beside[((where > 2) & (where < np.array(shape[::-1]) - 3)).all(axis=(1, 2))]
+            if len(beside) and ends(beside).mean() > 0.5:
+                return Failure(
+                    f"{there.sum()} points in a lattice were found, and nothing beside them where the board "
+                    "has more",
+                    Code.OTHER_DESIGN,
+                )
     seen, start = np.zeros(len(numbers), dtype=bool), np.zeros((len(numbers), 2))
     seen[of[there]], start[of[there]] = True, xy[there]
     frame, origin = _to_lattice(design, turn, moved + least)
-    located = Located(design.ids, design.xy, "dark", mapping, frame, origin, seen, start)
+    located = Located(design.ids, design.xy, design.polarity, mapping, frame, origin, seen, start)
     return Placed(located, _ambiguous(design, turn, alike))
+
+
+def _lines_beside(design: BoardDesign, found: Rows) -> list[Rows]:
+    """Points of the design in the row and the column next to those found, on all sides that have one."""
+    nodes, lines = design.nodes, []
+    low, high = nodes[found].min(axis=0), nodes[found].max(axis=0)
+    inside = (nodes >= low) & (nodes <= high)
+    for axis in range(2):
+        step = 2 if design.staggered and axis == 0 else 1
+        for away in (low[axis] - nodes[:, axis], nodes[:, axis] - high[axis]):
+            line = np.flatnonzero((away > 0) & (away <= step) & inside[:, 1 - axis])
+            lines += [line] if len(line) else []
+    return lines
 
 
 def _to_lattice(design: BoardDesign, turn: Integers, shift: Integers) -> tuple[Array, Array]:
@@ -334,7 +372,7 @@ def _ambiguous(
     return tuple(Remark(text, Code.AMBIGUOUS) for text in texts)
 
 
-def lay_circles(disks: Disks, design: BoardDesign, shape: tuple[int, int]) -> Placed | Failure:
+def lay_circles(grey: NDArray[np.float32], disks: Disks, design: BoardDesign) -> Placed | Failure:
     """Find a grid of circles among the ellipses of a frame, and number them.
 
     The circles of an asymmetric grid lie on the diagonals of its rows and columns: the lattice that is grown
@@ -342,14 +380,15 @@ def lay_circles(disks: Disks, design: BoardDesign, shape: tuple[int, int]) -> Pl
 
     Parameters
     ----------
+    grey : ndarray (h, w), float32
+        Grey values, in which circles are dark.
     disks : Disks
         The ellipses.
     design : BoardDesign
         A grid of circles.
-    shape : (int, int)
-        Height and width of the frame.
     """
     assert design.size is not None
+    shape = (grey.shape[0], grey.shape[1])
     numbers = design.nodes @ _lattice_of(design).T // (2 if design.asymmetric else 1)
     step = design.pitch * (np.sqrt(2) if design.asymmetric else 1.0)
     disks = disks.strongest(MOST_DISKS * len(numbers))
@@ -370,7 +409,20 @@ def lay_circles(disks: Disks, design: BoardDesign, shape: tuple[int, int]) -> Pl
         width = f"circles with a diameter of {100 * design.size / design.pitch:.0f} % of the pitch"
         return failed(0 if best is None else len(best[0]), f"{width} in a lattice")
     nodes, rows, mapping = best
-    return numbered(design, nodes.astype(np.intp), disks.xy[rows], mapping, shape, None)
+
+    def seen(nodes: Array) -> Array:
+        """How much darker nodes are than the middles of the meshes around them."""
+        around, centre = (sector_levels(grey, mapping, nodes, share) for share in (0.5, 0.0))
+        return np.asarray(np.median(around, axis=1) - centre[:, 0])
+
+    circle = float(np.median(seen(nodes)))
+
+    def cost(missing: Array) -> Array:
+        # Those that are blurred or cut by something are seen, but not found as disks.
+        return np.where(seen(missing) > circle / 2, 0.0, _MISSED)
+
+    known = nodes.astype(np.intp), disks.xy[rows], mapping, shape
+    return numbered(design, *known, None, cost)
 
 
 def _lattice_of(design: BoardDesign) -> Integers:
