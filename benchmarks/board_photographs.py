@@ -6,9 +6,9 @@ deviation of the points that both have from a smooth mapping of the plane (a len
 each of them in turn. It contains by what the board is not plane.
 
 The public photographs of ``docs/benchmarks/calibration.md``: the AprilGrids of EuRoC and TUM VI have 6 × 6
-tags of 88 mm and a spacing of 0.3; the chessboard of ``udacity/CarND-Camera-Calibration`` has 9 × 7 squares, those of
-``sourishg/stereo-calibration`` and ``sourishg/fisheye-stereo-calibration`` have 10 × 7, the screen of
-``henrikmidtiby/camera-calibration-with-large-chessboards`` 60 × 34; the ChArUco board of
+tags of 88 mm and a spacing of 0.3; the chessboard of ``udacity/CarND-Camera-Calibration`` has 9 × 7 squares,
+those of ``sourishg/stereo-calibration`` and ``sourishg/fisheye-stereo-calibration`` have 10 × 7, the screen
+of ``henrikmidtiby/camera-calibration-with-large-chessboards`` 60 × 34; the ChArUco board of
 ``DominikBabiarczyk/camera-calibration`` has 13 × 18 squares, markers of 15/20 of them, DICT_4X4_250.
 """
 

@@ -11,8 +11,10 @@ import pytest
 from reseau.bundle import adjust_network, example_network
 from reseau.calibration import CameraMapping
 from reseau.core.data import Frame
+from reseau.core.figures import contour_levels
 from reseau.core.numbers import power
 from reseau.core.provenance import Provenance
+from reseau.core.version import __version__
 from reseau.optics import PixelGrid
 from reseau.optics.cameras import camera_model
 from reseau.procedures.assessment import assess
@@ -150,3 +152,30 @@ def test_powers_of_ten_stand_with_each_number_and_options_that_were_not_given_ar
     assert "False" not in listed
     assert "<dt>free</dt>" not in listed
     assert "<dt>row jitter</dt><dd>0.0</dd>" in listed
+
+
+def test_the_first_screen_has_camera_days_version_verdict_map_and_every_photograph() -> None:
+    result = adjust_network(example_network()).required()
+    assessed = assess(result)
+    page = bundle_report(
+        result, title="Block", assessments={"camera": assessed}, photograph=lambda name: FRAME,
+        days={"2026-03-05", "2026-03-07"},
+    )  # fmt: skip
+    first = page.split("<header>")[1].split("</header>")[0]
+    camera = result.network.cameras[0]
+    assert f"{camera.model}, {camera.width} × {camera.height} px · {len(result.network.images)} " in first
+    assert f"2026-03-05 to 2026-03-07 · reseau {__version__}" in first
+    assert first.index(assessed.lines[0][1:]) < first.index("Total error of the projection")
+    captions = re.findall(r'<figcaption id="thumbnail-\d+">(.*?): \d+ points, [\d.e-]+ px rms<', first)
+    assert captions == list(result.network.images)
+
+
+def test_a_map_has_contours_at_1_2_5_and_a_colour_bar() -> None:
+    field = assess(adjust_network(example_network()).required()).total
+    levels = contour_levels(field.sigma)
+    assert len(levels) > 2
+    assert {f"{level:.0e}"[0] for level in levels} <= {"1", "2", "5"}
+    axes = field.plot()
+    bar = axes.figure.axes[-1]
+    assert bar is not axes
+    assert [label.get_text() for label in bar.get_yticklabels()] == [f"{level:g}" for level in levels]

@@ -216,6 +216,7 @@ def calibrate(
     from ..exchange import read_target
     from ..execution import Outputs
     from ..io import write_whole
+    from ..io.photographs import read_exif
     from ..measure import TestfieldOptions
     from ..procedures.calibration import calibrate_camera
     from ..procedures.exposures import photograph_reader, photographs_of
@@ -277,6 +278,7 @@ def calibrate(
             done.result, title=f"Calibration with {target.name}", provenance=provenance, against=differences,
             distances=distance, assessments=done.assessments, photograph=_pictures(photographs, channel),
             declined=done.declined,
+            days=sorted({day for path in photographs.values() if (day := read_exif(path).day)}),
         )  # fmt: skip
     if report is not None:
         write_whole(report, page)

@@ -12,7 +12,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -25,6 +25,7 @@ __all__ = [
     "INK",
     "PALE",
     "Panel",
+    "contour_levels",
     "draw_contours",
     "draw_ellipses",
     "draw_picture",
@@ -72,8 +73,8 @@ _STYLE = {
 
 
 _SHADES = LinearSegmentedColormap.from_list("reseau", ["#ffffff", "#c9d8e3", BLUE])
-_LEVELS, _SPAN = 8, 25.0
-"""Number of contours, and largest ratio of their levels."""
+_SPAN, _FEWEST, _MOST = 25.0, 3, 6
+"""Largest ratio of the levels of contours; fewest of them, and most of a narrow range."""
 
 
 def set_style() -> None:
@@ -367,7 +368,7 @@ def draw_picture(axes: Axes, pixels: NDArray[Any]) -> None:
 
 
 def draw_contours(axes: Axes, xy: Array, sigma: Array, scale: Array | None = None) -> None:
-    """Draw contours of positive values over an image, y down, at rounded levels in geometric steps.
+    """Draw contours of positive values over an image, y down, at levels 1, 2, 5 …, and a colour bar.
 
     Parameters
     ----------
@@ -381,26 +382,38 @@ def draw_contours(axes: Axes, xy: Array, sigma: Array, scale: Array | None = Non
         Values whose levels are taken, those of another map beside it.
     """
     x, y = xy[0, :, 0], xy[:, 0, 1]
-    levels, digits = _levels(sigma if scale is None else scale)
+    levels = contour_levels(sigma if scale is None else scale)
     shown = np.ma.masked_invalid(sigma)
-    axes.contourf(x, y, shown, levels=levels, cmap=_SHADES, extend="both")
+    # Each step of the levels is one of the colours, however far apart they are.
+    norm = BoundaryNorm(levels, _SHADES.N, extend="both")
+    filled = axes.contourf(x, y, shown, levels=levels, cmap=_SHADES, norm=norm, extend="both")
     lines = axes.contour(x, y, shown, levels=levels, colors=INK, linewidths=0.5)
-    axes.clabel(lines, fontsize=7.5, fmt=f"%.{digits}g")
+    axes.clabel(lines, fontsize=7.5, fmt="%g")
     axes.set_aspect("equal")
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(y[-1], y[0])
+    if axes.figure is not None:
+        bar = axes.figure.colorbar(filled, ax=axes, shrink=0.8, ticks=levels, format="%g")
+        bar.outline.set_linewidth(0.6)
 
 
-def _levels(sigma: Array) -> tuple[list[float], int]:
-    """Rounded levels in geometric steps over the range of the values, and their significant digits."""
-    known = sigma[np.isfinite(sigma) & (sigma > 0)]
+def contour_levels(values: Array) -> list[float]:
+    """Levels 1, 2, 5 × powers of ten over the range of values; of a narrow range, multiples of such a step.
+
+    Examples
+    --------
+    >>> contour_levels(np.array([0.013, 0.3])), contour_levels(np.array([0.112, 0.139]))
+    ([0.02, 0.05, 0.1, 0.2], [0.115, 0.12, 0.125, 0.13, 0.135])
+    """
+    known = values[np.isfinite(values) & (values > 0)]
     if not len(known):
-        return [0.0, 1.0], 1
+        return [0.5, 1.0]
     high = float(np.quantile(known, 0.995))
     low = max(float(known.min()), high / _SPAN)
-    steps = np.geomspace(1.1 * low, max(high, 1.2 * low), _LEVELS)
-    for digits in (2, 3, 4):
-        rounded = sorted({float(f"{step:.{digits}g}") for step in steps})
-        if len(rounded) == _LEVELS:
-            break
-    return rounded, digits
+    round_ones = [m * 10.0**k for k in range(-12, 12) for m in (1, 2, 5)]
+    levels = [level for level in round_ones if low < level < high]
+    if len(levels) < _FEWEST:
+        step = next(s for s in round_ones if s >= (high - low) / _MOST)
+        levels = [k * step for k in range(int(low / step) + 1, int(high / step) + 1)]
+    levels = [float(f"{level:.6g}") for level in levels]
+    return levels if len(levels) > 1 else [0.9 * low, 1.1 * high]

@@ -7,6 +7,7 @@ photograph is ignored, so that upright and sideways photographs are of one camer
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ PHOTOGRAPHS = (
 """Suffixes of photographs in a folder."""
 _BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _ORIENTATION, _EXIF = 0x0112, 0x8769
-_FOCAL, _FOCAL_35, _EXPOSURE = 0x920A, 0xA405, 0x829A
+_FOCAL, _FOCAL_35, _EXPOSURE, _TAKEN = 0x920A, 0xA405, 0x829A, 0x9003
 _DIAGONAL_35 = float(np.hypot(36.0, 24.0))
 """Of the format to which the equivalent focal length refers, mm."""
 
@@ -49,6 +50,8 @@ class Exif:
         Focal length of the same field of view in the format of 36 × 24 mm.
     exposure_us : float, optional
         Exposure time.
+    day : str
+        Day on which it was taken, as 2026-03-05; empty if it is not known.
 
     Examples
     --------
@@ -60,6 +63,7 @@ class Exif:
     focal_mm: float | None = None
     focal_35_mm: float | None = None
     exposure_us: float | None = None
+    day: str = ""
 
     def focal_px(self, width: int, height: int) -> float | None:
         """Approximate focal length in pixels; None if it is not known."""
@@ -159,7 +163,7 @@ def read_exif(path: Path) -> Exif:
     Examples
     --------
     >>> read_exif(Path("missing.jpg"))
-    Exif(orientation=1, focal_mm=None, focal_35_mm=None, exposure_us=None)
+    Exif(orientation=1, focal_mm=None, focal_35_mm=None, exposure_us=None, day='')
     """
     try:
         from PIL import Image
@@ -174,10 +178,12 @@ def read_exif(path: Path) -> Exif:
             found = image.getexif()
             inner = found.get_ifd(_EXIF)
             shown = image.info.get("original_orientation") or found.get(_ORIENTATION) or 1
+        day = re.match(r"(\d{4}):(\d\d):(\d\d) ", str(inner.get(_TAKEN, "")))
         numbers = [float(inner[tag]) if tag in inner else None for tag in (_FOCAL, _FOCAL_35, _EXPOSURE)]
     except (OSError, ValueError, SyntaxError, ZeroDivisionError, TypeError, ImportError):
         return Exif()
     focal, equivalent = (v if v is not None and 0.1 < v < 1e4 else None for v in numbers[:2])
     seconds = numbers[2] if numbers[2] is not None and 0 < numbers[2] < 1e5 else None
     exposure = None if seconds is None else seconds * 1e6
-    return Exif(int(shown) if shown in range(1, 9) else 1, focal, equivalent, exposure)
+    taken = "" if day is None else "-".join(day.groups())
+    return Exif(int(shown) if shown in range(1, 9) else 1, focal, equivalent, exposure, taken)

@@ -33,7 +33,7 @@ _ZONES = (
     ("left edge", "middle", "right edge"),
     ("lower left corner", "lower edge", "lower right corner"),
 )
-_ACROSS = 13
+_ACROSS = 25
 _ENOUGH = 6
 """Fewer images do not show whether the camera is stable and the model fits."""
 _STRAIGHT, _PLANE = 15.0, 0.05

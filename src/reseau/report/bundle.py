@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,10 @@ __all__ = ["bundle_report"]
 _IMAGES, _CAMERAS, _PLACES = 200, 20, 45
 _PHOTOGRAPHS, _ACROSS = 8, 800
 """Number of photographs that are shown, and their width in pixels."""
+_THUMBNAILS, _SMALL, _BOLD = 24, 360, 2.5
+"""Number of thumbnails, their width in pixels, and factor on the size of their marks."""
+_NAMED = 3
+"""Cameras that are named at the beginning of the page."""
 _LONG = 0.03
 """Length of a large residual in a photograph, of its width."""
 
@@ -43,6 +47,7 @@ def bundle_report(
     assessments: Mapping[str, Assessment] | None = None,
     photograph: Callable[[str], Frame | None] | None = None,
     declined: Mapping[str, str] | None = None,
+    days: Collection[str] = (),
 ) -> str:
     """Render the report of a bundle adjustment.
 
@@ -66,6 +71,8 @@ def bundle_report(
         shown.
     declined : mapping of str to str, optional
         Photographs that were left out, and why.
+    days : collection of str
+        Days on which the photographs were taken, as 2026-03-05.
 
     Returns
     -------
@@ -81,6 +88,7 @@ def bundle_report(
     return rendered(
         "bundle.html.j2",
         title=title,
+        facts=_facts(result, days, provenance or Provenance()),
         summary=_summary(result),
         verdicts=[_verdict(result, name, each) for name, each in assessments.items()],
         warnings=warnings,
@@ -97,7 +105,9 @@ def bundle_report(
         images=images_table(result)[:_IMAGES],
         more_images=max(0, len(result.network.images) - _IMAGES),
         worst=worst_points(result),
-        photographs=[] if photograph is None else _photographs(result, photograph),
+        thumbnails=_photographs(result, photograph, _THUMBNAILS, _SMALL, _BOLD) if assessments else [],
+        more_thumbnails=max(0, int(result.fit.usable.images.sum()) - _THUMBNAILS),
+        photographs=_photographs(result, photograph),
         more_photographs=max(0, int(result.fit.usable.images.sum()) - _PHOTOGRAPHS),
         declined=list((declined or {}).items()),
         patterns=patterns_of(result),
@@ -111,46 +121,69 @@ def bundle_report(
 def _verdict(result: Result, name: str, assessed: Assessment) -> dict[str, Any]:
     """The verdict on a camera, with the next photograph."""
     c = [entry.id for entry in result.network.cameras].index(name)
-    drawn = next_figure(result, c, _rows(result, c), assessed)
+    rows = _rows(result, c)
+    drawn = next_figure(result, c, rows, assessed)
+    errors = None if assessed.errors is None else errors_figure(assessed.errors, result.network.xy[rows])
     return {
+        "map": None if errors is None else Markup(errors),
         "camera": name if len(result.network.cameras) > 1 else "",
         "lines": assessed.lines,
         "use": assessed.use.value,
-        "errors": None
-        if assessed.errors is None
-        else Markup(errors_figure(assessed.errors, result.network.xy[_rows(result, c)])),
         "figure": None if drawn is None else Markup(drawn),
         "next": "" if assessed.next_photograph is None else assessed.next_photograph.text,
     }
 
 
-def _photographs(result: Result, photograph: Callable[[str], Frame | None]) -> list[dict[str, Any]]:
+def _facts(result: Result, days: Collection[str], provenance: Provenance) -> list[str]:
+    """What was calibrated, from how many photographs, when they were taken, and by which version."""
+    network, software = result.network, provenance.to_dict()["software"]
+    alone = len(network.cameras) == 1
+    cameras = [
+        f"{'' if alone else f'{entry.id}: '}{entry.model}, {entry.width} × {entry.height} px"
+        for entry in network.cameras[:_NAMED]
+    ]
+    cameras += [f"{len(network.cameras)} cameras"] * (len(network.cameras) > _NAMED)
+    taken = [" to ".join(sorted({min(days), max(days)}))] if days else []
+    return [*cameras, f"{int(result.fit.usable.images.sum())} photographs", *taken, software]
+
+
+def _photographs(
+    result: Result,
+    photograph: Callable[[str], Frame | None] | None,
+    count: int = _PHOTOGRAPHS,
+    across: int = _ACROSS,
+    bold: float = 1.0,
+) -> list[dict[str, Any]]:
     """Photographs with the largest residuals, in their order, with their marks."""
+    if photograph is None:
+        return []
     network = result.network
     good = result.fit.usable.observations & ~result.rejected
     squares = np.where(good, np.nan_to_num(result.residuals**2).sum(axis=1), 0.0)
-    count = np.bincount(network.image_of[good], minlength=len(network.images))
-    mean = np.bincount(network.image_of, squares, len(network.images)) / np.maximum(count, 1)
-    usable = np.flatnonzero(result.fit.usable.images & (count > 0))
+    number = np.bincount(network.image_of[good], minlength=len(network.images))
+    mean = np.bincount(network.image_of, squares, len(network.images)) / np.maximum(number, 1)
+    usable = np.flatnonzero(result.fit.usable.images & (number > 0))
     large = float(np.quantile(np.sqrt(squares[good]), 0.95)) if good.any() else 0.0
     found = []
-    for i in sorted(usable[np.argsort(-mean[usable], kind="stable")][:_PHOTOGRAPHS]):
+    for i in sorted(usable[np.argsort(-mean[usable], kind="stable")][:count]):
         frame = photograph(network.images[i])
         if frame is None:
             continue
         rows = np.flatnonzero(network.image_of == i)
-        enlarged = nice(_LONG * frame.width / large) if large > 0 else 1.0
+        enlarged = nice(_LONG * bold * frame.width / large) if large > 0 else 1.0
         shifts = np.where(good[rows, None], enlarged * result.residuals[rows], np.nan)
         names = tuple(network.points[j] for j in network.point_of[rows])
         marks = Marks(names, network.xy[rows], good[rows], shifts=shifts)
         found.append(
             {
                 "name": network.images[i],
-                "picture": frame_overlay(frame, marks, _ACROSS),
+                "picture": frame_overlay(frame, marks, across, bold),
                 "points": int(good[rows].sum()),
                 "rejected": int((~good[rows]).sum()),
                 "enlarged": f"{enlarged:g}",
                 "longest": f"{np.sqrt(squares[rows].max()):.2g}",
+                # Of one coordinate, as the summary has it.
+                "rms": f"{np.sqrt(mean[i] / 2):.2g}",
             }
         )
     return found

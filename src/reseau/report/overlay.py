@@ -83,7 +83,7 @@ def preview(frame: Frame, width: int = _WIDTH) -> NDArray[np.uint8]:
     return grey
 
 
-def frame_overlay(frame: Frame, marks: Marks, across: int = _WIDTH) -> str:
+def frame_overlay(frame: Frame, marks: Marks, across: int = _WIDTH, bold: float = 1.0) -> str:
     """Draw marks over the frame.
 
     Parameters
@@ -94,6 +94,8 @@ def frame_overlay(frame: Frame, marks: Marks, across: int = _WIDTH) -> str:
         The marks.
     across : int
         Largest width of the picture, pixels; the marks keep their places.
+    bold : float
+        Factor on the size of marks and lines, for small pictures.
 
     Returns
     -------
@@ -102,7 +104,7 @@ def frame_overlay(frame: Frame, marks: Marks, across: int = _WIDTH) -> str:
     """
     _, coded = cv2.imencode(".jpg", preview(frame, across), [cv2.IMWRITE_JPEG_QUALITY, 82])
     picture = base64.b64encode(coded.tobytes()).decode()
-    unit = frame.width / 1000
+    unit = bold * frame.width / 1000
     width, height = frame.width, frame.height
     parts = [
         f'<svg class="frame" viewBox="-0.5 -0.5 {width} {height}">',
