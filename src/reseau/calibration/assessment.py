@@ -206,7 +206,7 @@ class ErrorMap(Strict):
         return float(np.median(known)) if len(known) else float("nan")
 
     def _finely(self, values: Array) -> tuple[Array, Array]:
-        """Places and values between those of the map, for smooth contours; as they are where some have none."""
+        """Places and values between those of the map, for smooth contours; as they are without some."""
         if not (values > 0).all() or min(values.shape) < 4:
             return self.xy, values
         x, y = (np.linspace(at[0], at[-1], _FINE * (len(at) - 1) + 1) for at in (self.x, self.y))
