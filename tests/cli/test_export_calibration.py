@@ -57,4 +57,4 @@ def test_what_is_usable_for_nothing_is_not_passed_on(reseau: Run, tmp_path: Path
     good.write(tmp_path / "K.json")
     status, _, err = reseau(*export)
     assert (status, err.count("\n")) == (0, 1)
-    assert "has no verdict: it was imported, or made by an earlier version" in err
+    assert "has no verdict: it was imported, computed from others, or made by an earlier" in err

@@ -259,7 +259,10 @@ def calibrate(
     if report is not None:
         pictures = _pictures(photographs, channel)
         title = f"Calibration with {target.name}"
-        _write_report(report, done, title, provenance, differences, distance, pictures)
+        done.report(
+            report, title=title, photograph=pictures, provenance=provenance, against=differences,
+            distances=distance or (),
+        )  # fmt: skip
     if out is not None:
         for calibration, path in zip(calibrations, done.files(out).values(), strict=True):
             calibration.write(path)
@@ -370,25 +373,6 @@ def _shown(photographs: Iterator[Photograph], step: Callable[[str], None]) -> It
         yield each
 
 
-def _write_report(
-    path: Path,
-    done: Calibrated,
-    title: str,
-    provenance: Provenance,
-    differences: dict[str, FieldDifference],
-    distances: list[float] | None,
-    pictures: Callable[[str], Frame | None],
-) -> None:
-    from ..io import write_whole
-    from ..report.bundle import bundle_report
-
-    page = bundle_report(
-        done.result, title=title, provenance=provenance, against=differences, distances=distances or (),
-        assessments=done.assessments, photograph=pictures, declined=done.declined,
-    )  # fmt: skip
-    write_whole(path, page)
-
-
 def _pictures(photographs: Mapping[str, Path], channel: Channel) -> Callable[[str], Frame | None]:
     """The photographs, read again one by one: all of them would fill the memory."""
     from ..io import is_points
@@ -480,9 +464,8 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
             most, usual = two_digits(verdict.errors.greatest_px), two_digits(verdict.errors.median_px)
             say(f"error of the projection: median {usual} px over the image, at most {most} px\n")
         for away in distances:
-            say(
-                f"  at {away:g} {result.network.unit}: {_uncertainty(projection_field_at(result, c, away))}\n"
-            )
+            field = _uncertainty(projection_field_at(result, c, away))
+            say(f"  σ at {away:g} {result.network.unit}: {field}\n")
     if result.rig is not None:
         say_rig(result.rig)
     if result.stage is not None:
