@@ -86,7 +86,8 @@ def test_packages_that_share_a_name_with_a_function_are_callable_and_stay_packag
         (lambda: reseau.read_lens(5), "source: is of type int"),  # type: ignore[arg-type]
         (lambda: reseau.measure([], GRID), "source: is of type list"),  # type: ignore[arg-type]
         (lambda: reseau.measure(GREY, GRID, options=3), "options: is of type int"),  # type: ignore[arg-type]
-        (lambda: reseau.calibrate("photo.jpg", GRID), "images: is of type str"),
+        (lambda: reseau.calibrate(5, GRID), "images: is of type int"),  # type: ignore[arg-type]
+        (lambda: reseau.read_image(COLOUR), "colours: is None, and the array has three channels"),
         (lambda: reseau.calibrate([3, 4, 5], GRID), "photograph: is of type int"),  # type: ignore[list-item]
         (lambda: reseau.orient(3), "scan: is of type int"),  # type: ignore[arg-type]
         (lambda: reseau.refine(), "refine: needs `photo_i` and `reseau`"),
@@ -103,6 +104,7 @@ def test_an_argument_of_a_wrong_kind_is_named(call: object, named: str) -> None:
 
 
 GREY = np.full((60, 80), 128, np.uint8)
+COLOUR = np.stack([GREY, GREY // 2, GREY // 4], axis=2)
 GRID = regular_reseau(5, 4, 10.0, Mark(shape="disk", size=2.0), name="disks")
 
 
@@ -127,16 +129,35 @@ def test_photographs_become_a_calibration_its_file_and_its_plot(
     photographs: list[reseau.Frame], tmp_path: Path
 ) -> None:
     calibrated = reseau.calibrate(photographs, FieldBench().design, pitch_mm=0.027).required()
-    assert len(repr(calibrated)) < 400
+    assert len(repr(calibrated)) < 500
     assert "sigma0" in repr(calibrated)
-    assert calibrated._repr_html_().startswith("<table>")
-    assert len(calibrated.plot(photographs[0])) == 3
+    assert calibrated.assessment is not None
+    assert calibrated.assessment.short in repr(calibrated)
+    assert len(calibrated.plot(photographs[0])) == 4
     calibrated.write(tmp_path / "camera.json")
     calibration = reseau.read_calibration(tmp_path / "camera.json")
     estimate = calibrated.cameras["camera"]
     assert calibration.values()["c"] == dict(zip(estimate.parameters, estimate.values, strict=True))["c"]
-    assert len(repr(calibration)) < 200
-    assert calibration.plot().get_title(loc="left").startswith("σ of the projection")
+    assert calibration.assessment == calibrated.assessment
+    assert len(repr(calibration)) < 300
+    assert calibration.plot().get_title(loc="left") == "error of the projection / px"
+
+
+def test_a_folder_is_enough_and_the_target_is_found(photographs: list[reseau.Frame], tmp_path: Path) -> None:
+    for frame in photographs:
+        write_image(tmp_path / f"{frame.name}.png", frame.pixels)
+    FieldBench().design.write(tmp_path / "field.json")
+    found = reseau.calibrate(tmp_path).required()
+    assert len(found.measured) == len(photographs)
+    assert found.notes[0] == f"the target is {tmp_path / 'field.json'}"
+
+
+def test_channels_of_arrays_are_told_by_their_order() -> None:
+    one = reseau.read_image(COLOUR, colours="rgb").pixels
+    other = reseau.read_image(COLOUR[:, :, ::-1], colours="bgr").pixels
+    np.testing.assert_array_equal(one, other)
+    assert (reseau.read_image(COLOUR, "blue", colours="bgr").pixels == 128).all()
+    assert (reseau.read_image(COLOUR, colours="bgr").pixels < one).all()
 
 
 def test_the_lines_of_the_readme_make_a_calibration_of_photographs(

@@ -8,9 +8,9 @@ is a falsy :class:`~reseau.core.failure.Failure` with its reason; its ``required
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,12 @@ from .bundle import adjust_network as _adjust
 from .calibration import Calibration, InstrumentCorrection, SensorCorrection
 from .calibration import read_calibration as _read_calibration
 from .core.data import Frame, ImagePoints
-from .core.display import Display
 from .core.errors import UsageError
 from .core.failure import Failure
 from .exchange import Lens, read_network, read_target
 from .exchange import read_lens as _read_lens
 from .io import BoardDesign, ReseauDesign, TestfieldDesign, is_points, read_measurement
-from .io.images import Channel, open_scan
+from .io.images import Channel, grey_of, open_scan
 from .io.images import read_image as _read_image
 from .io.scans import scan_of
 from .measure import (
@@ -45,13 +44,12 @@ from .procedures import oscilloscope as _procedure
 from .procedures.calibrated import Calibrated
 from .procedures.calibration import calibrate_camera
 from .procedures.calibration_options import CalibrationOptions, CameraOptions
-from .procedures.exposures import photograph_reader, photographs_of
+from .procedures.exposures import photograph_reader, photographs_named, photographs_of
 from .procedures.film_frame import FrameOptions, FrameResult, orient_scan
-from .procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
+from .procedures.oscilloscope import PhotoI, PhotoII
+from .procedures.refined import Refined
 from .procedures.target_measurement import measurer_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from .procedures.which_target import Design, target_of
 
 __all__ = [
     "Adjusted",
@@ -70,6 +68,7 @@ __all__ = [
 T = TypeVar("T")
 
 PathLike = str | Path
+Colours = Literal["bgr", "rgb"]
 ImageLike = PathLike | NDArray[Any] | Frame
 PhotoLike = ImageLike | ImagePoints
 DesignLike = PathLike | ReseauDesign | TestfieldDesign | BoardDesign
@@ -77,16 +76,17 @@ CalibrationLike = PathLike | Calibration
 LensLike = PathLike | Lens
 
 
-def read_image(source: ImageLike, channel: Channel = "luma") -> Frame:
+def read_image(source: ImageLike, channel: Channel = "luma", *, colours: Colours | None = None) -> Frame:
     """Read an image as a frame of grey values.
 
     Parameters
     ----------
-    source : str, Path, ndarray (h, w) or Frame
-        An image file (PNG, JPEG, TIFF, BMP; 8 or 16 bit), an array of grey values, or a frame, which is
-        returned as it is.
+    source : str, Path, ndarray (h, w) or (h, w, 3), or Frame
+        An image file (PNG, JPEG, TIFF, BMP; 8 or 16 bit), an array, or a frame, which is returned as it is.
     channel : {"luma", "red", "green", "blue"}
         What is taken of a colour image.
+    colours : {"bgr", "rgb"}, optional
+        Order of the channels of an array; required for arrays in colour: those of OpenCV are ``bgr``.
 
     Raises
     ------
@@ -116,8 +116,20 @@ def read_image(source: ImageLike, channel: Channel = "luma") -> Frame:
         scale = (
             float(np.iinfo(source.dtype).max) if source.dtype.kind == "u" else float(source.max(initial=1))
         )
-        return Frame(source, scale)
+        return Frame(_grey(source, channel, colours), scale)
     return _read_image(_path(source, "source", "a path, an array or a Frame"), channel)
+
+
+def _grey(pixels: NDArray[Any], channel: Channel, colours: Colours | None) -> NDArray[Any]:
+    """The grey values of an array, or those of its channels in colour."""
+    if pixels.ndim != 3 or pixels.shape[2] != 3:
+        return pixels
+    if colours not in ("bgr", "rgb"):
+        raise UsageError(
+            f"is {colours!r}, and the array has three channels", where="colours",
+            do='give "bgr" for arrays of OpenCV, else "rgb"',
+        )  # fmt: skip
+    return grey_of(pixels if colours == "rgb" else pixels[:, :, ::-1], channel)
 
 
 def read_design(source: DesignLike) -> ReseauDesign | TestfieldDesign | BoardDesign:
@@ -227,12 +239,13 @@ def measure(
     options: ReseauOptions | TestfieldOptions | BoardOptions | PinOptions | None = None,
     sensor: CalibrationLike | None = None,
     channel: Channel = "luma",
+    colours: Colours | None = None,
 ) -> Measured | Failure:
     """Measure the marks of a target in an image to sub-pixel image coordinates with covariances.
 
     Parameters
     ----------
-    image : str, Path, ndarray (h, w) or Frame
+    image : str, Path, ndarray (h, w) or (h, w, 3), or Frame
         The image.
     design : str, Path, ReseauDesign, TestfieldDesign or BoardDesign
         The target: a reseau, a sheet of disks, the rods of a test object, a coded testfield, or a board.
@@ -242,6 +255,8 @@ def measure(
         Calibration of the sensor, applied first.
     channel : {"luma", "red", "green", "blue"}
         What is taken of a colour image.
+    colours : {"bgr", "rgb"}, optional
+        Order of the channels of an array; required for arrays in colour: those of OpenCV are ``bgr``.
 
     Returns
     -------
@@ -254,7 +269,7 @@ def measure(
         When `options` are those of another kind of target.
     """
     target = read_design(design)
-    frame = _corrected(read_image(image, channel), sensor)
+    frame = _corrected(read_image(image, channel, colours=colours), sensor)
     if isinstance(target, TestfieldDesign):
         return measure_testfield(frame, target, _options(options, TestfieldOptions))
     if isinstance(target, BoardDesign):
@@ -265,8 +280,8 @@ def measure(
 
 
 def calibrate(
-    images: Iterable[PhotoLike],
-    design: DesignLike,
+    images: PathLike | Iterable[PhotoLike],
+    design: DesignLike = "auto",
     *,
     model: str | CameraOptions | None = None,
     pitch_mm: float | None = None,
@@ -275,15 +290,16 @@ def calibrate(
     options: CalibrationOptions | None = None,
     sensor: CalibrationLike | None = None,
     channel: Channel = "luma",
+    colours: Colours | None = None,
 ) -> Calibrated | Failure:
     """Calibrate a camera from photographs of a target.
 
     Parameters
     ----------
-    images : iterable of str, Path, ndarray, Frame or ImagePoints
-        Photographs of one size, or the coordinates measured in them.
+    images : str or Path, or iterable of str, Path, ndarray, Frame or ImagePoints
+        A folder, or photographs of one size, folders of them, or the coordinates measured in them.
     design : str, Path, ReseauDesign, TestfieldDesign or BoardDesign
-        The target.
+        The target; ``auto`` looks for it, among the designs beside the photographs and the usual ones.
     model : str or CameraOptions, optional
         Name of the camera model; by default it is chosen, see :func:`reseau.bundle.choose_models`. With
         `free` alone it is ``brown`` where the pixel size is given, else ``opencv``.
@@ -295,7 +311,7 @@ def calibrate(
         Width and height in pixels, where no photograph gives them.
     options : CalibrationOptions, optional
         Options of the adjustment.
-    sensor, channel
+    sensor, channel, colours
         As for :func:`measure`.
 
     Returns
@@ -322,23 +338,33 @@ def calibrate(
     >>> reseau.calibrate(images, design, free=("fx", "fy", "cx", "cy"), size=(640, 480))
     <Calibrated: 4 images, 140 image points, 0 declined, sigma0 0.000, fx 800.00... px, ...>
     """
-    photos = _several(images, "images")
-    target = read_design(design)
+    given = (images,) if isinstance(images, str | Path) else _several(images, "images")
     if not isinstance(model, CameraOptions):
         pitch = None if pitch_mm is None else (pitch_mm, pitch_mm)
         model = CameraOptions(model or ("" if free else "auto"), tuple(free), pitch)
 
     named = list[tuple[str, Path | Frame | ImagePoints]]()
-    for number, image in enumerate(photos, start=1):
-        photo = Path(image) if isinstance(image, str | Path) else _photo(image, channel)
-        name = photo.name if isinstance(photo, Path | Frame) and not isinstance(image, np.ndarray) else ""
-        named.append((name or f"image {number}", photo))
+    for image in given:
+        if isinstance(image, str | Path):
+            named += [(path.name, path) for path in photographs_named([Path(image)])]
+            continue
+        photo = _photo(image, channel, colours)
+        name = photo.name if isinstance(photo, Frame) and not isinstance(image, np.ndarray) else ""
+        named.append((name or f"image {len(named) + 1}", photo))
 
-    said, photographs = photographs_of(named, photograph_reader(channel, _correction(sensor)))
+    read = photograph_reader(channel, _correction(sensor))
+    found: tuple[str, Design] | Failure = (
+        ("", read_design(design)) if design != "auto" else target_of([photo for _, photo in named], read)
+    )
+    if isinstance(found, Failure):
+        return found
+    note, target = found
+    said, photographs = photographs_of(named, read)
     options = options or CalibrationOptions()
     if options.focal_35_mm is None:
         options = replace(options, focal_35_mm=said)
-    return calibrate_camera(photographs, target, measurer_of(target), size, model, options)
+    done = calibrate_camera(photographs, target, measurer_of(target), size, model, options)
+    return replace(done, notes=(note, *done.notes)) if note and not isinstance(done, Failure) else done
 
 
 def orient(
@@ -384,101 +410,6 @@ def orient(
     elif format_mm is not None or dpi is not None:
         raise UsageError("cannot be given together with `format_mm` or `dpi`", where="options")
     return orient_scan(opened, options)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Refined(Display):
-    """The oscilloscope procedure's results, one for each photograph that was given.
-
-    Parameters
-    ----------
-    photo_i : PhotoI or None
-        The camera's correction (group A).
-    photo_ii : PhotoII or None
-        The instrument's correction (group B).
-    photo_iii : tuple of PhotoIII
-        True coordinates of the body in each further photograph.
-    """
-
-    photo_i: PhotoI | None
-    photo_ii: PhotoII | None
-    photo_iii: tuple[PhotoIII, ...]
-    reseau: ReseauDesign
-    test_object: ReseauDesign | None = None
-
-    def calibration(self, name: str = "oscilloscope") -> Calibration:
-        """Return the calibration of groups A and, with PHOTO II, B.
-
-        Raises
-        ------
-        UsageError
-            When the photographs were corrected by a stored calibration.
-        """
-        if self.photo_ii is not None and self.test_object is not None:
-            return self.photo_ii.instrument.calibration(self.reseau, self.test_object, name=name)
-        if self.photo_i is None:
-            raise UsageError("was given and not computed", where="calibration")
-        return self.photo_i.camera.calibration(name=name)
-
-    def write(self, path: PathLike) -> None:
-        """Write the calibration, or true coordinates to a CSV file.
-
-        Parameters
-        ----------
-        path : str or Path
-            A file that ends in ``.json`` for the calibration, or ``.csv`` for the true coordinates of the
-            first body.
-
-        Raises
-        ------
-        UsageError
-            When there is no such result, or the file has another suffix.
-        InputError
-            When the file cannot be written.
-        """
-        suffix = Path(path).suffix.lower()
-        if suffix == ".json":
-            self.calibration(Path(path).stem).write(path)
-        elif suffix == ".csv" and self.photo_iii:
-            self.photo_iii[0].true.write(path)
-        else:
-            raise UsageError("is neither .json nor, with PHOTO III, .csv", where=path)
-
-    def plot(self, axes: Axes | None = None) -> Axes:
-        """Draw the true coordinates of the first body, or the residuals of PHOTO I, with matplotlib.
-
-        Parameters
-        ----------
-        axes : matplotlib Axes, optional
-            Axes to draw into; by default those of a new figure.
-        """
-        from .core.figures import Panel, draw_vectors, new_axes
-
-        if self.photo_iii:
-            return self.photo_iii[0].true.plot(axes, y_down=False)
-        fit = None if self.photo_i is None else self.photo_i.camera.fit
-        if fit is None:
-            raise UsageError("was not computed", where="PHOTO I")
-        axes = new_axes(axes)
-        check = (fit.check_target, fit.check.xy - fit.check_target)
-        draw_vectors(
-            axes, (fit.target, fit.residuals), check, Panel(self.reseau.unit), "residuals of PHOTO I"
-        )
-        return axes
-
-    def _facts(self) -> list[tuple[str, str]]:
-        facts = []
-        if self.photo_i is not None:
-            facts.append(("PHOTO I", f"{len(self.photo_i.points)} marks"))
-        if self.photo_ii is not None:
-            facts.append(("PHOTO II", f"{len(self.photo_ii.pins)} rods"))
-        facts += [("PHOTO III", f"{len(found.true)} points") for found in self.photo_iii]
-        return facts
-
-    def _columns(self) -> dict[str, list[Any]]:
-        if not self.photo_iii:
-            raise UsageError("has no PHOTO III", where="Refined")
-        return self.photo_iii[0].true._columns()
 
 
 def refine(
@@ -669,7 +600,7 @@ def _kind(given: object) -> str:
     return "None" if given is None else f"of type {type(given).__name__}"
 
 
-def _photo(image: PhotoLike, channel: Channel) -> Frame | ImagePoints:
+def _photo(image: PhotoLike, channel: Channel, colours: Colours | None = None) -> Frame | ImagePoints:
     """A photograph, or the coordinates measured in it."""
     if isinstance(image, ImagePoints):
         return image
@@ -681,7 +612,7 @@ def _photo(image: PhotoLike, channel: Channel) -> Frame | ImagePoints:
         raise UsageError(
             f"is {_kind(image)}", where="photograph", do="give a path, an array, a Frame or ImagePoints"
         )
-    return read_image(image, channel)
+    return read_image(image, channel, colours=colours)
 
 
 def _split(photo: Frame | ImagePoints, grid: ReseauDesign) -> tuple[Frame | ImagePoints, ImagePoints | None]:

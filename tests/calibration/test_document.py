@@ -65,3 +65,16 @@ def test_a_covariance_of_the_wrong_size_is_refused(covariance: dict[str, object]
     content = json.loads(calibration().to_json()) | {"covariance": covariance}
     with pytest.raises(FormatError, match=complaint):
         Calibration.parse(json.dumps(content), where="c.json")
+
+
+def test_the_verdict_of_an_earlier_version_is_read_from_the_validity() -> None:
+    content = json.loads(calibration().to_json())
+    content["validity"]["assessment"] = {
+        "use": "nothing", "lines": ["not usable: …"], "centre_px": 0.157, "corners_px": 49.8,
+        "fits": False, "misfit_px": 0.027, "uncovered": [],
+    }  # fmt: skip
+    found = Calibration.parse(json.dumps(content), where="c.json")
+    assert found.assessment is not None
+    assert found.assessment.short == "not usable: 0.16 px at the centre, 50 px in the corners"
+    assert "assessment" not in found.validity
+    assert Calibration.parse(found.to_json(), where="c.json") == found

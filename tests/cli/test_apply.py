@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 import tifffile
 
-from reseau.calibration import Calibration, Covariance, Fields, Quantity, SensorCorrection, read_calibration
+from reseau.calibration import (
+    Assessment,
+    Calibration,
+    Covariance,
+    Fields,
+    Quantity,
+    SensorCorrection,
+    Use,
+    read_calibration,
+)
 from reseau.core.data import Array
 from reseau.io import CORNERS
 from reseau.io.images import read_image, write_image
@@ -39,6 +48,7 @@ def camera(tmp_path: Path) -> Path:
         sigma0=1.0,
         redundancy=50,
         validity={"extent": [60.0, 40.0, 260.0, 200.0], "unit": "px"},
+        assessment=Assessment(use=Use.MEASUREMENT, lines=(), centre_px=0.01, corners_px=0.03),
     )
     calibration.write(tmp_path / "cam.json")
     return tmp_path / "cam.json"

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reseau.calibration import Calibration
+from reseau.calibration import Assessment, Calibration, Use
 from reseau.calibration.document import Covariance, Quantity
 
 Run = Callable[..., tuple[int, str, str]]
@@ -33,6 +33,7 @@ def camera(model: str, values: dict[str, float], size: tuple[int, int]) -> Calib
             for k, v in values.items()
         },
         covariance=Covariance(names=("fx",), matrix=((0.01,),)),
+        assessment=Assessment(use=Use.MEASUREMENT, lines=(), centre_px=0.01, corners_px=0.03),
     )  # fmt: skip
 
 

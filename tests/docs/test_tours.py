@@ -71,6 +71,8 @@ def test_a_camera_is_calibrated_its_report_read_and_its_certificate_issued(
     pytest.importorskip("lxml", reason="certificates need the extra `certificates`")
     follow("certificate", tmp_path, values={"KEY": waiting})
     assert "R-7" in Path("certificate.html").read_text("utf-8")
+    follow("notebook", tmp_path)
+    assert all(Path(name).stat().st_size > 5000 for name in ("result.png", "result.html", "difference.png"))
 
 
 def test_a_roll_of_film_is_oriented(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,7 +31,7 @@ calibrated = reseau.calibrate(frames, bench.design, pitch_mm=0.006).required()
 print(calibrated)
 
 # %%
-# A measured photograph, the residuals of all, and the uncertainty of the projection over the image.
+# A measured photograph, the residuals of all, the error of the projection and its formal part.
 calibrated.plot(frames[1])
 
 # %%

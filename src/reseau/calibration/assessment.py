@@ -344,6 +344,9 @@ class Assessment(Strict):
         return f"{two_digits(self.centre_px)} px at the centre, {two_digits(self.corners_px)} px {place}"
 
 
+_WITHOUT = "it was imported, computed from others, or made by an earlier version"
+
+
 def required_use(
     assessed: Iterable[tuple[str, Assessment | None]], doing: str, *, anyway: bool = False
 ) -> tuple[str, ...]:
@@ -371,7 +374,7 @@ def required_use(
     Examples
     --------
     >>> required_use([("front", None)], "exported")
-    ('calibration front has no verdict: it was imported, or made by an earlier version',)
+    ('calibration front has no verdict: it was imported, computed from others, or made by an ...',)
     >>> bad = Assessment(use=Use.NOTHING, lines=(), centre_px=0.2, corners_px=50.0)
     >>> required_use([("front", bad)], "exported")
     Traceback (most recent call last):
@@ -381,7 +384,7 @@ def required_use(
     for name, found in assessed:
         where = f"calibration {name}"
         if found is None:
-            said.append(f"{where} has no verdict: it was imported, or made by an earlier version")
+            said.append(f"{where} has no verdict: {_WITHOUT}")
             continue
         if found.use is Use.NOTHING and not anyway:
             raise UsageError(

@@ -339,8 +339,12 @@ class Calibration(Document):
         verdict = (
             ("no verdict",) if self.assessment is None else self.assessment.lines or (self.assessment.short,)
         )
-        rows = (f"  {name:8} {measured(q.value, q.sigma, q.unit)}" for name, q in self.parameters.items())
-        return "\n".join((f"{self.kind} {self.name}", *verdict, *rows))
+        rows = (
+            f"  {name:8} {measured(q.value, q.sigma, q.unit)}"
+            for name, q in self.parameters.items()
+            if q.value or q.sigma
+        )
+        return "\n".join((f"{self.kind} {self.name!r}", *verdict, *rows))
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the error of the projection over the image with matplotlib.

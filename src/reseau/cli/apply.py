@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
@@ -23,8 +23,8 @@ from .common import (
 )
 
 if TYPE_CHECKING:
-    from ..calibration import CalibratedMapping, Calibration, CorrectedImage, SensorCorrection
-    from ..core.data import ImagePoints
+    from ..calibration import Calibration
+    from ..procedures.applying import Application
 
 __all__ = ["apply"]
 
@@ -36,8 +36,6 @@ _OF = {
     "fiducials": "a photograph with fiducial marks",
     "sensor": "a sensor",
 }
-
-View = Literal["keep", "all"] | float
 
 
 def apply(
@@ -122,10 +120,11 @@ def apply(
     resampled: without distortion (camera), in the system of the reseau (oscilloscope), or in millimetres of
     the frame (film frame, fiducial marks). With the calibration of a sensor, the grey values are corrected.
     """
-    from ..calibration import SensorCorrection, read_calibration, required_use
+    from ..calibration import read_calibration
     from ..core.provenance import sha256_of
     from ..io import is_points
     from ..io.stacks import VIDEOS
+    from ..procedures.applying import Application, View
 
     if scale is not None and not scale > 0:
         raise UsageError(f"{scale:g} is not positive", where="--scale")
@@ -137,10 +136,7 @@ def apply(
         stored, origin = read_calibration(calibration), {calibration.name: sha256_of(calibration)}
     else:
         stored, origin = _in_force(archive, objects, str(calibration), at)
-    if stored.kind == "camera":
-        for line in required_use([(stored.name, stored.assessment)], "applied", anyway=anyway):
-            typer.echo(f"note: {line}", err=True)
-    view = _View(_fov(fov), scale, alpha)
+    view = View(_fov(fov), scale, alpha)
     if alpha is not None and fov != "keep":
         raise UsageError("cannot be combined", where="--fov and --alpha")
     of_camera = {
@@ -150,30 +146,32 @@ def apply(
     _only(stored.kind, "camera", of_camera)
     _only(stored.kind, "oscilloscope", {"--object": object_system})
     _only(stored.kind, "sensor", {"--exposure-ms": exposure_ms is not None})
-    mapping = _mapping(stored, object_system)
+    applied = Application.of(stored, view, object_system=object_system, origin=origin, anyway=anyway)
+    for line in applied.notes:
+        typer.echo(f"note: {line}", err=True)
     if out is not None and not (source is not None and source.is_dir()):
         beside = [out.with_suffix(".json")] if stored.kind == "camera" else []
         _spare([calibration, *([source] if source is not None else [])], [out, *beside])
     if tables is not None:
-        _tables(mapping, tables, view)
+        _tables(applied, tables)
         if source is None:
             return
     if source is None:
         raise UsageError("is missing", where="SOURCE", do="give an image, a folder, a video or points")
     if is_points(source):
-        _points(mapping, source, out, as_json, None if directions else view, view, inverse)
+        _points(applied, source, out, as_json, inverse, directions)
     elif inverse:
         raise UsageError("applies to points only", where="--inverse")
     elif object_system or directions:
         raise UsageError("applies to points only", where="--object" if object_system else "--directions")
-    elif isinstance(mapping, SensorCorrection):
-        _frame(mapping, origin, source, out, exposure_ms, as_json)
+    elif stored.kind == "sensor":
+        _frame(applied, source, out, exposure_ms, as_json)
     elif source.is_dir():
-        _folder(stored, mapping, origin, source, out, view, as_json, calibration)
+        _folder(applied, source, out, as_json, calibration)
     elif source.suffix.lower() in VIDEOS:
-        _video(stored, mapping, source, out, view)
+        _video(applied, source, out)
     else:
-        _image(stored, mapping, origin, source, out, view, as_json)
+        _image(applied, source, out, as_json)
 
 
 def _in_force(
@@ -226,15 +224,7 @@ def _only(kind: str, required: str, options: dict[str, bool]) -> None:
             raise UsageError(f"needs a calibration of {_OF[required]}, not of {_OF[kind]}", where=name)
 
 
-class _View(NamedTuple):
-    """Field of view of an undistorted image, and its resolution."""
-
-    fov: View
-    scale: float | None
-    alpha: float | None
-
-
-def _fov(text: str) -> View:
+def _fov(text: str) -> Literal["keep", "all"] | float:
     """Parse the field of view.
 
     Raises
@@ -243,7 +233,7 @@ def _fov(text: str) -> View:
         If it is invalid.
     """
     if text in ("keep", "all"):
-        return cast(View, text)
+        return cast(Literal["keep", "all"], text)
     try:
         return float(text.removesuffix("°"))
     except ValueError:
@@ -252,158 +242,28 @@ def _fov(text: str) -> View:
         ) from None
 
 
-def _mapping(stored: Calibration, object_system: bool) -> CalibratedMapping:
-    """Return the mapping; for an oscilloscope only group A, unless object coordinates are requested.
-
-    Raises
-    ------
-    UsageError
-        If the calibration has no group B.
-    """
-    from ..calibration import InstrumentCorrection
-
-    mapping = stored.mapping()
-    if isinstance(mapping, InstrumentCorrection):
-        return mapping if object_system else mapping.camera
-    if object_system:
-        raise UsageError(
-            "needs a calibration with group B",
-            where="--object",
-            do="calibrate with reseau refine --photo-ii and --object",
-        )
-    return mapping
-
-
-def _raster(mapping: CalibratedMapping, size: tuple[int, int], view: _View) -> CorrectedImage:
-    """Return the raster of the corrected image."""
-    from ..calibration import (
-        CameraCorrection,
-        CameraMapping,
-        CorrectedImage,
-        FiducialMapping,
-        FilmFrameMapping,
-    )
-
-    fov, scale, alpha = view
-    if isinstance(mapping, CameraMapping):
-        return CorrectedImage.undistorted(mapping, fov, 1.0 if scale is None else scale, alpha)
-    if isinstance(mapping, FilmFrameMapping | FiducialMapping):
-        return CorrectedImage.of_frame(mapping, scale)
-    assert isinstance(mapping, CameraCorrection)
-    return CorrectedImage.plan(mapping, size, scale)
-
-
 def _points(
-    mapping: CalibratedMapping,
-    source: Path,
-    out: Path | None,
-    as_json: bool,
-    shown: _View | None,
-    view: _View,
-    inverse: bool,
+    applied: Application, source: Path, out: Path | None, as_json: bool, inverse: bool, directions: bool
 ) -> None:
-    """Correct points; for a camera, to pixels of the undistorted image, or without `shown` to directions."""
-    from ..calibration import CameraMapping
-    from ..core.provenance import canonical_json
-    from ..io import points_document, write_whole
+    """Correct points; for a camera, to pixels of the undistorted image, or to directions."""
+    from ..io import write_whole
 
-    if "points" not in mapping.applies_to:
-        raise UsageError("a sensor calibration corrects images, not points", where=source, do="give an image")
     suffix = ".csv" if out is None else suffix_of(writable(out), (".csv", ".json"))
-    more: dict[str, Any] = {}
-    raster = None
-    if isinstance(mapping, CameraMapping) and shown is not None:
-        raster = _raster(mapping, mapping.size, view)
-        more = {"camera": raster.pinhole}
-    given = "image" if not inverse else mapping.system if raster is None else "undistorted"
-    measured = _measured(source, given, more if inverse else {})
-    if inverse:
-        points = mapping.inverse(measured if raster is None else _to_directions(measured, raster))
-        why, unit, system = mapping.why_not(points), "px", "image"
-    else:
-        points, why = mapping.apply(measured), mapping.why_not(measured)
-        unit, system = mapping.unit, mapping.system
-        if raster is not None:
-            points, unit, system = _in_pixels(points, raster), "px", "undistorted"
-    content, text = points_document(points, unit, system) | more, points.to_csv()
-    if any(why):
-        content["points"] = _nullable(content["points"]) | {"ok": [not w for w in why], "why": list(why)}
-        head, *lines = text.splitlines()
-        rows = [f"{line},{int(not w)},{w}" for line, w in zip(lines, why, strict=True)]
-        text = "\n".join([f"{head},ok,why", *rows]) + "\n"
-    document = canonical_json(content)
+    found = applied.points(source, inverse=inverse, directions=directions)
     if out is not None:
-        write_whole(out, document if suffix == ".json" else text)
+        write_whole(out, found.to_json() if suffix == ".json" else found.to_csv())
     if as_json:
-        say(document)
+        say(found.to_json())
     elif out is None:
-        say(text)
+        say(found.to_csv())
     else:
-        say(f"{out}: {len(points)} points in {unit}\n")
-    _warn(points.names, why)
+        say(f"{out}: {len(found.points)} points in {found.unit}\n")
+    _warn(found.points.names, found.why)
 
 
-def _measured(source: Path, system: str, camera: dict[str, Any]) -> ImagePoints:
-    """Read points, also those that this command wrote, with their covariances and their `camera`.
-
-    Raises
-    ------
-    UsageError
-        If the points are in another coordinate system, or in an undistorted image of another camera.
-    FormatError
-        If the file is incomplete.
-    """
-    import json
-
-    import numpy as np
-
-    from ..io import POINTS, points_of, read_measurement, read_text
-
-    try:
-        content = json.loads(read_text(source)) if source.suffix.lower() == ".json" else None
-    except ValueError:
-        content = None
-    if not isinstance(content, dict) or content.get("schema") != POINTS:
-        return read_measurement(source).image_points()
-    if content.get("system") != system:
-        raise UsageError(f"has points of the system {content.get('system')}, not {system}", where=source)
-    for key, pinhole in camera.items():
-        own = content.get(key) or {}
-        if any(abs(own.get(name, np.inf) - value) > 1e-6 for name, value in pinhole.items()):
-            raise UsageError(
-                "has points of another undistorted image", where=source,
-                do="repeat --fov, --alpha or --scale as for that one",
-            )  # fmt: skip
-    return points_of(content, source)
-
-
-def _in_pixels(points: ImagePoints, raster: CorrectedImage) -> ImagePoints:
-    """Convert directions to pixels of the undistorted image."""
-    import numpy as np
-
-    from ..core.data import ImagePoints
-
-    slope = np.diag(raster.slope)
-    return ImagePoints(points.names, raster.of_system(points.xy), slope @ points.cov @ slope)
-
-
-def _to_directions(points: ImagePoints, raster: CorrectedImage) -> ImagePoints:
-    """Convert pixels of the undistorted image to directions."""
-    import numpy as np
-
-    from ..core.data import ImagePoints
-
-    slope = np.diag(1 / raster.slope)
-    return ImagePoints(points.names, raster.to_system(points.xy), slope @ points.cov @ slope)
-
-
-def _tables(mapping: CalibratedMapping, path: Path, view: _View) -> None:
+def _tables(applied: Application, path: Path) -> None:
     """Write the tables of the undistorted image."""
-    from ..calibration import CameraMapping, write_tables
-
-    assert isinstance(mapping, CameraMapping)
-    raster = _raster(mapping, mapping.size, view)
-    files = write_tables(writable(path), raster)
+    files, raster = applied.tables(writable(path)), applied.raster()
     say("".join(f"{file}: {raster.width} × {raster.height} px\n" for file in files))
     if len(files) == 2:
         # Without the format, ffmpeg takes the numbers of some tables for music.
@@ -411,16 +271,7 @@ def _tables(mapping: CalibratedMapping, path: Path, view: _View) -> None:
         say(f"ffmpeg -i video.mp4 {tables} -lavfi remap undistorted.mp4\n")
 
 
-def _folder(
-    stored: Calibration,
-    mapping: CalibratedMapping,
-    origin: dict[str, str],
-    source: Path,
-    out: Path | None,
-    view: _View,
-    as_json: bool,
-    calibration: Path,
-) -> None:
+def _folder(applied: Application, source: Path, out: Path | None, as_json: bool, calibration: Path) -> None:
     """Resample the images of a folder into another; one that cannot be read costs one line."""
     from ..core.errors import ImageError, InputError
     from ..procedures.exposures import photographs_in
@@ -439,7 +290,7 @@ def _folder(
         suffix = image.suffix if image.suffix.lower() in _IMAGES else ".png"
         try:
             _spare([calibration], [out / f"{image.stem}.json"])
-            _image(stored, mapping, origin, image, out / f"{image.stem}{suffix}", view, as_json)
+            _image(applied, image, out / f"{image.stem}{suffix}", as_json)
             done += 1
         except (ImageError, UsageError) as error:
             typer.echo(f"left out: {error}", err=True)
@@ -447,27 +298,14 @@ def _folder(
         raise InputError(f"none of its {len(images)} images could be corrected", where=source)
 
 
-def _video(
-    stored: Calibration, mapping: CalibratedMapping, source: Path, out: Path | None, view: _View
-) -> None:
+def _video(applied: Application, source: Path, out: Path | None) -> None:
     """Undistort a video."""
-    from ..calibration import CameraMapping, undistort_video
-
-    if not isinstance(mapping, CameraMapping):
-        raise UsageError("needs the calibration of a camera", where=source)
     suffix = ".mp4" if source.suffix.lower() == ".webm" else source.suffix
     out = writable(out or source.with_name(f"{source.stem}-undistorted{suffix}"))
-    raster = _raster(mapping, mapping.size, view)
     with progress(f"undistorting {source.name}", 0) as step:
-        count = undistort_video(source, out, raster, step)
+        count = applied.video(source, out, step)
+    raster = applied.raster()
     say(f"{out}: {count} frames of {raster.width} × {raster.height} px\n")
-
-
-def _nullable(table: dict[str, list[Any]]) -> dict[str, list[Any]]:
-    """Replace NaN by None, for points without a position."""
-    return {
-        key: [None if isinstance(v, float) and v != v else v for v in column] for key, column in table.items()
-    }
 
 
 def _warn(names: tuple[str, ...], why: tuple[str, ...]) -> None:
@@ -479,92 +317,44 @@ def _warn(names: tuple[str, ...], why: tuple[str, ...]) -> None:
         typer.echo(f"warning: {line}", err=True)
 
 
-def _image(
-    stored: Calibration,
-    mapping: CalibratedMapping,
-    origin: dict[str, str],
-    source: Path,
-    out: Path | None,
-    view: _View,
-    as_json: bool,
-) -> None:
+def _image(applied: Application, source: Path, out: Path | None, as_json: bool) -> None:
     """Resample an image; for a camera, also write the parameters of the pinhole camera of the result."""
-    from ..calibration import undistorted_camera, write_corrected
-    from ..core.provenance import Provenance, canonical_json, sha256_of
+    from ..core.provenance import canonical_json
 
-    suffix = {"camera": "undistorted", "film_frame": "frame", "fiducials": "frame"}.get(
-        stored.kind, "corrected"
-    )
+    kind = applied.calibration.kind
+    suffix = {"camera": "undistorted", "film_frame": "frame", "fiducials": "frame"}.get(kind, "corrected")
     out = out or source.with_name(f"{source.stem}-{suffix}{source.suffix}")
     suffix_of(writable(out), _IMAGES)
-    planes = _planes(source, colours=stored.kind != "oscilloscope")
-    height, width = planes[0].shape
-    mapping.check_size(width, height, source)
-    raster = _raster(mapping, (width, height), view)
-    with progress(f"resampling {source.name}", raster.bands) as step:
-        write_corrected(out, planes, raster, step)
-    inputs = {source.name: sha256_of(source)} | origin
-    if stored.kind == "camera":
-        provenance = Provenance(inputs, {"fov": view.fov, "scale": view.scale, "alpha": view.alpha})
-        camera, beside = undistorted_camera(raster, stored, provenance.to_dict()), out.with_suffix(".json")
-        camera.write(beside)
-        if as_json:
-            say(camera.to_json())
-        else:
-            p = raster.pinhole
-            say(f"{out}: {p['width']} × {p['height']} px, fx {p['fx']:.2f}, fy {p['fy']:.2f}, ")
-            say(f"cx {p['cx']:.2f}, cy {p['cy']:.2f} px\n{beside}: camera of the undistorted image\n")
-        return
-    provenance = Provenance(inputs, {"scale": raster.scale[0]})
+    with progress(f"resampling {source.name}", 0) as step:
+        raster, camera, provenance = applied.image(source, out, step)
     if as_json:
-        say(canonical_json(raster.to_dict() | {"image": str(out), "provenance": provenance.to_dict()}))
+        content = raster.to_dict() | {"image": str(out), "provenance": provenance.to_dict()}
+        say(canonical_json(content) if camera is None else camera.to_json())
+    elif camera is not None:
+        p = raster.pinhole
+        say(f"{out}: {p['width']} × {p['height']} px, fx {p['fx']:.2f}, fy {p['fy']:.2f}, ")
+        say(f"cx {p['cx']:.2f}, cy {p['cy']:.2f} px\n")
+        say(f"{out.with_suffix('.json')}: camera of the undistorted image\n")
     else:
-        (x, y), unit = raster.origin, mapping.unit
+        (x, y), unit = raster.origin, applied.mapping.unit
         say(
             f"{out}: {raster.width} × {raster.height} px, {raster.scale[0]:.6g} px/{unit}, "
             f"first pixel at ({x:.6g}, {y:.6g}) {unit}\n"
         )
 
 
-def _planes(source: Path, *, colours: bool) -> tuple[Any, ...]:
-    """Return the channels of an image, each (height, width); with `colours` false, only its grey values."""
-    from ..calibration.raster import planes_of
-    from ..io.images import open_scan, read_image
-
-    return planes_of(open_scan(source)) if colours else (read_image(source).pixels,)
-
-
 def _frame(
-    correction: SensorCorrection,
-    origin: dict[str, str],
-    source: Path,
-    out: Path | None,
-    exposure_ms: float | None,
-    as_json: bool,
+    applied: Application, source: Path, out: Path | None, exposure_ms: float | None, as_json: bool
 ) -> None:
     """Correct the grey values of a frame: a TIFF of floats, or a PNG of 16 bit up to the full scale."""
-    import numpy as np
-
-    from ..core.provenance import Provenance, canonical_json
-    from ..io.images import read_image, write_image
+    from ..core.provenance import canonical_json
 
     out = out or source.with_name(f"{source.stem}-corrected.tif")
     suffix = suffix_of(writable(out), (".tif", ".tiff", ".png"))
-    exposure_us = None if exposure_ms is None else 1000 * exposure_ms
-    frame = read_image(source)
-    correction.check_size(frame.width, frame.height, source)
-    found = correction.correct(frame, exposure_us)
-    pixels, step = found.pixels, 1.0
-    if suffix == ".png":
-        step = found.full_scale / 65535
-        pixels = np.clip(np.rint(pixels / step), 0, 65535).astype(np.uint16)
-    write_image(out, pixels)
-    used = correction.exposure_us if exposure_us is None else exposure_us
-    inputs = {source.name: frame.sha256} | origin
+    found = applied.frame(source, out, None if exposure_ms is None else 1000 * exposure_ms)
     if as_json:
-        content = {"image": str(out), "dn_per_step": step, "full_scale_dn": found.full_scale}
-        provenance = Provenance(inputs, {"exposure_us": used})
-        say(canonical_json(content | {"provenance": provenance.to_dict()}))
+        content = {"image": str(out), "dn_per_step": found.dn_per_step, "full_scale_dn": found.full_scale}
+        say(canonical_json(content | {"provenance": found.provenance.to_dict()}))
     else:
-        kind = f"16 bit, {step:.6g} DN per step" if suffix == ".png" else "32 bit float"
+        kind = f"16 bit, {found.dn_per_step:.6g} DN per step" if suffix == ".png" else "32 bit float"
         say(f"{out}: {found.width} × {found.height} px, {kind}, full scale {found.full_scale:.6g} DN\n")

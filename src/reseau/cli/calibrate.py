@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..core.errors import ImageError, UsageError
+from ..core.errors import UsageError
 from .bundle_compare import read_lens
 from .bundle_options import (
     ComponentsOf,
@@ -321,22 +321,12 @@ def _found_target(
     files: list[Path], channel: Channel, sensor: Path | None
 ) -> ReseauDesign | TestfieldDesign | BoardDesign:
     """The target that photographs show."""
-    from ..io import is_points
-    from ..procedures.which_target import designs_beside, which_target
+    from ..procedures.exposures import photograph_reader
+    from ..procedures.which_target import target_of
 
-    folders = dict.fromkeys(folder for path in files for folder in (path.parent, path.parent.parent))
-
-    def frames() -> Iterator[Frame]:
-        for path in files:
-            if not is_points(path):
-                try:
-                    yield read_frame(path, channel.value, sensor)
-                except ImageError:
-                    continue  # is reported with its name when all are measured
-
-    name, design = required(which_target(frames(), designs_beside([*folders, Path()])), "--design auto")
-    size = "" if Path(name).is_file() else "; photographs do not tell its size, on which only lengths depend"
-    typer.echo(f"note: the target is {name}{size}", err=True)
+    read = photograph_reader(channel.value, None if sensor is None else sensor_correction(sensor))
+    note, design = required(target_of(files, read), "--design auto")
+    typer.echo(f"note: {note}", err=True)
     return design
 
 
@@ -520,9 +510,8 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
             most, usual = two_digits(verdict.errors.greatest_px), two_digits(verdict.errors.median_px)
             say(f"error of the projection: median {usual} px over the image, at most {most} px\n")
         for away in distances:
-            say(
-                f"  at {away:g} {result.network.unit}: {_uncertainty(projection_field_at(result, c, away))}\n"
-            )
+            field = _uncertainty(projection_field_at(result, c, away))
+            say(f"  σ at {away:g} {result.network.unit}: {field}\n")
     if result.rig is not None:
         say_rig(result.rig)
     if result.stage is not None:

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from .errors import UsageError
 
-__all__ = ["Display", "Table", "data_frame"]
+__all__ = ["Display", "Table", "data_frame", "html_table"]
 
 Facts = Sequence[tuple[str, str]]
 Columns = Mapping[str, Sequence[Any]]
@@ -46,11 +46,7 @@ class Display:
         return f"<{type(self).__name__}: {facts}>"
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f'<tr><th style="text-align:left">{escape(name)}</th><td>{escape(value)}</td></tr>'
-            for name, value in self._facts()
-        )
-        return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
+        return html_table(type(self).__name__, self._facts())
 
     def to_dataframe(self) -> Any:
         """Return the rows of the result as a pandas data frame.
@@ -61,6 +57,21 @@ class Display:
             When the result has no rows, or pandas is not installed.
         """
         return data_frame(self._columns())
+
+
+def html_table(caption: str, facts: Facts) -> str:
+    """Names and values as a table of HTML.
+
+    Examples
+    --------
+    >>> html_table("Points", [("sigma", "0.006 px")])
+    '<table><caption>Points</caption><tr><th style="text-align:left">sigma</th><td>0.006 px</td></tr></table>'
+    """
+    rows = "".join(
+        f'<tr><th style="text-align:left">{escape(name)}</th><td>{escape(value)}</td></tr>'
+        for name, value in facts
+    )
+    return f"<table><caption>{escape(caption)}</caption>{rows}</table>"
 
 
 _SHOWN = 20

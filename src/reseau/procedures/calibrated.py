@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 
 from numpy.typing import NDArray
 
@@ -26,10 +26,11 @@ from ..bundle import (
 )
 from ..calibration import Assessment, Calibration, Covariance, FieldDifference
 from ..core.data import Array, Frame, ImagePoints
-from ..core.display import Display, Table
+from ..core.display import Display, Table, html_table
 from ..core.errors import UsageError
 from ..core.failure import Remark
 from ..core.lazy import above
+from ..core.provenance import Provenance
 from ..exchange.calibrations import Exported, export_calibrations
 from ..io import write_whole
 from .assessment import assess, sorted_remarks
@@ -37,10 +38,42 @@ from .assessment import assess, sorted_remarks
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["ONE_CAMERA", "Calibrated"]
+__all__ = ["ONE_CAMERA", "Calibrated", "ReportOptions"]
 
 ONE_CAMERA = "camera"
 """Name of a camera that is alone."""
+
+
+class ReportOptions(TypedDict, total=False):
+    """Options of a report; see :func:`reseau.report.bundle.bundle_report`.
+
+    Parameters
+    ----------
+    title : str
+        Heading of the page.
+    photograph : callable
+        Returns the photograph of an image by its name, or None; those with the largest residuals are shown.
+    provenance : Provenance
+        Inputs, options, version.
+    against : mapping of str to FieldDifference
+        Differences from other calibrations, by their names.
+    distances : sequence of float
+        Distances at which the uncertainty of the projection is mapped.
+    declined : mapping of str to str
+        Further photographs that were left out, and why.
+
+    Examples
+    --------
+    >>> ReportOptions(title="Camera 4711")
+    {'title': 'Camera 4711'}
+    """
+
+    title: str
+    photograph: Callable[[str], Frame | None]
+    provenance: Provenance
+    against: Mapping[str, FieldDifference]
+    distances: Sequence[float]
+    declined: Mapping[str, str]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -232,24 +265,15 @@ class Calibrated(Display):
             warnings.warn(line, stacklevel=2)
         return done
 
-    def report(
-        self,
-        path: Path | str,
-        *,
-        title: str = "Calibration",
-        photograph: Callable[[str], Frame | None] | None = None,
-    ) -> None:
+    def report(self, path: Path | str, **options: Unpack[ReportOptions]) -> None:
         """Write the report, an HTML page.
 
         Parameters
         ----------
         path : path
             File to write, ``.html``.
-        title : str
-            Its title.
-        photograph : callable, optional
-            Returns the photograph of an image by its name, or None; those with the largest residuals are
-            shown.
+        **options
+            See :class:`ReportOptions`.
 
         Raises
         ------
@@ -260,11 +284,16 @@ class Calibrated(Display):
         """
         if Path(path).suffix.lower() not in (".html", ".htm"):
             raise UsageError("is not .html", where=path)
-        page = above("reseau.report.bundle:bundle_report")(
-            self.result, title=title, assessments=self.assessments, photograph=photograph,
-            declined=self.declined,
+        write_whole(Path(path), self.report_page(**options))
+
+    def report_page(self, **options: Unpack[ReportOptions]) -> str:
+        """Return the page that :meth:`report` writes."""
+        declined = dict(options.pop("declined", {})) | self.declined
+        page: str = above("reseau.report.bundle:bundle_report")(
+            self.result, **({"title": "Calibration"} | options), assessments=self.assessments,
+            declined=declined,
         )  # fmt: skip
-        write_whole(Path(path), page)
+        return page
 
     def summary(self) -> str:
         """What it is good for, and the parameters with their standard deviations, in lines of text."""
@@ -386,11 +415,9 @@ class Calibrated(Display):
     def _facts(self) -> list[tuple[str, str]]:
         count = sum(len(points) for points in self.measured.values())
         several = len(self.cameras) > 1
+        verdicts = [f"{name}: " * several + each.short for name, each in self.assessments.items()]
         return [
-            *(
-                (f"{name}: {each.short}" if several else each.short, "")
-                for name, each in self.assessments.items()
-            ),
+            *((verdict, "") for verdict in verdicts),
             (f"{len(self.measured)} images", ""),
             (f"{count} image points", ""),
             (f"{len(self.declined)} declined", ""),
@@ -399,7 +426,8 @@ class Calibrated(Display):
         ]
 
     def _repr_html_(self) -> str:
-        return "".join(each._repr_html_() for each in self.assessments.values()) + super()._repr_html_()
+        verdicts = "".join(each._repr_html_() for each in self.assessments.values())
+        return verdicts + html_table(type(self).__name__, self._facts()[len(self.assessments) :])
 
     def _columns(self) -> dict[str, list[object]]:
         each = [camera._columns() for camera in self.cameras.values()]

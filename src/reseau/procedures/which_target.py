@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, islice
 from pathlib import Path
@@ -11,17 +11,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ..core.data import Frame
-from ..core.errors import ReseauError
+from ..core.data import Frame, ImagePoints
+from ..core.errors import ImageError, ReseauError
 from ..core.failure import Code, Failure
 from ..designs import board
 from ..designs.known import known_designs
 from ..exchange import read_target
-from ..io import BoardDesign, ReseauDesign, TestfieldDesign
+from ..io import BoardDesign, ReseauDesign, TestfieldDesign, is_points
 from ..measure import PuzzlePart, boards_shown, puzzle_part
 from .target_measurement import measurer_of
 
-__all__ = ["corrected", "described", "designs_beside", "which_target"]
+__all__ = ["Design", "corrected", "described", "designs_beside", "target_of", "which_target"]
 
 Design = ReseauDesign | TestfieldDesign | BoardDesign
 _DESIGNS = (".json", ".yaml", ".yml", ".xml")
@@ -253,6 +253,49 @@ class _Photographs:
             if showing >= len(self.small):
                 break
         return found
+
+
+def target_of(
+    photographs: Iterable[Path | Frame | ImagePoints], read: Callable[[Path | Frame], Frame]
+) -> tuple[str, Design] | Failure:
+    """Find the target that photographs show, among the designs beside their files and the usual ones.
+
+    Parameters
+    ----------
+    photographs : iterable of Path, Frame or ImagePoints
+        Those of a calibration; of image coordinates nothing is seen.
+    read : callable
+        Returns the frame of a file, or of a frame; see
+        :func:`~reseau.procedures.exposures.photograph_reader`.
+
+    Returns
+    -------
+    (str, design) or Failure
+        What was found, in words.
+
+    Examples
+    --------
+    >>> target_of([], lambda photograph: photograph).code
+    <Code.NOT_FOUND: 'not-found'>
+    """
+    every = list(photographs)
+    files = [path for path in every if isinstance(path, Path)]
+    folders = dict.fromkeys(folder for path in files for folder in (path.parent, path.parent.parent))
+
+    def frames() -> Iterator[Frame]:
+        for each in every:
+            if isinstance(each, Frame) or (isinstance(each, Path) and not is_points(each)):
+                try:
+                    yield read(each)
+                except ImageError:
+                    continue  # is reported with its name when all are measured
+
+    found = which_target(frames(), designs_beside([*folders, Path()]))
+    if isinstance(found, Failure):
+        return found
+    name, design = found
+    size = "" if Path(name).is_file() else "; photographs do not tell its size, on which only lengths depend"
+    return f"the target is {name}{size}", design
 
 
 def _is_part_of_another(frames: Iterable[Frame], design: Design) -> bool:

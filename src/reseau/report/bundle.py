@@ -395,7 +395,7 @@ def _fields(
             f"points at {plain(distance, 3)} {network.unit}",
             projection_field_at(result, c, distance, across=_PLACES),
         )
-        for distance in distances or ([usual] if usual > 0 else [])
+        for distance in distances or ([usual] if directions and usual > 0 else [])
     ]
     return [
         (what, Markup(uncertainty_figure(field, network.xy[rows])))

@@ -165,6 +165,7 @@ class CalibrationFunction(Document):
                 "parameters": parameters,
                 "covariance": Covariance(names=self.names, matrix=tuple(tuple(row) for row in cov.tolist())),
                 "sigma0": None, "redundancy": self.runs - len(row), "tests": (), "times": {},
+                "assessment": None,
                 "validity": {key: base.validity[key] for key in _OF_IMAGE if key in base.validity} | {
                     "covariates": {
                         each.name: {

@@ -301,7 +301,6 @@ def _of_files(run: Acquisition, given: SessionParameters) -> Plan:
 
 
 def _calibration_results(procedure: TestfieldProcedure, session: Session) -> dict[str, str]:
-    from ..report.bundle import bundle_report
     from ..report.scene import scene_of
 
     results = procedure.finish()
@@ -312,10 +311,9 @@ def _calibration_results(procedure: TestfieldProcedure, session: Session) -> dic
         step: each.verdict.why for step, each in frames.items()
         if each.verdict is not None and not each.verdict.ok
     }  # fmt: skip
-    report = bundle_report(
-        found.result, title=f"Calibration {session.name}", provenance=procedure.provenance,
-        assessments=found.assessments, photograph=lambda name: session.picture(frames[name]),
-        declined=declined | found.declined,
+    report = found.report_page(
+        title=f"Calibration {session.name}", provenance=procedure.provenance, declined=declined,
+        photograph=lambda name: session.picture(frames[name]),
     )  # fmt: skip
     return results | {"report.html": report, SCENE: scene_of(found.result).to_json()}
 

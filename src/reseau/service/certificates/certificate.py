@@ -103,6 +103,12 @@ class Certificate:
         return tuple(lines)
 
     @property
+    def verdict(self) -> tuple[str, ...]:
+        """What the calibration is good for, by its own assessment; empty without one."""
+        found = self.calibration.assessment
+        return () if found is None else (f"By its own assessment the calibration is {found.short}.",)
+
+    @property
     def conformity(self) -> str:
         """The decision in one line."""
         made = self.decision

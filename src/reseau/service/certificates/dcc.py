@@ -189,7 +189,7 @@ def _statements(parent: Any, made: Certificate, pages: str) -> None:
         one = _sub(parent, "statement", refType="reseau_pages")
         _sub(one, "reference", pages)
         _text(one, "declaration", "SHA-256 of the pages of this certificate as PDF.")
-    for remark in made.data.remarks:
+    for remark in (*made.verdict, *made.data.remarks):
         _text(_sub(parent, "statement", refType="reseau_remark"), "declaration", remark)
 
 
