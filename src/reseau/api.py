@@ -336,22 +336,13 @@ def calibrate(
     ...     seen = project(camera, Pose(turned.rotation, -turned.matrix.T @ [0.0, 0.0, 300.0]), xyz)
     ...     images.append(reseau.ImagePoints.with_sigma(design.ids, seen.xy, 0.01))
     >>> reseau.calibrate(images, design, free=("fx", "fy", "cx", "cy"), size=(640, 480))
-    <Calibrated: 4 images, 140 image points, 0 declined, sigma0 0.000, fx 800.00... px, ...>
+    <Calibrated: usable ..., 4 images, 140 image points, 0 declined, sigma0 0.000, fx 800.00... px, ...>
     """
-    given = (images,) if isinstance(images, str | Path) else _several(images, "images")
     if not isinstance(model, CameraOptions):
         pitch = None if pitch_mm is None else (pitch_mm, pitch_mm)
         model = CameraOptions(model or ("" if free else "auto"), tuple(free), pitch)
 
-    named = list[tuple[str, Path | Frame | ImagePoints]]()
-    for image in given:
-        if isinstance(image, str | Path):
-            named += [(path.name, path) for path in photographs_named([Path(image)])]
-            continue
-        photo = _photo(image, channel, colours)
-        name = photo.name if isinstance(photo, Frame) and not isinstance(image, np.ndarray) else ""
-        named.append((name or f"image {len(named) + 1}", photo))
-
+    named = _named(images, channel, colours)
     read = photograph_reader(channel, _correction(sensor))
     found: tuple[str, Design] | Failure = (
         ("", read_design(design)) if design != "auto" else target_of([photo for _, photo in named], read)
@@ -581,6 +572,22 @@ def _several(given: Iterable[PhotoLike], argument: str) -> tuple[PhotoLike, ...]
     if isinstance(given, str | Path | np.ndarray | Frame | ImagePoints) or not isinstance(given, Iterable):
         raise UsageError(f"is {_kind(given)}", where=argument, do="give a list of photographs")
     return tuple(given)
+
+
+def _named(
+    images: PathLike | Iterable[PhotoLike], channel: Channel, colours: Colours | None
+) -> list[tuple[str, Path | Frame | ImagePoints]]:
+    """Photographs of a calibration with their names; those of folders one by one."""
+    given = (images,) if isinstance(images, str | Path) else _several(images, "images")
+    named = list[tuple[str, Path | Frame | ImagePoints]]()
+    for image in given:
+        if isinstance(image, str | Path):
+            named += [(path.name, path) for path in photographs_named([Path(image)])]
+            continue
+        photo = _photo(image, channel, colours)
+        name = photo.name if isinstance(photo, Frame) and not isinstance(image, np.ndarray) else ""
+        named.append((name or f"image {len(named) + 1}", photo))
+    return named
 
 
 def _path(given: object, argument: str, expected: str) -> Path:
