@@ -278,6 +278,8 @@ class Calibrated(Display):
         How photographs were read.
     misnamed : Misnamed, optional
         Image points that were left out because they lie elsewhere than the others of their image say.
+    corrected : BoardDesign, optional
+        The board that the photographs show, where it is not the one that was told.
     """
 
     result: Result
@@ -287,6 +289,7 @@ class Calibrated(Display):
     board: BoardChoice | None = None
     notes: tuple[str, ...] = ()
     misnamed: Misnamed | None = None
+    corrected: BoardDesign | None = None
 
     def __bool__(self) -> bool:
         return True
@@ -372,6 +375,8 @@ class Calibrated(Display):
             more |= {"camera_models": self.choices[camera or _CAMERA].entries()}
         if self.board is not None:
             more |= {"target": self.board.entries()}
+        if self.corrected is not None:
+            more |= {"corrected_design": self.corrected.to_dict()}
         return found.model_copy(update={"validity": found.validity | more}) if more else found
 
     def write(self, path: Path | str) -> None:
@@ -523,7 +528,7 @@ def calibrate_camera(
             if isinstance(again, Failure) or again.sigma0 > _BETTER * done.sigma0:
                 break
             done = again
-    return done
+    return done if isinstance(done, Failure) else replace(done, corrected=seen.corrected)
 
 
 @dataclass(frozen=True, eq=False)
