@@ -286,7 +286,7 @@ def test_too_few_images_are_refused_with_their_reasons(reseau: Run, measured: tu
     status, _, err = reseau("calibrate", *measured[1:3], "-d", measured[0], "--size", "240x240")
     assert status == 1
     names = ", ".join(path.name for path in measured[1:3])
-    assert f"error: {measured[1].parent}: 2 images ({names}) show the target, 3 are needed" in err
+    assert f"{measured[1].parent}: 2 images ({names}) show the target, 3 are needed" in err
     assert err.count("\n") == 1
 
 

@@ -98,6 +98,13 @@ def test_photographs_that_show_a_target_are_named_where_there_are_too_few() -> N
     assert "; wall.png: " in found.reason
 
 
+def test_a_refusal_says_what_was_corrected() -> None:
+    told = CHESS.model_copy(update={"columns": 8, "rows": 7})
+    found = calibrate_camera(photographs(CHESS)[:1], told, measurer_of(told))
+    assert isinstance(found, Failure)
+    assert "; the photographs show a chessboard of 7 × 6 squares, not a chessboard of 8 × 7" in found.reason
+
+
 def test_a_size_in_another_unit_is_asked_about() -> None:
     told = CHESS.model_copy(update={"pitch": 0.024})
     (note,) = measured(CHESS, told).notes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from enum import StrEnum
@@ -256,7 +255,7 @@ def calibrate(
         found = calibrate_camera(
             _shown(frames, step), target, measure, _size(size), lens, options, taken or None, executor, kept
         )
-        done = required(found, _common_folder(files))
+        done = required(found, _named(files))
     for note in done.notes:
         typer.echo(f"note: {note}", err=True)
     named = (None if automatic else design, control, refraction, turntable, sensor)
@@ -312,9 +311,11 @@ def _folder(out: Path | None, files: list[Path], as_json: bool) -> Path | None:
     return made_folder(out) if out.is_dir() or not out.suffix else None
 
 
-def _common_folder(files: list[Path]) -> Path:
-    """The folder of the photographs, or the only one of them."""
-    return files[0] if len(files) == 1 else Path(os.path.commonpath([path.absolute() for path in files]))
+def _named(files: list[Path]) -> str:
+    """What a message about all photographs names: the only one, their folder, or nothing nearer."""
+    folders = {path.parent for path in files}
+    one = files[0] if len(files) == 1 else folders.pop() if len(folders) == 1 else Path()
+    return str(one) if one.name else "photographs"
 
 
 def _found_target(

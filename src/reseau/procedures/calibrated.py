@@ -32,7 +32,7 @@ from ..core.failure import Remark
 from ..core.lazy import above
 from ..core.provenance import Provenance
 from ..exchange.calibrations import Exported, export_calibrations
-from ..io import write_whole
+from ..io import BoardDesign, write_whole
 from .assessment import assess, sorted_remarks
 
 if TYPE_CHECKING:
@@ -96,6 +96,8 @@ class Calibrated(Display):
         How photographs were read.
     misnamed : Misnamed, optional
         Image points that were left out because they lie elsewhere than the others of their image say.
+    corrected : BoardDesign, optional
+        The board that the photographs show, where it is not the one that was told.
     """
 
     result: Result
@@ -105,6 +107,7 @@ class Calibrated(Display):
     board: BoardChoice | None = None
     notes: tuple[str, ...] = ()
     misnamed: Misnamed | None = None
+    corrected: BoardDesign | None = None
 
     def __bool__(self) -> Literal[True]:
         return True
@@ -347,6 +350,8 @@ class Calibrated(Display):
             more |= {"camera_models": self.choices[camera or ONE_CAMERA].entries()}
         if self.board is not None:
             more |= {"target": self.board.entries()}
+        if self.corrected is not None:
+            more |= {"corrected_design": self.corrected.to_dict()}
         return found.model_copy(update={"validity": found.validity | more, "assessment": assessed})
 
     def write(self, path: Path | str) -> None:

@@ -144,7 +144,7 @@ def calibrate_camera(
             if isinstance(again, Failure) or again.sigma0 > _BETTER * done.sigma0:
                 break
             done = again
-    return done
+    return done if isinstance(done, Failure) else replace(done, corrected=seen.corrected)
 
 
 @dataclass(frozen=True, eq=False)

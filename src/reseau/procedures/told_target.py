@@ -41,7 +41,7 @@ class TargetMeasured:
     notes : tuple of str
         What the user should know of the design.
     shown : str
-        What the photographs show instead of the target, in words; empty where it is measured.
+        What the photographs show in place of the target, in words; empty where they show it.
     """
 
     photographs: tuple[MeasuredPhotograph, ...]
@@ -88,13 +88,13 @@ def measured_as_shown(
     if isinstance(other, Failure):
         return TargetMeasured(tuple(done), None, notes, other.reason)
     again = measurer_with(measure, other)
-    if again is None:
+    if again is None:  # the caller's own
         return TargetMeasured(tuple(done), None, notes, f"the photographs show {described(other)}")
     # What is kept is kept for the design that was told.
     done = list(measured_in_order(seen, again, executor))
-    said = f"the photographs show {described(other)}, not {described(design)} as was told: "
-    said += f"{_difference(other, design)}; calibrated with what they show, correct the design"
-    return TargetMeasured(tuple(done), other, (*notes, said))
+    shown = f"the photographs show {described(other)}, not {described(design)} as was told"
+    said = f"{shown}: {_difference(other, design)}; calibrated with what they show, correct the design"
+    return TargetMeasured(tuple(done), other, (*notes, said), shown)
 
 
 def _difference(other: BoardDesign, told: BoardDesign) -> str:

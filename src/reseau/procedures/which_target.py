@@ -160,13 +160,8 @@ def _as_told(shown: BoardDesign, told: BoardDesign) -> list[BoardDesign]:
     layout: dict[str, object] = {"columns": counts[0], "rows": counts[1], "dots": ()}
     for name in ("dictionary", "border_bits", "legacy", "asymmetric", "polarity", "first_id"):
         layout[name] = getattr(shown, name)
-    if shown.dictionary is not None and told.dictionary is not None:
-        (series, _, least), (of_told, _, count) = (
-            d.rpartition("_") for d in (shown.dictionary, told.dictionary)
-        )
-        if series == of_told and (count == least or int(count) >= int(least)):
-            # A larger dictionary of one series has the same markers.
-            layout["dictionary"] = told.dictionary
+    if _contains(told.dictionary, shown.dictionary):
+        layout["dictionary"] = told.dictionary
     same = told.model_copy(update=layout)
     if shown.size is None or told.size is None:
         return [same]
@@ -174,6 +169,15 @@ def _as_told(shown: BoardDesign, told: BoardDesign) -> list[BoardDesign]:
     # A tag is measured with a ruler, the gap beside it is not.
     other = {"pitch": told.size / share} if told.kind == "aprilgrid" else {"size": told.pitch * share}
     return [same, same.model_copy(update={key: float(f"{value:.3g}") for key, value in other.items()})]
+
+
+def _contains(larger: str | None, smaller: str | None) -> bool:
+    """Whether a dictionary of markers is another one, or a larger one of its series with the same markers."""
+    if larger is None or smaller is None:
+        return False
+    (one, _, count), (other, _, least) = (name.lower().rpartition("_") for name in (larger, smaller))
+    sizes = count.isdecimal() and least.isdecimal()
+    return one == other and (int(count) >= int(least) if sizes else count == least)
 
 
 def described(design: BoardDesign) -> str:
