@@ -1,66 +1,70 @@
-"""Draws pictures of the README and the tours, for light and, with `-dark` in their names, for dark pages.
+"""Draws pictures of the README, the tours and the how-to pages, for light and, with `-dark`, for dark pages.
 
     python docs/figures.py calibration
-    python docs/figures.py tour-camera|blurred|underwater FOLDER
+    python docs/figures.py tour-camera|blurred|underwater|fiducial-marks FOLDER
 
-The first is simulated. The others show results of tours: the folder is the one in which the commands of
-`docs/tours/camera.md`, `blurred.md` or `blurred-under-water.md` were followed.
+The first is drawn by `docs/desk.py`. The others show results of pages: the folder is the one in which the
+commands of `docs/tours/camera.md`, `blurred.md`, `blurred-under-water.md` or of
+`docs/howto/fiducial-marks.md` were followed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
+from desk import Desk
 from matplotlib.figure import Figure
 from themes import save
 
 import reseau
+from reseau.core.data import Frame
 from reseau.core.failure import Failure
-from reseau.core.figures import ACCENT, FAINT, drawing
+from reseau.core.figures import ACCENT, FAINT, drawing, image_axes
+from reseau.designs import board
 from reseau.exchange import read_lens, read_network
 from reseau.io import ReseauDesign
 from reseau.io.reading import read_design
 from reseau.measure import ReseauOptions, measure_reseau
 from reseau.measure.blurred import BlurredOptions
-from reseau.optics import Brown, PixelGrid, Sensor
 from reseau.procedures.blurred import lens_camera, measure_blurred_frame
 from reseau.report.blurred import blurred_figure
-from reseau_sims import FieldBench, paper_stations
 
 IMAGES = Path(__file__).with_name("images")
-WIDTH, HEIGHT, PITCH_MM = 800, 600, 0.006
-
-
-def bench() -> FieldBench:
-    """The coded testfield in front of a camera of 800 × 600 pixels with barrel distortion."""
-    camera = Brown(side="object", grid=PixelGrid(WIDTH, HEIGHT, (PITCH_MM, PITCH_MM)))
-    values = {"c": 4.6, "x0": 0.02, "y0": -0.015, "K1": -8e-4, "P1": 2e-5}
-    return FieldBench(
-        seed=7,
-        camera=camera.with_values(values),
-        sensor=Sensor(WIDTH, HEIGHT, read_noise=1.2),
-        bend_mm=0.0,
-        distance_mm=1300.0,
-        gradient=(0.15, -0.1),
-    )
 
 
 def calibration() -> Figure:
-    """Photographs of a testfield are simulated and calibrated."""
-    world = bench()
-    stations = paper_stations()[::3]
-    frames = [world.record(station) for station in stations]
-    calibrated = reseau.calibrate(frames, world.design, pitch_mm=PITCH_MM).required()
-    shown = max(range(len(frames)), key=lambda k: len(calibrated.measured.get(frames[k].name, ())))
-    panels = calibrated.plot(frames[shown])
-    panels[0].set_title(f"measured: {len(calibrated.measured[frames[shown].name])} targets", loc="left")
-    figure = panels[0].figure
-    assert isinstance(figure, Figure)
+    """A board on a desk is photographed from twelve sides, and the camera calibrated."""
+    desk = Desk(board("charuco", 10, 7, 25.0))
+    colours = {f"{k:02}.png": desk.photograph(*view, k) for k, view in enumerate(_views())}
+    frames = [Frame(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), 255.0, name) for name, rgb in colours.items()]
+    calibrated = reseau.calibrate(frames, desk.design).required()
+    figure = Figure(figsize=(13.2, 3.9), layout="constrained")
+    photo, residuals, total = figure.subplots(1, 3, width_ratios=(1, 1, 1.12))
+    shown = "00.png"
+    photo.imshow(colours[shown])
+    image_axes(
+        photo, *desk.size, f"one of {len(frames)} photographs: {len(calibrated.measured[shown])} corners"
+    )
+    photo.plot(*calibrated.measured[shown].xy.T, "o", mfc="none", mec="#ffd24a", ms=7, mew=1.4)
+    calibrated.result.plot(residuals)
+    (assessed,) = calibrated.assessments.values()
+    assessed.total.plot(total)
+    total.set_title("total error of the projection / px", loc="left")
     return figure
+
+
+def _views() -> Iterator[tuple[tuple[float, float], float, float, float, float]]:
+    """Place beside the board and distance (mm), tilt, its direction, roll (degrees); the first is shown."""
+    yield (0.0, 0.0), 380.0, 36.0, -75.0, 10.0
+    for k in range(1, 12):
+        aside = ((-110.0, -70.0), (110.0, 70.0), (110.0, -70.0), (-110.0, 70.0))[k % 4]
+        yield aside, 330.0 + 25 * (k % 4), (35.0, 42.0, 15.0)[k % 3], 33.0 * k, 90.0 * k + 20.0
 
 
 def tour_camera(folder: Path) -> Figure:
@@ -114,6 +118,21 @@ def underwater(folder: Path) -> Figure:
     return figure
 
 
+def fiducial_marks(folder: Path) -> Figure:
+    """The overlay of the scan, and two of its marks."""
+    seen, half = cv2.cvtColor(cv2.imread(str(folder / "marks.png")), cv2.COLOR_BGR2RGB), 110
+    marks = json.loads((folder / "photo.json").read_text("utf-8"))["marks"]
+    places = {mark["id"]: (round(mark["at"]["x"]), round(mark["at"]["y"])) for mark in marks}
+    figure = Figure(figsize=(9.0, 3.2), layout="constrained")
+    whole, *parts = figure.subplots(1, 3)
+    whole.imshow(cv2.resize(seen, None, fx=0.3, fy=0.3, interpolation=cv2.INTER_AREA))
+    for axes, (x, y) in zip(parts, (places["1"], places["7"]), strict=True):
+        axes.imshow(seen[max(0, y - half) : y + half, max(0, x - half) : x + half])
+    for axes in (whole, *parts):
+        axes.set_axis_off()
+    return figure
+
+
 def main() -> None:
     """Draw the picture that is named."""
     parser = argparse.ArgumentParser(description="Pictures of the README and the tours.")
@@ -128,7 +147,12 @@ def main() -> None:
     print(IMAGES / f"{given.name}.png")
 
 
-TOURS = {"tour-camera": tour_camera, "blurred": blurred, "underwater": underwater}
+TOURS = {
+    "tour-camera": tour_camera,
+    "blurred": blurred,
+    "underwater": underwater,
+    "fiducial-marks": fiducial_marks,
+}
 
 if __name__ == "__main__":
     main()
