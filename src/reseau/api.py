@@ -323,8 +323,7 @@ def calibrate(
     photos = _several(images, "images")
     target = read_design(design)
     if not isinstance(model, CameraOptions):
-        pitch = None if pitch_mm is None else (pitch_mm, pitch_mm)
-        model = CameraOptions(model or ("" if free else "auto"), tuple(free), pitch)
+        model = CameraOptions(model or ("" if free else "auto"), tuple(free), pitch_mm)
 
     named = list[tuple[str, Path | Frame | ImagePoints]]()
     for number, image in enumerate(photos, start=1):

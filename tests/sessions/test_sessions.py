@@ -21,7 +21,13 @@ from ..capture.fieldrig import DESIGN, FieldRig
 
 STEPS = [[f"tilt {tilt} roll {roll}", {"tilt": tilt, "roll": roll, "camera_roll": roll}]
          for tilt, roll in ((0.0, 0.0), (30.0, 90.0), (30.0, 180.0), (30.0, 270.0))]  # fmt: skip
-TESTFIELD = {"steps": STEPS, "pitch": 0.027, "free": ["c", "x0", "y0"], "row_jitter": 0.0086, "fill": 0.8}
+TESTFIELD = {
+    "steps": STEPS,
+    "pitch_mm": 0.027,
+    "free": ["c", "x0", "y0"],
+    "row_jitter_px": 0.0086,
+    "fill": 0.8,
+}
 
 
 @pytest.fixture

@@ -4,25 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import InputError, ReseauError, UsageError
-from .common import (
-    AsJson,
-    ClusterAddress,
-    Jobs,
-    Store,
-    overlay_files,
-    progress,
-    required,
-    say,
-    say_files_left_out,
-)
+from ..core.options import Option
+from .common import Computing, overlay_files, progress, required, say, say_files_left_out
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,22 +26,13 @@ if TYPE_CHECKING:
 __all__ = ["orient"]
 
 
-class Transform(StrEnum):
-    """Transformations to calibrated corners."""
-
-    similarity = "similarity"
-    affine = "affine"
-    projective = "projective"
-    bilinear = "bilinear"
-
-
 @dataclass(frozen=True)
 class _Job:
     """One image and its options, for another process."""
 
     image: Path
     name: str
-    frame: str | None
+    format_mm: tuple[float, float] | None
     dpi: float | None
     near: tuple[float, ...] | None
     corners: Path | None
@@ -76,42 +58,27 @@ def orient(
     images: Annotated[
         list[Path], typer.Argument(help="Scans of film frames, or folders of them: TIFF, PNG, JPEG, BMP.")
     ],
-    frame: Annotated[
-        str | None, typer.Option(help="Format in mm, as 36x24 or 56x56. Default: try the usual formats.")
-    ] = None,
-    corners: Annotated[
-        Path | None, typer.Option("--corners", "-c", help="Calibrated corners (frame-corners/1).")
-    ] = None,
-    transform: Annotated[
-        Transform, typer.Option(help="Transformation to the calibrated corners.")
-    ] = Transform.affine,
-    dpi: Annotated[
-        float | None,
-        typer.Option(min=10, help="Resolution of the scan (dots per inch), if that in the file is wrong."),
-    ] = None,
+    computing: Computing,
+    format_mm: v.FormatMm | None = None,
+    corners: v.Corners | None = None,
+    transform: v.Transform = "affine",
+    dpi: v.Dpi | None = None,
     near: Annotated[
-        str | None, typer.Option(help="Approximate position of the frame: left,top,right,bottom (px).")
+        tuple[float, float, float, float] | None,
+        Option("Approximate position of the frame (px).", value="LEFT,TOP,RIGHT,BOTTOM"),
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write to.")] = None,
-    marked: Annotated[bool, typer.Option(help="Write copies of the scans with marked corners.")] = True,
+    out: v.Out | None = None,
+    marked: Annotated[
+        bool, typer.Option(help="Write copies of the scans with marked corners.", rich_help_panel="Files")
+    ] = True,
     roll: Annotated[bool, typer.Option(help="Use the common shape of the frames of a roll.")] = True,
-    overlay: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for a PNG of each scan: edges and corners, and what was not found. "
-            "FILE.png for a single scan."
-        ),
-    ] = None,
-    jobs: Jobs = None,
-    cluster: ClusterAddress = "",
-    store: Store = "",
-    as_json: AsJson = False,
+    overlay: Annotated[v.Overlay | None, "Here a folder, for each scan; FILE.png for a single one."] = None,
+    as_json: v.AsJson = False,
 ) -> int:
     """Orient scanned film frames by their four edges.
 
     The JSON document of a frame is the calibration of its scan for `reseau apply`.
     """
-    from ..execution import executor_at
     from ..io import FrameCorners, RollSummary, write_whole
     from ..procedures.exposures import photographs_named
     from ..report.frames import roll_page
@@ -120,8 +87,10 @@ def orient(
     images = photographs_named(images)
     if corners is not None:
         FrameCorners.read(corners)  # an invalid file is reported before the computation
-    box = _numbers(near)
-    _format(frame)
+    if near is not None and not (near[0] < near[2] and near[1] < near[3]):
+        raise UsageError(f"is empty: {near}", where="--near", do="write left,top,right,bottom in pixels")
+    if format_mm is not None and not 1 < min(format_mm) <= max(format_mm) < 400:
+        raise UsageError(f"is {format_mm}, not between 1 and 400 mm", where="--format-mm")
     if out is not None:
         _prepare(out)
     drawn = {} if overlay is None else overlay_files(overlay, images)
@@ -129,11 +98,11 @@ def orient(
         _Job(
             path,
             name,
-            frame,
+            format_mm,
             dpi,
-            box,
+            near,
             corners,
-            transform.value,
+            transform,
             out,
             marked and out is not None,
             drawn.get(path),
@@ -141,10 +110,10 @@ def orient(
         for path, name in zip(images, _names(images), strict=True)
     ]
     modules = ["reseau.cli.orient", "reseau.procedures.film_frame"]
-    with executor_at(jobs, cluster, store, modules, len(work)) as executor:
+    with computing.executor(modules, len(work)) as executor:
         if not executor.local and overlay is not None:
             raise UsageError("is drawn by this machine only", where="--overlay", do="leave out --cluster")
-        done = dict(zip((job.name for job in work), _all(work, executor, store), strict=True))
+        done = dict(zip((job.name for job in work), _all(work, executor, computing.store), strict=True))
     found = _common(done) if roll else None
     if found is not None:
         _again(work, done, found)
@@ -170,33 +139,6 @@ def _names(images: list[Path]) -> list[str]:
     ]
 
 
-def _numbers(text: str | None) -> tuple[float, ...] | None:
-    if text is None:
-        return None
-    do = "write left,top,right,bottom in pixels"
-    try:
-        left, top, right, bottom = (float(part) for part in text.split(","))
-    except ValueError:
-        raise UsageError(f"cannot interpret {text!r}", where="--near", do=do) from None
-    if not (left < right and top < bottom):
-        raise UsageError(f"the area of {text!r} is empty", where="--near", do=do)
-    return left, top, right, bottom
-
-
-def _format(text: str | None) -> tuple[float, float] | None:
-    if text is None:
-        return None
-    try:
-        width, height = (float(part) for part in text.lower().replace("×", "x").split("x"))
-        if not 1 < min(width, height) <= max(width, height) < 400:
-            raise ValueError
-    except ValueError:
-        raise UsageError(
-            f"cannot interpret {text!r}", where="--frame", do="write width x height in mm, as 36x24"
-        ) from None
-    return width, height
-
-
 def _prepare(out: Path) -> None:
     try:
         (out / "provenance").mkdir(parents=True, exist_ok=True)
@@ -209,7 +151,7 @@ def _options(job: _Job) -> FrameOptions:
 
     from ..procedures.film_frame import FrameOptions
 
-    size = _format(job.frame)
+    size = job.format_mm
     near = None
     if job.near is not None:
         x0, y0, x1, y1 = job.near
@@ -272,7 +214,7 @@ def _provenance(job: _Job) -> dict[str, Any]:
     inputs = {"image": sha256_of(job.image)}
     if job.corners is not None:
         inputs["corners"] = sha256_of(job.corners)
-    options = {"frame": job.frame, "dpi": job.dpi, "near": job.near, "transform": job.transform}
+    options = {"format_mm": job.format_mm, "dpi": job.dpi, "near": job.near, "transform": job.transform}
     return Provenance(inputs, options | {"marked": job.marked}).to_dict()
 
 

@@ -25,7 +25,6 @@ from ..bundle import (
     ControlPoints,
     Explanation,
     ImageEstimates,
-    Kind,
     Misnamed,
     ModelChoice,
     Network,
@@ -45,6 +44,7 @@ from ..bundle import (
 )
 from ..bundle.network import stage_of_turntable
 from ..calibration import Calibration, CameraMapping
+from ..core import vocabulary as v
 from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display
 from ..core.errors import UsageError
@@ -123,8 +123,9 @@ class CameraOptions:
         otherwise ``opencv``.
     free : tuple of str
         Parameters to estimate; by default the usual ones of the model.
-    pitch_mm : (float, float), optional
-        Pixel size; required for models whose parameters are in millimetres.
+    pitch_mm : float or (float, float), optional
+        Size of a pixel, one number where it is a square; required for models whose parameters are in
+        millimetres.
     options : mapping of str to str or float
         Options of the model, such as the side of Brown's distortion.
     shutter : Shutter, optional
@@ -138,17 +139,19 @@ class CameraOptions:
 
     Examples
     --------
-    >>> CameraOptions().model, CameraOptions(pitch_mm=(0.005, 0.005)).chosen
+    >>> CameraOptions().model, CameraOptions(pitch_mm=0.005).chosen
     ('opencv', ('c', 'x0', 'y0', 'K1', 'K2', 'P1', 'P2'))
     """
 
     model: str = ""
     free: tuple[str, ...] = ()
-    pitch_mm: tuple[float, float] | None = None
+    pitch_mm: tuple[float, float] | float | None = None
     options: Mapping[str, str | float] = field(default_factory=dict)
     shutter: Shutter | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.pitch_mm, int | float):
+            object.__setattr__(self, "pitch_mm", (float(self.pitch_mm), float(self.pitch_mm)))
         if not self.model:
             object.__setattr__(self, "model", default_camera_model(self.pitch_mm is not None).name)
         model = self.registered
@@ -196,11 +199,11 @@ class CalibrationOptions:
         larger, because the target or the lens deviates from its model.
     control : ControlPoints, optional
         Control points for the datum; by default inner constraints over all points.
-    without : tuple of (str, str)
+    leave_out : tuple of (str, str)
         Image points to leave out, by image and point.
     components : {"axes", "images", "cameras"}, optional
         Groups with separate factors on their standard deviations; see :func:`reseau.bundle.search_model`.
-    level : float, optional
+    eliminate : float, optional
         Significance level of the tests by which distortion parameters are dropped.
     heights : Heights, optional
         Heights of the target on a z-stage.
@@ -226,11 +229,11 @@ class CalibrationOptions:
     """
 
     adjustment: Options = field(default_factory=Options)
-    sigma_px: float | None = None
+    sigma_px: v.SigmaPx | None = None
     control: ControlPoints | None = None
-    without: tuple[tuple[str, str], ...] = ()
-    components: Kind | None = None
-    level: float | None = None
+    leave_out: tuple[tuple[str, str], ...] = ()
+    components: v.Components | None = None
+    eliminate: v.Eliminate | None = None
     heights: Heights | None = None
     refraction: RefractionEntry | None = None
     focal_35_mm: float | None = None
@@ -490,7 +493,7 @@ def calibrate_camera(
     options = options or CalibrationOptions()
     photographs = list(measured_in_order(_checked(frames, taken), measure, executor, outputs))
     measured, declined, sizes = _measured(photographs, size, taken)
-    measured = _without(measured, options.without)
+    measured = _without(measured, options.leave_out)
     notes = tuple(note for each in photographs for note in each.notes)
     job = _Job(declined, sizes, notes, design, model, options, taken)
     done = job.calibrated(measured)
@@ -611,7 +614,7 @@ class _Job:
             if isinstance(bent, Failure):
                 return bent
             board, network = bent, bent.network
-        found = search_model(network, options.adjustment, options.components, options.level)
+        found = search_model(network, options.adjustment, options.components, options.eliminate)
         if isinstance(found, Failure):
             if found.code is Code.NOT_CONVERGED:
                 return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
@@ -894,7 +897,7 @@ def first_camera(
         if focal_px is not None and not focal_px / _FOCAL_OFF < f < _FOCAL_OFF * focal_px:
             f = focal_px
     f /= magnification
-    pitch = model.pitch_mm or (1.0, 1.0)
+    pitch = model.pitch_mm if isinstance(model.pitch_mm, tuple) else (1.0, 1.0)
     values = model.registered.start_values(f, PixelGrid(*size, pitch))
     return Camera(
         _CAMERA, *size, pitch, model.registered.name, values, model.chosen, model.options,

@@ -107,7 +107,7 @@ def which_target(
         pattern = _pattern(candidates[name])
         points |= {name: 0 for name, design in candidates.items() if _pattern(design) == pattern}
     return Failure(
-        "none of the known targets is seen; describe yours with `reseau design board --json board.json`, and "
+        "none of the known targets is seen; describe yours with `reseau design board --out board.json`, and "
         "give that file",
         Code.NOT_FOUND,
     )
