@@ -184,7 +184,7 @@ def test_toml_keys_are_option_names_and_values_may_be_lists_and_tables(
         0.0086,
         {"tilt": 7.0, "roll": 0.5},
     )
-    Path("photos.toml").write_text('reseau = "none.json"\nobject = "none.json"\nbody = false\n')
+    Path("photos.toml").write_text('reseau = "none.json"\ntest-object = "none.json"\nbody = false\n')
     assert capture("oscilloscope", "--options", "photos.toml") == 2
     assert "none.json: cannot be read" in capsys.readouterr().err
 
