@@ -204,9 +204,9 @@ def command(paths: list[Path], camcal: ModuleType, folder: Path) -> None:
         control.write_text("id,x,y,z\n" + "\n".join(rows) + "\n")
         words = [
             sys.executable, "-c", "from reseau.cli import main; main()", "calibrate", *paths,
-            "--design", design, "--control", control, "--pitch", "0.0031911032863849768", "--side", "image",
-            "--free", "c,x0,y0,K1,K2,K3,P1,P2",
-            "--sigma", "0.1", "--channel", "green", "-o", out, "--report", Path(name) / "report.html",
+            "--design", design, "--control", control, "--pitch-mm", "0.0031911032863849768",
+            "--side", "image", "--free", "c,x0,y0,K1,K2,K3,P1,P2",
+            "--sigma-px", "0.1", "--channel", "green", "-o", out, "--report", Path(name) / "report.html",
         ]  # fmt: skip
         for mark in EXTRA:
             assert mark[1] not in theirs[mark[0]]

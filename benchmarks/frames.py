@@ -225,7 +225,7 @@ def _commanded(*arguments: object) -> tuple[str, float, float, float]:
     """Output of `reseau orient`, wall and processor time in s, peak memory in MB."""
     start = time.perf_counter()
     command = [str(Path(sys.executable).with_name("reseau")), "orient", *map(str, arguments)]
-    command += ["--frame", "36x24"]
+    command += ["--format-mm", "36x24"]
     with tempfile.TemporaryFile() as said:
         child = subprocess.Popen(command, stdout=said)
         _, _, used = os.wait4(child.pid, 0)

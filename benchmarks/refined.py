@@ -107,7 +107,7 @@ def refined(folder: Path, name: str, keep: Path) -> Refined:
         ("--photo-ii", "photo2.png"),
         ("--photo-iii", "photo3.png"),
         ("--reseau", "reseau.design.json"),
-        ("--object", "object.design.json"),
+        ("--test-object", "object.design.json"),
     ):
         command += [option, str(folder / f"{name}.{file}")]
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"COLUMNS": "200"})

@@ -57,7 +57,7 @@ def commands(data: Path, folder: Path) -> dict[str, tuple[str, list[str | Path]]
     if photographs.is_dir():
         camcal = of_the_tests("measure/camcal.py")
         camcal.design(photographs).write(folder / "design.json")
-        words = ["--pitch", "0.0031911032863849768", "--channel", "green", "--jobs", "1"]
+        words = ["--pitch-mm", "0.0031911032863849768", "--channel", "green", "--jobs", "1"]
         words += ["-o", folder / "camera.json"]
         found["calibrate"] = (
             RESEAU,
@@ -78,7 +78,8 @@ def commands(data: Path, folder: Path) -> dict[str, tuple[str, list[str | Path]]
         write_image(scan, FilmFrame(seed=number, dpi=300).scan())
     found["orient"] = (
         RESEAU,
-        ["orient", *scans, "--frame", "36x24", "--dpi", "300", "--jobs", "1", "--out", folder / "oriented"],
+        ["orient", *scans, "--format-mm", "36x24", "--dpi", "300", "--jobs", "1", "--out",
+         folder / "oriented"],
     )  # fmt: skip
     return found
 

@@ -171,7 +171,7 @@ class Year:
     def begin(self) -> None:
         """Calibrate for the first time, and define what is repeated, and when."""
         steps = [[f"{k}", dict(zip(AXES, pose, strict=True))] for k, pose in enumerate(POSES)]
-        given = {"steps": steps, "pitch": 0.027, "free": list(FREE), "row_jitter": 0.0086, "fill": 0.8,
+        given = {"steps": steps, "pitch_mm": 0.027, "free": list(FREE), "row_jitter_px": 0.0086, "fill": 0.8,
                  "home": True}  # fmt: skip
         inputs = {"design.json": self.simulated.laboratory.field.design.to_json()}
         session = sessions.begin(self.archive, "first", "testfield", given, inputs, bench=self._toml())

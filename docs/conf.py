@@ -30,7 +30,7 @@ extensions = [
     "myst_parser",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["api/_templates", "gallery"]
+exclude_patterns = ["reference/generated/names.md", "api/_templates", "gallery"]
 
 templates_path = ["api/_templates"]
 source_suffix = {".rst": "restructuredtext", ".md": "markdown"}

@@ -82,7 +82,7 @@ def blurred(folder: Path) -> Figure:
     plate, optics = read_design(folder / "plate.json"), read_lens(folder / "lens.zmx")
     assert isinstance(plate, ReseauDesign)
     frame = reseau.read_image(folder / "photo.png")
-    camera = lens_camera(optics, (frame.width, frame.height), pitch_um=6.0, distance=500.0)
+    camera = lens_camera(optics, (frame.width, frame.height), pitch_mm=0.006, distance=500.0)
     turned = ReseauOptions(mirrored=False, max_rotation_deg=40.0)
     sharp = partial(measure_reseau, design=plate, options=turned)
     options = BlurredOptions(polarity=plate.polarity)

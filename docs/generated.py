@@ -21,8 +21,11 @@ from reseau.core import errors
 from reseau.core.failure import Code
 from reseau.core.files import write_whole
 from reseau.core.plugins import CAMERAS, DISCOVERY, INSTRUMENTS, SESSIONS, SIMULATORS
+from reseau.core.vocabulary import names
 
-__all__ = ["command_pages", "documents_page", "errors_page", "plugins_page", "schemas", "write_pages"]
+__all__ = [
+    "command_pages", "documents_page", "errors_page", "names_table", "plugins_page", "schemas", "write_pages",
+]  # fmt: skip
 
 FOLDER = Path(__file__).with_name("reference") / "generated"
 
@@ -31,6 +34,7 @@ def write_pages(folder: Path = FOLDER) -> None:
     """Write all pages; a page that did not change keeps its time, so that it is not built again."""
     pages = {f"commands/{name}": text for name, text in command_pages().items()}
     pages |= {"errors": errors_page(), "documents": documents_page(), "plugins": plugins_page()}
+    pages["names"] = names_table()
     for stale in {*folder.rglob("*.md")} - {folder / f"{name}.md" for name in pages}:
         stale.unlink()
     for name, text in pages.items():
@@ -59,6 +63,32 @@ def command_pages() -> dict[str, str]:
     index = ["# Commands", "", "Generated from the program; `--help` of a command prints the same.", ""]
     index += ["| command | |", "|---|---|", *rows, "", "```{toctree}", ":hidden:", "", *pages, "```", ""]
     return pages | {"index": "\n".join(index)}
+
+
+def names_table() -> str:
+    """The vocabulary as a table: names in Python, files and commands, their values and meanings."""
+    root: Any = get_command(app)
+    used: dict[str, list[str]] = {}
+    for words, command in _walk(root, []):
+        for parameter in command.params:
+            used.setdefault(str(parameter.name).rstrip("_"), []).append(" ".join(words))
+    lines = ["| name | in commands | value | meaning | commands |", "|---|---|---|---|---|"]
+    for name, declared in sorted(names().items()):
+        option = declared.option
+        flag = f"`--{(option.called or name).replace('_', '-')}`"
+        value = option.value or ", ".join(declared.choices) or _KINDS.get(declared.type, "")
+        limits = [f"≥ {option.least:g}"] if option.least is not None else []
+        limits += [f"≤ {option.most:g}"] if option.most is not None else []
+        where = used.get(name, [])
+        lines.append(
+            f"| `{name}` | {flag}{f', `{option.letter}`' if option.letter else ''} "
+            f"| {_line(' '.join([value, *limits]))} | {_line(declared.help)} "
+            f"| {', '.join(where) if len(where) < 4 else len(where)} |"
+        )
+    return "\n".join([*lines, ""])
+
+
+_KINDS = {int: "integer", float: "number", str: "text", Path: "path", bool: "switch"}
 
 
 def _walk(command: Any, words: list[str]) -> Iterator[tuple[list[str], Any]]:

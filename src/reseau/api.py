@@ -339,8 +339,7 @@ def calibrate(
     <Calibrated: usable ..., 4 images, 140 image points, 0 declined, sigma0 0.000, fx 800.00... px, ...>
     """
     if not isinstance(model, CameraOptions):
-        pitch = None if pitch_mm is None else (pitch_mm, pitch_mm)
-        model = CameraOptions(model or ("" if free else "auto"), tuple(free), pitch)
+        model = CameraOptions(model or ("" if free else "auto"), tuple(free), pitch_mm)
 
     named = _named(images, channel, colours)
     read = photograph_reader(channel, _correction(sensor))

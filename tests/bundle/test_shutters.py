@@ -404,7 +404,7 @@ def test_commands_take_shutters(tmp_path: Path, capsys: pytest.CaptureFixture[st
             lines.append(f"{truth.names[j]},{float(x)!r},{float(y)!r},0.005,0.005")
         (tmp_path / f"{i:02d}.csv").write_text("\n".join(lines) + "\n")
     command = ["calibrate", *map(str, sorted(tmp_path.glob("*.csv"))), "-d", str(tmp_path / "field.json")]
-    more = ["--size", "240x240", "--free", "fx,fy,cx,cy", "--target", "flat"]
+    more = ["--image-size", "240x240", "--free", "fx,fy,cx,cy", "--target", "flat"]
     assert run([*command, *more, "--rolling-shutter", "1e-4", "-o", str(tmp_path / "K.json")]) == 0
     assert "motion of 9 images" in capsys.readouterr().out
     found = json.loads((tmp_path / "K.json").read_text())

@@ -423,10 +423,10 @@ def test_commands_accept_the_model_and_write_report_and_calibration(
 
     calibrated(case, tmp_path)
     options = [f"--model-option={name}={value}" for name, value in case.options.items()]
-    pitch = ("--pitch", 0.027) if case.model.needs_pitch else ()
+    pitch = ("--pitch-mm", 0.027) if case.model.needs_pitch else ()
     command = (
-        "calibrate", *sorted(tmp_path.glob("*.csv")), "-d", tmp_path / "field.json", "--size", "240x240",
-        "--model", case.model.name, *options, *pitch,
+        "calibrate", *sorted(tmp_path.glob("*.csv")), "-d", tmp_path / "field.json",
+        "--image-size", "240x240", "--model", case.model.name, *options, *pitch,
     )  # fmt: skip
     # With parallel rays and without distortion the principal point is not determined.
     roles = ("scale",) if case.model.parallel else ("scale", "centre")
@@ -487,14 +487,17 @@ def calibrated(case: Case, folder: Path) -> None:
 def test_an_unknown_model_or_option_is_named_in_one_line(reseau: Run, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("id,x,y\na,1,2\n")
     FieldBench(seed=3).design.write(tmp_path / "field.json")
-    command = ("calibrate", tmp_path / "a.csv", "-d", tmp_path / "field.json", "--size", "240x240")
+    command = ("calibrate", tmp_path / "a.csv", "-d", tmp_path / "field.json", "--image-size", "240x240")
     known = ", ".join(model.name for model in camera_models())
     for arguments, words in (
         (("--model", "pinhole"), f"camera model 'pinhole': is unknown; use one of {known}"),
         (("--side", "image"), "camera model opencv: has no option `side`"),
         (("--model", "brown"), "brown: requires the pixel size"),
-        (("--pitch", 0.01, "--model-option", "balance_radius_mm=-1"), "write a number that is not negative"),
-        (("--pitch", 0.01, "--model-option", "side"), "write name=value"),
+        (
+            ("--pitch-mm", 0.01, "--model-option", "balance_radius_mm=-1"),
+            "write a number that is not negative",
+        ),
+        (("--pitch-mm", 0.01, "--model-option", "side"), "write name=value"),
     ):
         status, out, err = reseau(*command, *arguments)
         assert (status, out) == (2, "")
@@ -514,8 +517,8 @@ def test_calibrate_says_which_model_it_chose_and_why(reseau: Run, tmp_path: Path
     """The lens has no distortion; the table, the document, and an option that cannot be given with it."""
     calibrated(Case(camera_model("opencv"), {}), tmp_path)
     command = (
-        "calibrate", *sorted(tmp_path.glob("*.csv")), "-d", tmp_path / "field.json", "--size", "240x240",
-        "--model", "auto",
+        "calibrate", *sorted(tmp_path.glob("*.csv")), "-d", tmp_path / "field.json",
+        "--image-size", "240x240", "--model", "auto",
     )  # fmt: skip
     status, out, err = reseau(*command, "--target", "auto", "-o", tmp_path / "K.json")
     assert (status, err) == (0, "")

@@ -40,8 +40,8 @@ driver = "camera"
 address = "sim-camera"
 """
 POSES = "tilt,roll,camera_roll\n0,0,0\n30,90,90\n30,180,180\n30,270,270\n30,0,0\n"
-TESTFIELD = ("--design", "field.json", "--poses", "poses.csv", "--pitch", "0.027", "--free", "c,x0,y0,K1",
-             "--row-jitter", "0.0086", "--fill", "0.8")  # fmt: skip
+TESTFIELD = ("--design", "field.json", "--poses", "poses.csv", "--pitch-mm", "0.027", "--free", "c,x0,y0,K1",
+             "--row-jitter-px", "0.0086", "--fill", "0.8")  # fmt: skip
 
 
 class Axis:

@@ -123,7 +123,7 @@ def test_every_scanner_of_the_simulated_bench_sees_the_same_rods_in_millimetres(
 
 
 def test_an_unknown_simulated_table_or_family_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    for wrong in (["--table", "acme"], ["--family", "acme"]):
+    for wrong in (["--controller", "acme"], ["--family", "acme"]):
         assert run(["bench", "sim", "--seconds", "0.01", *wrong]) == 2
         assert "acme" in capsys.readouterr().err
 
@@ -147,7 +147,7 @@ def test_check_reports_every_failure_and_sets_the_exit_status(
         for script in simulated.scripts.values():
             for number in range(40):
                 script.fault_at(script.count + number, Fault("dropped"))
-        assert run(["bench", "check", "--bench", str(path), "--seconds", "0.5"]) == 1
+        assert run(["bench", "check", "--bench", str(path), "--timeout-s", "0.5"]) == 1
         message = capsys.readouterr().out
     assert message.count("failed") == len(simulated.machines)
     assert "did not answer" in message
@@ -202,12 +202,12 @@ def test_sim_puts_a_port_and_water_before_the_camera(monkeypatch: pytest.MonkeyP
     assert port["tilt_X"] == pytest.approx(np.tan(np.deg2rad(2.0)), abs=1e-6)
     with pytest.raises(FormatError, match="windows"):
         BenchFile.parse_toml(text.replace('shape = "plane"', 'shape = "cone"'), where="bench.toml")
-    assert run(["bench", "sim", "--water", "--camera", "screen"]) == 2
+    assert run(["bench", "sim", "--water", "--scene", "screen"]) == 2
 
 
 def test_sim_with_a_frame_writes_what_a_session_needs(tmp_path: Path) -> None:
     out = tmp_path / "bench.toml"
-    assert run(["bench", "sim", "--seconds", "0.01", "--camera", "frame", "--out", str(out)]) == 0
+    assert run(["bench", "sim", "--seconds", "0.01", "--scene", "frame", "--out", str(out)]) == 0
     lens = read_lens(tmp_path / "lens.toml")
     assert lens.sensor is not None
     assert lens.sensor.size_px == (640, 480)

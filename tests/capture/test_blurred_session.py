@@ -48,7 +48,7 @@ def captured(folder: Path) -> tuple[Session, Laboratory, Any]:
         parameters = {
             "steps": [[name, dict(at)] for name, at in PROJECT_POSES.items()],
             "home": True,
-            "psf": 0.7,
+            "psf_px": 0.7,
         }
         archive = Archive.open(folder, create=True)
         session = sessions.begin(archive, "wet", "blurred", parameters, inputs, bench=text)

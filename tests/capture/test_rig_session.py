@@ -120,7 +120,13 @@ def test_a_rig_is_refused_by_plans_of_one_camera() -> None:
 
 def given(**more: Any) -> TestfieldParameters:
     steps = tuple((step.name, dict(step.position)) for step in POSES)
-    known = {"pitch": 0.027, "free": ("c", "x0", "y0", "K1"), "row_jitter": 0.0086, "fill": 0.8, "checks": 0}
+    known = {
+        "pitch_mm": 0.027,
+        "free": ("c", "x0", "y0", "K1"),
+        "row_jitter_px": 0.0086,
+        "fill": 0.8,
+        "checks": 0,
+    }
     return TestfieldParameters(steps=steps, camera="rig", home=True, **(known | more))
 
 

@@ -28,8 +28,8 @@ STEPS = tuple(
     Step(f"tilt {tilt:g} roll {roll:g}", {"tilt": tilt, "roll": roll, "camera_roll": camera})
     for tilt, roll, camera in POSES
 )
-TESTFIELD = {"steps": [[each.name, dict(each.position)] for each in STEPS], "pitch": 0.027,
-             "free": list(FREE), "row_jitter": 0.0086, "fill": 0.8, "home": True}  # fmt: skip
+TESTFIELD = {"steps": [[each.name, dict(each.position)] for each in STEPS], "pitch_mm": 0.027,
+             "free": list(FREE), "row_jitter_px": 0.0086, "fill": 0.8, "home": True}  # fmt: skip
 CAMERA = '\n[instruments.camera]\ndriver = "v4l2"\naddress = "in process"\n'
 
 

@@ -289,7 +289,10 @@ def test_a_sensor_refuses_points_and_other_sizes(sensor: Path, tmp_path: Path, r
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--object",), "--object: needs a calibration of an oscilloscope, not of a camera"),
+        (
+            ("--object-coordinates",),
+            "--object-coordinates: needs a calibration of an oscilloscope, not of a camera",
+        ),
         (("--exposure-ms", 5), "--exposure-ms: needs a calibration of a sensor, not of a camera"),
         (("--fov", "wide"), "--fov: cannot interpret 'wide'; write keep, all or an angle in degrees"),
         (("--scale", 0), "--scale: 0 is not positive"),

@@ -81,7 +81,7 @@ def test_tables_are_those_of_opencv(reseau: Run, lens: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize("alpha", [0.0, 0.4, 1.0])
 def test_alpha_shows_as_much_as_opencv_does(reseau: Run, lens: Path, tmp_path: Path, alpha: float) -> None:
     """OpenCV takes nine places along each side and their rectangle, we take 33: within a pixel."""
-    assert reseau("apply", lens, "--tables", tmp_path / "maps.npz", "--alpha", alpha)[0] == 0
+    assert reseau("apply", lens, "--tables", tmp_path / "maps.npz", "--opencv-alpha", alpha)[0] == 0
     matrix, _ = cv2.getOptimalNewCameraMatrix(MATRIX, DISTORTION, SIZE, alpha)
     x, y = cv2.initUndistortRectifyMap(MATRIX, DISTORTION, np.eye(3), matrix, SIZE, cv2.CV_32FC1)
     maps = np.load(tmp_path / "maps.npz")
@@ -242,7 +242,7 @@ def test_the_whole_field_of_a_fisheye_is_declined_with_what_to_do(reseau: Run, t
     assert "more than a plane image can show of this lens; give an angle" in err
 
 
-@pytest.mark.parametrize("options", [(), ("--directions",), ("--alpha", "0.5")])
+@pytest.mark.parametrize("options", [(), ("--directions",), ("--opencv-alpha", "0.5")])
 def test_points_come_back_from_the_other_direction(
     reseau: Run, lens: Path, tmp_path: Path, options: tuple[str, ...]
 ) -> None:

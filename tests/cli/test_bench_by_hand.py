@@ -57,7 +57,7 @@ def test_axes_are_homed_and_moved_within_their_range(
     assert bench("home") == 0
     assert "tilt, roll: homed" in capsys.readouterr().out
     assert bench("move", "tilt=10", "roll=-2.5") == 0
-    assert bench("move", "tilt=5", "--by") == 0
+    assert bench("move", "tilt=5", "--relative") == 0
     assert rig.table.stands == {"tilt": 15.0, "roll": -2.5, "camera_roll": 0.0}
     capsys.readouterr()
     for wrong, said in (
@@ -90,7 +90,7 @@ def test_a_frame_is_exposed_by_hand_and_described(rig: FieldRig, capsys: pytest.
     assert out.startswith("240 × 240 px: 0 % saturated, brightest ")
     assert "sharpest edges " in out
     assert Path("one.png").stat().st_size > 1000
-    assert bench("watch", "--count", "2", "--every", "0.1", "--json") == 0
+    assert bench("watch", "--limit", "2", "--every", "0.1", "--json") == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["axes"]["tilt"] for line in lines] == [0.0, 0.0]
     assert lines[0]["camera"]["fault"] == ""
@@ -153,7 +153,7 @@ def test_axes_without_a_reference_are_noticed_before_the_session_begins(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig.table.lost = {"tilt"}
-    given = ["capture", "testfield", "-d", "field.json", "--poses", "poses.csv", "--pitch", "0.027",
+    given = ["capture", "testfield", "-d", "field.json", "--poses", "poses.csv", "--pitch-mm", "0.027",
              "--free", "c", "--checks", "0", "--name", "monday"]  # fmt: skip
     assert run(given) == 1
     assert "table: tilt has no reference; give --home" in capsys.readouterr().err

@@ -73,7 +73,8 @@ def measured(files: dict[str, Path], document: str) -> float:
 def test_targets_are_measured_and_the_image_is_oriented_by_them(files, tmp_path: Path, reseau: Run) -> None:
     status, out, _ = reseau(
         "measure", "blurred", files["photo.png"], "-d", files["design.json"], "-l", files["lens.toml"],
-        "--not-mirrored", "--max-rotation", 40, "-o", tmp_path / "m.json", "--overlay", tmp_path / "o.png",
+        "--not-mirrored", "--max-rotation-deg", 40, "-o", tmp_path / "m.json",
+        "--overlay", tmp_path / "o.png",
     )  # fmt: skip
     assert status == 0
     assert "of 24 targets measured" in out
@@ -87,7 +88,7 @@ def test_a_focus_that_was_stated_wrong_is_estimated(files, tmp_path: Path, resea
     block = network(tmp_path / "network.json", POSE.x0.tolist())
     status, out, err = reseau(
         "measure", "blurred", files["photo.png"], "-d", files["design.json"], "-l", files["lens.toml"],
-        "--network", block, "--focus", 460, "--focus-sigma", 0.5, "-o", tmp_path / "m.json",
+        "--network", block, "--focus", 460, "--focus-sigma-mm", 0.5, "-o", tmp_path / "m.json",
     )  # fmt: skip
     assert status == 0, err
     stated = focused(lens(), 460.0).surfaces[-1].vertex - lens().surfaces[-1].vertex
@@ -179,7 +180,7 @@ def test_light_that_cannot_reach_the_sensor_is_one_line_and_nothing_is_written(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--pitch", "10"], "has a sensor; its pitch is not needed"),
+        (["--pitch-mm", "0.01"], "has a sensor; its pitch is not needed"),
         (["--focus", "5"], "forms no real image of an object at 5 mm"),
     ],
 )

@@ -261,7 +261,9 @@ def test_a_calibration_on_the_command_line_replaces_the_camera_of_the_network(
         adjust_network(read_network(path)).required(), "cam", name="cam of an earlier block"
     )
     calibration.write(tmp_path / "cam.json")
-    status, _, err = reseau("bundle", path, "--camera", f"cam={tmp_path / 'cam.json'}", "-o", result)
+    status, _, err = reseau(
+        "bundle", path, "--camera-calibration", f"cam={tmp_path / 'cam.json'}", "-o", result
+    )
     assert (status, err) == (0, "")
     first, again = (ResultDocument.read(tmp_path / name) for name in ("first.json", "result.json"))
     assert again.redundancy == first.redundancy + 4
@@ -284,7 +286,9 @@ def test_a_film_frame_on_the_command_line_gives_pixel_size_and_principal_point(
         "px_per_mm": (100.0, 100.0), "edges": {}})  # fmt: skip
     frame.write(tmp_path / "frame.json")
     result = tmp_path / "result.json"
-    status, _, err = reseau("bundle", network(), "--camera", f"cam={tmp_path / 'frame.json'}", "-o", result)
+    status, _, err = reseau(
+        "bundle", network(), "--camera-calibration", f"cam={tmp_path / 'frame.json'}", "-o", result
+    )
     assert (status, err) == (0, "")
     camera = ResultDocument.read(result).cameras[0]
     assert camera.correlation.names == ("c", "x0", "y0", "K1")
@@ -297,7 +301,7 @@ def test_a_film_frame_on_the_command_line_gives_pixel_size_and_principal_point(
 def test_a_camera_without_id_or_file_is_refused(
     given: str, reseau: Run, network: Callable[..., Path]
 ) -> None:
-    status, out, err = reseau("bundle", network(), "--camera", given)
+    status, out, err = reseau("bundle", network(), "--camera-calibration", given)
     assert (status, out) == (2, "")
     assert "ID=calibration.json" in err
 
@@ -331,7 +335,7 @@ def test_fiducial_marks_on_the_command_line_give_pixel_size_and_principal_point(
     found.write(tmp_path / "photo.json")
     result = tmp_path / "result.json"
     photo = f"cam={tmp_path / 'photo.json'}"
-    status, _, err = reseau("bundle", network(), "--camera", photo, "-o", result)
+    status, _, err = reseau("bundle", network(), "--camera-calibration", photo, "-o", result)
     assert (status, err) == (0, "")
     camera = ResultDocument.read(result).cameras[0]
     for name, true in (("c", 8.0), ("x0", 0.02), ("y0", 0.0)):

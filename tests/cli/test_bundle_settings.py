@@ -40,7 +40,7 @@ def test_parameters_are_freed_and_fixed(reseau: Run, network: Path) -> None:
         (("--free", "K7"), "K7: is no parameter of a camera"),
         (("--free", "left:K1"), "left: is not a camera of the network"),
         (("--free", "K1", "--fix", "K1"), "parameter K1: is both free and fixed"),
-        (("--sigma", "0"), "sigma: 0 is not above zero"),
+        (("--sigma-px", "0"), "Invalid value for '--sigma-px'"),
         (("--datum", "free", "--control", "control.csv"), "cannot be combined with --control"),
     ],
 )
@@ -87,21 +87,21 @@ def test_one_sigma_for_all_image_coordinates_and_another_datum(reseau: Run, netw
     _, out, _ = reseau("bundle", network, "--datum", "free", "--json")
     free = json.loads(out)
     assert free["constraints"] == 7
-    _, out, _ = reseau("bundle", network, "--datum", "free", "--sigma", "0.1", "--json")
+    _, out, _ = reseau("bundle", network, "--datum", "free", "--sigma-px", "0.1", "--json")
     twice = json.loads(out)
     assert twice["sigma0"] == pytest.approx(free["sigma0"] / 2, rel=1e-6)
 
 
 def test_a_network_beyond_the_memory_is_solved_by_conjugate_gradients(reseau: Run, network: Path) -> None:
-    status, out, err = reseau("bundle", network, "--datum", "free", "--memory", "0", "--json")
+    status, out, err = reseau("bundle", network, "--datum", "free", "--memory-gb", "0", "--json")
     assert status == 0, err
     found = json.loads(out)
     assert "conjugate gradients" in json.dumps(found["warnings"])
-    assert found["provenance"]["options"]["memory"] == 0.0
+    assert found["provenance"]["options"]["memory_gb"] == 0.0
     _, out, _ = reseau("bundle", network, "--datum", "free", "--json")
     whole = json.loads(out)
     assert "conjugate gradients" not in json.dumps(whole["warnings"])
-    assert "memory" not in whole["provenance"]["options"]
+    assert "memory_gb" not in whole["provenance"]["options"]
     one, other = found["cameras"][0]["parameters"], whole["cameras"][0]["parameters"]
     assert list(one) == list(other)
     for name, entry in other.items():

@@ -46,7 +46,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
 
 
 def common(measured: tuple[Path, ...]) -> tuple[object, ...]:
-    return ("calibrate", *measured[1:], "-d", measured[0], "--size", "240x240", "--pitch", 0.027)
+    return ("calibrate", *measured[1:], "-d", measured[0], "--image-size", "240x240", "--pitch-mm", 0.027)
 
 
 def test_the_calibration_is_within_its_sigmas_of_the_truth(
@@ -84,7 +84,7 @@ def test_two_calibrations_are_compared_as_a_field(
 ) -> None:
     """Of six recordings each: they differ by their sigmas; of another lens: significantly."""
     design, images = measured[0], measured[1:]
-    options = ("-d", design, "--size", "240x240", "--pitch", 0.027, "--free", "c,x0,y0,K1")
+    options = ("-d", design, "--image-size", "240x240", "--pitch-mm", 0.027, "--free", "c,x0,y0,K1")
     for name, part in (("A", images[::2]), ("B", images[1::2])):
         assert reseau("calibrate", *part, *options, "-o", tmp_path / f"{name}.json")[0] == 0
     files = ("-o", tmp_path / "D.json", "--figure", tmp_path / "D.svg")
@@ -262,7 +262,7 @@ def test_photographs_of_which_none_can_be_read_are_reported_in_one_line(reseau: 
 
 def test_sigma_naught_refers_to_the_given_sigma(reseau: Run, measured: tuple[Path, ...]) -> None:
     """Twice the sigma of the coordinates gives half the sigma naught."""
-    status, out, _ = reseau(*common(measured), "--free", "c,x0,y0,K1", "--sigma", 2 * SIGMA)
+    status, out, _ = reseau(*common(measured), "--free", "c,x0,y0,K1", "--sigma-px", 2 * SIGMA)
     assert status == 0
     sigma0 = float(out.partition("sigma0 ")[2].partition(",")[0])
     assert sigma0 == pytest.approx(0.5, abs=0.025)
@@ -283,7 +283,7 @@ def test_the_size_of_a_target_that_was_found_is_not_known(
 
 
 def test_too_few_images_are_refused_with_their_reasons(reseau: Run, measured: tuple[Path, ...]) -> None:
-    status, _, err = reseau("calibrate", *measured[1:3], "-d", measured[0], "--size", "240x240")
+    status, _, err = reseau("calibrate", *measured[1:3], "-d", measured[0], "--image-size", "240x240")
     assert status == 1
     names = ", ".join(path.name for path in measured[1:3])
     assert f"{measured[1].parent}: 2 images ({names}) show the target, 3 are needed" in err
@@ -293,9 +293,9 @@ def test_too_few_images_are_refused_with_their_reasons(reseau: Run, measured: tu
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--pitch", 0.027, "--free", "c,fx"), "fx: is not one of c, x0"),
-        (("--side", "inner", "--pitch", 0.027), "write `object` or `image`"),
-        (("--size", "large"), "write 640x480"),
+        (("--pitch-mm", 0.027, "--free", "c,fx"), "fx: is not one of c, x0"),
+        (("--side", "inner", "--pitch-mm", 0.027), "'inner' is not one of 'object', 'image'"),
+        (("--image-size", "large"), "write WIDTHxHEIGHT"),
         (("--distance", -3), "-3 is not positive"),
     ],
 )
@@ -321,7 +321,7 @@ def test_documents_of_measurements_are_accepted_as_images(
     for path in measured[1:]:
         files.append(tmp_path / f"{path.stem}.json")
         ReseauMeasurement.read_csv(path).write(files[-1])
-    arguments = ("-d", measured[0], "--size", "240x240", "--pitch", 0.027, "--free", "c", "--json")
+    arguments = ("-d", measured[0], "--image-size", "240x240", "--pitch-mm", 0.027, "--free", "c", "--json")
     first = reseau("calibrate", *files, *arguments)
     assert first[0] == 0
     assert reseau("calibrate", *files, *arguments) == first
@@ -388,7 +388,7 @@ def test_measurements_are_kept_in_a_store_and_not_repeated(
         *files,
         "-d",
         tmp_path / "field.json",
-        "--pitch",
+        "--pitch-mm",
         0.027,
         "--free",
         "c",
@@ -427,7 +427,7 @@ def test_a_calibration_beyond_the_memory_is_that_of_the_direct_solution(
 ) -> None:
     """Within a part of its sigmas; what conjugate gradients do not compute is said."""
     found = []
-    for memory in (("--memory", "0"), ("--memory", "1")):
+    for memory in (("--memory-gb", "0"), ("--memory-gb", "1")):
         out = tmp_path / "K.json"
         status, _, err = reseau(*common(measured), "--free", "c,x0,y0,K1", *memory, "-o", out)
         assert status == 0, err

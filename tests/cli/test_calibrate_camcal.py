@@ -14,7 +14,8 @@ from ..measure import camcal
 Run = Callable[..., tuple[int, str, str]]
 
 OPTIONS = (
-    "--pitch", "0.0031911032863849768", "--side", "image", "--free", "c,x0,y0,K1,K2,K3,P1,P2", "--sigma", 0.1,
+    "--pitch-mm", "0.0031911032863849768", "--side", "image", "--free", "c,x0,y0,K1,K2,K3,P1,P2",
+    "--sigma-px", 0.1,
 )  # fmt: skip
 """Those of the published network: one sigma for all, no affinity, residuals of the corrected point."""
 PUBLISHED = 1.68901
@@ -47,7 +48,7 @@ def test_the_published_marks_give_the_published_sigma_naught(
         files.append(tmp_path / f"{k:02d}.csv")
         rows = [f"{name},{float(xy[0]) - 0.5!r},{float(xy[1]) - 0.5!r}" for name, xy in marks.items()]
         files[-1].write_text("id,x,y\n" + "\n".join(rows) + "\n")
-    status, out, err = reseau("calibrate", *files, *sheet, *OPTIONS, "--size", "2272x1704", "--json")
+    status, out, err = reseau("calibrate", *files, *sheet, *OPTIONS, "--image-size", "2272x1704", "--json")
     assert (status, err) == (0, "")
     found = json.loads(out)
     # Without marks that are declined it would be 3726; the other program declines none.

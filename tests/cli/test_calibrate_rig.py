@@ -1,4 +1,4 @@
-"""`reseau calibrate --camera …`: cameras that are fixed to each other."""
+"""`reseau calibrate --rig …`: cameras that are fixed to each other."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CAMERAS = {
     "left": {"fx": 530.0, "fy": 531.0, "cx": 322.0, "cy": 235.0, "k1": -0.28, "k2": 0.08},
     "right": {"fx": 545.0, "fy": 544.0, "cx": 314.0, "cy": 241.0, "k1": -0.25, "k2": 0.06},
 }
-FREE = ("--size", "640x480", "--free", "fx,fy,cx,cy,k1,k2")
+FREE = ("--image-size", "640x480", "--free", "fx,fy,cx,cy,k1,k2")
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def both(folder: Path) -> tuple[object, ...]:
-    return ("--camera", f"left={folder / 'left'}", "--camera", f"right={folder / 'right' / '*.csv'}")
+    return ("--rig", f"left={folder / 'left'}", "--rig", f"right={folder / 'right' / '*.csv'}")
 
 
 @pytest.mark.slow
@@ -112,13 +112,13 @@ def test_images_that_were_not_taken_at_once_are_named(reseau: Run, exchanged: Pa
     ("arguments", "said"),
     [
         ((), "photographs: are missing"),
-        (("--camera", "left"), "--camera: is 'left'"),
-        (("--camera", "left={0}/left"), "at least two are required"),
-        (("--camera", "left={0}/left", "--camera", "left={0}/right"), "each name once"),
-        (("--camera", "left={0}/none*", "--camera", "b={0}/right"), "none*: matches no file"),
+        (("--rig", "left"), "--rig: is 'left'"),
+        (("--rig", "left={0}/left"), "at least two are required"),
+        (("--rig", "left={0}/left", "--rig", "left={0}/right"), "each name once"),
+        (("--rig", "left={0}/none*", "--rig", "b={0}/right"), "none*: matches no file"),
         (
-            ("{0}/left/00.csv", "--camera", "left={0}/left", "--camera", "b={0}/right"),
-            "combined with --camera",
+            ("{0}/left/00.csv", "--rig", "left={0}/left", "--rig", "b={0}/right"),
+            "combined with --rig",
         ),
     ],
 )

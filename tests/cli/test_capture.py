@@ -86,7 +86,7 @@ def test_a_user_plan_is_carried_out_and_resumed_with_its_original_code(
             raise StateError("stalled", where="table", command="move")
 
     rig.table.before = stall
-    assert capture("own", "--plan", "own.toml", "--name", "a") == 1
+    assert capture("own", "--options", "own.toml", "--name", "a") == 1
     assert rig.camera.exposures == 4
     Path("own.py").unlink()
     rig.table.before = lambda axis, position: None
@@ -151,16 +151,16 @@ def test_options_come_from_a_toml_file_and_the_command_line_takes_precedence(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("plan.toml").write_text('count = 3\nname = "toml"\n')
-    assert capture("frames", "--plan", "plan.toml", "--count", "2", "--json") == 0
+    assert capture("frames", "--options", "plan.toml", "--count", "2", "--json") == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [event["event"] for event in events] == ["begin", "frame", "frame", "end"]
     assert (events[0]["session"], events[0]["archive"], events[0]["poses"]) == ("toml", "archive", 2)
     assert events[-1]["status"] == "done"
     Path("plan.toml").write_text('checks = 0\nfirst = "x"\n')
-    assert capture("testfield", "--plan", "plan.toml") == 2
+    assert capture("testfield", "--options", "plan.toml") == 2
     assert "--first" in capsys.readouterr().err
     Path("plan.toml").write_text("cuont = 3\n")
-    assert capture("frames", "--plan", "plan.toml") == 2
+    assert capture("frames", "--options", "plan.toml") == 2
     assert "plan.toml: unknown key `cuont`; use " in capsys.readouterr().err
 
 
@@ -168,24 +168,24 @@ def test_toml_keys_are_option_names_and_values_may_be_lists_and_tables(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("monday.toml").write_text(
-        'design = "field.json"\nposes = "poses.csv"\npitch = 0.027\nfree = ["c", "x0", "y0", "K1"]\n'
-        "row-jitter = 0.0086\nfill = 0.8\nchecks = 0\njson = true\n[park]\ntilt = 7\nroll = 0.5\n"
+        'design = "field.json"\nposes = "poses.csv"\npitch-mm = 0.027\nfree = ["c", "x0", "y0", "K1"]\n'
+        "row-jitter-px = 0.0086\nfill = 0.8\nchecks = 0\njson = true\n[park]\ntilt = 7\nroll = 0.5\n"
     )
     Path("poses.csv").write_text("tilt\n0\n")
-    assert capture("testfield", "--plan", "monday.toml", "--name", "monday") == 1
+    assert capture("testfield", "--options", "monday.toml", "--name", "monday") == 1
     out, failed = capsys.readouterr()
     assert '"event": "end", "status": "failed"' in out
     assert "1 image" in failed  # of one nothing can be computed
     assert (rig.table.stands["tilt"], rig.table.stands["roll"]) == (7, 0.5)
     assert run(["archive", "show", "monday", "--json"]) == 0
     given = json.loads(capsys.readouterr().out)["parameters"]
-    assert (given["free"], given["row_jitter"], given["park"]) == (
+    assert (given["free"], given["row_jitter_px"], given["park"]) == (
         ["c", "x0", "y0", "K1"],
         0.0086,
         {"tilt": 7.0, "roll": 0.5},
     )
-    Path("photos.toml").write_text('reseau = "none.json"\nobject = "none.json"\nbody = false\n')
-    assert capture("oscilloscope", "--plan", "photos.toml") == 2
+    Path("photos.toml").write_text('reseau = "none.json"\ntest-object = "none.json"\nbody = false\n')
+    assert capture("oscilloscope", "--options", "photos.toml") == 2
     assert "none.json: cannot be read" in capsys.readouterr().err
 
 
@@ -358,7 +358,7 @@ def test_the_operator_is_asked_and_a_photograph_without_a_reseau_ends_the_sessio
 ) -> None:
     designs.standard_reseau().write("reseau.json")
     designs.test_object().write("rods.json")
-    given = ["--reseau", "reseau.json", "--object", "rods.json", "--retakes", "0"]
+    given = ["--reseau", "reseau.json", "--test-object", "rods.json", "--retakes", "0"]
     monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
     assert capture("oscilloscope", *given, "--name", "a") == 1
     err = capsys.readouterr().err.splitlines()

@@ -10,7 +10,16 @@ from reseau_sims import FieldBench
 
 from ..capture.fieldrig import AXES, FieldRig, enter, write_inputs
 
-HEIGHTS = ("--heights", "0,150,300", "--height-sigma", "0.05", "--axis-sigma", "5", "--field-sigma", "0.001")
+HEIGHTS = (
+    "--heights",
+    "0,150,300",
+    "--height-sigma",
+    "0.05",
+    "--axis-sigma-mrad",
+    "5",
+    "--field-sigma",
+    "0.001",
+)
 
 
 @pytest.fixture
@@ -27,7 +36,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FieldRig:
 def test_one_frontal_pose_at_three_heights_gives_a_reproducible_calibration(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = ("--design", "field.json", "--poses", "poses.csv", "--pitch", "0.027", "--free", "c,x0,y0")
+    given = ("--design", "field.json", "--poses", "poses.csv", "--pitch-mm", "0.027", "--free", "c,x0,y0")
     assert run(["capture", "testfield", *given, *HEIGHTS, "--fill", "0.8", "--name", "lifted"]) == 0
     assert "3/3 frontal z 300" in capsys.readouterr().out
     assert run(["archive", "show", "lifted", "--out", "results"]) == 0

@@ -86,7 +86,7 @@ def frames_of(name: str = "monday") -> list[tuple[str, str]]:
 def test_a_sensor_is_calibrated_on_the_bench(
     asked: list[str], sensor: PixelSensor, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert capture("--edge", "--out", "sensor.json", "--json") == 0
+    assert capture("--mtf", "--out", "sensor.json", "--json") == 0
     message = capsys.readouterr().out
     events = [json.loads(line) for line in message.splitlines()]
     assert [event["event"] for event in events].count("frame") == 4 * (14 + 12 + 1)
@@ -116,7 +116,7 @@ def test_a_sensor_is_calibrated_on_the_bench(
 def test_every_raw_frame_is_archived_and_the_calibration_can_be_recomputed(
     asked: list[str], camera: VideoCamera, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert capture("--edge") == 0
+    assert capture("--mtf") == 0
     message = capsys.readouterr().out
     assert "108/108 edge 00 003: good" in message
     assert "monday: done, 108 frames in archive\n  calibration.json\n  report.html\n" in message
@@ -166,7 +166,7 @@ def test_an_interrupted_session_is_resumed_where_it_stopped(
 def test_an_edge_that_cannot_be_measured_affects_the_sharpness_only(
     asked: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert capture("--edge", "--region", "0", "0", "20", "40", "--out", "sensor.json") == 1
+    assert capture("--mtf", "--region", "0,0,20,40", "--out", "sensor.json") == 1
     found = capsys.readouterr()
     assert "gain" in found.out
     assert found.err.strip().splitlines()[-1].startswith("reseau: edge: ")
@@ -177,7 +177,7 @@ def test_a_saturated_edge_is_reported(
     asked: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("LIGHT_OF_THE_EDGE", "40")
-    assert capture("--edge") == 1
+    assert capture("--mtf") == 1
     found = capsys.readouterr()
     assert found.err.strip().splitlines()[-1] == (
         "reseau: edge: its bright side is saturated: reduce the exposure"

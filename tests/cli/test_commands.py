@@ -154,12 +154,12 @@ def test_a_design_is_written_with_its_drawings(reseau: Run, tmp_path: Path) -> N
         files["svg"],
         "--pdf",
         files["pdf"],
-        "--json",
+        "--out",
         files["json"],
     )
     assert status == 0
     assert out.split() == [str(path) for path in files.values()]
-    status, out, _ = reseau("design", "reseau", *options, "--json", "-")
+    status, out, _ = reseau("design", "reseau", *options, "--out", "-")
     assert ReseauDesign.parse(out, where="stdout") == ReseauDesign.read(files["json"])
     assert files["svg"].read_text().startswith("<svg")
     assert files["pdf"].read_bytes().startswith(b"%PDF")
@@ -174,18 +174,16 @@ def test_a_board_file_is_read_and_its_unit_is_asked_for(reseau: Run, tmp_path: P
     (tmp_path / "kalibr.yaml").write_text(text)
     file = tmp_path / "board.json"
     # Kalibr does not say how large the circles are.
-    status, _, err = reseau(
-        "design", "board", "--from", tmp_path / "kalibr.yaml", "--size", 8, "--json", file
-    )
+    status, _, err = reseau("design", "board", "--from", tmp_path / "kalibr.yaml", "--size", 8, "--out", file)
     assert (status, err) == (0, "")
     written = json.loads(file.read_text())
     assert (written["pitch"], written["size"]) == (20.0, 8.0)
     # The design again, in another size.
-    assert reseau("design", "board", "--from", file, "--pitch", 25, "--json", file)[0] == 0
+    assert reseau("design", "board", "--from", file, "--pitch", 25, "--out", file)[0] == 0
     assert json.loads(file.read_text()) == written | {"pitch": 25.0}
     storage = "%YAML:1.0\n---\nsquaresX: 7\nsquaresY: 10\nsquareLength: 0.024\nmarkerLength: 0.018\n"
     (tmp_path / "opencv.yml").write_text(storage + "dictionary: 5\n")
-    status, _, err = reseau("design", "board", "--from", tmp_path / "opencv.yml", "--json", file)
+    status, _, err = reseau("design", "board", "--from", tmp_path / "opencv.yml", "--out", file)
     assert status == 0
     assert "is 0.024 mm (24 µm): is it 0.024 m, which is 24 mm? Lengths depend on it: give --pitch" in err
     # A pitch of zero is no pitch that was not given.

@@ -35,7 +35,7 @@ def test_a_roll_gives_documents_marked_copies_corners_and_an_overview(
     roll: Path, tmp_path: Path, reseau: Run
 ) -> None:
     images = sorted(roll.glob("*.tif"))
-    status, out, err = reseau("orient", *images, "--frame", "36x24", "--out", tmp_path, "--jobs", 1)
+    status, out, err = reseau("orient", *images, "--format-mm", "36x24", "--out", tmp_path, "--jobs", 1)
     assert (status, err) == (0, "")
     assert out.count(".tif: oriented") == 4
     assert "5 frames: 4 oriented, 1 with three edges" in out
@@ -55,12 +55,12 @@ def test_a_roll_gives_documents_marked_copies_corners_and_an_overview(
     assert (tmp_path / "summary.html").read_text("utf-8").count("<img") == 5
     # A second run, of the folder, finds the results of the first one, and its roll is still the same.
     (tmp_path / "corners.json").rename(tmp_path / "before.json")
-    assert reseau("orient", roll, "--frame", "36x24", "--out", tmp_path, "--jobs", 1)[1] == out
+    assert reseau("orient", roll, "--format-mm", "36x24", "--out", tmp_path, "--jobs", 1)[1] == out
     assert (tmp_path / "corners.json").read_text() == (tmp_path / "before.json").read_text()
     corners = FrameCorners.read(tmp_path / "corners.json")
     np.testing.assert_allclose(corners.xy(), frame.gate, rtol=0, atol=0.15)
     # The frame that lacks an edge is surer by its roll than by the format alone.
-    alone = json.loads(reseau("orient", roll / "4.tif", "--frame", "36x24", "--json")[1])
+    alone = json.loads(reseau("orient", roll / "4.tif", "--format-mm", "36x24", "--json")[1])
     helped = FrameOrientation.read(tmp_path / "4.json")
     assert helped.corners is not None
     assert helped.corners["ul"].sx < 0.5 * alone["corners"]["ul"]["sx"]
@@ -69,14 +69,14 @@ def test_a_roll_gives_documents_marked_copies_corners_and_an_overview(
 @pytest.mark.slow
 def test_a_second_run_continues_where_the_first_ended(roll: Path, tmp_path: Path, reseau: Run) -> None:
     images = [roll / "0.tif", roll / "1.tif"]
-    arguments = ("--frame", "36x24", "--out", tmp_path, "--jobs", 1, "--no-marked")
+    arguments = ("--format-mm", "36x24", "--out", tmp_path, "--jobs", 1, "--no-marked")
     reseau("orient", images[0], *arguments)
     written = (tmp_path / "0.json").stat().st_mtime_ns
     assert reseau("orient", *images, *arguments)[0] == 0
     assert (tmp_path / "0.json").stat().st_mtime_ns == written
     assert (tmp_path / "1.json").exists()
     # Other options are another result.
-    reseau("orient", images[0], "--out", tmp_path, "--jobs", 1, "--no-marked", "--frame", "36.1x24")
+    reseau("orient", images[0], "--out", tmp_path, "--jobs", 1, "--no-marked", "--format-mm", "36.1x24")
     assert (tmp_path / "0.json").stat().st_mtime_ns > written
 
 
@@ -107,7 +107,7 @@ def test_a_scan_in_floating_point_is_oriented_as_the_same_one_in_8_bits(tmp_path
     found = []
     for name, kind in (("bytes.tif", np.uint8), ("floats.tif", np.float32)):
         tifffile.imwrite(tmp_path / name, pixels.astype(kind))
-        status, out, _ = reseau("orient", tmp_path / name, "--frame", "36x24", "--json")
+        status, out, _ = reseau("orient", tmp_path / name, "--format-mm", "36x24", "--json")
         assert status == 0
         found.append(json.loads(out)["corners"])
     for corner in ("ul", "ur", "lr", "ll"):
@@ -160,7 +160,7 @@ def test_bad_input_is_reported_with_a_remedy(
 ) -> None:
     one_bad(name, tmp_path / "bad.tif")
     out_folder = tmp_path / "out"
-    got, out, err = reseau("orient", tmp_path / "bad.tif", "--frame", "36x24", "--out", out_folder)
+    got, out, err = reseau("orient", tmp_path / "bad.tif", "--format-mm", "36x24", "--out", out_folder)
     reported = out + err
     assert got == status
     assert wrong in reported
@@ -171,7 +171,7 @@ def test_bad_input_is_reported_with_a_remedy(
 
 def test_without_a_resolution_tag_the_scale_is_that_of_the_format(tmp_path: Path, reseau: Run) -> None:
     tifffile.imwrite(tmp_path / "untagged.tif", FilmFrame(0, dpi=300).scan())
-    status, out, _ = reseau("orient", tmp_path / "untagged.tif", "--frame", "36x24", "--json")
+    status, out, _ = reseau("orient", tmp_path / "untagged.tif", "--format-mm", "36x24", "--json")
     assert status == 0
     # The gate differs from its format by some hundredths of a millimetre.
     assert json.loads(out)["px_per_mm"] == pytest.approx([300 / 25.4] * 2, rel=0.005)
@@ -181,7 +181,7 @@ def test_every_frame_of_a_strip_is_oriented(tmp_path: Path, reseau: Run) -> None
     frames = [FilmFrame(seed, dpi=300) for seed in range(3)]
     height = min(frame.shape[0] for frame in frames)
     tifffile.imwrite(tmp_path / "strip.tif", np.hstack([frame.scan()[:height] for frame in frames]))
-    status, out, _ = reseau("orient", tmp_path / "strip.tif", "--frame", "36x24", "--json")
+    status, out, _ = reseau("orient", tmp_path / "strip.tif", "--format-mm", "36x24", "--json")
     assert status == 0
     found = json.loads(out)
     assert [one["status"] for one in found] == ["oriented"] * 3
@@ -205,7 +205,7 @@ def test_frames_that_cannot_be_oriented_are_reported_in_one_line(
         assert status == 2
         assert words in err
         assert err.count("\n") == 1
-    for arguments in (("--frame", "36"), ("--near", "1,2,3"), ("--frame", "ax b")):
+    for arguments in (("--format-mm", "36"), ("--near", "1,2,3"), ("--format-mm", "ax b")):
         status, _, err = reseau("orient", roll / "0.tif", *arguments)
         assert status == 2
         assert "write " in err

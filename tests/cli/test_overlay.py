@@ -104,7 +104,7 @@ def test_a_mirrored_frame_is_numbered_as_the_option_says(reseau: Run, photo: Any
 def test_a_rotated_frame_is_found_with_a_larger_maximum(reseau: Run, photo: Any, tmp_path: Path) -> None:
     write_image(tmp_path / "on-its-side.png", np.rot90(np.rint(photo.pixels).astype(np.uint8)).copy())
     arguments = ("measure", "reseau", tmp_path / "on-its-side.png", "-d", photo.design)
-    status, out, _ = reseau(*arguments, "--max-rotation", "100", "--not-mirrored", "--json")
+    status, out, _ = reseau(*arguments, "--max-rotation-deg", "100", "--not-mirrored", "--json")
     assert status == 0
     assert json.loads(out)["found"] == 63
 

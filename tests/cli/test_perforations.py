@@ -16,7 +16,16 @@ Run = Callable[..., tuple[int, str, str]]
 SCALE = 40.0
 """Pixels per millimetre."""
 ROWS, PITCH, COUNT = 28.17, 4.75, 7
-OPTIONS = ("--left", 88, 160, 200, 239, "--right", 1215, 160, 1327, 239, "--pitch", 190, "--count", COUNT)
+OPTIONS = (
+    "--left",
+    "88,160,200,239",
+    "--right",
+    "1215,160,1327,239",
+    "--perforation-px",
+    190,
+    "--number",
+    COUNT,
+)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +68,7 @@ def test_results_have_units_and_as_many_digits_as_the_sigma_supports(film: Path,
 def test_wrong_use_is_reported_in_one_line(film: Path, reseau: Run) -> None:
     for more, text in (
         (("--channel", "blue"), "--channel: the scan has no channel 'blue'; use grey"),
-        (("--left", 600, 160, 712, 239), "film.png: "),
+        (("--left", "600,160,712,239"), "film.png: "),
     ):
         status, _, err = reseau("measure", "perforations", film, *OPTIONS, *more)
         assert status in (1, 2)

@@ -49,7 +49,7 @@ def test_rods_are_measured_and_the_missing_one_is_named(
 
 
 def test_slanted_wires_are_measured_with_the_share_at_which_they_are_cut(reseau: Run, tmp_path: Path) -> None:
-    status, out, err = reseau("design", "n-wires", "--layers", 3, "--json", tmp_path / "phantom.json")
+    status, out, err = reseau("design", "n-wires", "--layers", 3, "--out", tmp_path / "phantom.json")
     assert (status, err) == (0, "")
     design = ReseauDesign.read(tmp_path / "phantom.json")
     share = np.array([0.3, 0.55, 0.8])

@@ -55,7 +55,7 @@ def bench(tmp_path):
     marks = (reseau.ids, _pixels(reseau.xy))
     return {
         "--reseau": tmp_path / "reseau.json",
-        "--object": tmp_path / "rods.json",
+        "--test-object": tmp_path / "rods.json",
         "--photo-i": _csv(tmp_path / "one.csv", marks),
         "--photo-ii": _csv(
             tmp_path / "two.csv", marks, (list(_RODS), _shown(np.array(list(_RODS.values()))))
@@ -137,7 +137,7 @@ def test_a_camera_that_moved_before_photo_iii_is_noticed_and_corrected(bench, tm
 
 
 def test_a_missing_row_of_pins_a_rotated_object_and_swapped_marks_are_reported(bench, tmp_path, capsys):
-    rods = ReseauDesign.read(bench["--object"])
+    rods = ReseauDesign.read(bench["--test-object"])
     reseau = ReseauDesign.read(bench["--reseau"])
     turn = np.deg2rad(5)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -160,8 +160,8 @@ def test_a_missing_row_of_pins_a_rotated_object_and_swapped_marks_are_reported(b
 @pytest.mark.parametrize(
     ("left_out", "message"),
     [
-        (("--object",), "--photo-ii and --object must be given together"),
-        (("--photo-ii", "--object"), "needs PHOTO II"),
+        (("--test-object",), "--photo-ii and --test-object must be given together"),
+        (("--photo-ii", "--test-object"), "needs PHOTO II"),
         (("--reseau",), "needs --photo-i and --reseau, or --calibration"),
     ],
 )

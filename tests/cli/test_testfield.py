@@ -18,7 +18,7 @@ Run = Callable[..., tuple[int, str, str]]
 def test_a_testfield_is_written_with_its_drawings(reseau: Run, tmp_path: Path) -> None:
     files = [tmp_path / f"field{suffix}" for suffix in (".svg", ".pdf", ".json")]
     svg, pdf, json = files
-    status, out, err = reseau("design", "testfield", "--svg", svg, "--pdf", pdf, "--json", json)
+    status, out, err = reseau("design", "testfield", "--svg", svg, "--pdf", pdf, "--out", json)
     assert (status, err) == (0, "")
     assert out.split() == [str(path) for path in files]
     assert TestfieldDesign.read(json) == coded_testfield(pitch=20.0)  # fills a sheet of A4
@@ -27,7 +27,7 @@ def test_a_testfield_is_written_with_its_drawings(reseau: Run, tmp_path: Path) -
 
 
 def test_the_design_is_printed_on_request(reseau: Run) -> None:
-    status, out, _ = reseau("design", "testfield", "--columns", 2, "--rows", 1, "--pitch", 125, "--json", "-")
+    status, out, _ = reseau("design", "testfield", "--columns", 2, "--rows", 1, "--pitch", 125, "--out", "-")
     assert status == 0
     assert TestfieldDesign.parse(out, where="stdout") == coded_testfield(2, 1)
 
@@ -41,18 +41,15 @@ def test_impossible_testfields_are_reported_in_one_line(reseau: Run, tmp_path: P
         "--spread",
         30,
         "--large",
-        17,
-        25,
-        25,
-        22,
-        "--json",
+        "17,25,25,22",
+        "--out",
         tmp_path / "f.json",
     )
     assert (status, out) == (2, "")
     assert err.count("\n") == 1
     assert "do not fit squares of 90 mm" in err
     assert not (tmp_path / "f.json").exists()
-    status, _, err = reseau("design", "testfield", "--json", tmp_path / "f.txt")
+    status, _, err = reseau("design", "testfield", "--out", tmp_path / "f.txt")
     assert (status, "use .json" in err) == (2, True)
 
 

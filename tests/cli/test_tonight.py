@@ -62,7 +62,7 @@ def evening(
     turned = kind == "asymmetric"
     option = ("circles", "--asymmetric") if turned else (kind,)
     target = ("board", "--kind", *option) if kind in BOARDS else ("sheet",)
-    files = ("--pdf", folder / "target.pdf", "--json", folder / "target.json")
+    files = ("--pdf", folder / "target.pdf", "--out", folder / "target.json")
     assert reseau("design", *target, "--columns", columns, "--rows", rows, *files)[0] == 0
     sheet, rng = print_out(folder / "target.pdf"), np.random.default_rng(seed)
     photos = folder / "photos"
@@ -136,7 +136,7 @@ def test_the_target_is_found_among_the_designs_beside_the_photographs(
     monkeypatch.chdir(tmp_path)
     lens = replace(LENS, width=320, height=240, fx=300.0, fy=300.0, cx=160.2, cy=119.1)
     for kind, size in (("charuco", (5, 7)), ("chess", (6, 9))):
-        files = ("--pdf", tmp_path / f"{kind}.pdf", "--json", tmp_path / f"{kind}.json")
+        files = ("--pdf", tmp_path / f"{kind}.pdf", "--out", tmp_path / f"{kind}.json")
         board = ("--kind", kind, "--columns", size[0], "--rows", size[1])
         assert reseau("design", "board", *board, *files)[0] == 0
     sheet, rng = print_out(tmp_path / "charuco.pdf"), np.random.default_rng(2)

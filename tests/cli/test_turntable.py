@@ -22,7 +22,7 @@ Run = Callable[..., tuple[int, str, str]]
 
 SIGMA, SIGMA_DEG = 0.05, 0.05
 CAMERA = {"fx": 900.0, "fy": 901.0, "cx": 322.0, "cy": 235.0, "k1": -0.28, "k2": 0.08}
-FREE = ("--size", "640x480", "--free", "fx,fy,cx,cy,k1,k2")
+FREE = ("--image-size", "640x480", "--free", "fx,fy,cx,cy,k1,k2")
 AXIS, POINT = np.array([0.1, 1.0, 0.05]), np.array([20.0, 0.0, -30.0])
 ANGLES = (-40, -25, -10, 5, 20, 35)
 

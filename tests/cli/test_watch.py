@@ -133,7 +133,7 @@ def test_watching_the_simulated_bench_leaves_frames_for_a_calibration(
         rig.table.stands.update(tilt=30.0, roll=90.0 * ((number - 1) // 2))
 
     rig.camera.during = moved
-    how = ("--pitch", "0.027", "--free", "c,x0,y0,K1", "--count", "3", "--seconds", "200")
+    how = ("--pitch-mm", "0.027", "--free", "c,x0,y0,K1", "--count", "3", "--seconds", "200")
     assert run(["watch", "--design", "field.json", "--camera", "camera", "-o", "photos", *how]) == 0
     printed = capsys.readouterr()
     assert printed.err.startswith("http://127.0.0.1:")

@@ -65,7 +65,7 @@ def test_what_was_compiled_ahead_is_all_that_a_calibration_of_a_board_calls(tmp_
         return len(list((tmp_path / "compiled" / "reseau").glob("*.nbc")))
 
     run("design", "board", "--kind", "chess", "--columns", "10", "--rows", "7", "--pitch", "25",
-        "--json", tmp_path / "board.json")  # fmt: skip
+        "--out", tmp_path / "board.json")  # fmt: skip
     before = run("compile")
     assert before >= len(main_loops())
     after = run(

@@ -128,7 +128,7 @@ def test_an_instrument_is_corrected_in_three_photographs(
         for name in ("photo_i", "photo_ii", "photo_iii"):
             write_image(out / f"{name}.png", getattr(world, name)().pixels)
         photos = ["--photo-i", "out/photo_i.png", "--photo-ii", "out/photo_ii.png"]
-        designs = ["--reseau", "out/reseau.json", "--object", "out/rods.json"]
+        designs = ["--reseau", "out/reseau.json", "--test-object", "out/rods.json"]
         return run(["refine", *photos, *designs, "--out", "out/calibration.json"]) == 0
 
     follow("instrument", tmp_path, instead=demo)

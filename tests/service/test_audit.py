@@ -141,7 +141,7 @@ def test_the_commands_verify_and_print_the_head(
     head = capsys.readouterr().out.strip()
     assert run(["audit", "verify", "--head", head, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["entries"] == 4
-    assert run(["audit", "verify", "--key", "archive-service/audit-public.pem", "--head", head]) == 0
+    assert run(["audit", "verify", "--public-key", "archive-service/audit-public.pem", "--head", head]) == 0
     tampered(place, "DELETE FROM entries WHERE key = '4'")
     assert run(["audit", "verify", "--head", head]) == 1
     assert "entries after 3 are missing" in capsys.readouterr().out

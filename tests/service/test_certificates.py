@@ -376,8 +376,11 @@ def test_only_an_accepted_calibration_gets_a_certificate(
         (["unknown.json", "-a", "archive"], "was not decided on"),
         (["accepted.json"], "was not decided on"),
         (["right", "-a", "archive"], "has no calibration in force"),
-        (["accepted.json", "-a", "archive", "--key", "k.pem"], "must be given together"),
-        (["accepted.json", "-a", "archive", "--key", "k.pem", "--certificate", "c.pem"], "k.pem: cannot be"),
+        (["accepted.json", "-a", "archive", "--signing-key", "k.pem"], "must be given together"),
+        (
+            ["accepted.json", "-a", "archive", "--signing-key", "k.pem", "--signing-certificate", "c.pem"],
+            "k.pem: cannot be",
+        ),
         (["accepted.json", "-a", "archive", "--issued", "2026-01-01"], "not in this order"),
         (["accepted.json", "-a", "archive", "--probability", "0.2"], "coverage probability"),
         (["accepted.json", "-a", "archive", "--data", "bad.json"], "responsible"),

@@ -48,7 +48,7 @@ def defined(tmp_path_factory: pytest.TempPathFactory) -> Path:
         define = [
             "recalibrate",
             "left",
-            "--from",
+            "--repeats",
             "first",
             "--configuration",
             "left",
@@ -160,12 +160,12 @@ def test_a_bench_in_use_blocks_the_run_and_nothing_is_begun(
     ("arguments", "part"),
     [
         (["recalibrate", "left"], "left: is not a recalibration of this archive"),
-        (["recalibrate", "left", "--from", "x"], "--from: needs --configuration and --rules"),
+        (["recalibrate", "left", "--repeats", "x"], "--repeats: needs --configuration and --rules"),
         (["schedule", "show", "weekly"], "weekly: is not a schedule of this archive"),
         (["schedule", "add", "endless.json"], "has no end"),
         (["schedule", "add", "weekly.json"], "left: is not a recalibration of this archive"),
         (["alarms", "acknowledge", "x", "--by", "Ada"], "'x': is no alarm"),
-        (["schedule", "run", "--once", "--to", "nowhere"], "address 1: cannot be used"),
+        (["schedule", "run", "--once", "--notify", "nowhere"], "address 1: cannot be used"),
         (["schedule", "units", "--archive", "my archive"], "--archive: contains characters"),
     ],
 )

@@ -89,7 +89,7 @@ def test_wrong_starts_are_refused_in_one_line(folder: Path, capsys: pytest.Captu
         ["--host", "example.org"],
         ["--certificate", "none.pem"],
         ["--proxy", "http://bench.example.org"],
-        ["--name", "bench.example.org"],
+        ["--host-name", "bench.example.org"],
     ):
         assert run(["serve", *arguments]) == 2
         assert len(capsys.readouterr().err.strip().splitlines()) == 1

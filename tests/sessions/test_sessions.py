@@ -21,7 +21,13 @@ from ..capture.fieldrig import DESIGN, FieldRig
 
 STEPS = [[f"tilt {tilt} roll {roll}", {"tilt": tilt, "roll": roll, "camera_roll": roll}]
          for tilt, roll in ((0.0, 0.0), (30.0, 90.0), (30.0, 180.0), (30.0, 270.0))]  # fmt: skip
-TESTFIELD = {"steps": STEPS, "pitch": 0.027, "free": ["c", "x0", "y0"], "row_jitter": 0.0086, "fill": 0.8}
+TESTFIELD = {
+    "steps": STEPS,
+    "pitch_mm": 0.027,
+    "free": ["c", "x0", "y0"],
+    "row_jitter_px": 0.0086,
+    "fill": 0.8,
+}
 
 
 @pytest.fixture
@@ -170,3 +176,15 @@ def test_two_demos_run_at_the_same_time(tmp_path: Path) -> None:
 def test_errors_of_this_package_are_of_one_tree() -> None:
     with pytest.raises(ReseauError, match="unknown plan"):
         sessions.kind_of("mystery")
+
+
+def test_archives_with_the_former_keys_are_read_as_before(tmp_path: Path) -> None:
+    former = {"model": "", "pitch": 0.027, "free": ["c"], "row_jitter": 0.01, "fill": 0.8}
+    with Archive.open(tmp_path, create=True) as archive:
+        archive.begin("old", plan="photographs", parameters=former)
+        given = sessions.parameters_of(archive.session("old"))
+        assert archive.session("old").parameters == former
+    assert isinstance(given, sessions.PhotographsParameters)
+    assert (given.pitch_mm, given.row_jitter_px) == (0.027, 0.01)
+    with pytest.raises(FormatError, match="unknown key `pitch`"):
+        sessions.check("new", "photographs", former, {"design.json": ""})

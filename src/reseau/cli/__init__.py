@@ -46,53 +46,64 @@ from . import (
     serve,
     watch,
 )
+from .declared import Commands
 
 __all__ = ["app", "main"]
 
 _COMPILING = "compiling for this processor, once, what this command calls; `reseau compile` does it ahead"
 
-app = typer.Typer(
+app = Commands(
     name="reseau",
     help="Calibrate measuring cameras and imaging instruments.",
-    no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command()(demo.demo)
-app.add_typer(design.app, name="design")
-app.add_typer(bench.app, name="bench")
 measure.app.command()(perforations.perforations)
 measure.app.command()(fiducials.fiducials)
 measure.app.command()(blurred.blurred)
 measure.app.command()(edge.edge)
-app.add_typer(measure.app, name="measure")
 capture.app.command()(capture_sensor.sensor)
 capture.app.command()(capture_own.own)
-app.add_typer(capture.app, name="capture")
-app.command()(watch.watch)
-app.command()(serve.serve)
-app.add_typer(serve.app, name="service")
-app.add_typer(serve.audit_app, name="audit")
-app.add_typer(remote.app, name="remote")
-app.add_typer(archive.app, name="archive")
-app.add_typer(calibrations.app, name="calibrations")
-app.command()(schedule.recalibrate)
-app.add_typer(schedule.app, name="schedule")
-app.add_typer(schedule.alarms, name="alarms")
-app.add_typer(certificates.app, name="certificate")
-app.command()(certificates.uncertainty)
-app.command()(sensor.sensor)
-app.command()(orient.orient)
-app.command()(refine.refine)
-app.command()(apply.apply)
-app.command()(export.export)
-app.command()(bundle.bundle)
-app.command("blurred")(blurred_network.blurred_network)
-app.command()(calibrate.calibrate)
-app.command()(bundle_compare.compare)
-app.command()(schema.schema)
-app.command("compile")(compile.compile_loops)
+
+# Help shows the commands in the order of the work.
+_ORDER: dict[str, dict[str, Any]] = {
+    "Calibrate": {
+        "calibrate": calibrate.calibrate,
+        "measure": measure.app,
+        "refine": refine.refine,
+        "orient": orient.orient,
+        "blurred": blurred_network.blurred_network,
+        "bundle": bundle.bundle,
+        "sensor": sensor.sensor,
+    },
+    "Use a calibration": {
+        "apply": apply.apply,
+        "export": export.export,
+        "compare": bundle_compare.compare,
+        "uncertainty": certificates.uncertainty,
+        "certificate": certificates.app,
+    },
+    "Targets and instruments": {
+        "design": design.app,
+        "bench": bench.app,
+        "watch": watch.watch,
+        "capture": capture.app,
+    },
+    "Archive and service": {
+        "archive": archive.app,
+        "calibrations": calibrations.app,
+        "recalibrate": schedule.recalibrate,
+        "schedule": schedule.app,
+        "alarms": schedule.alarms,
+        "serve": serve.serve,
+        "service": serve.app,
+        "remote": remote.app,
+        "audit": serve.audit_app,
+    },
+    "This program": {"demo": demo.demo, "schema": schema.schema, "compile": compile.compile_loops},
+}
+for _panel, _commands in _ORDER.items():
+    app.add_panel(_panel, _commands)
 
 
 def _version(requested: bool) -> None:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
 import json
 import sys
 import tomllib
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import UsageError
-from .common import ArchivePlace, ObjectsPlace, open_archive, say
+from .common import Place, say
 from .events import Display
 
 if TYPE_CHECKING:
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from ..capture import Bench, Decision
     from ..sessions import SessionParameters
 
-__all__ = ["CameraName", "Where", "ask_operator", "conduct", "in_session"]
+__all__ = ["Where", "ask_operator", "conduct"]
 
 
 def _from_toml(context: typer.Context, path: Path | None) -> Path | None:
@@ -43,7 +42,7 @@ def _from_toml(context: typer.Context, path: Path | None) -> Path | None:
         option.removeprefix("--"): parameter
         for parameter in context.command.params
         for option in parameter.opts
-        if option.startswith("--") and option != "--plan"
+        if option.startswith("--") and option != "--options"
     }
     context.default_map = {}
     for key, value in given.items():
@@ -62,77 +61,36 @@ def _as_text(value: Any, several: bool) -> Any:
     return ",".join(str(each) for each in value) if isinstance(value, list) and not several else value
 
 
-CameraName = Annotated[str | None, typer.Option("--camera", help="Camera to use, if the bench has several.")]
-
-
 @dataclass(frozen=True)
-class Where:
-    """Bench and session of a command; each field is an option of every command of `reseau capture`."""
+class Where(Place):
+    """Bench and session of a command of `reseau capture`."""
 
-    archive: ArchivePlace = "archive"
-    objects: ObjectsPlace = None
-    bench: Annotated[Path | None, typer.Option("--bench", "-b", help="Bench file. Default: bench.toml.")] = (
-        None
-    )
-    name: Annotated[
-        str, typer.Option("--name", "-n", help="Name of the session. Default: plan and time (UTC).")
-    ] = ""
-    resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Resume a session that is not complete, with its original options."),
-    ] = False
-    home: Annotated[
-        bool, typer.Option("--home", help="First home axes without a reference. The axes move.")
-    ] = False
-    plan: Annotated[
+    context: typer.Context = field(kw_only=True)
+    bench: Annotated[v.Bench | None, "Default: bench.toml."] = None
+    name: Annotated[v.Name, "Default: plan and time (UTC)."] = ""
+    resume: Annotated[v.Resume, "Here a session, with its original options."] = False
+    home: v.Home = False
+    options: Annotated[
         Path | None,
-        typer.Option("--plan", is_eager=True, callback=_from_toml, help="TOML file with values of options."),
+        typer.Option(
+            "--options", is_eager=True, callback=_from_toml, help="TOML file with values of options."
+        ),
     ] = None
-    as_json: Annotated[bool, typer.Option("--json", help="Write each event as a line of JSON.")] = False
+    as_json: Annotated[v.AsJson, "Each event is a line."] = False
 
+    def refuse_changes(self, allowed: Sequence[str]) -> None:
+        """Refuse options that a resumed session would ignore.
 
-def in_session(*also_resumed: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of :class:`Where`, passed as its first argument.
-
-    Parameters
-    ----------
-    also_resumed : str
-        Options of the command that can be used with ``--resume``; the session determines all others.
-    """
-    hints = get_type_hints(Where, include_extras=True)
-    common = [
-        inspect.Parameter(
-            each.name, inspect.Parameter.KEYWORD_ONLY, default=each.default, annotation=hints[each.name]
-        )
-        for each in fields(Where)
-    ]
-    about = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-
-    def decorated(command: Callable[..., None]) -> Callable[..., None]:
-        own = list(inspect.signature(command, eval_str=True).parameters.values())[1:]
-
-        @functools.wraps(command)
-        def called(context: typer.Context, **options: Any) -> None:
-            where = Where(**{each.name: options.pop(each.name) for each in fields(Where)})
-            if where.resume:
-                _refuse(context, set(options) - set(also_resumed))
-            command(where, **options)
-
-        parameters = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in own]
-        shown = [about, *parameters, *common]
-        called.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
-        called.__annotations__ = {each.name: each.annotation for each in shown}
-        return called
-
-    return decorated
-
-
-def _refuse(context: typer.Context, options: set[str]) -> None:
-    """Refuse options that a resumed session would ignore."""
-    for parameter in context.command.params:
-        source = context.get_parameter_source(str(parameter.name))
-        if parameter.name in options and source is not None and source.name == "COMMANDLINE":
-            raise UsageError("cannot be changed with --resume", where=parameter.opts[0], do="omit it")
+        Raises
+        ------
+        UsageError
+            If one is given.
+        """
+        known = {*allowed, *(each.name for each in fields(Where))}
+        for parameter in self.context.command.params:
+            source = self.context.get_parameter_source(str(parameter.name))
+            if parameter.name not in known and source is not None and source.name == "COMMANDLINE":
+                raise UsageError("cannot be changed with --resume", where=parameter.opts[0], do="omit it")
 
 
 def ask_operator(request: str) -> None:
@@ -150,6 +108,7 @@ def conduct(
     *,
     operator: Callable[[str], None] = ask_operator,
     afterwards: Callable[[Session], None] = lambda session: None,
+    also_resumed: Sequence[str] = (),
 ) -> None:
     """Begin or resume a session, carry it out, and print its outcome.
 
@@ -169,10 +128,14 @@ def conduct(
         Carries out requests to the operator.
     afterwards : callable
         Called with a complete session.
+    also_resumed : sequence of str
+        Options of the command that can be used with ``--resume``; the session determines all others.
     """
     from .. import sessions
 
-    with open_archive(where.archive, where.objects, create=not where.resume) as archive:
+    if where.resume:
+        where.refuse_changes(also_resumed)
+    with where.open(create=not where.resume) as archive:
         start = _resumed if where.resume else _new
         name, given, bench, begin = start(archive, where, plan, parameters, inputs or {})
         if where.home:
@@ -193,6 +156,9 @@ def conduct(
         afterwards(session)
 
 
+_OPTION = {"object.json": "--test-object"}
+"""Options of input files that have another name in the archive."""
+
 _Started = tuple[str, "SessionParameters", "Bench", Callable[[], "Session"]]
 """Name, parameters and bench of a session, and a function that begins or recovers it once all is checked."""
 
@@ -211,7 +177,9 @@ def _new(
     texts = {}
     for role, path in inputs.items():
         if path is None:
-            raise UsageError("is missing", where=f"--{Path(role).stem}", do="give the file")
+            raise UsageError(
+                "is missing", where=_OPTION.get(role, f"--{Path(role).stem}"), do="give the file"
+            )
         texts[role] = read_text(path)
         sessions.kind_of(plan).read(texts[role], role, path)
     path = where.bench or Path("bench.toml")

@@ -7,20 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import UsageError
+from ..core.options import Option
 from .calibrations import time_of
-from .common import (
-    Anyway,
-    AsJson,
-    ObjectsPlace,
-    Out,
-    open_archive,
-    progress,
-    say,
-    say_files_left_out,
-    suffix_of,
-    writable,
-)
+from .common import Place, progress, say, say_files_left_out, suffix_of, writable
 
 if TYPE_CHECKING:
     from ..calibration import Calibration
@@ -53,7 +44,7 @@ def apply(
             help="Image, folder of images, video, or image coordinates (JSON, CSV).",
         ),
     ] = None,
-    out: Out = None,
+    out: v.Out | None = None,
     scale: Annotated[
         float | None,
         typer.Option(
@@ -68,7 +59,7 @@ def apply(
             "all (every pixel of the image), or the horizontal angle in degrees."
         ),
     ] = "keep",
-    alpha: Annotated[
+    opencv_alpha: Annotated[
         float | None,
         typer.Option(
             min=0.0,
@@ -94,25 +85,18 @@ def apply(
             "--directions", help="Write points of a camera as directions x/z, y/z instead of pixels."
         ),
     ] = False,
-    object_system: Annotated[
-        bool,
-        typer.Option("--object", help="Write points of an oscilloscope in the object coordinate system."),
+    object_coordinates: Annotated[
+        bool, Option("Write points of an oscilloscope in the object coordinate system.")
     ] = False,
     exposure_ms: Annotated[
         float | None,
         typer.Option(min=0.0, help="Exposure time of the frame (ms). Default: that of the calibration."),
     ] = None,
-    archive: Annotated[
-        str | None,
-        typer.Option("--archive", "-a", help="Archive with the calibrations in force of a configuration."),
-    ] = None,
-    objects: ObjectsPlace = None,
-    at: Annotated[
-        str | None,
-        typer.Option(help="With --archive: when the image was taken, such as 2026-03-29T08:00Z."),
-    ] = None,
-    anyway: Anyway = False,
-    as_json: AsJson = False,
+    archive: Annotated[v.Archive | None, "Here with the calibrations in force of a configuration."] = None,
+    objects: v.Objects | None = None,
+    at: Annotated[v.At | None, "Here when the image was taken; required with --archive."] = None,
+    anyway: v.Anyway = False,
+    as_json: v.AsJson = False,
 ) -> None:
     """Apply a calibration to points or to an image.
 
@@ -128,25 +112,25 @@ def apply(
 
     if scale is not None and not scale > 0:
         raise UsageError(f"{scale:g} is not positive", where="--scale")
-    in_archive = {"--at": at, "--objects": objects} if archive is None else {}
+    in_archive = {} if archive is not None else {"--at": at, "--objects": objects}
     for name, given in in_archive.items():
         if given is not None:
             raise UsageError("needs --archive", where=name)
-    if archive is None:
+    if archive is None or calibration.is_file():
         stored, origin = read_calibration(calibration), {calibration.name: sha256_of(calibration)}
     else:
         stored, origin = _in_force(archive, objects, str(calibration), at)
-    view = View(_fov(fov), scale, alpha)
-    if alpha is not None and fov != "keep":
-        raise UsageError("cannot be combined", where="--fov and --alpha")
+    view = View(_fov(fov), scale, opencv_alpha)
+    if opencv_alpha is not None and fov != "keep":
+        raise UsageError("cannot be combined", where="--fov and --opencv-alpha")
     of_camera = {
-        "--fov": fov != "keep", "--alpha": alpha is not None, "--directions": directions,
+        "--fov": fov != "keep", "--opencv-alpha": opencv_alpha is not None, "--directions": directions,
         "--tables": tables is not None, "--inverse": inverse,
     }  # fmt: skip
     _only(stored.kind, "camera", of_camera)
-    _only(stored.kind, "oscilloscope", {"--object": object_system})
+    _only(stored.kind, "oscilloscope", {"--object-coordinates": object_coordinates})
     _only(stored.kind, "sensor", {"--exposure-ms": exposure_ms is not None})
-    applied = Application.of(stored, view, object_system=object_system, origin=origin, anyway=anyway)
+    applied = Application.of(stored, view, object_system=object_coordinates, origin=origin, anyway=anyway)
     for line in applied.notes:
         typer.echo(f"note: {line}", err=True)
     if out is not None and not (source is not None and source.is_dir()):
@@ -162,8 +146,9 @@ def apply(
         _points(applied, source, out, as_json, inverse, directions)
     elif inverse:
         raise UsageError("applies to points only", where="--inverse")
-    elif object_system or directions:
-        raise UsageError("applies to points only", where="--object" if object_system else "--directions")
+    elif object_coordinates or directions:
+        where = "--object-coordinates" if object_coordinates else "--directions"
+        raise UsageError("applies to points only", where=where)
     elif stored.kind == "sensor":
         _frame(applied, source, out, exposure_ms, as_json)
     elif source.is_dir():
@@ -190,7 +175,7 @@ def _in_force(
     time = time_of(at, "--at")
     if time is None:
         raise UsageError("is needed with --archive", where="--at", do="say when the image was taken")
-    with open_archive(archive, objects) as found:
+    with Place(archive, objects).open() as found:
         applied = Configurations(found).applied(name, time)
     if applied is None:
         raise UsageError(f"has no calibration in force at {time:%Y-%m-%d %H:%M}Z", where=name)

@@ -2,41 +2,28 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .common import (
-    ArchivePlace,
-    AsJson,
-    ClusterAddress,
-    Jobs,
-    ObjectsPlace,
-    SessionName,
-    Store,
-    open_archive,
-    progress,
-    required,
-    say,
-    suffix_of,
-    writable,
-)
+from ..core import vocabulary as v
+from .common import Computing, Place, SessionName, progress, required, say, suffix_of, writable
+from .declared import Commands
 
 if TYPE_CHECKING:
     from ..archive import ArchivedFrame
 
 __all__ = ["app"]
 
-app = typer.Typer(no_args_is_help=True, help="List, show, verify, export and recompute archived sessions.")
+app = Commands(help="List, show, verify, export and recompute archived sessions.")
 
 
 @app.command("list")
-def list_(archive: ArchivePlace = "archive", objects: ObjectsPlace = None, as_json: AsJson = False) -> None:
+def list_(place: Place, as_json: v.AsJson = False) -> None:
     """List the sessions of an archive."""
     from ..core.provenance import canonical_json
 
-    with open_archive(archive, objects) as found:
+    with place.open() as found:
         sessions = found.sessions()
     if as_json:
         rows = [vars(each) | {"begun": each.begun.isoformat()} for each in sessions]
@@ -50,16 +37,15 @@ def list_(archive: ArchivePlace = "archive", objects: ObjectsPlace = None, as_js
 @app.command()
 def show(
     session: SessionName,
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write the results to.")] = None,
-    as_json: AsJson = False,
+    place: Place,
+    out: Annotated[v.Out | None, "Here a folder, for the results."] = None,
+    as_json: v.AsJson = False,
 ) -> None:
     """Show a session: frames with verdicts, and results with their inputs."""
     from ..archive import describe
     from ..core.provenance import canonical_json
 
-    with open_archive(archive, objects) as found:
+    with place.open() as found:
         stored = found.session(session)
         if out is not None:
             stored.write_results(out)
@@ -82,12 +68,12 @@ def _verdict(frame: ArchivedFrame) -> str:
 
 
 @app.command()
-def verify(archive: ArchivePlace = "archive", objects: ObjectsPlace = None, as_json: AsJson = False) -> None:
+def verify(place: Place, as_json: v.AsJson = False) -> None:
     """Read every file, and compare its SHA-256 with the index."""
     from ..archive import verify as verified
     from ..core.provenance import canonical_json
 
-    with open_archive(archive, objects) as found, progress("verifying", len(found.files())) as step:
+    with place.open() as found, progress("verifying", len(found.files())) as step:
         result = verified(found, step)
     if as_json:
         say(canonical_json({"schema": "reseau-verified/1", **vars(result), "sound": bool(result)}))
@@ -102,42 +88,37 @@ def verify(archive: ArchivePlace = "archive", objects: ObjectsPlace = None, as_j
 @app.command()
 def export(
     session: SessionName,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Zip file to write.")],
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
+    out: Annotated[v.Out, "Here a zip file."],
+    place: Place,
 ) -> None:
     """Export a session to a zip file: frames, results and a table of contents."""
     from ..archive import export as exported
 
     suffix_of(writable(out), (".zip",))
-    with open_archive(archive, objects) as found:
+    with place.open() as found:
         count = exported(found.session(session), out)
     say(f"{out}: {count} files\n")
 
 
 @app.command()
 def rerun(
+    place: Place,
+    computing: Computing,
     session: Annotated[
         str | None, typer.Argument(help="Name of the session; by default all that have results.")
     ] = None,
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
-    jobs: Jobs = None,
-    cluster: ClusterAddress = "",
-    store: Store = "",
-    as_json: AsJson = False,
+    as_json: v.AsJson = False,
 ) -> None:
     """Recompute the results of sessions from their frames, and compare them byte for byte."""
     from .. import sessions
     from ..core.failure import Failure
     from ..core.provenance import canonical_json
-    from ..execution import executor_at
 
-    with open_archive(archive, objects) as found:
+    with place.open() as found:
         names = [each.name for each in found.sessions() if each.results] if session is None else [session]
     rows, same = [], True
-    with executor_at(jobs, cluster, store, ["reseau.sessions"], len(names)) as executor:
-        for name, done in sessions.rerun_all(archive, objects, names, executor):
+    with computing.executor(["reseau.sessions"], len(names)) as executor:
+        for name, done in sessions.rerun_all(place.archive, place.objects, names, executor):
             if isinstance(done, Failure):
                 if session is not None:
                     required(done, name)

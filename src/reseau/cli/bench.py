@@ -8,15 +8,17 @@ from typing import Annotated, Any
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import UsageError
+from ..core.options import Option
 from . import bench_by_hand as by_hand
-from .bench_by_hand import BenchPath
 from .bench_features import features
-from .common import AsJson, Out, say, writable
+from .common import say, writable
+from .declared import Commands
 
 __all__ = ["app"]
 
-app = typer.Typer(no_args_is_help=True, help="Find, check, simulate, and use instruments by hand.")
+app = Commands(help="Find, check, simulate, and use instruments by hand.")
 
 app.command()(by_hand.status)
 app.command()(by_hand.home)
@@ -30,7 +32,7 @@ app.command()(features)
 
 @app.command("list")
 def list_(
-    as_json: AsJson = False,
+    as_json: v.AsJson = False,
     write: Annotated[
         Path | None, typer.Option("--write", help="Write a bench file for what was found; a new file.")
     ] = None,
@@ -63,9 +65,9 @@ def list_(
 
 @app.command()
 def check(
-    bench: BenchPath = Path("bench.toml"),
-    seconds: Annotated[float, typer.Option(min=0.1, help="Time limit for each instrument (s).")] = 10.0,
-    as_json: AsJson = False,
+    bench: v.Bench = Path("bench.toml"),
+    timeout_s: Annotated[float, Option("Time limit for each instrument (s).", least=0.1)] = 10.0,
+    as_json: v.AsJson = False,
 ) -> None:
     """Connect all instruments and run their self-tests; list all failures."""
     from ..capture import Bench
@@ -73,7 +75,7 @@ def check(
 
     found = Bench.read(bench)
     try:
-        checked = found.check(seconds, "reseau bench check")
+        checked = found.check(timeout_s, "reseau bench check")
     finally:
         found.close()
     failed = sum(each.error is not None for each in checked)
@@ -97,16 +99,16 @@ def check(
 
 @app.command()
 def sim(
-    out: Out = None,
-    seed: Annotated[int, typer.Option(help="Seed of the simulated world.")] = 0,
-    table: Annotated[
+    out: v.Out | None = None,
+    seed: v.Seed = 0,
+    controller: Annotated[
         str, typer.Option(help="Controller of the turntable: zaber, smc100, kinesis, grbl, marlin, hand.")
     ] = "zaber",
     family: Annotated[str, typer.Option(help="Oscilloscope family: keysight, rigol-1000z, …")] = "keysight",
-    camera: Annotated[
+    scene: Annotated[
         str, typer.Option(help="Scene of the camera: screen, testfield, frame or sensor. Default: no camera.")
     ] = "",
-    scanner: Annotated[
+    scanners: Annotated[
         str, typer.Option(help="Ultrasonic scanner: ping360, bk, compactpulser, or all of them.")
     ] = "ping360",
     environment: Annotated[
@@ -141,7 +143,7 @@ def sim(
         int,
         typer.Option(min=1, max=4, help="Number of cameras before the testfield; several are a rig."),
     ] = 1,
-    seconds: Annotated[float, typer.Option(min=0.0, help="Running time (s); 0: until interrupted.")] = 0.0,
+    seconds: v.Seconds = 0.0,
 ) -> None:
     """Start simulated instruments on their real protocols, and print a bench.toml for them."""
     import threading
@@ -151,7 +153,8 @@ def sim(
 
     if out is not None:
         writable(out)
-    options: dict[str, Any] = {"table": table, "family": family, "camera": camera or None, "scanner": scanner}
+    options: dict[str, Any] = {"table": controller, "family": family, "camera": scene or None}
+    options |= {"scanner": scanners}
     options |= {"repeatable": repeatable, "flat": flat, "cameras": cameras}
     options |= {"environment": environment or None}
     if water:
@@ -160,7 +163,7 @@ def sim(
             "temperature_c": temperature,
         }  # fmt: skip
     with plugin("reseau.simulators", "bench")(seed, **options) as bench:
-        if camera and cameras == 1 and "[instruments.camera]" not in bench.toml:
+        if scene and cameras == 1 and "[instruments.camera]" not in bench.toml:
             typer.echo(
                 "no camera: it needs Aravis and PyGObject, which are not installed (on Debian: apt-get "
                 "install gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev pkg-config gcc, then "

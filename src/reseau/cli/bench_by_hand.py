@@ -12,18 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import InputError, ReseauError, StateError, UsageError
-from .acquisition import CameraName
-from .common import AsJson, Out, say, writable
+from ..core.options import Option
+from .common import say, writable
 
 if TYPE_CHECKING:
     from ..capture import Bench
     from ..instruments import Turntable
 
-__all__ = ["BenchPath", "expose", "home", "move", "set_", "status", "stop", "watch"]
+__all__ = ["expose", "home", "move", "set_", "status", "stop", "watch"]
 
-BenchPath = Annotated[Path, typer.Option("--bench", "-b", help="Bench file.")]
-TableName = Annotated[str | None, typer.Option("--table", help="Turntable to use, if there are several.")]
 _BENCH = Path("bench.toml")
 _PATIENCE_S = 15.0
 """Time that a process has to end a session that `stop` interrupts."""
@@ -54,7 +53,7 @@ def held_one(path: Path, kind: type, name: str | None, purpose: str) -> Iterator
         yield found
 
 
-def status(bench: BenchPath = _BENCH, as_json: AsJson = False) -> None:
+def status(bench: v.Bench = _BENCH, as_json: v.AsJson = False) -> None:
     """Show identity, positions and settings of each instrument, or who uses it; nothing moves."""
     from ..capture import Bench
     from ..core.provenance import canonical_json
@@ -108,8 +107,8 @@ def home(
     axes: Annotated[
         list[str] | None, typer.Argument(help="Axes. Default: those that have no reference.")
     ] = None,
-    bench: BenchPath = _BENCH,
-    table: TableName = None,
+    bench: v.Bench = _BENCH,
+    table: v.Table | None = None,
 ) -> None:
     """Find the reference of axes, one after the other. The axes move; Ctrl-C stops them."""
     from ..capture import by_hand
@@ -123,9 +122,9 @@ def home(
 
 def move(
     positions: Annotated[list[str], typer.Argument(help="Positions, as tilt=30 roll=-10.")],
-    bench: BenchPath = _BENCH,
-    table: TableName = None,
-    by: Annotated[bool, typer.Option("--by", help="The numbers are changes of the positions.")] = False,
+    bench: v.Bench = _BENCH,
+    table: v.Table | None = None,
+    relative: Annotated[bool, Option("The numbers are changes of the positions.")] = False,
 ) -> None:
     """Move axes, all at the same time, and wait. Ctrl-C stops them where they are."""
     from ..capture import by_hand
@@ -133,7 +132,7 @@ def move(
 
     wanted = dict(_number(text) for text in positions)
     with held_one(bench, Turntable, table, "reseau bench move") as found:
-        there = by_hand.targets(found, wanted, relative=by)
+        there = by_hand.targets(found, wanted, relative=relative)
         lost = [axis for axis in there if not found.state(axis).homed]
         if lost:
             raise StateError(
@@ -159,7 +158,7 @@ def _number(text: str) -> tuple[str, float]:
     raise UsageError(f"cannot interpret {text!r}", where="positions", do="write axis=number, as tilt=30")
 
 
-def stop(bench: BenchPath = _BENCH) -> None:
+def stop(bench: v.Bench = _BENCH) -> None:
     """Stop all motion, transmission and recording, also those of a session of another process.
 
     Such a session is asked to stop: it can be resumed. This is no emergency stop: it needs this computer, the
@@ -206,7 +205,7 @@ def _holders(bench: Bench) -> dict[int, str]:
 def set_(
     instrument: Annotated[str, typer.Argument(help="Instrument of the bench.")],
     changes: Annotated[list[str], typer.Argument(help="Settings, as exposure_us=2000 gain=3.")],
-    bench: BenchPath = _BENCH,
+    bench: v.Bench = _BENCH,
 ) -> None:
     """Change settings of an instrument, and in the bench file, which sets them at every connection."""
     from ..capture import Bench, BenchFile
@@ -252,28 +251,21 @@ def _with_settings(text: str, instrument: str, changes: dict[str, Any]) -> str:
 
 
 def expose(
-    out: Out = None,
-    bench: BenchPath = _BENCH,
-    camera: CameraName = None,
+    out: v.Out | None = None,
+    bench: v.Bench = _BENCH,
+    camera: v.Camera | None = None,
     exposure_us: Annotated[
         float | None, typer.Option(min=0.1, help="Exposure of this frame (µs). Default: as set.")
     ] = None,
-    auto: Annotated[
-        bool,
-        typer.Option(
-            "--auto", help="Set exposure and gain by the rule below, and keep them in the bench file."
-        ),
-    ] = False,
+    auto: Annotated[v.Auto, "They are kept in the bench file."] = False,
     percentile: Annotated[
         float, typer.Option(min=1.0, max=100.0, help="With --auto: percentile of the grey values.")
     ] = 99.5,
     share: Annotated[
         float, typer.Option(min=0.01, max=0.99, help="With --auto: its share of full scale.")
     ] = 0.8,
-    longest_ms: Annotated[
-        float, typer.Option(min=0.001, help="With --auto: longest exposure; then the gain is raised.")
-    ] = 50.0,
-    as_json: AsJson = False,
+    longest_ms: Annotated[v.LongestMs, "Here with --auto; then the gain is raised."] = 50.0,
+    as_json: v.AsJson = False,
 ) -> None:
     """Take a frame, and say how it is exposed and how sharp it is; it is not archived."""
     from ..capture import LightRule, steer
@@ -342,12 +334,12 @@ def _words(facts: dict[str, Any]) -> str:
 
 
 def watch(
-    bench: BenchPath = _BENCH,
-    every: Annotated[float, typer.Option(min=0.1, help="Time between two lines (s).")] = 1.0,
-    count: Annotated[int, typer.Option(min=0, help="Number of lines; 0: until Ctrl-C.")] = 0,
-    camera: CameraName = None,
-    table: TableName = None,
-    as_json: AsJson = False,
+    bench: v.Bench = _BENCH,
+    every: v.Every = 1.0,
+    limit: v.Limit = 0,
+    camera: v.Camera | None = None,
+    table: v.Table | None = None,
+    as_json: v.AsJson = False,
 ) -> None:
     """Show positions of the table, and exposure and sharpness of the camera, again and again.
 
@@ -366,7 +358,7 @@ def watch(
         raise InputError("has no camera and no table", where=bench)
     number = 0
     with _held(found.part(names), "reseau bench watch"), suppress(KeyboardInterrupt):
-        while not count or number < count:
+        while not limit or number < limit:
             axes = {} if stand is None else by_hand.axes_of(stand)
             facts = {} if eye is None else _facts(eye.expose().frame)
             if as_json:
@@ -379,5 +371,5 @@ def watch(
                 )
                 say("  |  ".join(filter(None, (places, _words(facts) if facts else ""))) + "\n")
             number += 1
-            if not count or number < count:
+            if not limit or number < limit:
                 time.sleep(every)

@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import UsageError
-from .acquisition import CameraName
-from .bench_by_hand import BenchPath, held_one
-from .common import AsJson, say
+from .bench_by_hand import held_one
+from .common import say
 
 __all__ = ["features"]
 
@@ -19,18 +19,15 @@ def features(
     search: Annotated[
         str, typer.Argument(help="Text in name, category, unit, values or description. Default: all.")
     ] = "",
-    bench: BenchPath = Path("bench.toml"),
-    camera: CameraName = None,
-    change: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Set a feature, within its range; repeatable."),
-    ] = None,
+    bench: v.Bench = Path("bench.toml"),
+    camera: v.Camera | None = None,
+    set_: Annotated[v.Set | None, "Here a feature, within its range."] = None,
     save: Annotated[str, typer.Option("--save-set", help="Keep the present values in this user set.")] = "",
     compare: Annotated[
         str,
         typer.Option("--compare", help="User sets to compare, as UserSet1,UserSet2; one: with the present."),
     ] = "",
-    as_json: AsJson = False,
+    as_json: v.AsJson = False,
 ) -> None:
     """List features of a GenICam camera with values, ranges and units; set them; save and compare user sets.
 
@@ -40,7 +37,7 @@ def features(
     from ..core.provenance import canonical_json
     from ..instruments import Camera
 
-    wanted = dict(_pair(text) for text in change or [])
+    wanted = dict(_pair(text) for text in set_ or [])
     with held_one(bench, Camera, camera, "reseau bench features") as found:
         if not hasattr(found, "user_sets"):
             raise UsageError("has no GenICam features", where=found.name)

@@ -2,103 +2,81 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from .common import (
-    AsJson,
-    MaxRotation,
-    Mirrored,
-    Out,
-    Overlay,
-    SensorFile,
-    orientation,
-    read_frame,
-    suffix_of,
-    writable,
-)
-from .measure import Task
+from ..core import vocabulary as v
+from .common import Reading, orientation, suffix_of, writable
+from .measure import BY_DESIGN, NOT_NOMINAL, Image, Output, Task
 
 if TYPE_CHECKING:
     from ..core.data import Frame
-    from ..measure.blurred import BlurredResult
-    from ..optics.lenses import RayMap
+    from ..exchange import Lens
+    from ..measure.blurred import BlurredOptions, BlurredResult
+    from ..optics.lenses import LensCamera, RayMap
 
-__all__ = ["FNumber", "Focus", "LensFile", "Pitch", "Psf", "Search", "blurred"]
+__all__ = ["BESIDE_RAYS", "Matching", "blurred"]
 
-LensFile = Annotated[
-    Path, typer.Option("--lens", "-l", help="Lens: lens/1 (TOML), Zemax .zmx or CODE V .seq.")
-]
-Focus = Annotated[
-    float | None,
-    typer.Option(
-        min=1e-3,
-        help="Distance from the front of the lens at which objects in air are sharp (mm). "
-        "Default: the image plane of the lens file.",
-    ),
-]
-Pitch = Annotated[
-    float | None,
-    typer.Option(
-        min=0.1,
-        max=1000,
-        help="Pitch of the pixels (µm), if the lens file has no sensor; the axis of the lens is "
-        "then at the centre of the image.",
-    ),
-]
-FNumber = Annotated[
-    float | None, typer.Option(min=0.3, help="F-number, if the stop is not as wide as in the lens file.")
-]
-Psf = Annotated[
-    float,
-    typer.Option(min=0.1, help="Blur of sensor and diffraction beside that of the rays (px, one sigma)."),
-]
-Search = Annotated[float, typer.Option(min=1, help="Largest distance from the predicted position (px).")]
+BESIDE_RAYS = "Here what blurs beside the rays: sensor and diffraction."
+
+
+@dataclass(frozen=True)
+class Matching:
+    """How blurred targets are matched, and the lens that forms their images."""
+
+    pitch_mm: Annotated[
+        v.PitchMm | None,
+        "Here if the lens file has no sensor; the axis of the lens is then at the centre of the image.",
+    ] = None
+    focus: v.Focus | None = None
+    f_number: v.FNumber | None = None
+    psf_px: Annotated[v.PsfPx, BESIDE_RAYS] = 0.5
+    search_px: v.SearchPx = 6.0
+
+    def camera(self, lens: Lens, size: tuple[int, int]) -> LensCamera:
+        """Return the lens with a sensor of a size in pixels."""
+        from ..procedures.blurred import lens_camera
+
+        return lens_camera(lens, size, pitch_mm=self.pitch_mm, distance=self.focus, f_number=self.f_number)
+
+    def options(self, polarity: Literal["dark", "bright"], fill: float) -> BlurredOptions:
+        """Return the options of the measurement."""
+        from ..measure.blurred import BlurredOptions
+
+        return BlurredOptions(polarity=polarity, psf_px=self.psf_px, search_px=self.search_px, fill=fill)
 
 
 def blurred(
-    image: Annotated[Path, typer.Argument(help="Image.")],
-    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the targets, in mm.")],
-    lens: LensFile,
+    image: Image,
+    design: v.Design,
+    lens: v.Lens,
+    reading: Reading,
+    output: Output,
+    matching: Matching,
     network: Annotated[
-        Path | None,
-        typer.Option(
-            "--network",
-            "-n",
-            help="Network with the orientation of the image, as written by `reseau bundle`. Default: the "
-            "image is oriented by its targets.",
-        ),
+        v.Network | None,
+        "Here with the orientation of the image, as written by `reseau bundle`. Default: the image is "
+        "oriented by its targets.",
     ] = None,
-    focus: Focus = None,
-    focus_sigma: Annotated[
+    focus_sigma_mm: Annotated[
         float | None,
         typer.Option(
             min=1e-4,
             max=10,
+            rich_help_panel="Adjustment",
             help="Standard deviation of the place of the image plane (mm): it is then estimated from all "
             "targets.",
         ),
     ] = None,
-    pitch: Pitch = None,
-    f_number: FNumber = None,
-    psf: Psf = 0.5,
-    search: Search = 6.0,
-    mirrored: Mirrored = None,
-    max_rotation: MaxRotation = None,
-    out: Out = None,
-    overlay: Overlay = None,
+    mirrored: Annotated[v.Mirrored | None, BY_DESIGN] = None,
+    max_rotation_deg: Annotated[v.MaxRotationDeg | None, NOT_NOMINAL] = None,
     figure: Annotated[
-        Path | None,
-        typer.Option(
-            help="Figure of the most blurred target to write (.svg, .png, .pdf): rays, formed image, "
-            "photograph, residuals."
-        ),
+        v.Figure | None,
+        "Here of the most blurred target (.svg, .png, .pdf): rays, formed image, photograph, residuals.",
     ] = None,
-    sensor: SensorFile = None,
-    as_json: AsJson = False,
 ) -> None:
     """Measure blurred targets: the places of their corresponding rays.
 
@@ -110,40 +88,31 @@ def blurred(
     from ..io import BoardDesign, ReseauDesign
     from ..io.reading import read_design
     from ..measure import ReseauOptions, measure_reseau
-    from ..measure.blurred import BlurredOptions
-    from ..procedures.blurred import calibrated_by, lens_camera, measure_blurred_frame, pose_in_network
+    from ..procedures.blurred import calibrated_by, measure_blurred_frame, pose_in_network
 
     kind = "" if figure is None else suffix_of(writable(figure), (".svg", ".png", ".pdf"))
-    task = Task(image, out, overlay, as_json, "targets", "deviations from the orientation")
+    task = Task(image, output, "targets", "deviations from the orientation")
     target, optics = read_design(design), read_lens(lens)
     if isinstance(target, BoardDesign):
         raise UsageError("is a board", where=design, do="give a testfield or a reseau")
-    frame = read_frame(image, sensor=sensor)
-    size = frame.width, frame.height
-    camera = lens_camera(optics, size, pitch_um=pitch, distance=focus, f_number=f_number)
-    options = BlurredOptions(
-        polarity=target.polarity,
-        psf_px=psf,
-        search_px=search,
-        fill=1.0 if optics.sensor is None else optics.sensor.fill,
-    )
-    view: RayMap = camera
-    pose, sharp = None, None
-    if network is not None:  # it determines the orientation; names need no help
-        block = read_network(network)
-        pose = pose_in_network(block, image.name, target)
-        view = calibrated_by(camera, block, image.name)
-    elif isinstance(target, ReseauDesign):
-        # Where the targets lie is predicted in the design as the image shows it.
-        turned = ReseauOptions(**orientation(None if mirrored is None else False, max_rotation))
+    fill = 1.0 if optics.sensor is None else optics.sensor.fill
+    options = matching.options(target.polarity, fill)
+    block = None if network is None else read_network(network)
+    sharp = None
+    if block is None:  # a network determines the orientation: names need no help
         target = target.from_behind() if mirrored else target
-        sharp = partial(measure_reseau, design=target, options=turned)
-    elif mirrored:
-        target = target.from_behind()
+        if isinstance(target, ReseauDesign):
+            # Where the targets lie is predicted in the design as the image shows it.
+            turned = ReseauOptions(**orientation(None if mirrored is None else False, max_rotation_deg))
+            sharp = partial(measure_reseau, design=target, options=turned)
 
-    def measured(_: Frame) -> BlurredResult | Failure:
+    def measured(frame: Frame) -> BlurredResult | Failure:
+        view: RayMap = matching.camera(optics, (frame.width, frame.height))
+        pose = None
+        if block is not None:
+            pose, view = pose_in_network(block, image.name, target), calibrated_by(view, block, image.name)
         found = measure_blurred_frame(
-            frame, target, view, pose, options, sharp=sharp, focus_sigma_mm=focus_sigma
+            frame, target, view, pose, options, sharp=sharp, focus_sigma_mm=focus_sigma_mm
         )
         if isinstance(found, Failure):
             return found
@@ -156,4 +125,4 @@ def blurred(
             write_whole(figure, to_bytes(drawn, kind[1:], dpi=150))
         return found.measured
 
-    task.run(lambda: frame, measured)
+    task.run(reading, measured)

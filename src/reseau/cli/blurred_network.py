@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .blurred import FNumber, Focus, Pitch, Psf, Search
-from .common import Jobs, SensorFile, progress, read_frame, required, say
+from ..core import vocabulary as v
+from .blurred import Matching
+from .common import Reading, progress, required, say
 
 if TYPE_CHECKING:
     from ..bundle import Network
@@ -30,48 +31,27 @@ def blurred_network(
         Path,
         typer.Option("--images", help="Folder with the photographs, named as the images of the network."),
     ],
-    targets: Annotated[
-        Path,
-        typer.Option("--targets", "-t", help="Targets, reseau-targets/1: shape, size and direction."),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out", "-o", help="Folder to write: every round, the final network, its result, a report."
-        ),
-    ],
+    targets: v.Targets,
+    out: Annotated[v.Out, "Here a folder: every round, the final network, its result, a report."],
+    matching: Matching,
+    reading: Reading,
     lens: Annotated[
-        Path | None,
-        typer.Option(
-            "--lens",
-            "-l",
-            help="Lens: lens/1 (TOML), Zemax .zmx or CODE V .seq. Without it a thin lens with the principal "
-            "distance of the camera stands in: give --focus and --f-number.",
-        ),
+        v.Lens | None,
+        "Without it a thin lens with the principal distance of the camera stands in: give --focus and "
+        "--f-number.",
     ] = None,
-    focus: Focus = None,
-    pitch: Pitch = None,
-    f_number: FNumber = None,
-    psf: Psf = 0.5,
-    search: Search = 6.0,
-    rounds: Annotated[int, typer.Option(min=1, help="Largest number of rounds.")] = 6,
-    initial: Annotated[
-        str,
-        typer.Option(
-            help="Ordinary coordinates: given (those of the network), centroid, or edge (ellipses), measured "
-            "near the given ones."
-        ),
-    ] = "given",
+    rounds: v.Rounds = 6,
+    initial: v.Initial = "given",
     keep_sharp: Annotated[
         bool,
         typer.Option(
             "--keep-sharp/--replace-sharp",
+            rich_help_panel="Adjustment",
             help="Whether sharp targets keep coordinates that do not differ significantly from those by "
             "rays: given ones always, others where they are as certain.",
         ),
     ] = True,
-    sensor: SensorFile = None,
-    jobs: Jobs = None,
+    jobs: v.Jobs | None = None,
 ) -> None:
     """Measure the blurred targets of a network by rays and adjust it, until sigma0 no longer falls."""
     from ..bundle import ResultDocument
@@ -82,28 +62,20 @@ def blurred_network(
     from ..io import write_whole
     from ..io.network import Network1
     from ..io.targets import SpaceTargets
-    from ..measure.blurred import BlurredOptions
     from ..procedures.blurred_network import NetworkOptions, final_document, measure_blurred_network
     from ..report.blurred_network import blurred_network_report
 
-    if initial not in ("given", "centroid", "edge"):
-        raise UsageError(f"is {initial!r}", where="--initial", do="use given, centroid or edge")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError("exists already", where=out, do="give a new or an empty folder")
     document, content = Network1.read(network), read_network(network)
-    lenses, fill = _lenses(content, lens, focus, pitch, f_number)
+    lenses, fill = _lenses(content, lens, matching)
     space = SpaceTargets.read(targets)
     frames: dict[str, Frame] = {}
     for image, file in _photographs(images, content).items():
-        frames[image] = read_frame(file, sensor=sensor)
+        frames[image] = reading.frame(file)
     if not frames:
         raise UsageError("has no photograph of an image of the network", where=images)
-    matching = BlurredOptions(
-        polarity=space.polarity,
-        psf_px=psf,
-        search_px=search,
-        fill=fill,
-    )
+    options = matching.options(space.polarity, fill)
     modules = ["reseau.procedures.blurred_network"]
     with executor_at(jobs, "", "", modules, len(frames)) as executor, progress("measuring", 5) as step:
         found = required(
@@ -112,7 +84,7 @@ def blurred_network(
                 frames,
                 space,
                 lenses,
-                NetworkOptions(matching, rounds, keep_sharp, initial=cast(Any, initial)),
+                NetworkOptions(options, rounds, keep_sharp, initial),
                 watch=step,
                 executor=executor,
             ),
@@ -121,15 +93,7 @@ def blurred_network(
     inputs = [network, *calibration_files(network), targets, *([] if lens is None else [lens])]
     provenance = Provenance(
         {file.name: sha256_of(file) for file in inputs},
-        {
-            "focus": focus,
-            "pitch": pitch,
-            "f-number": f_number,
-            "psf": psf,
-            "search": search,
-            "initial": initial,
-            "keep sharp": keep_sharp,
-        },
+        {**vars(matching), "initial": initial, "keep_sharp": keep_sharp},
     )
     out.mkdir(parents=True, exist_ok=True)
     for number, entry in enumerate(found.rounds):
@@ -141,29 +105,23 @@ def blurred_network(
 
 
 def _lenses(
-    network: Network, lens: Path | None, focus: float | None, pitch: float | None, f_number: float | None
+    network: Network, lens: Path | None, matching: Matching
 ) -> tuple[dict[str, LensCamera | ThinLens], float]:
     """Lenses by camera, and the light-sensitive share of a pixel."""
     from ..core.errors import UsageError
     from ..exchange import read_lens
-    from ..procedures.blurred import lens_camera, thin_lens_of
+    from ..procedures.blurred import thin_lens_of
 
     if lens is not None:
         optics = read_lens(lens)
-        known = {
-            camera.id: lens_camera(
-                optics, (camera.width, camera.height), pitch_um=pitch, distance=focus, f_number=f_number
-            )
-            for camera in network.cameras
-        }
+        known = {each.id: matching.camera(optics, (each.width, each.height)) for each in network.cameras}
         return dict(known), 1.0 if optics.sensor is None else optics.sensor.fill
+    focus, f_number = matching.focus, matching.f_number
     if focus is None or f_number is None:
         raise UsageError("no design of the lens", do="give --lens, or --focus and --f-number for a thin lens")
-    if pitch is not None:
-        raise UsageError("is that of the cameras of the network", where="--pitch", do="leave it out")
-    return {
-        camera.id: thin_lens_of(camera, distance=focus, f_number=f_number) for camera in network.cameras
-    }, 1.0
+    if matching.pitch_mm is not None:
+        raise UsageError("is that of the cameras of the network", where="--pitch-mm", do="leave it out")
+    return {each.id: thin_lens_of(each, distance=focus, f_number=f_number) for each in network.cameras}, 1.0
 
 
 def _photographs(folder: Path, network: Network) -> dict[str, Path]:

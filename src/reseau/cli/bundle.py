@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from ..core import vocabulary as v
+from ..core.options import Group, Option
 from .bundle_options import (
-    Alpha,
-    ComponentsOf,
-    DatumChoice,
-    Distances,
-    Eliminate,
-    Memory,
-    Reject,
-    component_kind,
     level_of,
     outputs,
     positive,
@@ -28,7 +23,7 @@ from .bundle_options import (
     say_rig,
     say_turntable,
 )
-from .common import AsJson, Out, progress, required, say
+from .common import progress, required, say
 
 if TYPE_CHECKING:
     from ..bundle import Network, Result
@@ -48,38 +43,37 @@ def bundle(
             "or a folder of COLMAP, OpenPTV or MicMac."
         ),
     ],
-    out: Out = None,
-    reject: Reject = False,
-    alpha: Alpha = 0.001,
-    components: ComponentsOf = None,
-    eliminate: Eliminate = None,
-    cov: Annotated[
-        bool, typer.Option("--cov", help="Include full covariances of the points in the result.")
-    ] = False,
-    camera: Annotated[
+    out: v.Out | None = None,
+    camera_calibration: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Calibration of a camera of the network, or orientation of its film frame, "
-            "as ID=calibration.json; repeatable."
+        Option(
+            "Calibration of a camera of the network, or orientation of its film frame; repeatable.",
+            Group.CAMERA,
+            value="ID=FILE",
         ),
     ] = None,
-    free: Annotated[
-        list[str] | None,
-        typer.Option(help="Parameters to estimate, e.g. K1,K2 or ID:K1 for one camera; all; repeatable."),
-    ] = None,
+    free: Annotated[v.Free, "ID:K1 for one camera; all."] = (),
     fix: Annotated[
-        list[str] | None, typer.Option(help="Parameters to hold at their given values; as --free.")
-    ] = None,
-    control: Annotated[
-        Path | None,
-        typer.Option(help="Control points, id,x,y,z[,sx,sy,sz]; held without sigmas, otherwise observed."),
-    ] = None,
+        tuple[str, ...],
+        Option("Parameters to hold at their given values; as --free.", Group.CAMERA, value="c,x0,y0,K1"),
+    ] = (),
+    control: Annotated[v.Control | None, "Held without sigmas, otherwise observed."] = None,
     datum: Annotated[
-        DatumChoice | None, typer.Option(help="What defines position, orientation and scale.")
+        Literal["control", "minimal", "free"] | None,
+        Option("What defines position, orientation and scale.", Group.ADJUSTMENT),
     ] = None,
-    sigma: Annotated[
-        float | None, typer.Option(help="Standard deviation of all image coordinates, pixels.")
-    ] = None,
+    sigma_px: v.SigmaPx | None = None,
+    reject: v.Reject = False,
+    alpha: Annotated[v.Alpha, "Here of data snooping."] = 0.001,
+    components: v.Components | None = None,
+    eliminate: v.Eliminate | None = None,
+    distance: v.Distance | None = None,
+    cov: Annotated[
+        bool,
+        typer.Option(
+            "--cov", help="Include full covariances of the points in the result.", rich_help_panel="Files"
+        ),
+    ] = False,
     convert: Annotated[
         Path | None,
         typer.Option(help="Write the network as reseau-network/1 with these settings; nothing is adjusted."),
@@ -90,10 +84,9 @@ def bundle(
             help="Write the adjusted network: .json (reseau-network/1), .bal, or a folder for COLMAP."
         ),
     ] = None,
-    report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
-    distance: Distances = None,
-    memory: Memory = None,
-    as_json: AsJson = False,
+    report: v.Report | None = None,
+    memory_gb: v.MemoryGb | None = None,
+    as_json: v.AsJson = False,
 ) -> None:
     """Adjust a network of images: orientation, calibration and object points, with their uncertainty."""
     from ..bundle import Options, ResultDocument, search_model
@@ -106,23 +99,22 @@ def bundle(
     outputs(out, report)
     outputs(convert, None)
     distance = positive(distance)
-    calibrations = _calibrations(camera or [])
-    chosen = None if datum is None else datum.value
-    content = _with_settings(read_network(network, calibrations), free, fix, control, chosen, sigma)
+    calibrations = _calibrations(camera_calibration or [])
+    content = _with_settings(read_network(network, calibrations), free, fix, control, datum, sigma_px)
     if convert is not None:
         network_document(content).write(convert)
         return
     with progress("adjusting", 30) as step:
         options = Options(
-            outliers="reject" if reject else "keep", alpha=alpha, memory_gb=memory,
+            outliers="reject" if reject else "keep", alpha=alpha, memory_gb=memory_gb,
             watch=lambda k, cost: step(f"iteration {k}"),
         )  # fmt: skip
-        found = search_model(content, options, component_kind(components), level_of(eliminate, "--eliminate"))
+        found = search_model(content, options, components, level_of(eliminate, "--eliminate"))
         result = required(found, network)
-    settings = {"reject": reject, "alpha": alpha, "components": component_kind(components),
-                "eliminate": eliminate, "free": free, "fix": fix, "datum": chosen,
-                "sigma": sigma, "memory": memory}  # fmt: skip
-    settings = {key: value for key, value in settings.items() if key in _ALWAYS or value is not None}
+    settings = {"reject": reject, "alpha": alpha, "components": components,
+                "eliminate": eliminate, "free": free, "fix": fix, "datum": datum,
+                "sigma_px": sigma_px, "memory_gb": memory_gb}  # fmt: skip
+    settings = {key: value for key, value in settings.items() if key in _ALWAYS or value not in (None, ())}
     more = [*calibrations.values(), *([] if control is None else [control])]
     hashes = {file.name: sha256_of(file) for file in more}
     provenance = Provenance(_hashes(network) | hashes, settings)
@@ -156,29 +148,25 @@ def _export(result: Result, path: Path) -> None:
 
 def _with_settings(
     network: Network,
-    free: list[str] | None,
-    fix: list[str] | None,
+    free: Sequence[str],
+    fix: Sequence[str],
     control: Path | None,
-    datum: str | None,
-    sigma: float | None,
+    datum: Datum | None,
+    sigma_px: float | None,
 ) -> Network:
     """Return the network with what the user sets."""
     from ..bundle.network import with_control, with_datum, with_parameters, with_sigma
     from ..core.errors import UsageError
     from ..exchange import read_control
 
-    names = [
-        [name.strip() for text in given or [] for name in text.split(",") if name.strip()]
-        for given in (free, fix)
-    ]
-    network = with_parameters(network, *names)
+    network = with_parameters(network, free, fix)
     if control is not None:
         if datum not in (None, "control"):
             raise UsageError("cannot be combined with --control", where=f"--datum {datum}")
         network = with_control(network, read_control(control))
     if datum is not None:
-        network = with_datum(network, cast("Datum", datum))
-    return network if sigma is None else with_sigma(network, sigma)
+        network = with_datum(network, datum)
+    return network if sigma_px is None else with_sigma(network, sigma_px)
 
 
 def _hashes(path: Path) -> dict[str, str]:
@@ -193,14 +181,16 @@ def _hashes(path: Path) -> dict[str, str]:
 
 
 def _calibrations(texts: list[str]) -> dict[str, Path]:
-    """Calibration files by camera, from options ``ID=file``."""
+    """Calibration files by camera, from texts ``ID=file``."""
     from ..core.errors import UsageError
 
     found: dict[str, Path] = {}
     for text in texts:
         name, equals, file = text.partition("=")
         if not equals or not name or not file or name in found:
-            raise UsageError(f"is {text!r}", where="--camera", do="write ID=calibration.json, each ID once")
+            raise UsageError(
+                f"is {text!r}", where="--camera-calibration", do="write ID=calibration.json, each ID once"
+            )
         found[name] = Path(file)
     return found
 

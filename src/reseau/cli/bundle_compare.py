@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ..core import vocabulary as v
 from .bundle_options import say_difference
-from .common import AsJson, Out, say, suffix_of, writable
+from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
     from ..calibration import CameraMapping, FieldDifference
@@ -21,10 +22,10 @@ SCHEMA = "reseau-difference/1"
 def compare(
     first: Annotated[Path, typer.Argument(help="Calibration of a camera, reseau-calibration/1.")],
     second: Annotated[Path, typer.Argument(help="Another calibration of the same camera.")],
-    out: Out = None,
-    figure: Annotated[Path | None, typer.Option(help="Write a map of the difference, SVG.")] = None,
+    out: v.Out | None = None,
+    figure: Annotated[v.Figure | None, "Here a map of the difference, SVG."] = None,
     places: Annotated[int, typer.Option(min=2, help="Number of positions across the image.")] = 25,
-    as_json: AsJson = False,
+    as_json: v.AsJson = False,
 ) -> None:
     """Compare two calibrations of a camera: map their difference over the image and test its significance."""
     from ..calibration import calibration_difference

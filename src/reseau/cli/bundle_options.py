@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from .common import say, suffix_of, writable
 
 if TYPE_CHECKING:
     from ..bundle import (
         CameraEstimate,
-        Kind,
         MotionEstimates,
         PriorInfluence,
         RefractionEstimate,
@@ -24,14 +20,6 @@ if TYPE_CHECKING:
     from ..calibration import FieldDifference
 
 __all__ = [
-    "Alpha",
-    "ComponentsOf",
-    "DatumChoice",
-    "Distances",
-    "Eliminate",
-    "Memory",
-    "Reject",
-    "component_kind",
     "level_of",
     "outputs",
     "positive",
@@ -50,58 +38,6 @@ __all__ = [
 _MOST = 60
 _LARGER = 1.05
 """Ratio of a standard deviation to the formal one from which both are printed: less changes no digit."""
-
-
-class Components(StrEnum):
-    """Groups of image coordinates with separate variance components."""
-
-    AXES = "axes"
-    IMAGES = "images"
-    CAMERAS = "cameras"
-
-
-class DatumChoice(StrEnum):
-    """Datum of a network."""
-
-    CONTROL = "control"
-    MINIMAL = "minimal"
-    FREE = "free"
-
-
-Reject = Annotated[bool, typer.Option("--reject", help="Reject gross errors by data snooping.")]
-Alpha = Annotated[float, typer.Option(help="Significance level of each test of data snooping.")]
-ComponentsOf = Annotated[
-    Components | None,
-    typer.Option(
-        "--components", help="Estimate variance components of x and y, of each image, or of each camera."
-    ),
-]
-Eliminate = Annotated[
-    float | None,
-    typer.Option(
-        help="Drop distortion parameters that are not significant at this level, e.g. 0.05; cross-validate."
-    ),
-]
-Memory = Annotated[
-    float | None,
-    typer.Option(
-        min=0.0,
-        metavar="GB",
-        help="Memory that the normal equations may take, by default half of what is available. Larger "
-        "networks are solved by conjugate gradients, without some of their statistics.",
-    ),
-]
-Distances = Annotated[
-    list[float] | None,
-    typer.Option(
-        "--distance", help="Distance at which to map the uncertainty of the projection; repeatable."
-    ),
-]
-
-
-def component_kind(chosen: Components | None) -> Kind | None:
-    """Return the kind of variance components."""
-    return None if chosen is None else chosen.value
 
 
 def level_of(value: float | None, name: str) -> float | None:

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
-from enum import StrEnum
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import UsageError
+from ..core.options import Group, Option
 from .bundle_compare import read_lens
 from .bundle_options import (
-    ComponentsOf,
-    Distances,
-    Eliminate,
-    Memory,
-    Reject,
-    component_kind,
     level_of,
     outputs,
     positive,
@@ -33,24 +28,19 @@ from .bundle_options import (
     say_turntable,
 )
 from .common import (
-    AsJson,
-    Channel,
-    ClusterAddress,
-    Jobs,
-    SensorFile,
-    Store,
+    CameraChoice,
+    Computing,
+    Reading,
     overlay_files,
     progress,
-    read_frame,
     remark_lines,
     required,
     say,
     say_files_left_out,
-    sensor_correction,
 )
 
 if TYPE_CHECKING:
-    from ..bundle import BoardChoice, Kind, ModelChoice
+    from ..bundle import BoardChoice, ModelChoice
     from ..calibration import CameraMapping, FieldDifference, ProjectionField
     from ..core.data import Frame
     from ..core.provenance import Provenance
@@ -63,150 +53,192 @@ if TYPE_CHECKING:
 
 __all__ = ["calibrate"]
 
-Sigma = Annotated[
-    float | None,
-    typer.Option(min=1e-6, help="Sigma of all image coordinates, pixels; replaces the measured sigmas."),
-]
-Control = Annotated[
-    Path | None,
-    typer.Option(help="Control points of the target, CSV id,x,y,z[,sx,sy,sz]; by default a free network."),
-]
-Refraction = Annotated[
-    Path | None,
-    typer.Option(help="Windows and media before the target, reseau-refraction/1; lengths in mm."),
-]
+
+@dataclass(frozen=True)
+class _Camera(CameraChoice):
+    """The camera model, with what only photographs of a target need."""
+
+    model: Annotated[
+        v.Model,
+        "Here of all cameras; by default, or with `auto`, one is chosen for each camera. With --free alone "
+        "brown with --pitch-mm, otherwise opencv. An unknown name lists all.",
+    ] = ""
+    side: Annotated[
+        Literal["object", "image"] | None,
+        Option("Side of Brown's distortion. Default: object.", Group.CAMERA),
+    ] = None
+    model_option: Annotated[
+        list[str] | None,
+        Option(
+            "Option of the camera model, e.g. balance_radius_mm=8; repeatable.",
+            Group.CAMERA,
+            value="NAME=VALUE",
+        ),
+    ] = None
+    rolling_shutter: Annotated[
+        float | None,
+        Option(
+            "The sensor is read line by line while the camera moves; time from one line to the next "
+            "(negative: from the last line on). The motion during each image is estimated.",
+            Group.CAMERA,
+            value="SECONDS",
+        ),
+    ] = None
+    motion: Annotated[
+        tuple[str, ...],
+        Option(
+            "Components of the motion to estimate with a rolling shutter, by default vx,vy,vz,wx,wy,wz; "
+            "with a narrow lens vx,vy,wz.",
+            Group.CAMERA,
+            value="vx,vy,wz",
+        ),
+    ] = ()
+
+    def options(self) -> CameraOptions:
+        """Return the options of the calibration.
+
+        Raises
+        ------
+        UsageError
+            When options contradict each other.
+        """
+        from ..bundle import Shutter
+        from ..procedures.calibration_options import CameraOptions
+
+        options: dict[str, str | float] = {} if self.side is None else {"side": self.side}
+        for text in self.model_option or ():
+            name, equals, value = text.partition("=")
+            if not equals or name in options:
+                raise UsageError(
+                    f"is {text!r}", where="--model-option", do="write name=value, each name once"
+                )
+            options[name] = value
+        if self.motion and self.rolling_shutter is None:
+            raise UsageError("requires --rolling-shutter", where="--motion")
+        shutter = None
+        if self.rolling_shutter is not None:
+            shutter = Shutter("rolling", self.rolling_shutter)
+            shutter = replace(shutter, free=self.motion) if self.motion else shutter
+        model = self.model or ("" if self.free or options else "auto")
+        return CameraOptions(model, self.free, self.pitch_mm, options, shutter)
 
 
-class Target(StrEnum):
-    """Model of the target."""
+@dataclass(frozen=True)
+class _Adjustment:
+    """The network of the photographs, and its adjustment."""
 
-    FREE = "free"
-    FLAT = "flat"
-    AUTO = "auto"
+    target: Annotated[
+        Literal["free", "flat", "auto"],
+        Option(
+            "Points of the target: all free, flat as designed, or chosen by a test, which also says how "
+            "much the target is bent.",
+            Group.TARGET,
+        ),
+    ] = "free"
+    control: Annotated[v.Control | None, "By default a free network."] = None
+    refraction: Annotated[
+        Path | None,
+        Option("Windows and media before the target, reseau-refraction/1; lengths in mm.", Group.TARGET),
+    ] = None
+    turntable: Annotated[
+        Path | None,
+        Option(
+            "Angles of a turntable that carried the target, or the camera: CSV "
+            "image,angle_deg[,sigma_deg][,pose]; its axis is estimated.",
+            Group.TARGET,
+        ),
+    ] = None
+    sigma_px: Annotated[v.SigmaPx | None, "It replaces the measured ones."] = None
+    leave_out: Annotated[
+        list[str] | None,
+        Option("Image point to leave out; repeatable.", Group.ADJUSTMENT, value="PHOTO:POINT"),
+    ] = None
+    reject: v.Reject = False
+    components: v.Components | None = None
+    eliminate: v.Eliminate | None = None
+    memory_gb: v.MemoryGb | None = None
 
+    @property
+    def files(self) -> tuple[Path | None, ...]:
+        """The files that are read."""
+        return self.control, self.refraction, self.turntable
 
-LeaveOut = Annotated[
-    list[str] | None, typer.Option(help="Image point to leave out, e.g. photo.jpg:A1; repeatable.")
-]
+    def options(self) -> CalibrationOptions:
+        """Return the options of the procedure; their files are read.
+
+        Raises
+        ------
+        UsageError
+            When an option cannot be interpreted.
+        """
+        from ..bundle import Options
+        from ..exchange import read_control, read_turntable
+        from ..io.refraction import RefractionFile
+        from ..procedures.calibration_options import CalibrationOptions
+
+        pairs = []
+        for text in self.leave_out or ():
+            image, colon, point = text.rpartition(":")
+            if not colon or not image or not point:
+                raise UsageError(f"is {text!r}", where="--leave-out", do="write image:point, as photo.jpg:A1")
+            pairs.append((image, point))
+        return CalibrationOptions(
+            Options(outliers="reject" if self.reject else "keep", memory_gb=self.memory_gb),
+            self.sigma_px,
+            None if self.control is None else read_control(self.control),
+            tuple(pairs),
+            self.components,
+            level_of(self.eliminate, "--eliminate"),
+            refraction=None if self.refraction is None else RefractionFile.read(self.refraction),
+            target=self.target,
+            turntable=None if self.turntable is None else read_turntable(self.turntable),
+        )
 
 
 def calibrate(
+    camera: _Camera,
+    adjustment: _Adjustment,
+    reading: Reading,
+    computing: Computing,
     images: Annotated[
         list[Path] | None,
         typer.Argument(help="Photographs of the target, folders of them, or measured image coordinates."),
     ] = None,
     design: Annotated[
-        Path,
-        typer.Option(
-            "--design",
-            "-d",
-            help="Design of the testfield, board or reseau; by default it is looked for, among designs "
-            "beside the photographs, in the folder above and the current one, and those that `reseau design` "
-            "draws.",
-        ),
+        v.Design,
+        "By default, or with `auto`, it is looked for: among designs beside the photographs, in the folder "
+        "above and the current one, and those that `reseau design` draws.",
     ] = Path("auto"),
-    camera: Annotated[
+    rig: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=FILES",
-            help="Photographs of one of several cameras that are fixed to each other, in place of IMAGES: a "
+        Option(
+            "Photographs of one of several cameras that are fixed to each other, in place of IMAGES: a "
             "folder or a pattern, e.g. 'left=left/*.png'; repeatable. Files with the same name, or the same "
             "last number in it, were taken at once.",
+            value="NAME=FILES",
         ),
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            help="Folder to write: report, calibrations, files for OpenCV, ROS and COLMAP, and undistorted "
-            "samples; by default, without --json, beside that of the photographs, which is called photos: "
-            "photos-calibration. With the suffix .json the file of the calibration alone.",
-        ),
+        v.Out | None,
+        "Here a folder for report, calibrations, files for OpenCV, ROS, COLMAP and undistorted samples; by "
+        "default, without --json, photos-calibration beside the folder of the photographs, photos. With the "
+        "suffix .json the file of the calibration alone.",
     ] = None,
-    report: Annotated[Path | None, typer.Option(help="Report to write, HTML.")] = None,
-    overlay: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for a PNG of each photograph: what was measured, what was declined, and why."
-        ),
-    ] = None,
-    model: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="Camera model, of all cameras; by default, or with `auto`, one is chosen for each camera. "
-            "With --free alone brown with --pitch, otherwise opencv. An unknown name lists all.",
-        ),
-    ] = "",
-    pitch: Annotated[float | None, typer.Option(min=1e-6, help="Pixel size, mm; required by brown.")] = None,
-    side: Annotated[
-        str | None, typer.Option(help="Side of Brown's distortion: object (default) or image.")
-    ] = None,
-    model_option: Annotated[
-        list[str] | None,
-        typer.Option(help="Option of the camera model, e.g. balance_radius_mm=8; repeatable."),
-    ] = None,
-    free: Annotated[str, typer.Option(help="Parameters to estimate, e.g. c,x0,y0,K1.")] = "",
-    rolling: Annotated[
-        float | None,
-        typer.Option(
-            "--rolling-shutter",
-            metavar="SECONDS",
-            help="The sensor is read line by line while the camera moves; time from one line to the next "
-            "(negative: from the last line on). The motion during each image is estimated.",
-        ),
-    ] = None,
-    motion: Annotated[
-        str,
-        typer.Option(
-            help="Components of the motion to estimate with a rolling shutter, by default vx,vy,vz,wx,wy,wz; "
-            "with a narrow lens vx,vy,wz."
-        ),
-    ] = "",
-    size: Annotated[
-        str, typer.Option(help="Width×height in pixels, e.g. 640x480; required without photographs.")
-    ] = "",
-    channel: Annotated[Channel, typer.Option(help="Channel of colour images.")] = Channel.LUMA,
-    sensor: SensorFile = None,
-    sigma: Sigma = None,
-    control: Control = None,
-    refraction: Refraction = None,
-    turntable: Annotated[
-        Path | None,
-        typer.Option(
-            help="Angles of a turntable that carried the target, or the camera: CSV "
-            "image,angle_deg[,sigma_deg][,pose]; its axis is estimated."
-        ),
-    ] = None,
-    target_points: Annotated[
-        Target,
-        typer.Option(
-            "--target",
-            help="Points of the target: all free, flat as designed, or chosen by a test, which also says how "
-            "much the target is bent.",
-        ),
-    ] = Target.FREE,
-    leave_out: LeaveOut = None,
-    reject: Reject = False,
-    components: ComponentsOf = None,
-    eliminate: Eliminate = None,
-    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor, pixels.")] = 0.0,
-    fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive fraction of a pixel.")] = 1.0,
+    report: v.Report | None = None,
+    overlay: Annotated[v.Overlay | None, "Here a folder, for each photograph."] = None,
+    image_size: Annotated[v.ImageSize | None, "Required without photographs."] = None,
+    row_jitter_px: v.RowJitterPx = 0.0,
+    fill: v.Fill = 1.0,
     against: Annotated[
         list[Path] | None, typer.Option(help="Calibration of the same camera to compare with; repeatable.")
     ] = None,
-    distance: Distances = None,
-    memory: Memory = None,
-    jobs: Jobs = None,
-    cluster: ClusterAddress = "",
-    store: Store = "",
-    as_json: AsJson = False,
+    distance: v.Distance | None = None,
+    as_json: v.AsJson = False,
 ) -> None:
     """Calibrate a camera from photographs of a target."""
-    photographs, taken = _photographs(images or [], camera or [])
+    photographs, taken = _photographs(images or [], rig or [])
     files = list(photographs.values())
-    executor = _executor(files, jobs, cluster, store)
+    executor = _executor(files, computing)
     if overlay is not None and not executor.local:
         raise UsageError("is drawn by this machine only", where="--overlay", do="leave out --cluster")
     import numpy as np
@@ -227,46 +259,42 @@ def calibrate(
     outputs(None if folder else out, report)
     drawn = {} if overlay is None else overlay_files(overlay, files)
     distance = positive(distance)
-    kind, automatic = component_kind(components), str(design) == "auto"
-    target = _found_target(files, channel, sensor) if automatic else read_target(design)
+    automatic = str(design) == "auto"
+    target = _found_target(files, reading) if automatic else read_target(design)
     others = {path.name: read_lens(path) for path in against or []}
     if others and taken:
         raise UsageError("requires one camera", where="--against", do="compare the cameras one by one")
-    level = level_of(eliminate, "--eliminate")
-
-    options = _options(
-        sigma, control, refraction, leave_out or [], reject, kind, level, target_points, turntable, memory
-    )
-    lens = _camera(model, pitch, side, model_option or [], free, rolling, motion)
-    measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter, fill=fill))
+    options, lens = adjustment.options(), camera.options()
+    measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter_px, fill=fill))
     measure = drawing_overlays(
         measure, {name: drawn[path] for name, path in photographs.items() if path in drawn}
     )
-    read = photograph_reader(channel.value, None if sensor is None else sensor_correction(sensor))
+    read = photograph_reader(reading.channel, reading.correction)
     about = {
         "compute": "points of a target", "design": sha256_of(target.to_json().encode()), "fill": fill,
-        "channel": channel.value, "row_jitter": row_jitter, "sensor": sha256_of(sensor) if sensor else None,
+        "channel": reading.channel, "row_jitter_px": row_jitter_px,
+        "sensor": sha256_of(reading.sensor) if reading.sensor else None,
     }  # fmt: skip
     # Overlays are drawn while photographs are measured.
-    kept = Outputs(store, about) if store and not drawn else None
+    kept = Outputs(computing.store, about) if computing.store and not drawn else None
     with executor, progress("measuring", len(files)) as step:
-        said, frames = photographs_of(list(photographs.items()), read, one_lens=not taken, store=store)
+        said, frames = photographs_of(
+            list(photographs.items()), read, one_lens=not taken, store=computing.store
+        )
         options = replace(options, focal_35_mm=said)
         found = calibrate_camera(
-            _shown(frames, step), target, measure, _size(size), lens, options, taken or None, executor, kept
+            _shown(frames, step), target, measure, image_size, lens, options, taken or None, executor, kept
         )
         done = required(found, _named(files))
     for note in done.notes:
         typer.echo(f"note: {note}", err=True)
-    named = (None if automatic else design, control, refraction, turntable, sensor)
-    inputs = {path.name: path for path in named if path} | photographs
-    provenance = _provenance(
-        inputs,
-        model=lens.model, pitch=pitch, options=dict(lens.options), free=free, sigma=sigma,
-        reject=reject, row_jitter=row_jitter, fill=fill, channel=channel.value, eliminate=eliminate,
-        leave_out=list(leave_out or []), components=kind, rolling_shutter=rolling, motion=motion or None,
-        **({} if memory is None else {"memory": memory}),
-    )  # fmt: skip
+    files_read = (None if automatic else design, *adjustment.files, reading.sensor)
+    inputs = {path.name: path for path in files_read if path} | photographs
+    settings = {
+        "model": lens.model, "options": dict(lens.options), "row_jitter_px": row_jitter_px, "fill": fill,
+        "channel": reading.channel,
+    }  # fmt: skip
+    provenance = _provenance(inputs, settings | _settings(camera) | _settings(adjustment))
     differences = _differences(done, others)
     calibrations = [
         done.calibration(entry.id if taken else target.name, provenance.to_dict(), entry.id)
@@ -275,8 +303,8 @@ def calibrate(
     if report is not None or folder is not None:
         page = bundle_report(
             done.result, title=f"Calibration with {target.name}", provenance=provenance, against=differences,
-            distances=distance, assessments=done.assessments, photograph=_pictures(photographs, channel),
-            declined=done.declined,
+            distances=distance, assessments=done.assessments,
+            photograph=_pictures(photographs, Reading(reading.channel)), declined=done.declined,
             days=sorted({day for path in photographs.values() if (day := read_exif(path).day)}),
         )  # fmt: skip
     if report is not None:
@@ -318,14 +346,12 @@ def _named(files: list[Path]) -> str:
     return str(one) if one.name else "photographs"
 
 
-def _found_target(
-    files: list[Path], channel: Channel, sensor: Path | None
-) -> ReseauDesign | TestfieldDesign | BoardDesign:
+def _found_target(files: list[Path], reading: Reading) -> ReseauDesign | TestfieldDesign | BoardDesign:
     """The target that photographs show."""
     from ..procedures.exposures import photograph_reader
     from ..procedures.which_target import target_of
 
-    read = photograph_reader(channel.value, None if sensor is None else sensor_correction(sensor))
+    read = photograph_reader(reading.channel, reading.correction)
     note, design = required(target_of(files, read), "--design auto")
     typer.echo(f"note: {note}", err=True)
     return design
@@ -337,9 +363,7 @@ def _photographs(images: list[Path], cameras: list[str]) -> tuple[dict[str, Path
 
     if not cameras:
         if not images:
-            raise UsageError(
-                "are missing", where="photographs", do="name IMAGES, or --camera for each camera"
-            )
+            raise UsageError("are missing", where="photographs", do="name IMAGES, or --rig for each camera")
         say_files_left_out(images)
         images = photographs_named(images)
         named = {path.name: path for path in images}
@@ -349,64 +373,41 @@ def _photographs(images: list[Path], cameras: list[str]) -> tuple[dict[str, Path
             raise UsageError("two photographs have this name", where=twice)
         return named, {}
     if images:
-        raise UsageError("cannot be combined with --camera", where=images[0])
+        raise UsageError("cannot be combined with --rig", where=images[0])
     files: dict[str, list[Path]] = {}
     for text in cameras:
         name, equals, pattern = text.partition("=")
         if not equals or not name or not pattern or name in files:
-            raise UsageError(f"is {text!r}", where="--camera", do="write name=files, each name once")
+            raise UsageError(f"is {text!r}", where="--rig", do="write name=files, each name once")
         files[name] = files_of(pattern)
         say_files_left_out([Path(pattern)])
     found = exposures_of_files(files)
     return {name: path for name, (path, _) in found.items()}, {name: at for name, (_, at) in found.items()}
 
 
-def _provenance(inputs: Mapping[str, Path], **settings: Any) -> Provenance:
+def _settings(options: CameraChoice | _Adjustment) -> dict[str, Any]:
+    """Options that were given, but for files: these are inputs."""
+    return {
+        name: value
+        for name, value in vars(options).items()
+        if value not in (None, (), "") and not isinstance(value, Path)
+    }
+
+
+def _provenance(inputs: Mapping[str, Path], settings: dict[str, Any]) -> Provenance:
     from ..core.provenance import Provenance, sha256_of
 
     return Provenance({name: sha256_of(path) for name, path in inputs.items()}, settings)
 
 
-def _options(
-    sigma: float | None,
-    control: Path | None,
-    refraction: Path | None,
-    leave_out: list[str],
-    reject: bool,
-    components: Kind | None,
-    level: float | None,
-    target: Target,
-    turntable: Path | None,
-    memory: float | None,
-) -> CalibrationOptions:
-    """Options of the procedure, from the options of the command."""
-    from ..bundle import Options
-    from ..exchange import read_control, read_turntable
-    from ..io.refraction import RefractionFile
-    from ..procedures.calibration_options import CalibrationOptions
-
-    pairs = []
-    for text in leave_out:
-        image, colon, point = text.rpartition(":")
-        if not colon or not image or not point:
-            raise UsageError(f"is {text!r}", where="--leave-out", do="write image:point, as photo.jpg:A1")
-        pairs.append((image, point))
-    return CalibrationOptions(
-        Options(outliers="reject" if reject else "keep", memory_gb=memory), sigma,
-        None if control is None else read_control(control), tuple(pairs), components, level,
-        refraction=None if refraction is None else RefractionFile.read(refraction), target=target.value,
-        turntable=None if turntable is None else read_turntable(turntable),
-    )  # fmt: skip
-
-
-def _executor(images: list[Path], jobs: int | None, cluster: str, store: str) -> Executor:
+def _executor(images: list[Path], computing: Computing) -> Executor:
     """What measures the photographs; its processes import in the background."""
     from ..core.processes import start_early
-    from ..execution import Processes, executor_at
+    from ..execution import Processes
     from ..io import is_points
 
     modules = ["reseau.procedures.target_measurement"]
-    executor = executor_at(jobs, cluster, store, modules, sum(not is_points(path) for path in images))
+    executor = computing.executor(modules, sum(not is_points(path) for path in images))
     if isinstance(executor, Processes):
         start_early(modules)
     return executor
@@ -419,50 +420,15 @@ def _shown(photographs: Iterator[Photograph], step: Callable[[str], None]) -> It
         yield each
 
 
-def _pictures(photographs: Mapping[str, Path], channel: Channel) -> Callable[[str], Frame | None]:
+def _pictures(photographs: Mapping[str, Path], reading: Reading) -> Callable[[str], Frame | None]:
     """The photographs, read again one by one: all of them would fill the memory."""
     from ..io import is_points
 
     def read(name: str) -> Frame | None:
         path = photographs[name]
-        return None if is_points(path) else read_frame(path, channel.value)
+        return None if is_points(path) else reading.frame(path)
 
     return read
-
-
-def _camera(
-    model: str, pitch: float | None, side: str | None, more: list[str], free: str, rolling: float | None,
-    motion: str,
-) -> CameraOptions:  # fmt: skip
-    """Camera model and parameters from the options of the command."""
-    from ..bundle import Shutter
-    from ..procedures.calibration_options import CameraOptions
-
-    options: dict[str, str | float] = {} if side is None else {"side": side}
-    for text in more:
-        name, equals, value = text.partition("=")
-        if not equals or name in options:
-            raise UsageError(f"is {text!r}", where="--model-option", do="write name=value, each name once")
-        options[name] = value
-    names = tuple(name.strip() for name in free.split(",") if name.strip())
-    chosen = tuple(name.strip() for name in motion.split(",") if name.strip())
-    if chosen and rolling is None:
-        raise UsageError("requires --rolling-shutter", where="--motion")
-    shutter = None
-    if rolling is not None:
-        shutter = Shutter("rolling", rolling, chosen) if chosen else Shutter("rolling", rolling)
-    model = model or ("" if names or options else "auto")
-    return CameraOptions(model, names, None if pitch is None else (pitch, pitch), options, shutter)
-
-
-def _size(text: str) -> tuple[int, int] | None:
-
-    if not text:
-        return None
-    width, _, height = text.replace("×", "x").partition("x")
-    if not width.isdigit() or not height.isdigit():
-        raise UsageError(f"is {text!r}", where="--size", do="write 640x480")
-    return int(width), int(height)
 
 
 def _differences(done: Calibrated, others: dict[str, CameraMapping]) -> dict[str, FieldDifference]:

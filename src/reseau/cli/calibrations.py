@@ -6,38 +6,32 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import EstimationError, UsageError
-from .common import ArchivePlace, AsJson, ObjectsPlace, Out, open_archive, say, suffix_of, writable
+from ..core.options import Option
+from .common import Place, say, suffix_of, writable
+from .declared import Commands
 
 if TYPE_CHECKING:
     from ..service import Configurations, Decision
 
 __all__ = ["app", "say_decision", "time_of"]
 
-app = typer.Typer(no_args_is_help=True, help="Calibrations in force: decide, review, return, history, drift.")
+app = Commands(help="Calibrations in force: decide, review, return, history, drift.")
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the configuration.")]
-Recorded = Annotated[
-    list[str] | None,
-    typer.Option("--recorded", help="Covariate that a sensor measured with the frames: temperature; repeat."),
-]
 Key = Annotated[str, typer.Argument(metavar="KEY", help="Decision, by the start of its key; see `history`.")]
-By = Annotated[str, typer.Option(help="By whom. Default: the user.")]
-Comment = Annotated[str, typer.Option("--comment", "-m", help="Why.")]
-Since = Annotated[
-    str | None, typer.Option(help="From when on it applies, such as 2026-03-29T08:00Z. Default: now.")
-]
 
 
 @contextmanager
-def _opened(archive: str, objects: str | None, *, create: bool = False) -> Iterator[Configurations]:
+def _opened(place: Place, *, create: bool = False) -> Iterator[Configurations]:
     from ..service import Configurations
 
-    with open_archive(archive, objects, create=create) as found:
+    with place.open(create=create) as found:
         yield Configurations(found)
 
 
@@ -66,12 +60,11 @@ def define(
     part: Annotated[
         list[str], typer.Option("--part", "-p", help="Part, KEY=VALUE: camera, lens, settings, firmware.")
     ],
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
+    place: Place,
 ) -> None:
     """Define a configuration of an instrument."""
     parts = dict(_pair(each) for each in part)
-    with _opened(archive, objects, create=True) as found:
+    with _opened(place, create=True) as found:
         found.define(name, parts)
     say(f"{name}: {', '.join(f'{k} {v}' for k, v in parts.items())}\n")
 
@@ -87,23 +80,19 @@ def _pair(text: str) -> tuple[str, str]:
 def decide(
     name: Name,
     calibration: Annotated[Path, typer.Argument(help="New calibration, reseau-calibration/1.")],
-    rules: Annotated[Path, typer.Option(help="Rules of acceptance, reseau-acceptance/1.")],
-    since: Annotated[
-        str | None,
-        typer.Option(help="From when on it applies. Default: the time of its session, or now."),
-    ] = None,
-    by: By = "",
-    comment: Comment = "",
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
-    as_json: AsJson = False,
+    rules: v.Rules,
+    place: Place,
+    since: Annotated[v.Since | None, "Default: the time of its session, or now."] = None,
+    by: v.By = "",
+    comment: v.Comment = "",
+    as_json: v.AsJson = False,
 ) -> None:
     """Judge a new calibration by rules, and put it in force if they accept it (exit status 0)."""
     from ..calibration import read_calibration
     from ..service import AcceptanceRules
 
     new, judged_by = read_calibration(calibration), AcceptanceRules.read(rules)
-    with _opened(archive, objects) as found:
+    with _opened(place) as found:
         made = found.decide(name, new, judged_by, since=time_of(since, "--since"), by=by, comment=comment)
     say_decision(made, as_json)
     raise typer.Exit(0 if made.outcome.startswith("accepted") else 1)
@@ -114,13 +103,12 @@ def review(
     name: Name,
     key: Key,
     outcome: Annotated[str, typer.Argument(metavar="accepted|rejected", help="Outcome of the review.")],
-    comment: Annotated[str, typer.Option("--comment", "-m", help="The reason.")],
-    by: By = "",
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
+    comment: v.Comment,
+    place: Place,
+    by: v.By = "",
 ) -> None:
     """Decide on a calibration that needs a review."""
-    with _opened(archive, objects) as found:
+    with _opened(place) as found:
         # Another text is refused by `review`.
         made = found.review(name, key, outcome, by=by, comment=comment)  # type: ignore[arg-type]
     say_decision(made, False)
@@ -131,12 +119,11 @@ def comment(
     name: Name,
     key: Key,
     text: Annotated[str, typer.Argument(help="Text.")],
-    by: By = "",
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
+    place: Place,
+    by: v.By = "",
 ) -> None:
     """Add a comment to a decision; the outcome stays as it is."""
-    with _opened(archive, objects) as found:
+    with _opened(place) as found:
         found.comment(name, key, text, by=by)
 
 
@@ -144,14 +131,13 @@ def comment(
 def return_(
     name: Name,
     key: Key,
-    since: Since = None,
-    by: By = "",
-    comment: Comment = "",
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
+    place: Place,
+    since: v.Since | None = None,
+    by: v.By = "",
+    comment: v.Comment = "",
 ) -> None:
     """Return to an earlier accepted calibration."""
-    with _opened(archive, objects) as found:
+    with _opened(place) as found:
         applied = found.roll_back(name, key, since=time_of(since, "--since"), by=by, comment=comment)
     say(f"{name}: {applied.key} applies from {applied.since:%Y-%m-%d %H:%M:%S}Z\n")
 
@@ -160,25 +146,23 @@ def return_(
 def event(
     name: Name,
     what: Annotated[str, typer.Argument(help="What happened: lens changed, camera dropped.")],
-    at: Annotated[str | None, typer.Option(help="When. Default: now.")] = None,
-    by: By = "",
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
+    place: Place,
+    at: v.At | None = None,
+    by: v.By = "",
 ) -> None:
     """Note a service event: from then on no calibration applies, and a run is due at once."""
-    with _opened(archive, objects) as found:
+    with _opened(place) as found:
         found.event(name, what, at=time_of(at, "--at"), by=by)
 
 
 @app.command()
 def show(
+    place: Place,
     name: Annotated[str | None, typer.Argument(metavar="NAME", help="Configuration. Default: all.")] = None,
-    at: Annotated[str | None, typer.Option(help="When the frame was taken. Default: now.")] = None,
-    known: Annotated[str | None, typer.Option(help="Use only what had been entered by this time.")] = None,
-    out: Out = None,
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
-    as_json: AsJson = False,
+    at: v.At | None = None,
+    known: Annotated[str | None, Option("Use only what had been entered by this time.", value="TIME")] = None,
+    out: v.Out | None = None,
+    as_json: v.AsJson = False,
 ) -> None:
     """Show the calibration that applies at a time; --out writes it."""
     from ..core.provenance import canonical_json
@@ -189,7 +173,7 @@ def show(
         if name is None:
             raise UsageError("needs the name of a configuration", where="--out")
     rows: list[dict[str, Any]] = []
-    with _opened(archive, objects) as found:
+    with _opened(place) as found:
         for each in found.names() if name is None else [name]:
             applied = found.applied(each, time, entered)
             row: dict[str, Any] = {"name": each, "parts": found.parts(each), "calibration": None}
@@ -210,13 +194,11 @@ def show(
 
 
 @app.command()
-def history(
-    name: Name, archive: ArchivePlace = "archive", objects: ObjectsPlace = None, as_json: AsJson = False
-) -> None:
+def history(name: Name, place: Place, as_json: v.AsJson = False) -> None:
     """Show all decisions with their findings, reviews and comments, and the service events."""
     from ..core.provenance import canonical_json
 
-    with _opened(archive, objects) as found:
+    with _opened(place) as found:
         decisions, events = found.history(name), found.events(name)
     if as_json:
         rows = [_row(each) for each in decisions]
@@ -258,17 +240,13 @@ def say_decision(made: Decision, as_json: bool) -> None:
 @app.command()
 def drift(
     name: Name,
+    place: Place,
     rate: Annotated[float, typer.Option(min=0.001, help="False alarms per year, of all charts.")] = 0.1,
     runs_per_year: Annotated[float, typer.Option(min=1, help="Number of runs in a year.")] = 52.0,
-    kind: Annotated[str, typer.Option(help="Chart: cusum, ewma or shewhart.")] = "cusum",
-    covariates: Annotated[
-        Path | None,
-        typer.Option(help="Table with the columns calibration and, for example, temperature [°C]."),
-    ] = None,
-    recorded: Recorded = None,
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
-    as_json: AsJson = False,
+    chart: Annotated[Literal["cusum", "ewma", "shewhart"], Option("Kind of the charts.")] = "cusum",
+    covariates: v.Covariates | None = None,
+    recorded: v.Recorded | None = None,
+    as_json: v.AsJson = False,
 ) -> None:
     """Chart all parameters and the field since the last service event; exit status 1 if one has drifted.
 
@@ -277,9 +255,9 @@ def drift(
     from ..core.provenance import canonical_json
     from ..service import ChartOptions, CovariateTable
 
-    options = ChartOptions(kind=kind, rate=rate, runs_per_year=runs_per_year)  # type: ignore[arg-type]
+    options = ChartOptions(kind=chart, rate=rate, runs_per_year=runs_per_year)
     table = None if covariates is None else CovariateTable.read(covariates)
-    with _opened(archive, objects) as found:
+    with _opened(place) as found:
         if recorded:
             _one_source(covariates)
             table = found.recorded(name, recorded)
@@ -348,15 +326,11 @@ def _one_source(covariates: Path | None) -> None:
 @app.command()
 def function(
     name: Name,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Function to write (.json).")],
-    covariates: Annotated[
-        Path | None,
-        typer.Option(help="Table with the columns calibration and, for example, temperature [°C]."),
-    ] = None,
-    recorded: Recorded = None,
+    out: Annotated[v.Out, "Here the function (.json)."],
+    place: Place,
+    covariates: v.Covariates | None = None,
+    recorded: v.Recorded | None = None,
     degree: Annotated[int, typer.Option(min=1, max=2, help="Degree of the polynomial.")] = 1,
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
 ) -> None:
     """Fit the calibrations since the last service event as a function of covariates.
 
@@ -368,7 +342,7 @@ def function(
     suffix_of(writable(out), (".json",))
     if covariates is None and not recorded:
         raise UsageError("none were given", where="covariates", do="give --covariates or --recorded")
-    with _opened(archive, objects) as opened:
+    with _opened(place) as opened:
         if covariates is None:
             table = opened.recorded(name, recorded or [])
         else:
@@ -390,7 +364,7 @@ def at(
         list[str],
         typer.Option("--covariate", "-c", help="NAME=VALUE, or NAME=VALUE±SIGMA."),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Calibration to write (.json).")],
+    out: Annotated[v.Out, "Here the calibration (.json)."],
 ) -> None:
     """Write the calibration at given values of the covariates, with what their uncertainties add."""
     from ..service import CalibrationFunction

@@ -8,29 +8,25 @@ from typing import Annotated, Any
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import UsageError
-from .acquisition import CameraName, Where, conduct, in_session
+from .acquisition import Where, conduct
 
 __all__ = ["own"]
 
 
-@in_session()
 def own(
     where: Where,
     generator: Annotated[
         Path | None, typer.Option("--generator", "-g", help="Python file with a generator `plan(run, …)`.")
     ] = None,
-    given: Annotated[
-        list[str] | None, typer.Option("--set", help="Argument of the plan, as tilt=30; repeatable.")
-    ] = None,
-    retakes: Annotated[int, typer.Option(min=0, help="Number of additional attempts after a bad frame.")] = 0,
-    camera: CameraName = None,
-    table: Annotated[
-        str | None, typer.Option("--table", help="Turntable to use, if there are several.")
-    ] = None,
+    set_: Annotated[v.Set | None, "Here arguments of the plan, as tilt=30."] = None,
+    retakes: v.Retakes = 0,
+    camera: v.Camera | None = None,
+    table: v.Table | None = None,
 ) -> None:
     """Carry out your own plan: a Python generator, stored with the session."""
-    values = dict(_value(text) for text in given or ())
+    values = dict(_value(text) for text in set_ or ())
     if generator is not None:
         from ..io import read_text
         from ..sessions import own_plan

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .acquisition import CameraName, Where, ask_operator, conduct, in_session
+from ..core import vocabulary as v
+from ..core.options import Option
+from .acquisition import Where, ask_operator, conduct
 from .common import say, writable
 from .sensor import event, lines
 
@@ -20,23 +22,17 @@ if TYPE_CHECKING:
 __all__ = ["sensor"]
 
 
-@in_session("out", "yes")
 def sensor(
     where: Where,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="File to write the calibration to, in addition to the archive."),
-    ] = None,
-    camera: CameraName = None,
-    levels: Annotated[int, typer.Option(min=5, help="Number of exposure times in light.")] = 14,
-    frames: Annotated[int, typer.Option(min=2, help="Number of frames for each exposure time.")] = 8,
-    longest_ms: Annotated[float, typer.Option(min=0.2, help="Longest exposure time (ms).")] = 1000.0,
-    edge: Annotated[bool, typer.Option("--edge", help="Also measure the MTF, with a slanted edge.")] = False,
-    region: Annotated[
-        tuple[int, int, int, int] | None, typer.Option(help="Region of the edge: left top width height (px).")
-    ] = None,
-    retakes: Annotated[int, typer.Option(min=0, help="Number of additional attempts after a bad frame.")] = 2,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not prompt.")] = False,
+    out: Annotated[v.Out | None, "Here the calibration, in addition to the archive."] = None,
+    camera: v.Camera | None = None,
+    levels: Annotated[int, Option("Number of exposure times in light.", least=5)] = 14,
+    frames: Annotated[int, Option("Number of frames for each exposure time.", least=2)] = 8,
+    longest_ms: v.LongestMs = 1000.0,
+    mtf: Annotated[bool, Option("Also measure the MTF, with a slanted edge.")] = False,
+    region: v.Region | None = None,
+    retakes: v.Retakes = 2,
+    yes: Annotated[bool, Option("Do not prompt.")] = False,
 ) -> None:
     """Calibrate a camera's sensor: dark signal, response, linearity, noise, gain, full well, defects, MTF."""
     if out is not None:
@@ -46,7 +42,7 @@ def sensor(
         from ..sessions import SensorParameters
 
         return SensorParameters.on_bench(
-            bench, camera=camera, levels=levels, frames=frames, longest_us=longest_ms * 1000, edge=edge,
+            bench, camera=camera, levels=levels, frames=frames, longest_us=longest_ms * 1000, edge=mtf,
             region=region, retakes=retakes,
         )  # fmt: skip
 
@@ -54,7 +50,7 @@ def sensor(
         _print_result(session, out, where.as_json)
 
     who = _print_request if yes else ask_operator
-    conduct(where, "sensor", parameters, operator=who, afterwards=afterwards)
+    conduct(where, "sensor", parameters, operator=who, afterwards=afterwards, also_resumed=("out", "yes"))
 
 
 def _print_request(request: str) -> None:

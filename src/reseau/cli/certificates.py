@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import UsageError
+from ..core.options import Option
 from .calibrations import time_of
-from .common import AsJson, ObjectsPlace, Out, open_archive, say, suffix_of, writable
+from .common import Place, say, suffix_of, writable
+from .declared import Commands
 
 if TYPE_CHECKING:
     from ..adjust import Simulated, UncertaintyBudget
@@ -22,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "uncertainty"]
 
-app = typer.Typer(no_args_is_help=True, help="Certificates of calibrations: create, verify, vocabulary.")
+app = Commands(help="Certificates of calibrations: create, verify, vocabulary.")
 
 Source = Annotated[
     str,
@@ -31,15 +35,16 @@ Source = Annotated[
         help="File of a calibration, or with --archive the name of a configuration.",
     ),
 ]
-Archive = Annotated[
-    str | None,
-    typer.Option(
-        "--archive", "-a", envvar="RESEAU_ARCHIVE", help="Archive with decisions and earlier calibrations."
-    ),
-]
-At = Annotated[str | None, typer.Option(help="The calibration in force at this time. Default: now.")]
-Key = Annotated[str | None, typer.Option("--decision", help="Decision, by the start of its key.")]
-Probability = Annotated[float, typer.Option(help="Coverage probability.")]
+
+
+@dataclass(frozen=True)
+class Decided:
+    """A calibration of an archive, with the decision on it."""
+
+    archive: Annotated[v.Archive | None, "Here with decisions and earlier calibrations."] = None
+    objects: v.Objects | None = None
+    at: v.At | None = None
+    decision: v.Decision | None = None
 
 
 class _Found(NamedTuple):
@@ -51,7 +56,7 @@ class _Found(NamedTuple):
     earlier: list[Calibration]
 
 
-def _find(source: str, archive: str | None, objects: str | None, at: str | None, key: str | None) -> _Found:
+def _find(source: str, place: Decided) -> _Found:
     """Read a calibration from a file or an archive, with what the archive knows of it.
 
     Raises
@@ -63,15 +68,15 @@ def _find(source: str, archive: str | None, objects: str | None, at: str | None,
     from ..service import Configurations
     from ..service.inforce import key_of
 
-    file = Path(source)
+    file, archive, key = Path(source), place.archive, place.decision
     stored = read_calibration(file) if file.is_file() or archive is None else None
     if archive is None:
         assert stored is not None
         return _Found(stored, None, "", [])
-    with open_archive(archive, objects) as opened:
+    with Place(archive, place.objects).open() as opened:
         known = Configurations(opened)
         if stored is None:
-            name, time = source, time_of(at, "--at") or datetime.now(UTC)
+            name, time = source, time_of(place.at, "--at") or datetime.now(UTC)
             if key is None:
                 applied = known.applied(name, time)
                 if applied is None:
@@ -93,29 +98,18 @@ def _find(source: str, archive: str | None, objects: str | None, at: str | None,
 @app.command()
 def create(
     source: Source,
-    data: Annotated[Path, typer.Option(help="Laboratory, item, standards: reseau-certificate-data/1.")],
-    out: Annotated[
-        list[Path],
-        typer.Option("--out", "-o", help="File to write: .pdf (with the XML embedded), .xml (DCC), .html."),
-    ],
-    key: Annotated[
-        Path | None, typer.Option(help="Private key to sign with (PEM); its password: RESEAU_KEY_PASSWORD.")
-    ] = None,
-    certificate: Annotated[Path | None, typer.Option(help="Certificate of the signer (PEM).")] = None,
+    data: Annotated[v.Data, "Laboratory, item, standards."],
+    out: Annotated[list[v.Out], "Repeatable: .pdf (with the XML embedded), .xml (DCC), .html."],
+    place: Decided,
+    signing_key: v.SigningKey | None = None,
+    signing_certificate: v.SigningCertificate | None = None,
     issued: Annotated[
-        str | None, typer.Option(help="Date of issue, such as 2026-03-29. Default: today.")
+        str | None, Option("Date of issue, such as 2026-03-29. Default: today.", value="DATE")
     ] = None,
-    probability: Probability = 0.95,
+    probability: v.Probability = 0.95,
     undecided: Annotated[
-        bool,
-        typer.Option(
-            "--undecided", help="Also if nobody decided on the calibration; the certificate says so."
-        ),
+        bool, Option("Also if nobody decided on the calibration; the certificate says so.")
     ] = False,
-    archive: Archive = None,
-    objects: ObjectsPlace = None,
-    at: At = None,
-    decision: Key = None,
 ) -> None:
     """Create the certificate of a calibration.
 
@@ -127,10 +121,10 @@ def create(
     kinds = [suffix_of(writable(each), (".pdf", ".xml", ".html")) for each in out]
     if len(set(kinds)) < len(kinds):
         raise UsageError("has two files of one kind", where="--out")
-    if (key is None) != (certificate is None):
-        raise UsageError("must be given together", where="--key and --certificate")
+    if (signing_key is None) != (signing_certificate is None):
+        raise UsageError("must be given together", where="--signing-key and --signing-certificate")
     given = CertificateData.read(data)
-    found = _find(source, archive, objects, at, decision)
+    found = _find(source, place)
     if found.decision is None and not undecided:
         where = f"calibration {found.calibration.name}"
         raise UsageError("was not decided on", where=where,
@@ -142,9 +136,9 @@ def create(
 
     def xml(pages: str = "") -> bytes:
         content = dcc_of(made, pages)
-        if key is None or certificate is None:
+        if signing_key is None or signing_certificate is None:
             return content
-        return sign(content, key, certificate, os.environ.get("RESEAU_KEY_PASSWORD"))
+        return sign(content, signing_key, signing_certificate, os.environ.get("RESEAU_KEY_PASSWORD"))
 
     contents: dict[str, bytes] = {}
     if ".pdf" in kinds:
@@ -185,7 +179,7 @@ def verify(
     trust: Annotated[
         list[Path] | None, typer.Option(help="Certificate of a trusted signer (PEM); it must be signed then.")
     ] = None,
-    as_json: AsJson = False,
+    as_json: v.AsJson = False,
 ) -> None:
     """Verify a certificate: syntax, schema, rules, signature, numbers, pages; exit status 1 if refused."""
     from ..core.provenance import canonical_json
@@ -206,7 +200,7 @@ def verify(
 
 
 @app.command()
-def vocabulary(out: Out = None) -> None:
+def vocabulary(out: v.Out | None = None) -> None:
     """Write our vocabulary of reference types (refType) in digital certificates."""
     from ..io import write_whole
     from ..service.certificates.vocabulary import vocabulary_text
@@ -219,13 +213,12 @@ def vocabulary(out: Out = None) -> None:
 
 def uncertainty(
     source: Source,
+    place: Decided,
     points: Annotated[
         Path | None,
         typer.Argument(metavar="POINTS", help="Image coordinates measured with it. Default: its parameters."),
     ] = None,
-    data: Annotated[
-        Path | None, typer.Option(help="Temperature and further contributions: reseau-certificate-data/1.")
-    ] = None,
+    data: Annotated[v.Data | None, "Here temperature and further contributions."] = None,
     draws: Annotated[
         int, typer.Option(min=0, help="Draws of Monte Carlo to compare with; at least 4000, or 0 for none.")
     ] = 0,
@@ -235,14 +228,10 @@ def uncertainty(
             min=1, max=3, help="Stop drawing when results are stable to so many digits; --draws is the most."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the draws.")] = 0,
-    probability: Probability = 0.95,
-    out: Out = None,
-    archive: Archive = None,
-    objects: ObjectsPlace = None,
-    at: At = None,
-    decision: Key = None,
-    as_json: AsJson = False,
+    seed: v.Seed = 0,
+    probability: v.Probability = 0.95,
+    out: v.Out | None = None,
+    as_json: v.AsJson = False,
 ) -> None:
     """Show the uncertainty budget of a calibration, or of points measured with it.
 
@@ -262,7 +251,7 @@ def uncertainty(
     if out is not None:
         suffix_of(writable(out), (".json",))
     given: CertificateData | None = None if data is None else CertificateData.read(data)
-    found = _find(source, archive, objects, at, decision)
+    found = _find(source, place)
     sources = uncertainty_of(found.calibration, found.earlier, given)
     simulated: Simulated | None = None
     if digits is not None and not draws:

@@ -6,13 +6,14 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from enum import StrEnum
-from functools import cache
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import EstimationError, InputError, UsageError
 
 if TYPE_CHECKING:
@@ -20,138 +21,112 @@ if TYPE_CHECKING:
     from ..calibration import SensorCorrection
     from ..core.data import Frame, ImagePoints
     from ..core.failure import Failure
-    from ..io.images import Channel as ChannelName
+    from ..execution import Executor
+    from ..procedures.calibration import CameraOptions
 
 T = TypeVar("T")
 
 
-class Channel(StrEnum):
-    """Channel of a colour image."""
+@dataclass(frozen=True)
+class Place:
+    """The archive that a command uses."""
 
-    LUMA = "luma"
-    RED = "red"
-    GREEN = "green"
-    BLUE = "blue"
+    archive: v.Archive = "archive"
+    objects: v.Objects | None = None
+
+    def open(self, *, create: bool = False) -> Archive:
+        """Open the archive.
+
+        Raises
+        ------
+        ArchiveError
+            If it does not exist or cannot be used.
+        """
+        from ..archive import Archive
+
+        return Archive.open(self.archive, self.objects, create=create)
 
 
-Anyway = Annotated[
-    bool, typer.Option("--anyway", help="Go on with a calibration that is usable for nothing.")
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Write the result as JSON to standard output.")]
-Out = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
-Overlay = Annotated[
-    Path | None,
-    typer.Option(help="PNG to write: the frame with what was measured, what was declined, and why."),
-]
-ArchivePlace = Annotated[
-    str,
-    typer.Option(
-        "--archive", "-a", envvar="RESEAU_ARCHIVE", help="Archive: a folder, or the URL of a database."
-    ),
-]
-ObjectsPlace = Annotated[
-    str | None, typer.Option("--objects", help="Folder or URL of the files, if the archive is a database.")
-]
+@dataclass(frozen=True)
+class Computing:
+    """What does the work of a command."""
+
+    jobs: v.Jobs | None = None
+    cluster: v.Cluster = ""
+    store: v.Store = ""
+
+    def executor(self, modules: Sequence[str], parts: int) -> Executor:
+        """Return what computes a number of independent parts, which import modules."""
+        from ..execution import executor_at
+
+        return executor_at(self.jobs, self.cluster, self.store, modules, parts)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a command reads images."""
+
+    channel: v.Channel = "luma"
+    sensor: v.Sensor | None = None
+
+    def frame(self, path: Path) -> Frame:
+        """Read an image; notes on how it was read are written to standard error.
+
+        With a calibration of a sensor the grey values are corrected.
+
+        Raises
+        ------
+        FormatError
+            If a file cannot be read, or `sensor` is not a calibration of a sensor.
+        UsageError
+            If the size of the frame is not that of the sensor.
+        """
+        from ..io.images import read_image
+
+        frame = read_image(path, self.channel)
+        for note in frame.notes:
+            typer.echo(f"note: {note}", err=True)
+        return frame if self.correction is None else self.correction.correct(frame)
+
+    @cached_property
+    def correction(self) -> SensorCorrection | None:
+        """The correction of the sensor, which is read once for all frames of a command."""
+        from ..calibration import Calibration, SensorCorrection
+
+        return (
+            None if self.sensor is None else SensorCorrection.from_calibration(Calibration.read(self.sensor))
+        )
+
+
+@dataclass(frozen=True)
+class CameraChoice:
+    """The camera model of a calibration."""
+
+    model: v.Model = ""
+    pitch_mm: v.PitchMm | None = None
+    free: v.Free = ()
+
+    def options(self) -> CameraOptions:
+        """Return the options of the calibration."""
+        from ..procedures.calibration import CameraOptions
+
+        return CameraOptions(self.model, self.free, self.pitch_mm)
+
+
 SessionName = Annotated[str, typer.Argument(help="Name of the session.")]
 
 
-Jobs = Annotated[int | None, typer.Option(min=1, help="Number of processes; by default the number of cores.")]
-ClusterAddress = Annotated[
-    str,
-    typer.Option(
-        "--cluster",
-        envvar="RESEAU_CLUSTER",
-        metavar="tcp://HOST:PORT",
-        help="Scheduler of a Dask cluster that does the work, in place of processes; requires --store.",
-    ),
-]
-Store = Annotated[
-    str,
-    typer.Option(
-        "--store",
-        envvar="RESEAU_STORE",
-        help="Folder or URL that keeps what is computed: a repeated command continues where it ended. "
-        "Workers of a cluster share it.",
-    ),
-]
-
-
-SensorFile = Annotated[
-    Path | None,
-    typer.Option("--sensor", help="Calibration of the sensor; correct images with it before measuring."),
-]
-
-
-Mirrored = Annotated[
-    bool | None,
-    typer.Option(
-        "--mirrored/--not-mirrored",
-        help="The image shows the design from behind, or from the front (x right, y up). Default: determined "
-        "by the design if it is not symmetric. Not used with nominal positions.",
-    ),
-]
-MaxRotation = Annotated[
-    float | None,
-    typer.Option(
-        min=0,
-        max=180,
-        help="Maximum rotation of the design in the image (degrees). Not used with nominal positions.",
-    ),
-]
-
-
-def orientation(mirrored: bool | None, max_rotation: float | None) -> dict[str, Any]:
+def orientation(mirrored: bool | None, max_rotation_deg: float | None) -> dict[str, Any]:
     """Options of a measurement from those of a command; what is not given keeps its default."""
-    given: dict[str, Any] = {} if mirrored is None else {"mirrored": mirrored}
-    return given if max_rotation is None else given | {"max_rotation_deg": max_rotation}
-
-
-@cache
-def sensor_correction(path: Path) -> SensorCorrection:
-    """Return the correction of a calibration of a sensor, which is read once for all frames of a command."""
-    from ..calibration import Calibration, SensorCorrection
-
-    return SensorCorrection.from_calibration(Calibration.read(path))
-
-
-def open_archive(place: str, objects: str | None, *, create: bool = False) -> Archive:
-    """Open an archive.
-
-    Raises
-    ------
-    ArchiveError
-        If it does not exist or cannot be used.
-    """
-    from ..archive import Archive
-
-    return Archive.open(place, objects, create=create)
-
-
-def read_frame(path: Path, channel: ChannelName = "luma", sensor: Path | None = None) -> Frame:
-    """Read an image; notes on how it was read are written to standard error.
-
-    With a calibration of `reseau capture sensor` the grey values are corrected.
-
-    Raises
-    ------
-    FormatError
-        If a file cannot be read, or `sensor` is not a calibration of a sensor.
-    UsageError
-        If the size of the frame is not that of the sensor.
-    """
-    from ..io.images import read_image
-
-    frame = read_image(path, channel)
-    for note in frame.notes:
-        typer.echo(f"note: {note}", err=True)
-    return frame if sensor is None else sensor_correction(sensor).correct(frame)
+    given = {"mirrored": mirrored, "max_rotation_deg": max_rotation_deg}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def read_photo(path: Path) -> Frame | ImagePoints:
     """Read an image, or image coordinates."""
     from ..io import is_points, read_measurement
 
-    return read_measurement(path).image_points() if is_points(path) else read_frame(path)
+    return read_measurement(path).image_points() if is_points(path) else Reading().frame(path)
 
 
 def required(found: T | Failure, where: object) -> T:

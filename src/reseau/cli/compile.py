@@ -6,12 +6,13 @@ import time
 
 import typer
 
-from .common import Jobs, progress, say
+from ..core import vocabulary as v
+from .common import progress, say
 
 __all__ = ["compile_loops"]
 
 
-def compile_loops(jobs: Jobs = None) -> None:
+def compile_loops(jobs: v.Jobs | None = None) -> None:
     """Compile for this processor, once, what commands compile at their first call otherwise."""
     from ..core.ahead import by_module, compile_ahead, main_loops
     from ..execution import executor_at

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from .common import AsJson, progress, say
+from ..core import vocabulary as v
+from .common import progress, say
 
 if TYPE_CHECKING:
     from ..sessions.demo import TestfieldSession
@@ -16,9 +15,9 @@ __all__ = ["demo"]
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("out"),
-    seed: Annotated[int, typer.Option(min=0, help="Random seed; the same seed gives the same bytes.")] = 1,
-    as_json: AsJson = False,
+    out: v.Out = Path("out"),
+    seed: v.Seed = 1,
+    as_json: v.AsJson = False,
 ) -> None:
     """Capture, correct and adjust on a simulated bench with real protocols; compare with the true values."""
     from ..core.provenance import canonical_json

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import StrEnum
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from ..core import vocabulary as v
+from ..core.options import Option
 from .common import say, suffix_of, writable
+from .declared import Commands
 
 if TYPE_CHECKING:
     from ..designs.drawing import Drawable
@@ -18,66 +21,26 @@ if TYPE_CHECKING:
 __all__ = ["app"]
 
 
-app = typer.Typer(
-    help="Draw a target for printing in true size, and write its coordinates.", no_args_is_help=True
-)
+app = Commands(help="Draw a target for printing in true size, and write its coordinates.")
 
 
-class Shape(StrEnum):
-    """Shapes of a mark."""
+@dataclass(frozen=True)
+class Drawn:
+    """What a design is written to."""
 
-    LINES = "line-grid"
-    CROSS = "cross"
-    DISK = "disk"
-    SQUARE = "square"
+    out: Annotated[v.Out | None, "Here the design, JSON; - for standard output."] = None
 
 
-class Paper(StrEnum):
-    """Sizes of paper."""
+@dataclass(frozen=True)
+class Printed(Drawn):
+    """The same, with drawings."""
 
-    A4 = "A4"
-    A3 = "A3"
-    LETTER = "Letter"
-    TABLOID = "Tabloid"
-    OWN = "own"
-
-
-class Polarity(StrEnum):
-    """Whether marks are darker or brighter than the background."""
-
-    DARK = "dark"
-    BRIGHT = "bright"
+    svg: v.Svg | None = None
+    pdf: v.Pdf | None = None
+    paper: v.Paper = "A4"
 
 
-class Kind(StrEnum):
-    """Kinds of boards."""
-
-    CHESS = "chess"
-    PUZZLE = "puzzle"
-    DELTILLE = "deltille"
-    CHARUCO = "charuco"
-    CIRCLES = "circles"
-    APRILGRID = "aprilgrid"
-    MARKERS = "markers"
-
-
-Svg = Annotated[Path | None, typer.Option("--svg", help="SVG drawing to write.")]
-Pdf = Annotated[Path | None, typer.Option("--pdf", help="PDF drawing to write.")]
-PaperOf = Annotated[
-    Paper,
-    typer.Option(
-        "--paper",
-        help="Paper of the PDF. Larger targets are divided over several sheets, with marks to join them; own "
-        "is a page as large as the target needs.",
-    ),
-]
-Fitted = Annotated[
-    float | None, typer.Option(help="Distance between neighbouring marks (mm). Default: fills the --paper.")
-]
-Design = Annotated[
-    Path | None,
-    typer.Option("--json", "--out", "-o", help="JSON design to write; - for standard output."),
-]
+FITTED = "Default: fills the --paper."
 
 
 @app.callback()
@@ -87,82 +50,71 @@ def _targets() -> None:
 
 @app.command()
 def reseau(
-    columns: Annotated[int, typer.Option(help="Number of marks in a row.")] = 15,
-    rows: Annotated[int, typer.Option(help="Number of marks in a column.")] = 11,
-    pitch: Annotated[float, typer.Option(help="Distance between neighbouring marks (mm).")] = 10.0,
-    shape: Annotated[Shape, typer.Option(help="Shape of a mark.")] = Shape.LINES,
-    size: Annotated[
-        float | None,
-        typer.Option(help="Size of a mark (mm); not used for a line grid. Default: a fraction of --pitch."),
-    ] = None,
-    line_width: Annotated[float, typer.Option(help="Line width of a cross or line grid (mm).")] = 0.3,
-    polarity: Annotated[Polarity, typer.Option(help="Dark or bright marks.")] = Polarity.DARK,
-    origin: Annotated[str | None, typer.Option(help="Mark O, the origin of the common system.")] = None,
-    axis: Annotated[str | None, typer.Option(help="Mark S, on the x-axis of the common system.")] = None,
-    name: Annotated[str, typer.Option(help="Name of the design.")] = "reseau",
-    svg: Svg = None,
-    pdf: Pdf = None,
-    paper: PaperOf = Paper.A4,
-    out: Design = None,
+    printed: Printed,
+    columns: v.Columns = 15,
+    rows: v.Rows = 11,
+    pitch: v.Pitch = 10.0,
+    shape: v.Shape = "line-grid",
+    size: Annotated[v.Size | None, "Not used for a line grid. Default: a fraction of --pitch."] = None,
+    line_width: v.LineWidth = 0.3,
+    polarity: v.Polarity = "dark",
+    origin: Annotated[str | None, Option("Mark O, the origin of the common system.")] = None,
+    axis: Annotated[str | None, Option("Mark S, on the x-axis of the common system.")] = None,
+    name: v.Name = "reseau",
 ) -> None:
     """Design a reseau: a regular grid of marks."""
     from ..designs import regular_reseau
     from ..io import Mark
 
-    lined = shape in (Shape.LINES, Shape.CROSS)
-    diameter = None if shape is Shape.LINES else size or (pitch / 3 if shape is Shape.CROSS else pitch / 5)
+    lined = shape in ("line-grid", "cross")
+    diameter = None if shape == "line-grid" else size or (pitch / 3 if shape == "cross" else pitch / 5)
     design = regular_reseau(
         columns,
         rows,
         pitch,
-        Mark(shape=shape.value, size=diameter, line_width=line_width if lined else None),
+        Mark(shape=shape, size=diameter, line_width=line_width if lined else None),
         name=name,
-        polarity=polarity.value,
+        polarity=polarity,
         origin=origin,
         axis=axis,
     )
-    _write(design, svg, pdf, out, paper, f"{columns} × {rows} marks, pitch {pitch:g} mm")
+    _write(design, printed, f"{columns} × {rows} marks, pitch {pitch:g} mm")
 
 
 @app.command()
 def sheet(
-    columns: Annotated[int, typer.Option(help="Number of disks in a row.")] = 10,
-    rows: Annotated[int, typer.Option(help="Number of disks in a column.")] = 13,
-    pitch: Fitted = None,
-    size: Annotated[
-        float | None, typer.Option(help="Diameter of a disk (mm). Default: 0.22 times --pitch.")
-    ] = None,
-    polarity: Annotated[Polarity, typer.Option(help="Dark or bright disks.")] = Polarity.DARK,
-    name: Annotated[str, typer.Option(help="Name of the design.")] = "sheet",
-    svg: Svg = None,
-    pdf: Pdf = None,
-    paper: PaperOf = Paper.A4,
-    out: Design = None,
+    printed: Printed,
+    columns: v.Columns = 10,
+    rows: v.Rows = 13,
+    pitch: Annotated[v.Pitch | None, FITTED] = None,
+    size: Annotated[v.Size | None, "Default: 0.22 times --pitch."] = None,
+    polarity: v.Polarity = "dark",
+    name: v.Name = "sheet",
 ) -> None:
     """Design a sheet of disks, four of them in coded rings that identify all disks."""
     from ..designs import coded_sheet
 
     def of(pitch: float, size: float | None = None) -> ReseauDesign:
-        return coded_sheet(columns, rows, pitch, size=size, name=name, polarity=polarity.value)
+        return coded_sheet(columns, rows, pitch, size=size, name=name, polarity=polarity)
 
-    pitch = _filling(of, paper) if pitch is None else pitch
+    pitch = _filling(of, printed.paper) if pitch is None else pitch
     design = of(pitch, size)
-    _write(design, svg, pdf, out, paper, f"{columns} × {rows} disks, pitch {pitch:g} mm")
+    _write(design, printed, f"{columns} × {rows} disks, pitch {pitch:g} mm")
 
 
 @app.command("n-wires")
 def n_wires(
+    drawn: Drawn,
     layers: Annotated[int, typer.Option(help="Number of layers, each with one N.")] = 3,
     width: Annotated[float, typer.Option(help="Distance of the parallel wires of a layer (mm).")] = 40.0,
     spacing: Annotated[float, typer.Option(help="Distance of the layers (mm).")] = 15.0,
-    name: Annotated[str, typer.Option(help="Name of the design.")] = "n-wires",
-    out: Design = None,
+    name: v.Name = "n-wires",
 ) -> None:
     """Design an N-wire phantom: coordinates of parallel and slanted wires, to be edited to one's own."""
     from ..designs import n_wire_phantom
 
     design = n_wire_phantom(layers, width, spacing, name=name)
-    _write(design, None, None, out, Paper.OWN, f"{layers} layers of {width:g} mm, {spacing:g} mm apart")
+    _write(design, drawn, f"{layers} layers of {width:g} mm, {spacing:g} mm apart")
 
 
 @app.command()
@@ -170,7 +122,7 @@ def fiducials(
     name: Annotated[
         str | None, typer.Argument(metavar="NAME", help="Name of a camera; by default all are listed.")
     ] = None,
-    out: Design = None,
+    out: Annotated[v.Out | None, "Here the design, JSON; - for standard output."] = None,
 ) -> None:
     """Write the fiducial marks of an aerial camera that is known by name, to be edited to its report."""
     from ..designs import aerial_camera, aerial_cameras
@@ -190,27 +142,23 @@ def fiducials(
 
 @app.command("testfield")
 def coded_field(
-    columns: Annotated[int, typer.Option(help="Number of squares in a row.")] = 8,
-    rows: Annotated[int, typer.Option(help="Number of squares in a column.")] = 8,
-    pitch: Annotated[
-        float | None,
-        typer.Option(help="Distance between the lines (mm). Default: fills the --paper; the paper's is 125."),
-    ] = None,
-    line_width: Annotated[
-        float | None, typer.Option(help="Width of the lines (mm). Default: 2/125 of --pitch.")
-    ] = None,
+    printed: Printed,
+    columns: v.Columns = 8,
+    rows: v.Rows = 8,
+    pitch: Annotated[v.Pitch | None, "Here between the lines; the paper's is 125.", FITTED] = None,
+    line_width: Annotated[v.LineWidth | None, "Default: 2/125 of --pitch."] = None,
     small: Annotated[
         tuple[float, float, float, float] | None,
-        typer.Option(
-            help="Sizes of small squares, triangles, crosses and circles (mm). Default: 9 13 15 12 "
-            "at a pitch of 125 mm."
+        Option(
+            "Sizes of small squares, triangles, crosses and circles (mm). Default: 9,13,15,12 at a pitch of "
+            "125 mm."
         ),
     ] = None,
     large: Annotated[
         tuple[float, float, float, float] | None,
-        typer.Option(
-            help="Sizes of large squares, triangles, crosses and circles (mm). Default: 17 25 25 22 "
-            "at a pitch of 125 mm."
+        Option(
+            "Sizes of large squares, triangles, crosses and circles (mm). Default: 17,25,25,22 at a pitch of "
+            "125 mm."
         ),
     ] = None,
     spread: Annotated[
@@ -219,12 +167,8 @@ def coded_field(
     turn_seed: Annotated[
         int | None, typer.Option(help="Rotate each target by an angle drawn from this seed.")
     ] = None,
-    polarity: Annotated[Polarity, typer.Option(help="Dark or bright targets.")] = Polarity.DARK,
-    name: Annotated[str, typer.Option(help="Name of the design.")] = "testfield",
-    svg: Svg = None,
-    pdf: Pdf = None,
-    paper: PaperOf = Paper.A4,
-    out: Design = None,
+    polarity: v.Polarity = "dark",
+    name: v.Name = "testfield",
 ) -> None:
     """Design a coded testfield: squares of sixteen targets, coded by their arrangement."""
     from ..designs import coded_testfield
@@ -233,59 +177,56 @@ def coded_field(
 
     def of(pitch: float, **sizes: Any) -> TestfieldDesign:
         return coded_testfield(
-            columns, rows, pitch, turn_seed=turn_seed, polarity=polarity.value, name=name, **sizes
+            columns, rows, pitch, turn_seed=turn_seed, polarity=polarity, name=name, **sizes
         )
 
-    pitch = _filling(of, paper) if pitch is None else pitch
+    pitch = _filling(of, printed.paper) if pitch is None else pitch
     design = of(pitch, **{key: value for key, value in given.items() if value is not None})
-    _write(design, svg, pdf, out, paper, f"{columns} × {rows} squares, pitch {pitch:g} mm")
+    _write(design, printed, f"{columns} × {rows} squares, pitch {pitch:g} mm")
 
 
 @app.command()
 def frame(
-    sides: Annotated[
-        tuple[float, float, float], typer.Option(help="Sides of the frame along X, Y and Z (mm).")
-    ] = (1200.0, 900.0, 400.0),
-    count: Annotated[int, typer.Option(help="Number of targets.")] = 28,
-    size: Annotated[float, typer.Option(help="Diameter of a disk or side of a square (mm).")] = 20.0,
-    shape: Annotated[Shape, typer.Option(help="disk or square.")] = Shape.DISK,
-    polarity: Annotated[Polarity, typer.Option(help="Dark or bright targets.")] = Polarity.DARK,
-    name: Annotated[str, typer.Option(help="Name of the design.")] = "frame",
-    svg: Svg = None,
-    pdf: Pdf = None,
-    paper: PaperOf = Paper.A4,
-    out: Design = None,
+    printed: Printed,
+    sides: Annotated[tuple[float, float, float], Option("Sides of the frame along X, Y and Z (mm).")] = (
+        1200.0,
+        900.0,
+        400.0,
+    ),
+    number: v.Number = 28,
+    size: v.Size = 20.0,
+    shape: Annotated[v.Shape, "Here disk or square."] = "disk",
+    polarity: v.Polarity = "dark",
+    name: v.Name = "frame",
 ) -> None:
     """Design the targets of a space frame, to be cut out and fixed to it; for `reseau blurred`."""
     from ..core.errors import UsageError
     from ..designs import space_frame
 
-    if shape is not Shape.DISK and shape is not Shape.SQUARE:
-        raise UsageError(f"is {shape.value!r}", where="--shape", do="use disk or square")
-    kind: Literal["disk", "square"] = "disk" if shape is Shape.DISK else "square"
-    design = space_frame(sides, count, size, shape=kind, polarity=polarity.value, name=name)
-    _write(design, svg, pdf, out, paper, f"{count} targets of {size:g} mm")
+    if shape not in ("disk", "square"):
+        raise UsageError(f"is {shape!r}", where="--shape", do="use disk or square")
+    design = space_frame(sides, number, size, shape=shape, polarity=polarity, name=name)
+    _write(design, printed, f"{number} targets of {size:g} mm")
 
 
 @app.command()
 def board(
-    kind: Annotated[Kind, typer.Option(help="Pattern of the board.")] = Kind.CHARUCO,
-    columns: Annotated[int, typer.Option(help="Number of squares, circles or tags in a row.")] = 7,
-    rows: Annotated[int, typer.Option(help="Number of squares, circles or tags in a column.")] = 10,
+    printed: Printed,
+    kind: Annotated[
+        Literal["chess", "puzzle", "deltille", "charuco", "circles", "aprilgrid", "markers"],
+        Option("Pattern of the board."),
+    ] = "charuco",
+    columns: v.Columns = 7,
+    rows: v.Rows = 10,
     pitch: Annotated[
-        float | None,
-        typer.Option(
-            help="Side of a square, distance of rows of circles, or of tags (mm). Default: fills the --paper."
-        ),
+        v.Pitch | None, "Side of a square, distance of rows of circles, or of tags.", FITTED
     ] = None,
-    size: Annotated[
-        float | None, typer.Option(help="Diameter of a circle, or side of a marker or tag (mm).")
-    ] = None,
-    dictionary: Annotated[str | None, typer.Option(help="Markers, as OpenCV's DICT_5X5_100.")] = None,
+    size: Annotated[v.Size | None, "Diameter of a circle, or side of a marker or tag."] = None,
+    dictionary: v.Dictionary | None = None,
     first_id: Annotated[int, typer.Option(min=0, help="Number of the first marker.")] = 0,
-    border_bits: Annotated[int, typer.Option(help="Width of the border of a marker (bits).")] = 1,
+    border_bits: v.BorderBits = 1,
     legacy: Annotated[bool, typer.Option("--legacy", help="ChArUco layout of OpenCV before 4.6.")] = False,
-    polarity: Annotated[Polarity, typer.Option(help="Dark or bright circles.")] = Polarity.DARK,
+    polarity: Annotated[v.Polarity, "Of circles."] = "dark",
     asymmetric: Annotated[
         bool, typer.Option("--asymmetric", help="Shift every second row of circles by half a step.")
     ] = False,
@@ -294,7 +235,7 @@ def board(
         typer.Option(help="Squares of a chessboard with a dot, column row …, as OpenCV's: '7 4 7 5 8 5'."),
     ] = None,
     start: Annotated[
-        tuple[int, int], typer.Option(help="Column and row of a PuzzleBoard's first corner in its code.")
+        tuple[int, int], Option("Column and row of a PuzzleBoard's first corner in its code.")
     ] = (0, 0),
     given: Annotated[
         Path | None,
@@ -304,11 +245,7 @@ def board(
             "replace what it says.",
         ),
     ] = None,
-    name: Annotated[str, typer.Option(help="Name of the design.")] = "board",
-    svg: Svg = None,
-    pdf: Pdf = None,
-    paper: PaperOf = Paper.A4,
-    out: Design = None,
+    name: v.Name = "board",
 ) -> None:
     """Design a chessboard, PuzzleBoard, deltille, ChArUco board, circle grid or grid of tags."""
     from ..designs.boards import unusual_size
@@ -327,16 +264,16 @@ def board(
 
         def of(pitch: float, size: float | None = None) -> BoardDesign:
             return board_of(
-                kind.value, columns, rows, pitch, size=size, dictionary=dictionary, first_id=first_id,
-                border_bits=border_bits, legacy=legacy, polarity=polarity.value,
-                asymmetric=asymmetric, dots=marked, start=start, name=name,
+                kind, columns, rows, pitch, size=size, dictionary=dictionary, first_id=first_id,
+                border_bits=border_bits, legacy=legacy, polarity=polarity, asymmetric=asymmetric, dots=marked,
+                start=start, name=name,
             )  # fmt: skip
 
-        design = of(_filling(of, paper) if pitch is None else pitch, size)
+        design = of(_filling(of, printed.paper) if pitch is None else pitch, size)
     if asked := unusual_size(design):
         typer.echo(f"note: {asked}: give --pitch and --size in mm", err=True)
     what = f"{design.kind}, {design.columns} × {design.rows}, pitch {design.pitch:g} mm"
-    _write(design, svg, pdf, out, paper, what)
+    _write(design, printed, what)
 
 
 def _pairs(text: str) -> tuple[tuple[int, int], ...]:
@@ -351,28 +288,24 @@ def _pairs(text: str) -> tuple[tuple[int, int], ...]:
     return tuple((int(a), int(b)) for a, b in zip(words[::2], words[1::2], strict=True))
 
 
-def _filling(of: Callable[[float], Drawable], paper: Paper) -> float:
+def _filling(of: Callable[[float], Drawable], paper: str) -> float:
     """The pitch with which a target fills the paper."""
     from ..designs.drawing import content_of
     from ..designs.paper import largest_pitch
 
-    size = Paper.A4 if paper is Paper.OWN else paper
-    return largest_pitch(lambda pitch: content_of(of(pitch)), size.value)
+    size = "A4" if paper == "own" else paper
+    return largest_pitch(lambda pitch: content_of(of(pitch)), size)
 
 
-def _write(
-    design: Drawable,
-    svg: Path | None,
-    pdf: Path | None,
-    out: Path | None,
-    paper: Paper,
-    what: str,
-) -> None:
+def _write(design: Drawable, drawn: Drawn, what: str) -> None:
     """Write the requested drawings and design, either all or none, and report their paths."""
     from ..io import write_whole
 
-    to_stdout = out is not None and str(out) == "-"
-    out = None if to_stdout else out
+    to_stdout = drawn.out is not None and str(drawn.out) == "-"
+    out = None if to_stdout else drawn.out
+    svg, pdf, paper = (
+        (drawn.svg, drawn.pdf, drawn.paper) if isinstance(drawn, Printed) else (None, None, "own")
+    )
     for path, suffix in ((svg, ".svg"), (pdf, ".pdf"), (out, ".json")):
         if path is not None:
             suffix_of(writable(path), (suffix,))
@@ -383,7 +316,7 @@ def _write(
         if svg is not None:
             files[svg] = design_svg(design)
         if pdf is not None:
-            files[pdf] = design_pdf(design, None if paper is Paper.OWN else paper.value)
+            files[pdf] = design_pdf(design, None if paper == "own" else paper)
     if out is not None:
         files[out] = design.to_json()
     for path, content in files.items():
@@ -393,4 +326,4 @@ def _write(
     elif files:
         say("".join(f"{path}\n" for path in files))
     else:
-        say(f"{design.name}: {what}; give --svg, --pdf or --json\n")
+        say(f"{design.name}: {what}; give --svg, --pdf or --out\n")

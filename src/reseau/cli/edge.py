@@ -7,20 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .common import (
-    AsJson,
-    Channel,
-    Out,
-    Overlay,
-    SensorFile,
-    overlay_files,
-    progress,
-    read_frame,
-    required,
-    say,
-    suffix_of,
-    writable,
-)
+from ..core import vocabulary as v
+from .common import Reading, overlay_files, progress, required, say, suffix_of, writable
+from .measure import Output
 
 if TYPE_CHECKING:
     from ..io.edges import EdgesDocument
@@ -33,31 +22,24 @@ _SHOWN = 40
 
 def edge(
     image: Annotated[Path, typer.Argument(help="Photograph of an edge, or of a chart of slanted edges.")],
-    region: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Region with one edge, left,top,width,height (px); repeatable. Default: edges are found."
-        ),
-    ] = None,
-    out: Out = None,
-    overlay: Overlay = None,
-    report: Annotated[Path | None, typer.Option(help="HTML report to write.")] = None,
-    channel: Annotated[Channel, typer.Option(help="Channel of a colour image.")] = Channel.LUMA,
-    sensor: SensorFile = None,
-    as_json: AsJson = False,
+    reading: Reading,
+    output: Output,
+    region: Annotated[list[v.Region] | None, "Repeatable. Default: edges are found."] = None,
+    report: v.Report | None = None,
 ) -> None:
     """Measure the sharpness (MTF, SFR) of a photograph from slanted edges, over the field for a chart."""
     from ..io import write_whole
     from ..procedures.edges import measure_sharpness
     from ..report.edges import edges_overlay, edges_report
 
-    regions = [_region(text) for text in region or []]
+    regions = region or []
+    out, overlay = output.out, output.overlay
     suffix = ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
     if report is not None:
         writable(report)
     picture = overlay_files(overlay, [image])[image] if overlay is not None else None
-    frame = read_frame(image, channel.value, sensor)
-    options = {"regions": regions or None, "channel": channel.value}
+    frame = reading.frame(image)
+    options = {"regions": regions or None, "channel": reading.channel}
     with progress(f"measuring {image.name}", max(1, len(regions))) as step:
         result = measure_sharpness(frame, regions, options=options, step=step)
     found = required(result, image)
@@ -68,26 +50,7 @@ def edge(
         write_whole(report, edges_report(found, title=f"Sharpness of {image.name}"))
     if out is not None:
         write_whole(out, _csv(document) if suffix == ".csv" else document.to_json())
-    say(document.to_json() if as_json else _lines(document))
-
-
-def _region(text: str) -> tuple[int, int, int, int]:
-    """A region from text.
-
-    Raises
-    ------
-    UsageError
-        If it is not four numbers.
-    """
-    from ..core.errors import UsageError
-
-    try:
-        left, top, width, height = (int(part) for part in text.replace(",", " ").split())
-    except ValueError:
-        raise UsageError(
-            "is no region", where=repr(text), do="write left,top,width,height, as 120,80,60,90"
-        ) from None
-    return left, top, width, height
+    say(document.to_json() if output.as_json else _lines(document))
 
 
 def _lines(document: EdgesDocument) -> str:

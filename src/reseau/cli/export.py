@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import UsageError
-from .common import Anyway, Out, say, suffix_of, writable
+from .common import say, suffix_of, writable
 
 __all__ = ["export"]
 
@@ -33,7 +34,7 @@ def export(
             "dbat, matlab, openptv, reseau.",
         ),
     ] = None,
-    out: Out = None,
+    out: v.Out | None = None,
     micmac: Annotated[
         Path | None,
         typer.Option(help="Folder of the images for MicMac: writes Ori-InterneScan and id_fiducial.txt."),
@@ -41,10 +42,8 @@ def export(
     metashape: Annotated[
         Path | None, typer.Option(help="Script to write, which defines the marks in Metashape (.py).")
     ] = None,
-    anyway: Anyway = False,
-    design: Annotated[
-        Path | None, typer.Option("--design", "-d", help="Design of the reseau, for its measurements.")
-    ] = None,
+    anyway: v.Anyway = False,
+    design: Annotated[v.Design | None, "Here the reseau, for its measurements."] = None,
 ) -> None:
     """Write a calibration for another program, or marks of scanned film with their coordinates."""
     if to is not None or out is not None:

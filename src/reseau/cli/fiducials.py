@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from .common import AsJson, Out, Overlay, overlay_files, progress, required, say, suffix_of, writable
-from .orient import Transform
+from ..core import vocabulary as v
+from .common import overlay_files, progress, required, say, suffix_of, writable
+from .measure import Output
 
 if TYPE_CHECKING:
     from ..io import FiducialOrientation
@@ -17,52 +17,26 @@ if TYPE_CHECKING:
 __all__ = ["fiducials"]
 
 
-class Rotation(StrEnum):
-    """Rotation of the film in the scan, degrees."""
-
-    r0 = "0"
-    r90 = "90"
-    r180 = "180"
-    r270 = "270"
-
-
 def fiducials(
     scan: Annotated[Path, typer.Argument(help="Scanned photograph with its borders: TIFF, PNG, JPEG.")],
     design: Annotated[
-        Path,
-        typer.Option(
-            "--design",
-            "-d",
-            metavar="FILE|NAME",
-            help="Fiducial marks of the camera (fiducial-design/1), or the name of a camera that "
-            "`reseau design fiducials` lists.",
-        ),
+        v.Design,
+        "Here the fiducial marks of the camera, fiducial-design/1, or the name of a camera that "
+        "`reseau design fiducials` lists.",
     ],
-    out: Out = None,
-    overlay: Overlay = None,
-    transform: Annotated[
-        Transform, typer.Option(help="Transformation to the calibrated coordinates.")
-    ] = Transform.affine,
-    dpi: Annotated[
-        float | None,
-        typer.Option(min=10, help="Resolution of the scan (dots per inch), if that in the file is wrong."),
-    ] = None,
+    output: Output,
+    transform: v.Transform = "affine",
+    dpi: v.Dpi | None = None,
     rotation: Annotated[
-        Rotation | None,
+        Literal["0", "90", "180", "270"] | None,
         typer.Option(
             help="Rotation of the camera's x-axis in the scan, degrees counter-clockwise. Default: "
             "determined by the marks if they are not symmetric."
         ),
     ] = None,
     mirrored: Annotated[
-        bool | None,
-        typer.Option(
-            "--mirrored/--not-mirrored",
-            help="The scan shows the film from behind, or from the front. Default: determined by the "
-            "marks if they are not symmetric.",
-        ),
+        v.Mirrored | None, "Default: determined by the marks if they are not symmetric."
     ] = None,
-    as_json: AsJson = False,
 ) -> None:
     """Measure the fiducial marks of a scanned aerial photograph, and orient it.
 
@@ -76,13 +50,12 @@ def fiducials(
     from ..io.images import open_scan, read_image
     from ..measure.fiducials import FiducialOptions, measure_fiducials
 
+    out, overlay = output.out, output.overlay
     suffix = ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
     drawn = None if overlay is None else overlay_files(overlay, [scan])[scan]
     named = design.parent == Path() and not design.suffix and not design.exists()
     camera = aerial_camera(design.name) if named else FiducialDesign.read(design)
-    options = FiducialOptions(
-        dpi, None if rotation is None else int(rotation.value), mirrored, transform.value
-    )
+    options = FiducialOptions(dpi, None if rotation is None else int(rotation), mirrored, transform)
     opened = open_scan(scan)
     with progress(f"measuring {scan.name}", 1):
         found = measure_fiducials(opened, camera, options, sha256_of(scan))
@@ -96,7 +69,7 @@ def fiducials(
     document = result.document()
     if out is not None:
         write_whole(out, document.to_json() if suffix == ".json" else csv_of(document))
-    if as_json:
+    if output.as_json:
         say(document.to_json())
         return
     _say(document)

@@ -3,28 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .common import (
-    AsJson,
-    Channel,
-    MaxRotation,
-    Mirrored,
-    Out,
-    Overlay,
-    SensorFile,
-    orientation,
-    overlay_files,
-    progress,
-    read_frame,
-    required,
-    say,
-    suffix_of,
-    writable,
-)
+from ..core import vocabulary as v
+from .common import Reading, orientation, overlay_files, progress, required, say, suffix_of, writable
+from .declared import Commands
 
 if TYPE_CHECKING:
     from ..core.data import Frame
@@ -32,10 +19,24 @@ if TYPE_CHECKING:
     from ..io import ReseauMeasurement
     from ..measure.points import Measured
 
-__all__ = ["Task", "app", "measurement_csv"]
+__all__ = ["BY_DESIGN", "NOT_NOMINAL", "Image", "Output", "Task", "app", "measurement_csv"]
 
 
-app = typer.Typer(help="Measure image coordinates of a target.", no_args_is_help=True)
+BY_DESIGN = "Default: determined by the design if it is not symmetric. Not used with nominal positions."
+NOT_NOMINAL = "Not used with nominal positions."
+
+app = Commands(help="Measure image coordinates of a target.")
+
+Image = Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")]
+
+
+@dataclass(frozen=True)
+class Output:
+    """What a measurement writes."""
+
+    out: v.Out | None = None
+    overlay: v.Overlay | None = None
+    as_json: v.AsJson = False
 
 
 @app.callback()
@@ -45,156 +46,120 @@ def _targets() -> None:
 
 @app.command()
 def reseau(
-    image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
-    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the reseau.")],
-    out: Out = None,
-    overlay: Overlay = None,
+    image: Image,
+    design: v.Design,
+    reading: Reading,
+    output: Output,
     mark_px: Annotated[
         float | None, typer.Option(help="Size of a mark (px); for a grid, the width of its lines.")
     ] = None,
-    mirrored: Mirrored = None,
-    max_rotation: MaxRotation = None,
-    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor (px).")] = 0.0,
-    channel: Annotated[Channel, typer.Option(help="Channel of a colour image.")] = Channel.LUMA,
-    sensor: SensorFile = None,
-    as_json: AsJson = False,
+    mirrored: Annotated[v.Mirrored | None, BY_DESIGN] = None,
+    max_rotation_deg: Annotated[v.MaxRotationDeg | None, NOT_NOMINAL] = None,
+    row_jitter_px: v.RowJitterPx = 0.0,
+    fill: v.Fill = 1.0,
 ) -> None:
     """Measure the marks of a reseau, or of a sheet of disks with coded rings."""
     from ..io import ReseauDesign
     from ..measure import ReseauOptions, measure_reseau
 
-    task = Task(image, out, overlay, as_json, "marks")
+    task = Task(image, output, "marks")
     target = ReseauDesign.read(design)
     options = ReseauOptions(
-        mark_px=mark_px,
-        row_jitter_px=row_jitter,
-        **orientation(mirrored, max_rotation),
+        mark_px=mark_px, row_jitter_px=row_jitter_px, fill=fill, **orientation(mirrored, max_rotation_deg)
     )
-    task.run(
-        lambda: read_frame(image, channel.value, sensor),
-        lambda frame: measure_reseau(frame, target, options),
-    )
+    task.run(reading, lambda frame: measure_reseau(frame, target, options))
 
 
 @app.command()
 def pins(
-    image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
-    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the test object's rods.")],
-    out: Out = None,
-    overlay: Overlay = None,
+    image: Image,
+    design: v.Design,
+    reading: Reading,
+    output: Output,
     also: Annotated[
         list[Path] | None,
         typer.Option(help="Other image of the sequence, to reject static spots; repeatable."),
     ] = None,
     max_length_px: Annotated[
         float | None,
-        typer.Option(min=1, help="Maximum length of an echo (px). Default: 6 % of the frame diagonal."),
+        typer.Option(min=1, help="Largest length of an echo (px). Default: 6 % of the frame diagonal."),
     ] = None,
-    mirrored: Mirrored = None,
-    max_rotation: MaxRotation = None,
-    sensor: SensorFile = None,
-    as_json: AsJson = False,
+    mirrored: Annotated[v.Mirrored | None, BY_DESIGN] = None,
+    max_rotation_deg: Annotated[v.MaxRotationDeg | None, NOT_NOMINAL] = None,
 ) -> None:
     """Measure the rods of an ultrasonic test object, or the wires of an N-wire phantom."""
     from ..io import ReseauDesign
     from ..measure import PinOptions, measure_pins
 
-    task = Task(image, out, overlay, as_json, "rods")
+    task = Task(image, output, "rods")
     target = ReseauDesign.read(design)
-    options = PinOptions(most_length_px=max_length_px, **orientation(mirrored, max_rotation))
+    options = PinOptions(max_length_px=max_length_px, **orientation(mirrored, max_rotation_deg))
     task.run(
-        lambda: read_frame(image, sensor=sensor),
-        lambda frame: measure_pins(
-            frame, target, options, [read_frame(path, sensor=sensor) for path in also or []]
-        ),
+        reading,
+        lambda frame: measure_pins(frame, target, options, [reading.frame(path) for path in also or []]),
     )
 
 
 @app.command("testfield")
 def coded_field(
-    image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
-    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the testfield.")],
-    out: Out = None,
-    overlay: Overlay = None,
-    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor (px).")] = 0.0,
-    fill: Annotated[
-        float, typer.Option(min=0, max=1, help="Light-sensitive fraction of the pixel pitch.")
-    ] = 1.0,
-    mirrored: Annotated[
-        bool, typer.Option("--mirrored", help="The image shows the testfield from behind, or in a mirror.")
-    ] = False,
-    sensor: SensorFile = None,
-    as_json: AsJson = False,
+    image: Image,
+    design: v.Design,
+    reading: Reading,
+    output: Output,
+    mirrored: v.Mirrored = False,
+    row_jitter_px: v.RowJitterPx = 0.0,
+    fill: v.Fill = 1.0,
 ) -> None:
     """Measure the targets of a coded testfield."""
     from ..io import TestfieldDesign
     from ..measure import TestfieldOptions, measure_testfield
 
-    task = Task(image, out, overlay, as_json, "targets", "deviations from the mapping of the field")
+    task = Task(image, output, "targets", "deviations from the mapping of the field")
     target = TestfieldDesign.read(design)
     if mirrored:
         target = target.from_behind()
-    options = TestfieldOptions(row_jitter_px=row_jitter, fill=fill)
-    task.run(
-        lambda: read_frame(image, sensor=sensor),
-        lambda frame: measure_testfield(frame, target, options),
-    )
+    options = TestfieldOptions(row_jitter_px=row_jitter_px, fill=fill)
+    task.run(reading, lambda frame: measure_testfield(frame, target, options))
 
 
 @app.command()
 def board(
-    image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
-    design: Annotated[Path, typer.Option("--design", "-d", help="Design of the board.")],
-    out: Out = None,
-    overlay: Overlay = None,
-    mirrored: Annotated[
-        bool, typer.Option("--mirrored", help="The image shows the board from behind, or is mirrored.")
-    ] = False,
-    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor (px).")] = 0.0,
-    fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive fraction of a pixel.")] = 1.0,
-    channel: Annotated[Channel, typer.Option(help="Channel of a colour image.")] = Channel.LUMA,
-    sensor: SensorFile = None,
-    as_json: AsJson = False,
+    image: Image,
+    design: v.Design,
+    reading: Reading,
+    output: Output,
+    mirrored: v.Mirrored = False,
+    row_jitter_px: v.RowJitterPx = 0.0,
+    fill: v.Fill = 1.0,
 ) -> None:
     """Measure a chessboard, PuzzleBoard, deltille, ChArUco board, circle grid or grid of tags."""
     from ..exchange import read_board
     from ..measure import BoardOptions, measure_board
 
-    task = Task(image, out, overlay, as_json, "points")
+    task = Task(image, output, "points")
     target = read_board(design)
-    options = BoardOptions(mirrored=mirrored, row_jitter_px=row_jitter, fill=fill)
-    task.run(
-        lambda: read_frame(image, channel.value, sensor),
-        lambda frame: measure_board(frame, target, options),
-    )
+    options = BoardOptions(mirrored=mirrored, row_jitter_px=row_jitter_px, fill=fill)
+    task.run(reading, lambda frame: measure_board(frame, target, options))
 
 
 @app.command()
 def tags(
-    image: Annotated[Path, typer.Argument(help="Image, or measured coordinates (JSON, CSV).")],
-    dictionary: Annotated[
-        str, typer.Option(help="Markers, as OpenCV's DICT_4X4_50 or DICT_APRILTAG_36h11.")
-    ] = "DICT_APRILTAG_36h11",
-    border_bits: Annotated[int, typer.Option(min=1, max=4, help="Width of their borders (bits).")] = 1,
-    out: Out = None,
-    overlay: Overlay = None,
-    row_jitter: Annotated[float, typer.Option(help="Row jitter of the sensor (px).")] = 0.0,
-    fill: Annotated[float, typer.Option(min=0, max=1, help="Light-sensitive fraction of a pixel.")] = 1.0,
-    channel: Annotated[Channel, typer.Option(help="Channel of a colour image.")] = Channel.LUMA,
-    sensor: SensorFile = None,
-    as_json: AsJson = False,
+    image: Image,
+    reading: Reading,
+    output: Output,
+    dictionary: v.Dictionary = "DICT_APRILTAG_36h11",
+    border_bits: v.BorderBits = 1,
+    row_jitter_px: v.RowJitterPx = 0.0,
+    fill: v.Fill = 1.0,
 ) -> None:
     """Measure the corners of single ArUco markers or AprilTags, wherever they are in the scene."""
     from ..designs.boards import marker_dictionary
     from ..measure import BoardOptions, measure_tags
 
-    task = Task(image, out, overlay, as_json, "points")
+    task = Task(image, output, "points")
     marker_dictionary(dictionary)
-    options = BoardOptions(row_jitter_px=row_jitter, fill=fill)
-    task.run(
-        lambda: read_frame(image, channel.value, sensor),
-        lambda frame: measure_tags(frame, dictionary, border_bits, options),
-    )
+    options = BoardOptions(row_jitter_px=row_jitter_px, fill=fill)
+    task.run(reading, lambda frame: measure_tags(frame, dictionary, border_bits, options))
 
 
 class Task:
@@ -204,26 +169,27 @@ class Task:
     """
 
     def __init__(
-        self,
-        image: Path,
-        out: Path | None,
-        overlay: Path | None,
-        as_json: bool,
-        marks: str,
-        spread: str = "leave-one-out deviations",
+        self, image: Path, output: Output, marks: str, spread: str = "leave-one-out deviations"
     ) -> None:
-        self.image, self.out, self.as_json, self.marks, self.spread = image, out, as_json, marks, spread
+        out, overlay = output.out, output.overlay
+        self.image, self.out, self.as_json, self.marks, self.spread = (
+            image,
+            out,
+            output.as_json,
+            marks,
+            spread,
+        )
         self.suffix = ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
         self.overlay = overlay_files(overlay, [image])[image] if overlay is not None else None
 
-    def run(self, read: Callable[[], Frame], measure: Callable[[Frame], Any]) -> None:
+    def run(self, reading: Reading, measure: Callable[[Frame], Any]) -> None:
         """Measure the image and deliver the result."""
         from ..io import is_points, read_measurement
 
         if is_points(self.image):
             self._deliver(read_measurement(self.image), None)
             return
-        frame = read()
+        frame = reading.frame(self.image)
         with progress(f"measuring {self.image.name}", 1):
             result: Measured | Failure = measure(frame)
         if self.overlay is not None:

@@ -7,7 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from .common import AsJson, Overlay, overlay_files, required, say
+from ..core import vocabulary as v
+from ..core.options import Option
+from .common import overlay_files, required, say
 
 __all__ = ["perforations"]
 
@@ -18,21 +20,26 @@ def perforations(
     scan: Annotated[Path, typer.Argument(help="Scan of 35 mm film that runs from top to bottom.")],
     left: Annotated[
         Box,
-        typer.Option(
-            help="Approximate edges of the first perforation of the left row: left top right bottom (px)."
+        Option(
+            "Approximate edges of the first perforation of the left row (px).",
+            value="LEFT,TOP,RIGHT,BOTTOM",
         ),
     ],
     right: Annotated[
-        Box, typer.Option(help="Approximate edges of the first perforation of the right row (px).")
+        Box,
+        Option(
+            "Approximate edges of the first perforation of the right row (px).",
+            value="LEFT,TOP,RIGHT,BOTTOM",
+        ),
     ],
-    pitch: Annotated[float, typer.Option(min=1.0, help="Approximate pitch of the perforations (px).")],
-    count: Annotated[int, typer.Option(min=2, help="Number of perforations in a row.")],
-    channel: Annotated[
-        str, typer.Option(help="Channel with the darkest rims: red, green, blue. Default: the last.")
-    ] = "",
+    perforation_px: Annotated[
+        float, typer.Option(min=1.0, help="Approximate pitch of the perforations (px).")
+    ],
+    number: Annotated[v.Number, "Here of perforations in a row, at least 2."],
+    channel: Annotated[v.Channel | None, "Here that with the darkest rims. Default: the last."] = None,
     reach: Annotated[float, typer.Option(min=1.0, help="Search distance from the given edges (px).")] = 12.0,
-    overlay: Overlay = None,
-    as_json: AsJson = False,
+    overlay: v.Overlay | None = None,
+    as_json: v.AsJson = False,
 ) -> None:
     """Measure the perforations of 35 mm film: scale, rotation and perspective of the scan.
 
@@ -47,14 +54,16 @@ def perforations(
     from ..measure.film import film_plane
     from ..procedures.film_frame import film_scale
 
+    if number < 2:
+        raise UsageError(f"is {number}, not at least 2", where="--number")
     drawn = None if overlay is None else overlay_files(overlay, [scan])[scan]
     opened = open_scan(scan)
     name = channel or opened.channels[-1]
     if name not in opened.channels:
         do = f"use {', '.join(opened.channels)}"
         raise UsageError(f"the scan has no channel {name!r}", where="--channel", do=do)
-    rows = [np.array([*box, pitch]) for box in (left, right)]
-    plane = required(film_plane(opened, rows, count, channel=opened.channels.index(name), reach=reach), scan)
+    rows = [np.array([*box, perforation_px]) for box in (left, right)]
+    plane = required(film_plane(opened, rows, number, channel=opened.channels.index(name), reach=reach), scan)
     if drawn is not None:
         pixels = opened.window(0, opened.height, 0, opened.width)
         plane.overlay(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels, drawn)

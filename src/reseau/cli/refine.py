@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ..core import vocabulary as v
+from ..core.options import Option
 from .common import (
-    AsJson,
-    MaxRotation,
-    Mirrored,
-    Out,
     orientation,
     overlay_files,
     probability,
@@ -25,6 +24,7 @@ from .common import (
     suffix_of,
     writable,
 )
+from .measure import BY_DESIGN, NOT_NOMINAL
 
 if TYPE_CHECKING:
     from ..calibration import InstrumentCorrection
@@ -41,30 +41,40 @@ __all__ = ["refine"]
 class _Files:
     """The input files and options of a run."""
 
-    photo_i: Path | None
-    photo_ii: Path | None
-    photo_iii: tuple[Path, ...]
-    reseau: Path | None
-    test_object: Path | None
-    calibration: Path | None
-    points: Path | None
-    check: tuple[str, ...]
-    alpha: float
-    mirrored: bool | None = None
-    max_rotation: float | None = None
-    overlays: Mapping[Path, Path] = field(default_factory=dict)
+    photo_i: Annotated[Path | None, typer.Option(help="PHOTO I: the reseau alone.")] = None
+    photo_ii: Annotated[
+        Path | None,
+        typer.Option(help="PHOTO II: the test object behind the reseau; with --calibration, test it."),
+    ] = None
+    photo_iii: Annotated[tuple[Path, ...], Option("PHOTO III: the body to measure; repeatable.")] = ()
+    reseau: v.Reseau | None = None
+    test_object: v.TestObject | None = None
+    calibration: Annotated[
+        Path | None, typer.Option(help="Stored calibration: apply it to PHOTO III, or test it with PHOTO II.")
+    ] = None
+    points: Annotated[Path | None, typer.Option(help="Points of the body in PHOTO III (JSON, CSV).")] = None
+    check: Annotated[v.Check, "Here also rods."] = ()
+    alpha: Annotated[v.Alpha, "Here of the coefficients."] = 0.05
+    mirrored: Annotated[v.Mirrored | None, BY_DESIGN] = None
+    max_rotation_deg: Annotated[v.MaxRotationDeg | None, NOT_NOMINAL] = None
+    overlay: Annotated[v.Overlay | None, "Here a folder, for all photographs; FILE.png for one."] = None
+
+    @cached_property
+    def overlays(self) -> Mapping[Path, Path]:
+        """The overlay of each photograph, if overlays are wanted."""
+        return {} if self.overlay is None else overlay_files(self.overlay, self.photographs())
 
     def marks(self) -> ReseauOptions:
         """Options of the measurement of the reseau."""
         from ..measure import ReseauOptions
 
-        return ReseauOptions(**orientation(self.mirrored, self.max_rotation))
+        return ReseauOptions(**orientation(self.mirrored, self.max_rotation_deg))
 
     def pins(self) -> PinOptions:
         """Options of the measurement of the rods."""
         from ..measure import PinOptions
 
-        return PinOptions(**orientation(None, self.max_rotation))
+        return PinOptions(**orientation(None, self.max_rotation_deg))
 
     def draw(self, path: Path, photo: Frame | ImagePoints, found: Any) -> None:
         """Write the overlay of a photograph, if one is wanted: its marks and rods, or why there are none."""
@@ -101,8 +111,8 @@ class _Files:
         options: dict[str, Any] = {"alpha": self.alpha, "check": list(self.check)}
         if self.mirrored is not None:
             options["mirrored"] = self.mirrored
-        if self.max_rotation is not None:
-            options["max_rotation"] = self.max_rotation
+        if self.max_rotation_deg is not None:
+            options["max_rotation_deg"] = self.max_rotation_deg
         return Provenance(inputs, options)
 
     def photographs(self) -> list[Path]:
@@ -119,37 +129,11 @@ class _Files:
 
 
 def refine(
-    photo_i: Annotated[Path | None, typer.Option(help="PHOTO I: the reseau alone.")] = None,
-    photo_ii: Annotated[
-        Path | None,
-        typer.Option(help="PHOTO II: the test object behind the reseau; with --calibration, test it."),
-    ] = None,
-    photo_iii: Annotated[
-        list[Path] | None, typer.Option(help="PHOTO III: the body to measure; repeatable.")
-    ] = None,
-    reseau: Annotated[Path | None, typer.Option(help="Design of the reseau.")] = None,
-    test_object: Annotated[
-        Path | None, typer.Option("--object", help="Design of the test object: its rods.")
-    ] = None,
-    calibration: Annotated[
-        Path | None, typer.Option(help="Stored calibration: apply it to PHOTO III, or test it with PHOTO II.")
-    ] = None,
-    points: Annotated[Path | None, typer.Option(help="Points of the body in PHOTO III (JSON, CSV).")] = None,
-    out: Out = None,
+    files: _Files,
+    out: v.Out | None = None,
     true: Annotated[Path | None, typer.Option(help="File to write true coordinates to (CSV, JSON).")] = None,
-    report: Annotated[Path | None, typer.Option(help="HTML report to write.")] = None,
-    alpha: Annotated[float, typer.Option(help="Significance level of the tests of the coefficients.")] = 0.05,
-    check: Annotated[str, typer.Option(help="Marks and rods used only as check points, as A1,B2.")] = "",
-    mirrored: Mirrored = None,
-    max_rotation: MaxRotation = None,
-    overlay: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for a PNG of each photograph: what was measured, what was declined, and why. "
-            "FILE.png for a single photograph."
-        ),
-    ] = None,
-    as_json: AsJson = False,
+    report: v.Report | None = None,
+    as_json: v.AsJson = False,
 ) -> None:
     """Correct oscilloscope photographs: camera (PHOTO I), instrument (II), true coordinates (III).
 
@@ -159,20 +143,14 @@ def refine(
     """
     from ..core.threads import one_thread
 
-    held = tuple(name for name in check.split(",") if name)
-    files = _Files(
-        photo_i, photo_ii, tuple(photo_iii or ()), reseau, test_object, calibration, points, held, alpha,
-        mirrored, max_rotation,
-    )  # fmt: skip
     _checked(files)
     for path, suffixes in ((out, (".json",)), (report, (".html",)), (true, (".csv", ".json"))):
         if path is not None:
             suffix_of(writable(path), suffixes)
-    if overlay is not None:
-        files = replace(files, overlays=overlay_files(overlay, files.photographs()))
+    assert files.overlays is not None  # their names are checked before anything is computed
     with one_thread():  # results do not depend on the number of processors
-        if calibration is not None:
-            _by_calibration(files, calibration, out, true, report, as_json)
+        if files.calibration is not None:
+            _by_calibration(files, files.calibration, out, true, report, as_json)
         else:
             _by_photographs(files, out, true, report, as_json)
 
@@ -202,9 +180,9 @@ def _checked(files: _Files) -> None:
     if files.photo_i is None or files.reseau is None:
         raise UsageError("needs --photo-i and --reseau, or --calibration", where="refine")
     if (files.photo_ii is None) != (files.test_object is None):
-        raise UsageError("--photo-ii and --object must be given together", where="refine")
+        raise UsageError("--photo-ii and --test-object must be given together", where="refine")
     if files.photo_iii and files.photo_ii is None:
-        raise UsageError("needs PHOTO II", where="--photo-iii", do="give --photo-ii and --object")
+        raise UsageError("needs PHOTO II", where="--photo-iii", do="give --photo-ii and --test-object")
 
 
 def _by_photographs(
@@ -370,7 +348,7 @@ def _by_calibration(
 def _again(
     files: _Files, path: Path, instrument: InstrumentCorrection, design: ReseauDesign, rods: ReseauDesign
 ) -> StillStandard:
-    """Test the stored coefficients with a new PHOTO II; --object names another test object."""
+    """Test the stored coefficients with a new PHOTO II; --test-object names another test object."""
     from ..core.data import ImagePoints
     from ..io import ReseauDesign
     from ..procedures.oscilloscope import still_standard_in

@@ -3,43 +3,42 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import quote
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import UsageError
-from .common import AsJson, Out, say, writable
+from .common import CameraChoice, say, writable
+from .declared import Commands
 
 if TYPE_CHECKING:
     from ..service.client import Client
 
 __all__ = ["app"]
 
-app = typer.Typer(
-    no_args_is_help=True,
+app = Commands(
     help="A service, by its API: sessions, calibrations, alarms, benches. The token is in RESEAU_TOKEN.",
 )
 
-Server = Annotated[
-    str, typer.Option("--server", "-s", envvar="RESEAU_SERVER", help="Address of the service.")
-]
-Authority = Annotated[
-    Path | None, typer.Option(help="Certificate by which that of the service is checked (PEM).")
-]
 Bench = Annotated[str, typer.Argument(help="Name of the bench.")]
-LOCAL = "http://127.0.0.1:8480"
 
 
-@contextmanager
-def _client(server: str, authority: Path | None) -> Iterator[Client]:
-    from ..service.client import Client
+@dataclass(frozen=True)
+class Service:
+    """The service that a command asks."""
 
-    with Client(server, None, authority) as client:
-        yield client
+    server: v.Server = "http://127.0.0.1:8480"
+    authority: v.Authority | None = None
+
+    def client(self) -> Client:
+        """Return a client, to be used in a ``with`` statement."""
+        from ..service.client import Client
+
+        return Client(self.server, None, self.authority)
 
 
 def _shown(value: Any, as_json: bool, lines: list[str]) -> None:
@@ -51,17 +50,16 @@ def _shown(value: Any, as_json: bool, lines: list[str]) -> None:
 
 @app.command()
 def sessions(
+    service: Service,
     like: Annotated[str, typer.Option(help="Part of the name or the plan.")] = "",
-    count: Annotated[int, typer.Option(min=1, help="Number of sessions.")] = 50,
-    server: Server = LOCAL,
-    authority: Authority = None,
-    as_json: AsJson = False,
+    limit: v.Limit = 50,
+    as_json: v.AsJson = False,
 ) -> None:
     """List sessions, latest first."""
     import itertools
 
-    with _client(server, authority) as client:
-        found = list(itertools.islice(client.sessions(like), count))
+    with service.client() as client:
+        found = list(itertools.islice(client.sessions(like), limit or None))
     lines = [
         f"{s['begun'][:16]}Z  {s['name']}  {s['plan']}  {s['frames']} frames  {s['status']}" for s in found
     ]
@@ -71,13 +69,12 @@ def sessions(
 @app.command()
 def show(
     name: Annotated[str, typer.Argument(help="Name of the session.")],
-    out: Out = None,
-    server: Server = LOCAL,
-    authority: Authority = None,
-    as_json: AsJson = False,
+    service: Service,
+    out: Annotated[v.Out | None, "Here a folder, for the latest result of each name."] = None,
+    as_json: v.AsJson = False,
 ) -> None:
-    """Show a session; --out writes the latest result of each name to a folder."""
-    with _client(server, authority) as client:
+    """Show a session."""
+    with service.client() as client:
         found = client.get(f"/sessions/{quote(name, safe='')}")
         if out is not None:
             out.mkdir(exist_ok=True)
@@ -92,9 +89,9 @@ def show(
 
 
 @app.command()
-def calibrations(server: Server = LOCAL, authority: Authority = None, as_json: AsJson = False) -> None:
+def calibrations(service: Service, as_json: v.AsJson = False) -> None:
     """List the configurations with the calibration in force."""
-    with _client(server, authority) as client:
+    with service.client() as client:
         found = client.get("/configurations")
     lines = []
     for each in found:
@@ -105,18 +102,18 @@ def calibrations(server: Server = LOCAL, authority: Authority = None, as_json: A
 
 
 @app.command()
-def alarms(server: Server = LOCAL, authority: Authority = None, as_json: AsJson = False) -> None:
+def alarms(service: Service, as_json: v.AsJson = False) -> None:
     """List the open alarms; exit status 1 if there are any."""
-    with _client(server, authority) as client:
+    with service.client() as client:
         found = client.get("/alarms")
     _shown(found, as_json, [each["text"] for each in found])
     raise typer.Exit(1 if found else 0)
 
 
 @app.command()
-def benches(server: Server = LOCAL, authority: Authority = None, as_json: AsJson = False) -> None:
+def benches(service: Service, as_json: v.AsJson = False) -> None:
     """List the benches with their states and sessions."""
-    with _client(server, authority) as client:
+    with service.client() as client:
         found = client.get("/benches")
     lines = []
     for each in found:
@@ -127,9 +124,9 @@ def benches(server: Server = LOCAL, authority: Authority = None, as_json: AsJson
 
 
 @app.command()
-def stop(bench: Bench, server: Server = LOCAL, authority: Authority = None) -> None:
+def stop(bench: Bench, service: Service) -> None:
     """Stop everything that moves or transmits on a bench; a session pauses."""
-    with _client(server, authority) as client:
+    with service.client() as client:
         say(f"{bench}: stopped within {client.stop(bench):.0f} ms\n")
 
 
@@ -137,11 +134,10 @@ def stop(bench: Bench, server: Server = LOCAL, authority: Authority = None) -> N
 def begin(
     bench: Bench,
     name: Annotated[str, typer.Argument(help="Name of the session.")],
+    service: Service,
     plan: Annotated[str, typer.Option(help="Plan: testfield, frames, sensor, …")] = "frames",
     parameters: Annotated[str, typer.Option(help="Parameters of the plan, JSON.")] = "{}",
     file: Annotated[list[Path] | None, typer.Option("--input", "-i", help="Input file; repeatable.")] = None,
-    server: Server = LOCAL,
-    authority: Authority = None,
 ) -> None:
     """Begin a session on a bench."""
     from ..io import read_text
@@ -152,14 +148,14 @@ def begin(
         raise UsageError(f"is not JSON ({error})", where="--parameters") from None
     inputs = {path.name: read_text(path) for path in file or []}
     body = {"name": name, "plan": plan, "parameters": given, "inputs": inputs}
-    with _client(server, authority) as client:
+    with service.client() as client:
         client.post(f"/benches/{quote(bench, safe='')}/sessions", body)
     say(f"{bench}: session {name} has begun\n")
 
 
 def _steer(action: str, words: str) -> Any:
-    def command(bench: Bench, server: Server = LOCAL, authority: Authority = None) -> None:
-        with _client(server, authority) as client:
+    def command(bench: Bench, service: Service) -> None:
+        with service.client() as client:
             found = client.post(f"/benches/{quote(bench, safe='')}/{action}")
         say(f"{bench}: {found['state']}\n")
 
@@ -176,29 +172,26 @@ app.command("abort")(_steer("abort", "End the session of a bench at once; it can
 def upload(
     name: Annotated[str, typer.Argument(help="Name of the session.")],
     photographs: Annotated[list[Path], typer.Argument(help="Photographs of the target, or scans of film.")],
-    target: Annotated[str, typer.Option(help="camera, oscilloscope (PHOTO I, II, III) or film.")] = "camera",
-    design: Annotated[Path | None, typer.Option("--design", "-d", help="Design of the target.")] = None,
-    test_object: Annotated[Path | None, typer.Option("--object", help="Design of the test object.")] = None,
-    corners: Annotated[Path | None, typer.Option(help="Calibrated corners, for film.")] = None,
-    model: Annotated[str, typer.Option(help="Camera model.")] = "",
-    pitch: Annotated[float | None, typer.Option(min=1e-6, help="Pixel size, mm.")] = None,
-    free: Annotated[str, typer.Option(help="Parameters to estimate, e.g. c,x0,y0,K1.")] = "",
-    frame: Annotated[str, typer.Option(help="Format of film in mm, as 36x24.")] = "",
-    dpi: Annotated[float | None, typer.Option(min=10, help="Resolution of scans of film.")] = None,
-    server: Server = LOCAL,
-    authority: Authority = None,
+    service: Service,
+    camera: CameraChoice,
+    subject: v.Subject = "camera",
+    design: v.Design | None = None,
+    test_object: v.TestObject | None = None,
+    corners: v.Corners | None = None,
+    format_mm: v.FormatMm | None = None,
+    dpi: v.Dpi | None = None,
 ) -> None:
     """Calibrate from files on the service, which archives them; exit status 1 if it fails."""
     given: dict[str, Any] = {
-        "target": target,
-        "model": model,
-        "free": free,
-        "film_format": frame,
-        "pitch": pitch,
+        "subject": subject,
+        "model": camera.model,
+        "free": ",".join(camera.free),
+        "format_mm": "" if format_mm is None else "x".join(f"{side:g}" for side in format_mm),
+        "pitch_mm": camera.pitch_mm,
         "dpi": dpi,
     }
     inputs = {"test_object": test_object, "corners": corners}
-    with _client(server, authority) as client:
+    with service.client() as client:
         found = client.upload(
             name, photographs, design, inputs={k: v for k, v in inputs.items() if v is not None},
             **{k: v for k, v in given.items() if v not in (None, "")},
@@ -211,16 +204,15 @@ def upload(
 
 @app.command()
 def events(
-    count: Annotated[int, typer.Option(min=0, help="End after this many; 0: no limit.")] = 0,
-    server: Server = LOCAL,
-    authority: Authority = None,
+    service: Service,
+    limit: v.Limit = 0,
 ) -> None:
     """Print events as they happen, a line of JSON each."""
-    with _client(server, authority) as client:
+    with service.client() as client:
         for number, each in enumerate(client.events(), start=1):
             say(json.dumps(vars(each)) + "\n")
             typer.get_text_stream("stdout").flush()
-            if number == count:
+            if number == limit:
                 break
 
 
@@ -228,17 +220,16 @@ def events(
 def call(
     method: Annotated[str, typer.Argument(help="GET, POST, PUT, PATCH or DELETE.")],
     path: Annotated[str, typer.Argument(help="Path after /api/1, such as /sessions.")],
+    service: Service,
     body: Annotated[str, typer.Argument(help="Content, JSON.")] = "",
-    out: Out = None,
-    server: Server = LOCAL,
-    authority: Authority = None,
+    out: v.Out | None = None,
 ) -> None:
     """Do any operation of the API, and print or write its answer."""
     try:
         content = json.loads(body) if body else None
     except ValueError as error:
         raise UsageError(f"is not JSON ({error})", where="content") from None
-    with _client(server, authority) as client:
+    with service.client() as client:
         found = client.request(method.upper(), path, content)
     if isinstance(found, bytes):
         if out is None:

@@ -11,21 +11,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import ReseauError, UsageError
+from ..core.options import Option
 from .calibrations import say_decision, time_of
-from .common import ArchivePlace, AsJson, ObjectsPlace, open_archive, say, suffix_of, writable
+from .common import Place, say, suffix_of, writable
+from .declared import Commands
 
 if TYPE_CHECKING:
     from ..service import Run
 
 __all__ = ["alarms", "app", "recalibrate"]
 
-app = typer.Typer(no_args_is_help=True, help="Schedules of recalibrations: add, show, export, run.")
-Inside = Annotated[
-    list[str] | None,
-    typer.Option(help="Network inside to which alarms may be sent, as 192.168.1.0/24; repeatable."),
-]
-alarms = typer.Typer(no_args_is_help=True, help="Alarms: list, acknowledge, send.")
+app = Commands(help="Schedules of recalibrations: add, show, export, run.")
+alarms = Commands(help="Alarms: list, acknowledge, send.")
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the schedule.")]
 
@@ -33,34 +32,33 @@ Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the schedule.
 @app.command()
 def add(
     schedule: Annotated[Path, typer.Argument(help="Schedule, reseau-schedule/1.")],
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
+    place: Place,
 ) -> None:
     """Add a schedule to an archive, or change one of the same name."""
     from ..service import Recalibrations, Schedule, Schedules
 
     given = Schedule.read(schedule)
-    with open_archive(archive, objects) as found:
+    with place.open() as found:
         Recalibrations(found).get(given.recalibration)
         Schedules(found).add(given)
     say(f"{given.name}: {given.rule}, from {given.start} {given.zone}\n")
 
 
 @app.command()
-def remove(name: Name, archive: ArchivePlace = "archive", objects: ObjectsPlace = None) -> None:
+def remove(name: Name, place: Place) -> None:
     """Remove a schedule; its history stays in the archive."""
     from ..service import Schedules
 
-    with open_archive(archive, objects) as found:
+    with place.open() as found:
         Schedules(found).remove(name)
 
 
 @app.command("list")
-def list_(archive: ArchivePlace = "archive", objects: ObjectsPlace = None) -> None:
+def list_(place: Place) -> None:
     """List the schedules with the last and the next run."""
     from ..service import Schedules
 
-    with open_archive(archive, objects) as found:
+    with place.open() as found:
         schedules = Schedules(found)
         for name in schedules.names():
             say(f"{name}\n")
@@ -71,17 +69,16 @@ def list_(archive: ArchivePlace = "archive", objects: ObjectsPlace = None) -> No
 @app.command()
 def show(
     name: Name,
-    at: Annotated[str | None, typer.Option(help="State at this time. Default: now.")] = None,
+    place: Place,
+    at: v.At | None = None,
     ahead: Annotated[int, typer.Option(min=0, help="Number of later runs.")] = 3,
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
-    as_json: AsJson = False,
+    as_json: v.AsJson = False,
 ) -> None:
     """Show all runs of a schedule; exit status 1 if one is overdue, or the last one failed."""
     from ..core.provenance import canonical_json
     from ..service import Schedules
 
-    with open_archive(archive, objects) as found:
+    with place.open() as found:
         runs = Schedules(found).runs(name, time_of(at, "--at"), ahead)
     if as_json:
         rows = [vars(each) | {"time": each.time.isoformat()} for each in runs]
@@ -100,28 +97,26 @@ def _row(run: Run) -> str:
 @app.command()
 def export(
     name: Name,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Calendar to write (.ics).")],
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
+    out: Annotated[v.Out, "Here a calendar (.ics)."],
+    place: Place,
 ) -> None:
     """Export the runs of a schedule as an iCalendar feed."""
     from ..io import write_whole
     from ..service import Schedules
 
     suffix_of(writable(out), (".ics",))
-    with open_archive(archive, objects) as found:
+    with place.open() as found:
         write_whole(out, Schedules(found).feed(name))
 
 
 @app.command("run")
 def run_(
+    place: Place,
     once: Annotated[bool, typer.Option("--once", help="Carry out what is due now, and end.")] = False,
-    every: Annotated[float, typer.Option(min=1, help="Time between two looks at the schedules (s).")] = 300.0,
-    to: Annotated[list[str] | None, typer.Option(help="Where to send alarms: a URL of apprise.")] = None,
-    inside: Inside = None,
-    repeat: Annotated[float, typer.Option(min=0.01, help="Repeat alarms after this time (h).")] = 24.0,
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
+    every: v.Every = 300.0,
+    notify: v.Notify | None = None,
+    inside: v.Inside | None = None,
+    repeat: v.Repeat = 24.0,
 ) -> None:
     """Carry out the runs that are due: as a daemon, or --once from cron or a timer of systemd."""
     over = threading.Event()
@@ -130,13 +125,13 @@ def run_(
             signal.signal(each, lambda *_: over.set())
     from ..service import Alarms, Recalibrations, Schedules, sender
 
-    deliver = None if not to else sender(to, inside or ())
+    deliver = None if not notify else sender(notify, inside or ())
     if not once:
-        say(f"looking at the schedules of {archive} every {every:g} s; Ctrl-C ends this\n")
+        say(f"looking at the schedules of {place.archive} every {every:g} s; Ctrl-C ends this\n")
     failed = False
     while True:
         try:
-            with open_archive(archive, objects) as found:
+            with place.open() as found:
                 for run in Schedules(found).run_due(Recalibrations(found).carry_out):
                     failed = failed or run.state != "done"
                     say(f"{run.schedule}: {run.time:%Y-%m-%d %H:%M}Z {run.state}: {run.why}\n")
@@ -180,7 +175,7 @@ WantedBy=timers.target
 
 
 @app.command()
-def units(archive: ArchivePlace = "archive") -> None:
+def units(archive: v.Archive = "archive") -> None:
     """Print a service and a timer for systemd."""
     import shutil
 
@@ -193,37 +188,34 @@ def units(archive: ArchivePlace = "archive") -> None:
 
 def recalibrate(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the recalibration.")],
-    source: Annotated[
-        str | None, typer.Option("--from", help="Define it: the session of the archive that it repeats.")
+    place: Place,
+    repeats: Annotated[
+        str | None, Option("Define it: the session of the archive that it repeats.", value="SESSION")
     ] = None,
     configuration: Annotated[
-        str | None, typer.Option(help="With --from: the configuration that it calibrates.")
+        str | None, Option("With --repeats: the configuration that it calibrates.", value="NAME")
     ] = None,
-    rules: Annotated[
-        Path | None, typer.Option(help="With --from: rules of acceptance, reseau-acceptance/1.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the one that is not done.")] = False,
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
-    as_json: AsJson = False,
+    rules: Annotated[v.Rules | None, "With --repeats."] = None,
+    resume: v.Resume = False,
+    as_json: v.AsJson = False,
 ) -> None:
     """Check the bench, acquire, measure, adjust, compare with the calibration in force, and decide.
 
-    With --from it is defined and not carried out. The exit status is 0 if the new calibration is accepted.
+    With --repeats it is defined and not carried out. The exit status is 0 if the new calibration is accepted.
     """
     from ..service import AcceptanceRules, Recalibrations
 
-    if source is None and (configuration is not None or rules is not None):
-        raise UsageError("needs --from", where="--configuration, --rules")
-    if source is not None and (configuration is None or rules is None or resume):
-        raise UsageError("needs --configuration and --rules, and no --resume", where="--from")
-    with open_archive(archive, objects) as found:
+    if repeats is None and (configuration is not None or rules is not None):
+        raise UsageError("needs --repeats", where="--configuration, --rules")
+    if repeats is not None and (configuration is None or rules is None or resume):
+        raise UsageError("needs --configuration and --rules, and no --resume", where="--repeats")
+    with place.open() as found:
         known = Recalibrations(found)
-        if source is not None:
+        if repeats is not None:
             assert configuration is not None
             assert rules is not None
-            made = known.define(name, found.session(source), configuration, AcceptanceRules.read(rules))
-            say(f"{name}: repeats {source}, plan {made.plan}, for {configuration}\n")
+            made = known.define(name, found.session(repeats), configuration, AcceptanceRules.read(rules))
+            say(f"{name}: repeats {repeats}, plan {made.plan}, for {configuration}\n")
             return
         unfinished = known.unfinished(name)
         if resume and unfinished is None:
@@ -237,16 +229,15 @@ def recalibrate(
 
 @alarms.command("list")
 def list_alarms(
+    place: Place,
     everything: Annotated[bool, typer.Option("--all", help="Also acknowledged ones.")] = False,
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
-    as_json: AsJson = False,
+    as_json: v.AsJson = False,
 ) -> None:
     """List the alarms that nobody acknowledged; exit status 1 if there are any."""
     from ..core.provenance import canonical_json
     from ..service import Alarms
 
-    with open_archive(archive, objects) as found:
+    with place.open() as found:
         known = Alarms(found).all() if everything else Alarms(found).open()
     if as_json:
         rows = [vars(each) | {"sent": [at.isoformat() for at in each.sent]} for each in known]
@@ -261,28 +252,26 @@ def list_alarms(
 @alarms.command()
 def acknowledge(
     key: Annotated[str, typer.Argument(help="Key of the alarm; see `list`.")],
-    by: Annotated[str, typer.Option(help="By whom.")],
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
+    by: v.By,
+    place: Place,
 ) -> None:
     """Acknowledge an alarm: it is not repeated."""
     from ..service import Alarms
 
-    with open_archive(archive, objects) as found:
+    with place.open() as found:
         Alarms(found).acknowledge(key, by)
 
 
 @alarms.command()
 def send(
-    to: Annotated[list[str], typer.Option(help="Where to: a URL of apprise; may be repeated.")],
-    inside: Inside = None,
-    repeat: Annotated[float, typer.Option(min=0.01, help="Repeat after this time (h).")] = 24.0,
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
+    notify: v.Notify,
+    place: Place,
+    inside: v.Inside | None = None,
+    repeat: v.Repeat = 24.0,
 ) -> None:
     """Send the open alarms, each once, and again while nobody acknowledges it."""
     from ..service import Alarms, sender
 
-    with open_archive(archive, objects) as found:
-        sent = Alarms(found).send(sender(to, inside or ()), timedelta(hours=repeat))
+    with place.open() as found:
+        sent = Alarms(found).send(sender(notify, inside or ()), timedelta(hours=repeat))
     say(f"{len(sent)} sent\n")

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import EstimationError, UsageError
-from .common import AsJson, Channel, Out, probability, progress, say, writable
+from .common import probability, progress, say, writable
 
 if TYPE_CHECKING:
     from ..calibration.document import Calibration
@@ -35,16 +36,12 @@ def sensor(
     edge: Annotated[
         list[Path] | None, typer.Option(help="Folder or file of a slanted edge, for the MTF; repeatable.")
     ] = None,
-    region: Annotated[
-        tuple[int, int, int, int] | None, typer.Option(help="Region of the edge: left top width height (px).")
-    ] = None,
-    out: Out = None,
-    report: Annotated[Path | None, typer.Option(help="HTML report to write.")] = None,
-    name: Annotated[
-        str | None, typer.Option(help="Name of the calibration. Default: that of the folder or list.")
-    ] = None,
-    channel: Annotated[Channel, typer.Option(help="Channel of colour images.")] = Channel.LUMA,
-    as_json: AsJson = False,
+    region: v.Region | None = None,
+    out: v.Out | None = None,
+    report: v.Report | None = None,
+    name: Annotated[v.Name | None, "Default: that of the folder or list."] = None,
+    channel: v.Channel = "luma",
+    as_json: v.AsJson = False,
 ) -> None:
     """Calibrate a sensor from files: dark signal, response, linearity, noise, gain, full well, defects, MTF.
 
@@ -62,10 +59,10 @@ def sensor(
     given = _exposures(series, {"light": light, "dark": dark, "edge": edge})
     called = name or (series.stem if series is not None else "sensor")
     root = None if series is None else series if series.is_dir() else series.parent
-    options: dict[str, Any] = {"region": region, "channel": channel.value}
+    options: dict[str, Any] = {"region": region, "channel": channel}
     procedure = SensorProcedure(name=called, region=region, options=options)
     with progress("reading", len(given)) as step:
-        notes = add_files(procedure, given, channel=channel.value, root=root, step=step)
+        notes = add_files(procedure, given, channel=channel, root=root, step=step)
     for note in notes:
         typer.echo(f"note: {note}", err=True)
     found = procedure.calibration(called)

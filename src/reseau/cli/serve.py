@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import UsageError
-from .common import ArchivePlace, AsJson, ObjectsPlace, Out, open_archive, say, writable
+from ..core.options import Option
+from .common import Place, say, writable
+from .declared import Commands
 
 if TYPE_CHECKING:
     from ..service.accounts import Accounts
@@ -18,61 +22,69 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "audit_app", "serve"]
 
-app = typer.Typer(no_args_is_help=True, help="The service: users, tokens, backup, upgrade, unit of systemd.")
-user_app = typer.Typer(no_args_is_help=True, help="Users of the service.")
-token_app = typer.Typer(no_args_is_help=True, help="Tokens of programs.")
-audit_app = typer.Typer(no_args_is_help=True, help="The audit log of the service.")
+app = Commands(help="The service: users, tokens, backup, upgrade, unit of systemd.")
+user_app = Commands(help="Users of the service.")
+token_app = Commands(help="Tokens of programs.")
+audit_app = Commands(help="The audit log of the service.")
 app.add_typer(user_app, name="user")
 app.add_typer(token_app, name="token")
 
-State = Annotated[
-    Path | None,
-    typer.Option(
-        "--state", envvar="RESEAU_STATE", help="Folder of accounts and keys. Default: beside the archive."
-    ),
-]
-AccountsPlace = Annotated[
-    str | None,
-    typer.Option("--accounts", help="URL of the database of accounts. Default: a file in the state folder."),
-]
-Scope = Annotated[str, typer.Option(help="What it may do: read, operate or administer.")]
+
+@dataclass(frozen=True)
+class Stated(Place):
+    """An archive with the accounts and keys of a service beside it."""
+
+    state: v.State | None = None
+
+    @property
+    def folder(self) -> StateFolder:
+        """The folder of accounts and keys."""
+        from ..service.state import StateFolder
+
+        return StateFolder.beside(self.archive, self.state)
+
+
+@dataclass(frozen=True)
+class Registered:
+    """The accounts of a service."""
+
+    archive: v.Archive = "archive"
+    state: v.State | None = None
+    accounts: v.Accounts | None = None
+
+    def open(self, **options: Any) -> Accounts:
+        """Open the accounts."""
+        from ..service.accounts import Accounts
+
+        place = self.accounts or Stated(self.archive, None, self.state).folder.path("accounts.sqlite")
+        return Accounts(place, **options)
 
 
 def serve(
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
+    place: Stated,
     bench: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--bench",
-            "-b",
-            help="Bench file; repeatable. Each has a worker process; on another machine: FILE@ADDRESS:PORT.",
-        ),
+        list[v.Bench] | None,
+        "Repeatable. Each has a worker process; on another machine: FILE@ADDRESS:PORT.",
     ] = None,
     host: Annotated[
-        str, typer.Option(help="Address to listen on; others than 127.0.0.1 need TLS and users.")
+        str, Option("Address to listen on; others than 127.0.0.1 need TLS and users.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0: a free one.")] = 8480,
-    name: Annotated[
-        list[str] | None, typer.Option("--name", help="Name by which the service is asked; repeatable.")
+    port: v.Port = 8480,
+    host_name: Annotated[
+        list[str] | None, Option("Name by which the service is asked; repeatable.", value="NAME")
     ] = None,
-    certificate: Annotated[Path | None, typer.Option(help="Own certificate with its chain (PEM).")] = None,
-    key: Annotated[Path | None, typer.Option(help="Private key of the certificate (PEM).")] = None,
+    certificate: Annotated[Path | None, Option("Own certificate with its chain (PEM).")] = None,
+    key: Annotated[Path | None, Option("Private key of the certificate (PEM).")] = None,
     proxy: Annotated[
-        str, typer.Option(help="Public address of a proxy that ends TLS, as https://bench.example.org.")
+        str, Option("Public address of a proxy that ends TLS, as https://bench.example.org.", value="URL")
     ] = "",
     tiled: Annotated[
-        str, typer.Option(help="Server of tiled to publish bluesky's documents to; its key: TILED_API_KEY.")
+        str,
+        Option("Server of tiled to publish bluesky's documents to; its key: TILED_API_KEY.", value="URL"),
     ] = "",
-    sign_key: Annotated[
-        Path | None,
-        typer.Option(
-            help="Key that signs certificates of calibrations (PEM); password: RESEAU_KEY_PASSWORD."
-        ),
-    ] = None,
-    sign_certificate: Annotated[Path | None, typer.Option(help="Certificate of that key (PEM).")] = None,
-    state: State = None,
-    accounts: AccountsPlace = None,
+    signing_key: v.SigningKey | None = None,
+    signing_certificate: v.SigningCertificate | None = None,
+    accounts: v.Accounts | None = None,
 ) -> None:
     """Serve pages and API over an archive, and the benches given."""
     from ..core.optional import optional
@@ -81,11 +93,12 @@ def serve(
         from ..service.http.app import serve as run
     from ..service.http.options import ServeOptions
 
-    benches = [_placed(each) for each in bench or ()]
+    benches = [_placed(str(each)) for each in bench or ()]
     options = ServeOptions(
-        archive, objects, state, accounts, host, port, tuple(name or ()), certificate, key, proxy,
+        place.archive, place.objects, place.state, accounts, host, port, tuple(host_name or ()),
+        certificate, key, proxy,
         tuple(path for path, _ in benches), {path: at for path, at in benches if at is not None}, tiled,
-        sign_key, sign_certificate,
+        signing_key, signing_certificate,
     )  # fmt: skip
 
     def ready(service: Service) -> None:
@@ -127,8 +140,8 @@ def worker(
     bench: Annotated[Path, typer.Argument(help="Bench file; the service has the same.")],
     listen: Annotated[str, typer.Option(help="Address and port to listen on, such as 192.0.2.5:8490.")],
     certificates: Annotated[Path, typer.Option(help="Folder made by `reseau service worker-certificate`.")],
-    archive: ArchivePlace,
-    objects: ObjectsPlace = None,
+    archive: v.Archive,
+    objects: v.Objects | None = None,
 ) -> None:
     """Hold the instruments of a bench for a service on another machine, which uses the same archive."""
     from ..service.worker import run
@@ -140,9 +153,9 @@ def worker(
 @app.command("worker-certificate")
 def worker_certificate(
     address: Annotated[str, typer.Argument(help="Address of the other machine, such as 192.0.2.5.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write, for the other machine.")],
-    archive: ArchivePlace = "archive",
-    state: State = None,
+    out: Annotated[v.Out, "Here a folder, for the other machine."],
+    archive: v.Archive = "archive",
+    state: v.State | None = None,
 ) -> None:
     """Make the certificate of a worker on another machine; copy its folder there, and keep it secret."""
     from ..core.optional import optional
@@ -150,25 +163,24 @@ def worker_certificate(
     with optional():
         from ..service.wire import Certificates
 
-    Certificates(_state(archive, state)).export(address, out)
+    Certificates(Stated(archive, None, state).folder).export(address, out)
     say(f"{out}: for `reseau service worker --certificates` on {address}\n")
 
 
 @app.command()
 def link(
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the service.")] = 8480,
-    archive: ArchivePlace = "archive",
-    state: State = None,
+    port: v.Port = 8480,
+    archive: v.Archive = "archive",
+    state: v.State | None = None,
 ) -> None:
     """Print an address that lets a browser of this machine in, once."""
     from ..core.errors import InputError
     from ..core.optional import optional
-    from ..service.state import StateFolder
 
     with optional():
         import httpx
     origin = f"http://127.0.0.1:{port}"
-    headers = {"Authorization": f"Bearer {StateFolder.beside(archive, state).local_token()}"}
+    headers = {"Authorization": f"Bearer {Stated(archive, None, state).folder.local_token()}"}
     try:
         answer = httpx.post(f"{origin}/api/1/entries", headers=headers, timeout=10.0)
     except httpx.HTTPError as error:
@@ -176,18 +188,6 @@ def link(
     if answer.status_code != 201:
         raise InputError(str(answer.json()["error"]["text"]), where=origin)
     say(f"{origin}{answer.json()['path']}\n")
-
-
-def _state(archive: str, state: Path | None) -> StateFolder:
-    from ..service.state import StateFolder
-
-    return StateFolder.beside(archive, state)
-
-
-def _accounts(archive: str, state: Path | None, accounts: str | None, **options: Any) -> Accounts:
-    from ..service.accounts import Accounts
-
-    return Accounts(accounts or _state(archive, state).path("accounts.sqlite"), **options)
 
 
 def _asked_password() -> str:
@@ -203,28 +203,24 @@ def _asked_password() -> str:
 @user_app.command("add")
 def add_user(
     name: Annotated[str, typer.Argument(help="Name of the user.")],
-    scope: Scope = "read",
-    archive: ArchivePlace = "archive",
-    state: State = None,
-    accounts: AccountsPlace = None,
+    known: Registered,
+    scope: v.Scope = "read",
 ) -> None:
     """Add a user; the password is asked for on the console."""
-    with _accounts(archive, state, accounts) as found:
-        found.add_user(name, _asked_password(), scope)  # type: ignore[arg-type]
+    with known.open() as found:
+        found.add_user(name, _asked_password(), scope)
     say(f"{name}: {scope}\n")
 
 
 @user_app.command("list")
 def list_users(
-    archive: ArchivePlace = "archive",
-    state: State = None,
-    accounts: AccountsPlace = None,
-    as_json: AsJson = False,
+    known: Registered,
+    as_json: v.AsJson = False,
 ) -> None:
     """List the users."""
     from ..core.provenance import canonical_json
 
-    with _accounts(archive, state, accounts) as found:
+    with known.open() as found:
         users = found.users()
     if as_json:
         rows = [vars(each) | {"created": each.created.isoformat()} for each in users]
@@ -237,22 +233,20 @@ def list_users(
 @user_app.command("change")
 def change_user(
     name: Annotated[str, typer.Argument(help="Name of the user.")],
+    known: Registered,
     password: Annotated[bool, typer.Option("--password", help="Ask for a new password.")] = False,
-    scope: Annotated[str, typer.Option(help="New scope: read, operate or administer.")] = "",
+    scope: v.Scope | None = None,
     one_time: Annotated[
         bool | None,
         typer.Option("--one-time/--no-one-time", help="Require a one-time password (TOTP), or not."),
     ] = None,
-    archive: ArchivePlace = "archive",
-    state: State = None,
-    accounts: AccountsPlace = None,
 ) -> None:
     """Change password, scope or one-time password of a user; their logins end."""
     if not password and not scope and one_time is None:
         raise UsageError("nothing to change", where=name, do="give --password, --scope or --one-time")
-    with _accounts(archive, state, accounts) as found:
+    with known.open() as found:
         if scope:
-            found.set_scope(name, scope)  # type: ignore[arg-type]
+            found.set_scope(name, scope)
         if password:
             found.set_password(name, _asked_password())
         if one_time:
@@ -264,37 +258,31 @@ def change_user(
 @user_app.command("remove")
 def remove_user(
     name: Annotated[str, typer.Argument(help="Name of the user.")],
-    archive: ArchivePlace = "archive",
-    state: State = None,
-    accounts: AccountsPlace = None,
+    known: Registered,
 ) -> None:
     """Remove a user; their logins end."""
-    with _accounts(archive, state, accounts) as found:
+    with known.open() as found:
         found.remove_user(name)
 
 
 @token_app.command("create")
 def create_token(
     name: Annotated[str, typer.Argument(help="Name of the token.")],
-    scope: Scope = "read",
+    known: Registered,
+    scope: v.Scope = "read",
     days: Annotated[int, typer.Option(min=1, max=731, help="How long it lasts.")] = 90,
-    archive: ArchivePlace = "archive",
-    state: State = None,
-    accounts: AccountsPlace = None,
 ) -> None:
     """Create a token for a program, and print it; it is not kept."""
     from datetime import timedelta
 
-    with _accounts(archive, state, accounts) as found:
-        say(found.create_token(name, scope, timedelta(days=days), "console") + "\n")  # type: ignore[arg-type]
+    with known.open() as found:
+        say(found.create_token(name, scope, timedelta(days=days), "console") + "\n")
 
 
 @token_app.command("list")
-def list_tokens(
-    archive: ArchivePlace = "archive", state: State = None, accounts: AccountsPlace = None
-) -> None:
+def list_tokens(known: Registered) -> None:
     """List the tokens, without their secrets."""
-    with _accounts(archive, state, accounts) as found:
+    with known.open() as found:
         for each in found.tokens():
             ended = f"revoked {each.revoked:%Y-%m-%d}" if each.revoked else f"until {each.expires:%Y-%m-%d}"
             say(f"{each.name}: {each.scope}, by {each.made_by}, {ended}\n")
@@ -303,33 +291,31 @@ def list_tokens(
 @token_app.command("revoke")
 def revoke_token(
     name: Annotated[str, typer.Argument(help="Name of the token.")],
-    archive: ArchivePlace = "archive",
-    state: State = None,
-    accounts: AccountsPlace = None,
+    known: Registered,
 ) -> None:
     """Revoke a token."""
-    with _accounts(archive, state, accounts) as found:
+    with known.open() as found:
         found.revoke_token(name)
 
 
 @app.command()
 def backup(
     out: Annotated[Path, typer.Argument(help="Folder to write; new or empty.")],
-    archive: ArchivePlace = "archive",
-    state: State = None,
+    archive: v.Archive = "archive",
+    state: v.State | None = None,
 ) -> None:
     """Copy archive, accounts and keys of a service that may be running; the copy is verified."""
     from ..service.upkeep import backup as made
 
-    counted = made(Path(archive), _state(archive, state).folder, out)
+    counted = made(Path(archive), Stated(archive, None, state).folder.folder, out)
     say(f"{out}: {counted.sessions} sessions, {counted.files} files, accounts and keys\n")
 
 
 @app.command()
 def restore(
     source: Annotated[Path, typer.Argument(help="Folder of a backup.")],
-    archive: ArchivePlace = "archive",
-    state: State = None,
+    archive: v.Archive = "archive",
+    state: v.State | None = None,
 ) -> None:
     """Restore a backup to a new archive; it is verified first."""
     from ..service.upkeep import restore as made
@@ -340,18 +326,13 @@ def restore(
 
 
 @app.command()
-def upgrade(
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
-    state: State = None,
-    accounts: AccountsPlace = None,
-) -> None:
+def upgrade(place: Stated, accounts: v.Accounts | None = None) -> None:
     """Change archive and accounts of an earlier version to the present one."""
     from ..service.upkeep import upgrade_archive
 
-    with open_archive(archive, objects) as found:
+    with place.open() as found:
         changed = upgrade_archive(found)
-    with _accounts(archive, state, accounts, upgrade=True) as known:
+    with Registered(place.archive, place.state, accounts).open(upgrade=True) as known:
         if known.upgraded_from is not None:
             changed.append(f"accounts of version {known.upgraded_from}")
     say("".join(f"upgraded: {each}\n" for each in changed) or "everything is of the present version\n")
@@ -389,8 +370,7 @@ WantedBy=multi-user.target
 
 @app.command()
 def unit(
-    archive: ArchivePlace = "archive",
-    bench: Annotated[list[Path] | None, typer.Option("--bench", "-b", help="Bench file; repeatable.")] = None,
+    archive: v.Archive = "archive", bench: Annotated[list[v.Bench] | None, "Repeatable."] = None
 ) -> None:
     """Print a unit of systemd for the service."""
     import shutil
@@ -406,17 +386,13 @@ def unit(
 
 @audit_app.command()
 def verify(
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
-    state: State = None,
-    key: Annotated[
-        Path | None, typer.Option(help="Public key (PEM). Default: that of the state folder.")
-    ] = None,
+    place: Stated,
+    public_key: Annotated[Path | None, Option("Public key (PEM). Default: that of the state folder.")] = None,
     head: Annotated[
         list[str] | None,
         typer.Option(help="Head that was kept elsewhere, a line of `reseau audit head`; repeatable."),
     ] = None,
-    as_json: AsJson = False,
+    as_json: v.AsJson = False,
 ) -> None:
     """Verify chain, signatures and end of the audit log; exit status 1 if something is wrong."""
     from ..core.provenance import canonical_json
@@ -424,11 +400,11 @@ def verify(
     from ..service.audit import Audit, Head, verify_log
 
     heads = [Head.read_line(each) for each in head or []]
-    with open_archive(archive, objects) as found:
-        if key is None:
-            wrong = Audit(found, _state(archive, state)).verify(heads)
+    with place.open() as found:
+        if public_key is None:
+            wrong = Audit(found, place.folder).verify(heads)
         else:
-            wrong = verify_log(found, read_text(key).encode(), heads)
+            wrong = verify_log(found, read_text(public_key).encode(), heads)
         count = len(found.journal("audit").entries())
     if as_json:
         say(canonical_json({"schema": "reseau-audit-verification/1", "entries": count, "wrong": wrong}))
@@ -438,15 +414,13 @@ def verify(
 
 
 @audit_app.command("head")
-def head_(
-    archive: ArchivePlace = "archive", objects: ObjectsPlace = None, state: State = None, out: Out = None
-) -> None:
+def head_(place: Stated, out: v.Out | None = None) -> None:
     """Print the end of the audit log, to be kept elsewhere."""
     from ..io import write_whole
     from ..service.audit import Audit
 
-    with open_archive(archive, objects) as found:
-        head = Audit(found, _state(archive, state)).head()
+    with place.open() as found:
+        head = Audit(found, place.folder).head()
     if head is None:
         raise UsageError("has no entries", where="audit log")
     line = f"{head.number} {head.hash}\n"
@@ -458,16 +432,14 @@ def head_(
 
 @audit_app.command("list")
 def list_audit(
-    count: Annotated[int, typer.Option(min=1, help="Number of entries.")] = 50,
-    archive: ArchivePlace = "archive",
-    objects: ObjectsPlace = None,
-    state: State = None,
+    place: Stated,
+    limit: v.Limit = 50,
 ) -> None:
     """List the last entries of the audit log, newest first."""
     from ..service.audit import Audit
 
-    with open_archive(archive, objects) as found:
-        for each in Audit(found, _state(archive, state)).entries(count):
+    with place.open() as found:
+        for each in Audit(found, place.folder).entries(limit):
             facts = ", ".join(f"{k} {v}" for k, v in each.facts.items())
             who = f"{each.by} ({each.via})"
             say(f"{each.number:>6} {each.at[:19]}Z {who}: {each.action}, {each.about}  {facts}\n")

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import UsageError
-from .common import say
+from ..core.options import Option
+from .common import CameraChoice, say
 
 if TYPE_CHECKING:
     from ..capture import Bench
@@ -26,34 +28,17 @@ _LEAST = 3
 
 
 def watch(
-    design: Annotated[
-        Path,
-        typer.Option("--design", "-d", help="Design of the testfield, board or sheet before the camera."),
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the frames; new or empty.")] = Path(
-        "photos"
-    ),
-    camera: Annotated[
-        str | None,
-        typer.Option(help="Camera of the bench, or a video device, as /dev/video0. Default: the only one."),
-    ] = None,
-    bench: Annotated[Path, typer.Option("--bench", "-b", help="Bench file.")] = Path("bench.toml"),
-    count: Annotated[int, typer.Option(min=_LEAST, help="Number of frames to take.")] = 15,
-    model: Annotated[str, typer.Option(metavar="NAME", help="Camera model, as for calibrate.")] = "",
-    pitch: Annotated[float | None, typer.Option(min=1e-6, help="Pixel size, mm.")] = None,
-    free: Annotated[str, typer.Option(help="Parameters to estimate, e.g. c,x0,y0,K1.")] = "",
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Port of the page on 127.0.0.1; 0: a free one.")
-    ] = 0,
-    seconds: Annotated[float, typer.Option(min=0.0, help="End after this time (s); 0: no limit.")] = 0.0,
-    auto: Annotated[
-        bool,
-        typer.Option(
-            "--auto", help="First set exposure and gain: 99.5 % of the pixels below 80 % of full scale."
-        ),
-    ] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue with the frames of --out.")] = False,
-    window: Annotated[bool, typer.Option(help="Open the page in a window, where there is a display.")] = True,
+    design: v.Design,
+    model: CameraChoice,
+    out: Annotated[v.Out, "Here a folder for the frames; new or empty."] = Path("photos"),
+    camera: Annotated[v.Camera | None, "Or a video device, as /dev/video0."] = None,
+    bench: v.Bench = Path("bench.toml"),
+    count: v.Count = 15,
+    port: Annotated[v.Port, "Here of the page on 127.0.0.1."] = 0,
+    seconds: v.Seconds = 0.0,
+    auto: Annotated[v.Auto, "99.5 % of the pixels below 80 % of full scale."] = False,
+    resume: Annotated[v.Resume, "Here with the frames of --out."] = False,
+    window: Annotated[bool, Option("Open the page in a window, where there is a display.")] = True,
 ) -> None:
     """Show the live picture of a camera on a page, and take a frame when it is sharp and new."""
     import time
@@ -64,15 +49,15 @@ def watch(
     from ..exchange import read_target
     from ..instruments import Camera
     from ..io.images import read_image, write_image
-    from ..procedures.calibration_options import CameraOptions
     from ..procedures.exposures import photographs_in
     from ..procedures.target_measurement import measurer_of
     from ..procedures.watching import Watching
     from ..service.live import LivePage
 
     target = read_target(design)
-    names = tuple(name.strip() for name in free.split(",") if name.strip())
-    options = CameraOptions(model, names, None if pitch is None else (pitch, pitch))
+    if count < _LEAST:
+        raise UsageError(f"is {count}, not at least {_LEAST}", where="--count")
+    options = model.options()
     if options.automatic:
         raise UsageError("is chosen from all photographs", where="--model auto", do="give it to calibrate")
     before = photographs_in(out) if resume and out.is_dir() and any(out.iterdir()) else []

@@ -269,7 +269,7 @@ class Code(StrEnum):
     TOO_LARGE = (
         "too-large",
         "needs more memory than it may take",
-        "allow more with `--memory`, or divide the work",
+        "allow more with `--memory-gb`, or divide the work",
     )
     TOO_MANY_OUTLIERS = (
         "too-many-outliers",

@@ -195,8 +195,8 @@ class Application:
         elif object_system:
             raise UsageError(
                 "needs a calibration with group B",
-                where="--object",
-                do="calibrate with reseau refine --photo-ii and --object",
+                where="--object-coordinates",
+                do="calibrate with reseau refine --photo-ii and --test-object",
             )
         return cls(calibration, mapping, view or View(), origin or {}, notes)
 
@@ -352,7 +352,7 @@ def _read(source: Path, system: str, camera: Mapping[str, Any]) -> ImagePoints:
     if any(abs(own.get(name, np.inf) - value) > 1e-6 for name, value in camera.items()):
         raise UsageError(
             "has points of another undistorted image", where=source,
-            do="repeat --fov, --alpha or --scale as for that one",
+            do="repeat --fov, --opencv-alpha or --scale as for that one",
         )  # fmt: skip
     return points_of(content, source)
 

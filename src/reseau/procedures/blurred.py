@@ -141,7 +141,7 @@ def lens_camera(
     lens: Lens,
     size_px: tuple[int, int],
     *,
-    pitch_um: float | None = None,
+    pitch_mm: float | None = None,
     distance: float | None = None,
     f_number: float | None = None,
 ) -> LensCamera:
@@ -153,8 +153,8 @@ def lens_camera(
         See :func:`reseau.exchange.read_lens`.
     size_px : (int, int)
         Width and height of its images.
-    pitch_um : float, optional
-        Pitch of the pixels where the file has no sensor; the axis is then at the centre of the image.
+    pitch_mm : float, optional
+        Size of a pixel where the file has no sensor; the axis is then at the centre of the image.
     distance : float, optional
         Distance from the first surface at which objects are sharp, mm; by default the image surface is where
         the prescription has it.
@@ -170,21 +170,21 @@ def lens_camera(
     --------
     >>> from reseau.optics.lenses import AIR, Constant, in_order
     >>> lens = Prescription(in_order([(0.02, 6.0, Constant(1.5)), (0.0, 96.0, AIR)]), stop=0, stop_radius=8.0)
-    >>> camera = lens_camera(Lens(lens), (1001, 801), pitch_um=10.0, distance=1000.0)
+    >>> camera = lens_camera(Lens(lens), (1001, 801), pitch_mm=0.01, distance=1000.0)
     >>> camera.corresponding(np.array([[0.0, 0.0, 1000.0]]))
     array([[500., 400.]])
     """
     prescription, sensor = lens.prescription, lens.sensor
     if sensor is None:
-        if pitch_um is None:
+        if pitch_mm is None:
             raise UsageError(
                 "has no sensor",
                 where=prescription.name,
-                do="give the pitch of the pixels, or add [sensor] to the file",
+                do="give --pitch-mm, or add [sensor] to the file",
             )
         width, height = size_px
-        plane = SensorPlane((pitch_um / 1e3, pitch_um / 1e3), ((width - 1) / 2, (height - 1) / 2))
-    elif pitch_um is not None:
+        plane = SensorPlane((pitch_mm, pitch_mm), ((width - 1) / 2, (height - 1) / 2))
+    elif pitch_mm is not None:
         raise UsageError("has a sensor; its pitch is not needed", where=prescription.name)
     elif tuple(sensor.size_px) != tuple(size_px):
         raise UsageError(

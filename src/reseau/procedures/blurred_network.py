@@ -12,12 +12,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..bundle import Network, Result, adjust_network
 from ..bundle import Options as BundleOptions
+from ..core import vocabulary as v
 from ..core.data import Array, Frame, Mask, Rows
 from ..core.display import Display
 from ..core.errors import UsageError
@@ -89,9 +90,9 @@ class NetworkOptions:
     """
 
     matching: BlurredOptions = field(default_factory=BlurredOptions)
-    rounds: int = 6
+    rounds: v.Rounds = 6
     keep_sharp: bool = True
-    initial: Literal["given", "centroid", "edge"] = "given"
+    initial: v.Initial = "given"
     bundle: BundleOptions = field(default_factory=BundleOptions)
 
     def __post_init__(self) -> None:

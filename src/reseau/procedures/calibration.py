@@ -124,7 +124,7 @@ def calibrate_camera(
     copies = copies_among(measured)
     measured = {name: points for name, points in measured.items() if name not in copies}
     declined |= {name: f"a copy of {original}" for name, original in copies.items()}
-    measured = _without(measured, options.without)
+    measured = _without(measured, options.leave_out)
     notes = (*seen.notes, *said_of_copies(copies), *(note for each in photographs for note in each.notes))
     job = _Job(declined, sizes, notes, design, model, options, taken, seen.shown)
     done = job.calibrated(measured)
@@ -251,7 +251,7 @@ class _Job:
             if isinstance(bent, Failure):
                 return bent
             board, network = bent, bent.network
-        found = search_model(network, options.adjustment, options.components, options.level)
+        found = search_model(network, options.adjustment, options.components, options.eliminate)
         if isinstance(found, Failure):
             if found.code is Code.NOT_CONVERGED:
                 return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
@@ -523,7 +523,7 @@ def first_camera(
         if focal_px is not None and not focal_px / _FOCAL_OFF < f < _FOCAL_OFF * focal_px:
             f = focal_px
     f /= magnification
-    pitch = model.pitch_mm or (1.0, 1.0)
+    pitch = model.pitch_mm if isinstance(model.pitch_mm, tuple) else (1.0, 1.0)
     values = model.registered.start_values(f, PixelGrid(*size, pitch))
     return Camera(
         ONE_CAMERA, *size, pitch, model.registered.name, values, model.chosen, model.options,

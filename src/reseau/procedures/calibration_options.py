@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
-from ..bundle import ControlPoints, Kind, Options, Shutter
+from ..bundle import ControlPoints, Options, Shutter
+from ..core import vocabulary as v
 from ..core.data import Array
 from ..core.errors import UsageError
 from ..io.network import TurntableEntry
@@ -46,8 +47,9 @@ class CameraOptions:
         otherwise ``opencv``.
     free : tuple of str
         Parameters to estimate; by default the usual ones of the model.
-    pitch_mm : (float, float), optional
-        Pixel size; required for models whose parameters are in millimetres.
+    pitch_mm : float or (float, float), optional
+        Size of a pixel, one number where it is a square; required for models whose parameters are in
+        millimetres.
     options : mapping of str to str or float
         Options of the model, such as the side of Brown's distortion.
     shutter : Shutter, optional
@@ -61,17 +63,19 @@ class CameraOptions:
 
     Examples
     --------
-    >>> CameraOptions().model, CameraOptions(pitch_mm=(0.005, 0.005)).chosen
+    >>> CameraOptions().model, CameraOptions(pitch_mm=0.005).chosen
     ('opencv', ('c', 'x0', 'y0', 'K1', 'K2', 'P1', 'P2'))
     """
 
     model: str = ""
     free: tuple[str, ...] = ()
-    pitch_mm: tuple[float, float] | None = None
+    pitch_mm: tuple[float, float] | float | None = None
     options: Mapping[str, str | float] = field(default_factory=dict)
     shutter: Shutter | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.pitch_mm, int | float):
+            object.__setattr__(self, "pitch_mm", (float(self.pitch_mm), float(self.pitch_mm)))
         if not self.model:
             object.__setattr__(self, "model", default_camera_model(self.pitch_mm is not None).name)
         model = self.registered
@@ -119,11 +123,11 @@ class CalibrationOptions:
         larger, because the target or the lens deviates from its model.
     control : ControlPoints, optional
         Control points for the datum; by default inner constraints over all points.
-    without : tuple of (str, str)
+    leave_out : tuple of (str, str)
         Image points to leave out, by image and point.
     components : {"axes", "images", "cameras"}, optional
         Groups with separate factors on their standard deviations; see :func:`reseau.bundle.search_model`.
-    level : float, optional
+    eliminate : float, optional
         Significance level of the tests by which distortion parameters are dropped.
     heights : Heights, optional
         Heights of the target on a z-stage.
@@ -149,11 +153,11 @@ class CalibrationOptions:
     """
 
     adjustment: Options = field(default_factory=Options)
-    sigma_px: float | None = None
+    sigma_px: v.SigmaPx | None = None
     control: ControlPoints | None = None
-    without: tuple[tuple[str, str], ...] = ()
-    components: Kind | None = None
-    level: float | None = None
+    leave_out: tuple[tuple[str, str], ...] = ()
+    components: v.Components | None = None
+    eliminate: v.Eliminate | None = None
     heights: Heights | None = None
     refraction: RefractionEntry | None = None
     focal_35_mm: float | None = None

@@ -107,7 +107,7 @@ def which_target(
         return found
     also = f"; {_shown_words(list(shown.values()))}" if shown else ""
     return Failure(
-        f"none of the known targets is seen{also}; describe yours with `reseau design board --json "
+        f"none of the known targets is seen{also}; describe yours with `reseau design board --out "
         "board.json`, and give that file",
         Code.NOT_FOUND,
     )

@@ -193,7 +193,7 @@ class Client:
         wait : bool
             Whether to wait for the calibration.
         **given
-            `target`, `model`, `pitch`, `free`, `film_format`, `dpi`.
+            `subject`, `model`, `pitch_mm`, `free`, `format_mm`, `dpi`.
 
         Returns
         -------

@@ -137,8 +137,12 @@ class Recalibrations:
         """
         entries = self._archive.journal(_PREFIX + name).entries("definition")
         if not entries:
-            raise UsageError("is not a recalibration of this archive", where=name, do="define it with --from")
-        return Recalibration.from_content(dict(entries[-1].document), where=name)
+            raise UsageError(
+                "is not a recalibration of this archive", where=name, do="define it with --repeats"
+            )
+        content = dict(entries[-1].document)
+        content["parameters"] = sessions.present_keys(content["parameters"])
+        return Recalibration.from_content(content, where=name)
 
     def unfinished(self, name: str) -> str | None:
         """Return the last session of a recalibration that was begun and is not done, or None."""

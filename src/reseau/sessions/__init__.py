@@ -35,6 +35,7 @@ from .parameters import (
     SensorParameters,
     SessionParameters,
     TestfieldParameters,
+    present_keys,
 )
 
 __all__ = [
@@ -62,6 +63,7 @@ __all__ = [
     "lock",
     "own_plan",
     "parameters_of",
+    "present_keys",
     "procedure_of",
     "rerun",
     "rerun_all",

@@ -26,7 +26,7 @@ from ..core.errors import ReseauError, UsageError
 from ..core.failure import Code, Failure
 from ..execution import Executor
 from .kinds import GENERATOR, Reported, SessionKind, kind_of, own_plan
-from .parameters import OwnParameters, SessionParameters
+from .parameters import OwnParameters, SessionParameters, present_keys
 
 __all__ = [
     "begin",
@@ -202,7 +202,7 @@ def parameters_of(session: Session) -> SessionParameters:
     1
     """
     return kind_of(session.plan).parameters.from_archive(
-        session.parameters, where=_where(session.name, session.plan)
+        present_keys(session.parameters), where=_where(session.name, session.plan)
     )
 
 

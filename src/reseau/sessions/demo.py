@@ -56,7 +56,7 @@ STEPS = 18
 _POSES = 12
 _SETTINGS: dict[str, dict[str, Any]] = {"scanner": {"half_sector": 100}, "table": {"speed": 1000.0}}
 """The head sweeps over the whole tank; the table is fast."""
-_CAMERA = {"pitch": 0.027, "free": ["c", "x0", "y0", "K1"], "row_jitter": 0.0086, "fill": 0.8}
+_CAMERA = {"pitch_mm": 0.027, "free": ["c", "x0", "y0", "K1"], "row_jitter_px": 0.0086, "fill": 0.8}
 """Camera of the testfield: that of the paper."""
 
 

@@ -275,7 +275,7 @@ def _testfield_procedure(
     design = parse_design(session.input("design.json"), "design.json")
     # The poses and the goal have no influence on the result of given frames.
     options = {key: value for key, value in session.parameters.items() if key not in ("steps", "until")}
-    measure = measurer_of(design, TestfieldOptions(row_jitter_px=given.row_jitter, fill=given.fill))
+    measure = measurer_of(design, TestfieldOptions(row_jitter_px=given.row_jitter_px, fill=given.fill))
     return TestfieldProcedure(
         design, measure, given.camera_options(), name=session.name, options=options, inputs=_hashes(session),
         sigmas=given.sigmas, refraction=_refraction(session, given),
@@ -381,7 +381,7 @@ def _blurred_procedure(session: Session, given: BlurredParameters) -> BlurredPro
     document, targets, lens = (_read_blurred(session.input(name), name, name) for name in _OF_BLURRED)
     sensor = lens.sensor  # type: ignore[attr-defined]
     matching = BlurredOptions(
-        psf_px=given.psf, search_px=given.search, fill=1.0 if sensor is None else sensor.fill
+        psf_px=given.psf_px, search_px=given.search_px, fill=1.0 if sensor is None else sensor.fill
     )
     options = {key: value for key, value in session.parameters.items() if key != "steps"}
     return BlurredProcedure(

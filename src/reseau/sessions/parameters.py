@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
-from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
+from pydantic import Field, PositiveInt, model_validator
 
 from ..capture import HEIGHT, ROLES, Bench, Goal, SensorSeriesPlan, Step
 from ..capture.by_hand import check_reach
+from ..core import vocabulary as v
 from ..core.errors import FormatError, StateError, UsageError
 from ..instruments import Camera, CameraRig, EnvironmentSensor, Turntable
 from ..io import Document
@@ -34,7 +35,20 @@ __all__ = [
     "SensorParameters",
     "SessionParameters",
     "TestfieldParameters",
+    "present_keys",
 ]
+
+
+_FORMERLY = {
+    "pitch": "pitch_mm", "row_jitter": "row_jitter_px", "psf": "psf_px", "search": "search_px",
+    "format": "format_mm",
+}  # fmt: skip
+"""Keys that archives of older versions have."""
+
+
+def present_keys(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return archived parameters of any version with the keys of the present one."""
+    return {_FORMERLY.get(key, key): value for key, value in parameters.items()}
 
 
 class SessionParameters(Document):
@@ -70,15 +84,15 @@ class SessionParameters(Document):
     RIGS: ClassVar[bool] = False
     """Whether the camera may be a rig."""
 
-    retakes: NonNegativeInt = 2
+    retakes: v.Retakes = 2
     park: dict[str, float] = Field(default_factory=dict)
     retreat: dict[str, float] | None = None
-    home: bool = False
-    camera: str | None = None
-    table: str | None = None
-    oscilloscope: str | None = None
-    scanner: str | None = None
-    seed: int | None = None
+    home: v.Home = False
+    camera: v.Camera | None = None
+    table: v.Table | None = None
+    oscilloscope: v.Oscilloscope | None = None
+    scanner: v.Scanner | None = None
+    seed: v.Seed | None = None
 
     @classmethod
     def from_archive(cls, parameters: Mapping[str, Any], *, where: object) -> Self:
@@ -213,10 +227,10 @@ class FramesParameters(SessionParameters):
     RIGS: ClassVar[bool] = True
     NEEDS: ClassVar[tuple[str, ...]] = ("camera",)
 
-    retakes: NonNegativeInt = 0
-    count: PositiveInt = 1
-    average: PositiveInt = 1
-    checks: NonNegativeInt = 0
+    retakes: v.Retakes = 0
+    count: v.Count = 1
+    average: v.Average = 1
+    checks: v.Checks = 0
 
     @property
     def expected(self) -> int:
@@ -242,8 +256,8 @@ class ScanParameters(SessionParameters):
     NEEDS: ClassVar[tuple[str, ...]] = ("scanner",)
     USES: ClassVar[tuple[str, ...]] = ("oscilloscope",)
 
-    retakes: NonNegativeInt = 0
-    count: PositiveInt = 1
+    retakes: v.Retakes = 0
+    count: v.Count = 1
 
     @property
     def expected(self) -> int:
@@ -267,7 +281,7 @@ class OwnParameters(SessionParameters):
 
     SCHEMA: ClassVar[str] = "reseau-own-parameters/1"
 
-    retakes: NonNegativeInt = 0
+    retakes: v.Retakes = 0
     set: dict[str, Any] = Field(default_factory=dict)
 
     def part_of(self, bench: Bench) -> Bench:
@@ -298,9 +312,9 @@ class OscilloscopeParameters(SessionParameters):
     USES: ClassVar[tuple[str, ...]] = ("scanner", "oscilloscope")
 
     body: bool = True
-    average: PositiveInt = 1
-    checks: NonNegativeInt = 0
-    check: tuple[str, ...] = ()
+    average: v.Average = 1
+    checks: v.Checks = 0
+    check: v.Check = ()
 
 
 class BlurredParameters(SessionParameters):
@@ -310,9 +324,9 @@ class BlurredParameters(SessionParameters):
     ----------
     steps : tuple of (str, dict of str to float)
         Names and positions of the poses; the names are those of images of the network.
-    psf : float
+    psf_px : float
         Blur of sensor and diffraction beside that of the rays (px, one sigma).
-    search : float
+    search_px : float
         Largest distance from the predicted position (px).
     rounds : int
         Largest number of rounds.
@@ -331,12 +345,12 @@ class BlurredParameters(SessionParameters):
     NEEDS: ClassVar[tuple[str, ...]] = ("camera", "table")
 
     steps: tuple[tuple[str, dict[str, float]], ...]
-    psf: float = Field(default=0.5, ge=0.1)
-    search: float = Field(default=6.0, ge=1.0)
-    rounds: PositiveInt = 6
-    initial: Literal["given", "centroid", "edge"] = "centroid"
-    average: PositiveInt = 1
-    checks: NonNegativeInt = 0
+    psf_px: v.PsfPx = 0.5
+    search_px: v.SearchPx = 6.0
+    rounds: v.Rounds = 6
+    initial: v.Initial = "centroid"
+    average: v.Average = 1
+    checks: v.Checks = 0
 
     @property
     def expected(self) -> int:
@@ -360,11 +374,11 @@ class TestfieldParameters(SessionParameters):
     ----------
     steps : tuple of (str, dict of str to float)
         Names and positions of the poses; with `until`, the candidates.
-    pitch : float or None
+    pitch_mm : float or None
         Size of a pixel (mm), for Brown's model; None: OpenCV's model.
     free : tuple of str
         Parameters to estimate; empty: the usual ones of the model.
-    row_jitter : float
+    row_jitter_px : float
         Standard deviation of the start of a row of the sensor (px).
     fill : float
         Light-sensitive part of a pixel, as a share of its area.
@@ -381,7 +395,7 @@ class TestfieldParameters(SessionParameters):
     Examples
     --------
     >>> steps = (("frontal", {"tilt": 0.0}), ("tilted", {"tilt": 30.0}))
-    >>> given = TestfieldParameters(steps=steps, pitch=0.027, free=("c",), row_jitter=0.0, fill=0.8)
+    >>> given = TestfieldParameters(steps=steps, pitch_mm=0.027, free=("c",), row_jitter_px=0.0, fill=0.8)
     >>> given.expected, given.camera_options().model
     (2, 'brown')
     """
@@ -392,15 +406,15 @@ class TestfieldParameters(SessionParameters):
     NEEDS: ClassVar[tuple[str, ...]] = ("camera", "table")
 
     steps: tuple[tuple[str, dict[str, float]], ...]
-    pitch: float | None
-    free: tuple[str, ...]
-    row_jitter: float
-    fill: float
+    pitch_mm: v.PitchMm | None
+    free: v.Free
+    row_jitter_px: v.RowJitterPx
+    fill: v.Fill
     until: str = ""
     first: PositiveInt = 5
     sigmas: tuple[float, float, float] | None = None
-    average: PositiveInt = 1
-    checks: NonNegativeInt = 0
+    average: v.Average = 1
+    checks: v.Checks = 0
 
     @property
     def expected(self) -> int | None:
@@ -428,8 +442,7 @@ class TestfieldParameters(SessionParameters):
         """Return the camera model and the parameters to estimate."""
         from ..procedures.calibration_options import CameraOptions
 
-        pitch = None if self.pitch is None else (self.pitch, self.pitch)
-        return CameraOptions(free=self.free, pitch_mm=pitch)
+        return CameraOptions(free=self.free, pitch_mm=self.pitch_mm)
 
     @staticmethod
     def lifted(steps: Sequence[Step]) -> bool:
@@ -475,28 +488,28 @@ class PhotographsParameters(SessionParameters):
     Parameters
     ----------
     model : str
-        Camera model; empty: Brown's with `pitch`, else OpenCV's.
-    pitch : float, optional
+        Camera model; empty: Brown's with `pitch_mm`, else OpenCV's.
+    pitch_mm : float, optional
         Size of a pixel (mm).
     free : tuple of str
         Parameters to estimate; empty: the usual ones of the model.
-    row_jitter, fill : float
+    row_jitter_px, fill : float
         As for :class:`TestfieldParameters`.
 
     Examples
     --------
-    >>> PhotographsParameters(pitch=0.005).camera_options().model
+    >>> PhotographsParameters(pitch_mm=0.005).camera_options().model
     'brown'
     """
 
     SCHEMA: ClassVar[str] = "reseau-photographs-parameters/1"
 
-    retakes: NonNegativeInt = 0
-    model: str = ""
-    pitch: float | None = None
-    free: tuple[str, ...] = ()
-    row_jitter: float = 0.0
-    fill: float = 1.0
+    retakes: v.Retakes = 0
+    model: v.Model = ""
+    pitch_mm: v.PitchMm | None = None
+    free: v.Free = ()
+    row_jitter_px: v.RowJitterPx = 0.0
+    fill: v.Fill = 1.0
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -521,8 +534,7 @@ class PhotographsParameters(SessionParameters):
         """
         from ..procedures.calibration_options import CameraOptions
 
-        pitch = None if self.pitch is None else (self.pitch, self.pitch)
-        return CameraOptions(self.model, self.free, pitch)
+        return CameraOptions(self.model, self.free, self.pitch_mm)
 
 
 class FilmParameters(SessionParameters):
@@ -530,7 +542,7 @@ class FilmParameters(SessionParameters):
 
     Parameters
     ----------
-    format : (float, float), optional
+    format_mm : (float, float), optional
         Width and height of a frame (mm). Default: the usual formats are tried.
     dpi : float, optional
         Resolution of the scans (pixels per inch), if that in the files is missing or wrong.
@@ -539,24 +551,26 @@ class FilmParameters(SessionParameters):
 
     Examples
     --------
-    >>> FilmParameters(format=(36, 24)).options().formats
+    >>> FilmParameters(format_mm=(36, 24)).options().formats
     ((36.0, 24.0),)
     """
 
     SCHEMA: ClassVar[str] = "reseau-film-parameters/1"
 
-    retakes: NonNegativeInt = 0
-    format: tuple[Annotated[float, Field(gt=1, lt=400)], Annotated[float, Field(gt=1, lt=400)]] | None = None
-    dpi: float | None = Field(default=None, ge=10, le=100_000)
-    transform: Literal["similarity", "affine", "projective", "bilinear"] = "affine"
+    retakes: v.Retakes = 0
+    format_mm: tuple[Annotated[float, Field(gt=1, lt=400)], Annotated[float, Field(gt=1, lt=400)]] | None = (
+        None
+    )
+    dpi: v.Dpi | None = None
+    transform: v.Transform = "affine"
 
     def options(self) -> FrameOptions:
         """Return the prior knowledge of the frames."""
         from ..procedures.film_frame import FrameOptions
 
-        if self.format is None:
+        if self.format_mm is None:
             return FrameOptions(dpi=self.dpi)
-        return FrameOptions(formats=(self.format,), dpi=self.dpi)
+        return FrameOptions(formats=(self.format_mm,), dpi=self.dpi)
 
 
 class SensorParameters(SessionParameters):
@@ -584,12 +598,12 @@ class SensorParameters(SessionParameters):
     SCHEMA: ClassVar[str] = "reseau-sensor-parameters/1"
     NEEDS: ClassVar[tuple[str, ...]] = ("camera",)
 
-    region: tuple[int, int, int, int] | None
+    region: v.Region | None
     levels: PositiveInt = 14
     frames: PositiveInt = 8
     longest_us: float = 1e6
     edge_us: float | None = None
-    count: PositiveInt | None = None
+    count: v.Count | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
 
     @classmethod

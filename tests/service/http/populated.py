@@ -21,7 +21,7 @@ STEPS = (
     ("left", {"tilt": 30.0, "roll": 270.0, "camera_roll": 270.0}),
 )  # fmt: skip
 PARAMETERS = {
-    "steps": STEPS, "pitch": 0.027, "free": ("c", "x0", "y0", "K1"), "row_jitter": 0.0086, "fill": 0.8
+    "steps": STEPS, "pitch_mm": 0.027, "free": ("c", "x0", "y0", "K1"), "row_jitter_px": 0.0086, "fill": 0.8
 }  # fmt: skip
 
 

@@ -320,7 +320,7 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
     chosen(browser, "[name=photographs]", *sorted(place.folder.glob("*.png")))
     chosen(browser, "[name=design]", place.folder / "field.json")
     browser.click("summary")
-    browser.fill("[name=pitch]", "0.027")
+    browser.fill("[name=pitch_mm]", "0.027")
     browser.fill("[name=free]", "c,x0,y0,K1")
     shot(browser, "service-files")
     browser.click("form button.primary")

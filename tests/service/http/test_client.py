@@ -77,7 +77,9 @@ def test_photographs_are_uploaded(place: tuple[Path, str, str], tmp_path: Path) 
         for each in session.frames(kind="frame")[2:]:
             cv2.imwrite(str(tmp_path / f"{each.step}.png"), session.picture(each).pixels)
     with Client(place[1], place[2]) as client:
-        found = client.upload("sent", sorted(tmp_path.glob("*.png")), design, pitch="0.027", free="c,x0,y0")
+        found = client.upload(
+            "sent", sorted(tmp_path.glob("*.png")), design, pitch_mm="0.027", free="c,x0,y0"
+        )
     assert (found["status"], found["good"]) == ("done", 3)
 
 

@@ -58,7 +58,7 @@ def test_photographs_become_a_calibration_with_a_verdict_that_is_computed_again(
 ) -> None:
     client = one.client("operate")
     files = photographs | {"../../notes.png": b"no photograph"}
-    given = {"pitch": "0.027", "free": "c,x0,y0,K1"}
+    given = {"pitch_mm": "0.027", "free": "c,x0,y0,K1"}
     begun = sent(client, "dropped", files, **given)
     assert begun.status_code == 202, begun.text
     assert finished(client, begun.json()["job"])["found"] == "done"
@@ -95,7 +95,7 @@ def test_an_upload_that_was_cut_off_is_finished_after_the_next_start(
 ) -> None:
     with served(tmp_path) as first:
         client = first.client("operate")
-        assert sent(client, "cut off", photographs, pitch="0.027", free="c,x0,y0").status_code == 202
+        assert sent(client, "cut off", photographs, pitch_mm="0.027", free="c,x0,y0").status_code == 202
     with served(tmp_path) as second:
         client = second.client("operate")
         end = time.monotonic() + 120
@@ -116,8 +116,8 @@ def test_an_upload_that_was_cut_off_is_finished_after_the_next_start(
         ({"a.png": b"x"}, {"design": "[" * 100_000}, "is not JSON"),
         ({"a.png": b"x"}, {"design": "{}"}, "schema"),
         ({"a.png": b"x"}, {"model": "no such model"}, "no such model"),
-        ({"a.png": b"x"}, {"pitch": "-1"}, "pitch"),
-        ({"a.png": b"x"}, {"target": "oscilloscope"}, "PHOTO I and II"),
+        ({"a.png": b"x"}, {"pitch_mm": "-1"}, "pitch_mm"),
+        ({"a.png": b"x"}, {"subject": "oscilloscope"}, "PHOTO I and II"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_calibrated_is_refused_in_one_line_and_leaves_no_session(
@@ -241,7 +241,7 @@ def test_scans_of_film_are_archived_and_oriented(one: Served) -> None:
     client = one.client("operate")
     scans = {"07.png": film(7), "08.png": np.full((580, 840), 128, np.uint8)}
     parts = [("photographs", (name, cv2.imencode(".png", each)[1].tobytes())) for name, each in scans.items()]
-    given = {"name": "roll 12", "target": "film", "film_format": "36x24"}
+    given = {"name": "roll 12", "subject": "film", "format_mm": "36x24"}
     begun = client.post("/api/1/uploads", data=given, files=parts)
     assert begun.status_code == 202, begun.text
     assert finished(client, begun.json()["job"])["found"] == "done"
@@ -273,7 +273,7 @@ def test_photographs_of_an_oscilloscope_of_other_origin_are_corrected_to_the_tru
     files = [("photographs", (f"{k}.png", (folder / f"set01.photo{k}.png").read_bytes())) for k in (1, 2, 3)]
     for role, name in (("design", "reseau"), ("test_object", "object")):
         files.append((role, (f"{name}.json", (folder / f"set01.{name}.design.json").read_bytes())))
-    begun = client.post("/api/1/uploads", data={"name": "scope", "target": "oscilloscope"}, files=files)
+    begun = client.post("/api/1/uploads", data={"name": "scope", "subject": "oscilloscope"}, files=files)
     assert finished(client, begun.json()["job"])["found"] == "done"
     found = client.get("/api/1/sessions/scope").json()
     names = {each["name"]: each["id"] for each in found["results"]}

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ...adjust import SnoopingStep
+from ...core import vocabulary as v
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
@@ -83,12 +84,12 @@ class Options:
     """
 
     outliers: Literal["keep", "reject"] = "keep"
-    alpha: float = 0.001
+    alpha: v.Alpha = 0.001
     max_fraction: float = 0.25
     max_iterations: int = 200
     tolerance: float = 1e-6
     watch: Callable[[int, float], None] | None = None
-    memory_gb: float | None = None
+    memory_gb: v.MemoryGb | None = None
 
     def __post_init__(self) -> None:
         if self.outliers not in ("keep", "reject"):

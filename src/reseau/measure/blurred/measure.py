@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import scipy.spatial
 from numpy.typing import NDArray
 
+from ...core import vocabulary as v
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
@@ -126,12 +127,12 @@ class BlurredOptions:
     0.5
     """
 
-    polarity: Literal["dark", "bright"] = "dark"
-    psf_px: float = 0.5
+    polarity: v.Polarity = "dark"
+    psf_px: v.PsfPx = 0.5
     psf_log_sigma: float = 0.3
-    search_px: float = 6.0
+    search_px: v.SearchPx = 6.0
     varied: Varied | None = None
-    fill: float = 1.0
+    fill: v.Fill = 1.0
     rings: int | None = None
     background: int = 1
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from ...core import vocabulary as v
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Failure, Remark
 from ...core.threads import one_thread
@@ -69,10 +70,10 @@ class BoardOptions:
     0.2
     """
 
-    mirrored: bool = False
-    psf_px: float = 0.8
-    row_jitter_px: float = 0.0
-    fill: float = 1.0
+    mirrored: v.Mirrored = False
+    psf_px: v.PsfPx = 0.8
+    row_jitter_px: v.RowJitterPx = 0.0
+    fill: v.Fill = 1.0
     least_t: float = 3.5
     most_sigma_px: float = 0.2
     neighbour_px: float = 0.5

@@ -10,6 +10,7 @@ import numpy as np
 from ...adjust import Adjustment
 from ...calibration import scan_coordinates, scan_pixels
 from ...calibration.film import TRANSFORMS
+from ...core import vocabulary as v
 from ...core.data import Array, ImagePoints, Mask, Rows
 from ...core.failure import Code, Failure, Remark
 from ...io import FiducialDesign
@@ -79,10 +80,10 @@ class FiducialOptions:
     'affine'
     """
 
-    dpi: float | None = None
+    dpi: v.Dpi | None = None
     rotation: int | None = None
-    mirrored: bool | None = None
-    transform: Kind = "affine"
+    mirrored: v.Mirrored | None = None
+    transform: v.Transform = "affine"
     max_tilt_deg: float = 8.0
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from ...core import vocabulary as v
 from ...core.data import Array, Frame
 from ...core.display import Display
 from ...core.failure import Code, Failure
@@ -94,7 +95,7 @@ class FrameOptions:
     """
 
     formats: tuple[tuple[float, float], ...] = FORMATS
-    dpi: float | None = None
+    dpi: v.Dpi | None = None
     near: Array | None = None
     aspect_sigma: float = 0.007
     angle_sigma_deg: float = 0.25
@@ -376,8 +377,8 @@ def _found(
     formats = ", ".join(f"{w:g}x{h:g}" for w, h in options.formats)
     return Failure(
         f"no frame of the format {formats} stands out from unexposed film on at least three sides; scan it "
-        "with a margin of film around, or give --frame, --dpi or the approximate corners (overlapping frames "
-        "cannot be separated)",
+        "with a margin of film around, or give --format-mm, --dpi or the approximate corners (overlapping "
+        "frames cannot be separated)",
         Code.NOT_FOUND,
     ), reduction
 
@@ -543,7 +544,7 @@ def _judged(
             base,
             lines=None,
             why=f"the four edges do not form a frame of {w:g}x{h:g} mm (test value {worst:.1f}); one of them "
-            "may be a line of the picture: give the approximate corners, or the correct --frame",
+            "may be a line of the picture: give the approximate corners, or the correct --format-mm",
             code=Code.INCONSISTENT,
         )
     sigma = np.sqrt(np.diag(lines.covariance))
@@ -568,7 +569,7 @@ def _judged(
         w, h = (side * own / known for side in guess.format_mm)
         what = f"at the {25.4 * known:.0f} dpi of the scan it has {w:.2f} mm × {h:.2f} mm"
         if abs(own / known - 1) > _CONTRADICTS:
-            why = f"{what}, which is not the format; give the correct --frame or --dpi"
+            why = f"{what}, which is not the format; give the correct --format-mm or --dpi"
             return replace(base, lines=None, why=why, code=Code.INCONSISTENT)
         # The opening of a mount hides the edges of the frame and is smaller: its size gives no scale.
         why = "; ".join(

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...core import vocabulary as v
 from ...core.data import Array, Frame, ImagePoints, Mask, Rows
 from ...core.failure import Code
 from ...core.overlaid import Overlaid
@@ -54,9 +55,9 @@ class PinOptions:
 
     Parameters
     ----------
-    psf_px : float
+    smoothing_px : float
         Width (one sigma) of the Gaussian that smooths the frame for detection.
-    most_length_px : float, optional
+    max_length_px : float, optional
         Largest length of a pin's arc; by default 6 % of the frame's diagonal, at least 40 px. Longer spots
         are edges of the sector, the face of the transducer or interfaces.
     most_tilt_deg : float
@@ -90,8 +91,8 @@ class PinOptions:
     0.15
     """
 
-    psf_px: float = 1.2
-    most_length_px: float | None = None
+    smoothing_px: float = 1.2
+    max_length_px: float | None = None
     most_tilt_deg: float = 60.0
     least_strength: float = 0.2
     least_correlation: float = 0.92
@@ -102,8 +103,8 @@ class PinOptions:
     most_wire_px: int = 5
     most_sigma_px: float = 0.5
     gate: float = 0.15
-    max_rotation_deg: float = 12.0
-    mirrored: bool | None = None
+    max_rotation_deg: v.MaxRotationDeg = 12.0
+    mirrored: v.Mirrored | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +243,7 @@ def find_pins(
     """
     o = options or PinOptions()
     screened = screen(frame, run=None)
-    longest = o.most_length_px or max(_LONG_PX, 0.06 * float(np.hypot(*frame.pixels.shape)))
+    longest = o.max_length_px or max(_LONG_PX, 0.06 * float(np.hypot(*frame.pixels.shape)))
     ground = ground_of(screened.grey, max(15, round(_GROUND_LENGTHS * longest)))
     blur = None
     if hidden is not None:
@@ -254,7 +255,7 @@ def find_pins(
     covered = find_cuts(light, screened.noise, o.most_wire_px)
     if hidden is not None:
         covered |= hidden
-    echoes = find_echoes(bridged(light, covered), o.psf_px, least)
+    echoes = find_echoes(bridged(light, covered), o.smoothing_px, least)
     open_ = replace(screened, valid=screened.valid & ~covered)
     return _Judge(frame, open_, echoes, longest, o, tuple(others), blur).verdict()
 

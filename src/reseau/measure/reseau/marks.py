@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
+from ...core import vocabulary as v
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code
 from ...io import ReseauDesign
@@ -127,12 +128,12 @@ class ReseauOptions:
 
     nominal: bool = True
     nominal_within_px: float | None = None
-    mirrored: bool | None = None
-    max_rotation_deg: float | None = None
+    mirrored: v.Mirrored | None = None
+    max_rotation_deg: v.MaxRotationDeg | None = None
     mark_px: float | None = None
-    psf_px: float = 0.6
-    row_jitter_px: float = 0.0
-    fill: float = 1.0
+    psf_px: v.PsfPx = 0.6
+    row_jitter_px: v.RowJitterPx = 0.0
+    fill: v.Fill = 1.0
     least_t: float = 3.5
     most_sigma_px: float = 0.5
     neighbour_px: float = 1.0

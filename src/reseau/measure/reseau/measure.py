@@ -350,7 +350,7 @@ def _oriented(
     text = (
         f"the orientation is ambiguous: {others}, the design fits as well; its names are those of the "
         "upright one (give nominal positions, or say whether it is mirrored and how far it may be turned: "
-        "--not-mirrored, --max-rotation)"
+        "--not-mirrored, --max-rotation-deg)"
     )
     return placed, (Remark(text, Code.AMBIGUOUS),)
 

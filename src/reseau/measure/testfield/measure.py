@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
+from ...core import vocabulary as v
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Failure, Remark
 from ...core.threads import one_thread
@@ -108,9 +109,9 @@ class TestfieldOptions:
     """
 
     __test__ = False  # prevents collection by pytest
-    psf_px: float = 0.8
-    row_jitter_px: float = 0.0
-    fill: float = 1.0
+    psf_px: v.PsfPx = 0.8
+    row_jitter_px: v.RowJitterPx = 0.0
+    fill: v.Fill = 1.0
     least_t: float = 8.0
     most_sigma_px: float = 0.3
     neighbour_px: float = 0.03

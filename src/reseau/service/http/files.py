@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, File, Form, Path, UploadFile
 from pydantic import ConfigDict
 
+from ...core import vocabulary as v
 from ...core.errors import InputError, UsageError
 from ...io.photographs import PHOTOGRAPHS
 from ..decoding import PHOTOGRAPH
@@ -19,6 +20,7 @@ __all__ = ["JobAnswer", "router"]
 
 router = APIRouter(tags=["files"], responses=refusals(400, 401, 403, 404, 413, 422, 503))
 
+WORDS = v.names()
 MOST_FILES, MOST_BYTES = 200, 200 << 20
 """Photographs of an upload, and bytes of one."""
 _MOST_DESIGN = 4 << 20
@@ -76,24 +78,18 @@ def upload(
     corners: Annotated[
         UploadFile | None, File(description="For film: calibrated corners of the camera (`frame-corners/1`).")
     ] = None,
-    target: Annotated[
-        Literal["camera", "oscilloscope", "film"],
-        Form(
-            description="What is calibrated: a camera, an oscilloscope by PHOTO I, II and III, "
-            "or the frames of a roll of film."
-        ),
-    ] = "camera",
-    model: Annotated[str, Form(max_length=40, description="Camera model; empty: the usual one.")] = "",
-    pitch: Annotated[float | None, Form(gt=0, le=1, description="Size of a pixel (mm).")] = None,
-    free: Annotated[str, Form(max_length=400, description="Parameters to estimate, as c,x0,y0,K1.")] = "",
-    film_format: Annotated[
+    subject: Annotated[v.Subject, Form()] = "camera",
+    model: Annotated[v.Model, Form(max_length=40)] = "",
+    pitch_mm: Annotated[v.PitchMm | None, Form()] = None,
+    free: Annotated[str, Form(max_length=400, description=f"{WORDS['free'].help} As c,x0,y0,K1.")] = "",
+    format_mm: Annotated[
         str,
         Form(
             pattern=r"^([0-9]{1,3}(\.[0-9]{1,3})?x[0-9]{1,3}(\.[0-9]{1,3})?)?$",
-            description="Format of film, mm.",
+            description=WORDS["format_mm"].help,
         ),
     ] = "",
-    dpi: Annotated[float | None, Form(ge=10, le=100_000, description="Resolution of scans of film.")] = None,
+    dpi: Annotated[v.Dpi | None, Form()] = None,
 ) -> Uploaded:
     """Calibrate from photographs: they are archived as they come, decoded, measured and adjusted.
 
@@ -112,20 +108,20 @@ def upload(
             raise UsageError(f"is larger than {MOST_BYTES >> 20} MiB", where=label)
         if not each.size:
             raise InputError("is empty", where=label)
-    if target != "oscilloscope" and len(set(labels)) < len(labels):
+    if subject != "oscilloscope" and len(set(labels)) < len(labels):
         raise UsageError("have names that occur twice", where="photographs")
-    if target != "film" and design is None:
+    if subject != "film" and design is None:
         raise UsageError("is missing", where="design", do="give the design of the target")
     plan, inputs = "photographs", dict[str, str]()
-    given: dict[str, Any] = {"model": model, "pitch": pitch}
-    if target == "camera":
+    given: dict[str, Any] = {"model": model, "pitch_mm": pitch_mm}
+    if subject == "camera":
         assert design is not None
         inputs["design.json"] = _text(design)
         given["free"] = [each.strip() for each in free.split(",") if each.strip()]
-    elif target == "film":
+    elif subject == "film":
         plan, given = "film", {}
-        if film_format:
-            given["format"] = [float(each) for each in film_format.split("x")]
+        if format_mm:
+            given["format_mm"] = [float(each) for each in format_mm.split("x")]
         if dpi is not None:
             given["dpi"] = dpi
         if corners is not None:

@@ -78,7 +78,7 @@ class ServeOptions:
         if (self.certificate is None) != (self.key is None):
             raise UsageError("must be given together", where="--certificate and --key")
         if (self.signing_key is None) != (self.signing_certificate is None):
-            raise UsageError("must be given together", where="--sign-key and --sign-certificate")
+            raise UsageError("must be given together", where="--signing-key and --signing-certificate")
         if self.proxy:
             parts = urlsplit(self.proxy)
             if parts.scheme != "https" or not parts.hostname or parts.path not in ("", "/"):
@@ -90,7 +90,7 @@ class ServeOptions:
             raise UsageError("is open to others without TLS", where=self.host, do=do)
         if self.names and self.certificate is None:
             # A name of another machine that resolves to this one is how pages of others get in.
-            raise UsageError("needs --certificate and --key", where="--name")
+            raise UsageError("needs --certificate and --key", where="--host-name")
         for path in (self.certificate, self.key, self.signing_key, self.signing_certificate):
             if path is not None and not path.is_file():
                 raise UsageError("is not a file", where=path)

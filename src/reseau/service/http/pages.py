@@ -14,6 +14,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 
 from ...archive import Session
 from ...core.errors import ReseauError
+from ...core.vocabulary import names
 from ...io.photographs import PHOTOGRAPHS
 from . import accounts, benches, calibrations, history, operations, sessions
 from .access import Administering, Here, NotFound, Reading, Unknown, csrf_of, principal_of, service_of
@@ -54,6 +55,7 @@ def _templates() -> jinja2.Environment:
         lstrip_blocks=True, undefined=jinja2.StrictUndefined,
     )  # fmt: skip
     found.filters |= {"plain": _plain, "powers": _powers, "symbol": _symbol, "sentence": _sentence}
+    found.globals["vocabulary"] = names()
     return found
 
 

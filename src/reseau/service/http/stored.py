@@ -131,12 +131,13 @@ def marks_of(session: Session, archived: ArchivedFrame) -> tuple[Frame, Marks, s
     from ...measure import TestfieldOptions
     from ...procedures.target_measurement import measurer_of
     from ...report.overlay import Marks
+    from ...sessions import present_keys
 
     names = [name for name in session.inputs() if name in ("design.json", "reseau.json")]
     if not names:
         raise UsageError("has no design of a target", where=session.name)
-    given = session.parameters
-    options = TestfieldOptions(row_jitter_px=given.get("row_jitter", 0.0), fill=given.get("fill", 1.0))
+    given = present_keys(session.parameters)
+    options = TestfieldOptions(row_jitter_px=given.get("row_jitter_px", 0.0), fill=given.get("fill", 1.0))
     frame = session.picture(archived)
     try:
         found: Any = measurer_of(parse_design(session.input(names[0]), names[0]), options)(frame)
