@@ -186,7 +186,7 @@ def test_measured_marks_are_shown_written_and_read_back(
     assert len(measured.points.plot().collections) == 1
     measured.write(tmp_path / "marks.json")
     measured.write(tmp_path / "marks.csv")
-    again = reseau.calibrate([tmp_path / "marks.json"], FieldBench().design, size=(240, 240))
+    again = reseau.calibrate([tmp_path / "marks.json"], FieldBench().design, image_size=(240, 240))
     assert again.code == Code.TOO_FEW_IMAGES
     with pytest.raises(UsageError, match=r"use \.json or \.csv"):
         measured.write(tmp_path / "marks.txt")

@@ -286,7 +286,7 @@ def calibrate(
     model: str | CameraOptions | None = None,
     pitch_mm: float | None = None,
     free: Sequence[str] = (),
-    size: tuple[int, int] | None = None,
+    image_size: tuple[int, int] | None = None,
     options: CalibrationOptions | None = None,
     sensor: CalibrationLike | None = None,
     channel: Channel = "luma",
@@ -307,7 +307,7 @@ def calibrate(
         Size of a pixel in millimetres.
     free : sequence of str
         Parameters to estimate; by default the usual ones of the model.
-    size : (int, int), optional
+    image_size : (int, int), optional
         Width and height in pixels, where no photograph gives them.
     options : CalibrationOptions, optional
         Options of the adjustment.
@@ -335,7 +335,7 @@ def calibrate(
     ...     turned = Pose.from_angles(omega, phi, kappa, [0.0, 0.0, 0.0])
     ...     seen = project(camera, Pose(turned.rotation, -turned.matrix.T @ [0.0, 0.0, 300.0]), xyz)
     ...     images.append(reseau.ImagePoints.with_sigma(design.ids, seen.xy, 0.01))
-    >>> reseau.calibrate(images, design, free=("fx", "fy", "cx", "cy"), size=(640, 480))
+    >>> reseau.calibrate(images, design, free=("fx", "fy", "cx", "cy"), image_size=(640, 480))
     <Calibrated: usable ..., 4 images, 140 image points, 0 declined, sigma0 0.000, fx 800.00... px, ...>
     """
     if not isinstance(model, CameraOptions):
@@ -353,7 +353,7 @@ def calibrate(
     options = options or CalibrationOptions()
     if options.focal_35_mm is None:
         options = replace(options, focal_35_mm=said)
-    done = calibrate_camera(photographs, target, measurer_of(target), size, model, options)
+    done = calibrate_camera(photographs, target, measurer_of(target), image_size, model, options)
     return replace(done, notes=(note, *done.notes)) if note and not isinstance(done, Failure) else done
 
 

@@ -45,7 +45,7 @@ for axes, (name, given) in zip(
     panels, {"image filled": (300.0, 0.6, 1), "edges left empty": (520.0, 0.12, 2)}.items(), strict=True
 ):
     images = photographs(*given)
-    calibrated = reseau.calibrate(images, chess, size=(1280, 960)).required()
+    calibrated = reseau.calibrate(images, chess, image_size=(1280, 960)).required()
     field = projection_field(calibrated.calibration("camera").mapping())
     field.plot(axes)
     for image in images:

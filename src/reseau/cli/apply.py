@@ -112,11 +112,12 @@ def apply(
 
     if scale is not None and not scale > 0:
         raise UsageError(f"{scale:g} is not positive", where="--scale")
-    in_archive = {} if archive is not None else {"--at": at, "--objects": objects}
+    from_file = archive is None or calibration.is_file()
+    in_archive = {"--at": at, "--objects": objects} if from_file else {}
     for name, given in in_archive.items():
         if given is not None:
-            raise UsageError("needs --archive", where=name)
-    if archive is None or calibration.is_file():
+            raise UsageError("needs --archive, and the name of a configuration", where=name)
+    if archive is None or from_file:
         stored, origin = read_calibration(calibration), {calibration.name: sha256_of(calibration)}
     else:
         stored, origin = _in_force(archive, objects, str(calibration), at)

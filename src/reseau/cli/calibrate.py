@@ -252,7 +252,6 @@ def calibrate(
     from ..procedures.calibration import calibrate_camera
     from ..procedures.exposures import photograph_reader, photographs_of
     from ..procedures.target_measurement import drawing_overlays, measurer_of
-    from ..report.bundle import bundle_report
     from ..report.calibration_folder import calibration_folder
 
     folder = _folder(out, files, as_json)
@@ -301,10 +300,9 @@ def calibrate(
         for entry in done.result.network.cameras
     ]
     if report is not None or folder is not None:
-        page = bundle_report(
-            done.result, title=f"Calibration with {target.name}", provenance=provenance, against=differences,
-            distances=distance, assessments=done.assessments,
-            photograph=_pictures(photographs, Reading(reading.channel)), declined=done.declined,
+        page = done.report_page(
+            title=f"Calibration with {target.name}", provenance=provenance, against=differences,
+            distances=distance, photograph=_pictures(photographs, Reading(reading.channel)),
             days=sorted({day for path in photographs.values() if (day := read_exif(path).day)}),
         )  # fmt: skip
     if report is not None:

@@ -439,7 +439,7 @@ def list_audit(
     from ..service.audit import Audit
 
     with place.open() as found:
-        for each in Audit(found, place.folder).entries(limit):
+        for each in Audit(found, place.folder).entries(limit or None):
             facts = ", ".join(f"{k} {v}" for k, v in each.facts.items())
             who = f"{each.by} ({each.via})"
             say(f"{each.number:>6} {each.at[:19]}Z {who}: {each.action}, {each.about}  {facts}\n")

@@ -170,7 +170,7 @@ def options_of(cls: type) -> dict[str, Declared]:
     --------
     >>> from reseau.measure import BoardOptions
     >>> list(options_of(BoardOptions))
-    ['mirrored', 'row_jitter_px', 'fill']
+    ['mirrored', 'psf_px', 'row_jitter_px', 'fill']
     """
     found = {}
     for base in reversed(cls.__mro__):

@@ -172,8 +172,8 @@ class Audit:
         found = self._journal.last()
         return None if found is None else found.document
 
-    def entries(self, count: int = 100, before: int | None = None) -> list[AuditEntry]:
-        """Return the last entries, newest first."""
+    def entries(self, count: int | None = 100, before: int | None = None) -> list[AuditEntry]:
+        """Return the last entries, or all, newest first."""
         found = self._journal.entries(before=None if before is None else str(before), last=count)
         return [
             AuditEntry(**{k: v for k, v in each.document.items() if k in AuditEntry.__dataclass_fields__})

@@ -47,7 +47,13 @@ _FORMERLY = {
 
 
 def present_keys(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """Return archived parameters of any version with the keys of the present one."""
+    """Return archived parameters of any version with the keys of the present one.
+
+    Examples
+    --------
+    >>> present_keys({"pitch": 0.027, "fill": 0.8})
+    {'pitch_mm': 0.027, 'fill': 0.8}
+    """
     return {_FORMERLY.get(key, key): value for key, value in parameters.items()}
 
 
