@@ -48,7 +48,7 @@ def measured(printed: BoardDesign, told: BoardDesign) -> TargetMeasured:
         (CHARUCO, {"columns": 6, "rows": 7}, "columns 7 in place of 6, rows 6 in place of 7; calibrated"),
         (CHARUCO, {"dictionary": "DICT_4X4_50"}, "dictionary DICT_5X5_50 in place of DICT_4X4_50"),
         (LEGACY, {"legacy": False}, "legacy True in place of False"),
-        (APRIL, {"pitch": 40.0}, "pitch 30.0 in place of 40.0"),
+        (APRIL, {"pitch": 40.0}, "in other proportions than was told: pitch 30.0 in place of 40.0"),
         (CIRCLES.model_copy(update={"polarity": "bright"}), {"polarity": "dark"}, "bright in place of dark"),
     ],
 )  # fmt: skip

@@ -92,7 +92,10 @@ def measured_as_shown(
         return TargetMeasured(tuple(done), None, notes, f"the photographs show {described(other)}")
     # What is kept is kept for the design that was told.
     done = list(measured_in_order(seen, again, executor))
-    shown = f"the photographs show {described(other)}, not {described(design)} as was told"
+    shown, told = f"the photographs show {described(other)}", described(design)
+    shown += (
+        f", not {told} as was told" if told != described(other) else " in other proportions than was told"
+    )
     said = f"{shown}: {_difference(other, design)}; calibrated with what they show, correct the design"
     return TargetMeasured(tuple(done), other, (*notes, said), shown)
 
