@@ -313,19 +313,13 @@ def numbered(
     inside = ((place >= 0) & (place < size)).all(axis=1)
     of = np.where(inside, index[tuple(np.where(inside[:, None], place, 0).T)], -1)
     there = of >= 0
-    if ends is not None:
-        inverse = np.rint(np.linalg.inv(turn)).astype(np.intp)
-        for line in _lines_beside(design, of[there]):
-            beside = ((numbers[line] - moved) @ inverse.T).astype(np.float64)
-            # With all that surrounds them.
-            where = images_of(mapping, (beside[:, None] + _AROUND).reshape(-1, 2)).reshape(-1, 4, 2)
-            beside = beside[((where > 2) & (where < np.array(shape[::-1]) - 3)).all(axis=(1, 2))]
-            if len(beside) and ends(beside).mean() > 0.5:
-                return Failure(
-                    f"{there.sum()} points in a lattice were found, and nothing beside them where the board "
-                    "has more",
-                    Code.OTHER_DESIGN,
-                )
+    inverse = np.rint(np.linalg.inv(turn)).astype(np.intp)
+    lines = [(numbers[line] - moved) @ inverse.T for line in _lines_beside(design, of[there])]
+    if ends is not None and any(_ends(line.astype(np.float64), mapping, shape, ends) for line in lines):
+        return Failure(
+            f"{there.sum()} points in a lattice were found, and nothing beside them where the board has more",
+            Code.OTHER_DESIGN,
+        )
     seen, start = np.zeros(len(numbers), dtype=bool), np.zeros((len(numbers), 2))
     seen[of[there]], start[of[there]] = True, xy[there]
     frame, origin = _to_lattice(design, turn, moved + least)
@@ -344,6 +338,13 @@ def _lines_beside(design: BoardDesign, found: Rows) -> list[Rows]:
             line = np.flatnonzero((away > 0) & (away <= step) & inside[:, 1 - axis])
             lines += [line] if len(line) else []
     return lines
+
+
+def _ends(nodes: Array, mapping: Chain, shape: tuple[int, int], ends: Callable[[Array], Mask]) -> bool:
+    """Whether the pattern ends at most nodes (n, 2) of a line that are in sight with what surrounds them."""
+    where = images_of(mapping, (nodes[:, None] + _AROUND).reshape(-1, 2)).reshape(-1, 4, 2)
+    nodes = nodes[((where > 2) & (where < np.array(shape[::-1]) - 3)).all(axis=(1, 2))]
+    return bool(len(nodes) and ends(nodes).mean() > 0.5)
 
 
 def _to_lattice(design: BoardDesign, turn: Integers, shift: Integers) -> tuple[Array, Array]:
