@@ -229,7 +229,7 @@ class ErrorMap(Strict):
 
         axes = new_axes(axes)
         xy, drawn = self._finely(self.formal if formal else self.total)
-        draw_contours(axes, xy, drawn, scale=self.total)
+        draw_contours(axes, xy, drawn, scale=np.stack([self.total, self.formal]))
         what = "formal σ of the projection" if formal else "error of the projection"
         image_axes(axes, self.x[-1] + 1, self.y[-1] + 1, f"{what} / px")
         return axes

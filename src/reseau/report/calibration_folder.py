@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..calibration import Calibration, CameraMapping, CorrectedImage, write_corrected
+from ..calibration import Calibration, CameraMapping, CorrectedImage, Use, write_corrected
 from ..calibration.raster import planes_of
 from ..core.errors import InputError
 from ..exchange import export_calibration, export_rig
@@ -74,8 +74,8 @@ def calibration_folder(
 ) -> list[tuple[str, str]]:
     """Write the calibrations of one camera, or of several that are fixed to each other.
 
-    The report, each calibration, its files for OpenCV, ROS and COLMAP where these have its model, those of
-    the rig for Kalibr, and three undistorted photographs of each camera.
+    The report, and each calibration; where it is usable its files for OpenCV, ROS and COLMAP, as far as these
+    have its model, those of the rig for Kalibr, and three undistorted photographs of each camera.
 
     Parameters
     ----------
@@ -108,11 +108,15 @@ def calibration_folder(
         own = f"{name}.json" if before else "camera.json"
         calibration.write(folder / own)
         written.append((own, "calibration with its uncertainty"))
+        for file in _FILES.values():  # of an earlier calibration
+            (folder / f"{before}{file}").unlink(missing_ok=True)
+        if calibration.assessment is not None and calibration.assessment.use is Use.NOTHING:
+            written.append(("", "not usable: no files for other programs, no undistorted photographs"))
+            continue
         holding = formats_holding(calibration)
-        for to, file in _FILES.items():
-            if to in holding:
-                export_calibration(calibration, to, folder / f"{before}{file}")
-                written.append((f"{before}{file}", f"camera for {_NAMES[to]}"))
+        for to in (to for to in _FILES if to in holding):
+            export_calibration(calibration, to, folder / f"{before}{_FILES[to]}")
+            written.append((f"{before}{_FILES[to]}", f"camera for {_NAMES[to]}"))
         lacking = [_NAMES[to] for to in _FILES if to not in holding]
         if lacking:
             written.append(("", f"not for {' and '.join(lacking)}, which lack its model: see reseau export"))
@@ -143,8 +147,12 @@ def _samples(
 
 
 def _rig(folder: Path, calibrations: Sequence[Calibration]) -> list[tuple[str, str]]:
-    """The cameras together, where Kalibr has their models."""
-    if any("kalibr" not in formats_holding(each) for each in calibrations):
+    """The cameras together, where Kalibr has their models and all are usable."""
+    (folder / "camchain.yaml").unlink(missing_ok=True)
+    assessed = [each.assessment for each in calibrations]
+    if any("kalibr" not in formats_holding(each) for each in calibrations) or any(
+        found is not None and found.use is Use.NOTHING for found in assessed
+    ):
         return []
     export_rig(calibrations, "kalibr", folder / "camchain.yaml")
     return [("camchain.yaml", "cameras for Kalibr")]
