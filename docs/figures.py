@@ -54,7 +54,8 @@ def calibration() -> Figure:
     photo.plot(*calibrated.measured[shown].xy.T, "o", mfc="none", mec="#ffd24a", ms=7, mew=1.4)
     calibrated.result.plot(residuals)
     (assessed,) = calibrated.assessments.values()
-    assessed.total.plot(total)
+    assert assessed.errors is not None
+    assessed.errors.plot(total)
     total.set_title("total error of the projection / px", loc="left")
     return figure
 

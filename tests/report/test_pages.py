@@ -165,17 +165,18 @@ def test_the_first_screen_has_camera_days_version_verdict_map_and_every_photogra
     camera = result.network.cameras[0]
     assert f"{camera.model}, {camera.width} × {camera.height} px · {len(result.network.images)} " in first
     assert f"2026-03-05 to 2026-03-07 · reseau {__version__}" in first
-    assert first.index(assessed.lines[0][1:]) < first.index("Total error of the projection")
+    assert first.index(assessed.lines[0][1:]) < first.index("the total error of the projection")
     captions = re.findall(r'<figcaption id="thumbnail-\d+">(.*?): \d+ points, [\d.e-]+ px rms<', first)
     assert captions == list(result.network.images)
 
 
 def test_a_map_has_contours_at_1_2_5_and_a_colour_bar() -> None:
-    field = assess(adjust_network(example_network()).required()).total
-    levels = contour_levels(field.sigma)
+    errors = assess(adjust_network(example_network()).required()).errors
+    assert errors is not None
+    levels = contour_levels(np.stack([errors.total, errors.formal]))
     assert len(levels) > 2
     assert {f"{level:.0e}"[0] for level in levels} <= {"1", "2", "5"}
-    axes = field.plot()
+    axes = errors.plot()
     bar = axes.figure.axes[-1]
     assert bar is not axes
     assert [label.get_text() for label in bar.get_yticklabels()] == [f"{level:g}" for level in levels]
