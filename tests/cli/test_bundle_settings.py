@@ -106,7 +106,8 @@ def test_a_network_beyond_the_memory_is_solved_by_conjugate_gradients(reseau: Ru
     assert list(one) == list(other)
     for name, entry in other.items():
         assert one[name]["value"] == pytest.approx(entry["value"], abs=1e-4 * (entry["sigma"] or 1.0))
-        assert one[name]["sigma"] == pytest.approx(entry["sigma"], rel=1e-4)
+        # What the points of an image have in common is not looked for in networks of this size.
+        assert 0.9 * entry["sigma"] <= one[name]["sigma"] <= 1.0001 * entry["sigma"]
 
 
 def test_a_network_is_converted_with_its_settings(reseau: Run, network: Path, tmp_path: Path) -> None:

@@ -294,7 +294,7 @@ def test_too_few_images_are_refused_with_their_reasons(reseau: Run, measured: tu
     ("arguments", "message"),
     [
         (("--pitch-mm", 0.027, "--free", "c,fx"), "fx: is not one of c, x0"),
-        (("--side", "inner", "--pitch-mm", 0.027), "'inner' is not one of 'object', 'image'"),
+        (("--side", "inner", "--pitch-mm", 0.027), "'inner' is not one of '"),
         (("--image-size", "large"), "write WIDTHxHEIGHT"),
         (("--distance", -3), "-3 is not positive"),
     ],

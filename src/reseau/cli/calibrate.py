@@ -252,7 +252,7 @@ def calibrate(
     from ..procedures.calibration import calibrate_camera
     from ..procedures.exposures import photograph_reader, photographs_of
     from ..procedures.target_measurement import drawing_overlays, measurer_of
-    from ..report.calibration_folder import calibration_folder
+    from ..procedures.calibration_folder import calibration_folder
 
     folder = _folder(out, files, as_json)
     outputs(None if folder else out, report)
@@ -330,7 +330,7 @@ def calibrate(
 
 def _folder(out: Path | None, files: list[Path], as_json: bool) -> Path | None:
     """The folder for all results, made before anything is computed; None where one file or none is wanted."""
-    from ..report.calibration_folder import folder_beside, made_folder
+    from ..procedures.calibration_folder import folder_beside, made_folder
 
     if out is None:
         return None if as_json else made_folder(folder_beside(files))
