@@ -250,9 +250,9 @@ def calibrate(
     from ..io.photographs import read_exif
     from ..measure import TestfieldOptions
     from ..procedures.calibration import calibrate_camera
+    from ..procedures.calibration_folder import calibration_folder
     from ..procedures.exposures import photograph_reader, photographs_of
     from ..procedures.target_measurement import drawing_overlays, measurer_of
-    from ..procedures.calibration_folder import calibration_folder
 
     folder = _folder(out, files, as_json)
     outputs(None if folder else out, report)

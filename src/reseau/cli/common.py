@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..core.data import Frame, ImagePoints
     from ..core.failure import Failure
     from ..execution import Executor
-    from ..procedures.calibration import CameraOptions
+    from ..procedures.calibration_options import CameraOptions
 
 T = TypeVar("T")
 
@@ -108,7 +108,7 @@ class CameraChoice:
 
     def options(self) -> CameraOptions:
         """Return the options of the calibration."""
-        from ..procedures.calibration import CameraOptions
+        from ..procedures.calibration_options import CameraOptions
 
         return CameraOptions(self.model, self.free, self.pitch_mm)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -61,6 +61,8 @@ class ReportOptions(TypedDict, total=False):
         Distances at which the uncertainty of the projection is mapped.
     declined : mapping of str to str
         Further photographs that were left out, and why.
+    days : collection of str
+        When the photographs were taken.
 
     Examples
     --------
@@ -74,6 +76,7 @@ class ReportOptions(TypedDict, total=False):
     against: Mapping[str, FieldDifference]
     distances: Sequence[float]
     declined: Mapping[str, str]
+    days: Collection[str]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
