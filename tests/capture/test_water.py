@@ -92,4 +92,4 @@ def test_a_session_under_water_gives_the_calibration_of_the_camera_in_air(tmp_pa
     size, measured = (240, 240), adjusted.measured.items()
     ignored = calibrate_camera(measured, design, measurer_of(design), size, full, CalibrationOptions())
     assert ignored.required().sigma0 > 1.2
-    assert any("global test" in str(each) for each in ignored.required().warnings)
+    assert any("global test" in str(each) for each in ignored.required().result.warnings)
