@@ -33,8 +33,7 @@ def uncertainty_figure(field: ProjectionField, points: Array | None = None) -> s
     with drawing():
         figure = Figure(figsize=_SIZE, layout="constrained")
         axes = figure.subplots()
-        if points is not None:
-            axes.plot(*points[:: max(1, len(points) // 4000)].T, ",", color=FAINT, alpha=0.6, zorder=3)
+        _dots(axes, points)
         draw_contours(axes, field.xy, field.sigma)
         _label_axes(axes, field.xy, "σ of the projection in the worst direction [px]")
         return to_svg(figure)
@@ -79,10 +78,15 @@ def errors_figure(errors: ErrorMap, points: Array | None = None) -> str:
     with drawing():
         figure = Figure(figsize=(2 * _SIZE[0], _SIZE[1]), layout="constrained")
         for axes, formal in zip(figure.subplots(1, 2), (False, True), strict=True):
-            if points is not None:
-                axes.plot(*points[:: max(1, len(points) // 4000)].T, ",", color=FAINT, alpha=0.6, zorder=3)
+            _dots(axes, points)
             errors.plot(axes, formal=formal)
         return to_svg(figure)
+
+
+def _dots(axes: Axes, points: Array | None) -> None:
+    """Draw image points, of many some."""
+    if points is not None:
+        axes.plot(*points[:: max(1, len(points) // 4000)].T, ",", color=FAINT, alpha=0.6, zorder=3)
 
 
 def _label_axes(axes: Axes, xy: Array, title: str) -> None:
