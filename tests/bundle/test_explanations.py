@@ -18,6 +18,7 @@ from reseau.procedures.calibration_options import CalibrationOptions, CameraOpti
 DESIGN = coded_sheet(9, 7, 20.0)
 SIZE, SIGMA = (800, 600), 0.03
 LENS = np.array([-0.2, 0.05, 3e-4, -2e-4, 0.0])
+OPENCV = CameraOptions("opencv")
 
 
 def world(
@@ -60,9 +61,17 @@ def world(
     return found
 
 
-def calibrated(measured: Mapping[str, ImagePoints], target: str = "flat") -> Calibrated:
-    options, model = CalibrationOptions(target=target), CameraOptions("opencv")  # type: ignore[arg-type]
+def calibrated(
+    measured: Mapping[str, ImagePoints], target: str = "flat", model: CameraOptions | None = OPENCV
+) -> Calibrated:
+    options = CalibrationOptions(target=target)  # type: ignore[arg-type]
     return calibrate_camera(measured.items(), DESIGN, lambda _: None, SIZE, model, options).required()  # type: ignore[arg-type, return-value]
+
+
+def test_a_target_that_is_held_wrongly_does_not_choose_the_model_of_the_lens() -> None:
+    found = calibrated(world(scale=1.003), model=None)
+    assert {"k1", "k2"} <= set(found.result.network.cameras[0].free)
+    assert found.explanation.causes[0].code == "target-scale"
 
 
 @pytest.mark.parametrize("target", ["flat", "free"])

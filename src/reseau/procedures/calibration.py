@@ -232,9 +232,8 @@ class _Job:
             network = _scaled(network)
         if options.sigma_px is not None:
             network = replace(network, cov=np.tile(np.eye(2) * options.sigma_px**2, (len(network.xy), 1, 1)))
-        if options.target == "flat":
-            network = held_as_designed(network)
         choices = dict[str, ModelChoice]()
+        # With all points free: what is wrong with a target must not choose the model of the lens.
         if model.automatic:
             chosen = choose_models(network, options=options.adjustment)
             if isinstance(chosen, Failure):
@@ -246,6 +245,8 @@ class _Job:
                 network = replace(network, cameras=tuple(each.camera for each in chosen))
                 choices = dict(zip(cameras, chosen, strict=True))
         board = None
+        if options.target == "flat":
+            network = held_as_designed(network)
         if options.target == "auto":
             bent = choose_board(network, options.adjustment)
             if isinstance(bent, Failure):
