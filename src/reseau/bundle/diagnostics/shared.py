@@ -278,9 +278,10 @@ class SharedErrors:
         g = np.einsum("iq,iqk->ik", self.scores.g.reshape(groups, width), turned) ** 2 / self.variance
         k = np.arange(groups)
         m = self.scores.m.reshape(groups, width, groups, width)[k, :, k, :]
-        # Cameras without any of the images that were looked at have no score at all.
-        own = np.maximum(np.einsum("iqk,iqr,irk->ik", turned, m, turned), 1e-100)
-        shared = np.einsum("iqk,iqr,irk->ik", turned, self.pulls, turned)
+        own = np.einsum("iqk,iqr,irk->ik", turned, m, turned)
+        # Where no image that was looked at has a score, there is nothing but rounding errors.
+        own = np.maximum(own, 1e-12 * float(own.max(initial=1e-88)))
+        shared = np.maximum(np.einsum("iqk,iqr,irk->ik", turned, self.pulls, turned), 0.0)
         grid = np.linspace(np.log(0.05), np.log(5.0), 160)
         # The sum over the images is what the parameters are pulled by: as many squares as are about equal.
         squares = g.sum(axis=0)
