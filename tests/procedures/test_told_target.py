@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import pytest
 
@@ -17,11 +19,16 @@ from reseau.procedures.told_target import TargetMeasured, measured_as_shown
 
 from ..measure.board_pictures import picture
 
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from worlds import prints
+from worlds.sheets import View, pose
+
 CHESS = board("chess", 7, 6, 24.0)
 CHARUCO = board("charuco", 7, 6, 24.0)
 LEGACY = board("charuco", 7, 6, 24.0, legacy=True)
 APRIL = board("aprilgrid", 5, 4, 30.0, border_bits=2)
 CIRCLES = board("circles", 7, 5, 24.0)
+SHIFTED = board("circles", 3, 5, 24.0, asymmetric=True)
 
 
 @cache
@@ -49,6 +56,8 @@ def measured(printed: BoardDesign, told: BoardDesign) -> TargetMeasured:
         (CHARUCO, {"dictionary": "DICT_4X4_50"}, "dictionary DICT_5X5_50 in place of DICT_4X4_50"),
         (LEGACY, {"legacy": False}, "legacy True in place of False"),
         (APRIL, {"pitch": 40.0}, "in other proportions than was told: pitch 30.0 in place of 40.0"),
+        (CIRCLES, {"columns": 8}, "columns 7 in place of 8; calibrated"),
+        (SHIFTED, {"rows": 6}, "rows 5 in place of 6; calibrated"),
         (CIRCLES.model_copy(update={"polarity": "bright"}), {"polarity": "dark"}, "bright in place of dark"),
     ],
 )  # fmt: skip
@@ -65,6 +74,20 @@ def test_the_board_that_photographs_show_is_measured_in_place_of_the_told_one(
     for each in found.photographs:
         assert not isinstance(each.found, Failure)
         assert len(each.found) > 0.9 * len(printed.ids)
+
+
+def test_a_deltille_told_too_large_has_no_points_that_do_not_exist() -> None:
+    printed = prints.Deltille(7, 8, 20.0)
+    frames = [
+        replace(Frame(View(printed, *pose(k, printed, nearer=0.7), seed=k).picture(), 255.0), name=str(k))
+        for k in (1, 2)
+    ]
+    told = board("deltille", 7, 9, 20.0)
+    found = measured_as_shown(frames, told, measurer_of(told))
+    assert found.corrected == told.model_copy(update={"rows": 8})
+    for each in found.photographs:
+        assert not isinstance(each.found, Failure)
+        assert 40 < len(each.found) <= 56
 
 
 def test_a_right_design_is_compared_with_no_other(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,14 +51,40 @@ def test_a_lattice_that_few_photographs_show_is_said_where_no_target_is_found() 
     assert "seen; the photographs show a lattice of 7 × 6 squares without markers; describe" in found.reason
 
 
-def test_lines_are_not_looked_for_where_markers_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    tried = []
+def test_all_targets_that_fit_alike_are_named() -> None:
+    frame, _ = picture(board("chess", 7, 6, 24.0))
+    found = which_target(
+        [frame], {"mine": board("chess", 7, 6, 24.0), "his": board("chess", 6, 7, 30.0)} | known_designs()
+    )
+    assert not isinstance(found, Failure)
+    assert found[0] == "mine or his"
+
+
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the designs that are measured."""
+    names = []
 
     def measuring(design: Design) -> Measurer:
-        tried.append(design.name)
+        names.append(design.name)
         return measurer_of(design)
 
     monkeypatch.setattr("reseau.procedures.which_target.measurer_of", measuring)
+    return names
+
+
+def test_where_a_lattice_is_seen_no_testfield_is_looked_for(tried: list[str]) -> None:
+    frame, _ = picture(board("chess", 9, 8, 24.0))
+    designs: dict[str, Design] = {"field": coded_testfield(4, 4, 30.0)}
+    for kind in ("deltille", "circles", "chess"):
+        designs[kind] = board(kind, 5, 6, 24.0, name=kind)
+    found = which_target([frame], designs)
+    assert not isinstance(found, Failure)
+    assert found[0] == "a chessboard of 9 × 8 squares"
+    assert set(tried) == {"chess", board("chess", 9, 8, 24.0).name}
+
+
+def test_lines_are_not_looked_for_where_markers_are_read(tried: list[str]) -> None:
     charuco = board("charuco", 7, 6, 24.0, name="mine")
     frame, _ = picture(charuco)
     large = Frame(np.kron(frame.pixels, np.ones((8, 8), np.uint8)), 255.0)
@@ -107,7 +133,11 @@ def test_boards_that_are_drawn_by_default_are_known() -> None:
         (prints.Deltille(7, 10, 20.0), "deltille on A4"),
     ):
         frame = Frame(View(printed, *pose(3, printed), seed=3).picture(), 255.0)
-        assert which_target([frame], boards) == (name, boards[name])
+        found = which_target([frame], boards)
+        assert not isinstance(found, Failure)
+        # The same on other paper differs in its size alone.
+        kind = name.partition(" ")[0]
+        assert found == (f"{name}, {kind} on A3, {kind} on Letter or {kind} on Tabloid", boards[name])
 
 
 def test_boards_of_other_programs_beside_photographs_are_candidates(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ _APART = 10
 _MORE, _LARGER = 6, 1 / 3
 """Further photographs in which a plain pattern is looked for; the most that may show a larger lattice, as a
 share of those that show it: something beside a board may continue it by chance."""
+_LATEST = 2
 _KINDS = {
     "chess": "a chessboard",
     "puzzle": "a PuzzleBoard",
@@ -44,8 +45,6 @@ _KINDS = {
     "aprilgrid": "an AprilGrid",
     "markers": "a grid",
 }
-_CODED, _PLAIN, _LINED = range(3)
-"""Kinds of targets in the order in which they are looked for."""
 
 
 def designs_beside(folders: Iterable[Path]) -> dict[str, Design]:
@@ -71,10 +70,12 @@ def which_target(
 ) -> tuple[str, Design] | Failure:
     """Find the target that photographs show.
 
-    Targets that identify themselves are tried before plain chessboards and grids, and given ones before
-    others; a target is taken if it has nearly as many points as that with the most. Targets of the same
-    pattern in other sizes are not distinguished: the calibration does not depend on the size. A PuzzleBoard
-    that is not among the candidates is found, too, by the part of its code that all photographs show.
+    What photographs show is looked at first; of the candidates those are measured that may be it. Targets
+    that identify themselves are tried before plain chessboards and grids, and given ones before others; a
+    target is taken if it has nearly as many points as that with the most. Those that have as many are named,
+    and the first is taken: targets of the same pattern in other sizes are not distinguished, and the
+    calibration does not depend on the size. A PuzzleBoard that is not among the candidates is found, too, by
+    the part of its code that all photographs show.
 
     Parameters
     ----------
@@ -94,9 +95,11 @@ def which_target(
     photographs = _Photographs(frames, tried)
     usual = next((d for d in designs.values() if isinstance(d, BoardDesign) and d.kind == "puzzle"), None)
     puzzle = _puzzle_of(photographs.small, usual)
-    candidates = designs if puzzle is None else {**designs, puzzle[0]: puzzle[1]}
+    candidates = dict(designs)
+    if puzzle is not None and _pattern(puzzle[1]) not in map(_pattern, designs.values()):
+        candidates[puzzle[0]] = puzzle[1]
     found = photographs.explained_by(candidates)
-    if found is not None and puzzle is not None and found[0] == puzzle[0]:
+    if found is not None and puzzle is not None and found[1] is puzzle[1]:
         # Those tried may show a part of it.
         return _puzzle_of(photographs.every(), usual) or puzzle
     if found is not None:
@@ -222,36 +225,81 @@ class _Photographs:
         self.others = iter(frames)
         self.full = list(islice(self.others, tried))
         self.small = [_reduced(frame) for frame in self.full]
+        self._further = list[Frame]()
+        self._shown: dict[int, list[BoardDesign]] = {}
+
+    def shown(self, frame: Frame) -> list[BoardDesign]:
+        """Boards that one of them shows."""
+        if id(frame) not in self._shown:
+            self._shown[id(frame)] = boards_shown(frame)
+        return self._shown[id(frame)]
 
     def every(self) -> Iterator[Frame]:
         """All of them, reduced."""
-        return chain(self.small, map(_reduced, self.others))
+        return chain(self._further or self.small, map(_reduced, self.others))
 
     def explained_by(self, candidates: Mapping[str, Design]) -> tuple[str, Design] | None:
-        """The candidate with most points, with its name; none where something larger is seen instead."""
-        points = _counted(self.small, candidates)
+        """The candidate with most points; none where something larger is seen instead.
+
+        With its name, and those of others that have as many.
+        """
+        points = self._counted(self.small, candidates)
         if not any(points.values()) and any(a is not b for a, b in zip(self.full, self.small, strict=True)):
-            points = _counted(self.full, candidates)
-        order = sorted(candidates, key=lambda name: _plain(candidates[name]))
+            # Testfields, which take long, have targets large enough to be seen in reduced frames.
+            quick = {name: each for name, each in candidates.items() if _turn(each) < _LATEST}
+            points |= self._counted(self.full, quick)
+        order = sorted(candidates, key=lambda name: (_plain(candidates[name]), -points[name]))
         while most := max(points.values(), default=0):
             name = next(name for name in order if points[name] >= _ENOUGH * most)
             design = candidates[name]
             if not _plain(design) or not _is_part_of_another(self.further(), design):
-                return name, design
+                same = _plain(design), points[name]
+                alike = [each for each in order if (_plain(candidates[each]), points[each]) == same]
+                return _either(alike), design
             pattern = _pattern(design)
             points |= {name: 0 for name, each in candidates.items() if _pattern(each) == pattern}
         return None
 
+    def _counted(self, frames: Sequence[Frame], designs: Mapping[str, Design]) -> dict[str, int]:
+        """Points of each design measured in all frames; none of plain patterns that most frames do not show.
+
+        A part of a larger grid may pass for a smaller one, the whole does not. What was found in one frame is
+        looked for in the next one before anything else.
+        """
+        patterns = {name: _pattern(design) for name, design in designs.items()}
+        first = {pattern: name for name, pattern in reversed(patterns.items())}
+        total, times = dict.fromkeys(first, 0), Counter[str]()
+        for frame in frames:
+            seen, enough, known = dict[str, int](), _LATEST, any(total.values())
+            for pattern in sorted(first, key=lambda each: (not total[each], _turn(designs[first[each]]))):
+                design = designs[first[pattern]]
+                if (known and not total[pattern] and any(seen.values())) or _turn(design) > enough:
+                    break
+                if _may_be(design, self.shown(frame)):
+                    measured = measurer_of(design)(frame)
+                    count = 0 if isinstance(measured, Failure) else len(measured.points)
+                    seen[pattern] = count if count >= _LEAST else 0
+                    if count >= (_ENOUGH * len(design.ids) if _plain(design) else _LEAST):
+                        enough = _turn(design)
+            for pattern, count in seen.items():
+                total[pattern] += count
+                times[pattern] += count > 0
+        return {
+            name: 0 if _plain(designs[name]) and 2 * times[pattern] <= len(frames) else total[pattern]
+            for name, pattern in patterns.items()
+        }
+
     def further(self) -> list[Frame]:
-        """Those tried, and some more."""
-        self.full += islice(self.others, max(0, _MORE + len(self.small) - len(self.full)))
-        return self.full
+        """Those tried, and some more, reduced."""
+        if not self._further:
+            self._further = [*self.small, *map(_reduced, islice(self.others, _MORE))]
+        return self._further
 
     def boards(self) -> list[BoardDesign]:
         """Boards that the photographs show; with markers, of the first ones that show any."""
         found, showing = list[BoardDesign](), 0
         for frame in self.further():
-            shown = boards_shown(_reduced(frame))
+            shown = self.shown(frame)
             found += shown
             showing += any(not _plain(each) for each in shown)
             if showing >= len(self.small):
@@ -306,7 +354,7 @@ def _is_part_of_another(frames: Iterable[Frame], design: Design) -> bool:
     """Whether photographs show a larger lattice: parts of it may pass for the design."""
     shown = larger = 0
     for frame in frames:
-        measured = measurer_of(design)(_reduced(frame))
+        measured = measurer_of(design)(frame)
         shown += not isinstance(measured, Failure)
         larger += isinstance(measured, Failure) and measured.code is Code.OTHER_DESIGN
     return larger > _LARGER * shown
@@ -356,44 +404,6 @@ def _reduced(frame: Frame) -> Frame:
     return replace(frame, pixels=np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)))
 
 
-def _counted(frames: Sequence[Frame], designs: Mapping[str, Design]) -> dict[str, int]:
-    """Points of each design measured in all frames; none of plain patterns that most frames do not show.
-
-    A part of a larger grid may pass for a smaller one, the whole does not. What takes long is not looked for
-    where something else was found. Designs that a frame showed are looked for in the next one before others.
-    """
-    patterns = {name: _pattern(design) for name, design in designs.items()}
-    total, times, shown = dict.fromkeys(patterns.values(), 0), Counter[str](), len(frames)
-    for frame in frames:
-        seen: dict[str, int] = {}
-        known = any(total.values())
-        for found_before in (True, False) if known else (False,):
-            if found_before is False and any(seen.values()):
-                break
-            for effort in (_CODED, _PLAIN, _LINED):
-                enough = False
-                for name, design in designs.items():
-                    pattern = patterns[name]
-                    if pattern in seen or _effort(design) != effort:
-                        continue
-                    if found_before and not total[pattern]:
-                        continue
-                    measured = measurer_of(design)(frame)
-                    count = 0 if isinstance(measured, Failure) else len(measured.points)
-                    seen[pattern] = count if count >= _LEAST else 0
-                    whole = _ENOUGH * len(design.ids) if _plain(design) else _LEAST
-                    enough |= count >= whole
-                if enough:
-                    break
-        for pattern, count in seen.items():
-            total[pattern] += count
-            times[pattern] += count > 0
-    return {
-        name: 0 if _plain(designs[name]) and 2 * times[pattern] <= shown else total[pattern]
-        for name, pattern in patterns.items()
-    }
-
-
 def _pattern(design: Design) -> str:
     """What distinguishes targets in photographs: all but the size and the name."""
     content = design.to_dict()
@@ -417,8 +427,22 @@ def _plain(design: Design) -> bool:
     return design.rings is None
 
 
-def _effort(design: Design) -> int:
-    """What finding the target takes: markers or rings are read, lattices grown, lines laid."""
-    if isinstance(design, TestfieldDesign) or (isinstance(design, BoardDesign) and design.kind == "deltille"):
-        return _LINED
-    return _PLAIN if _plain(design) else _CODED
+def _may_be(design: Design, shown: Sequence[BoardDesign]) -> bool:
+    """Whether a frame that shows these boards may show a design; what is coded says so itself."""
+    kinds = {each.kind for each in shown}
+    if isinstance(design, TestfieldDesign):
+        return not shown
+    if isinstance(design, BoardDesign) and _plain(design):
+        return design.kind in kinds
+    return not _plain(design) or not shown or "circles" in kinds
+
+
+def _turn(design: Design) -> int:
+    """When a design is looked for: those that are coded first, testfields, which take long, at the end."""
+    return _LATEST if isinstance(design, TestfieldDesign) else int(_plain(design))
+
+
+def _either(names: Sequence[str]) -> str:
+    """One of several, in words."""
+    *first, last = names
+    return f"{', '.join(first)} or {last}" if first else last

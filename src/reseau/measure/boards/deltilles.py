@@ -12,6 +12,7 @@ camera calibration, ICCV 2017.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -22,14 +23,14 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask, Rows
-from ...core.failure import Failure
+from ...core.failure import Code, Failure
 from ...io.board import BoardDesign
 from ...optics import Chain
 from ..testfield.lattice_mapping import images_of
 from .candidates import first_mapping, grown_through, levels_at
 from .placement import Placed, cost_of, failed, numbered
 
-__all__ = ["find_deltille"]
+__all__ = ["find_deltille", "lattice_of_deltille"]
 
 _SMOOTH_PX = 1.8
 """Width of the smoothing, pixels."""
@@ -62,6 +63,8 @@ _CLOSE = 0.3
 """Part of the way to the middle of a triangle at which a sector is seen close to its corner."""
 _MOSTLY = 0.8
 """Share of the corners in sight with which a deltille is not looked for any further."""
+_STEPS = np.array([[1, 0], [0, 1], [-1, 1], [-1, 0], [0, -1], [1, -1]])
+"""Steps to the neighbours of a corner in the lattice."""
 _SHORTER_PX = 0.7
 """Width of the smoothing before a frame is shortened, pixels."""
 _LARGE_PX = 2_500_000
@@ -232,20 +235,41 @@ def lay_deltille(grey: NDArray[np.float32], corners: SixSectors, design: BoardDe
         A deltille.
     """
     found: Placed | Failure = failed(0, _LATTICE)
-    # Edges and texture have weaker corners, some of them beside the true ones.
-    for share in _STRONG if len(corners) else ():
-        strong = corners.strength >= share * corners.strength[:_SHOWN].mean()
-        few = SixSectors(corners.xy[strong], corners.phase[strong], corners.strength[strong])
-        found = _laid(grey, few, design)
-        if not isinstance(found, Failure):
-            break
+    for few in _by_strength(corners):
+        laid = _laid(grey, few, design)
+        if not isinstance(laid, Failure):
+            return laid
+        # Another board than that which was designed says more than none.
+        found = laid if found.code is Code.NOT_FOUND else found
     return found
 
 
-def _laid(grey: NDArray[np.float32], corners: SixSectors, design: BoardDesign) -> Placed | Failure:
-    """A deltille among corners of one strength, see :func:`lay_deltille`."""
+def lattice_of_deltille(grey: NDArray[np.float32], noise: float, extent: int) -> Rows:
+    """Nodes (m, 2) of the largest lattice of triangles in a frame, at most `extent` to any side."""
+    best: Rows = np.zeros((0, 2), dtype=np.intp)
+    for few in _by_strength(find_six_sectors(grey, noise)):
+        found = _grown(grey, few, extent, np.inf)
+        if found is None or len(found[0]) <= len(best):
+            continue
+        # Outer corners are seen close to them only, where the print ends within the triangles beside them.
+        beside = np.unique((found[0][:, None] + _STEPS).reshape(-1, 2), axis=0)
+        close = _crossed(_levels(grey, found[2], beside, _CLOSE))
+        best = np.unique(np.concatenate([found[0], beside[close]]), axis=0).astype(np.intp)
+    return best
+
+
+def _by_strength(corners: SixSectors) -> Iterator[SixSectors]:
+    """The strong ones, and more: edges and texture have weaker corners, some of them beside the true ones."""
+    for share in _STRONG if len(corners) else ():
+        strong = corners.strength >= share * corners.strength[:_SHOWN].mean()
+        yield SixSectors(corners.xy[strong], corners.phase[strong], corners.strength[strong])
+
+
+def _grown(
+    grey: NDArray[np.float32], corners: SixSectors, extent: int, enough: float
+) -> tuple[Array, Rows, Chain] | None:
+    """The largest lattice that grows from corners: nodes (m, 2), rows of the corners, and mapping."""
     shape = (grey.shape[0], grey.shape[1])
-    extent = design.columns + design.rows
 
     def accepted(mapping: Chain, beside: Array, row: Rows, slopes: Array) -> Mask:
         return _crossed(_levels(grey, mapping, beside))
@@ -260,8 +284,15 @@ def _laid(grey: NDArray[np.float32], corners: SixSectors, design: BoardDesign) -
         found = grown_through(corners.xy, mapping, extent, shape, accepted)
         if best is None or len(found[0]) > len(best[0]):
             best = found
-        if len(best[0]) >= _ENOUGH * len(design.nodes):
+        if len(best[0]) >= enough:
             break
+    return best
+
+
+def _laid(grey: NDArray[np.float32], corners: SixSectors, design: BoardDesign) -> Placed | Failure:
+    """A deltille among corners of one strength, see :func:`lay_deltille`."""
+    shape = (grey.shape[0], grey.shape[1])
+    best = _grown(grey, corners, design.columns + design.rows, _ENOUGH * len(design.nodes))
     if best is None or len(best[0]) < _FEWEST:
         return failed(0 if best is None else len(best[0]), _LATTICE)
     nodes, rows, mapping = best
@@ -272,7 +303,16 @@ def _laid(grey: NDArray[np.float32], corners: SixSectors, design: BoardDesign) -
         levels = _levels(grey, mapping, missing)
         return cost(levels, _crossed(levels))
 
-    return numbered(design, nodes.astype(np.intp), corners.xy[rows], mapping, shape, None, missed)
+    # The print may end within the triangles beside its outer corners.
+    between = float(np.median(_levels(grey, mapping, nodes, _CLOSE), axis=0).mean())
+
+    def ended(beyond: Array) -> Mask:
+        """Whether one of the dark triangles is paper, as the bright ones are."""
+        around = _levels(grey, mapping, beyond, _CLOSE)
+        return np.asarray((around[:, :3].min(axis=1) > between) & (around[:, 3:].max(axis=1) > between))
+
+    known = nodes.astype(np.intp), corners.xy[rows], mapping, shape
+    return numbered(design, *known, None, missed, ends=ended)
 
 
 def _seeds(corners: SixSectors) -> list[tuple[int, Array]]:

@@ -45,6 +45,7 @@ from .candidates import (
 from .puzzles import MISREAD, QUARTER, PuzzlePart, part_of_code
 
 __all__ = [
+    "THIRD",
     "Placed",
     "cost_of",
     "failed",
@@ -96,7 +97,7 @@ _PUZZLE = 40
 """Largest number of corners of a PuzzleBoard of unknown size, along an axis from any of them."""
 _AROUND = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, 0.5], [-0.5, -0.5]])
 """Middles of the squares that meet in a node."""
-_THIRD = np.array([[-1, -1], [1, 0]])
+THIRD = np.array([[-1, -1], [1, 0]])
 """A turn of a lattice of triangles, whose steps are at 60°."""
 
 
@@ -253,7 +254,7 @@ def numbered(
     mirrored = _mirrored(mapping)
     found: list[tuple[float, Integers, Integers]] = []
     signs = None if bits is None else dot_signs(design)
-    once, turns = (_THIRD, 3) if design.kind == "deltille" else (QUARTER, 4)
+    once, turns = (THIRD, 3) if design.kind == "deltille" else (QUARTER, 4)
     for quarter in range(turns):
         # Rows of a design go downwards as those of a frame do.
         turn = np.linalg.matrix_power(once, quarter)
@@ -411,19 +412,24 @@ def lay_circles(grey: NDArray[np.float32], disks: Disks, design: BoardDesign) ->
         return failed(0 if best is None else len(best[0]), f"{width} in a lattice")
     nodes, rows, mapping = best
 
-    def seen(nodes: Array) -> Array:
-        """How much darker nodes are than the middles of the meshes around them."""
+    def seen(nodes: Array) -> tuple[Array, Array]:
+        """How much darker nodes are than the middles of the meshes around them, and the brightest one."""
         around, centre = (sector_levels(grey, mapping, nodes, share) for share in (0.5, 0.0))
-        return np.asarray(np.median(around, axis=1) - centre[:, 0])
+        return np.asarray(np.median(around, axis=1) - centre[:, 0]), around.max(axis=1)
 
-    circle = float(np.median(seen(nodes)))
+    circle, paper = (float(np.median(each)) for each in seen(nodes))
 
     def cost(missing: Array) -> Array:
         # Those that are blurred or cut by something are seen, but not found as disks.
-        return np.where(seen(missing) > circle / 2, 0.0, _MISSED)
+        return np.where(seen(missing)[0] > circle / 2, 0.0, _MISSED)
+
+    def ended(beyond: Array) -> Mask:
+        """Whether there is no circle beside paper: a hand would hide both."""
+        darker, beside = seen(beyond)
+        return np.asarray((darker < circle / 2) & (beside > paper - circle / 2))
 
     known = nodes.astype(np.intp), disks.xy[rows], mapping, shape
-    return numbered(design, *known, None, cost)
+    return numbered(design, *known, None, cost, ends=ended)
 
 
 def _lattice_of(design: BoardDesign) -> Integers:

@@ -23,7 +23,9 @@ from ..screening import screen
 from ..testfield.lattice_mapping import slope_of
 from .bits import Integers
 from .candidates import Saddles, find_saddles, first_mapping, grown, seeds
+from .deltilles import lattice_of_deltille
 from .markers import ReadMarkers, markers_of_any_dictionary
+from .placement import THIRD
 from .tags import with_seen_edges
 
 __all__ = ["boards_shown"]
@@ -83,7 +85,23 @@ def boards_shown(frame: Frame) -> list[BoardDesign]:
             for nodes, rows, mapping in _lattices_of_disks(disks, grey.shape):
                 if len(nodes) > most:
                     most, circles = len(nodes), list(_circles(nodes, rows, mapping, disks, polarity))
-        return circles
+        return circles or _deltilles(lattice_of_deltille(grey, screened.noise, _MOST))
+
+
+def _deltilles(nodes: Integers) -> list[BoardDesign]:
+    """A deltille in that of its three directions in which its nodes (m, 2) fill a rectangle best, or none."""
+    best, most = list[BoardDesign](), 0.0
+    for turn in range(3):
+        # Columns in halves of the distance of corners in a row, and rows.
+        turned = nodes @ np.linalg.matrix_power(THIRD, turn).T @ np.array([[2, 0], [1, 1]])
+        filled = _filled(turned, 2)
+        if len(filled) < _FEWEST:
+            continue
+        wide, high = (np.ptp(filled, axis=0) + 1).tolist()
+        # Each corner in a rectangle speaks for it, each place without one against it.
+        if (lead := 2 * len(filled) - wide * high / 2) > most:
+            best, most = [board("deltille", (wide + 1) // 2, high, _SIDE_MM)], lead
+    return best
 
 
 def _chessboard(grey: NDArray[np.float32], saddles: Saddles) -> BoardDesign | None:

@@ -32,8 +32,8 @@ _NEIGHBOURS, _SEEDS = 12, 6
 """Number of neighbours among which the steps of the lattice are searched, and of seeds that are tried."""
 _GATE = 0.3
 """Largest distance of a target from its node, in steps."""
-_BESIDE = 1.6
-"""Distance from the nodes found, in steps, up to which others are searched."""
+_BESIDE = np.array(list(product((-1, 0, 1), repeat=2)))
+"""Where others are searched from the nodes found, in steps."""
 _LEAST = 40
 """Minimum number of targets on a lattice."""
 _PLACED_PX = 0.3
@@ -140,13 +140,13 @@ def _grown(xy: Array, seed: int, steps: Array, shape: tuple[int, ...]) -> tuple[
     if np.linalg.det(steps) > 0:
         steps = steps * [1.0, -1.0]
     tree, extent = KDTree(xy), int(np.ceil(np.sqrt(len(xy)))) + 4
-    grid = np.array(list(product(range(-extent, extent + 1), repeat=2)))
     nodes, rows = np.zeros((1, 2), np.intp), np.array([seed])
     matrix = np.column_stack([np.vstack([steps, np.zeros(2)]), np.append(xy[seed], 1.0)])
     mapping, off = started(matrix, 1, shape), np.zeros((1, 2))
     for _ in range(3 * extent):
-        distance, nearest = KDTree(nodes).query(grid, distance_upper_bound=_BESIDE)
-        beside, nearest = grid[distance < _BESIDE], nearest[distance < _BESIDE]
+        beside = np.unique((nodes[:, None] + _BESIDE).reshape(-1, 2), axis=0)
+        beside = beside[(np.abs(beside) <= extent).all(axis=1)]
+        nearest = KDTree(nodes).query(beside)[1]
         at = beside.astype(np.float64)
         # Distortion, and the wider gaps beside lines, displace a node as they do the nearest one.
         predicted = images_of(mapping, at) + off[nearest]
