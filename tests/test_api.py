@@ -90,9 +90,9 @@ def test_packages_that_share_a_name_with_a_function_are_callable_and_stay_packag
         (lambda: reseau.read_image(COLOUR), "colours: is None, and the array has three channels"),
         (lambda: reseau.calibrate([3, 4, 5], GRID), "photograph: is of type int"),  # type: ignore[list-item]
         (lambda: reseau.orient(3), "scan: is of type int"),  # type: ignore[arg-type]
-        (lambda: reseau.refine(), "refine: needs `photo_i` and `reseau`"),
+        (lambda: reseau.refine(), "refine: needs PHOTO I and its reseau"),
         (lambda: reseau.refine(GREY, GRID, photo_ii=GREY), "must be given together"),
-        (lambda: reseau.refine(GREY, GRID, photo_iii=[GREY]), "photo_iii: needs `photo_ii`"),
+        (lambda: reseau.refine(GREY, GRID, photo_iii=[GREY]), "PHOTO III: needs PHOTO II"),
         (lambda: reseau.adjust_network(7), "network: is of type int"),  # type: ignore[arg-type]
     ],
 )

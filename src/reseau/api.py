@@ -8,7 +8,7 @@ is a falsy :class:`~reseau.core.failure.Failure` with its reason; its ``required
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .bundle import Network, Result, ResultDocument
 from .bundle import Options as AdjustmentOptions
 from .bundle import adjust_network as _adjust
-from .calibration import Calibration, InstrumentCorrection, SensorCorrection
+from .calibration import Calibration, SensorCorrection
 from .calibration import read_calibration as _read_calibration
 from .core.data import Frame, ImagePoints
 from .core.errors import UsageError
@@ -40,16 +40,13 @@ from .measure import (
     measure_testfield,
 )
 from .measure.points import Measured
-from .procedures import oscilloscope as _procedure
 from .procedures.calibrated import Calibrated
-from .procedures.calibration import calibrate_camera
+from .procedures.calibrating import calibrate_photographs
 from .procedures.calibration_options import CalibrationOptions, CameraOptions
-from .procedures.exposures import photograph_reader, photographs_named, photographs_of
+from .procedures.exposures import photographs_named
 from .procedures.film_frame import FrameOptions, FrameResult, orient_scan
-from .procedures.oscilloscope import PhotoI, PhotoII
 from .procedures.refined import Refined
-from .procedures.target_measurement import measurer_of
-from .procedures.which_target import Design, target_of
+from .procedures.refining import Photographs, RefineOptions, refine_photographs
 
 __all__ = [
     "Adjusted",
@@ -341,20 +338,10 @@ def calibrate(
     if not isinstance(model, CameraOptions):
         model = CameraOptions(model or ("" if free else "auto"), tuple(free), pitch_mm)
 
-    named = _named(images, channel, colours)
-    read = photograph_reader(channel, _correction(sensor))
-    found: tuple[str, Design] | Failure = (
-        ("", read_design(design)) if design != "auto" else target_of([photo for _, photo in named], read)
-    )
-    if isinstance(found, Failure):
-        return found
-    note, target = found
-    said, photographs = photographs_of(named, read)
-    options = options or CalibrationOptions()
-    if options.focal_35_mm is None:
-        options = replace(options, focal_35_mm=said)
-    done = calibrate_camera(photographs, target, measurer_of(target), image_size, model, options)
-    return replace(done, notes=(note, *done.notes)) if note and not isinstance(done, Failure) else done
+    return calibrate_photographs(
+        _named(images, channel, colours), None if design == "auto" else read_design(design), image_size,
+        model, options, channel=channel, correction=_correction(sensor),
+    )  # fmt: skip
 
 
 def orient(
@@ -431,7 +418,7 @@ def refine(
     photo_iii : iterable of str, Path, ndarray, Frame or ImagePoints
         Photographs of bodies; they need PHOTO II or a calibration.
     calibration : str, Path or Calibration, optional
-        A stored calibration of groups A and B, for PHOTO III.
+        A stored calibration of groups A and B, for PHOTO III, or tested by a new PHOTO II.
     check : iterable of str
         Marks and rods that are held out for a check.
     alpha : float
@@ -447,40 +434,14 @@ def refine(
     UsageError
         When arguments are missing or cannot be given together.
     """
-    further = _several(photo_iii, "photo_iii")
-    _checked(photo_i, reseau, photo_ii, test_object, further, calibration)
-    held = tuple(check)
-    first: PhotoI | Failure | None = None
-    rods: ReseauDesign | None = None
-    second: PhotoII | Failure | None = None
-    if calibration is not None:
-        instrument, grid, _ = InstrumentCorrection.from_calibration(read_calibration(calibration))
-    else:
-        assert photo_i is not None
-        assert reseau is not None
-        grid = _reseau_design(reseau, "reseau")
-        photo = _photo(photo_i, "luma")
-        first = _procedure.photo_i(photo, grid, alpha=alpha, check=held)
-        if isinstance(first, Failure):
-            return first
-        if photo_ii is None or test_object is None:
-            return Refined(first, None, (), grid)
-        rods = _reseau_design(test_object, "test_object")
-        photo, marks = _split(_photo(photo_ii, "luma"), grid)
-        second = _procedure.photo_ii(photo, grid, rods, first.camera, marks=marks, alpha=alpha, check=held)
-        if isinstance(second, Failure):
-            return second
-        instrument = second.instrument
-    bodies = []
-    for image in further:
-        photo, marks = _split(_photo(image, "luma"), grid)
-        found = _procedure.photo_iii(photo, instrument, grid, marks=marks)
-        if isinstance(found, Failure):
-            return found
-        bodies.append(found)
-    assert not isinstance(first, Failure)
-    assert not isinstance(second, Failure)
-    return Refined(first, second, tuple(bodies), grid, rods)
+    return refine_photographs(
+        Photographs(photo_i, photo_ii, _several(photo_iii, "photo_iii")),
+        None if reseau is None else _reseau_design(reseau, "reseau"),
+        None if test_object is None else _reseau_design(test_object, "test_object"),
+        None if calibration is None else read_calibration(calibration),
+        RefineOptions(check=tuple(check), alpha=alpha),
+        read=lambda photo: _photo(photo, "luma"),
+    )
 
 
 class Adjusted(Result):
@@ -537,27 +498,6 @@ def adjust_network(
     if isinstance(found, Failure):
         return found
     return Adjusted(**{each.name: getattr(found, each.name) for each in fields(found)})
-
-
-def _checked(
-    photo_i: object,
-    reseau: object,
-    photo_ii: object,
-    test_object: object,
-    photo_iii: object,
-    calibration: object,
-) -> None:
-    """Refuse arguments of :func:`refine` that cannot be given together."""
-    if calibration is not None:
-        if any(given is not None for given in (photo_i, reseau, photo_ii, test_object)):
-            raise UsageError("contains PHOTO I and II", where="calibration", do="give `photo_iii` only")
-        return
-    if photo_i is None or reseau is None:
-        raise UsageError("needs `photo_i` and `reseau`, or `calibration`", where="refine")
-    if (photo_ii is None) != (test_object is None):
-        raise UsageError("`photo_ii` and `test_object` must be given together", where="refine")
-    if photo_ii is None and photo_iii:
-        raise UsageError("needs `photo_ii` and `test_object`", where="photo_iii")
 
 
 def _several(given: Iterable[PhotoLike], argument: str) -> tuple[PhotoLike, ...]:
@@ -619,14 +559,6 @@ def _photo(image: PhotoLike, channel: Channel, colours: Colours | None = None) -
             f"is {_kind(image)}", where="photograph", do="give a path, an array, a Frame or ImagePoints"
         )
     return read_image(image, channel, colours=colours)
-
-
-def _split(photo: Frame | ImagePoints, grid: ReseauDesign) -> tuple[Frame | ImagePoints, ImagePoints | None]:
-    """Coordinates without the marks of the reseau, and these; frames as they are."""
-    if isinstance(photo, Frame):
-        return photo, None
-    marks = np.isin(photo.names, grid.ids)
-    return photo.select(~marks), photo.select(marks) if marks.any() else None
 
 
 def _reseau_design(given: DesignLike, argument: str) -> ReseauDesign:

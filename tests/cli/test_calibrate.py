@@ -276,7 +276,7 @@ def test_the_size_of_a_target_that_was_found_is_not_known(
     (tmp_path / "photos").mkdir()
     write_image(tmp_path / "photos" / "a.png", picture(design, distance=460.0)[0].pixels)
     _, _, err = reseau("calibrate", tmp_path / "photos", "--design", "auto", "--jobs", 1)
-    assert "note: on Letter or charuco on Tabloid; photographs do not tell its size" in err
+    assert "on Letter or charuco on Tabloid; photographs do not tell its size" in err
     design.write(tmp_path / "mine.json")
     _, _, err = reseau("calibrate", tmp_path / "photos", "--design", "auto", "--jobs", 1)
     assert "mine.json\n" in err

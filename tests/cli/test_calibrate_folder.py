@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,10 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
+from reseau import calibrate as reseau_calibrate
 from reseau.calibration import Calibration, CameraMapping
+from reseau.core.errors import InputError
 from reseau.designs import board
 from reseau.exchange import import_calibration
 from reseau.io.images import write_image
+from reseau.procedures.calibrated import Calibrated
+from reseau.procedures.calibration_folder import write_calibrated
 
 from ..measure.board_pictures import picture
 
@@ -59,7 +64,50 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(
     (tmp_path / "taken").touch()
     status, out, err = reseau("calibrate", photos, "-o", tmp_path / "taken")
     assert (status, out) == (2, "")
-    assert "taken: cannot be written (File exists); choose another folder by --out" in err
+    assert "taken: cannot be written (File exists); choose another folder or file by --out" in err
     status, _, err = reseau("calibrate", photos, "-o", tmp_path / "none" / "results")
     assert status == 2
     assert "results: cannot be written (No such file or directory)" in err
+    status, _, err = reseau("calibrate", photos, "-o", tmp_path / "camera.yml")
+    assert status == 2
+    assert "camera.yml: has the suffix '.yml'; use .json for the calibration alone, or a name without" in err
+
+
+def test_where_nothing_can_be_calibrated_no_folder_is_made(reseau: Run, photos: Path, tmp_path: Path) -> None:
+    few = tmp_path / "few"
+    few.mkdir()
+    shutil.copy(photos / "0.png", few)
+    status, _, err = reseau("calibrate", few, "--jobs", 1)
+    assert status != 0
+    assert "0.png: 1 image (0.png) shows the target, 3 are needed" in err
+    assert list(tmp_path.iterdir()) == [few]
+
+
+def test_a_folder_that_cannot_be_completed_is_left_as_it_was(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = calibrated(photos, tmp_path / "copy")
+
+    def full(*_: object, **__: object) -> None:
+        raise InputError("cannot be written (No space left on device)", where="opencv.yml")
+
+    monkeypatch.setattr("reseau.procedures.calibration_folder.export_calibration", full)
+    with pytest.raises(InputError, match="No space"):
+        write_calibrated(tmp_path / "results", done, done.documents(), "page")
+    assert [path.name for path in tmp_path.iterdir()] == ["copy"]
+
+
+def test_a_report_shows_the_photographs_that_are_still_there(photos: Path, tmp_path: Path) -> None:
+    done = calibrated(photos, tmp_path / "copy")
+    pictures = []
+    for gone in (None, "0.png", "*.png"):
+        for path in (tmp_path / "copy").glob(gone or "none"):
+            path.unlink()
+        done.report(tmp_path / "report.html")
+        pictures.append((tmp_path / "report.html").read_text("utf-8").count("data:image/"))
+    assert pictures[0] > pictures[1] > pictures[2]
+
+
+def calibrated(photos: Path, copy: Path) -> Calibrated:
+    shutil.copytree(photos, copy)
+    return reseau_calibrate(copy).required()

@@ -160,9 +160,9 @@ def test_a_missing_row_of_pins_a_rotated_object_and_swapped_marks_are_reported(b
 @pytest.mark.parametrize(
     ("left_out", "message"),
     [
-        (("--test-object",), "--photo-ii and --test-object must be given together"),
+        (("--test-object",), "PHOTO II and its test object must be given together"),
         (("--photo-ii", "--test-object"), "needs PHOTO II"),
-        (("--reseau",), "needs --photo-i and --reseau, or --calibration"),
+        (("--reseau",), "needs PHOTO I and its reseau, or a calibration"),
     ],
 )
 def test_contradictory_options_are_refused_in_one_line(bench, capsys, left_out, message):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -42,14 +41,10 @@ from .common import (
 if TYPE_CHECKING:
     from ..bundle import BoardChoice, ModelChoice
     from ..calibration import CameraMapping, FieldDifference, ProjectionField
-    from ..core.data import Frame
-    from ..core.provenance import Provenance
     from ..execution import Executor
-    from ..io import BoardDesign, ReseauDesign, TestfieldDesign
     from ..procedures.calibrated import Calibrated
     from ..procedures.calibration_options import CalibrationOptions, CameraOptions
     from ..procedures.exposures import Taken
-    from ..procedures.target_measurement import Photograph
 
 __all__ = ["calibrate"]
 
@@ -237,104 +232,74 @@ def calibrate(
 ) -> None:
     """Calibrate a camera from photographs of a target."""
     photographs, taken = _photographs(images or [], rig or [])
-    files = list(photographs.values())
+    files = [path for _, path in photographs]
     executor = _executor(files, computing)
     if overlay is not None and not executor.local:
         raise UsageError("is drawn by this machine only", where="--overlay", do="leave out --cluster")
-    import numpy as np
-
-    from ..core.provenance import sha256_of
+    from ..core.failure import Code, Failure
+    from ..core.provenance import Provenance, sha256_of
     from ..exchange import read_target
-    from ..execution import Outputs
     from ..io import write_whole
-    from ..io.photographs import read_exif
     from ..measure import TestfieldOptions
-    from ..procedures.calibration import calibrate_camera
-    from ..procedures.calibration_folder import calibration_folder
-    from ..procedures.exposures import photograph_reader, photographs_of
-    from ..procedures.target_measurement import drawing_overlays, measurer_of
+    from ..procedures.calibrating import calibrate_photographs
+    from ..procedures.calibration_folder import checked_output, folder_beside, write_calibrated
 
-    folder = _folder(out, files, as_json)
-    outputs(None if folder else out, report)
+    place = out if out is not None or as_json else folder_beside(files)
+    place = None if place is None else checked_output(place)
+    outputs(None, report)
     drawn = {} if overlay is None else overlay_files(overlay, files)
     distance = positive(distance)
-    automatic = str(design) == "auto"
-    target = _found_target(files, reading) if automatic else read_target(design)
+    target = None if str(design) == "auto" else read_target(design)
     others = {path.name: read_lens(path) for path in against or []}
     if others and taken:
         raise UsageError("requires one camera", where="--against", do="compare the cameras one by one")
     options, lens = adjustment.options(), camera.options()
-    measure = measurer_of(target, TestfieldOptions(row_jitter_px=row_jitter_px, fill=fill))
-    measure = drawing_overlays(
-        measure, {name: drawn[path] for name, path in photographs.items() if path in drawn}
-    )
-    read = photograph_reader(reading.channel, reading.correction)
-    about = {
-        "compute": "points of a target", "design": sha256_of(target.to_json().encode()), "fill": fill,
-        "channel": reading.channel, "row_jitter_px": row_jitter_px,
-        "sensor": sha256_of(reading.sensor) if reading.sensor else None,
-    }  # fmt: skip
-    # Overlays are drawn while photographs are measured.
-    kept = Outputs(computing.store, about) if computing.store and not drawn else None
     with executor, progress("measuring", len(files)) as step:
-        said, frames = photographs_of(
-            list(photographs.items()), read, one_lens=not taken, store=computing.store
-        )
-        options = replace(options, focal_35_mm=said)
-        found = calibrate_camera(
-            _shown(frames, step), target, measure, image_size, lens, options, taken or None, executor, kept
-        )
-        done = required(found, _named(files))
-    for note in done.notes:
-        typer.echo(f"note: {note}", err=True)
-    files_read = (None if automatic else design, *adjustment.files, reading.sensor)
-    inputs = {path.name: path for path in files_read if path} | photographs
+        found = calibrate_photographs(
+            photographs, target, image_size, lens, options, taken,
+            channel=reading.channel, correction=reading.correction,
+            testfield=TestfieldOptions(row_jitter_px=row_jitter_px, fill=fill),
+            overlays={name: drawn[path] for name, path in photographs if path in drawn},
+            executor=executor, store=computing.store,
+            about={"sensor": sha256_of(reading.sensor) if reading.sensor else None},
+            note=_note, step=step,
+        )  # fmt: skip
+        sought = target is None and isinstance(found, Failure) and found.code is Code.NOT_FOUND
+        done = required(found, "--design auto" if sought else _named(files))
+    for line in done.notes:
+        _note(line)
+    inputs = dict(photographs) | {
+        path.name: path for path in (target and design, *adjustment.files, reading.sensor) if path
+    }
     settings = {
         "model": lens.model, "options": dict(lens.options), "row_jitter_px": row_jitter_px, "fill": fill,
         "channel": reading.channel,
     }  # fmt: skip
-    provenance = _provenance(inputs, settings | _settings(camera) | _settings(adjustment))
+    provenance = Provenance(
+        {name: sha256_of(path) for name, path in inputs.items()},
+        settings | _settings(camera) | _settings(adjustment),
+    )
     differences = _differences(done, others)
-    calibrations = [
-        done.calibration(entry.id if taken else target.name, provenance.to_dict(), entry.id)
-        for entry in done.result.network.cameras
-    ]
-    if report is not None or folder is not None:
-        page = done.report_page(
-            title=f"Calibration with {target.name}", provenance=provenance, against=differences,
-            distances=distance, photograph=_pictures(photographs, Reading(reading.channel)),
-            days=sorted({day for path in photographs.values() if (day := read_exif(path).day)}),
-        )  # fmt: skip
+    calibrations, page = done.documents(provenance.to_dict()), ""
+    if report is not None or (place is not None and place.suffix != ".json"):
+        page = done.report_page(provenance=provenance, against=differences, distances=distance)
     if report is not None:
         write_whole(report, page)
     written = list[tuple[str, str]]()
-    if folder is not None:
+    if place is not None:
         with progress("writing", 0) as step:
-            network = done.result.network
-            used = {
-                entry.id: [photographs[network.images[i]] for i in np.flatnonzero(network.camera_of == c)]
-                for c, entry in enumerate(network.cameras)
-            }
-            written = calibration_folder(folder, calibrations, page, used, step)
-    elif out is not None:
-        for calibration, path in zip(calibrations, done.files(out).values(), strict=True):
-            calibration.write(path)
+            written = write_calibrated(place, done, calibrations, page, step)
     if as_json:
         say("".join(calibration.to_json() for calibration in calibrations))
-    else:
-        _say(done, differences, distance or [])
-    if folder is not None and not as_json:
-        say(f"written: {folder}\n")
+        return
+    _say(done, differences, distance)
+    if written:
+        say(f"written: {place}\n")
         say("".join(f"  {name:26} {what}\n" for name, what in written))
 
 
-def _folder(out: Path | None, files: list[Path], as_json: bool) -> Path | None:
-    """The folder for all results, made before anything is computed; None where one file or none is wanted."""
-    from ..procedures.calibration_folder import folder_beside, made_folder
-
-    if out is None:
-        return None if as_json else made_folder(folder_beside(files))
-    return made_folder(out) if out.is_dir() or not out.suffix else None
+def _note(line: str) -> None:
+    typer.echo(f"note: {line}", err=True)
 
 
 def _named(files: list[Path]) -> str:
@@ -344,32 +309,15 @@ def _named(files: list[Path]) -> str:
     return str(one) if one.name else "photographs"
 
 
-def _found_target(files: list[Path], reading: Reading) -> ReseauDesign | TestfieldDesign | BoardDesign:
-    """The target that photographs show."""
-    from ..procedures.exposures import photograph_reader
-    from ..procedures.which_target import target_of
-
-    read = photograph_reader(reading.channel, reading.correction)
-    note, design = required(target_of(files, read), "--design auto")
-    typer.echo(f"note: {note}", err=True)
-    return design
-
-
-def _photographs(images: list[Path], cameras: list[str]) -> tuple[dict[str, Path], dict[str, Taken]]:
-    """Photographs by their names; with several cameras also when each was taken."""
+def _photographs(images: list[Path], cameras: list[str]) -> tuple[list[tuple[str, Path]], dict[str, Taken]]:
+    """Photographs with their names; with several cameras also when each was taken."""
     from ..procedures.exposures import exposures_of_files, files_of, photographs_named
 
     if not cameras:
         if not images:
             raise UsageError("are missing", where="photographs", do="name IMAGES, or --rig for each camera")
         say_files_left_out(images)
-        images = photographs_named(images)
-        named = {path.name: path for path in images}
-        if len(named) < len(images):
-            names = [path.name for path in images]
-            twice = next(name for name in named if names.count(name) > 1)
-            raise UsageError("two photographs have this name", where=twice)
-        return named, {}
+        return [(path.name, path) for path in photographs_named(images)], {}
     if images:
         raise UsageError("cannot be combined with --rig", where=images[0])
     files: dict[str, list[Path]] = {}
@@ -380,7 +328,8 @@ def _photographs(images: list[Path], cameras: list[str]) -> tuple[dict[str, Path
         files[name] = files_of(pattern)
         say_files_left_out([Path(pattern)])
     found = exposures_of_files(files)
-    return {name: path for name, (path, _) in found.items()}, {name: at for name, (_, at) in found.items()}
+    photographs = [(name, path) for name, (path, _) in found.items()]
+    return photographs, {name: at for name, (_, at) in found.items()}
 
 
 def _settings(options: CameraChoice | _Adjustment) -> dict[str, Any]:
@@ -390,12 +339,6 @@ def _settings(options: CameraChoice | _Adjustment) -> dict[str, Any]:
         for name, value in vars(options).items()
         if value not in (None, (), "") and not isinstance(value, Path)
     }
-
-
-def _provenance(inputs: Mapping[str, Path], settings: dict[str, Any]) -> Provenance:
-    from ..core.provenance import Provenance, sha256_of
-
-    return Provenance({name: sha256_of(path) for name, path in inputs.items()}, settings)
 
 
 def _executor(images: list[Path], computing: Computing) -> Executor:
@@ -409,24 +352,6 @@ def _executor(images: list[Path], computing: Computing) -> Executor:
     if isinstance(executor, Processes):
         start_early(modules)
     return executor
-
-
-def _shown(photographs: Iterator[Photograph], step: Callable[[str], None]) -> Iterator[Photograph]:
-    """The photographs; each is a step of the progress bar."""
-    for each in photographs:
-        step(f"measuring {each[0] if isinstance(each, tuple) else each.name}")
-        yield each
-
-
-def _pictures(photographs: Mapping[str, Path], reading: Reading) -> Callable[[str], Frame | None]:
-    """The photographs, read again one by one: all of them would fill the memory."""
-    from ..io import is_points
-
-    def read(name: str) -> Frame | None:
-        path = photographs[name]
-        return None if is_points(path) else reading.frame(path)
-
-    return read
 
 
 def _differences(done: Calibrated, others: dict[str, CameraMapping]) -> dict[str, FieldDifference]:

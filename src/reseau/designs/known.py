@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 
 from ..io import BoardDesign, ReseauDesign, TestfieldDesign
 from ..io.board import BoardKind
@@ -19,6 +19,7 @@ _KINDS: tuple[BoardKind, ...] = ("charuco", "aprilgrid", "markers", "circles", "
 """All but the PuzzleBoard, whose dots tell what a photograph shows of it."""
 
 
+@cache
 def known_designs() -> dict[str, ReseauDesign | TestfieldDesign | BoardDesign]:
     """Sheets, testfields and boards that fill each size of paper, by a description.
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ..bundle import (
@@ -27,12 +29,14 @@ from ..bundle import (
 from ..calibration import Assessment, Calibration, Covariance, FieldDifference
 from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display, Table, html_table
-from ..core.errors import UsageError
+from ..core.errors import InputError, UsageError
 from ..core.failure import Remark
 from ..core.lazy import above
 from ..core.provenance import Provenance
 from ..exchange.calibrations import Exported, export_calibrations
-from ..io import BoardDesign, write_whole
+from ..io import BoardDesign, is_points, write_whole
+from ..io.images import Channel, read_image
+from ..io.photographs import read_exif
 from .assessment import assess, sorted_remarks
 
 if TYPE_CHECKING:
@@ -53,6 +57,7 @@ class ReportOptions(TypedDict, total=False):
         Heading of the page.
     photograph : callable
         Returns the photograph of an image by its name, or None; those with the largest residuals are shown.
+        By default their files are read, as far as they are there.
     provenance : Provenance
         Inputs, options, version.
     against : mapping of str to FieldDifference
@@ -62,7 +67,7 @@ class ReportOptions(TypedDict, total=False):
     declined : mapping of str to str
         Further photographs that were left out, and why.
     days : collection of str
-        When the photographs were taken.
+        When the photographs were taken; by default as their files say.
 
     Examples
     --------
@@ -101,6 +106,12 @@ class Calibrated(Display):
         Image points that were left out because they lie elsewhere than the others of their image say.
     corrected : BoardDesign, optional
         The board that the photographs show, where it is not the one that was told.
+    target : str
+        Name of the target.
+    sources : mapping of str to Path
+        Files of the photographs, or of their image coordinates, by image.
+    channel : str
+        Channel of colour images that was read.
     """
 
     result: Result
@@ -111,6 +122,9 @@ class Calibrated(Display):
     notes: tuple[str, ...] = ()
     misnamed: Misnamed | None = None
     corrected: BoardDesign | None = None
+    target: str = ""
+    sources: Mapping[str, Path] = field(default_factory=dict)
+    channel: Channel = "luma"
 
     def __bool__(self) -> Literal[True]:
         return True
@@ -190,6 +204,22 @@ class Calibrated(Display):
             for c, entry in enumerate(network.cameras)
             if c in one and (entry.additional is None or entry.additional.per == "camera")
         }
+
+    def photograph(self, image: str) -> Frame | None:
+        """Read the photograph of an image again; None where it is gone, or was never a file."""
+        path = self.sources.get(image)
+        if path is None or is_points(path):
+            return None
+        with suppress(InputError):
+            return read_image(path, self.channel)
+        return None
+
+    def photographs(self, camera: str) -> list[Path]:
+        """Return the files of a camera that are used, without those of image coordinates."""
+        network = self.result.network
+        c = [entry.id for entry in network.cameras].index(camera)
+        own = [self.sources.get(network.images[i]) for i in np.flatnonzero(network.camera_of == c)]
+        return [path for path in own if path is not None and not is_points(path)]
 
     @property
     def assessment(self) -> Assessment | None:
@@ -295,10 +325,14 @@ class Calibrated(Display):
     def report_page(self, **options: Unpack[ReportOptions]) -> str:
         """Return the page that :meth:`report` writes."""
         declined = dict(options.pop("declined", {})) | self.declined
+        usual: ReportOptions = {
+            "title": f"Calibration with {self.target}" if self.target else "Calibration",
+            "photograph": self.photograph,
+            "days": sorted({day for path in self.sources.values() if (day := read_exif(path).day)}),
+        }
         page: str = above("reseau.report.bundle:bundle_report")(
-            self.result, **({"title": "Calibration"} | options), assessments=self.assessments,
-            declined=declined,
-        )  # fmt: skip
+            self.result, **(usual | options), assessments=self.assessments, declined=declined
+        )
         return page
 
     def summary(self) -> str:
@@ -356,6 +390,12 @@ class Calibrated(Display):
         if self.corrected is not None:
             more |= {"corrected_design": self.corrected.to_dict()}
         return found.model_copy(update={"validity": found.validity | more, "assessment": assessed})
+
+    def documents(self, provenance: Mapping[str, Any] | None = None) -> list[Calibration]:
+        """Return the calibration of each camera; one that is alone has the name of the target."""
+        names = [entry.id for entry in self.result.network.cameras]
+        alone = self.target if names == [ONE_CAMERA] else ""
+        return [self.calibration(alone or name, provenance, name) for name in names]
 
     def write(self, path: Path | str) -> None:
         """Write the calibration, ``reseau-calibration/1``; of several cameras one file each.

@@ -5,18 +5,20 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from ..calibration import Calibration, CameraMapping, CorrectedImage, Use, write_corrected
 from ..calibration.raster import planes_of
-from ..core.errors import InputError
+from ..core.errors import InputError, UsageError
 from ..exchange import export_calibration, export_rig
 from ..exchange.calibrations import formats_holding
-from ..io import is_points, write_whole
+from ..io import write_whole
 from ..io.images import open_scan
+from .calibrated import Calibrated
 
-__all__ = ["calibration_folder", "folder_beside", "made_folder"]
+__all__ = ["calibration_folder", "checked_output", "folder_beside", "write_calibrated"]
 
 _FILES = {"opencv": "opencv.yml", "ros": "ros.yaml", "colmap": "colmap.txt"}
 """Files for other programs, by their formats."""
@@ -40,29 +42,82 @@ def folder_beside(photographs: Sequence[Path]) -> Path:
     return found.relative_to(Path.cwd()) if found.is_relative_to(Path.cwd()) else found
 
 
-def made_folder(folder: Path) -> Path:
-    """Make the folder, before anything is computed.
+def checked_output(path: Path) -> Path:
+    """Return the path of the folder, or of the file of a calibration, if it can be written.
+
+    Nothing is made: this is called before anything is computed.
 
     Raises
     ------
     InputError
-        When files cannot be written there.
+        When nothing can be written there.
+    UsageError
+        When the suffix is that of another file.
 
     Examples
     --------
-    >>> made_folder(Path("README.md"))
+    >>> checked_output(Path("camera.yml"))
     Traceback (most recent call last):
     ...
-    reseau.core.errors.InputError: README.md: cannot be written (File exists); choose another folder by --out
+    reseau.core.errors.UsageError: camera.yml: has the suffix '.yml'; use .json for the calibration alone, ...
     """
-    do = "choose another folder by --out"
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror})", where=folder, do=do) from None
-    if not os.access(folder, os.W_OK):
-        raise InputError("cannot be written (Permission denied)", where=folder, do=do)
-    return folder
+    if path.suffix.lower() not in ("", ".json") and not path.is_dir():
+        raise UsageError(
+            f"has the suffix {path.suffix!r}", where=path,
+            do="use .json for the calibration alone, or a name without suffix for a folder with the files of "
+            "all programs",
+        )  # fmt: skip
+    where, do = path if path.is_dir() else path.parent, "choose another folder or file by --out"
+    if not where.is_dir():
+        raise InputError("cannot be written (No such file or directory)", where=path, do=do)
+    if path.exists() and not path.suffix and not path.is_dir():
+        raise InputError("cannot be written (File exists)", where=path, do=do)
+    if not os.access(where, os.W_OK):
+        raise InputError("cannot be written (Permission denied)", where=path, do=do)
+    return path
+
+
+def write_calibrated(
+    path: Path, done: Calibrated, calibrations: Sequence[Calibration], page: str,
+    step: Callable[[str], None] = lambda _: None,
+) -> list[tuple[str, str]]:  # fmt: skip
+    """Write calibrations into a folder, or with the suffix ``.json`` alone; all files or none.
+
+    Parameters
+    ----------
+    path : Path
+        See :func:`checked_output`. Files of the same name are replaced, those of an earlier calibration too.
+    done : Calibrated
+        What was calibrated.
+    calibrations : sequence of Calibration
+        Its documents.
+    page, step
+        See :func:`calibration_folder`.
+
+    Returns
+    -------
+    list of (str, str)
+        Files in the folder, and what they are, or why they are not written.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be written.
+    """
+    if path.suffix.lower() == ".json" and not path.is_dir():
+        for calibration, file in zip(calibrations, done.files(path).values(), strict=True):
+            calibration.write(file)
+        return []
+    used = {name: done.photographs(name) for name in done.files(path)}
+    with TemporaryDirectory(dir=path if path.is_dir() else path.parent, prefix=".reseau-") as place:
+        written = calibration_folder(Path(place), calibrations, page, used, step)
+        path.mkdir(exist_ok=True)
+        names = [f"{name}-" * (len(used) > 1) + file for name in used for file in _FILES.values()]
+        for name in ("camchain.yaml", *names):  # of an earlier calibration
+            (path / name).unlink(missing_ok=True)
+        for file in Path(place).iterdir():
+            file.replace(path / file.name)
+    return written
 
 
 def calibration_folder(
@@ -72,7 +127,7 @@ def calibration_folder(
     photographs: Mapping[str, Sequence[Path]],
     step: Callable[[str], None] = lambda _: None,
 ) -> list[tuple[str, str]]:
-    """Write the calibrations of one camera, or of several that are fixed to each other.
+    """Write the calibrations of one camera, or of several that are fixed to each other, into an empty folder.
 
     The report, and each calibration; where it is usable its files for OpenCV, ROS and COLMAP, as far as these
     have its model, those of the rig for Kalibr, and three undistorted photographs of each camera.
@@ -80,13 +135,13 @@ def calibration_folder(
     Parameters
     ----------
     folder : Path
-        The folder, see :func:`made_folder`. Files of the same name are replaced.
+        The folder.
     calibrations : sequence of Calibration
         The cameras; of several the first is the reference of the rig.
     page : str
         The report.
     photographs : mapping of str to sequence of Path
-        Photographs from which each camera was calibrated, or measured image coordinates, by its name.
+        Photographs from which each camera was calibrated, by its name.
     step : callable
         Is called with what is written next.
 
@@ -108,8 +163,6 @@ def calibration_folder(
         own = f"{name}.json" if before else "camera.json"
         calibration.write(folder / own)
         written.append((own, "calibration with its uncertainty"))
-        for file in _FILES.values():  # of an earlier calibration
-            (folder / f"{before}{file}").unlink(missing_ok=True)
         if calibration.assessment is not None and calibration.assessment.use is Use.NOTHING:
             written.append(("", "not usable: no files for other programs, no undistorted photographs"))
             continue
@@ -132,10 +185,9 @@ def _samples(
     folder: Path, before: str, lens: CameraMapping, files: Sequence[Path], step: Callable[[str], None]
 ) -> list[tuple[str, str]]:
     """Undistorted photographs, spread over all."""
-    photographs = [path for path in files if not is_points(path)]
-    chosen = sorted(set(np.linspace(0, len(photographs) - 1, _SAMPLES).astype(int))) if photographs else []
+    chosen = sorted(set(np.linspace(0, len(files) - 1, _SAMPLES).astype(int))) if files else []
     raster, names = CorrectedImage.undistorted(lens, "keep"), list[str]()
-    for path in (photographs[k] for k in chosen):
+    for path in (files[k] for k in chosen):
         step(f"undistorting {path.name}")
         planes = planes_of(open_scan(path))
         lens.check_size(planes[0].shape[1], planes[0].shape[0], path)
@@ -148,7 +200,6 @@ def _samples(
 
 def _rig(folder: Path, calibrations: Sequence[Calibration]) -> list[tuple[str, str]]:
     """The cameras together, where Kalibr has their models and all are usable."""
-    (folder / "camchain.yaml").unlink(missing_ok=True)
     assessed = [each.assessment for each in calibrations]
     if any("kalibr" not in formats_holding(each) for each in calibrations) or any(
         found is not None and found.use is Use.NOTHING for found in assessed

@@ -8,9 +8,9 @@ without control points gets true coordinates. The steps have the numbers and sym
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from ..calibration import CameraCorrection, InstrumentCorrection
 from ..core.data import Frame, ImagePoints
@@ -382,6 +382,21 @@ class StillStandard(_Corrected):
     notes: tuple[Remark, ...]
     measured: PinResult | None
     marks: ReseauResult | None = None
+
+    def entries(self) -> dict[str, Any]:
+        """The test as JSON."""
+        test = self.test
+        return {
+            "holds": test.holds, "same_object": test.same_object, "chi2": test.statistic,
+            "degrees": test.degrees, "critical": test.critical, "p": test.p, "shift": test.shift.tolist(),
+            "shift_sigma": test.shift_sigma.tolist(), "p_shift": test.p_shift, "p_rest": test.p_rest,
+            "rods": {"id": list(test.names), "change": test.change.tolist(), "sigma": test.sigma.tolist()},
+        } | note_entries(self.notes)  # fmt: skip
+
+
+def note_entries(notes: Sequence[Remark]) -> dict[str, Any]:
+    """Notes as JSON."""
+    return {"notes": [note.text for note in notes], "note_codes": [note.code.value for note in notes]}
 
 
 def still_standard_in(

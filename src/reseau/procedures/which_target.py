@@ -56,7 +56,7 @@ def designs_beside(folders: Iterable[Path]) -> dict[str, Design]:
     'sheet on A4'
     """
     found = dict[str, Design]()
-    for folder in folders:
+    for folder in {folder.resolve(): folder for folder in reversed([*folders])}.values():
         for file in sorted(path for path in folder.glob("*") if path.suffix.lower() in _DESIGNS):
             try:
                 found[str(file)] = read_target(file)
@@ -255,7 +255,8 @@ class _Photographs:
             if not _plain(design) or not _is_part_of_another(self.further(), design):
                 same = _plain(design), points[name]
                 alike = [each for each in order if (_plain(candidates[each]), points[each]) == same]
-                return _either(alike), design
+                given = [each for each in alike if each not in known_designs()]
+                return _either(given or alike), design
             pattern = _pattern(design)
             points |= {name: 0 for name, each in candidates.items() if _pattern(each) == pattern}
         return None
@@ -431,7 +432,8 @@ def _may_be(design: Design, shown: Sequence[BoardDesign]) -> bool:
     """Whether a frame that shows these boards may show a design; what is coded says so itself."""
     kinds = {each.kind for each in shown}
     if isinstance(design, TestfieldDesign):
-        return not shown
+        # Its targets are disks, too.
+        return kinds <= {"circles"}
     if isinstance(design, BoardDesign) and _plain(design):
         return design.kind in kinds
     return not _plain(design) or not shown or "circles" in kinds

@@ -95,11 +95,11 @@ def _deltilles(nodes: Integers) -> list[BoardDesign]:
         # Columns in halves of the distance of corners in a row, and rows.
         turned = nodes @ np.linalg.matrix_power(THIRD, turn).T @ np.array([[2, 0], [1, 1]])
         filled = _filled(turned, 2)
-        if len(filled) < _FEWEST:
+        wide, high = (np.ptp(filled, axis=0) + 1).tolist() if len(filled) >= _FEWEST else (0, 0)
+        if min(wide / 2, high) < 3:
             continue
-        wide, high = (np.ptp(filled, axis=0) + 1).tolist()
         # Each corner in a rectangle speaks for it, each place without one against it.
-        if (lead := 2 * len(filled) - wide * high / 2) > most:
+        if (lead := _lead(filled, 0.5)) > most:
             best, most = [board("deltille", (wide + 1) // 2, high, _SIDE_MM)], lead
     return best
 
@@ -133,7 +133,13 @@ def _filled(nodes: Integers, step: int = 1) -> Integers:
                 break
         else:
             break
-    return nodes
+    # A line alone is no lattice.
+    return nodes if len(nodes) and np.ptp(nodes, axis=0).min() > 0 else nodes[:0]
+
+
+def _lead(nodes: Integers, filled: float = 1.0) -> float:
+    """Nodes (m, 2) on a grid less the empty places of its outline, of which a share is `filled`."""
+    return 2 * len(nodes) - filled * float((np.ptp(nodes, axis=0) + 1).prod()) if len(nodes) else 0.0
 
 
 def _lattices_of_disks(disks: Disks, shape: tuple[int, ...]) -> Iterator[tuple[Integers, Rows, Chain]]:
@@ -153,13 +159,16 @@ def _circles(
     size = 2 * float(np.median(np.sqrt(np.linalg.det(disks.form[rows]) / slope)))
     # The diagonals of a shifted grid are its rows and columns.
     straight, shifted = _filled(nodes), _filled(nodes @ np.array([[1, 1], [-1, 1]]), 2)
-    across, diagonal = np.ptp(straight, axis=0) + 1, np.ptp(shifted, axis=0) + 1
     # Each circle on a grid speaks for it, each place without a circle against it.
-    if 2 * len(straight) - across.prod() >= 2 * len(shifted) - diagonal.prod() / 2:
-        columns, high = across.tolist()
+    regular, diagonal = _lead(straight), _lead(shifted, 0.5)
+    if max(regular, diagonal) <= 0:
+        return
+    if regular >= diagonal:
+        columns, high = (np.ptp(straight, axis=0) + 1).tolist()
         yield board("circles", columns, high, _SIDE_MM, size=size * _SIDE_MM, polarity=polarity)
         return
-    for wide, high in np.stack([diagonal, diagonal[::-1]]).tolist():
+    ends = (np.ptp(shifted, axis=0) + 1).tolist()
+    for wide, high in (ends, ends[::-1]):
         if wide % 2 == 0:
             yield board(
                 "circles", wide // 2, high, _SIDE_MM, size=np.sqrt(2) * size * _SIDE_MM, polarity=polarity,
