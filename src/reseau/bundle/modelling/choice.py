@@ -46,7 +46,8 @@ from .left_out import Information, Prediction, information_of
 __all__ = ["Compared", "ModelChoice", "choose_model", "choose_models"]
 
 # A model with more parameters predicts better by more than chance where it makes the images that are left out
-# ten times as probable. One parameter too many does this in 1 % of cases: its logarithm is (χ² − 2) / 2 with
+# ten times as probable, and as many times more as there are such models, one of which could do so by chance.
+# One parameter too many makes them ten times as probable in 1 % of cases: the logarithm is (χ² − 2) / 2 with
 # one degree of freedom (Stone 1977, J. R. Statist. Soc. B 39), and χ² > 2 + 2 ln 10 has this probability. So
 # have several.
 _ODDS = np.log(10.0)
@@ -211,8 +212,8 @@ def choose_model(
 
     Notes
     -----
-    Chosen is the candidate with the fewest parameters of those than which none with more parameters makes
-    images that are left out ten times as probable. One image that others contradict decides nothing: what
+    Chosen is the candidate with the fewest parameters of those than which none of the n with more parameters
+    makes images that are left out 10 n times as probable. One image that others contradict decides nothing: what
     images tell of the camera counts with the variance with which they differ. Large networks are represented
     by 60 of their images.
 
@@ -529,7 +530,7 @@ class _Search:
         density = {each: float(one.log_density.sum()) for each, one in found.items()}
         for each in sorted(found, key=lambda each: found[each].parameters):
             richer = [density[other] for other in found if found[other].parameters >= found[each].parameters]
-            if max(richer) <= density[each] + _ODDS:
+            if max(richer) <= density[each] + _ODDS + np.log(len(richer)):
                 return each
         # Too few images to leave one out.
         usual = camera_model(self.start.model).usual
