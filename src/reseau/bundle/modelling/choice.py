@@ -482,9 +482,9 @@ class _Search:
 
     @property
     def variance(self) -> float:
-        """Variance factor of the predictions, of the model by which images contradict each other least."""
-        known = (each.information for each in self.adjusted.values())
-        return min((each.variance for each in known if each is not None), default=1.0)
+        """Variance factor of what is chosen."""
+        known = self.adjusted[self.pick].information
+        return 1.0 if known is None else known.predicted(self.pick.estimated).variance
 
     @property
     def fit(self) -> BundleFit:
@@ -515,22 +515,22 @@ class _Search:
 
     def _predictions(self) -> dict[Candidate, Prediction]:
         """Predictions of all candidates for which a model with their parameters was adjusted."""
-        found, variance = dict[Candidate, Prediction](), self.variance
+        found = dict[Candidate, Prediction]()
         for each in self.candidates:
             if each in self.declined or not any(own.alike(each) for own in self.adjusted):
                 continue
             near = self._nearest(each).information
             if near is not None and len(near.own) >= _LEAST:
-                found[each] = near.predicted(each.estimated, variance)
+                found[each] = near.predicted(each.estimated)
         return found
 
     def _picked(self) -> Candidate:
         """The simplest candidate than which no richer one predicts better by more than chance."""
         found = self._predictions()
-        density = {each: float(one.log_density.sum()) for each, one in found.items()}
-        for each in sorted(found, key=lambda each: found[each].parameters):
-            richer = [density[other] for other in found if found[other].parameters >= found[each].parameters]
-            if max(richer) <= density[each] + _ODDS + np.log(len(richer)):
+        order = sorted(found, key=lambda each: found[each].parameters)
+        for k, each in enumerate(order):
+            better = [found[richer].better(found[each]) for richer in order[k:]]
+            if max(better) <= _ODDS + np.log(len(better)):
                 return each
         # Too few images to leave one out.
         usual = camera_model(self.start.model).usual
@@ -550,7 +550,8 @@ class _Search:
     def choice(self) -> ModelChoice:
         """Return the choice, with all candidates."""
         found, fit = self._predictions(), self.fit
-        density = {each: float(one.log_density.sum()) for each, one in found.items()}
+        variance = found[self.pick].variance if self.pick in found else 1.0
+        density = {each: one.log_density(variance) for each, one in found.items()}
         best = max(density.values(), default=0.0)
         compared = []
         for each in sorted(self.candidates, key=lambda each: -density.get(each, -np.inf)):
@@ -581,7 +582,7 @@ class _Search:
         predicted = float(np.sqrt(one.squares.sum() / information.count))
         p, more = np.nan, abs(one.parameters - chosen.parameters)
         if (own.within(self.pick) or self.pick.within(own)) and more > 0:
-            f = abs(one.cost - chosen.cost) / more / self.variance
+            f = abs(one.cost - chosen.cost) / more / max(one, chosen, key=lambda each: each.parameters).variance
             p = float(scipy.special.fdtrc(more, max(left, 1.0), f))
         found = Compared(
             own, "", sigma0, one.cost, length, predicted, p, **self._difference(own, one, chosen)
@@ -590,7 +591,7 @@ class _Search:
 
     def _reason(self, found: Compared, one: Prediction, chosen: Prediction) -> str:
         """Say why a candidate was chosen, or not."""
-        gain = float(one.log_density.sum() - chosen.log_density.sum())
+        gain = one.better(chosen)
         if found.candidate == self.pick:
             return "chosen: none with more parameters predicts images better"
         if self.pick.within(found.candidate):
