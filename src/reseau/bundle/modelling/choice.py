@@ -551,7 +551,7 @@ class _Search:
         """Return the choice, with all candidates."""
         found, fit = self._predictions(), self.fit
         variance = found[self.pick].variance if self.pick in found else 1.0
-        density = {each: one.log_density(variance) for each, one in found.items()}
+        density = {each: float(one.log_density(variance).sum()) for each, one in found.items()}
         best = max(density.values(), default=0.0)
         compared = []
         for each in sorted(self.candidates, key=lambda each: -density.get(each, -np.inf)):

@@ -75,17 +75,21 @@ class Prediction:
     values: Array
     covariance: Array
 
-    def log_density(self, variance: float) -> float:
-        """Logarithm of the density of all images, with a variance factor."""
-        return float(self.log_det.sum() - self.squares.sum() / (2 * variance))
+    def log_density(self, variance: float) -> Array:
+        """Logarithm of the density of each image (m,), with a variance factor."""
+        return self.log_det - self.squares / (2 * variance)
 
     def better(self, other: Prediction) -> float:
-        """Logarithm of how much better than another it predicts.
+        """Logarithm of how much better than another it predicts, as far as images agree in that.
 
-        Images contradict each other in what only the camera with more parameters has: by its variance factor.
+        Images contradict each other in what only the camera with more parameters has: its variance factor
+        counts. With a gain G = χ²/2, what an image tells has the variance χ² altogether; images that are
+        predicted worse show how large it is, and χ² is smaller by the same factor: G² / Σ (d < 0) d².
         """
         variance = max(self, other, key=lambda one: one.parameters).variance
-        return self.log_density(variance) - other.log_density(variance)
+        each = self.log_density(variance) - other.log_density(variance)
+        gain, worse = float(each.sum()), float((np.minimum(each, 0.0) ** 2).sum())
+        return min(gain, gain**2 / worse) if gain > 0 and worse > 0 else gain
 
 
 @dataclass(frozen=True, eq=False)
