@@ -296,8 +296,7 @@ def calibrate(
     provenance = _provenance(inputs, settings | _settings(camera) | _settings(adjustment))
     differences = _differences(done, others)
     calibrations = [
-        done.calibration(entry.id if taken else target.name, provenance.to_dict(), entry.id)
-        for entry in done.result.network.cameras
+        done.calibration(entry.id, provenance.to_dict(), entry.id) for entry in done.result.network.cameras
     ]
     if report is not None or folder is not None:
         page = done.report_page(

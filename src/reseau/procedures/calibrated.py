@@ -224,6 +224,8 @@ class Calibrated(Display):
         """
         if by == "image":
             return self.result.residuals_by_image()
+        if by != "point":
+            raise UsageError(f"is {by!r}", where="by", do="use point or image")
         return Table("image points", self.result._columns())
 
     def undistort(

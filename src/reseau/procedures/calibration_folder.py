@@ -111,7 +111,9 @@ def calibration_folder(
         for file in _FILES.values():  # of an earlier calibration
             (folder / f"{before}{file}").unlink(missing_ok=True)
         if calibration.assessment is not None and calibration.assessment.use is Use.NOTHING:
-            written.append(("", "not usable: no files for other programs, no undistorted photographs"))
+            written.append(
+                ("", "not usable: no files for other programs (reseau export --anyway writes them)")
+            )
             continue
         holding = formats_holding(calibration)
         for to in (to for to in _FILES if to in holding):
@@ -143,7 +145,7 @@ def _samples(
         name = f"{before}undistorted-{path.stem}{suffix}"
         write_corrected(folder / name, planes, raster)
         names.append(name)
-    return [(", ".join(names), "undistorted photographs")] if names else []
+    return [(name, "undistorted photograph") for name in names]
 
 
 def _rig(folder: Path, calibrations: Sequence[Calibration]) -> list[tuple[str, str]]:
