@@ -266,7 +266,7 @@ class CameraCorrection(CalibratedMapping):
                 cofactor = np.array(content["datum"]["in_system"], dtype=np.float64)[:u, :u]
                 if cofactor.shape != (u, u) or len(datum.influence) != u:
                     raise ValueError(f"datum of {len(datum.influence)} instead of {u} coefficients")
-        except (KeyError, TypeError, ValueError, UsageError) as error:
+        except (KeyError, TypeError, ValueError, UsageError, FormatError) as error:
             raise FormatError(
                 f"has a damaged or missing entry: {error}", where=f"model of calibration {calibration.name}"
             ) from None
