@@ -6,13 +6,14 @@ Equations (5a, b) of Wishahy's paper as they are applied and stored; :mod:`resea
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Literal, Protocol, Self, cast
+from typing import Any, ClassVar, Final, Protocol, Self, cast
 
 import numpy as np
 
 from ..adjust import Adjustment
 from ..core.data import Array, ImagePoints
 from ..core.errors import FormatError, UsageError
+from ..core.failure import Estimated
 from ..optics import RationalPolynomial, Similarity
 from .document import Calibration, Covariance, OscilloscopeModel, Quantity
 from .entries import system_from_dict, system_to_dict, unit_of, with_stored_values
@@ -92,7 +93,7 @@ class Datum:
 
 
 @dataclass(frozen=True, eq=False)
-class CameraCorrection(CalibratedMapping):
+class CameraCorrection(Estimated, CalibratedMapping):
     """From pixels to the plane of the reseau, corrected for lens distortion and film deformation.
 
     Parameters
@@ -138,13 +139,6 @@ class CameraCorrection(CalibratedMapping):
     extent: tuple[float, ...] | None = None
     size: tuple[int, int] | None = None
     datum: Datum | None = None
-
-    def __bool__(self) -> Literal[True]:
-        return True
-
-    def required(self) -> Self:
-        """The correction itself; see :meth:`reseau.core.failure.Failure.required`."""
-        return self
 
     @property
     def parameter_covariance(self) -> Array:
