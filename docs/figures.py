@@ -70,7 +70,7 @@ def _views() -> Iterator[tuple[tuple[float, float], float, float, float, float]]
 
 def tour_camera(folder: Path) -> Figure:
     """A photograph of the tour with its distortion, and without."""
-    figure = Figure(figsize=(9.0, 3.2), layout="constrained")
+    figure = Figure(figsize=(9.0, 3.5), layout="constrained")
     for axes, name in zip(figure.subplots(1, 2), ("photos", "flat"), strict=True):
         axes.imshow(reseau.read_image(folder / name / "10.png").pixels, cmap="gray", vmin=0, vmax=255)
         axes.set_title(f"{name}/10.png", loc="left")
