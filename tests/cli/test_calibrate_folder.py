@@ -51,15 +51,3 @@ def test_photographs_end_in_a_folder_with_all_that_is_needed(reseau: Run, photos
     sample = cv2.imread(str(folder / "undistorted-0.jpg"), cv2.IMREAD_UNCHANGED)
     assert sample is not None
     assert sample.shape == (400, 480)
-
-
-def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(
-    reseau: Run, photos: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "taken").touch()
-    status, out, err = reseau("calibrate", photos, "-o", tmp_path / "taken")
-    assert (status, out) == (2, "")
-    assert "taken: cannot be written (File exists); choose another folder by --out" in err
-    status, _, err = reseau("calibrate", photos, "-o", tmp_path / "none" / "results")
-    assert status == 2
-    assert "results: cannot be written (No such file or directory)" in err

@@ -296,8 +296,7 @@ def calibrate(
     provenance = _provenance(inputs, settings | _settings(camera) | _settings(adjustment))
     differences = _differences(done, others)
     calibrations = [
-        done.calibration(entry.id if taken else target.name, provenance.to_dict(), entry.id)
-        for entry in done.result.network.cameras
+        done.calibration(entry.id, provenance.to_dict(), entry.id) for entry in done.result.network.cameras
     ]
     if report is not None or folder is not None:
         page = done.report_page(
@@ -330,11 +329,11 @@ def calibrate(
 
 def _folder(out: Path | None, files: list[Path], as_json: bool) -> Path | None:
     """The folder for all results, made before anything is computed; None where one file or none is wanted."""
-    from ..procedures.calibration_folder import folder_beside, made_folder
+    from ..procedures.calibration_folder import folder_beside, writable_folder
 
     if out is None:
-        return None if as_json else made_folder(folder_beside(files))
-    return made_folder(out) if out.is_dir() or not out.suffix else None
+        return None if as_json else writable_folder(folder_beside(files))
+    return writable_folder(out) if out.is_dir() or not out.suffix else None
 
 
 def _named(files: list[Path]) -> str:

@@ -28,7 +28,7 @@ from ..calibration import Assessment, Calibration, Covariance, FieldDifference
 from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display, Table, html_table
 from ..core.errors import UsageError
-from ..core.failure import Remark
+from ..core.failure import Estimated, Remark
 from ..core.lazy import above
 from ..core.provenance import Provenance
 from ..exchange.calibrations import Exported, export_calibrations
@@ -80,7 +80,7 @@ class ReportOptions(TypedDict, total=False):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Calibrated(Display):
+class Calibrated(Estimated, Display):
     """A camera calibration with its measurements; truthy.
 
     Parameters
@@ -112,9 +112,6 @@ class Calibrated(Display):
     misnamed: Misnamed | None = None
     corrected: BoardDesign | None = None
 
-    def __bool__(self) -> Literal[True]:
-        return True
-
     def __getitem__(self, camera: str) -> Calibration:
         """The calibration of a camera by its name."""
         if camera not in self.cameras:
@@ -122,10 +119,6 @@ class Calibrated(Display):
         if camera not in self._documents:
             self._documents[camera] = self.calibration(camera, camera=camera)
         return self._documents[camera]
-
-    def required(self) -> Calibrated:
-        """Return the calibration itself; see :meth:`~reseau.core.failure.Failure.required`."""
-        return self
 
     @cached_property
     def _documents(self) -> dict[str, Calibration]:
@@ -224,6 +217,8 @@ class Calibrated(Display):
         """
         if by == "image":
             return self.result.residuals_by_image()
+        if by != "point":
+            raise UsageError(f"is {by!r}", where="by", do="use point or image")
         return Table("image points", self.result._columns())
 
     def undistort(

@@ -16,7 +16,7 @@ from ..exchange.calibrations import formats_holding
 from ..io import is_points, write_whole
 from ..io.images import open_scan
 
-__all__ = ["calibration_folder", "folder_beside", "made_folder"]
+__all__ = ["calibration_folder", "folder_beside", "writable_folder"]
 
 _FILES = {"opencv": "opencv.yml", "ros": "ros.yaml", "colmap": "colmap.txt"}
 """Files for other programs, by their formats."""
@@ -40,8 +40,8 @@ def folder_beside(photographs: Sequence[Path]) -> Path:
     return found.relative_to(Path.cwd()) if found.is_relative_to(Path.cwd()) else found
 
 
-def made_folder(folder: Path) -> Path:
-    """Make the folder, before anything is computed.
+def writable_folder(folder: Path) -> Path:
+    """Return the folder; it is checked before anything is computed, and made when it is written.
 
     Raises
     ------
@@ -50,18 +50,18 @@ def made_folder(folder: Path) -> Path:
 
     Examples
     --------
-    >>> made_folder(Path("README.md"))
+    >>> writable_folder(Path("README.md"))
     Traceback (most recent call last):
     ...
     reseau.core.errors.InputError: README.md: cannot be written (File exists); choose another folder by --out
     """
-    do = "choose another folder by --out"
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror})", where=folder, do=do) from None
-    if not os.access(folder, os.W_OK):
-        raise InputError("cannot be written (Permission denied)", where=folder, do=do)
+    place, why = folder if folder.exists() else folder.absolute().parent, ""
+    if not place.is_dir():
+        why = "File exists" if folder.exists() else "No such file or directory"
+    elif not os.access(place, os.W_OK | os.X_OK):
+        why = "Permission denied"
+    if why:
+        raise InputError(f"cannot be written ({why})", where=folder, do="choose another folder by --out")
     return folder
 
 
@@ -80,7 +80,7 @@ def calibration_folder(
     Parameters
     ----------
     folder : Path
-        The folder, see :func:`made_folder`. Files of the same name are replaced.
+        The folder, made where it is missing. Files of the same name are replaced.
     calibrations : sequence of Calibration
         The cameras; of several the first is the reference of the rig.
     page : str
@@ -100,6 +100,7 @@ def calibration_folder(
     InputError
         When a file cannot be written.
     """
+    folder.mkdir(exist_ok=True)
     written = [("report.html", "report")]
     step("report")
     write_whole(folder / "report.html", page)
@@ -111,7 +112,9 @@ def calibration_folder(
         for file in _FILES.values():  # of an earlier calibration
             (folder / f"{before}{file}").unlink(missing_ok=True)
         if calibration.assessment is not None and calibration.assessment.use is Use.NOTHING:
-            written.append(("", "not usable: no files for other programs, no undistorted photographs"))
+            written.append(
+                ("", "not usable: no files for other programs (reseau export --anyway writes them)")
+            )
             continue
         holding = formats_holding(calibration)
         for to in (to for to in _FILES if to in holding):
@@ -143,7 +146,7 @@ def _samples(
         name = f"{before}undistorted-{path.stem}{suffix}"
         write_corrected(folder / name, planes, raster)
         names.append(name)
-    return [(", ".join(names), "undistorted photographs")] if names else []
+    return [(name, "undistorted photograph") for name in names]
 
 
 def _rig(folder: Path, calibrations: Sequence[Calibration]) -> list[tuple[str, str]]:

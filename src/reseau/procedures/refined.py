@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ..calibration import Calibration
 from ..core.display import Display
 from ..core.errors import UsageError
+from ..core.failure import Estimated
 from ..io import ReseauDesign
 from .oscilloscope import PhotoI, PhotoII, PhotoIII
 
@@ -19,7 +20,7 @@ __all__ = ["Refined"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Refined(Display):
+class Refined(Estimated, Display):
     """The oscilloscope procedure's results, one for each photograph that was given.
 
     Parameters

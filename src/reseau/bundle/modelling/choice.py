@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import scipy.special
@@ -21,7 +21,7 @@ from ...calibration import CameraMapping, calibration_difference
 from ...calibration.camera import projection_field
 from ...core.display import Display
 from ...core.errors import UsageError
-from ...core.failure import Code, Failure
+from ...core.failure import Code, Estimated, Failure
 from ...optics.cameras import camera_model
 from ..diagnostics.checks import unmodelled_pattern
 from ..network import Camera, Network
@@ -110,7 +110,7 @@ class Compared:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ModelChoice(Display):
+class ModelChoice(Estimated, Display):
     """The chosen camera model and the others, also those that were not adjusted and why; truthy.
 
     Parameters
@@ -136,9 +136,6 @@ class ModelChoice(Display):
     camera: Camera
     compared: tuple[Compared, ...]
     chosen: Compared
-
-    def __bool__(self) -> Literal[True]:
-        return True
 
     @property
     def alternatives(self) -> tuple[Compared, ...]:
