@@ -523,7 +523,10 @@ def _decoded_at_once(page: Any, path: Path) -> Window:
 
             done, found = cv2.imreadmulti(str(path), int(page.index), 1, flags=cv2.IMREAD_UNCHANGED)
             pixels = np.atleast_3d(found[0])[:, :, :3] if done else np.zeros((0, 0, 0))
-            if (pixels.dtype, pixels.shape) != (page.dtype, (page.imagelength, page.imagewidth, _colours(page))):
+            if (pixels.dtype, pixels.shape) != (
+                page.dtype,
+                (page.imagelength, page.imagewidth, _colours(page)),
+            ):
                 raise _damaged(path, ImportError("imagecodecs"))
             # Blue comes first, and black is zero in images of 8 bit, whatever the file says.
             inverted = page.photometric == 0 and page.dtype == np.uint8

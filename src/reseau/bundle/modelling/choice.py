@@ -210,9 +210,9 @@ def choose_model(
     Notes
     -----
     Chosen is the candidate with the fewest parameters of those than which none of the n with more parameters
-    makes images that are left out 10 n times as probable. One image that others contradict decides nothing: what
-    images tell of the camera counts with the variance with which they differ. Large networks are represented
-    by 60 of their images.
+    makes images that are left out 10 n times as probable, as far as these agree in it. One image that others
+    contradict decides nothing: what images tell of the camera counts with the variance with which they
+    differ. Large networks are represented by 60 of their images.
 
     Examples
     --------
@@ -579,7 +579,8 @@ class _Search:
         predicted = float(np.sqrt(one.squares.sum() / information.count))
         p, more = np.nan, abs(one.parameters - chosen.parameters)
         if (own.within(self.pick) or self.pick.within(own)) and more > 0:
-            f = abs(one.cost - chosen.cost) / more / max(one, chosen, key=lambda each: each.parameters).variance
+            richer = max(one, chosen, key=lambda each: each.parameters)
+            f = abs(one.cost - chosen.cost) / more / richer.variance
             p = float(scipy.special.fdtrc(more, max(left, 1.0), f))
         found = Compared(
             own, "", sigma0, one.cost, length, predicted, p, **self._difference(own, one, chosen)

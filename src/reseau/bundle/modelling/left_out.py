@@ -142,9 +142,9 @@ class Information:
     def predicted(self, free: Sequence[str]) -> Prediction:
         """Predict each image from the others with these parameters free.
 
-        Others that were estimated are zero, and those that were not are as they were. With G = R_BB^(−½) K̃, an
-        image contradicts the estimates by s = Gᵀd with the cofactors T − T N⁻¹ T; sᵀ(T − T N⁻¹ T)⁺s is its χ²
-        of as many degrees of freedom as there are parameters.
+        Others that were estimated are zero, and those that were not are as they were. With G = R_BB^(−½) K̃,
+        an image contradicts the estimates by s = Gᵀd with the cofactors T − T N⁻¹ T; sᵀ(T − T N⁻¹ T)⁺s is its
+        χ² of as many degrees of freedom as there are parameters.
         """
         moved = np.where(self._at(self.free) & ~self._at(free), -self.values, 0.0)
         basis = self._basis(free)
