@@ -1,11 +1,11 @@
 """How well the chosen camera model predicts: boards drawn by OpenCV's cameras, compared with the truth.
 
-    python benchmarks/model_choice.py [--seeds 5] [--case tilted …] [--model default auto right …]
+    python benchmarks/model_choice.py [--seeds 5] [--case tilted …] [--model auto right …]
 
-For every case and seed, views of a board are calibrated without a model named (``default``), with ``auto``,
-and with the model and the parameters of the drawn lens (``right``). Printed are the root mean square error of
-the image of rays over the whole image, after the best rotation, in pixels: its median and its largest value
-over the seeds, and the ratio of the median to that of the right model; processor time; and the models chosen.
+For every case and seed, views of a board are calibrated without a model named (``auto``), and with the model
+and the parameters of the drawn lens (``right``). Printed are the root mean square error of the image of rays
+over the whole image, after the best rotation, in pixels: its median and its largest value over the seeds, and
+the ratio of the median to that of the right model; processor time; and the models chosen.
 """
 
 from __future__ import annotations
@@ -118,16 +118,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--case", nargs="*", choices=CASES, default=list(CASES))
-    parser.add_argument("--model", nargs="*", choices=("default", "auto", "right"), default=("auto", "right"))
+    parser.add_argument("--model", nargs="*", choices=("auto", "right"), default=("auto", "right"))
     given = parser.parse_args()
     for name in given.case:
         case, typical = CASES[name], dict[str, float]()
         pitch = case.right.pitch_mm
         for kind in sorted(given.model, reverse=True):
-            model = {"default": CameraOptions(pitch_mm=pitch), "right": case.right}.get(kind)
+            model = case.right if kind == "right" else CameraOptions("auto", pitch_mm=pitch)
             errors, labels, begun = list[float](), Counter[str](), time.process_time()
             for seed in range(given.seeds):
-                found = calibrated(case, seed, model or CameraOptions("auto", pitch_mm=pitch))
+                found = calibrated(case, seed, model)
                 errors.append(np.inf if isinstance(found, str) else error_px(case, found))
                 if isinstance(found, str):
                     labels[found] += 1

@@ -1,7 +1,7 @@
 """Draws pictures of the README, the tours and the how-to pages, for light and, with `-dark`, for dark pages.
 
     python docs/figures.py calibration
-    python docs/figures.py tour-camera|blurred|underwater|fiducial-marks FOLDER
+    python docs/figures.py tour-camera|seen|blurred|underwater|fiducial-marks FOLDER
 
 The first is drawn by `docs/desk.py`. The others show results of pages: the folder is the one in which the
 commands of `docs/tours/camera.md`, `blurred.md`, `blurred-under-water.md` or of
@@ -70,10 +70,22 @@ def _views() -> Iterator[tuple[tuple[float, float], float, float, float, float]]
 
 def tour_camera(folder: Path) -> Figure:
     """A photograph of the tour with its distortion, and without."""
-    figure = Figure(figsize=(9.0, 3.2), layout="constrained")
+    figure = Figure(figsize=(9.0, 3.5), layout="constrained")
     for axes, name in zip(figure.subplots(1, 2), ("photos", "flat"), strict=True):
         axes.imshow(reseau.read_image(folder / name / "10.png").pixels, cmap="gray", vmin=0, vmax=255)
         axes.set_title(f"{name}/10.png", loc="left")
+        axes.set_axis_off()
+    return figure
+
+
+def seen(folder: Path) -> Figure:
+    """The overlay of a photograph of the tour, and a part of it."""
+    picture = cv2.cvtColor(cv2.imread(str(folder / "seen.png")), cv2.COLOR_BGR2RGB)
+    figure = Figure(figsize=(9.0, 3.2), layout="constrained")
+    whole, part = figure.subplots(1, 2)
+    whole.imshow(cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    part.imshow(picture[90:450, 960:])
+    for axes in (whole, part):
         axes.set_axis_off()
     return figure
 
@@ -150,6 +162,7 @@ def main() -> None:
 
 TOURS = {
     "tour-camera": tour_camera,
+    "seen": seen,
     "blurred": blurred,
     "underwater": underwater,
     "fiducial-marks": fiducial_marks,

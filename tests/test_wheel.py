@@ -52,7 +52,7 @@ def test_the_wheel_contains_every_file_of_the_packages(wheel: Path) -> None:
 @pytest.mark.timeout(1200)
 def test_the_wheel_runs_the_demo_in_a_clean_environment(wheel: Path, tmp_path: Path) -> None:
     venv.create(tmp_path / "venv", with_pip=True)
-    pip(tmp_path / "venv/bin/python", "install", "--quiet", "-c", "constraints.txt", wheel)
+    pip(tmp_path / "venv/bin/python", "install", "--quiet", "-c", "constraints.txt", f"{wheel}[bench]")
     command = [tmp_path / "venv/bin/reseau", "demo", "--out", tmp_path / "out"]
     environment = {"PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)

@@ -526,6 +526,8 @@ def _named(
         photo = _photo(image, channel, colours)
         name = photo.name if isinstance(photo, Frame) and not isinstance(image, np.ndarray) else ""
         named.append((name or f"image {len(named) + 1}", photo))
+    if not named:
+        raise UsageError("is empty", where="images", do="give photographs, or their folder")
     return named
 
 

@@ -35,7 +35,7 @@ def test_squares_of_an_image_are_what_the_others_alone_do_not_leave(
     """The points of the target are unknown, and the same for all images; K1 is 27 sigma."""
     network = example_network()
     _, found, _ = adjusted(network, (*FRAME, "K1"))
-    prediction = found.predicted(free, 1.0)
+    prediction = found.predicted(free)
     whole, _, values = adjusted(network, free)
     assert prediction.cost == pytest.approx(whole, rel=linear)
     assert prediction.values[: len(values)] == pytest.approx(values, rel=linear, abs=3e-3)
@@ -61,5 +61,5 @@ def test_images_that_differ_in_the_principal_distance_have_a_larger_variance_fac
     _, found, _ = adjusted(
         replace(network, xy=centre + factor[:, None] * (network.xy - centre)), (*FRAME, "K1")
     )
-    assert sound.variance < 2
-    assert found.variance > 2.5 * found.noise
+    assert sound.predicted(sound.free).variance < 2
+    assert found.predicted(found.free).variance > 2.5 * found.noise

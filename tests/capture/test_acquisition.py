@@ -400,7 +400,7 @@ def test_wrong_use_is_refused_before_anything_moves(rig: FieldRig, session: Sess
     with pytest.raises(UsageError, match="needs an operator"):
         carry_out(run, plans.oscilloscope(run))
     wrong = rig.acquisition(session, camera="table")
-    with pytest.raises(UsageError, match="is not a Camera"):
+    with pytest.raises(UsageError, match="is no camera"):
         carry_out(wrong, plans.frames(wrong, 1))
 
 

@@ -114,7 +114,7 @@ def test_a_rig_is_refused_by_plans_of_one_camera() -> None:
         SensorParameters(region=None, camera="rig"),
         BlurredParameters(steps=(("a", {}),), camera="rig"),
     ):
-        with pytest.raises(UsageError, match="rig: is not a Camera"):
+        with pytest.raises(UsageError, match="rig: is no camera"):
             parameters.check_bench(bench)
 
 

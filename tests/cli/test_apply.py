@@ -139,15 +139,6 @@ def test_points_outside_the_validity_are_flagged_in_the_output_and_in_a_warning(
     assert table["why"][0] == ""
 
 
-def test_an_image_of_another_size_is_refused_in_one_line(camera: Path, tmp_path: Path, reseau: Run) -> None:
-    write_image(tmp_path / "small.png", np.zeros((100, 120), np.uint8))
-    status, _, err = reseau("apply", camera, tmp_path / "small.png")
-    assert status == 2
-    assert "has 120×100 pixels, the calibrated images 320×240" in err
-    assert err.count("\n") == 1
-    assert not list(tmp_path.glob("small-*"))
-
-
 def test_a_photograph_of_another_size_than_photo_i_is_refused(
     calibration: Path, photo: object, tmp_path: Path, reseau: Run
 ) -> None:
@@ -284,24 +275,3 @@ def test_a_sensor_refuses_points_and_other_sizes(sensor: Path, tmp_path: Path, r
         assert status == 2
         assert message in err
         assert err.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            ("--object-coordinates",),
-            "--object-coordinates: needs a calibration of an oscilloscope, not of a camera",
-        ),
-        (("--exposure-ms", 5), "--exposure-ms: needs a calibration of a sensor, not of a camera"),
-        (("--fov", "wide"), "--fov: cannot interpret 'wide'; write keep, all or an angle in degrees"),
-        (("--scale", 0), "--scale: 0 is not positive"),
-        (("--directions",), "--directions: applies to points only"),
-    ],
-)
-def test_options_of_another_kind_are_refused(
-    camera: Path, tmp_path: Path, reseau: Run, options: tuple[object, ...], message: str
-) -> None:
-    write_image(tmp_path / "photo.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    status, _, err = reseau("apply", camera, tmp_path / "photo.png", *options)
-    assert (status, err) == (2, f"reseau: {message}\n")

@@ -256,12 +256,3 @@ def test_points_come_back_from_the_other_direction(
     # The calibration is uncertain in both directions: more than what was measured, by its sigma in x.
     far = np.abs(found[:, 0] - 82.0) * 0.1 / 210.0
     assert found[:, 2] == pytest.approx(np.sqrt(0.1**2 + 2 * far**2), rel=0.05)
-
-
-def test_options_of_cameras_are_refused_elsewhere(reseau: Run, lens: Path, tmp_path: Path) -> None:
-    status, _, err = reseau("apply", lens)
-    assert status == 2
-    assert "SOURCE: is missing" in err
-    status, _, err = reseau("apply", lens, "--tables", tmp_path / "t.png")
-    assert status == 2
-    assert "use .npz" in err

@@ -297,15 +297,6 @@ def test_a_film_frame_on_the_command_line_gives_pixel_size_and_principal_point(
     assert camera.parameters["x0"].sigma < 0.002 * 1.5
 
 
-@pytest.mark.parametrize("given", ["cam.json", "=cam.json", "cam="])
-def test_a_camera_without_id_or_file_is_refused(
-    given: str, reseau: Run, network: Callable[..., Path]
-) -> None:
-    status, out, err = reseau("bundle", network(), "--camera-calibration", given)
-    assert (status, out) == (2, "")
-    assert "ID=calibration.json" in err
-
-
 def test_fiducial_marks_on_the_command_line_give_pixel_size_and_principal_point(
     reseau: Run, network: Callable[..., Path], tmp_path: Path
 ) -> None:

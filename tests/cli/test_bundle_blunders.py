@@ -226,10 +226,3 @@ def test_unnecessary_parameters_are_dropped_and_cross_validated(reseau: Run, tmp
     status, out, _ = reseau("bundle", path, "--eliminate", 0.001)
     assert "dropped: B1 of camera cam" in out
     assert "cross-validation" in out
-
-
-@pytest.mark.parametrize("option", ["--eliminate", "--alpha"])
-def test_an_invalid_significance_level_is_refused(option: str, reseau: Run, tmp_path: Path) -> None:
-    status, out, err = reseau("bundle", written(tmp_path, block()), option, 1.5)
-    assert (status, out) == (2, "")
-    assert "is not between 0 and 1" in err

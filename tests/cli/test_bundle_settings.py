@@ -34,27 +34,6 @@ def test_parameters_are_freed_and_fixed(reseau: Run, network: Path) -> None:
     assert "all" in json.dumps(json.loads(out)["provenance"])
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (("--free", "K7"), "K7: is no parameter of a camera"),
-        (("--free", "left:K1"), "left: is not a camera of the network"),
-        (("--free", "K1", "--fix", "K1"), "parameter K1: is both free and fixed"),
-        (("--sigma-px", "0"), "Invalid value for '--sigma-px'"),
-        (("--datum", "free", "--control", "control.csv"), "cannot be combined with --control"),
-    ],
-)
-def test_a_wrong_setting_is_refused_in_one_line(
-    options: tuple[str, ...], words: str, reseau: Run, network: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(network.parent)
-    status, out, err = reseau("bundle", network, *options)
-    assert status != 0
-    assert out == ""
-    assert words in err
-    assert err.count("\n") == 1
-
-
 def test_control_in_a_file_of_its_own_held_and_weighted(reseau: Run, tmp_path: Path) -> None:
     """The same result as with the control in the network; sigmas make observations."""
     document = content()

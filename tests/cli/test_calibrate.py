@@ -138,28 +138,6 @@ def test_control_points_define_the_datum(reseau: Run, measured: tuple[Path, ...]
     assert "control.csv" in found["provenance"]["inputs"]
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ("id,x,y\na,1,2\n", "start with the header id,x,y,z"),
-        ("id,x,y,z\na,1,2,3\na,1,2,3\n", "line 3: point a appears twice"),
-        ("id,x,y,z\na,1,2\n", "line 2: has 3 fields, not 4"),
-        ("id,x,y,z\na,1,two,3\n", "line 2: 'two' is not a number"),
-        ("id,x,y,z,sx,sy,sz\na,1,2,3,0,-1,0\n", "the sigma of point a is negative"),
-        ("id,x,y,z\nnowhere,1,2,3\n", "control point nowhere: was measured in no image"),
-        ("id,x,y,z\n", "contains no points"),
-    ],
-)
-def test_a_bad_table_of_control_points_is_refused(
-    content: str, words: str, reseau: Run, measured: tuple[Path, ...], tmp_path: Path
-) -> None:
-    (tmp_path / "control.csv").write_text(content)
-    status, out, err = reseau(*common(measured), "--control", tmp_path / "control.csv")
-    assert (status, out) == (2, "")
-    assert words in err
-    assert err.count("\n") == 1
-
-
 @pytest.mark.slow
 def test_a_point_can_be_left_out_by_name(reseau: Run, measured: tuple[Path, ...]) -> None:
     name = measured[3].read_text().splitlines()[5].partition(",")[0]
@@ -238,17 +216,6 @@ def test_photographs_are_measured_and_blank_ones_are_named(reseau: Run, tmp_path
     assert drawn == {f"{image.stem}-overlay.png" for image in images}
 
 
-def test_photographs_without_an_image_are_named_in_one_line(reseau: Run, tmp_path: Path) -> None:
-    FieldBench(seed=4).design.write(tmp_path / "field.json")
-    for name in "abc":
-        write_image(tmp_path / f"{name}.png", np.full((240, 240), 80, dtype=np.uint8))
-    images = sorted(tmp_path.glob("*.png"))
-    status, out, err = reseau("calibrate", *images, "-d", tmp_path / "field.json", "--jobs", 2)
-    assert (status, out) == (1, "")
-    assert err.count("\n") == 1
-    assert "a.png, b.png, c.png: is all of one grey" in err
-
-
 def test_photographs_of_which_none_can_be_read_are_reported_in_one_line(reseau: Run, tmp_path: Path) -> None:
     FieldBench(seed=4).design.write(tmp_path / "field.json")
     for name in "abcde":
@@ -280,37 +247,6 @@ def test_the_size_of_a_target_that_was_found_is_not_known(
     design.write(tmp_path / "mine.json")
     _, _, err = reseau("calibrate", tmp_path / "photos", "--design", "auto", "--jobs", 1)
     assert "mine.json\n" in err
-
-
-def test_too_few_images_are_refused_with_their_reasons(reseau: Run, measured: tuple[Path, ...]) -> None:
-    status, _, err = reseau("calibrate", *measured[1:3], "-d", measured[0], "--image-size", "240x240")
-    assert status == 1
-    names = ", ".join(path.name for path in measured[1:3])
-    assert f"{measured[1].parent}: 2 images ({names}) show the target, 3 are needed" in err
-    assert err.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--pitch-mm", 0.027, "--free", "c,fx"), "fx: is not one of c, x0"),
-        (("--side", "inner", "--pitch-mm", 0.027), "'inner' is not one of '"),
-        (("--image-size", "large"), "write WIDTHxHEIGHT"),
-        (("--distance", -3), "-3 is not positive"),
-    ],
-)
-def test_wrong_options_are_named(
-    reseau: Run, measured: tuple[Path, ...], arguments: tuple[object, ...], message: str
-) -> None:
-    status, _, err = reseau("calibrate", *measured[1:], "-d", measured[0], *arguments)
-    assert status == 2
-    assert message in err
-
-
-def test_coordinates_without_a_size_are_refused(reseau: Run, measured: tuple[Path, ...]) -> None:
-    status, _, err = reseau("calibrate", *measured[1:], "-d", measured[0])
-    assert status == 2
-    assert "size of the images" in err
 
 
 @pytest.mark.slow
@@ -414,12 +350,6 @@ def test_measurements_are_kept_in_a_store_and_not_repeated(
         patched.setattr("reseau.procedures.target_measurement._points", fails)
         assert reseau(*kept)[0] == 0
     assert (tmp_path / "kept.json").read_bytes() == (tmp_path / "plain.json").read_bytes()
-
-
-def test_a_cluster_without_a_store_is_one_line(reseau: Run, measured: tuple[Path, ...]) -> None:
-    status, _, err = reseau(*common(measured), "--cluster", "tcp://127.0.0.1:9")
-    assert (status, err.count("\n")) == (2, 1)
-    assert "--cluster: requires a store that all workers share; add --store" in err
 
 
 def test_a_calibration_beyond_the_memory_is_that_of_the_direct_solution(

@@ -106,27 +106,3 @@ def test_images_that_were_not_taken_at_once_are_named(reseau: Run, exchanged: Pa
     place = Calibration.read(tmp_path / "K-right.json").place
     assert place is not None
     assert np.abs(np.array(place.base) - BASE).max() < 0.5
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ((), "photographs: are missing"),
-        (("--rig", "left"), "--rig: is 'left'"),
-        (("--rig", "left={0}/left"), "at least two are required"),
-        (("--rig", "left={0}/left", "--rig", "left={0}/right"), "each name once"),
-        (("--rig", "left={0}/none*", "--rig", "b={0}/right"), "none*: matches no file"),
-        (
-            ("{0}/left/00.csv", "--rig", "left={0}/left", "--rig", "b={0}/right"),
-            "combined with --rig",
-        ),
-    ],
-)
-def test_cameras_that_are_not_told_apart_are_refused(
-    reseau: Run, measured: Path, arguments: tuple[str, ...], said: str
-) -> None:
-    given = [text.format(measured) for text in arguments]
-    status, _, err = reseau("calibrate", *given, "-d", measured / "disks.json")
-    assert status == 2
-    assert said in err
-    assert len(err.strip().splitlines()) == 1

@@ -40,6 +40,7 @@ def test_the_version_is_that_of_the_package(reseau: Run) -> None:
     from reseau import __version__
 
     assert reseau("--version")[:2] == (0, f"reseau {__version__}\n")
+    assert f"\nversion: {__version__}\n" in (Path(__file__).parents[2] / "CITATION.cff").read_text()
 
 
 def test_the_package_runs_as_the_command() -> None:

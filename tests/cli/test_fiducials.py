@@ -55,31 +55,6 @@ def test_a_scan_is_oriented_and_resampled_to_millimetres(files, tmp_path: Path, 
         assert frame[row + 3, column + 3] < 80  # beside it
 
 
-def test_a_foreign_picture_is_declined_in_one_line(files, tmp_path: Path, reseau: Run) -> None:
-    rng = np.random.default_rng(0)
-    write_image(tmp_path / "other.png", rng.integers(0, 255, (400, 400)).astype(np.uint8))
-    status, _, err = reseau("measure", "fiducials", tmp_path / "other.png", "-d", files[1])
-    assert status == 1
-    assert len(err.splitlines()) == 1
-    assert "test camera" in err
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"unit": "m"}, "unit"),
-        ({"points": []}, "points"),
-        ({"marks": {}}, "marks"),
-    ],
-)
-def test_a_damaged_design_is_named(files, tmp_path: Path, reseau: Run, change, message: str) -> None:
-    content = json.loads(files[1].read_text()) | change
-    (tmp_path / "bad.json").write_text(json.dumps(content))
-    status, _, err = reseau("measure", "fiducials", files[0], "-d", tmp_path / "bad.json")
-    assert status == 2
-    assert message in err
-
-
 def test_an_oriented_scan_is_exported_to_micmac_and_metashape(files, tmp_path: Path, reseau: Run) -> None:
     photo, design = files
     reseau("measure", "fiducials", photo, "-d", design, "-o", tmp_path / "photo.json")

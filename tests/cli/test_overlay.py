@@ -44,22 +44,6 @@ def test_a_design_that_is_not_found_has_an_overlay_too(reseau: Run, photo: Any, 
     assert shape(tmp_path / "o.png")[1] == 4 * 360
 
 
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [("photo.png", "would replace the image"), ("o.jpg", "has the suffix '.jpg'"), ("no/o.png", "folder")],
-)
-def test_an_overlay_that_cannot_be_written_is_refused_before_measuring(
-    reseau: Run, photo: Any, tmp_path: Path, name: str, reason: str
-) -> None:
-    image = tmp_path / "photo.png"
-    image.write_bytes(photo.image.read_bytes())
-    status, out, err = reseau("measure", "reseau", image, "-d", photo.design, "--overlay", tmp_path / name)
-    assert (status, out) == (2, "")
-    assert reason in err
-    assert err.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["photo.png"]
-
-
 def test_image_coordinates_have_no_overlay(reseau: Run, photo: Any, tmp_path: Path) -> None:
     (tmp_path / "m.csv").write_text("id,x,y\nA1,1,2\n")
     arguments = ("measure", "reseau", tmp_path / "m.csv", "-d", photo.design, "--overlay", tmp_path / "o.png")

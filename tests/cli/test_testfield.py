@@ -32,27 +32,6 @@ def test_the_design_is_printed_on_request(reseau: Run) -> None:
     assert TestfieldDesign.parse(out, where="stdout") == coded_testfield(2, 1)
 
 
-def test_impossible_testfields_are_reported_in_one_line(reseau: Run, tmp_path: Path) -> None:
-    status, out, err = reseau(
-        "design",
-        "testfield",
-        "--pitch",
-        90,
-        "--spread",
-        30,
-        "--large",
-        "17,25,25,22",
-        "--out",
-        tmp_path / "f.json",
-    )
-    assert (status, out) == (2, "")
-    assert err.count("\n") == 1
-    assert "do not fit squares of 90 mm" in err
-    assert not (tmp_path / "f.json").exists()
-    status, _, err = reseau("design", "testfield", "--out", tmp_path / "f.txt")
-    assert (status, "use .json" in err) == (2, True)
-
-
 def test_a_simulated_recording_is_measured(reseau: Run, tmp_path: Path) -> None:
     bench = FieldBench()
     write_image(tmp_path / "frame.png", bench.record(Station(30)).pixels)
@@ -68,11 +47,3 @@ def test_a_simulated_recording_is_measured(reseau: Run, tmp_path: Path) -> None:
     assert len(points) == found.found > 340
     error = points.xy - np.array([at[name] for name in points.names])
     assert np.abs(error).max() < 0.05  # px
-
-
-def test_a_frame_without_the_testfield_is_reported(reseau: Run, tmp_path: Path) -> None:
-    write_image(tmp_path / "ramp.png", np.tile(np.arange(200, dtype=np.uint8), (200, 1)))
-    coded_testfield().write(tmp_path / "field.json")
-    status, out, err = reseau("measure", "testfield", tmp_path / "ramp.png", "-d", tmp_path / "field.json")
-    assert (status, out) == (1, "")
-    assert "ramp.png: no straight lines were found" in err

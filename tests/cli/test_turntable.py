@@ -77,30 +77,6 @@ def test_a_calibration_estimates_the_axis_of_a_turntable(reseau: Run, measured: 
     assert "anticlockwise" in (tmp_path / "F.html").read_text()
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("image,angle\na,1\n", "start with the header image,angle_deg[,sigma_deg][,pose]"),
-        ("image,angle_deg\nother.png,1\n", "has none of the photographs, but other.png"),
-        ("image,angle_deg,sigma_deg\na,1,-2\n", "the sigma of the angle of image 'a' is negative"),
-        ("image,angle_deg,sigma_deg\na,,1\n", "has a sigma, but no angle"),
-        ("image,angle_deg\na,1\na,2\n", "image 'a' has two angles"),
-        ("image,angle_deg\na,x\n", "line 2: 'x' is not a number"),
-    ],
-)
-def test_tables_that_are_none_are_refused(
-    reseau: Run, measured: Path, tmp_path: Path, text: str, said: str
-) -> None:
-    (tmp_path / "table.csv").write_text(text)
-    status, _, err = reseau(
-        "calibrate", *photographs(measured), "-d", measured / "disks.json", *FREE,
-        "--turntable", tmp_path / "table.csv",
-    )  # fmt: skip
-    assert status == 2
-    assert said in err
-    assert len(err.strip().splitlines()) == 1
-
-
 def test_angles_in_radians_are_reported(reseau: Run, measured: Path, tmp_path: Path) -> None:
     lines = [line.split(",") for line in (measured / "angles.txt").read_text().split()]
     rows = [f"{name},{np.radians(float(angle))},,{pose}" for name, angle, _, pose in lines[1:]]

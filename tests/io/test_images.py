@@ -119,6 +119,25 @@ def test_further_pages_of_a_tiff_are_reported(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("compression", "kind", "colour"),
+    [("lzw", np.uint8, "miniswhite"), ("lzw", np.uint16, "rgb"), ("zlib", np.uint16, "miniswhite"),
+     ("zlib", np.float32, "minisblack"), ("jpeg", np.uint8, "rgb")],
+)  # fmt: skip
+def test_opencv_decodes_where_imagecodecs_is_not_installed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: str, kind: type, colour: str
+) -> None:
+    shape = (40, 50, 3) if colour == "rgb" else (40, 50)
+    pixels = np.random.default_rng(0).integers(0, 255, shape).astype(kind)
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for page in (pixels, pixels[::-1]):
+            file.write(page, photometric=colour, compression=compression, predictor=compression != "jpeg")
+    usual = [open_scan(tmp_path / name).window(0, 40, 0, 50) for name in ("a.tif", "a.tif#2")]
+    monkeypatch.setattr("reseau.io.images._has_imagecodecs", lambda: False)
+    for name, expected in zip(("a.tif", "a.tif#2"), usual, strict=True):
+        np.testing.assert_array_equal(open_scan(tmp_path / name).window(0, 40, 0, 50), expected)
+
+
 @pytest.mark.parametrize("compression", [None, "lzw"])
 def test_a_page_of_a_tiff_is_chosen_by_its_number(tmp_path: Path, compression: str | None) -> None:
     two_pages(tmp_path / "a.tif", compression)

@@ -170,7 +170,7 @@ def _library() -> tuple[Any, Any]:
     except (ImportError, ValueError) as error:
         raise UsageError(
             f"Aravis is not installed ({error})",
-            do="install gir1.2-aravis-0.8, and pip install reseau[aravis]",
+            do="install gir1.2-aravis-0.8, and pip install 'reseau[aravis]'",
         ) from None
     return library, GLib
 

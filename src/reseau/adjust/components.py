@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Generic, Literal
+from typing import Generic
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.data import Array
 from ..core.errors import UsageError
-from ..core.failure import Code, Failure
+from ..core.failure import Code, Estimated, Failure
 from .engine import Options
 from .fitted import Adjustable, F
 from .stochastic import blocks_of
@@ -23,7 +23,7 @@ _STEP = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class VarianceComponents(Generic[F]):
+class VarianceComponents(Estimated, Generic[F]):
     """Estimated factors on the standard deviations of groups; truthy.
 
     Parameters
@@ -60,15 +60,8 @@ class VarianceComponents(Generic[F]):
     adjustment: F
     iterations: int
 
-    def __bool__(self) -> Literal[True]:
-        return True
-
     def __getitem__(self, name: str) -> float:
         return float(self.factors[self.names.index(name)])
-
-    def required(self) -> VarianceComponents[F]:
-        """The result itself; a failure raises here, see :meth:`reseau.core.failure.Failure.required`."""
-        return self
 
 
 def variance_components(

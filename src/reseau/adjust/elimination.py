@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..core.errors import UsageError
-from ..core.failure import Failure
+from ..core.failure import Estimated, Failure
 from .engine import AdjustmentFailure, Options
 from .fitted import compare
 from .problem import Adjustment, Problem, adjust
@@ -56,7 +56,7 @@ class EliminationStep:
 
 
 @dataclass(frozen=True, eq=False)
-class Elimination:
+class Elimination(Estimated):
     """Record and result of a backward elimination; truthy.
 
     Parameters
@@ -92,17 +92,10 @@ class Elimination:
     criterion: str
     alpha: float
 
-    def __bool__(self) -> Literal[True]:
-        return True
-
     @property
     def dropped(self) -> tuple[str, ...]:
         """Names of the dropped parameters, in their order."""
         return tuple(step.name for step in self.steps)
-
-    def required(self) -> Elimination:
-        """The result itself; a failure raises here, see :meth:`reseau.core.failure.Failure.required`."""
-        return self
 
 
 def eliminate(

@@ -8,14 +8,14 @@ adjusted observations, block by block.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, Literal, Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.data import Array, Mask
 from ..core.errors import UsageError
-from ..core.failure import Failure
+from ..core.failure import Estimated, Failure
 from ..core.threads import one_thread
 from .engine import Options
 from .reliability import Standardised, Whitened, noncentrality
@@ -25,7 +25,7 @@ from .stochastic import Covariance
 __all__ = ["Adjustable", "Fitted", "compare"]
 
 
-class Fitted:
+class Fitted(Estimated):
     """An adjustment that converged; truthy. For its attributes see :class:`~reseau.adjust.Adjustment`."""
 
     problem: Any
@@ -36,13 +36,6 @@ class Fitted:
     iterations: int
     scale: str
     solution: Any
-
-    def __bool__(self) -> Literal[True]:
-        return True
-
-    def required(self) -> Self:
-        """The result itself; a failure raises here, see :meth:`reseau.core.failure.Failure.required`."""
-        return self
 
     @property
     def converged(self) -> bool:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.data import Array, Mask
 from ..core.errors import UsageError
-from ..core.failure import Code, Failure
+from ..core.failure import Code, Estimated, Failure
 from .engine import Options
 from .fitted import Adjustable, F, Fitted
 from .problem import GaussHelmert
@@ -31,7 +31,7 @@ TUNING = {"huber": 1.345, "tukey": 4.685, "danish": 2.0}
 
 
 @dataclass(frozen=True, eq=False)
-class Robust(Generic[F]):
+class Robust(Estimated, Generic[F]):
     """An adjustment with robust weights; truthy.
 
     Parameters
@@ -59,13 +59,6 @@ class Robust(Generic[F]):
     factors: Array
     scale: float
     iterations: int
-
-    def __bool__(self) -> Literal[True]:
-        return True
-
-    def required(self) -> Robust[F]:
-        """The result itself; a failure raises here, see :meth:`reseau.core.failure.Failure.required`."""
-        return self
 
 
 def weight_function(name: WeightName, tuning: float | None = None) -> Callable[[Array], Array]:
@@ -226,7 +219,7 @@ class SnoopingStep:
 
 
 @dataclass(frozen=True, eq=False)
-class Rejection(Generic[F]):
+class Rejection(Estimated, Generic[F]):
     """An adjustment without the rejected observations; truthy.
 
     Parameters
@@ -256,13 +249,6 @@ class Rejection(Generic[F]):
     rejected: Mask
     steps: tuple[SnoopingStep, ...]
     rounds: int
-
-    def __bool__(self) -> Literal[True]:
-        return True
-
-    def required(self) -> Rejection[F]:
-        """The result itself; a failure raises here, see :meth:`reseau.core.failure.Failure.required`."""
-        return self
 
 
 def data_snooping(

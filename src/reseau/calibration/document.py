@@ -81,6 +81,9 @@ class Covariance(Strict):
     names: tuple[str, ...]
     matrix: tuple[tuple[float, ...], ...]
 
+    def __repr__(self) -> str:
+        return f"<Covariance of {', '.join(self.names)}; numpy.asarray() is its matrix>"
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
         """The matrix (u, u), for ``numpy.asarray``."""
         return np.array(self.matrix, dtype=dtype).reshape(len(self.names), len(self.names))
@@ -476,6 +479,12 @@ class Calibration(Document):
             When one is not that of a camera, or the images differ in size.
         """
         for each in (self, other):
+            if not isinstance(each, Calibration):
+                raise UsageError(
+                    f"is of type {type(each).__name__}",
+                    where="other",
+                    do="use reseau.read_calibration",
+                )
             if each.kind != "camera":
                 raise UsageError(each.not_of("camera"), where=f"calibration {each.name}")
         found: FieldDifference = above("reseau.calibration.compare:calibration_difference")(

@@ -6,13 +6,14 @@ Equations (5a, b) of Wishahy's paper as they are applied and stored; :mod:`resea
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Literal, Protocol, Self, cast
+from typing import Any, ClassVar, Final, Protocol, Self, cast
 
 import numpy as np
 
 from ..adjust import Adjustment
 from ..core.data import Array, ImagePoints
 from ..core.errors import FormatError, UsageError
+from ..core.failure import Estimated
 from ..optics import RationalPolynomial, Similarity
 from .document import Calibration, Covariance, OscilloscopeModel, Quantity
 from .entries import system_from_dict, system_to_dict, unit_of, with_stored_values
@@ -92,7 +93,7 @@ class Datum:
 
 
 @dataclass(frozen=True, eq=False)
-class CameraCorrection(CalibratedMapping):
+class CameraCorrection(Estimated, CalibratedMapping):
     """From pixels to the plane of the reseau, corrected for lens distortion and film deformation.
 
     Parameters
@@ -138,13 +139,6 @@ class CameraCorrection(CalibratedMapping):
     extent: tuple[float, ...] | None = None
     size: tuple[int, int] | None = None
     datum: Datum | None = None
-
-    def __bool__(self) -> Literal[True]:
-        return True
-
-    def required(self) -> Self:
-        """The correction itself; see :meth:`reseau.core.failure.Failure.required`."""
-        return self
 
     @property
     def parameter_covariance(self) -> Array:
@@ -266,7 +260,7 @@ class CameraCorrection(CalibratedMapping):
                 cofactor = np.array(content["datum"]["in_system"], dtype=np.float64)[:u, :u]
                 if cofactor.shape != (u, u) or len(datum.influence) != u:
                     raise ValueError(f"datum of {len(datum.influence)} instead of {u} coefficients")
-        except (KeyError, TypeError, ValueError, UsageError) as error:
+        except (KeyError, TypeError, ValueError, UsageError, FormatError) as error:
             raise FormatError(
                 f"has a damaged or missing entry: {error}", where=f"model of calibration {calibration.name}"
             ) from None

@@ -6,12 +6,13 @@ Equations (7a, b) of Wishahy's paper as they are applied and stored; :mod:`resea
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Self, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
 from ..core.data import Array, ImagePoints
 from ..core.errors import FormatError, UsageError
+from ..core.failure import Estimated
 from ..core.provenance import canonical_json
 from ..io import ReseauDesign, ReseauMeasurement
 from ..optics import RationalPolynomial, Similarity
@@ -72,7 +73,7 @@ class ObjectPlane:
 
 
 @dataclass(frozen=True, eq=False)
-class InstrumentCorrection(CalibratedMapping):
+class InstrumentCorrection(Estimated, CalibratedMapping):
     """From pixels to the object's plane, corrected for group A and group B.
 
     Parameters
@@ -122,13 +123,6 @@ class InstrumentCorrection(CalibratedMapping):
     pins: ImagePoints
     local: LocalModel | None = None
     fit: FitRecord | None = None
-
-    def __bool__(self) -> Literal[True]:
-        return True
-
-    def required(self) -> Self:
-        """The correction itself; see :meth:`reseau.core.failure.Failure.required`."""
-        return self
 
     @property
     def size(self) -> tuple[int, int] | None:

@@ -459,6 +459,12 @@ def undistort(
     lens = calibration.mapping()
     if not isinstance(lens, CameraMapping):
         raise UsageError(calibration.not_of("camera"), where=f"calibration {calibration.name}")
+    if not isinstance(image, np.ndarray):
+        raise UsageError(
+            f"is of type {type(image).__name__}",
+            where="image",
+            do="use reseau.read_image(path).pixels",
+        )
     if image.ndim not in (2, 3):
         raise UsageError(
             f"has the shape {image.shape}", where="image", do="give (height, width), or with channels last"

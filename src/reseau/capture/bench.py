@@ -340,15 +340,16 @@ class Bench:
         """
         found = {each: made for each, made in self.instruments.items() if isinstance(made, kind)}
         names = ", ".join(found) or "none"
+        role = next((role for role, each in ROLES.items() if each is kind), kind.__name__)
+        where = f"bench {self.file.name}"
         if name is not None:
             if not isinstance(self[name], kind):
-                raise UsageError(f"is not a {kind.__name__}", where=name, do=f"on this bench: {names}")
+                raise UsageError(f"is no {role}", where=name, do=f"on this bench: {names}")
             return self[name]
+        if not found:
+            raise UsageError(f"has no {role}", where=where, do="add one under [instruments] of its file")
         if len(found) != 1:
-            if not found:
-                raise UsageError(f"has no {kind.__name__}", where="bench")
-            option = next((f"`--{role} NAME`" for role, each in ROLES.items() if each is kind), "a name")
-            raise UsageError(f"has several of {kind.__name__}: {names}", where="bench", do=f"give {option}")
+            raise UsageError(f"has several of {role}: {names}", where=where, do=f"give `--{role} NAME`")
         return next(iter(found.values()))
 
     def has(self, kind: type) -> bool:

@@ -149,7 +149,8 @@ def run(arguments: list[str] | None = None) -> int:
         format_message: Any = getattr(error, "format_message", None)
         if format_message is None:
             raise
-        return _report(str(format_message()) or "see `reseau --help`", int(getattr(error, "exit_code", 2)))
+        said = str(format_message()).replace("Value error, ", "")  # of pydantic
+        return _report(said or "see `reseau --help`", int(getattr(error, "exit_code", 2)))
 
 
 def _report(message: str, status: int) -> int:

@@ -135,16 +135,17 @@ def conduct(
 
     if where.resume:
         where.refuse_changes(also_resumed)
+    # A new session is checked before an archive is made for it.
+    new = None if where.resume else _new(where, plan, parameters, inputs or {})
     with where.open(create=not where.resume) as archive:
-        start = _resumed if where.resume else _new
-        name, given, bench, begin = start(archive, where, plan, parameters, inputs or {})
+        name, given, bench, begin = new or _resumed(archive, where, plan)
         if where.home:
             given = given.model_copy(update={"home": True})
         bench = given.part_of(bench)
         with sessions.lock(bench, archive, name), bench:
             if not given.home:
                 given.check_homed(bench)
-            session = begin()
+            session = begin(archive)
             with Display(where.as_json, given.frames_on(bench), plan == "scan", given.units) as display:
                 facts = {"session": session.name, "archive": where.archive, "poses": given.expected}
                 display.watch("begin", facts)
@@ -159,12 +160,11 @@ def conduct(
 _OPTION = {"object.json": "--test-object"}
 """Options of input files that have another name in the archive."""
 
-_Started = tuple[str, "SessionParameters", "Bench", Callable[[], "Session"]]
+_Started = tuple[str, "SessionParameters", "Bench", Callable[["Archive"], "Session"]]
 """Name, parameters and bench of a session, and a function that begins or recovers it once all is checked."""
 
 
 def _new(
-    archive: Archive,
     where: Where,
     plan: str,
     parameters: Callable[[Bench], SessionParameters | Mapping[str, Any]],
@@ -188,10 +188,10 @@ def _new(
     name = where.name or f"{plan}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
     given = parameters(bench)
     checked = sessions.check(name, plan, given, texts, bench)
-    return name, checked, bench, lambda: sessions.begin(archive, name, plan, given, texts, bench=text)
+    return name, checked, bench, lambda archive: sessions.begin(archive, name, plan, given, texts, bench=text)
 
 
-def _resumed(archive: Archive, where: Where, plan: str, *_: object) -> _Started:
+def _resumed(archive: Archive, where: Where, plan: str) -> _Started:
     from .. import sessions
     from ..capture import Bench, BenchFile
     from ..io import read_text
@@ -200,7 +200,7 @@ def _resumed(archive: Archive, where: Where, plan: str, *_: object) -> _Started:
     text = session.bench if where.bench is None else read_text(where.bench)
     bench = Bench(BenchFile.parse_toml(text, where=where.bench or session.name))
 
-    def recovered() -> Session:
+    def recovered(archive: Archive) -> Session:
         session.recover()
         return session
 

@@ -132,7 +132,7 @@ def apply(
     _only(stored.kind, "oscilloscope", {"--object-coordinates": object_coordinates})
     _only(stored.kind, "sensor", {"--exposure-ms": exposure_ms is not None})
     applied = Application.of(stored, view, object_system=object_coordinates, origin=origin, anyway=anyway)
-    for line in applied.notes:
+    for line in (*applied.notes, *(() if source is None or is_points(source) else applied.about(source))):
         typer.echo(f"note: {line}", err=True)
     if out is not None and not (source is not None and source.is_dir()):
         beside = [out.with_suffix(".json")] if stored.kind == "camera" else []

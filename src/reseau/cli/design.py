@@ -125,9 +125,12 @@ def fiducials(
     out: Annotated[v.Out | None, "Here the design, JSON; - for standard output."] = None,
 ) -> None:
     """Write the fiducial marks of an aerial camera that is known by name, to be edited to its report."""
+    from ..core.errors import UsageError
     from ..designs import aerial_camera, aerial_cameras
 
     if name is None:
+        if out is not None:
+            raise UsageError("needs the NAME of a camera", where="--out", do="without --out all are listed")
         for each, design in aerial_cameras().items():
             say(f"{each:18} {design.name}\n")
         return

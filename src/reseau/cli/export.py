@@ -23,7 +23,7 @@ def export(
         typer.Argument(
             help="For --to a calibration of a camera, ours or of another program, or those of a rig; or "
             "oriented scans of one camera: results of `reseau measure fiducials`, `reseau orient` or "
-            "`reseau measure reseau`."
+            "`reseau measure reseau`, or a folder of them."
         ),
     ],
     to: Annotated[
@@ -50,8 +50,7 @@ def export(
         _calibration(files, to, out, anyway)
         if micmac is None and metashape is None:
             return
-    scans = files
-    from ..exchange import metashape_script, read_film_marks, write_micmac
+    from ..exchange import film_files, metashape_script, read_film_marks, write_micmac
     from ..io import ReseauDesign, write_whole
 
     if micmac is None and metashape is None:
@@ -59,7 +58,7 @@ def export(
     if metashape is not None:
         suffix_of(writable(metashape), (".py",))
     grid = None if design is None else ReseauDesign.read(design)
-    marks = [read_film_marks(path, grid) for path in scans]
+    marks = [read_film_marks(path, grid) for path in film_files(files)]
     if len({each.image for each in marks}) < len(marks):
         raise UsageError("two of the files are of one scan", where="reseau export")
     if micmac is not None:
@@ -77,7 +76,7 @@ def _calibration(files: list[Path], to: str | None, out: Path | None, anyway: bo
     from ..exchange.calibrations import calibration_formats, formats_holding
 
     if to is None or out is None:
-        raise UsageError("are both required", where="--to FORMAT and --out FILE")
+        raise UsageError("must be given together", where="--to FORMAT and --out FILE")
     calibrations = [any_calibration(source) for source in files]
     writable(out)
     if to == "reseau" and len(calibrations) == 1:

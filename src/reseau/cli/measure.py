@@ -24,6 +24,8 @@ __all__ = ["BY_DESIGN", "NOT_NOMINAL", "Image", "Output", "Task", "app", "measur
 
 BY_DESIGN = "Default: determined by the design if it is not symmetric. Not used with nominal positions."
 NOT_NOMINAL = "Not used with nominal positions."
+_NAMED = 8
+"""Marks that are printed of those that were not measured for one reason."""
 
 app = Commands(help="Measure image coordinates of a target.")
 
@@ -201,6 +203,7 @@ class Task:
         """Write the measurement to its file, and report what was measured."""
         from ..core.numbers import measured
         from ..io import write_whole
+        from ..procedures.target_measurement import by_reason, few_of
 
         if self.out is not None:
             write_whole(self.out, measurement_csv(document) if self.suffix == ".csv" else document.to_json())
@@ -212,10 +215,10 @@ class Task:
             rms = result.rms()
             if rms[0] == rms[0]:  # NaN if too few points were measured
                 say(f"{self.spread} {rms[0]:.2g} px in x, {rms[1]:.2g} px in y (rms)\n")
+        for why, names in by_reason({each.id: each.why for each in document.points if not each.ok}).items():
+            say(f"  {few_of(names, _NAMED)}: {why}\n")
         for point in document.points:
-            if not point.ok:
-                say(f"  {point.id}: {point.why}\n")
-            elif point.share is not None and point.s_share is not None:
+            if point.share is not None and point.s_share is not None:
                 say(f"  {point.id}: cut at {measured(point.share, point.s_share)} of its segment\n")
         for note in document.notes:
             say(f"note: {note}\n")

@@ -60,6 +60,8 @@ def orient(
     ):
         found = orient_files(jobs, executor, computing.store, roll=roll, step=step)
     _report(found, as_json)
+    if found.summary is not None and not as_json:
+        say("nothing written: give a folder by --out\n" if out is None else f"written: {out}\n")
     return 0 if any(each.status != "declined" for each in found.documents) and not found.failed else 1
 
 
@@ -90,12 +92,13 @@ def _report(found: OrientedFiles, as_json: bool) -> None:
 
 
 def _print_summary(summary: RollSummary) -> None:
-    """Print how many frames were oriented, with and without the roll, and which were not and why."""
+    """Print how many frames were oriented, with and without the roll, and again which of them were not."""
     rows = summary.frames
     say(f"{len(rows)} frames: " + ", ".join(f"{count} {what}" for what, count in summary.counts() if count))
     say("\n")
-    for row in rows:
-        if row.status in ("declined", "failed"):
+    lost = [row for row in rows if row.status in ("declined", "failed")]
+    if len(lost) < len(rows):
+        for row in lost:
             say(f"  {row.image}: {row.status}: {row.why.removeprefix(row.image + ': ')}\n")
 
 

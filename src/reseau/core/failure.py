@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from .data import Frame
 
-__all__ = ["Code", "Failure", "Remark"]
+__all__ = ["Code", "Estimated", "Failure", "Remark"]
 
 
 class Code(StrEnum):
@@ -311,6 +311,24 @@ class Code(StrEnum):
         "points, images or parameters with very large uncertainty",
         "add convergent images, and images turned by 90°",
     )
+
+
+class Estimated:
+    """What did not fail: truthy, which type checkers know, too.
+
+    Examples
+    --------
+    >>> result = Estimated()
+    >>> result.required() is result if result else "failed"
+    True
+    """
+
+    def __bool__(self) -> Literal[True]:
+        return True
+
+    def required(self) -> Self:
+        """Return this; a :class:`Failure` raises."""
+        return self
 
 
 @dataclass(frozen=True)

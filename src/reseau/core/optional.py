@@ -12,15 +12,15 @@ __all__ = ["missing", "optional"]
 _DISTRIBUTIONS = {
     "apprise": "reseau[service]",
     "argon2": "reseau[service]",
-    "bluesky": "bluesky",
+    "bluesky": "reseau[bench]",
     "cryptography": "reseau[service]",
     "dateutil": "reseau[service]",
     "distributed": "reseau[scale]",
     "fastapi": "reseau[service]",
-    "fsspec": "fsspec",
+    "fsspec": "reseau[bench]",
     "gi": "reseau[aravis]",
     "httpx": "reseau[service]",
-    "imagecodecs": "imagecodecs",
+    "imagecodecs": "reseau[photographs]",
     "jinja2": "jinja2",
     "lxml": "reseau[certificates]",
     "markupsafe": "jinja2",
@@ -30,18 +30,20 @@ _DISTRIBUTIONS = {
     "pandas": "pandas",
     "pillow_heif": "reseau[photographs]",
     "prometheus_client": "reseau[service]",
+    "psutil": "reseau[bench]",
     "psycopg": "reseau[scale]",
     "pydicom": "reseau[dicom]",
     "pypdf": "reseau[certificates]",
     "python_multipart": "reseau[service]",
     "rawpy": "reseau[photographs]",
-    "pyvisa": "pyvisa pyvisa-py pyusb libusb-package",
+    "pyvisa": "reseau[bench]",
     "saxonche": "reseau[certificates]",
-    "serial": "pyserial",
-    "sqlalchemy": "sqlalchemy",
+    "serial": "reseau[bench]",
+    "sqlalchemy": "reseau[bench]",
     "starlette": "reseau[service]",
-    "tifffile": "tifffile imagecodecs",
-    "usb": "pyusb libusb-package",
+    "tifffile": "tifffile",
+    "tomlkit": "reseau[bench]",
+    "usb": "reseau[bench]",
     "uvicorn": "reseau[service]",
     "weasyprint": "reseau[certificates]",
     "xmlsec": "reseau[certificates]",
@@ -61,7 +63,7 @@ def missing(error: ImportError) -> UsageError | None:
     Examples
     --------
     >>> print(missing(ModuleNotFoundError("No module named 'serial'", name="serial.tools")))
-    needs serial, which is not installed; pip install pyserial
+    needs serial, which is not installed; pip install 'reseau[bench]'
     """
     package = (error.name or "").partition(".")[0]
     if not isinstance(error, ModuleNotFoundError) or package not in _DISTRIBUTIONS:

@@ -53,7 +53,10 @@ def regular_reseau(
     ('B2', 'B3', -10.0, 5.0)
     """
     if min(columns, rows) < 2 or not pitch > 0 or columns * rows > 100_000:
-        raise UsageError(f"cannot have {columns} × {rows} marks at {pitch} mm", where=f"design {name}")
+        raise UsageError(
+            f"cannot have {columns} × {rows} marks at {pitch} mm", where=f"design {name}",
+            do="at least two columns and rows are needed, and a pitch above zero",
+        )  # fmt: skip
     extent = (mark.line_width if mark.shape == "line-grid" else mark.size) or 0.0
     if not 0 < extent < pitch:
         raise UsageError(f"marks of {extent} mm do not fit a pitch of {pitch} mm", where=f"design {name}")

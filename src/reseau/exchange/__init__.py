@@ -16,7 +16,7 @@ from .codev import read_codev
 from .colmap import read_colmap, write_colmap
 from .control import read_control
 from .dbat import read_dbat
-from .film import FilmMarks, metashape_script, read_film_marks, read_micmac, write_micmac
+from .film import FilmMarks, film_files, metashape_script, read_film_marks, read_micmac, write_micmac
 from .lenses import Lens, read_lens
 from .libmv import read_libmv
 from .metashape import read_metashape
@@ -34,6 +34,7 @@ __all__ = [
     "export_calibration",
     "export_calibrations",
     "export_rig",
+    "film_files",
     "import_calibration",
     "metashape_script",
     "read_bal",

@@ -62,7 +62,7 @@ def read_board(path: Path | str) -> BoardDesign:
     """
     path = Path(path)
     text = read_text(path)
-    if f'"{BoardDesign.SCHEMA}"' in text[:4096]:
+    if '"schema"' in text[:4096]:
         return BoardDesign.parse(text, where=path)
     entries = _entries(text)
     get = _Values(entries, path)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,9 +22,10 @@ from ..core.errors import FormatError, InputError, UsageError
 from ..io import CORNERS, FiducialOrientation, FrameOrientation, ReseauDesign, ReseauMeasurement
 from ..io.document import read_text, write_whole
 
-__all__ = ["FilmMarks", "metashape_script", "read_film_marks", "read_micmac", "write_micmac"]
+__all__ = ["FilmMarks", "film_files", "metashape_script", "read_film_marks", "read_micmac", "write_micmac"]
 
 _FOLDER, _CAMERA = "Ori-InterneScan", "MeasuresCamera.xml"
+_SCHEMAS = (FiducialOrientation.SCHEMA, FrameOrientation.SCHEMA, ReseauMeasurement.SCHEMA)
 _TO_CORNER = 0.5
 """Metashape's origin is the corner of the first pixel, here it is its centre."""
 _SAME_MM = 1e-3
@@ -94,20 +95,54 @@ def read_film_marks(path: Path | str, design: ReseauDesign | None = None) -> Fil
     ('ul', array([-18.,  12.]))
     """
     path = Path(path)
-    text = read_text(path)
-    try:
-        content = json.loads(text)
-    except ValueError as error:
-        raise FormatError(f"is not JSON ({error})", where=path) from None
-    schema = content.get("schema") if isinstance(content, dict) else None
+    text, schema = _schema_of(path)
     if schema == FiducialOrientation.SCHEMA:
         return _of_fiducials(FiducialOrientation.parse(text, where=path))
     if schema == FrameOrientation.SCHEMA:
         return _of_frame(FrameOrientation.parse(text, where=path))
     if schema == ReseauMeasurement.SCHEMA:
         return _of_reseau(ReseauMeasurement.parse(text, where=path), design, path)
-    known = ", ".join((FiducialOrientation.SCHEMA, FrameOrientation.SCHEMA, ReseauMeasurement.SCHEMA))
-    raise FormatError(f"has the schema {schema!r}", where=path, do=f"give one of {known}")
+    raise FormatError(f"has the schema {schema!r}", where=path, do=f"give one of {', '.join(_SCHEMAS)}")
+
+
+def film_files(paths: Iterable[Path]) -> list[Path]:
+    """Return files of marks; of a folder, as `reseau orient` writes it, those with a transformation.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        Files for :func:`read_film_marks`, or folders of them.
+
+    Raises
+    ------
+    InputError
+        When a folder has none.
+
+    Examples
+    --------
+    >>> film_files([Path("1.json"), Path("2.json")]) == [Path("1.json"), Path("2.json")]
+    True
+    """
+    found = list[Path]()
+    for path in paths:
+        inside = [path]
+        if path.is_dir():
+            inside = [each for each in sorted(path.glob("*.json")) if _schema_of(each)[1] in _SCHEMAS]
+            inside = [each for each in inside if json.loads(read_text(each)).get("status") != "declined"]
+            if not inside:
+                raise InputError("has no oriented scan", where=path, do="use `reseau orient --out`")
+        found += inside
+    return found
+
+
+def _schema_of(path: Path) -> tuple[str, str | None]:
+    """The text of a document, and its schema."""
+    text = read_text(path)
+    try:
+        content = json.loads(text)
+    except ValueError as error:
+        raise FormatError(f"is not JSON ({error})", where=path) from None
+    return text, content.get("schema") if isinstance(content, dict) else None
 
 
 def _of_fiducials(found: FiducialOrientation) -> FilmMarks:

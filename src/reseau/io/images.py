@@ -8,7 +8,7 @@ an orientation tag: pixel coordinates are those of the sensor. A colour profile 
 its curve is given beside them.
 
 An uncompressed TIFF is mapped into memory; of a compressed one only the strips or tiles that a window touches
-are decoded.
+are decoded, unless imagecodecs is not installed.
 """
 
 from __future__ import annotations
@@ -56,6 +56,9 @@ _DECODED = 50_000_000
 """Bytes of decoded strips or tiles that are kept: windows side by side cross the same ones."""
 _HELP = "convert it to grey or RGB of 8 or 16 bit"
 _AGAIN = "copy or scan it again"
+_CODECS = "pip install 'reseau[photographs]'"
+_BY_OPENCV = (5, 7, 8, 32946)
+"""Compressions LZW, JPEG and Deflate of a TIFF, which OpenCV decodes, too."""
 
 Channel = Literal["luma", "red", "green", "blue"]
 
@@ -361,9 +364,10 @@ def _further_pages(tiff: Any, path: Path) -> tuple[str, ...]:
 
 
 def _damaged(path: Path, error: Exception) -> ImageError:
-    if "imagecodecs" in str(error):  # tifffile's message where its optional package is not installed
+    # A message of tifffile, or an import, where its optional package is not installed.
+    if isinstance(error, ImportError) or "imagecodecs" in str(error):
         what = "is a TIFF in a compression that needs imagecodecs, which is not installed"
-        return ImageError(what, where=path, do="pip install imagecodecs")
+        return ImageError(what, where=path, do=_CODECS)
     return ImageError(f"is a damaged TIFF ({error})", where=path, do=_AGAIN)
 
 
@@ -452,6 +456,8 @@ def _channels_last(pixels: NDArray[Any], page: Any) -> NDArray[Any]:
 
 def _decoding(page: Any, path: Path) -> Window:
     """Windows of a compressed image: decode the strips or tiles they touch, and keep the last ones."""
+    if page.compression in _BY_OPENCV and not _has_imagecodecs():
+        return _decoded_at_once(page, path)
     high, wide = (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, page.imagewidth)
     high = min(high, page.imagelength) if not page.is_tiled else high
     across = -(-page.imagewidth // wide)
@@ -495,6 +501,37 @@ def _decoding(page: Any, path: Path) -> Window:
                     where = slice(plane, plane + 1) if planes > 1 else slice(None)
                     out[y0 - top : y1 - top, x0 - left : x1 - left, where] = seen[:, :, :channels]
         return out
+
+    return window
+
+
+def _has_imagecodecs() -> bool:
+    try:
+        import imagecodecs  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def _decoded_at_once(page: Any, path: Path) -> Window:
+    """Windows of an image that OpenCV decodes as a whole."""
+    kept: list[NDArray[Any]] = []
+
+    def window(top: int, bottom: int, left: int, right: int) -> NDArray[Any]:
+        if not kept:
+            import cv2
+
+            done, found = cv2.imreadmulti(str(path), int(page.index), 1, flags=cv2.IMREAD_UNCHANGED)
+            pixels = np.atleast_3d(found[0])[:, :, :3] if done else np.zeros((0, 0, 0))
+            if (pixels.dtype, pixels.shape) != (
+                page.dtype,
+                (page.imagelength, page.imagewidth, _colours(page)),
+            ):
+                raise _damaged(path, ImportError("imagecodecs"))
+            # Blue comes first, and black is zero in images of 8 bit, whatever the file says.
+            inverted = page.photometric == 0 and page.dtype == np.uint8
+            kept.append(255 - pixels if inverted else pixels[:, :, ::-1])
+        return kept[0][top:bottom, left:right]
 
     return window
 

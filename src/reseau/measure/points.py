@@ -11,7 +11,7 @@ import numpy as np
 from ..core.data import Array, Frame, ImagePoints, Mask
 from ..core.display import Display
 from ..core.errors import UsageError
-from ..core.failure import Code, Remark
+from ..core.failure import Code, Estimated, Remark
 from ..core.overlaid import Overlaid
 from ..io import ReseauMeasurement
 
@@ -88,7 +88,7 @@ def deviating(deviation: Array, cov: Array) -> tuple[Remark, ...]:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Measured(Display, Overlaid):
+class Measured(Estimated, Display, Overlaid):
     """Points of a design measured in one frame, in columns over all n points of the design.
 
     Parameters

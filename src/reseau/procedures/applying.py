@@ -200,6 +200,13 @@ class Application:
             )
         return cls(calibration, mapping, view or View(), origin or {}, notes)
 
+    def about(self, source: Path) -> tuple[str, ...]:
+        """What is to be said of an image: that it is not the scan which a frame was oriented in."""
+        own = str(self.calibration.model.get("image") or source.name)
+        if source.name == own:
+            return ()
+        return (f"{source}: the orientation is that of {own}; it holds for this scan alone",)
+
     def raster(self, size: tuple[int, int] | None = None) -> CorrectedImage:
         """The raster of the corrected image of one of this size; a camera knows that of its images."""
         fov, scale, alpha = self.view

@@ -30,7 +30,7 @@ from ..calibration import Assessment, Calibration, Covariance, FieldDifference
 from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display, Table, html_table
 from ..core.errors import InputError, UsageError
-from ..core.failure import Remark
+from ..core.failure import Estimated, Remark
 from ..core.lazy import above
 from ..core.provenance import Provenance
 from ..exchange.calibrations import Exported, export_calibrations
@@ -85,7 +85,7 @@ class ReportOptions(TypedDict, total=False):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Calibrated(Display):
+class Calibrated(Estimated, Display):
     """A camera calibration with its measurements; truthy.
 
     Parameters
@@ -126,9 +126,6 @@ class Calibrated(Display):
     sources: Mapping[str, Path] = field(default_factory=dict)
     channel: Channel = "luma"
 
-    def __bool__(self) -> Literal[True]:
-        return True
-
     def __getitem__(self, camera: str) -> Calibration:
         """The calibration of a camera by its name."""
         if camera not in self.cameras:
@@ -136,10 +133,6 @@ class Calibrated(Display):
         if camera not in self._documents:
             self._documents[camera] = self.calibration(camera, camera=camera)
         return self._documents[camera]
-
-    def required(self) -> Calibrated:
-        """Return the calibration itself; see :meth:`~reseau.core.failure.Failure.required`."""
-        return self
 
     @cached_property
     def _documents(self) -> dict[str, Calibration]:
@@ -254,6 +247,8 @@ class Calibrated(Display):
         """
         if by == "image":
             return self.result.residuals_by_image()
+        if by != "point":
+            raise UsageError(f"is {by!r}", where="by", do="use point or image")
         return Table("image points", self.result._columns())
 
     def undistort(
@@ -392,10 +387,8 @@ class Calibrated(Display):
         return found.model_copy(update={"validity": found.validity | more, "assessment": assessed})
 
     def documents(self, provenance: Mapping[str, Any] | None = None) -> list[Calibration]:
-        """Return the calibration of each camera; one that is alone has the name of the target."""
-        names = [entry.id for entry in self.result.network.cameras]
-        alone = self.target if names == [ONE_CAMERA] else ""
-        return [self.calibration(alone or name, provenance, name) for name in names]
+        """Return the calibration of each camera, which has its name."""
+        return [self.calibration(one.id, provenance, one.id) for one in self.result.network.cameras]
 
     def write(self, path: Path | str) -> None:
         """Write the calibration, ``reseau-calibration/1``; of several cameras one file each.

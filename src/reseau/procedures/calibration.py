@@ -180,7 +180,9 @@ class _Job:
                 )
         if not all(name in sizes for name in cameras):
             raise UsageError(
-                "is not known without a photograph", where="size of the images", do="give width and height"
+                "is not known without a photograph",
+                where="size of the images",
+                do="give width and height (image_size)",
             )
         stand_in = Camera(ONE_CAMERA, 1, 1, (1.0, 1.0), "opencv", np.zeros(len(camera_model("opencv").names)))
         wrong = left_out(network_of(measured, design, stand_in), cameras, sizes, of)

@@ -155,6 +155,7 @@ def calibration_folder(
     InputError
         When a file cannot be written.
     """
+    folder.mkdir(exist_ok=True)
     written = [("report.html", "report")]
     step("report")
     write_whole(folder / "report.html", page)
@@ -164,7 +165,9 @@ def calibration_folder(
         calibration.write(folder / own)
         written.append((own, "calibration with its uncertainty"))
         if calibration.assessment is not None and calibration.assessment.use is Use.NOTHING:
-            written.append(("", "not usable: no files for other programs, no undistorted photographs"))
+            written.append(
+                ("", "not usable: no files for other programs (reseau export --anyway writes them)")
+            )
             continue
         holding = formats_holding(calibration)
         for to in (to for to in _FILES if to in holding):
@@ -195,7 +198,7 @@ def _samples(
         name = f"{before}undistorted-{path.stem}{suffix}"
         write_corrected(folder / name, planes, raster)
         names.append(name)
-    return [(", ".join(names), "undistorted photographs")] if names else []
+    return [(name, "undistorted photograph") for name in names]
 
 
 def _rig(folder: Path, calibrations: Sequence[Calibration]) -> list[tuple[str, str]]:

@@ -13,6 +13,7 @@ from ..calibration import Calibration, InstrumentCorrection
 from ..core.data import Frame, ImagePoints
 from ..core.display import Display
 from ..core.errors import UsageError
+from ..core.failure import Estimated
 from ..core.lazy import above
 from ..core.provenance import canonical_json
 from ..io import ReseauDesign, points_document
@@ -25,7 +26,7 @@ __all__ = ["Refined"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Refined(Display):
+class Refined(Estimated, Display):
     """The oscilloscope procedure's results, one for each photograph that was given.
 
     Parameters

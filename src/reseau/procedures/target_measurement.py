@@ -255,12 +255,14 @@ def by_reason(declined: Mapping[str, str]) -> dict[str, list[str]]:
     return dict(found.values())
 
 
-def few_of(names: Sequence[str]) -> str:
-    """Names, of more than three the first and the number of the others.
+def few_of(names: Sequence[str], most: int = 1) -> str:
+    """Names, of many the first, or as many as wanted, and the number of the others.
 
     Examples
     --------
     >>> few_of(["a", "b"]), few_of(["a", "b", "c", "d"])
     ('a, b', 'a and 3 others')
     """
-    return ", ".join(names) if len(names) < 4 else f"{names[0]} and {len(names) - 1} others"
+    if len(names) <= most + 2:
+        return ", ".join(names)
+    return f"{', '.join(names[:most])} and {len(names) - most} others"

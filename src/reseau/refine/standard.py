@@ -14,7 +14,6 @@ coefficients.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import scipy.special
@@ -22,14 +21,14 @@ import scipy.special
 from ..calibration import InstrumentCorrection
 from ..core.data import Array, ImagePoints
 from ..core.errors import UsageError
-from ..core.failure import Code, Failure
+from ..core.failure import Code, Estimated, Failure
 from ..io import ReseauDesign
 
 __all__ = ["StandardTest", "still_standard"]
 
 
 @dataclass(frozen=True, eq=False)
-class StandardTest:
+class StandardTest(Estimated):
     """Test of stored coefficients by a new photograph; object coordinates in the unit of the instrument.
 
     Parameters
@@ -75,9 +74,6 @@ class StandardTest:
     p_rest: float
     same_object: bool
     alpha: float
-
-    def __bool__(self) -> Literal[True]:
-        return True
 
     @property
     def holds(self) -> bool:

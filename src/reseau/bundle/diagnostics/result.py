@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ...adjust.significance import CoefficientTest, GlobalTest, ratio_test
 from ...core.data import Array, Mask, Rows
 from ...core.display import Display, Table
 from ...core.errors import UsageError
-from ...core.failure import Remark
+from ...core.failure import Estimated, Remark
 from ...optics.cameras import distortion_names
 from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
 from ..network import Network
@@ -70,7 +70,7 @@ class Eliminated:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Result(Display):
+class Result(Estimated, Display):
     """Result of a bundle adjustment, with covariances and tests; truthy.
 
     Standard deviations and covariances are a posteriori (multiplied by the estimated variance factor);
@@ -117,13 +117,6 @@ class Result(Display):
     components: VarianceComponents[BundleFit] | None = None
     eliminated: tuple[Eliminated, ...] | None = None
     validation: tuple[float, float] | None = None
-
-    def __bool__(self) -> Literal[True]:
-        return True
-
-    def required(self) -> Result:
-        """Return the result itself; see :meth:`~reseau.core.failure.Failure.required`."""
-        return self
 
     @property
     def sigma0(self) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.special
@@ -17,7 +17,7 @@ import scipy.special
 from ...core.data import Array
 from ...core.display import Display
 from ...core.errors import UsageError
-from ...core.failure import Failure
+from ...core.failure import Estimated, Failure
 from ..diagnostics import Result
 from ..network import Network
 from ..solver import BundleFit, BundleProblem
@@ -73,7 +73,7 @@ class BoardModel:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class BoardChoice(Display):
+class BoardChoice(Estimated, Display):
     """The chosen model of the target and the others; truthy.
 
     Parameters
@@ -96,9 +96,6 @@ class BoardChoice(Display):
     chosen: BoardModel
     models: tuple[BoardModel, ...]
     network: Network
-
-    def __bool__(self) -> Literal[True]:
-        return True
 
     def entries(self) -> dict[str, Any]:
         """Return the comparison as JSON values for the calibration document; unknown numbers are null."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import scipy.special
@@ -21,7 +21,7 @@ from ...calibration import CameraMapping, calibration_difference
 from ...calibration.camera import projection_field
 from ...core.display import Display
 from ...core.errors import UsageError
-from ...core.failure import Code, Failure
+from ...core.failure import Code, Estimated, Failure
 from ...optics.cameras import camera_model
 from ..diagnostics.checks import unmodelled_pattern
 from ..network import Camera, Network
@@ -46,7 +46,8 @@ from .left_out import Information, Prediction, information_of
 __all__ = ["Compared", "ModelChoice", "choose_model", "choose_models"]
 
 # A model with more parameters predicts better by more than chance where it makes the images that are left out
-# ten times as probable. One parameter too many does this in 1 % of cases: its logarithm is (χ² − 2) / 2 with
+# ten times as probable, and as many times more as there are such models, one of which could do so by chance.
+# One parameter too many makes them ten times as probable in 1 % of cases: the logarithm is (χ² − 2) / 2 with
 # one degree of freedom (Stone 1977, J. R. Statist. Soc. B 39), and χ² > 2 + 2 ln 10 has this probability. So
 # have several.
 _ODDS = np.log(10.0)
@@ -109,7 +110,7 @@ class Compared:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ModelChoice(Display):
+class ModelChoice(Estimated, Display):
     """The chosen camera model and the others, also those that were not adjusted and why; truthy.
 
     Parameters
@@ -135,9 +136,6 @@ class ModelChoice(Display):
     camera: Camera
     compared: tuple[Compared, ...]
     chosen: Compared
-
-    def __bool__(self) -> Literal[True]:
-        return True
 
     @property
     def alternatives(self) -> tuple[Compared, ...]:
@@ -211,10 +209,10 @@ def choose_model(
 
     Notes
     -----
-    Chosen is the candidate with the fewest parameters of those than which none with more parameters makes
-    images that are left out ten times as probable. One image that others contradict decides nothing: what
-    images tell of the camera counts with the variance with which they differ. Large networks are represented
-    by 60 of their images.
+    Chosen is the candidate with the fewest parameters of those than which none of the n with more parameters
+    makes images that are left out 10 n times as probable, as far as these agree in it. One image that others
+    contradict decides nothing: what images tell of the camera counts with the variance with which they
+    differ. Large networks are represented by 60 of their images.
 
     Examples
     --------
@@ -481,9 +479,9 @@ class _Search:
 
     @property
     def variance(self) -> float:
-        """Variance factor of the predictions, of the model by which images contradict each other least."""
-        known = (each.information for each in self.adjusted.values())
-        return min((each.variance for each in known if each is not None), default=1.0)
+        """Variance factor of what is chosen."""
+        known = self.adjusted[self.pick].information
+        return 1.0 if known is None else known.predicted(self.pick.estimated).variance
 
     @property
     def fit(self) -> BundleFit:
@@ -514,22 +512,22 @@ class _Search:
 
     def _predictions(self) -> dict[Candidate, Prediction]:
         """Predictions of all candidates for which a model with their parameters was adjusted."""
-        found, variance = dict[Candidate, Prediction](), self.variance
+        found = dict[Candidate, Prediction]()
         for each in self.candidates:
             if each in self.declined or not any(own.alike(each) for own in self.adjusted):
                 continue
             near = self._nearest(each).information
             if near is not None and len(near.own) >= _LEAST:
-                found[each] = near.predicted(each.estimated, variance)
+                found[each] = near.predicted(each.estimated)
         return found
 
     def _picked(self) -> Candidate:
         """The simplest candidate than which no richer one predicts better by more than chance."""
         found = self._predictions()
-        density = {each: float(one.log_density.sum()) for each, one in found.items()}
-        for each in sorted(found, key=lambda each: found[each].parameters):
-            richer = [density[other] for other in found if found[other].parameters >= found[each].parameters]
-            if max(richer) <= density[each] + _ODDS:
+        order = sorted(found, key=lambda each: found[each].parameters)
+        for k, each in enumerate(order):
+            better = [found[richer].better(found[each]) for richer in order[k:]]
+            if max(better) <= _ODDS + np.log(len(better)):
                 return each
         # Too few images to leave one out.
         usual = camera_model(self.start.model).usual
@@ -549,7 +547,8 @@ class _Search:
     def choice(self) -> ModelChoice:
         """Return the choice, with all candidates."""
         found, fit = self._predictions(), self.fit
-        density = {each: float(one.log_density.sum()) for each, one in found.items()}
+        variance = found[self.pick].variance if self.pick in found else 1.0
+        density = {each: float(one.log_density(variance).sum()) for each, one in found.items()}
         best = max(density.values(), default=0.0)
         compared = []
         for each in sorted(self.candidates, key=lambda each: -density.get(each, -np.inf)):
@@ -580,7 +579,8 @@ class _Search:
         predicted = float(np.sqrt(one.squares.sum() / information.count))
         p, more = np.nan, abs(one.parameters - chosen.parameters)
         if (own.within(self.pick) or self.pick.within(own)) and more > 0:
-            f = abs(one.cost - chosen.cost) / more / self.variance
+            richer = max(one, chosen, key=lambda each: each.parameters)
+            f = abs(one.cost - chosen.cost) / more / richer.variance
             p = float(scipy.special.fdtrc(more, max(left, 1.0), f))
         found = Compared(
             own, "", sigma0, one.cost, length, predicted, p, **self._difference(own, one, chosen)
@@ -589,7 +589,7 @@ class _Search:
 
     def _reason(self, found: Compared, one: Prediction, chosen: Prediction) -> str:
         """Say why a candidate was chosen, or not."""
-        gain = float(one.log_density.sum() - chosen.log_density.sum())
+        gain = one.better(chosen)
         if found.candidate == self.pick:
             return "chosen: none with more parameters predicts images better"
         if self.pick.within(found.candidate):

@@ -51,8 +51,9 @@ class Prediction:
 
     Parameters
     ----------
-    log_density : ndarray (m,)
-        Logarithm of the density of the coordinates of each image, without terms that all cameras share.
+    log_det : ndarray (m,)
+        Logarithm of the density of the coordinates of each image that is predicted without an error, without
+        terms that all cameras share.
     squares : ndarray (m,)
         Sum of squares of the predicted coordinates of each image, in their standard deviations without the
         variance factor: what vᵀPv of the other images is smaller.
@@ -60,16 +61,35 @@ class Prediction:
         vᵀPv of all images.
     parameters : float
         Parameters that the images determine, without what is only regularised.
+    variance : float
+        ω: the variance of unit weight, or that of what images tell of the camera, if it is larger.
     values, covariance : ndarray (u,), (u, u)
-        Estimates of all parameters, those that are not free zero; with the variance factor of `Information`.
+        Estimates of all parameters, those that are not free zero; with this variance factor.
     """
 
-    log_density: Array
+    log_det: Array
     squares: Array
     cost: float
     parameters: float
+    variance: float
     values: Array
     covariance: Array
+
+    def log_density(self, variance: float) -> Array:
+        """Logarithm of the density of each image (m,), with a variance factor."""
+        return self.log_det - self.squares / (2 * variance)
+
+    def better(self, other: Prediction) -> float:
+        """Logarithm of how much better than another it predicts, as far as images agree in that.
+
+        Images contradict each other in what only the camera with more parameters has: its variance factor
+        counts. With a gain G = χ²/2, what an image tells has the variance χ² altogether; images that are
+        predicted worse show how large it is, and χ² is smaller by the same factor: G² / Σ (d < 0) d².
+        """
+        variance = max(self, other, key=lambda one: one.parameters).variance
+        each = self.log_density(variance) - other.log_density(variance)
+        gain, worse = float(each.sum()), float((np.minimum(each, 0.0) ** 2).sum())
+        return min(gain, gain**2 / worse) if gain > 0 and worse > 0 else gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,32 +139,12 @@ class Information:
         left = self.redundancy - basis.shape[1]
         return (self.cost - float(((basis.T @ self.side) ** 2).sum())) / left if left >= 1 else 1.0
 
-    @cached_property
-    def variance(self) -> float:
-        """ω: the variance of unit weight, or that of what images tell of the camera, if it is larger.
-
-        With G = R_BB^(−½) K̃, an image contradicts the estimates by s = Gᵀd with the cofactors T − T N⁻¹ T;
-        sᵀ(T − T N⁻¹ T)⁺s is its χ² of as many degrees of freedom as there are parameters.
-        """
-        basis = self._basis(self.free)
-        own = basis.T @ self.own @ basis
-        tau, turn = np.linalg.eigh(own)
-        s = np.einsum("mji,mj->mi", turn, self.own_side @ basis - own @ (basis.T @ self.side))
-        known = (tau > _RANK**0.5) & (tau < 1 - _RANK**0.5)
-        square = s[known] ** 2 / (tau * (1 - tau))[known]
-        return max(self.noise, float(square.sum() / known.sum())) if known.any() else self.noise
-
-    def predicted(self, free: Sequence[str], variance: float) -> Prediction:
+    def predicted(self, free: Sequence[str]) -> Prediction:
         """Predict each image from the others with these parameters free.
 
-        Others that were estimated are zero, and those that were not are as they were.
-
-        Parameters
-        ----------
-        free : sequence of str
-            Parameters.
-        variance : float
-            Variance factor ω.
+        Others that were estimated are zero, and those that were not are as they were. With G = R_BB^(−½) K̃,
+        an image contradicts the estimates by s = Gᵀd with the cofactors T − T N⁻¹ T; sᵀ(T − T N⁻¹ T)⁺s is its
+        χ² of as many degrees of freedom as there are parameters.
         """
         moved = np.where(self._at(self.free) & ~self._at(free), -self.values, 0.0)
         basis = self._basis(free)
@@ -155,11 +155,15 @@ class Information:
         residual = square - 2 * along @ x + np.einsum("i,mij,j->m", x, own, x)
         tau, turn = np.linalg.eigh(own)
         alone = np.maximum(1 - tau, _ALONE)
-        q = residual + (np.einsum("mji,mj->mi", turn, left) ** 2 / alone).sum(axis=1)
-        density = self.offset + 0.5 * np.log(alone).sum(axis=1) - q / (2 * variance)
+        contradiction = np.einsum("mji,mj->mi", turn, left) ** 2
+        q = residual + (contradiction / alone).sum(axis=1)
+        known = (tau > _RANK**0.5) & (tau < 1 - _RANK**0.5)
+        square, variance = contradiction[known] / (tau * (1 - tau))[known], self.noise
+        variance = max(variance, float(square.mean())) if known.any() else variance
         found = basis @ basis.T
         return Prediction(
-            density, q, cost - float(x @ x), basis.shape[1] - float(self.weight @ np.diag(found)),
+            self.offset + 0.5 * np.log(alone).sum(axis=1), q, cost - float(x @ x),
+            basis.shape[1] - float(self.weight @ np.diag(found)), variance,
             self.values + moved + basis @ x, variance * found,
         )  # fmt: skip
 

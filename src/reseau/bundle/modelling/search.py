@@ -12,7 +12,7 @@ from ...adjust import VarianceComponents, variance_components
 from ...adjust.significance import CoefficientTest
 from ...core.data import Mask, Rows
 from ...core.errors import UsageError
-from ...core.failure import Code, Failure
+from ...core.failure import Code, Estimated, Failure
 from ..diagnostics import Eliminated, Result
 from ..network import Camera, Network
 from ..solver import BundleFit
@@ -174,7 +174,7 @@ def reweighted(network: Network, found: VarianceComponents[BundleFit], kind: Kin
 
 
 @dataclass(frozen=True, eq=False)
-class Selection:
+class Selection(Estimated):
     """A network without the parameters that are not significant; truthy.
 
     Parameters
@@ -197,9 +197,6 @@ class Selection:
     network: Network
     result: Result
     steps: tuple[Eliminated, ...]
-
-    def __bool__(self) -> Literal[True]:
-        return True
 
 
 def eliminate_parameters(
