@@ -12,6 +12,7 @@ and scans are measured by the process of the command, whose time would not conta
 from __future__ import annotations
 
 import argparse
+import ctypes
 import os
 import resource
 import subprocess
@@ -19,6 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from statistics import median
 
@@ -32,18 +34,37 @@ ROOT = Path(__file__).resolve().parents[1]
 RESEAU = "from reseau.cli import main; main()"
 
 
-def spent(code: str, words: Sequence[str | Path], checkout: Path, cache: Path) -> tuple[float, float]:
-    """Processor time and wall time (s) of a command of a checkout, which keeps compiled code in a folder."""
+def environment(checkout: Path, cache: Path) -> dict[str, str]:
+    """Variables of a command of a checkout, which keeps compiled code in a folder."""
     paths = [str(checkout / each) for each in ("src", "sims", "drivers")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "NUMBA_CACHE_DIR": str(cache)}
+    own = {"PYTHONPATH": os.pathsep.join(paths), "NUMBA_CACHE_DIR": str(cache), "PYTHONDONTWRITEBYTECODE": ""}
+    return os.environ | own
+
+
+def spent(code: str, words: Sequence[str | Path], checkout: Path, cache: Path) -> tuple[float, float]:
+    """Processor time and wall time (s) of a command of a checkout, with all processes that it starts."""
     before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-c", code, *map(str, words)], capture_output=True, text=True, env=environment
-    )
-    wall, after = time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_CHILDREN)
+        [sys.executable, "-c", code, *map(str, words)],
+        capture_output=True, text=True, env=environment(checkout, cache),
+    )  # fmt: skip
+    wall = time.perf_counter() - begun
+    with suppress(ChildProcessError):
+        while True:  # those that outlived it; see `adopt`
+            os.wait()
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
         raise SystemExit(f"{' '.join(map(str, words))}: {done.stderr.strip()[-500:]}")
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, wall
+
+
+def adopt() -> None:
+    """Become the parent of processes that outlive theirs, such as the server that forks workers (Linux)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
+
+
+adopt()
 
 
 def commands(data: Path, folder: Path) -> dict[str, tuple[str, list[str | Path]]]:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import scipy.special
+import scipy
 
 from ..calibration import InstrumentCorrection
 from ..core.data import Array, ImagePoints

@@ -14,7 +14,7 @@ from collections.abc import Set
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from ...core.compiled import compiled
 from ...core.data import Array, Rows, rows_of_groups

@@ -14,8 +14,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.fft import irfft2, next_fast_len, rfft2
 
 from ...core.data import Array, Mask, Rows
 from ..compiled_filter import filtered
@@ -203,8 +203,8 @@ def _lag_sums(windows: NDArray[Any]) -> Array:
     Negative distances are counted from the end. By the theorem of Wiener and Khinchin these are the transform
     of the power spectrum, of windows with as many zeros beside them.
     """
-    size = [next_fast_len(n + _LAGS, real=True) for n in windows.shape[1:]]
-    spectrum = rfft2(windows, size)
+    size = [scipy.fft.next_fast_len(n + _LAGS, real=True) for n in windows.shape[1:]]
+    spectrum = scipy.fft.rfft2(windows, size)
     power = np.einsum("kij,kij->ij", spectrum.real, spectrum.real)
     power += np.einsum("kij,kij->ij", spectrum.imag, spectrum.imag)
-    return np.asarray(irfft2(power, size))
+    return np.asarray(scipy.fft.irfft2(power, size))

@@ -11,8 +11,8 @@ import math
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from ...core.assign import assign
 from ...core.compiled import compiled
@@ -33,7 +33,7 @@ _FAR, _PER_SIGMA = 8.0, 64
 _FLAT = 1e-3
 """Argument of the fisheye up to which its series is used."""
 _AT = np.arange(-_FAR * _PER_SIGMA, _FAR * _PER_SIGMA + 1) / _PER_SIGMA
-_STEP, _BELL = ndtr(_AT), np.exp(-0.5 * _AT * _AT) / np.sqrt(2 * np.pi)
+_STEP, _BELL = scipy.special.ndtr(_AT), np.exp(-0.5 * _AT * _AT) / np.sqrt(2 * np.pi)
 
 
 @compiled

@@ -14,8 +14,8 @@ from itertools import islice, product
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ...adjust.compiled import reweighted
 from ...core.data import Array, Mask, Rows
@@ -339,7 +339,7 @@ def common_part(at: Array, residuals: Array) -> Array | None:
     far = (np.abs(residuals) > _TOGETHER_PX).any(axis=1)
     if len(at) < _NEIGHBOURS or np.count_nonzero(far) <= _NEIGHBOURS // 2:
         return None
-    near = KDTree(at).query(at, k=_NEIGHBOURS)[1]
+    near = scipy.spatial.KDTree(at).query(at, k=_NEIGHBOURS)[1]
     common: Array = np.median(residuals[near], axis=1)
     size, scatter = np.abs(common), np.median(np.abs(residuals[near] - common[:, None]), axis=1)
     return common if ((size > _TOGETHER_PX) & (scatter < _SCATTER * size)).any() else None
