@@ -14,7 +14,6 @@ import numpy as np
 
 from ...core.assign import assign
 from ...core.compiled import compiled
-from ...optics.compiled import formed
 from .compiled_rows import (
     TOGETHER,
     Floats,
@@ -34,7 +33,6 @@ __all__ = [
     "DONE",
     "FAILED",
     "STALE",
-    "adjusted",
     "advanced",
     "compared",
     "cut",
@@ -54,8 +52,6 @@ _WIDTH, _CONTRAST, _LEVEL = 2, 3, 4
 _SERVES, _SHRINKS, _LEAST_DAMPING, _MOST_DAMPING = 0.75, 0.1, 1e-10, 1e12
 _GAINS, _HELD = 1e-4, 1e-2
 """As in :mod:`reseau.adjust.batch`."""
-_AT_ONCE = 40_000
-"""Number of pixels in the windows that are adjusted together."""
 _TINY = 1e-300
 f32 = np.float32
 
@@ -669,172 +665,3 @@ def advanced(
                 state[k] = FAILED
             else:
                 _next(k, normals[k], gradients[k], limit, x, trial, iteration, state)
-
-
-@compiled
-def adjusted(
-    shares: Floats,
-    slopes: Floats,
-    outlines: tuple[Floats, Floats, Floats, Floats],
-    place: Floats,
-    fill: float,
-    observed: Floats,
-    weights: Floats,
-    window: tuple[Floats, Floats, int],
-    light: tuple[bool, float, float],
-    psf: Floats,
-    prior: Floats,
-    share_of_sigma: float,
-    most: int,
-    x: Floats,
-    found: tuple[Floats, Floats, Floats, Floats, Floats],
-    influence: tuple[Floats, Floats],
-) -> None:
-    """Adjust windows with one outline each, as many together as fit into a cache.
-
-    Parameters
-    ----------
-    shares : ndarray (k, r, c), float32
-        Images formed at the initial values, replaced by those formed last.
-    slopes : ndarray (k, 3 + p, n), float32
-        Derivatives of the first images.
-    outlines : tuple
-        Nodes, tangents and generators, and the index (k,) of the outline of each window; see
-        :func:`reseau.optics.compiled.formed`.
-    place : ndarray (k, 2)
-        Origins of the outlines from the first pixel of each window, where x and y are 0.
-    fill : float
-        Light-sensitive share of the pitch.
-    most : int
-        Largest number of iterations.
-    found : tuple
-        Filled: residuals (k, n), cofactors (k, u, u), numbers of iterations (k,). Filled as in
-        :func:`linearised`: iteration (k, 6), state (k,); windows that are neither DONE nor FAILED need
-        another Jacobian, or more iterations.
-    influence : tuple
-        As in :func:`linearised`.
-    observed, weights, window, light, psf, prior, share_of_sigma, x
-        As in :func:`linearised`.
-    """
-    residuals, cofactors, rounds, iteration, state = found
-    nodes, tangents, generators, at = outlines
-    (count, high, wide), n, u = shares.shape, observed.shape[1], x.shape[1]
-    forms, together = len(generators), max(1, min(_AT_ONCE // observed.shape[1], len(observed)))
-    normals, begun = np.zeros((together, u, u)), np.empty((together, n), f32)
-    common = np.zeros((2, together if light[2] > 0 else 0, n), f32)
-    trial, first, gradients = (
-        np.empty((together, u)),
-        np.empty((together, u)),
-        np.zeros((together, u)),
-    )
-    images, where = np.empty((together, 1, high, wide), f32), np.empty((together, 2), f32)
-    form, sigma = np.empty((together, forms), f32), np.empty(together, f32)
-    rows, every, flat = np.empty(together, np.intp), np.arange(together), shares.reshape(count, n)
-    wanted, (on_position, leverage) = len(influence[1]) > 0, influence
-    for begin in range(0, count, together):
-        part = slice(begin, min(begin + together, count))
-        some = part.stop - begin
-        for j in range(some):
-            assign(first[j], x[begin + j])
-            assign(trial[j], x[begin + j])
-            assign(begun[j], flat[begin + j])
-        linear = first[:some], begun[:some], slopes[part]
-        work = (
-            residuals[part],
-            normals[:some],
-            gradients[:some],
-            cofactors[part],
-            common[0, :some],
-            common[1, :some],
-        )
-        linearised(
-            every[:some],
-            flat[part],
-            slopes[part],
-            observed[part],
-            weights[part],
-            window,
-            light,
-            psf[part],
-            first[:some],
-            prior,
-            share_of_sigma,
-            x[part],
-            work,
-            trial[:some],
-            iteration[part],
-            state[part],
-            (on_position[part], leverage[part]) if wanted else (on_position, leverage),
-        )
-        for _ in range(most):
-            active = 0
-            for j in range(some):
-                k = begin + j
-                if state[k] != ACTIVE:
-                    continue
-                total = 0.0
-                for i in range(2):
-                    where[active, i] = place[k, i] + trial[j, i]
-                    total += where[active, i]
-                for i in range(forms):
-                    form[active, i] = trial[j, u - forms + i]
-                    total += form[active, i]
-                sigma[active] = math.hypot(psf[k], math.exp(trial[j, _WIDTH]))
-                if not math.isfinite(total + sigma[active]):
-                    state[k] = STALE  # a step may lead to values without an image
-                    continue
-                rounds[k] += 1
-                rows[active] = j
-                active += 1
-            if active == 0:
-                break
-            formed(
-                nodes,
-                tangents,
-                generators,
-                at[begin + rows[:active]],
-                where[:active],
-                form[:active],
-                sigma[:active],
-                fill,
-                images[:active],
-            )
-            tried = images[:active].reshape(active, n)
-            for j in range(active):
-                assign(flat[begin + rows[j]], tried[j])
-            advanced(
-                rows[:active],
-                rows[:active],
-                linear,
-                tried,
-                observed[part],
-                weights[part],
-                window,
-                light[0],
-                psf[part],
-                first[:some],
-                prior,
-                share_of_sigma,
-                x[part],
-                work,
-                trial[:some],
-                iteration[part],
-                state[part],
-            )
-        if wanted:
-            active = 0
-            for j in range(some):
-                if state[begin + j] == DONE and rounds[begin + j] > 0:
-                    rows[active] = j
-                    active += 1
-            influenced(
-                rows[:active],
-                rows[:active],
-                linear,
-                weights[part],
-                window,
-                light[0],
-                psf[part],
-                cofactors[part],
-                (on_position[part], leverage[part]),
-            )

@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ...adjust.compiled import reweighted
+from ...adjust.reweighted import reweighted
 from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
 from ...optics import Chain
