@@ -1,7 +1,7 @@
 """Robust adjustment of linear problems with a common design.
 
 The iteration is that of :func:`reseau.adjust.adjust_batch` with Tukey's weights, for the small problems that
-a measurement solves again and again: without functions of images and derivatives, it takes a fifth of the time.
+a measurement solves again and again.
 """
 
 from __future__ import annotations
