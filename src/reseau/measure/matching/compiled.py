@@ -34,12 +34,8 @@ __all__ = [
     "FAILED",
     "STALE",
     "advanced",
-    "compared",
-    "cut",
     "influenced",
     "linearised",
-    "weighed",
-    "windows",
 ]
 
 ACTIVE, DONE, STALE, FAILED = 0, 1, 2, 3
@@ -54,126 +50,6 @@ _GAINS, _HELD = 1e-4, 1e-2
 """As in :mod:`reseau.adjust.batch`."""
 _TINY = 1e-300
 f32 = np.float32
-
-
-@compiled
-def cut(
-    pixels: Floats, valid: Floats, centre: Floats, half: tuple[int, int], grey: Floats, weights: Floats
-) -> None:
-    """Fill grey values and weights (k, n) of windows around pixels `centre` (k, 2).
-
-    Beyond the frame, those of its border continue; there, and where they are not valid, the weight is 0.
-    """
-    (h, w), (right, down) = pixels.shape, half
-    for k in range(len(centre)):
-        left, top, i = centre[k, 0] - right, centre[k, 1] - down, 0
-        for row in range(top, top + 2 * down + 1):
-            r = min(max(row, 0), h - 1)
-            for column in range(left, left + 2 * right + 1):
-                c = min(max(column, 0), w - 1)
-                grey[k, i] = pixels[r, c]
-                weights[k, i] = 1.0 if r == row and c == column and valid[r, c] else 0.0
-                i += 1
-
-
-@compiled
-def windows(pixels: Floats, centre: Floats, half: tuple[int, int]) -> Floats:
-    """Values (k, r, c) of windows around pixels `centre` (k, 2); beyond the frame those of its border."""
-    (h, w), (right, down) = pixels.shape, half
-    found = np.empty((len(centre), 2 * down + 1, 2 * right + 1), pixels.dtype)
-    for k in range(len(centre)):
-        left, top = centre[k, 0] - right, centre[k, 1] - down
-        for i in range(found.shape[1]):
-            row = pixels[min(max(top + i, 0), h - 1)]
-            for j in range(found.shape[2]):
-                found[k, i, j] = row[min(max(left + j, 0), w - 1)]
-    return found
-
-
-@compiled
-def weighed(
-    x: Floats,
-    share: Floats,
-    weights: Floats,
-    window: tuple[Floats, Floats, int],
-    dark: bool,
-    variance: tuple[float, float],
-    least: float,
-) -> Floats:
-    """Relative weights (k, n) of grey values as formed at `x` (k, u); see `noise.relative_weights`.
-
-    They are about 1 on average where `weights` (k, n) are not 0.
-    """
-    n = share.shape[1]
-    plane, contrast, grey, found = np.empty(n), np.empty(n), np.empty(n), np.empty(share.shape)
-    for k in range(len(x)):
-        _formed(x[k], share[k], window[0], window[1], dark, plane, contrast, grey)
-        total, count = 0.0, 0
-        for i in range(n):
-            grey[i] = variance[0] + variance[1] * grey[i]
-            if weights[k, i] > 0:
-                total += grey[i]
-                count += 1
-        inverse = 1.0 / max(total / max(count, 1), 1e-12)
-        for i in range(n):
-            found[k, i] = 1.0 / max(grey[i] * inverse, least)
-    return found
-
-
-@compiled
-def compared(
-    grey: Floats,
-    x: Floats,
-    monomials: Floats,
-    share: Floats,
-    weights: Floats,
-    used: Floats,
-    near: Floats,
-    dark: bool,
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Windows compared with what was formed in them.
-
-    Parameters
-    ----------
-    grey, share : ndarray (k, n)
-        Grey values, and share of the pixels covered by the mark.
-    x, monomials : ndarray (k, u), (b, n)
-        Estimates, and monomials of the background.
-    weights : ndarray (k, n)
-        Ones where a pixel may be used.
-    used, near : ndarray of bool (k, n)
-        Pixels that were used, and those that belong to the window.
-
-    Returns
-    -------
-    ndarray (k,), four
-        Correlation without the background; number of pixels used; shares of the mark on pixels that may be
-        used, and on those of them that were not.
-    """
-    count, seen, rejected = np.zeros(len(grey)), np.zeros(len(grey)), np.zeros(len(grey))
-    correlation, plane = np.zeros(len(grey)), np.empty(grey.shape[1])
-    for k in range(len(grey)):
-        plane[:] = 0.0
-        add_weighted(x[k], _LEVEL, monomials, plane)
-        whole, a, b = 0.0, 0.0, 0.0
-        for i in range(grey.shape[1]):
-            covered = share[k, i]
-            whole += covered * near[k, i]
-            seen[k] += covered * weights[k, i]
-            rejected[k] += covered * (weights[k, i] - used[k, i])
-            if used[k, i]:
-                count[k] += 1
-                a += grey[k, i] - plane[i]
-                b += -plane[i] * covered if dark else covered
-        seen[k], rejected[k] = seen[k] / max(whole, 1e-12), rejected[k] / max(whole, 1e-12)
-        a, b, ab, aa, bb = a / count[k], b / count[k], 0.0, 0.0, 0.0
-        for i in range(grey.shape[1]):
-            if used[k, i]:
-                u = grey[k, i] - plane[i] - a
-                v = (-plane[i] * share[k, i] if dark else np.float64(share[k, i])) - b
-                ab, aa, bb = ab + u * v, aa + u * u, bb + v * v
-        correlation[k] = ab / math.sqrt(aa * bb)
-    return correlation, count, seen, rejected
 
 
 @compiled
