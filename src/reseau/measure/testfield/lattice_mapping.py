@@ -16,7 +16,6 @@ import numpy as np
 from ...core.data import Array
 from ...optics import Chain, Equidistant, PlaneMapping, RationalPolynomial
 from .compiled_lattice import images
-from .compiled_lattice import lattice_coordinates as inverted
 
 __all__ = [
     "degree_of",
@@ -25,6 +24,7 @@ __all__ = [
     "matrix_of",
     "numbers_of",
     "of_degree",
+    "projective_slope",
     "reduced",
     "second_order",
     "slope_of",
@@ -37,6 +37,8 @@ __all__ = [
 
 _LONGEST = 0.5
 """Longest step, in lattice coordinates, of the inversion of a mapping."""
+_STEPS, _SHORT = 6, 1e-3
+"""Most steps of the inversion, and the longest step that ends it."""
 
 
 @lru_cache(maxsize=64)
@@ -145,12 +147,27 @@ def straightened(mapping: Chain, xy: Array) -> Array:
 
 
 def lattice_coordinates(mapping: Chain, xy: Array) -> Array:
-    """Lattice coordinates (n, 2) of image points; a few Newton steps are accurate enough here."""
-    numbers = numbers_of(mapping)
+    """Lattice coordinates (n, 2) of image points, by Newton steps with the slope of the projectivity."""
+    at = straightened(mapping, xy)
     zero = of_degree(mapping, degree_of(mapping)).second
-    bent = bool((mapping.second.values != zero.values).any())
-    back = np.linalg.inv(numbers[0])
-    return np.asarray(inverted(numbers, back, bent, np.ascontiguousarray(xy), _LONGEST))
+    if not len(xy) or not (mapping.second.values != zero.values).any():
+        return at
+    (p, q), (r, s) = projective_slope(matrix_of(mapping), at).transpose(1, 2, 0)
+    inverse = np.array([[s, -q], [-r, p]]).transpose(2, 0, 1) / (p * s - q * r)[:, None, None]
+    for _ in range(_STEPS):
+        step = (inverse * (xy - images_of(mapping, at))[:, None]).sum(axis=2)
+        at = at + np.clip(step, -_LONGEST, _LONGEST)
+        if np.abs(step).max() < _SHORT:
+            break
+    return at
+
+
+def projective_slope(matrix: Array, at: Array) -> Array:
+    """Derivatives (n, 2, 2) of a projectivity (3, 3) at points (n, 2)."""
+    seen = at @ matrix[:, :2].T + matrix[:, 2]
+    depth = seen[:, 2, None, None]
+    slope: Array = (matrix[:2, :2] - seen[:, :2, None] / depth * matrix[2, :2]) / depth
+    return slope
 
 
 def reduced(mapping: Chain, factor: float, shift: Array) -> Chain:
