@@ -98,7 +98,7 @@ def products_of(derivatives: Array, camera_of: Rows, count: Rows) -> Array:
     products = np.zeros((len(count), most, most))
     each = np.split(order, np.searchsorted(camera_of[order], np.arange(1, len(count))))
     for c, (rows, n) in enumerate(zip(each, count, strict=True)):
-        j = derivatives[rows, :, 6 : 6 + n].reshape(-1, n)
+        j = derivatives[rows, :, 6 : 6 + n].reshape(2 * len(rows), n)
         products[c, :n, :n] = j.T @ j
     return products
 
