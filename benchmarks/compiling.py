@@ -30,12 +30,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
-import cv2
-from waiting import RESEAU, ROOT, environment, spent
-from worlds import prints
-from worlds.sheets import View, pose
+from waiting import RESEAU, ROOT, draw, environment, spent
 
-PHOTOGRAPHS = 13
 ALONE = "import numpy, cv2, numba, scipy.linalg"
 OWN = ALONE + "; import reseau; reseau.calibrate"
 LOADED = "import reseau, sys; reseau.calibrate(sys.argv[1]); print(*sys.modules)"
@@ -81,15 +77,6 @@ def unit() -> float:
     begun = time.process_time()
     counted()
     return time.process_time() - begun
-
-
-def draw(folder: Path, seed: int) -> None:
-    """Write photographs of a ChArUco board."""
-    folder.mkdir(parents=True, exist_ok=True)
-    sheet = prints.charuco(9, 6, 30.0, 22.0, "DICT_4X4_100")
-    for k in range(PHOTOGRAPHS):
-        view = View(sheet, *pose(100 * seed + k, sheet, nearer=1.15), seed=7777 * seed + k)
-        cv2.imwrite(str(folder / f"{k + 1:02}.png"), view.picture())
 
 
 def stored(cache: Path) -> list[Path]:

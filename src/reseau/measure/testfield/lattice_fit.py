@@ -329,14 +329,14 @@ def _assigned(
     """
     first, last = (np.array([pick(number) for number in numbers]) for pick in (np.min, np.max))
     rows = np.flatnonzero(((at > first - 0.5) & (at < last + 0.5)).all(axis=1))
-    at, normal = at[rows], normal[rows]
+    at, normal = at[rows], normal[rows].T
     line, sine = np.rint(at), float(np.sin(np.deg2rad(degrees)))
     near, slope = np.abs(at - line) < gate, projective_slope(matrix_of(mapping), at)
     found = []
     for axis in (0, 1):
         # Along a line the other coordinate changes.
-        along = slope[:, :, 1 - axis]
-        parallel = np.abs((along * normal).sum(axis=1)) < sine * np.maximum(np.hypot(*along.T), 1e-12)
+        along = slope[:, 1 - axis]
+        parallel = np.abs((along * normal).sum(axis=0)) < sine * np.maximum(np.hypot(*along), 1e-12)
         found.append(rows[parallel & near[:, axis] & np.isin(line[:, axis], numbers[axis])])
     return np.concatenate(found), np.repeat([0, 1], [len(each) for each in found])
 

@@ -142,7 +142,7 @@ def second_order(mapping: Chain, at: Array) -> tuple[Array, Array, Array]:
 def straightened(mapping: Chain, xy: Array) -> Array:
     """Lattice coordinates (n, 2) of image points by the projectivity alone."""
     back = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(matrix_of(mapping)).T
-    at: Array = back[:, :2] / back[:, 2:]
+    at: Array = np.ascontiguousarray(back[:, :2] / back[:, 2:])
     return at
 
 
@@ -152,22 +152,23 @@ def lattice_coordinates(mapping: Chain, xy: Array) -> Array:
     zero = of_degree(mapping, degree_of(mapping)).second
     if not len(xy) or not (mapping.second.values != zero.values).any():
         return at
-    (p, q), (r, s) = projective_slope(matrix_of(mapping), at).transpose(1, 2, 0)
-    inverse = np.array([[s, -q], [-r, p]]).transpose(2, 0, 1) / (p * s - q * r)[:, None, None]
+    numbers, seen = numbers_of(mapping), np.empty(at.shape)
+    (p, q), (r, s) = projective_slope(numbers[0], at)
+    inverse = np.array([[s, -q], [-r, p]]) / (p * s - q * r)
     for _ in range(_STEPS):
-        step = (inverse * (xy - images_of(mapping, at))[:, None]).sum(axis=2)
-        at = at + np.clip(step, -_LONGEST, _LONGEST)
+        images(numbers, at, seen, *_NONE)
+        step = np.clip((inverse * (xy - seen).T).sum(axis=1), -_LONGEST, _LONGEST)
+        at += step.T
         if np.abs(step).max() < _SHORT:
             break
     return at
 
 
 def projective_slope(matrix: Array, at: Array) -> Array:
-    """Derivatives (n, 2, 2) of a projectivity (3, 3) at points (n, 2)."""
-    seen = at @ matrix[:, :2].T + matrix[:, 2]
-    depth = seen[:, 2, None, None]
-    slope: Array = (matrix[:2, :2] - seen[:, :2, None] / depth * matrix[2, :2]) / depth
-    return slope
+    """Derivatives (2, 2, n) of a projectivity (3, 3) at points (n, 2)."""
+    x, y, depth = matrix[:, :2] @ at.T + matrix[:, 2:]
+    seen = np.stack([x / depth, y / depth])[:, None]
+    return np.asarray((matrix[:2, :2, None] - seen * matrix[2, :2, None]) / depth)
 
 
 def reduced(mapping: Chain, factor: float, shift: Array) -> Chain:

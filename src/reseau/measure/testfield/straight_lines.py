@@ -29,12 +29,18 @@ def voted(xy: Array, own: Rows, direction: Array, spread: int, reach: int) -> Ar
         Index of the distance 0.
     """
     turns, wide = len(direction), 2 * reach + 1
-    turn = (own[:, None] + np.arange(-spread, spread + 1)) % turns
-    place = (xy[:, None] * direction[turn]).sum(axis=2) + reach
-    low = np.floor(place)
-    at, part = (turn * wide + low.astype(np.intp)).ravel(), (place - low).ravel()
-    votes = np.bincount(at, 1 - part, turns * wide + 1) + np.bincount(at + 1, part, turns * wide + 1)
-    return np.asarray(votes[:-1].reshape(turns, wide))
+    count, share = np.zeros(turns * wide), np.zeros(turns * wide)
+    x, y = np.ascontiguousarray(xy.T)
+    for step in range(-spread, spread + 1):
+        turn = (own + step) % turns
+        place = x * direction[turn, 0] + y * direction[turn, 1] + reach
+        low = place.astype(np.intp)  # never negative
+        at = turn * wide + low
+        count += np.bincount(at, minlength=len(count))
+        share += np.bincount(at, place - low, len(count))
+    votes = (count - share).reshape(turns, wide)
+    votes[:, 1:] += share.reshape(turns, wide)[:, :-1]
+    return votes
 
 
 def _near(
