@@ -36,7 +36,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("data", nargs="?", default=os.environ.get("RESEAU_DATA", "../shared/data"), type=Path)
-    parser.add_argument("--only", nargs="+", help="some of demo, calibrate, board, orient")
+    parser.add_argument("--only", nargs="+", help="some of demo, auto, calibrate, board, orient")
     given = parser.parse_args()
     jobs: dict[str, set[str]] = {}
     if LOOPS.exists():

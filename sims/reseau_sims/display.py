@@ -6,9 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import gaussian_filter, map_coordinates
 
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
@@ -122,7 +121,9 @@ class Bending(PlaneMapping):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", as_values(self.names, self.values))
-        splines = tuple(RectBivariateSpline(self.y, self.x, self.shift[..., k]) for k in range(2))
+        splines = tuple(
+            scipy.interpolate.RectBivariateSpline(self.y, self.x, self.shift[..., k]) for k in range(2)
+        )
         object.__setattr__(self, "_splines", splines)
 
     def _value(self, xy: Array) -> Array:
@@ -262,7 +263,9 @@ class Display:
 
         columns, rows = on_lattice(aimed, np.arange(float(len(x))), np.arange(float(len(y))))
         # Cubic: with linear interpolation the middle of an echo would depend on how it lies between samples.
-        light = map_coordinates(picture, [rows, columns], output=np.float32, order=3, mode="nearest")
+        light = scipy.ndimage.map_coordinates(
+            picture, [rows, columns], output=np.float32, order=3, mode="nearest"
+        )
         screen.illuminate(
             np.maximum(light, 0), rng, gradient=self.gradient, falloff=self.falloff, grain=self.grain
         )
@@ -290,7 +293,9 @@ class Display:
         steps = np.array([self.line_mm, self.sample_mm])
         # One node per millimetre is enough: the charge is blurred over several millimetres.
         every = np.maximum(1, np.rint(_CHARGE_STEP * self.sample_mm / steps)).astype(int)
-        charge = gaussian_filter(signal, reach / steps)[:: every[0], :: every[1]][::-1].astype(np.float64)
+        charge = scipy.ndimage.gaussian_filter(signal, reach / steps)[:: every[0], :: every[1]][::-1].astype(
+            np.float64
+        )
         x, y = video.x[:: every[1]], video.y[:: every[0]][::-1]
         up, right = np.gradient(charge, y, x)
         # At the straight edge of a large area the gradient of the charge is 1/(reach·√(2π)).

@@ -14,8 +14,8 @@ from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from reseau.core.data import Array
 
@@ -315,7 +315,7 @@ def _share(distance: Plane, frame: FilmFrame) -> Plane:
     d = distance[near].astype(np.float64)
 
     def integral(t: Array) -> Array:
-        return np.asarray(t * ndtr(t) + np.exp(-0.5 * t * t) / np.sqrt(2 * np.pi))
+        return np.asarray(t * scipy.special.ndtr(t) + np.exp(-0.5 * t * t) / np.sqrt(2 * np.pi))
 
     def step(t: Array) -> Array:
         """The blurred step without the disk."""

@@ -15,8 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
@@ -182,7 +182,7 @@ class Scanner:
         # Nothing is drawn outside the sweep, or beyond the maximum depth.
         swept = 0.5 - 0.5 * np.tanh((np.abs(place) - self.half_sweep_mm) / 0.5)
         lit = 0.5 + 0.5 * np.tanh(np.minimum(depth + 0.5, self.depth_mm - depth) / 0.3)
-        noise = gaussian_filter1d(rng.standard_normal(power.shape), 2.0, axis=1)
+        noise = scipy.ndimage.gaussian_filter1d(rng.standard_normal(power.shape), 2.0, axis=1)
         noise *= self.noise * np.sqrt(2 * np.sqrt(np.pi) * 2.0) * (0.5 + 0.5 * depth / self.depth_mm)[:, None]
         signal = (signal + noise) * lit[:, None] * swept[None, :]
         return Video(x, y, signal.astype(np.float32))

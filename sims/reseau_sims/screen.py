@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
 
 from reseau.core.data import Array
 from reseau.optics import PlaneMapping
@@ -124,5 +124,9 @@ class Screen:
         at = np.nan_to_num(at, nan=-1e9)
         # Samples are as large as a pixel, and the tube has nothing finer than its spot.
         order = 2 if blur_px else 1
-        light: Array = map_coordinates(self.light, at, output=np.float64, order=order, mode="nearest")
-        return np.maximum(gaussian_filter(light, blur_px, truncate=5.0), 0) if blur_px else light
+        light: Array = scipy.ndimage.map_coordinates(
+            self.light, at, output=np.float64, order=order, mode="nearest"
+        )
+        return (
+            np.maximum(scipy.ndimage.gaussian_filter(light, blur_px, truncate=5.0), 0) if blur_px else light
+        )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter
 
+from reseau.adjust import adjust_batch
 from reseau.measure import MatchOptions, match
 from reseau.measure.matching import compiled, matcher
 from reseau.measure.matching.correlation import with_alike_errors
@@ -250,22 +251,35 @@ def test_compiled_matches_from_known_light_are_those_of_the_general_adjustment(o
     known = {"noise": NOISE, "form_sigma": np.array([0.1]), "searching": 0.0}
     light = np.full(len(xy), 102.0 if bright else 0.68), level
     compiled = match(*given, settings, light=light, **known)
-    monkeypatch.setattr(matcher, "_compiled", lambda *_: (None, np.arange(len(xy))))
+    iterated = matcher._iterated
+
+    def by_general(patch, rows, start, mean, formed, weights, free, iteration, noise=None):
+        if noise is None:  # of blunders
+            return iterated(patch, rows, start, mean, formed, weights, free, iteration)
+        images = {"values": patch.form_values, "weights": weights, "prior": (mean, free)}
+        for _ in range(4):  # each time with derivatives where the last one ended
+            if settings.row_jitter_px > 0:
+                patch.whiten(start, np.full((len(start), 1), noise), settings.row_jitter_px)
+            found = adjust_batch(patch.form_image, start, patch.grey, **images, options=iteration)
+            start = found.estimates
+        return found
+
+    monkeypatch.setattr(matcher, "_iterated", by_general)
     general = match(*given, settings, light=light, **known)
     assert compiled.converged.sum() > len(xy) - 5
     for name in ("converged", "seen", "rejected"):
         np.testing.assert_allclose(getattr(compiled, name), getattr(general, name), rtol=0, atol=1e-6)
     compiled, general = compiled.select(general.converged), general.select(general.converged)
     sigma = np.sqrt(np.diagonal(general.cov, axis1=1, axis2=2))
-    # Rounding of sums in single precision, and other steps where another Jacobian is needed: both end at
-    # corrections of a tenth of a sigma, which is 0.01 px.
-    np.testing.assert_allclose((compiled.xy - general.xy) / sigma, 0, rtol=0, atol=2e-2)
-    np.testing.assert_allclose(compiled.cov, general.cov, rtol=1e-3, atol=1e-9)
+    # Iterations end at corrections of a tenth of a sigma, which is 0.01 px.
+    np.testing.assert_allclose((compiled.xy - general.xy) / sigma, 0, rtol=0, atol=settings.settled)
+    scaled = (compiled.cov - general.cov) / (sigma[:, :, None] * sigma[:, None])
+    np.testing.assert_allclose(scaled, 0, rtol=0, atol=0.05)
     off = np.linalg.norm((compiled.residuals - general.residuals).reshape(len(sigma), -1), axis=1)
-    np.testing.assert_allclose(off / NOISE, 0, rtol=0, atol=settings.settled)
-    np.testing.assert_allclose(compiled.form_sigma, general.form_sigma, rtol=1e-3, atol=0)
+    np.testing.assert_allclose(off / NOISE, 0, rtol=0, atol=3 * settings.settled)
+    np.testing.assert_allclose(compiled.form_sigma, general.form_sigma, rtol=0.05, atol=0)
     for name in ("psf_px", "contrast", "level", "noise", "correlation", "t"):
-        np.testing.assert_allclose(getattr(compiled, name), getattr(general, name), rtol=1e-3, atol=0)
+        np.testing.assert_allclose(getattr(compiled, name), getattr(general, name), rtol=5e-3, atol=5e-3)
 
 
 @pytest.mark.parametrize("trials", [4, 6, 8])
@@ -283,7 +297,6 @@ def test_marks_that_have_no_trials_left_are_never_corrected_with_derivatives_of_
         corrected(rows, place, first, *rest)
 
     monkeypatch.setattr(matcher, "advanced", advanced)
-    monkeypatch.setattr(matcher, "outlines_of", lambda *_: None)
     monkeypatch.setattr(matcher, "_FIRST", trials)
     level = np.zeros((len(xy), 3))
     level[:, 0] = LEVEL

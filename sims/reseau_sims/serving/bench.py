@@ -10,8 +10,8 @@ from functools import partial
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
@@ -470,7 +470,7 @@ def _edge() -> Array:
     """Light on the sensor from a straight edge, slanted by six degrees."""
     width, height = _SENSOR
     y, x = np.mgrid[:height, :width]
-    share: Array = ndtr((x - width / 2 - 0.1 * (y - height / 2)) / 0.6)
+    share: Array = scipy.special.ndtr((x - width / 2 - 0.1 * (y - height / 2)) / 0.6)
     return np.asarray(_LAMP * (0.2 + 1.8 * share))
 
 

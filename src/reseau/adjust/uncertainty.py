@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import scipy.special
+import scipy
 
 from ..core.data import Array, Mask
 from ..core.display import Display

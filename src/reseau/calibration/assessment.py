@@ -13,8 +13,8 @@ from html import escape
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
+import scipy
 from pydantic import Field
-from scipy.interpolate import RectBivariateSpline
 
 from ..core.data import Array
 from ..core.errors import UsageError
@@ -210,7 +210,7 @@ class ErrorMap(Strict):
         if not (values > 0).all() or min(values.shape) < 4:
             return self.xy, values
         x, y = (np.linspace(at[0], at[-1], _FINE * (len(at) - 1) + 1) for at in (self.x, self.y))
-        between = RectBivariateSpline(self.y, self.x, np.log(values))
+        between = scipy.interpolate.RectBivariateSpline(self.y, self.x, np.log(values))
         return np.stack(np.meshgrid(x, y), axis=-1), np.exp(between(y, x))
 
     def plot(self, axes: Axes | None = None, *, formal: bool = False) -> Axes:

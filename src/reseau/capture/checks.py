@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-import scipy.ndimage
-from scipy.special import ndtri
+import scipy
 
 from ..core.data import Array, Frame
 from ..core.errors import UsageError
@@ -186,7 +185,7 @@ def edge_sigma(frame: Frame) -> float:
         share = max(_steepest(grey, reach, quantum), _steepest(grey.T, reach, quantum))
         if share > 0.0:
             # Too short a reach and a second edge within it both make the height too small, and so the width.
-            sigma = max(sigma, 1.0 / float(ndtri(0.5 + 0.5 * min(share, 0.9999))), _PIXEL)
+            sigma = max(sigma, 1.0 / float(scipy.special.ndtri(0.5 + 0.5 * min(share, 0.9999))), _PIXEL)
         if sigma <= reach / 4:
             break
     return sigma or float("inf")

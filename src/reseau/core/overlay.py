@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
@@ -226,12 +227,10 @@ def _stretched(pixels: NDArray[Any], zoom: float) -> NDArray[np.uint8]:
 
 def _radius(xy: Array, zoom: float, text: float) -> float:
     """Radius of the symbols, pixels of the picture: at most a third of the distance of neighbours."""
-    from scipy.spatial import KDTree
-
     most = 0.9 * text
     if len(xy) < 2:
         return most
-    apart = KDTree(xy).query(xy, k=2)[0][:, 1]
+    apart = scipy.spatial.KDTree(xy).query(xy, k=2)[0][:, 1]
     return float(np.clip(0.33 * np.median(apart) * zoom, min(4.0, most), most))
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from ..bundle import Camera, Network, Result, camera_mapping
@@ -183,9 +184,7 @@ def _words(values: Sequence[float] | Array) -> str:
 
 def _quaternion(matrix: Array) -> Array:
     """Quaternion of a rotation matrix, scalar first and not negative."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(matrix).as_quat(canonical=True)
+    x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(matrix).as_quat(canonical=True)
     return np.array([w, x, y, z])
 
 

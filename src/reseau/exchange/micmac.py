@@ -20,8 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
+import scipy
 
 from ..bundle import Camera, Network
 from ..core.data import Array, Mask, Rows

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
+import scipy
 from pydantic import Field, model_validator
 
 from ..core.data import Array
@@ -250,15 +251,13 @@ class ReseauDesign(Document):
 
 def at_one_place(places: Array) -> tuple[int, int] | None:
     """The first two rows of `places` (n, k) that are equal to a millionth of their extent, if any."""
-    from scipy.spatial import KDTree
-
     known = np.flatnonzero(np.isfinite(places).all(axis=1))
     if len(known) < 2:
         return None
     # A single point far away, by a slip of the pen, does not make others one place.
     low, high = np.quantile(places[known], [0.1, 0.9], axis=0)
     within = _ONE_PLACE * float((high - low).max())
-    pairs = KDTree(places[known]).query_pairs(within, p=np.inf, output_type="ndarray")
+    pairs = scipy.spatial.KDTree(places[known]).query_pairs(within, p=np.inf, output_type="ndarray")
     if not len(pairs):
         return None
     first, second = known[pairs[np.lexsort(pairs.T[::-1])[0]]]

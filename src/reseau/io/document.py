@@ -30,7 +30,8 @@ class Strict(BaseModel):
     pydantic_core._pydantic_core.ValidationError: 1 validation error for Point...
     """
 
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+    # A model is built when it is used first: importing needs few of them.
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True, defer_build=True)
 
 
 def read_text(path: Path, otherwise: str | None = None) -> str:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
+import scipy
 from pydantic import Discriminator, Field, Tag, model_validator
-from scipy.spatial.transform import Rotation
 
 from ..core.errors import FormatError, UsageError
 from ..optics.lenses import (
@@ -392,7 +392,7 @@ class LensDocument(Document):
                 layout.turn(at.turned.decentre, at.turned.tilt_deg)
             mirror = at.medium == "mirror"
             behind = medium if mirror or at.medium is None else medium_of(at.medium, name)
-            alone = Rotation.from_euler("XYZ", at.tilt_deg, degrees=True).as_matrix()
+            alone = scipy.spatial.transform.Rotation.from_euler("XYZ", at.tilt_deg, degrees=True).as_matrix()
             surfaces.append(
                 Surface(
                     at.bent,
@@ -559,7 +559,7 @@ def _tilt(turn: np.ndarray[Any, np.dtype[np.float64]]) -> Triple:
     """Angles, degrees, of a rotation about x, the new y and the newest z."""
     if np.abs(turn - np.eye(3)).max() < 1e-15:
         return 0.0, 0.0, 0.0
-    x, y, z = Rotation.from_matrix(turn).as_euler("XYZ", degrees=True)
+    x, y, z = scipy.spatial.transform.Rotation.from_matrix(turn).as_euler("XYZ", degrees=True)
     return float(x), float(y), float(z)
 
 

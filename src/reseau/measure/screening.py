@@ -8,9 +8,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.fft import dctn
-from scipy.ndimage import median_filter
 
 from ..core.data import Array, Frame, Mask
 from ..core.errors import ImageError
@@ -211,7 +210,7 @@ def _level_borders(grey: NDArray[np.float32], valid: Mask) -> NDArray[np.float32
 
 
 def _running_median(line: NDArray[Any]) -> Array:
-    smooth: Array = median_filter(line.astype(np.float64), size=_ALONG, mode="nearest")
+    smooth: Array = scipy.ndimage.median_filter(line.astype(np.float64), size=_ALONG, mode="nearest")
     return smooth
 
 
@@ -255,7 +254,7 @@ def lost_in_blocks(pixels: NDArray[Any]) -> float | None:
     whole = grey[first[0] :, first[1] :]
     rows, columns = (n // _SIDE for n in whole.shape)
     blocks = whole[: rows * _SIDE, : columns * _SIDE].reshape(rows, _SIDE, columns, _SIDE)
-    coefficients = np.abs(dctn(blocks, axes=(1, 3), norm="ortho")).transpose(1, 3, 0, 2)
+    coefficients = np.abs(scipy.fft.dctn(blocks, axes=(1, 3), norm="ortho")).transpose(1, 3, 0, 2)
     found = []
     for u, v in list(product(range(_LOW), repeat=2))[1:]:
         distinct = coefficients[u, v][coefficients[u, v] > _ROUNDED]

@@ -31,7 +31,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtr
+import scipy
 
 from ..core.compiled import compiled
 from ..core.data import Array, Rows
@@ -150,7 +150,9 @@ class Arcs:
         if self.flatness is not None and self.flatness.any():
             # Symmetric in u; differences of the lower tails lose no digits.
             far = np.abs(u) / soft
-            line = (ndtr(w / soft - far) - ndtr(-w / soft - far)) / (2 * ndtr(w / soft) - 1)
+            line = (scipy.special.ndtr(w / soft - far) - scipy.special.ndtr(-w / soft - far)) / (
+                2 * scipy.special.ndtr(w / soft) - 1
+            )
         else:
             line = np.exp(-0.5 * t * t)
         image: Array = line * pulse

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Any, cast
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from ..core.compiled import Instruction, compiled
 
@@ -39,7 +39,7 @@ def normal_table(far: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     0.5
     """
     z = np.arange(-far * PER_SIGMA, far * PER_SIGMA + 1) / PER_SIGMA
-    return ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
+    return scipy.special.ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
 
 
 _FINE_STEP, _FINE_BELL = normal_table(_FAR)

@@ -15,8 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eigh
-from scipy.spatial.distance import cdist
+import scipy
 
 from ..core.data import Array
 from ..core.errors import UsageError
@@ -125,7 +124,7 @@ class SmoothField:
         q, _ = np.linalg.qr(design / relative[:, None], mode="complete")
         free = q[:, design.shape[1] :]
         white = free.T @ (target / relative[:, None])
-        distance = cdist(source, source)
+        distance = scipy.spatial.distance.cdist(source, source)
         ratios, lengths = _RATIOS, _LENGTHS if length is None else np.array([length / extent])
         spectra = [_spectrum(free, _correlation(distance / (extent * scale)), relative) for scale in lengths]
         gains = np.array([_gains(spectrum, vectors.T @ white, ratios) for spectrum, vectors in spectra])
@@ -166,7 +165,7 @@ class SmoothField:
         design, _ = _design(self.source, xy, self.degree)
         if not self.ratio.any():
             return design @ np.stack([trend for _, _, trend in self._solutions], axis=1)
-        kernel = _correlation(cdist(xy, self.source) / self.length)
+        kernel = _correlation(scipy.spatial.distance.cdist(xy, self.source) / self.length)
         parts = [
             design @ trend + ratio * (kernel @ (weights / self.sigma))
             for ratio, (weights, _, trend) in zip(self.ratio, self._solutions, strict=True)
@@ -255,7 +254,9 @@ def _correlation(z: Array) -> Array:
 
 def _spectrum(free: Array, correlation: Array, relative: Array) -> tuple[Array, Array]:
     """Eigenvalues and eigenvectors of the signal's covariance in the space orthogonal to the trend."""
-    values, vectors = eigh(free.T @ (correlation / np.outer(relative, relative)) @ free, check_finite=False)
+    values, vectors = scipy.linalg.eigh(
+        free.T @ (correlation / np.outer(relative, relative)) @ free, check_finite=False
+    )
     return np.maximum(values, 0), vectors
 
 

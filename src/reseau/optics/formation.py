@@ -22,7 +22,7 @@ from functools import cache, lru_cache
 from typing import cast
 
 import numpy as np
-from scipy.special import ndtr
+import scipy
 
 from ..core.data import Array
 from ..core.errors import UsageError
@@ -336,7 +336,10 @@ def _compiled_orders(pixels: Array, points: Array, sigma: Array | float) -> list
 def _steps(t: Array, sigma: Array | float, highest: int, integral: bool) -> list[Array]:
     """Integral of the blurred step, the step, and its derivatives at offsets `t`."""
     z = t / sigma
-    step, bell = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi) if integral or highest else z
+    step, bell = (
+        scipy.special.ndtr(z),
+        np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi) if integral or highest else z,
+    )
     found: list[Array] = [step]
     if integral:
         found.insert(0, t * found[0] + sigma * bell)

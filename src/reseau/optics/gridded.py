@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import spline_filter1d
+import scipy
 
 from ..core.data import Array
 from ..core.errors import UsageError
@@ -148,7 +148,7 @@ class GriddedOutline:
         low, high = int(np.floor((-reach - begin) * _PER_PX)), int(np.ceil((reach - begin) * _PER_PX))
         offsets = begin + np.arange(low, high + 1) / _PER_PX
         orders = np.stack([order[0] for order in response.orders(offsets, np.zeros(1), sigma, 2)])
-        return np.asarray(spline_filter1d(orders, order=5, axis=1)), low
+        return np.asarray(scipy.ndimage.spline_filter1d(orders, order=5, axis=1)), low
 
     @staticmethod
     def _along(cells: Array, taps: tuple[Array, int], count: int, *, summed: bool = False) -> Array:

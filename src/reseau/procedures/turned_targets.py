@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ..calibration import CameraMapping
 from ..core.data import Array, ImagePoints
@@ -58,7 +58,7 @@ def ways_to_turn(design: BoardDesign) -> tuple[Way, ...]:
     for quarter in range(4):
         c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
         rotation = np.array([[c, -s], [s, c]], dtype=np.float64)
-        away, to = KDTree(xy).query(xy @ rotation.T)
+        away, to = scipy.spatial.KDTree(xy).query(xy @ rotation.T)
         if away.max() > 1e-6 * design.pitch:
             continue
         # Dark squares lie one way or the other at a corner of a chessboard; a quarter turn exchanges them.

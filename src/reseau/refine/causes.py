@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.special
+import scipy
 
 from ..adjust import Adjustment, GaussMarkov, Parameters, adjust
 from ..core.data import Array

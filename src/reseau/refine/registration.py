@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import scipy.special
+import scipy
 
 from ..adjust import Adjustment
 from ..calibration import CameraCorrection

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 
 from ..adjust import Adjustment
@@ -104,7 +105,6 @@ def rivals(
         errors.append(found[0])
         squares.append(found[1])
     difference = squares[0] - squares[1]
-    import scipy.stats  # half a second of every command otherwise
 
     p = float(scipy.stats.wilcoxon(difference).pvalue) if difference.any() else 1.0
     better = "first" if np.median(difference) < 0 else "second"

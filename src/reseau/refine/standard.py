@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.special
+import scipy
 
 from ..calibration import InstrumentCorrection
 from ..core.data import Array, ImagePoints

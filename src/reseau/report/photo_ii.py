@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.special
+import scipy
 from markupsafe import Markup
 
 from ..calibration import InstrumentCorrection

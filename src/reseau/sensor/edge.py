@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from ..adjust import Adjustment, CoefficientTest, NestedTest, compare
 from ..calibration.document import Quantity
@@ -88,7 +88,7 @@ class EdgeSpread:
         """Frequency at which the modulation of the Gaussian is 0.5 (cycles per pixel), and its sigma."""
 
         def half(psf: float) -> float:
-            return float(brentq(lambda f: float(self.mtf(f, psf)) - 0.5, 1e-6, 0.99))
+            return float(scipy.optimize.brentq(lambda f: float(self.mtf(f, psf)) - 0.5, 1e-6, 0.99))
 
         psf, step = abs(self.fit["psf"]), 1e-4
         slope = (half(psf + step) - half(max(psf - step, 0.0))) / (step + min(step, psf))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import chdtri, ndtri
+import scipy
 
 from ..calibration.sensor import Fields
 from ..core.data import Mask
@@ -145,7 +145,7 @@ def _unshaded(response: np.ndarray) -> np.ndarray:
 def _outliers(values: np.ndarray) -> Mask:
     middle = np.median(values)
     scale = _MAD * np.median(np.abs(values - middle))
-    limit = -ndtri(_FALSE_ALARMS / _TESTS / values.size / 2)
+    limit = -scipy.special.ndtri(_FALSE_ALARMS / _TESTS / values.size / 2)
     found: Mask = np.abs(values - middle) > limit * max(scale, 1e-12)
     return found if scale > 0 else np.zeros(values.shape, dtype=bool)
 
@@ -156,7 +156,7 @@ def _noisy(series: SensorSeries) -> Mask:
     pooled = np.zeros(series.shape)
     for level in series.dark:
         pooled += (level.count - 1) / dof * level.variance
-    usual = float(np.median(pooled)) / (chdtri(dof, 0.5) / dof)
-    limit = chdtri(dof, _FALSE_ALARMS / _TESTS / pooled.size) / dof
+    usual = float(np.median(pooled)) / (scipy.special.chdtri(dof, 0.5) / dof)
+    limit = scipy.special.chdtri(dof, _FALSE_ALARMS / _TESTS / pooled.size) / dof
     noisy: Mask = pooled > limit * max(usual, 1 / 12)
     return noisy

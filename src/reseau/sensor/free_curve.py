@@ -21,10 +21,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
-from scipy.optimize import brentq
-from scipy.special import fdtrc
 
 from ..adjust import Adjustment, GaussMarkov, Parameters, adjust
 from ..core.data import Array
@@ -62,16 +60,16 @@ class _Spline:
         return len(self.knots) - 3
 
     @cached_property
-    def _lines(self) -> BSpline:
+    def _lines(self) -> scipy.interpolate.BSpline:
         k = self.knots
         # Exclude splines that extend beyond the end knots.
         wide = np.concatenate([k[0] - [3.0, 2.0, 1.0], k, k[-1] + [1.0, 2.0, 3.0]])
         chosen = np.zeros((len(wide) - 3, self.size))
         chosen[3 : 3 + self.size] = np.eye(self.size)
-        return BSpline(wide, chosen, 2)
+        return scipy.interpolate.BSpline(wide, chosen, 2)
 
     @cached_property
-    def _integrals(self) -> BSpline:
+    def _integrals(self) -> scipy.interpolate.BSpline:
         return self._lines.antiderivative()
 
     def beyond(self, distance: float) -> NDArray[np.intp]:
@@ -253,7 +251,7 @@ class FreeCurve:
         if not len(below):
             return None
         low, high = float(grid[below[0] - 1]), float(grid[below[0]])
-        half = float(brentq(lambda f: float(self.mtf(f)[0][0]) - 0.5, low, high, xtol=1e-7))
+        half = float(scipy.optimize.brentq(lambda f: float(self.mtf(f)[0][0]) - 0.5, low, high, xtol=1e-7))
         aside = min(_CHORD * half, self.limit - half)
         values, sigmas = self.mtf(np.array([half - aside, half, half + aside]))
         slope = float(values[0] - values[2]) / (2 * aside) if aside > 0 else 0.0
@@ -300,7 +298,7 @@ class FreeCurve:
         outer = self.spline.beyond(0.75 * min(-k[0], k[-1]))
         with one_thread():
             statistic = float(a[outer] @ np.linalg.solve(cov[np.ix_(outer, outer)], a[outer])) / len(outer)
-        p = float(fdtrc(len(outer), self.fit.redundancy, statistic))
+        p = float(scipy.special.fdtrc(len(outer), self.fit.redundancy, statistic))
         return float(np.abs(found).sum() / abs(self._step[0])), p
 
 

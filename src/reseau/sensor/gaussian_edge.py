@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
+import scipy
 
 from ..adjust import Adjustment, GaussMarkov, Options, Parameters, adjust
 from ..core.data import Array, Mask
@@ -231,7 +231,7 @@ def _close(d: Array, sigma: float) -> Array:
 
 def _never(u: Array, sigma: float) -> Array:
     """The normal distribution of this width."""
-    integral: Array = ndtr(u / max(sigma, 1e-6))
+    integral: Array = scipy.special.ndtr(u / max(sigma, 1e-6))
     return integral
 
 
@@ -239,7 +239,7 @@ def _once(u: Array, sigma: float) -> Array:
     """The first integral of the normal distribution of this width."""
     width = max(sigma, 1e-6)
     density = np.exp(-0.5 * (u / width) ** 2) / np.sqrt(2 * np.pi)
-    integral: Array = u * ndtr(u / width) + width * density
+    integral: Array = u * scipy.special.ndtr(u / width) + width * density
     return integral
 
 
@@ -247,5 +247,5 @@ def _twice(u: Array, sigma: float) -> Array:
     """The second integral of the normal distribution of this width."""
     width = max(sigma, 1e-6)
     density = np.exp(-0.5 * (u / width) ** 2) / np.sqrt(2 * np.pi)
-    integral: Array = ((u**2 + width**2) * ndtr(u / width) + u * width * density) / 2
+    integral: Array = ((u**2 + width**2) * scipy.special.ndtr(u / width) + u * width * density) / 2
     return integral

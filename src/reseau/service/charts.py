@@ -20,8 +20,7 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-import scipy.optimize
-import scipy.special
+import scipy
 
 from ..core.data import Array, Mask, Rows
 from ..core.errors import UsageError

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-import scipy.linalg
-import scipy.special
+import scipy
 from pydantic import Field
 
 from ..calibration import Calibration, Covariance, Quantity

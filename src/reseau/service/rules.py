@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
-import scipy.special
+import scipy
 from pydantic import Field, model_validator
 
 from ..calibration import Calibration, CameraMapping, calibration_difference, in_model_of

@@ -15,8 +15,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import scipy.special
-import scipy.stats
+import scipy
 
 from ..core.data import Array
 from ..core.errors import UsageError

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 import numpy as np
-import scipy.special
+import scipy
 
 from ...adjust import critical_w
 from ...core.data import Rows

@@ -12,7 +12,7 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-import scipy.special
+import scipy
 
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure, Remark

@@ -19,8 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.sparse
-import scipy.special
+import scipy
 
 from ...core.data import Array, Rows
 from ...core.display import Display

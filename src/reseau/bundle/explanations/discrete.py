@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import scipy.special
+import scipy
 
 from ...core.data import Array, Rows
 from ..diagnostics.evidence import Effect, Scores, scores

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import scipy.special
+import scipy
 
 from ...calibration import Cause
 from ...calibration.camera import by_rotation, places, projection_slopes, referred

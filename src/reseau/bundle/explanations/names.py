@@ -13,8 +13,7 @@ from typing import Any, ClassVar, Protocol
 
 import cv2
 import numpy as np
-import scipy.spatial
-import scipy.special
+import scipy
 
 from ...core.data import Array, Mask, Rows
 from ...optics import PlaneMapping

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.special
+import scipy
 
 from ...core.data import Array
 from ...core.display import Display

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import scipy.special
+import scipy
 
 from ...calibration import CameraMapping, calibration_difference
 from ...calibration.camera import projection_field

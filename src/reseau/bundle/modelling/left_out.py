@@ -23,8 +23,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse
+import scipy
 
 from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread

@@ -16,8 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+import scipy
 
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
@@ -101,17 +100,17 @@ class Rig:
         used : ndarray of bool (m,)
             Images that count.
         """
-        _, label = connected_components(self._shared(used), directed=False)
+        _, label = scipy.sparse.csgraph.connected_components(self._shared(used), directed=False)
         first = [int(np.flatnonzero(label == own)[0]) for own in label]
         return np.array(first, dtype=np.intp)
 
-    def _shared(self, known: Mask) -> coo_array:
+    def _shared(self, known: Mask) -> scipy.sparse.coo_array:
         """Number of exposures (c, c) that two cameras have in common, of known images."""
         count = int(self.camera.max(initial=-1)) + 1
         on = np.flatnonzero((self.exposure >= 0) & known)
         seen = np.zeros((count, int(self.exposure.max(initial=-1)) + 1))
         seen[self.camera[on], self.exposure[on]] = 1.0
-        return coo_array(seen @ seen.T)
+        return scipy.sparse.coo_array(seen @ seen.T)
 
     def approximate(self, rotation: Array, x0: Array) -> tuple[RigValues, Array, Array]:
         """Approximate values from those of the images (m, 3, 3) and (m, 3), NaN where unknown.
@@ -124,7 +123,7 @@ class Rig:
         values = RigValues(np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)))
         shared, reference = self._shared(known), self.references(known)
         for first in np.unique(reference):
-            order, before = breadth_first_order(shared, int(first), directed=False)
+            order, before = scipy.sparse.csgraph.breadth_first_order(shared, int(first), directed=False)
             for camera in order[1:]:
                 turn, base = self._relative(int(before[camera]), int(camera), known, rotation, x0)
                 at = int(before[camera])

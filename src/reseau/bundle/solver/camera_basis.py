@@ -14,9 +14,8 @@ from collections.abc import Set
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy
 
-from ...core.compiled import compiled
 from ...core.data import Array, Rows, rows_of_groups
 from .normal import Sums
 from .unknowns import Unknowns
@@ -93,23 +92,14 @@ def camera_bases(
     return tuple(found)
 
 
-@compiled
 def products_of(derivatives: Array, camera_of: Rows, count: Rows) -> Array:
     """Compute JᵀJ of the parameters of each camera (c, k, k), padded with zeros."""
-    most = 0
-    for c in range(len(count)):
-        most = max(most, count[c])
+    most, order = max(count, default=0), np.argsort(camera_of, kind="stable")
     products = np.zeros((len(count), most, most))
-    for k in range(len(camera_of)):
-        c = camera_of[k]
-        for i in range(count[c]):
-            x0, x1 = derivatives[k, 0, 6 + i], derivatives[k, 1, 6 + i]
-            for o in range(i + 1):
-                products[c, i, o] += x0 * derivatives[k, 0, 6 + o] + x1 * derivatives[k, 1, 6 + o]
-    for c in range(len(count)):
-        for i in range(count[c]):
-            for o in range(i):
-                products[c, o, i] = products[c, i, o]
+    each = np.split(order, np.searchsorted(camera_of[order], np.arange(1, len(count))))
+    for c, (rows, n) in enumerate(zip(each, count, strict=True)):
+        j = derivatives[rows, :, 6 : 6 + n].reshape(2 * len(rows), n)
+        products[c, :n, :n] = j.T @ j
     return products
 
 

@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from ...core.data import Array, Mask, Rows
 from ..network import Network

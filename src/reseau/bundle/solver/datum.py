@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from ...core.data import Array, Mask, Rows
 from ..network import Camera

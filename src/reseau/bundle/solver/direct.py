@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse
+import scipy
 
 from ...core.data import Array, Mask, Rows
 from .arrow import Arrow, full

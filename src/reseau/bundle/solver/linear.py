@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse
+import scipy
 
 from ...core.data import Array, Rows
 from .camera_basis import CameraBasis, camera_bases, with_bases

@@ -23,8 +23,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse
+import scipy
 
 from ...core.compiled import compiled
 from ...core.data import Array, Mask, Rows, rows_of_groups

@@ -16,7 +16,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-import scipy.sparse
+import scipy
 
 from ...core.data import Array, Mask, Rows
 from .datum import Freedom

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import cv2
 import numpy as np
-import scipy.spatial
+import scipy
 from numpy.typing import NDArray
 
 from ...core import vocabulary as v

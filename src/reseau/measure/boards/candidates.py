@@ -15,8 +15,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask, Rows
 from ...optics import Chain
@@ -185,7 +185,7 @@ def _seeds_among(saddles: Saddles) -> list[tuple[int, Array]]:
     """Seeds of a part of the saddles, see :func:`seeds`."""
     if len(saddles) < 6:
         return []
-    tree = KDTree(saddles.xy)
+    tree = scipy.spatial.KDTree(saddles.xy)
     most = min(_NEAR + 1, len(saddles))
     near = tree.query(saddles.xy, k=most)[1][:, 1:]
     away = saddles.xy[near] - saddles.xy[:, None]
@@ -296,11 +296,11 @@ def grown_through(
         As :func:`grown`.
     """
     grid = np.array(list(product(range(-extent, extent + 1), repeat=2)), dtype=np.float64)
-    tree = KDTree(xy)
+    tree = scipy.spatial.KDTree(xy)
     nodes, rows, free = np.zeros((1, 2)), np.zeros(1, dtype=np.intp), mapping
     through_lens = led = False
     for _ in range(3 * extent):
-        beside = grid[KDTree(nodes).query(grid)[0] < _FROM + 0.5 * (len(nodes) < 4)]
+        beside = grid[scipy.spatial.KDTree(nodes).query(grid)[0] < _FROM + 0.5 * (len(nodes) < 4)]
         predicted, slopes, _ = second_order(mapping, beside)
         pixels = np.maximum(np.linalg.norm(slopes, axis=1).min(axis=1), 1e-6)
         if led:
@@ -333,7 +333,7 @@ def grown_through(
     return nodes, rows, mapping
 
 
-def _within(tree: KDTree, places: Array, gate: Array) -> tuple[Array, Rows, Rows]:
+def _within(tree: scipy.spatial.KDTree, places: Array, gate: Array) -> tuple[Array, Rows, Rows]:
     """Points within the distance `gate` of some places: their distances, and rows of places and of points."""
     gap, row = tree.query(places, k=np.arange(1, min(_CHOICE, tree.n) + 1))
     at, k = np.nonzero(gap < gate[:, None])

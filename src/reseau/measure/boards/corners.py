@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code
@@ -350,7 +350,7 @@ class CornerMarks(PlaneMarks):
         known = np.flatnonzero(np.isfinite(self.widths))
         if len(known) < _NEAR:
             return np.full(len(at), self.look.psf_px)
-        near = KDTree(self.at[known]).query(at, k=_NEAR)[1]
+        near = scipy.spatial.KDTree(self.at[known]).query(at, k=_NEAR)[1]
         return np.asarray(np.median(self.widths[known][near], axis=1))
 
     def settle(self, first: Matches) -> Matches:

@@ -19,8 +19,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
@@ -320,7 +320,7 @@ def _seeds(corners: SixSectors) -> list[tuple[int, Array]]:
     if len(corners) < _FEWEST:
         return []
     most = min(_NEAR + 1, len(corners))
-    near = KDTree(corners.xy).query(corners.xy, k=most)[1][:, 1:]
+    near = scipy.spatial.KDTree(corners.xy).query(corners.xy, k=most)[1][:, 1:]
     apart = np.abs(np.angle(np.exp(1j * (corners.phase[near] - corners.phase[:, None]))))
     away = np.where(apart[..., None] < _ALIKE * np.pi, corners.xy[near] - corners.xy[:, None], np.inf)
     found: list[tuple[int, int, Array]] = []

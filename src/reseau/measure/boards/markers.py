@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import bdtr
 
 from ...core.data import Array, Frame
 from ...designs.boards import dictionary_cells, marker_cells, marker_dictionary
@@ -156,7 +156,7 @@ def find_tags(
     """Corners (m, 4, 2) of the tags of an AprilGrid, clockwise from the upper left, and their numbers."""
     words = marker_cells(design)[1]
     bits = (words.shape[1] - 2 * design.border_bits) ** 2
-    likely = 4 * len(words) * bdtr(np.arange(bits), bits, 0.5) < _CHANCE
+    likely = 4 * len(words) * scipy.special.bdtr(np.arange(bits), bits, 0.5) < _CHANCE
     most = min(int(_WRONG * words[0].size), max(int(likely.sum()) - 1, 0))
     rings = np.zeros((0, 4), dtype=np.intp)
     for search in SEARCHES:

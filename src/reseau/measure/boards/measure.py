@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ...core import vocabulary as v
 from ...core.data import Array, Frame, Mask, Rows
@@ -292,7 +292,7 @@ class CircleMarks(DiskMarks):
         self, image: Frame, screened: Screened, located: Located, options: ReseauOptions, size: float
     ) -> None:
         super().__init__(image, screened, located, options, size)
-        nearest = KDTree(self.xy).query(self.xy, k=2)[0][:, 1]
+        nearest = scipy.spatial.KDTree(self.xy).query(self.xy, k=2)[0][:, 1]
         self.free = float(nearest.min()) - size / 2
 
     def _region(self, rows: Rows, half: tuple[int, int]) -> Mask | None:

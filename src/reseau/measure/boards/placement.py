@@ -13,9 +13,8 @@ from itertools import product
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
-from scipy.special import bdtr
 
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure, Remark
@@ -302,7 +301,7 @@ def numbered(
             return Failure(
                 f"{wrong} of {total} dots are not as on the board where it fits best", Code.OTHER_DESIGN
             )
-        if puzzle and len(found) * bdtr(wrong, total, 0.5) > _CHANCE:
+        if puzzle and len(found) * scipy.special.bdtr(wrong, total, 0.5) > _CHANCE:
             return Failure(f"{total} dots are too few to tell which part it is", Code.NOT_IDENTIFIED)
     if score < _FITS * min(len(nodes), len(numbers)):
         return Failure(
@@ -586,11 +585,11 @@ def _nearest(
     if not len(saddles):
         return np.zeros(len(nodes), dtype=bool), np.zeros(len(nodes), dtype=np.intp)
     where, slopes = images_of(mapping, nodes), slope_of(mapping, nodes)
-    gap, row = KDTree(saddles.xy).query(where)
+    gap, row = scipy.spatial.KDTree(saddles.xy).query(where)
     pixels = apart * np.linalg.norm(slopes, axis=1).min(axis=1)
     # Do not extrapolate: the next corners are those beside what is known.
     support = np.concatenate([plane, nodes[known]])
-    close = KDTree(support).query(nodes)[0] < 1.8
+    close = scipy.spatial.KDTree(support).query(nodes)[0] < 1.8
     down = slopes * [1.0, -1.0]
     fits = bright_between(saddles.edges[row], down) != dark
     near = gap < np.minimum(_NEAR * pixels, _NEAR_PX + 0.03 * pixels)

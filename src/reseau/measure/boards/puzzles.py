@@ -14,8 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import bdtr
 
 from ...core.failure import Code, Failure
 from ...designs.dots import puzzle_maps
@@ -85,7 +85,10 @@ def part_of_code(nodes: NDArray[np.intp], bits: Bits, mirrored: bool) -> PuzzleP
     found.sort(key=lambda one: one[0])
     wrong, _, halves, turn = found[0]
     count = len(bits.sign)
-    if wrong > MISREAD * count or len(found) * PUZZLE_CODE**2 * bdtr(wrong, count, 0.5) > _CHANCE:
+    if (
+        wrong > MISREAD * count
+        or len(found) * PUZZLE_CODE**2 * scipy.special.bdtr(wrong, count, 0.5) > _CHANCE
+    ):
         return Failure(f"{count} dots do not show a part of the code of PuzzleBoards", Code.NOT_IDENTIFIED)
     # Every dot is misread with the same probability, by the rule of succession.
     lost = np.log((count - wrong + 1) / (wrong + 1))

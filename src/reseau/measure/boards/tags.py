@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask, Rows
 from .candidates import Saddles
@@ -74,7 +74,7 @@ def tag_outlines(grey: NDArray[np.float32], saddles: Saddles, weak: float, radiu
     # Seen from a corner, the interior of a tag is the sector from `leaves` to `arrives`, x into y: a cycle
     # that is clockwise in the image leaves along the former and arrives against the latter.
     leaves, arrives = (second + turn).ravel(), (first + np.pi + turn).ravel()
-    near = KDTree(saddles.xy).query(saddles.xy, k=min(_NEIGHBOURS + 1, count))[1][:, 1:]
+    near = scipy.spatial.KDTree(saddles.xy).query(saddles.xy, k=min(_NEIGHBOURS + 1, count))[1][:, 1:]
     limits, edge = (_AIMED, _PARALLEL, _STRONG), (_ALONG, _BESIDE, _EDGE)
     after = next_corners(grey, saddles.xy, saddles.strength, leaves, arrives, near, limits, edge)
     cycle = [np.arange(2 * count)]

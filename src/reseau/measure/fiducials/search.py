@@ -15,8 +15,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ...calibration import film_axes
 from ...core.data import Array, Rows
@@ -242,7 +242,7 @@ def _combined(
     expected: Array, candidates: list[tuple[Array, Array]], within: float, max_tilt_deg: float
 ) -> tuple[Array, Array] | None:
     """The candidates (n, 2) that best form a pattern, and their correlations (n,); None without three."""
-    trees = [KDTree(xy) if len(xy) else None for xy, _ in candidates]
+    trees = [scipy.spatial.KDTree(xy) if len(xy) else None for xy, _ in candidates]
     place = expected[:, 0] + 1j * expected[:, 1]
     extent = float(np.abs(place[:, None] - place).max())
     reach = _AWAY_PX + _AFFINE * extent

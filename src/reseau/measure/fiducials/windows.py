@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from ...core.data import Array, Mask
 from ...io import FiducialDesign
@@ -304,8 +304,8 @@ def _unit(found: Matches, by_grey: Array) -> tuple[Array, Array]:
     residuals = found.residuals[0]
     used = np.isfinite(residuals)
     v = np.where(used, residuals, 0.0)
-    weight = gaussian_filter(used.astype(np.float64), 4.0)
-    local = np.sqrt(gaussian_filter(v * v, 4.0) / np.maximum(weight, 1e-3))
+    weight = scipy.ndimage.gaussian_filter(used.astype(np.float64), 4.0)
+    local = np.sqrt(scipy.ndimage.gaussian_filter(v * v, 4.0) / np.maximum(weight, 1e-3))
     rms = float(np.sqrt((v * v).sum() / max(int(used.sum()), 1)))
     local = np.maximum(np.maximum(local, by_grey), max(0.3 * rms, 1e-9))
     return v / local, local

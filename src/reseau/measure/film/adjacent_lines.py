@@ -23,8 +23,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
-from scipy.special import ndtr
+import scipy
 
 from ...adjust import BatchOptions, adjust_batch
 from ...core.data import Array, Rows
@@ -172,7 +171,7 @@ def _unlike(found: EdgeProfiles, sharp: SharpSteps, sigmas: float) -> Array:
     """Significant differences from the width of a sharp step, logarithm (n,): of profiles or groups."""
     other, variance = found.blur[0] - sharp.log_width, found.blur[1] + sharp.texture**2
     size = min(_NEIGHBOURHOODS * NEIGHBOURS, len(other))
-    mean, own = (uniform_filter1d(values, size, mode="nearest") for values in (other, variance))
+    mean, own = (scipy.ndimage.uniform_filter1d(values, size, mode="nearest") for values in (other, variance))
     alone = np.abs(other) - sigmas * np.sqrt(variance)
     together = mean - sigmas * np.sqrt(own / _INDEPENDENT)
     return np.asarray(np.minimum(np.maximum(alone, together) - sharp.scatter, 1.0))
@@ -453,7 +452,7 @@ class _Model:
         each = x[:, _SHARED:].reshape(m, s, 4)
         steps = np.stack([p, q, q + x[:, 6, None]], axis=2)
         u = (self.at[None, :, :, None] - steps[:, :, None, :]) / w
-        phi = ndtr(u)
+        phi = scipy.special.ndtr(u)
         bell = each[:, :, None, 1:] * np.exp(-0.5 * u * u) / (np.sqrt(2 * np.pi) * -w)
         value = each[:, :, :1] + (each[:, :, None, 1:] * phi).sum(axis=3)
         jacobian = np.zeros((m, s, n, x.shape[1]))

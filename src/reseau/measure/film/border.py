@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from ...core.data import Array, Mask, Rows
 from ...io.scans import Scan
@@ -304,7 +304,7 @@ def _running(values: Array) -> Array:
     if not np.isfinite(values).any():
         return values
     filled = np.where(np.isfinite(values), values, np.nanmedian(values))
-    return np.asarray(median_filter(filled, size=_RUNNING, mode="nearest"))
+    return np.asarray(scipy.ndimage.median_filter(filled, size=_RUNNING, mode="nearest"))
 
 
 def border_of(grey: Array, band: Band, reach: float, gap: float, film: Film | None = None) -> Border | None:
@@ -390,7 +390,7 @@ def _ground(tones: Array, outer: Mask, band: Band, film: Film | None, between: t
     over = max(1, round(_ALONG / band.columns))
     # Medians, because a scratch that crosses the edge is a few columns wide.
     rest = np.where(np.isfinite(tones), tones - level[:, None], 0.0)
-    smooth = median_filter(rest, size=(over | 1, 1), mode="nearest")
+    smooth = scipy.ndimage.median_filter(rest, size=(over | 1, 1), mode="nearest")
     return _Ground(level, smooth, _spread(smooth, outer) if film is None else film.noise, foreign)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import median_filter
+import scipy
 
 from ...core.data import Array, Mask
 from .adjacent_lines import (
@@ -323,7 +323,7 @@ def _only_inwards(inward: Array, agree: Mask) -> bool:
 
 def _straight(place: Array, inward: Array) -> Mask:
     """Mask of profiles outside rounded corners, where the edge turns inwards significantly."""
-    turned = median_filter(inward, size=min(9, len(inward)), mode="nearest") > _TURNED
+    turned = scipy.ndimage.median_filter(inward, size=min(9, len(inward)), mode="nearest") > _TURNED
     keep = np.ones(len(place), dtype=bool)
     for order in (np.arange(len(place)), np.arange(len(place))[::-1]):
         straight = np.flatnonzero(~turned[order])

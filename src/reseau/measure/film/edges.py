@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter1d
-from scipy.special import ndtr
+import scipy
 
 from ...adjust import BatchAdjustment, BatchOptions, adjust_batch, weight_function
 from ...core.data import Array, Mask, Rows
@@ -303,7 +302,7 @@ def _of_contrast(
     low = tone.light(level)
     rise = (tone.light(level + top) - low) / border.contrast
     # The noise of light depends on the expected grey value.
-    expected = tone.grey(low + rise * border.contrast * ndtr(distance / form.width))
+    expected = tone.grey(low + rise * border.contrast * scipy.special.ndtr(distance / form.width))
     return (tone.light(value) - low) / rise, rise / tone.slope(expected)
 
 
@@ -355,14 +354,14 @@ def _own_width(found: Array, cofactor: Array, known: float, spread: float, good:
     weight = np.where(good, share / np.maximum(cofactor, 1e-9), 1e-9)
     alone = np.where(good, np.clip((found - known) / share, -1.0, 1.0), 0.0)
     size = min(NEIGHBOURS, len(found))
-    total = np.maximum(uniform_filter1d(weight, size, mode="nearest"), 1e-9)
-    mean = uniform_filter1d(weight * alone, size, mode="nearest") / total
+    total = np.maximum(scipy.ndimage.uniform_filter1d(weight, size, mode="nearest"), 1e-9)
+    mean = scipy.ndimage.uniform_filter1d(weight * alone, size, mode="nearest") / total
     return np.stack([known + mean, 1 / (size * total)])
 
 
 def _along(values: Array) -> Array:
     """Running median over neighbouring profiles."""
-    return np.asarray(median_filter(values, size=min(NEIGHBOURS, len(values)), mode="nearest"))
+    return np.asarray(scipy.ndimage.median_filter(values, size=min(NEIGHBOURS, len(values)), mode="nearest"))
 
 
 def merged(fine: EdgeProfiles, wide: EdgeProfiles) -> EdgeProfiles:

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from ...core.data import Array
 from .border import best_line, likelihood
@@ -136,7 +136,7 @@ def settled(guess: FrameGuess, grey: Plane) -> FrameGuess:
 def _running(values: Array, level: float) -> Array:
     """Running median of values (n,) along an edge, because the scanner's light may be uneven."""
     filled = np.where(np.isfinite(values), values, level)
-    return np.asarray(median_filter(filled, size=31, mode="nearest"))
+    return np.asarray(scipy.ndimage.median_filter(filled, size=31, mode="nearest"))
 
 
 def _moved(corners: Array, ends: Array) -> Array:

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
+import scipy
 
 from ...core.data import Array, Rows
 from ...core.tone import ToneCurve
@@ -183,7 +183,7 @@ def _linear(distance: Array, form: StepForm | None) -> Any:
         away = distance[rows] - p
         first = 0 if plain else 1
         u = (away / w)[:, :, None] - shifts[first:]
-        phi, bell = ndtr(u), np.exp(-0.5 * u * u) / _ROOT
+        phi, bell = scipy.special.ndtr(u), np.exp(-0.5 * u * u) / _ROOT
         height = steps[..., first:]
         jacobian = np.empty((*away.shape, x.shape[1]))
         jacobian[..., 0] = -(height * bell).sum(axis=2) / w
@@ -217,7 +217,7 @@ def _formed(t: Array, w: Array, a: Array, h: float) -> tuple[Array, Array, Array
     root = np.sqrt(variance**2 + 4 * _LEAST_VARIANCE**2)
     sigma, soft = np.sqrt((variance + root) / 2), (1 + variance / root) / 2
     u = (t[..., None] + h * np.array([-3.0, -1.0, 1.0, 3.0])) / sigma[..., None]
-    phi, bell = ndtr(u), np.exp(-0.5 * u * u) / _ROOT
+    phi, bell = scipy.special.ndtr(u), np.exp(-0.5 * u * u) / _ROOT
     integral = sigma[..., None] * (u * phi + bell)
     share = np.concatenate([-a, 3 * a - 1, 1 - 3 * a, a], axis=1)[:, None, :] / (2 * h)
     step, along, by_sigma = ((part * share).sum(axis=2) for part in (integral, phi, bell))

@@ -14,12 +14,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.fft import irfft2, next_fast_len, rfft2
 
 from ...core.data import Array, Mask, Rows
 from ..compiled_filter import filtered
-from .compiled_errors import by_class, of_neighbours, products, standardised, weighted
 from .matches import Matches
 
 __all__ = ["with_alike_errors"]
@@ -97,21 +96,24 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
         if not _neighbours(unit, shown, activity, free, both_ways=centres is not None):
             return found
     limits = _limits(activity, shown, np.arange(1, _CLASSES) / _CLASSES)
-    variance = by_class(unit, shown, activity, limits, free)
+    variance = _by_class(unit, shown, activity, limits, free)
     correlation = _correlation(unit, shown, free)
     # The errors that a pixel has in common with those around it, weighted by their influence.
     kernel = np.zeros((2 * _LAGS + 1,) * 2, np.float32)
     kernel[_LAGS, _LAGS] = 1.0
     for (down, right), r in correlation.items():
         kernel[_LAGS + down, _LAGS + right] = kernel[_LAGS - down, _LAGS - right] = r
-    k, _, high, broad = found.influence.shape
+    plain = found.influence * found.noise[:, None, None, None]
+    known = np.isfinite(plain).all(axis=(1, 2, 3))[:, None, None, None]
+    plain = np.where(known, plain, 0.0)
+    own = plain * np.sqrt(variance)[_classes(_activity(found.influence), limits)][:, None]
+    largest = np.abs(own).max(axis=(1, 2, 3), initial=0.0)
+    largest = np.where(largest > 0, largest, 1.0)[:, None, None, None]
+    own = (own / largest).astype(np.float32)
     # Beside the windows are no errors.
-    wide = np.zeros((k, 2, high + 2 * _LAGS, broad + 2 * _LAGS), np.float32)
-    largest, plain = np.empty(k), np.empty((k, 2, 2))
-    classes = limits, np.sqrt(variance)
-    weighted(found.influence, found.noise, classes, _SPREAD, wide, (largest, plain))
-    together = filtered(wide.reshape(-1, *wide.shape[2:]), kernel).reshape(found.influence.shape)
-    extra = products(wide, together) * largest[:, None, None] ** 2 - plain
+    wide = np.pad(own, ((0, 0), (0, 0), (_LAGS, _LAGS), (_LAGS, _LAGS)))
+    together = filtered(wide.reshape(-1, *wide.shape[2:]), kernel).reshape(own.shape)
+    extra = _products(own, together) * largest[:, 0] ** 2 - _products(plain, plain)
     extra = (extra + np.swapaxes(extra, 1, 2)) / 2
     # Errors that cancel each other, as after sharpening, are not relied upon without further evidence.
     cov, least = found.cov + extra, found.cov if centres is None else _CANCELLED * found.cov
@@ -126,13 +128,47 @@ def _prepared(found: Matches, rows: Rows, centres: Array | None) -> tuple[Array,
     See :func:`with_alike_errors` for `centres`. An image is reflected at the half pixel that is nearest to
     its point.
     """
-    shape = len(rows), *found.residuals.shape[1:]
-    shifts = np.zeros((0, 2), np.int64)
+    unit = found.residuals[rows] / np.maximum(found.noise[rows], 1e-300)[:, None, None]
     if centres is not None:
-        shifts = np.rint(2 * (found.xy[rows] - centres)).astype(np.int64)
-    unit, used, activity = np.empty(shape, np.float32), np.empty(shape, bool), np.empty(shape, np.float32)
-    standardised(rows, found.residuals, found.noise, found.influence, shifts, _SPREAD, (unit, used, activity))
-    return unit, used, activity
+        right, down = np.rint(2 * (found.xy[rows] - centres)).astype(np.intp).T[:, :, None]
+        high, wide = unit.shape[1:]
+        across, other = np.arange(high)[::-1] + down, np.arange(wide)[::-1] + right
+        there = ((across >= 0) & (across < high))[:, :, None] & ((other >= 0) & (other < wide))[:, None]
+        at = np.arange(len(rows))[:, None, None], across[:, :, None] % high, other[:, None] % wide
+        unit = np.where(there, unit - unit[at], np.nan) / np.sqrt(2)
+    used = np.isfinite(unit)
+    return np.where(used, unit, 0.0).astype(np.float32), used, _activity(found.influence[rows])
+
+
+def _activity(influence: Array) -> Array:
+    """Mean square influence (k, r, c) of pixels and those around them on a position; at most 1."""
+    found = np.square(influence, dtype=np.float32).sum(axis=1)
+    for axis in (1, 2):
+        found = scipy.ndimage.uniform_filter1d(found, _SPREAD, axis)
+    return np.asarray(found / np.maximum(found.max(axis=(1, 2), keepdims=True), 1e-30))
+
+
+def _classes(activity: Array, limits: Array) -> Rows:
+    """Number of the limits that each value reaches."""
+    return np.searchsorted(limits, activity, side="right")
+
+
+def _by_class(values: Array, used: Mask, activity: Array, limits: Array, free: Array) -> Array:
+    """Variances (c,) of pixels (m, r, c) by the class of their activity; 1 for a class without pixels.
+
+    `values` are divided by their roots; `free` are redundancy numbers.
+    """
+    kind, count = _classes(activity, limits), len(limits) + 1
+    squares, degrees = (np.bincount(kind[used], of[used], count) for of in (values.astype(float) ** 2, free))
+    variance = np.where(degrees > 0, squares / np.maximum(degrees, 1.0), 1.0)
+    values /= np.maximum(np.sqrt(variance), 1e-6)[kind]
+    return variance
+
+
+def _products(one: Array, other: Array) -> Array:
+    """Scalar products (k, 2, 2) of windows (k, 2, r, c)."""
+    flat = len(one), 2, -1
+    return np.asarray(one.reshape(flat) @ np.swapaxes(other.reshape(flat), 1, 2), np.float64)
 
 
 def _limits(activity: Array, shown: Mask, share: float | Array) -> Array:
@@ -165,13 +201,17 @@ def _neighbours(unit: Array, shown: Mask, activity: Array, free: Array, both_way
     formed image lacks, which is alike in all marks and symmetric.
     """
     most = float(_limits(activity, shown, 0.5)[0])
-    side, pairs, above, columns, squares, count = of_neighbours(unit, shown, activity, most)
+    even = shown & (activity <= most)
+    quiet = np.where(even, unit, 0.0)
+    squares, count = float(np.vdot(quiet, quiet)), np.count_nonzero(even)
     if not squares > 0:
         return False
     # Residuals are smaller than errors by what the adjustment has taken from them.
-    taken = 1 - float(free[shown & (activity <= most)].mean())
+    taken = 1 - float(free[even].mean())
     power = squares / count / (1 - taken)
-    for total, number in ((side, pairs), (above, columns)):
+    for before, after in ((np.s_[:, :, :-1], np.s_[:, :, 1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        total = float((quiet[before] * quiet[after]).sum())
+        number = np.count_nonzero(even[before] & even[after])
         r = total / max(number, 1) / power + _TAKEN * taken
         if (abs(r) if both_ways else r) > max(_LEAST, _SIGNIFICANT / np.sqrt(max(number, 1))):
             return True
@@ -203,8 +243,8 @@ def _lag_sums(windows: NDArray[Any]) -> Array:
     Negative distances are counted from the end. By the theorem of Wiener and Khinchin these are the transform
     of the power spectrum, of windows with as many zeros beside them.
     """
-    size = [next_fast_len(n + _LAGS, real=True) for n in windows.shape[1:]]
-    spectrum = rfft2(windows, size)
+    size = [scipy.fft.next_fast_len(n + _LAGS, real=True) for n in windows.shape[1:]]
+    spectrum = scipy.fft.rfft2(windows, size)
     power = np.einsum("kij,kij->ij", spectrum.real, spectrum.real)
     power += np.einsum("kij,kij->ij", spectrum.imag, spectrum.imag)
-    return np.asarray(irfft2(power, size))
+    return np.asarray(scipy.fft.irfft2(power, size))

@@ -17,11 +17,11 @@ from ...adjust import BatchAdjustment, BatchOptions, BatchReason, adjust_batch
 from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
 from ...optics.formation import Outline
-from .compiled import ACTIVE, DONE, FAILED, STALE, adjusted, advanced, influenced, linearised
+from .compiled import ACTIVE, DONE, FAILED, STALE, advanced, influenced, linearised
 from .matches import Matches, matches_of, with_rows
 from .noise import medians
 from .patches import CONTRAST, SHARPEST, WIDTH, MatchOptions, Patches, X, Y
-from .shapes import GrownOutline, Shape, ShapeSubset, outlines_of
+from .shapes import GrownOutline, Shape, ShapeSubset
 
 __all__ = ["SIZE", "match"]
 
@@ -229,7 +229,11 @@ def _continued(
     weights = patch.weights * patch.relative_weights / noise**2
     options = BatchOptions(share=patch.options.settled, max_iterations=_FIRST, damping=1e-5)
     jitter = patch.options.row_jitter_px
-    found, rows = _compiled(patch, start, free, noise, weights, options)
+    found, rows = None, np.arange(len(start))
+    if patch.single:
+        assert patch.first is not None
+        found = _iterated(patch, rows, start, start, patch.first, weights, free, options, noise)
+        rows = np.flatnonzero(found.reasons == BatchReason.MAX_ITERATIONS)
     if found is not None and least is not None and len(rows):
         rows = rows[patch.correlation(found.estimates, rows) >= least[0][rows]]
     if found is not None and len(rows) and jitter == 0:
@@ -288,44 +292,6 @@ def _trimmed(
         again = _iterated(patch, some, at, start[some], patch.slopes(at, some), weighted, free, options)
         found = with_rows(found, some, again)
     return found, kept
-
-
-def _compiled(
-    patch: Patches, start: Array, free: Array, noise: float, weights: Array, options: BatchOptions
-) -> tuple[BatchAdjustment | None, Rows]:
-    """The adjustment of :func:`_continued` by compiled code, and the rows that it leaves."""
-    every = np.arange(len(start))
-    assert patch.first is not None
-    if not patch.single:
-        return None, every
-    outlines = outlines_of(patch.form, every)
-    if outlines is None:
-        found = _iterated(patch, every, start, start, patch.first, weights, free, options, noise)
-        return found, np.flatnonzero(found.reasons == BatchReason.MAX_ITERATIONS)
-    share, slopes = patch.first
-    (k, n), (plain, at) = patch.grey.shape, outlines
-    work = _Iteration(patch, start, options, noise)
-    patch.shares = share.copy()
-    with one_thread():
-        adjusted(
-            patch.shares,
-            slopes.reshape(k, -1, n),
-            (plain.nodes.xy, plain.nodes.dxy, plain.generators.astype(np.float32), at),
-            patch.xy - np.stack([patch.window.columns[:, 0], patch.window.rows[:, 0]], axis=1),
-            patch.options.response.fill,
-            patch.grey,
-            weights,
-            work.window,
-            work.light,
-            SHARPEST * patch.psf,
-            1 / free**2,
-            options.share,
-            options.max_iterations - 1,
-            work.x,
-            (work.residuals, work.cofactor, work.rounds, work.iteration, work.state),
-            work.influence,
-        )
-    return work.finished(patch, every, weights, free), np.flatnonzero(work.left)
 
 
 class _Iteration:

@@ -9,7 +9,6 @@ import numpy as np
 
 from ...adjust import BatchAdjustment
 from ...core.data import Array, Mask, Rows
-from .compiled import compared
 from .patches import CONTRAST, LEVEL, Patches
 
 __all__ = ["Matches", "matches_of", "with_rows"]
@@ -126,12 +125,20 @@ def matches_of(
     """Columns of results from the adjusted batch; `share` as formed last, and influences, if known."""
     x, k = found.estimates, len(patch.xy)
     flat = (patch.share(x) if share is None else share).reshape(k, -1)
-    monomials, dark = np.ascontiguousarray(patch.monomials.T), patch.options.polarity == "dark"
-    correlation, count, seen, rejected = compared(
-        patch.grey, x, monomials, flat, patch.weights, used, patch.near, dark
-    )
+    plane = x[:, patch.ground] @ patch.monomials.T
+    formed = -plane * flat if patch.options.polarity == "dark" else flat
+    whole = np.maximum((flat * patch.near).sum(axis=1), 1e-12)
+    seen, unused = ((flat * each).sum(axis=1) / whole for each in (patch.weights, patch.weights - used))
+    # Without the background.
+    count = used.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         cov = found.covariance
+        one, other = (
+            np.where(used, each - np.where(used, each, 0.0).sum(axis=1, keepdims=True) / count[:, None], 0.0)
+            for each in (patch.grey - plane, formed)
+        )
+        squares = (one * one).sum(axis=1) * (other * other).sum(axis=1)
+        correlation = (one * other).sum(axis=1) / np.sqrt(squares)
         t = correlation * np.sqrt(np.maximum(count - patch.form_at, 1) / (1 - correlation**2))
     influence, leverage = np.zeros((k, 2, 0, 0)), np.zeros((k, 0, 0))
     if influences is not None:
@@ -149,7 +156,7 @@ def matches_of(
         noise=found.sigma0 * scale,
         correlation=np.nan_to_num(correlation),
         seen=seen,
-        rejected=rejected,
+        rejected=unused,
         converged=found.converged & np.isfinite(cov[:, :2, :2]).all(axis=(1, 2)),
         residuals=np.where(used, found.residuals, np.nan).reshape(patch.shape),
         form_sigma=np.sqrt(np.diagonal(cov, axis1=1, axis2=2)[:, patch.form_at :]),

@@ -75,11 +75,11 @@ def grey_variance(pixels: NDArray[Any], start: Array, residuals: Array) -> tuple
     return (float(a), float(b)) if b > _SIGNIFICANT * sigma else None
 
 
-def relative_weights(grey: Array, variance: tuple[float, float]) -> Array:
-    """Relative weights (k, n) of grey values, about 1 on average in each patch."""
-    expected = variance[0] + variance[1] * grey
-    mean = np.maximum(expected.mean(axis=1, keepdims=True), 1e-12)
-    weights: Array = 1 / np.maximum(expected / mean, LEAST)
+def relative_weights(grey: Array, variance: tuple[float, float], used: Mask | None = None) -> Array:
+    """Relative weights (k, n) of grey values, about 1 on average of those in use in each patch."""
+    expected, used = variance[0] + variance[1] * grey, np.ones(grey.shape, bool) if used is None else used
+    mean = np.where(used, expected, 0.0).sum(axis=1) / np.maximum(used.sum(axis=1), 1)
+    weights: Array = 1 / np.maximum(expected / np.maximum(mean, 1e-12)[:, None], LEAST)
     return weights
 
 

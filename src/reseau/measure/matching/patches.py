@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
 from ...optics.formation import PixelResponse
-from .compiled import cut, weighed
-from .noise import LEAST, medians, relative_weights
+from .noise import medians, relative_weights
 from .shapes import Shape, Window
 
 __all__ = ["CONTRAST", "LEVEL", "SHARPEST", "WIDTH", "MatchOptions", "Patches", "X", "Y"]
@@ -109,6 +108,14 @@ class MatchOptions:
         return (self.half_px, self.half_px) if isinstance(self.half_px, int) else self.half_px
 
 
+def windows(values: NDArray[Any], centre: Rows, half: tuple[int, int]) -> NDArray[Any]:
+    """Values (k, r, c) of windows around pixels `centre` (k, 2); beyond the frame those of its border."""
+    (h, w), (right, down) = values.shape, half
+    rows = np.clip(centre[:, 1:] + np.arange(-down, down + 1), 0, h - 1)
+    columns = np.clip(centre[:, :1] + np.arange(-right, right + 1), 0, w - 1)
+    return values[rows[:, :, None], columns[:, None]]
+
+
 class Patches:
     """Windows of a frame, and the images formed in them."""
 
@@ -141,8 +148,11 @@ class Patches:
         self.window = Window(columns.astype(float), rows.astype(float), options.response, region)
         k = len(xy)
         self.shape = (k, len(down), len(right))
-        self.grey, self.weights = np.empty((2, k, len(down) * len(right)))
-        cut(pixels, valid, self.centre, options.half, self.grey, self.weights)
+        self.grey = windows(pixels, self.centre, options.half).reshape(k, -1).astype(np.float64)
+        inside = ((rows >= 0) & (rows < len(pixels)))[:, :, None] & (
+            (columns >= 0) & (columns < pixels.shape[1])
+        )[:, None]
+        self.weights = (windows(valid, self.centre, options.half) & inside).reshape(k, -1).astype(np.float64)
         if others is not None:
             self.grey -= others.reshape(k, -1)
         self.near: Mask = np.ones(self.grey.shape, dtype=bool)
@@ -185,10 +195,8 @@ class Patches:
         else:
             x[:, CONTRAST], x[:, self.ground] = light
         if self.options.variance is not None:
-            share, dark = self.first[0].reshape(len(x), -1), self.options.polarity == "dark"
-            self.relative_weights = weighed(
-                *(x, share, self.weights, self.terms, dark, self.options.variance, LEAST)
-            )
+            grey = self._grey(x, self.first[0]).reshape(len(x), -1)
+            self.relative_weights = relative_weights(grey, self.options.variance, self.weights > 0)
         return x
 
     @property

@@ -16,7 +16,7 @@ from ...core.threads import one_thread
 from ...optics.compiled import formed
 from ...optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
 
-__all__ = ["FormedShape", "GrownOutline", "Shape", "ShapeSubset", "Window", "outlines_of"]
+__all__ = ["FormedShape", "GrownOutline", "Shape", "ShapeSubset", "Window"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,28 +252,3 @@ class FormedShape:
         if same and (np.abs(width - wide) <= 1e-9 * wide).all():
             return self.share[some], self.slopes[some]
         return self.shape.derivatives(xy, width, form, at, window)
-
-
-def outlines_of(shape: Shape, rows: Rows) -> tuple[GrownOutline, Rows] | None:
-    """Outlines in single precision, with common generators, and their indices for the marks `rows`.
-
-    Returns
-    -------
-    (GrownOutline, ndarray of int) or None
-        None for other shapes.
-
-    Examples
-    --------
-    >>> disk = Outline.circle(2.0, 0.5).single()
-    >>> plain = GrownOutline(Outline(disk.xy[None], disk.dxy[None]), np.zeros((0, 2, 2)))
-    >>> found = outlines_of(ShapeSubset(plain, np.array([0, 0])), np.array([1]))
-    >>> found[0] is plain, found[1].tolist()
-    (True, [0])
-    """
-    if isinstance(shape, FormedShape):
-        return outlines_of(shape.shape, rows)
-    if isinstance(shape, ShapeSubset):
-        return outlines_of(shape.whole, shape.rows[rows])
-    if not isinstance(shape, GrownOutline) or shape.generators.ndim != 3:
-        return None
-    return (shape, rows) if shape.nodes.xy.dtype == np.float32 else None

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+import scipy
 
 from ...core.data import Array, Rows
 from ...optics import Arcs
@@ -150,7 +150,7 @@ def _blurred(arcs: Arcs, xy: Array, columns: Array, lines: Array, blur: Array) -
     inner = slice(pad * n, -pad * n if pad else None, n)
     found = np.stack(
         [
-            gaussian_filter(one, n * width, mode="nearest", truncate=4.0)[inner, inner]
+            scipy.ndimage.gaussian_filter(one, n * width, mode="nearest", truncate=4.0)[inner, inner]
             for one, width in zip(light, np.sqrt(variance), strict=True)
         ]
     )

@@ -13,8 +13,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from ...core.data import Array, Rows
 
@@ -254,7 +254,7 @@ def _claimed(owner: NDArray[np.int32]) -> NDArray[np.int32]:
     """Regions extended by a few pixels, each pixel assigned to the nearest."""
     if not (owner >= 0).any():
         return owner
-    distance, (row, column) = distance_transform_edt(owner < 0, return_indices=True)
+    distance, (row, column) = scipy.ndimage.distance_transform_edt(owner < 0, return_indices=True)
     claimed: NDArray[np.int32] = np.where(distance <= _CLAIM_PX, owner[row, column], -1).astype(np.int32)
     return claimed
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ...core.data import Array, Frame, Mask, Rows
 from .echoes import Echoes, Grey
@@ -199,7 +199,9 @@ def find_cuts(light: Grey, noise: float, most_px: int) -> Mask:
     upright &= _soft_around(light, labels.astype(np.int32), count)
     # Wires are far apart; between the strokes of characters gaps are close together.
     at = np.flatnonzero(stats[:, cv2.CC_STAT_HEIGHT] >= 3)[1:]
-    crowd = KDTree(centres[at]).query_ball_point(centres[at], _APART_PX, p=np.inf, return_length=True)
+    crowd = scipy.spatial.KDTree(centres[at]).query_ball_point(
+        centres[at], _APART_PX, p=np.inf, return_length=True
+    )
     upright[at[crowd > 2]] = False
     # The blur of the wire's edges extends one pixel further.
     cut = cv2.dilate(upright[labels].astype(np.uint8), np.ones((3, 3), np.uint8))

@@ -11,7 +11,7 @@ The blur is estimated from the edges of the wires.
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import ndtr
+import scipy
 
 from ...core.data import Array, Mask
 from .echoes import Grey
@@ -161,17 +161,15 @@ def _blur_across(grey: Grey, hidden: Mask, noise: float) -> tuple[float, float] 
     centre = np.clip((shares * offsets).sum(axis=1) / np.maximum(shares.sum(axis=1), 1e-3), -_OFF_PX, _OFF_PX)
     values = np.array([usual / 3, 1.0, 1.0, 0.0])
 
-    from scipy.optimize import least_squares  # a fifth of the time of importing
-
     def rest(values: Array) -> Array:
         half, blur, height, level = values
         x = offsets - centre[:, None]
-        bar = ndtr((x + half) / blur) - ndtr((x - half) / blur)
+        bar = scipy.special.ndtr((x + half) / blur) - scipy.special.ndtr((x - half) / blur)
         return np.asarray((height * bar + level - shares).ravel())
 
     # Errors of the centres would blur the mean of the profiles: each is adjusted to its edges.
     for _ in range(_ROUNDS):
-        fit = least_squares(
+        fit = scipy.optimize.least_squares(
             rest,
             values,
             bounds=([0.3, 0.2, 0.5, -0.5], [usual, _MOST_BLUR_PX, 2.0, 0.5]),

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from ...core.data import Array, Rows
 from ...core.failure import Code
@@ -74,8 +75,6 @@ def cut_segments(
     >>> cuts.row, cuts.share.round(3)
     (array([0]), array([0.4]))
     """
-    from scipy.optimize import linear_sum_assignment  # a fifth of the time of importing
-
     count = len(segments)
     none = np.full(count, np.nan)
     row = np.full(count, -1)
@@ -103,7 +102,7 @@ def cut_segments(
     beyond = np.abs(share - np.clip(share, 0, 1)) > _BEYOND + np.minimum(3 * sigma, _BEYOND)
     cost = np.where(beyond | (across > gate_px), 2.0, across / gate_px)
     why = Reason("no echo on its segment", Code.NOT_FOUND).repeated(count)
-    mine, theirs = linear_sum_assignment(cost) if xy.size else (row[:0], row[:0])
+    mine, theirs = scipy.optimize.linear_sum_assignment(cost) if xy.size else (row[:0], row[:0])
     for wire, echo in zip(mine, theirs, strict=True):
         if cost[wire, echo] > 1:
             continue

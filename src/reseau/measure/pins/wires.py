@@ -12,8 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import KDTree
-from scipy.special import gammaln
+import scipy
 
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
@@ -75,7 +74,7 @@ class Wires:
     def spacing(self) -> float:
         """Median distance of a point to its nearest neighbour."""
         points = self.start[self.fixed]
-        return float(np.median(KDTree(points).query(points, k=2)[0][:, 1]))
+        return float(np.median(scipy.spatial.KDTree(points).query(points, k=2)[0][:, 1]))
 
 
 @dataclass(frozen=True)
@@ -235,7 +234,7 @@ def _supported(wires: Wires, seen: Array, layout: Layout, positions: float) -> L
     chance = np.log(positions) + _log_choose(n, m) + (m - 2) * np.log(near)
     half = m - 3.0
     ball = m * (max(layout.rms_px, _EXACT_PX) / gate) ** 2
-    chance += min(half * np.log(ball) - float(gammaln(half + 1)), 0.0)
+    chance += min(half * np.log(ball) - float(scipy.special.gammaln(half + 1)), 0.0)
     askew = np.flatnonzero(~fixed)
     met = askew[layout.row[askew] >= 0]
     if len(askew):
@@ -254,7 +253,9 @@ def _supported(wires: Wires, seen: Array, layout: Layout, positions: float) -> L
 
 
 def _log_choose(n: int, m: int) -> float:
-    return float(gammaln(n + 1) - gammaln(m + 1) - gammaln(n - m + 1))
+    return float(
+        scipy.special.gammaln(n + 1) - scipy.special.gammaln(m + 1) - scipy.special.gammaln(n - m + 1)
+    )
 
 
 def _hypotheses(
@@ -265,7 +266,7 @@ def _hypotheses(
     far = np.argsort(-np.hypot(*(points[first] - points[second]).T), kind="stable")[:_BASES]
     first, second = first[far], second[far]
     i, j = np.nonzero(~np.eye(len(seen), dtype=bool))
-    z, tree = seen[:, 0] + 1j * seen[:, 1], KDTree(seen)
+    z, tree = seen[:, 0] + 1j * seen[:, 1], scipy.spatial.KDTree(seen)
     found: list[tuple[float, complex, Array, bool]] = []
     for mirror in (True, False) if o.mirrored is None else (o.mirrored,):
         p = points[:, 0] + (-1j if mirror else 1j) * points[:, 1]
@@ -331,19 +332,15 @@ def nearest_pairs(predicted: Array, seen: Array, gate: float) -> tuple[Rows, Row
     mine, theirs : ndarray of int (k,)
         Indices of the paired points and detections.
     """
-    from scipy.optimize import linear_sum_assignment  # a fifth of the time of importing
-
     distance = np.hypot(*np.moveaxis(predicted[:, None] - seen[None], -1, 0))
     cost = np.minimum(distance / gate, 1.0) ** 2
-    mine, theirs = linear_sum_assignment(cost)
+    mine, theirs = scipy.optimize.linear_sum_assignment(cost)
     near = distance[mine, theirs] < gate
     return mine[near], theirs[near]
 
 
 def _read_segments(wires: Wires, seen: Array, layout: Layout) -> None:
     """Assign to the segments detections that lie on them and belong to no point."""
-    from scipy.optimize import linear_sum_assignment  # a fifth of the time of importing
-
     askew = np.flatnonzero(~wires.fixed)
     free = np.setdiff1d(np.arange(len(seen)), layout.row)
     if not len(askew) or not len(free):
@@ -356,6 +353,6 @@ def _read_segments(wires: Wires, seen: Array, layout: Layout) -> None:
     distance = np.hypot(*np.moveaxis(offset - foot, -1, 0))
     beyond = np.abs(share - np.clip(share, 0, 1)) > _BEYOND
     cost = np.where(beyond, 2.0, np.minimum(distance / layout.gate_px, 2.0))
-    mine, theirs = linear_sum_assignment(cost)
+    mine, theirs = scipy.optimize.linear_sum_assignment(cost)
     good = cost[mine, theirs] < 1
     layout.row[askew[mine[good]]] = free[theirs[good]]

@@ -10,8 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
-from scipy.spatial import KDTree
+import scipy
 
 from ...core.data import Array, Mask, Rows
 from ...optics.field import SmoothField, monomials, trend_degree
@@ -79,7 +78,7 @@ def _usual(t: Array, marks: int) -> float:
 
 def spacing(xy: Array) -> float:
     """Median distance of a point to its nearest neighbour."""
-    return float(np.median(KDTree(xy).query(xy, k=2)[0][:, 1]))
+    return float(np.median(scipy.spatial.KDTree(xy).query(xy, k=2)[0][:, 1]))
 
 
 def assign(
@@ -135,7 +134,7 @@ def _assigned(
     """Assign candidates to marks whose approximate positions are wrong by a smooth distortion only."""
     centre = _densest(start, candidates, pitch)
     far = np.hypot(*(start - centre).T)
-    tree, predicted, gate = KDTree(candidates.xy), start, widest
+    tree, predicted, gate = scipy.spatial.KDTree(candidates.xy), start, widest
     field: SmoothField | None = None
     rows = np.full(len(start), -1)
     for step, most in enumerate((1, 1, 2, 3, 3, 5, 5, 5)):
@@ -203,21 +202,21 @@ def voted(
         centres.append(np.linspace(low, high, 2 * count + 1)[1::2])
     # Without values `bincount` counts in integers.
     votes = np.bincount(index, weight, minlength=bins[0] * bins[1]).astype(np.float64).reshape(bins)
-    smooth: Array = gaussian_filter(votes, blur, mode="constant", truncate=3.0)
+    smooth: Array = scipy.ndimage.gaussian_filter(votes, blur, mode="constant", truncate=3.0)
     return smooth, (centres[0], centres[1])
 
 
 def _densest(start: Array, candidates: Candidates, pitch: float) -> Array:
     """Position of a mark most of whose neighbours have a candidate at their predicted places."""
-    has = KDTree(candidates.xy).query(start)[0] < 0.2 * pitch
-    near = KDTree(start).query(start, k=min(9, len(start)))[1]
+    has = scipy.spatial.KDTree(candidates.xy).query(start)[0] < 0.2 * pitch
+    near = scipy.spatial.KDTree(start).query(start, k=min(9, len(start)))[1]
     score = has[near].sum(axis=1) - 1e-3 * np.hypot(*(start - start.mean(axis=0)).T) / pitch
     centre: Array = start[score.argmax()]
     return centre
 
 
 def nearest_candidates(
-    tree: KDTree, candidates: Candidates, predicted: Array, gate: float, reached: Mask
+    tree: scipy.spatial.KDTree, candidates: Candidates, predicted: Array, gate: float, reached: Mask
 ) -> Rows:
     """Likeliest candidate within the search radius of each mark: strong, and near."""
     distance, row = tree.query(predicted, k=min(4, len(candidates)), distance_upper_bound=gate)

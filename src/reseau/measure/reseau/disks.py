@@ -7,8 +7,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask
 from .components import part_sums
@@ -122,7 +122,7 @@ def _parts(mask: Mask, contrast: NDArray[Any], side: int) -> tuple[Array, Array,
 def _once(xy: Array, radius: Array, quality: Array) -> Mask:
     """Mask that keeps the most elliptic of components found in squares of several sizes."""
     keep = np.ones(len(xy), dtype=bool)
-    near = KDTree(xy).query_ball_point(xy, 0.5 * radius)
+    near = scipy.spatial.KDTree(xy).query_ball_point(xy, 0.5 * radius)
     for k in np.argsort(-quality, kind="stable"):
         if keep[k]:
             keep[near[k]] = False

@@ -12,8 +12,8 @@ from itertools import chain
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask
 from ...optics.field import SmoothField, monomials, trend_degree
@@ -127,7 +127,7 @@ def place_grid(source: Array, candidates: Candidates, valid: Mask, options: Grid
 
 def _supported(starts: list[Array], candidates: Candidates, usual: float, count: int) -> list[Array]:
     """The start positions near which most marks have a candidate that is as strong as marks usually are."""
-    tree, likeness = KDTree(candidates.xy), np.minimum(candidates.t / usual, 1.0)
+    tree, likeness = scipy.spatial.KDTree(candidates.xy), np.minimum(candidates.t / usual, 1.0)
     support = []
     for start in starts:
         distance, row = tree.query(start)
@@ -212,7 +212,7 @@ def _scatter(source: Array, at: Array) -> float:
 
 def _unevenness(source: Array) -> float:
     """Scatter of the steps between neighbours of a design, beyond a smooth mapping of it."""
-    tree, pitch, found = KDTree(source), spacing(source), [0.0]
+    tree, pitch, found = scipy.spatial.KDTree(source), spacing(source), [0.0]
     for step in grid_steps(source):
         distance, row = tree.query(source + step)
         neighbour = np.where((distance < 0.3 * pitch)[:, None], source[row], np.nan)
@@ -223,7 +223,7 @@ def _unevenness(source: Array) -> float:
 
 def _projected(source: Array, start: Array, candidates: Candidates, valid: Mask) -> Assignment | None:
     """Assign candidates to marks of a plane in perspective, starting from approximate positions."""
-    tree, pitch, predicted = KDTree(candidates.xy), spacing(start), start
+    tree, pitch, predicted = scipy.spatial.KDTree(candidates.xy), spacing(start), start
     every = np.ones(len(source), dtype=bool)
     for _ in range(_PROJECTED):
         rows = nearest_candidates(tree, candidates, predicted, 0.2 * pitch, every)
@@ -256,7 +256,9 @@ def _on_plane(plane: Array, source: Array) -> Array:
 
 def grid_steps(source: Array) -> Array:
     """Steps (k, 2) from many marks of a design to a neighbour."""
-    offset = source[KDTree(source).query(source, k=min(5, len(source)))[1][:, 1:]] - source[:, None]
+    offset = (
+        source[scipy.spatial.KDTree(source).query(source, k=min(5, len(source)))[1][:, 1:]] - source[:, None]
+    )
     grain = np.hypot(*np.moveaxis(offset, -1, 0)).min() / 4
     steps, count = np.unique(np.round(offset.reshape(-1, 2) / grain), axis=0, return_counts=True)
     return np.asarray(steps[count > 0.2 * len(source)] * grain)
@@ -282,7 +284,7 @@ def _similarities(plane: Array, candidates: Candidates, most: float, count: int)
 
     def steps(xy: Array, count: int) -> NDArray[np.complex128]:
         z = _complex(xy)
-        row = KDTree(xy).query(xy, k=min(count + 1, len(xy)))[1]
+        row = scipy.spatial.KDTree(xy).query(xy, k=min(count + 1, len(xy)))[1]
         vectors: NDArray[np.complex128] = (z[row[:, 1:]] - z[:, None]).ravel()
         return vectors
 

@@ -32,7 +32,7 @@ from ..testfield.lattice_mapping import (
     strength_of,
     with_coefficients,
 )
-from .compiled_lens import distorted, projected
+from .plane_lens import distorted, projected
 from .plane_mapping import fisheye_of, polynomial_through
 
 __all__ = ["UNFIT", "FoundMapping", "free_through", "lens_through", "mapping_through"]

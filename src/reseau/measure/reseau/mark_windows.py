@@ -26,7 +26,7 @@ from ..matching import (
     Window,
     match,
 )
-from ..matching.compiled import windows
+from ..matching.patches import windows
 from ..response import FilteredShape, Samples
 from ..screening import Screened
 from ..testfield.targets import merged
@@ -284,7 +284,7 @@ class MarkWindows(ABC):
 
     def _cut(self, values: NDArray[Any], rows: Rows, half: tuple[int, int]) -> NDArray[Any]:
         """Values (k, r, c) of a frame in the windows of marks."""
-        return np.asarray(windows(values, np.rint(self.start[rows]).astype(np.intp), half))
+        return windows(values, np.rint(self.start[rows]).astype(np.intp), half)
 
     def _form_sigma(self) -> Array:
         """Standard deviations of the parameters of the form."""

@@ -7,8 +7,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.spatial import KDTree
 
 from ...core import vocabulary as v
 from ...core.data import Array, Frame, Mask, Rows
@@ -261,7 +261,9 @@ class MarkMeasurement:
         sigma = float(np.median(np.sqrt(np.trace(found.cov[plain], axis1=1, axis2=2) / 2)))
         if not scatter < _PREDICTABLE * sigma:
             return found  # the neighbours do not tell where a mark is
-        near = KDTree(self.source[at[plain]]).query(self.source[at[suspect]], k=_FEWEST_PLAIN)[1]
+        near = scipy.spatial.KDTree(self.source[at[plain]]).query(self.source[at[suspect]], k=_FEWEST_PLAIN)[
+            1
+        ]
         left_out = np.nan_to_num(judged.deviation[at[suspect]])
         predicted = np.where(left_out != 0, found.xy[suspect] - left_out, judged.predicted[at[suspect]])
         options = replace(
@@ -548,7 +550,7 @@ class MarkMeasurement:
         step = 0.5 * spacing(self.predicted)
         angle = np.arange(16) * np.pi / 8
         around = self.predicted[at, None] + step * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        free = KDTree(self.predicted).query(around)[0].argmax(axis=1)
+        free = scipy.spatial.KDTree(self.predicted).query(around)[0].argmax(axis=1)
         beside = around[np.arange(len(at)), free]
         inside = self._near_frame(beside)
         at, beside = at[inside], beside[inside]

@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.spatial import KDTree
-from scipy.special import bdtrc
+import scipy
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
@@ -361,7 +360,7 @@ def _open_names(source: Array, judged: Verdict, valid: Mask) -> tuple[Remark, ..
     if good.sum() < _FEW or good.all():
         return ()
     chosen = misfit(source, judged.xy, good)
-    tree, pitch = KDTree(source), spacing(source)
+    tree, pitch = scipy.spatial.KDTree(source), spacing(source)
     # Where a row in the frame is not seen, the picture ends there, and another one may be missing, too.
     missed = 2 * int((in_sight(judged.predicted, valid) & ~good).sum())
     for step in grid_steps(source):
@@ -397,7 +396,7 @@ def _chance(measurement: MarkMeasurement, at: Rows, judged: Verdict) -> str:
         return f"the compression of the image has left {good} of {len(visible)} marks"
     passed, tried = measurement.found_by_chance(visible)
     share = (passed + 1) / (tried + 2)
-    if bdtrc(good - 1, len(visible), share) < _BY_CHANCE:
+    if scipy.special.bdtrc(good - 1, len(visible), share) < _BY_CHANCE:
         return ""
     return f"{good} of {len(visible)} places look like its marks, and {passed} of {tried} where it has none"
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ...core.data import Array, Mask
 from ...optics.field import SmoothField, trend_degree
@@ -61,7 +61,7 @@ def rival_orientations(
         moved = ((along - middle) @ change.T + middle) @ axes.T
         if not _allowed(found.field.jacobian(source.mean(axis=0)[None])[0] @ axes @ change @ axes.T, options):
             continue
-        near = KDTree(source).query(moved)[0] < _SAME * spacing(source)
+        near = scipy.spatial.KDTree(source).query(moved)[0] < _SAME * spacing(source)
         if near.mean() < _SYMMETRIC:
             continue
         rival = assign(source, found.field(moved), placed.candidates, valid, shifts=1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import scipy
 
 from ...core.data import Array, Mask
 from ...optics import Chain
@@ -92,8 +93,6 @@ def fisheye_of(at: Array, xy: Array, shape: tuple[int, int]) -> float:
         See :func:`plane_through`.
     """
 
-    from scipy.optimize import minimize_scalar  # a fifth of the time of importing
-
     def left(strength: float) -> float:
         straight = projectivity_behind(at, xy, shape, strength)[0]
         if straight is None:
@@ -110,7 +109,9 @@ def fisheye_of(at: Array, xy: Array, shape: tuple[int, int]) -> float:
     if k == 0:
         return 0.0
     low, high = STRENGTHS[k - 1], STRENGTHS[min(k + 1, len(STRENGTHS) - 1)]
-    found = minimize_scalar(left, bounds=(low, high), method="bounded", options={"xatol": 0.02})
+    found = scipy.optimize.minimize_scalar(
+        left, bounds=(low, high), method="bounded", options={"xatol": 0.02}
+    )
     return float(found.x if found.fun < squares[k] else STRENGTHS[k])
 
 

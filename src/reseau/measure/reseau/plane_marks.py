@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Remark
@@ -311,8 +311,6 @@ class PlaneMarks(MarkWindows):
         that are even about a mark, and do not displace it. The covariance is then C + f E, or at least that
         of the odd residuals, whichever agrees better with the scatter.
         """
-        from scipy.optimize import brentq  # a fifth of the time of importing
-
         extra = alike.cov - plain.cov
         # A polynomial through few marks has too few terms for a lens.
         mapping, known = self._best_known(rows)
@@ -337,7 +335,7 @@ class PlaneMarks(MarkWindows):
         none, whole = excess(0.0), excess(1.0)
         share, left = (0.0, none) if abs(none) < abs(whole) else (1.0, whole)
         if none * whole < 0:
-            share, left = float(brentq(excess, 0.0, 1.0, xtol=0.01)), 0.0
+            share, left = float(scipy.optimize.brentq(excess, 0.0, 1.0, xtol=0.01)), 0.0
         scatter = 1 + none / redundancy
         odd = self._odd_share(plain.residuals[good]) if self.even else 1.0
         bound = min(odd, scatter * (1 + _BOUND * np.sqrt(2 / redundancy)))
@@ -407,7 +405,9 @@ class PlaneMarks(MarkWindows):
         of a quarter of a pixel, and of the uncertainty of the prediction, which is larger towards a margin.
         """
         good = ~uneasy & ~self.dazzled[rows]
-        near = KDTree(self.at[rows[good]]).query(self.at[rows], k=min(_NEIGHBOURS, int(good.sum())))[1]
+        near = scipy.spatial.KDTree(self.at[rows[good]]).query(
+            self.at[rows], k=min(_NEIGHBOURS, int(good.sum()))
+        )[1]
         level, depth = (np.median(values[good][near], axis=1) for values in (found.level, self.depth(found)))
         noise = float(np.median(found.noise[good]))
         some = rows[uneasy]
@@ -451,7 +451,7 @@ class PlaneMarks(MarkWindows):
             ordinary = np.median(width[known]) if known.any() else np.hypot(self.look.psf_px, 12**-0.5)
             return np.asarray(width > _BLURRED * ordinary)
         # Towards the margin of a lens all are less sharp. A mark is the nearest to itself.
-        near = KDTree(self.at[rows[known]]).query(self.at[rows], k=_NEIGHBOURS + 1)[1]
+        near = scipy.spatial.KDTree(self.at[rows[known]]).query(self.at[rows], k=_NEIGHBOURS + 1)[1]
         beside = np.median(width[known][near], axis=1)
         return np.asarray(width > _BLURRED * np.maximum(beside, np.median(width[known])))
 

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
-from scipy.spatial import KDTree
 
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
@@ -138,7 +137,7 @@ def disk_seeds(disks: Disks, reach: float) -> Iterator[tuple[int, Array]]:
     if len(disks) < 6:
         return
     most = min(25, len(disks))
-    near = KDTree(disks.xy).query(disks.xy, k=most)[1][:, 1:]
+    near = scipy.spatial.KDTree(disks.xy).query(disks.xy, k=most)[1][:, 1:]
     back = np.linalg.inv(disks.form)
     away = np.einsum("kij,knj->kni", back, disks.xy[near] - disks.xy[:, None])
     z = (away[..., 0] + 1j * away[..., 1]) / reach
@@ -169,11 +168,11 @@ def grown_disks(
     """Nodes (m, 2) of the lattice grown from a seed, the disks on them, and the mapping to the image."""
     count = int(extent)
     grid = np.array(list(product(range(-count, count + 1), repeat=2)), dtype=np.float64)
-    tree, size = KDTree(disks.xy), np.log(np.linalg.det(disks.form))
+    tree, size = scipy.spatial.KDTree(disks.xy), np.log(np.linalg.det(disks.form))
     mapping = started(np.vstack([np.column_stack([slope, disks.xy[seed]]), [0.0, 0.0, 1.0]]), 1, shape)
     nodes, rows = np.zeros((1, 2)), np.array([seed])
     for _ in range(3 * count):
-        beside = grid[KDTree(nodes).query(grid)[0] < _FROM]
+        beside = grid[scipy.spatial.KDTree(nodes).query(grid)[0] < _FROM]
         predicted, slopes, _ = second_order(mapping, beside)
         pixels = stretches(slopes)[1]
         gap, row = tree.query(predicted)
@@ -248,7 +247,7 @@ def _tables(
     row_of = np.full((wide, high), -1, dtype=np.intp)
     row_of[tuple((nodes - corner).astype(np.intp).T)] = np.arange(len(nodes))
     at = corner + np.argwhere(row_of < 0).astype(np.float64)
-    near = KDTree(nodes).query(at)[0] < _FROM
+    near = scipy.spatial.KDTree(nodes).query(at)[0] < _FROM
     xy = mapping.first(at)
     xy[near] = mapping(at[near])
     seen = np.zeros(row_of.shape, dtype=bool)
@@ -280,7 +279,7 @@ def _darkness(
 
     def along(diameter: float) -> Array:
         xy = mapping((nodes[:, None] + diameter / 2 / step * circle).reshape(-1, 2))
-        values: Array = map_coordinates(grey, xy[:, ::-1].T, order=1, mode="nearest")
+        values: Array = scipy.ndimage.map_coordinates(grey, xy[:, ::-1].T, order=1, mode="nearest")
         return values.reshape(len(nodes), _ANGLES)
 
     low = np.median(along(0.4 * size), axis=1, keepdims=True)

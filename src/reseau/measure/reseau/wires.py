@@ -10,11 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from ...core.data import Array, Rows
 
@@ -71,7 +68,7 @@ def grid_wires(xy: Array) -> GridWires:
         The family whose direction is nearer to the x-axis comes first.
     """
     count = min(_NEIGHBOURS, len(xy) - 1)
-    other = KDTree(xy).query(xy, k=count + 1)[1][:, 1:]
+    other = scipy.spatial.KDTree(xy).query(xy, k=count + 1)[1][:, 1:]
     step = xy[other] - xy[:, None]
     length, angle = np.hypot(*np.moveaxis(step, -1, 0)), np.arctan2(step[..., 1], step[..., 0])
     marks: list[tuple[Rows, ...]] = []
@@ -90,7 +87,7 @@ def _prevailing(angle: Array, length: Array) -> tuple[float, float]:
     """The two directions, in (−π/2, π/2], in which most near neighbours lie; the one nearer to x first."""
     weight = np.where(length > 0, np.maximum(length, 1e-300) ** -3.0, 0.0) / (length**-3.0).max()
     votes = np.bincount(np.rint(np.rad2deg(angle)).astype(int).ravel() % 180, weight.ravel(), minlength=180)
-    smooth = gaussian_filter1d(votes, 2.0, mode="wrap")
+    smooth = scipy.ndimage.gaussian_filter1d(votes, 2.0, mode="wrap")
     first = int(smooth.argmax())
     off = np.abs((np.arange(180) - first + 90) % 180 - 90)
     second = int(np.where(off >= np.rad2deg(_APART), smooth, -1.0).argmax())
@@ -117,8 +114,10 @@ def _chains(xy: Array, other: Rows, length: Array, angle: Array, along: float) -
     )
     each = np.arange(len(xy))
     mutual = (ahead >= 0) & (behind[np.maximum(ahead, 0)] == each)
-    links = coo_array((np.ones(int(mutual.sum())), (each[mutual], ahead[mutual])), shape=(len(xy),) * 2)
-    count, of = connected_components(links, directed=False)
+    links = scipy.sparse.coo_array(
+        (np.ones(int(mutual.sum())), (each[mutual], ahead[mutual])), shape=(len(xy),) * 2
+    )
+    count, of = scipy.sparse.csgraph.connected_components(links, directed=False)
     order = np.argsort(xy @ [np.cos(along), np.sin(along)], kind="stable")
     chains = [order[of[order] == k] for k in range(count)]
     return tuple(chain for chain in chains if len(chain) > 1)

@@ -11,19 +11,17 @@ import math
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from ...core.assign import assign
 from ...core.compiled import compiled
 
-__all__ = ["assigned", "images", "lattice_coordinates", "monomials", "profiles", "radially", "shade_lines"]
+__all__ = ["images", "monomials", "profiles", "shade_lines"]
 
 Floats = NDArray[Any]
 Mapped = tuple[Floats, Floats, Floats]
 
-_STEPS, _SHORT = 6, 1e-3
-"""Most steps of the inversion of a mapping, and the longest step, in lattice coordinates, that ends it."""
 _REACH = 2
 """Pixels to either side of a line that are looked at."""
 _MOST_PX = 0.7
@@ -33,7 +31,7 @@ _FAR, _PER_SIGMA = 8.0, 64
 _FLAT = 1e-3
 """Argument of the fisheye up to which its series is used."""
 _AT = np.arange(-_FAR * _PER_SIGMA, _FAR * _PER_SIGMA + 1) / _PER_SIGMA
-_STEP, _BELL = ndtr(_AT), np.exp(-0.5 * _AT * _AT) / np.sqrt(2 * np.pi)
+_STEP, _BELL = scipy.special.ndtr(_AT), np.exp(-0.5 * _AT * _AT) / np.sqrt(2 * np.pi)
 
 
 @compiled
@@ -180,54 +178,6 @@ def images(mapping: Mapped, at: Floats, value: Floats, slope: Floats, bend: Floa
 
 
 @compiled
-def lattice_coordinates(mapping: Mapped, back: Floats, curved: bool, xy: Floats, longest: float) -> Floats:
-    """Lattice coordinates (n, 2) of image points, by Newton steps with the slope of the projectivity.
-
-    Parameters
-    ----------
-    back : ndarray (3, 3)
-        Inverse of the projectivity, which gives the first values.
-    curved : bool
-        Whether there is a polynomial beside the projectivity.
-    longest : float
-        Longest step along each lattice coordinate.
-    """
-    matrix, none = mapping[0], np.empty((0, 2, 2))
-    at, inverse = np.empty(xy.shape), np.empty((len(xy), 2, 2))
-    for k in range(len(xy)):
-        x, y = xy[k]
-        depth = back[2, 0] * x + back[2, 1] * y + back[2, 2]
-        a = (back[0, 0] * x + back[0, 1] * y + back[0, 2]) / depth
-        b = (back[1, 0] * x + back[1, 1] * y + back[1, 2]) / depth
-        at[k, 0], at[k, 1] = a, b
-        if curved:
-            depth = matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2]
-            u = (matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2]) / depth
-            v = (matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2]) / depth
-            p, q = matrix[0, 0] - u * matrix[2, 0], matrix[0, 1] - u * matrix[2, 1]
-            r, s = matrix[1, 0] - v * matrix[2, 0], matrix[1, 1] - v * matrix[2, 1]
-            scale = depth / (p * s - q * r)
-            inverse[k, 0, 0], inverse[k, 0, 1] = s * scale, -q * scale
-            inverse[k, 1, 0], inverse[k, 1, 1] = -r * scale, p * scale
-    if not curved:
-        return at
-    seen = np.empty(xy.shape)
-    for _ in range(_STEPS):
-        images(mapping, at, seen, none, none.reshape(0, 2, 2, 1))
-        most = 0.0
-        for k in range(len(xy)):
-            x, y = xy[k, 0] - seen[k, 0], xy[k, 1] - seen[k, 1]
-            for i in range(2):
-                step = inverse[k, i, 0] * x + inverse[k, i, 1] * y
-                if not abs(step) <= most:
-                    most = abs(step)
-                at[k, i] += min(max(step, -longest), longest)
-        if most < _SHORT:
-            break
-    return at
-
-
-@compiled
 def monomials(mapping: Mapped, at: Floats, degree: int) -> tuple[Floats, Floats]:
     """Monomials (n, m) of the polynomial, and images (n, 2) without it."""
     matrix, _, normal = mapping
@@ -251,155 +201,6 @@ def monomials(mapping: Mapped, at: Floats, degree: int) -> tuple[Floats, Floats]
                 found[k, m] = x[0, n - j] * y[0, j]
                 m += 1
     return found, straight
-
-
-@compiled
-def assigned(
-    matrix: Floats,
-    normal: Floats,
-    at: Floats,
-    gate: float,
-    sine: float,
-    first: Floats,
-    count: Floats,
-    there: Floats,
-) -> tuple[Floats, Floats]:
-    """Points on a lattice line and parallel to it: their indices, and the axis that numbers the line.
-
-    Parameters
-    ----------
-    matrix : ndarray (3, 3)
-        Projectivity of the mapping.
-    normal, at : ndarray (n, 2)
-        Normals and lattice coordinates of the points.
-    gate, sine : float
-        Largest distance from a line, in steps; largest sine of the angle between them.
-    first, count : ndarray of int (2,)
-        First line of either family, and number of lines up to the last.
-    there : ndarray (2, l) of bool
-        Which of these lines count.
-    """
-    rows, axes, found = np.empty(2 * len(at), np.intp), np.empty(2 * len(at), np.intp), 0
-    for axis in range(2):
-        other = 1 - axis
-        for k in range(len(at)):
-            outside = False
-            for i in range(2):
-                place = at[k, i] - first[i]
-                outside = outside or not (place > -0.5 and place < count[i] - 0.5)
-            if outside:
-                continue
-            line = np.rint(at[k, axis])
-            if not (abs(at[k, axis] - line) < gate and there[axis, int(line) - first[axis]]):
-                continue
-            # Along a line the other coordinate changes.
-            a, b = at[k]
-            depth = matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2]
-            u = (matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2]) / depth
-            v = (matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2]) / depth
-            p = (matrix[0, other] - u * matrix[2, other]) / depth
-            q = (matrix[1, other] - v * matrix[2, other]) / depth
-            if abs(p * normal[k, 0] + q * normal[k, 1]) < sine * max(math.hypot(p, q), 1e-12):
-                rows[found], axes[found] = k, axis
-                found += 1
-    return rows[:found].copy(), axes[:found].copy()
-
-
-@compiled
-def radially(
-    matrix: Floats,
-    distortion: float,
-    normal: Floats,
-    xy: Floats,
-    across: Floats,
-    on: Floats,
-    prior: float,
-    point_px: float,
-    most: float,
-    times: int,
-) -> float:
-    """Adjust a projectivity (3, 3), in place, and a radial distortion, robustly to points on lines.
-
-    With u the image of the projectivity from the middle of the frame, the image is u (1 + k u²).
-
-    Parameters
-    ----------
-    distortion : float
-        Initial value of k.
-    normal : ndarray (3,)
-        Middle of the frame, and scale of u.
-    xy, across, on : ndarray (n, 2)
-        Points, normals of their lines, and lattice coordinates on these.
-    prior : float
-        Weight of k = 0.
-    point_px : float
-        Usual distance of a point from its line.
-    most : float
-        Largest k.
-    times : int
-        Most iterations.
-
-    Returns
-    -------
-    float
-        The distortion.
-    """
-    n, k, scale = len(xy), distortion, normal[2]
-    off, design, seen = np.empty(n), np.empty((n, 9)), np.empty(3)
-    for _ in range(times):
-        size, equations, right = np.zeros(9), np.zeros((9, 9)), np.zeros(9)
-        for i in range(n):
-            a, b = on[i]
-            for c in range(3):
-                seen[c] = matrix[c, 0] * a + matrix[c, 1] * b + matrix[c, 2]
-            x, y = seen[0] / seen[2], seen[1] / seen[2]
-            u, v = (x - normal[0]) / scale, (y - normal[1]) / scale
-            r2 = u * u + v * v
-            grown, radial = 1 + k * r2, across[i, 0] * u + across[i, 1] * v
-            off[i] = across[i, 0] * (xy[i, 0] - normal[0] - scale * u * grown)
-            off[i] += across[i, 1] * (xy[i, 1] - normal[1] - scale * v * grown)
-            # nᵀ dF/du, and du/dH.
-            p = (grown * across[i, 0] + 2 * k * radial * u) / seen[2]
-            q = (grown * across[i, 1] + 2 * k * radial * v) / seen[2]
-            r = -(p * x + q * y)
-            row = design[i]
-            row[0], row[1], row[2], row[3], row[4], row[5] = p * a, p * b, p, q * a, q * b, q
-            row[6], row[7], row[8] = r * a, r * b, scale * radial * r2
-            for c in range(9):
-                size[c] += row[c] * row[c]
-        for c in range(9):
-            size[c] = math.sqrt(size[c]) + 1e-12
-        limit = max(4.0 * 1.4826 * np.median(np.abs(off)), 3 * point_px)
-        for i in range(n):
-            weight = max(1 - (off[i] / limit) ** 2, 0.0) ** 2
-            if weight > 0:
-                row = design[i]
-                for c in range(9):
-                    part = weight * row[c]
-                    right[c] += part * off[i]
-                    for d in range(c + 1):
-                        equations[c, d] += part * row[d]
-        right[8] -= prior * k
-        for c in range(9):
-            right[c] /= size[c]
-            for d in range(c + 1):
-                equations[c, d] /= size[c] * size[d]
-                equations[d, c] = equations[c, d]
-            equations[c, c] += 1e-9
-        equations[8, 8] += prior / size[8] ** 2
-        step = np.linalg.solve(equations, right) / size
-        for c in range(8):
-            matrix[c // 3, c % 3] += step[c]
-        k = min(max(k + step[8], -most), most)
-        moved = 0.0
-        for i in range(n):
-            total = 0.0
-            for c in range(9):
-                total += design[i, c] * step[c]
-            moved = max(moved, abs(total))
-        if moved < 0.1 * point_px:
-            break
-    return k
 
 
 @compiled

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
-from .compiled import distinct_lines, numberings, supported, voted
 from .compiled import ridges as compiled_ridges
+from .straight_lines import distinct_lines, numberings, supported, voted
 
 __all__ = ["BETWEEN_SIDES", "Lattice", "Ridges", "find_lattices", "median", "quantile", "ridge_points", "rms"]
 

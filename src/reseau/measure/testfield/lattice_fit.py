@@ -14,22 +14,24 @@ from itertools import islice, product
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
-from ...adjust.compiled import reweighted
+from ...adjust.reweighted import reweighted
 from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
 from ...optics import Chain
 from ...optics.field import trend_degree
-from .compiled_lattice import assigned, monomials, profiles, radially
+from .compiled_lattice import monomials, profiles
 from .lattice import BETWEEN_SIDES, Lattice, Ridges, median, quantile, rms
 from .lattice_mapping import (
     degree_of,
     images_of,
     lattice_coordinates,
+    matrix_of,
     numbers_of,
     of_degree,
+    projective_slope,
     started,
     with_coefficients,
 )
@@ -251,10 +253,53 @@ def _radially(mapping: Chain, xy: Array, normal: Array, at: Array, axis: Rows) -
     # Two lines in each direction do not determine the distortion.
     prior = (_POINT_PX / scale / (_DISTORTED if lines > 2 else 1e-9)) ** 2
     with one_thread():
-        k = radially(matrix, k, middle, xy, normal, on, prior, _POINT_PX, _MOST_DISTORTED, _RADIAL_TIMES)
+        for _ in range(_RADIAL_TIMES):
+            step, moved = _radial_step(matrix, k, middle, xy, normal, on, prior)
+            matrix.flat[:8] += step[:8]
+            k = float(np.clip(k + step[8], -_MOST_DISTORTED, _MOST_DISTORTED))
+            if moved < 0.1 * _POINT_PX:
+                break
     added = np.zeros((2, 10))
     added[0, [6, 8]] = added[1, [7, 9]] = k * scale
     return with_coefficients(Chain(mapping.first.with_values(matrix.ravel()[:8]), curved.second), added)
+
+
+def _radial_step(
+    matrix: Array, k: float, middle: Array, xy: Array, across: Array, on: Array, prior: float
+) -> tuple[Array, float]:
+    """Robust correction (9,) of a projectivity and a radial distortion, and how far it moves a point.
+
+    Parameters
+    ----------
+    middle : ndarray (3,)
+        Middle of the frame, and scale of u.
+    xy, across, on : ndarray (n, 2)
+        Points, normals of their lines, and lattice coordinates on these.
+    prior : float
+        Weight of k = 0.
+    """
+    scale, flat = middle[2], np.column_stack([on, np.ones(len(on))])
+    seen = flat @ matrix.T
+    image = seen[:, :2] / seen[:, 2:]
+    u = (image - middle[:2]) / scale
+    r2, radial = (u * u).sum(axis=1), (across * u).sum(axis=1)
+    grown = 1 + k * r2
+    off = (across * (xy - middle[:2])).sum(axis=1) - scale * radial * grown
+    # nᵀ dF/du, and du/dH.
+    by_u = (grown[:, None] * across + (2 * k * radial)[:, None] * u) / seen[:, 2:]
+    by_depth = -(by_u * image).sum(axis=1, keepdims=True)
+    parts = by_u[:, :1] * flat, by_u[:, 1:] * flat, by_depth * on, (scale * radial * r2)[:, None]
+    design = np.concatenate(parts, axis=1)
+    size = np.sqrt((design * design).sum(axis=0)) + 1e-12
+    limit = max(4.0 * 1.4826 * float(np.median(np.abs(off))), 3 * _POINT_PX)
+    weighted = (design * (np.maximum(1 - (off / limit) ** 2, 0.0) ** 2)[:, None]).T
+    right, equations = weighted @ off, weighted @ design
+    right[8] -= prior * k
+    equations[8, 8] += prior
+    equations /= size[:, None] * size
+    equations.flat[::10] += 1e-9
+    step = np.linalg.solve(equations, right / size) / size
+    return step, float(np.abs(design @ step).max())
 
 
 def _sharpened(fit: LatticeFit, grey: NDArray[np.float32], width: float, blur: float) -> LatticeFit:
@@ -283,13 +328,17 @@ def _assigned(
     Only the lines of these numbers count, and points between the outermost of them and half a step beyond.
     """
     first, last = (np.array([pick(number) for number in numbers]) for pick in (np.min, np.max))
-    count = last - first + 1
-    there = np.zeros((2, count.max()), dtype=bool)
+    rows = np.flatnonzero(((at > first - 0.5) & (at < last + 0.5)).all(axis=1))
+    at, normal = at[rows], normal[rows].T
+    line, sine = np.rint(at), float(np.sin(np.deg2rad(degrees)))
+    near, slope = np.abs(at - line) < gate, projective_slope(matrix_of(mapping), at)
+    found = []
     for axis in (0, 1):
-        there[axis, numbers[axis] - first[axis]] = True
-    sine = float(np.sin(np.deg2rad(degrees)))
-    row, axes = assigned(numbers_of(mapping)[0], normal, at, gate, sine, first, count, there)
-    return row, axes
+        # Along a line the other coordinate changes.
+        along = slope[:, 1 - axis]
+        parallel = np.abs((along * normal).sum(axis=0)) < sine * np.maximum(np.hypot(*along), 1e-12)
+        found.append(rows[parallel & near[:, axis] & np.isin(line[:, axis], numbers[axis])])
+    return np.concatenate(found), np.repeat([0, 1], [len(each) for each in found])
 
 
 def _adjusted(mapping: Chain, degree: int, xy: Array, normal: Array, at: Array) -> tuple[Chain, Array]:
@@ -339,7 +388,7 @@ def common_part(at: Array, residuals: Array) -> Array | None:
     far = (np.abs(residuals) > _TOGETHER_PX).any(axis=1)
     if len(at) < _NEIGHBOURS or np.count_nonzero(far) <= _NEIGHBOURS // 2:
         return None
-    near = KDTree(at).query(at, k=_NEIGHBOURS)[1]
+    near = scipy.spatial.KDTree(at).query(at, k=_NEIGHBOURS)[1]
     common: Array = np.median(residuals[near], axis=1)
     size, scatter = np.abs(common), np.median(np.abs(residuals[near] - common[:, None]), axis=1)
     return common if ((size > _TOGETHER_PX) & (scatter < _SCATTER * size)).any() else None

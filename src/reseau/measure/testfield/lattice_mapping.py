@@ -16,7 +16,6 @@ import numpy as np
 from ...core.data import Array
 from ...optics import Chain, Equidistant, PlaneMapping, RationalPolynomial
 from .compiled_lattice import images
-from .compiled_lattice import lattice_coordinates as inverted
 
 __all__ = [
     "degree_of",
@@ -25,6 +24,7 @@ __all__ = [
     "matrix_of",
     "numbers_of",
     "of_degree",
+    "projective_slope",
     "reduced",
     "second_order",
     "slope_of",
@@ -37,6 +37,8 @@ __all__ = [
 
 _LONGEST = 0.5
 """Longest step, in lattice coordinates, of the inversion of a mapping."""
+_STEPS, _SHORT = 6, 1e-3
+"""Most steps of the inversion, and the longest step that ends it."""
 
 
 @lru_cache(maxsize=64)
@@ -140,17 +142,33 @@ def second_order(mapping: Chain, at: Array) -> tuple[Array, Array, Array]:
 def straightened(mapping: Chain, xy: Array) -> Array:
     """Lattice coordinates (n, 2) of image points by the projectivity alone."""
     back = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(matrix_of(mapping)).T
-    at: Array = back[:, :2] / back[:, 2:]
+    at: Array = np.ascontiguousarray(back[:, :2] / back[:, 2:])
     return at
 
 
 def lattice_coordinates(mapping: Chain, xy: Array) -> Array:
-    """Lattice coordinates (n, 2) of image points; a few Newton steps are accurate enough here."""
-    numbers = numbers_of(mapping)
+    """Lattice coordinates (n, 2) of image points, by Newton steps with the slope of the projectivity."""
+    at = straightened(mapping, xy)
     zero = of_degree(mapping, degree_of(mapping)).second
-    bent = bool((mapping.second.values != zero.values).any())
-    back = np.linalg.inv(numbers[0])
-    return np.asarray(inverted(numbers, back, bent, np.ascontiguousarray(xy), _LONGEST))
+    if not len(xy) or not (mapping.second.values != zero.values).any():
+        return at
+    numbers, seen = numbers_of(mapping), np.empty(at.shape)
+    (p, q), (r, s) = projective_slope(numbers[0], at)
+    inverse = np.array([[s, -q], [-r, p]]) / (p * s - q * r)
+    for _ in range(_STEPS):
+        images(numbers, at, seen, *_NONE)
+        step = np.clip((inverse * (xy - seen).T).sum(axis=1), -_LONGEST, _LONGEST)
+        at += step.T
+        if np.abs(step).max() < _SHORT:
+            break
+    return at
+
+
+def projective_slope(matrix: Array, at: Array) -> Array:
+    """Derivatives (2, 2, n) of a projectivity (3, 3) at points (n, 2)."""
+    x, y, depth = matrix[:, :2] @ at.T + matrix[:, 2:]
+    seen = np.stack([x / depth, y / depth])[:, None]
+    return np.asarray((matrix[:2, :2, None] - seen * matrix[2, :2, None]) / depth)
 
 
 def reduced(mapping: Chain, factor: float, shift: Array) -> Chain:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ...core import vocabulary as v
 from ...core.data import Array, Frame, Mask, Rows
@@ -592,7 +592,7 @@ class _Measurement:
         if not uneasy.any() or len(easy) < _LEAST_FIRST:
             return found, covered
         xy = self.predicted[self.rows[self.inside]]
-        near = KDTree(xy[easy]).query(xy[uneasy], k=_NEIGHBOURS)[1]
+        near = scipy.spatial.KDTree(xy[easy]).query(xy[uneasy], k=_NEIGHBOURS)[1]
         level = np.median(found.level[easy][near], axis=1)
         valid, seen = pixels_of_targets(self.scene, self.rows, self._among(uneasy), level)
         some = np.flatnonzero(uneasy)[seen >= _SEEN]

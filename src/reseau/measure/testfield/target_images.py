@@ -13,8 +13,8 @@ from ...optics import Chain
 from ...optics.formation import Outline
 from ...optics.targets import target_outline
 from ..matching import SIZE, GrownOutline
-from .compiled import curved
 from .lattice_mapping import second_order, stretches
+from .light import curved
 
 __all__ = ["flat_outline", "form_targets", "stacked"]
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from ...core.data import Array, Rows
 from ...io import TestfieldDesign
@@ -104,7 +104,7 @@ def _extremes(dark: NDArray[np.float32], noise: float) -> Array:
 
 def _seeds(xy: Array) -> Iterator[tuple[int, Array]]:
     """Targets with neighbours on a lattice around them, and its steps (2, 2) in columns."""
-    distance, near = KDTree(xy).query(xy, k=min(_NEIGHBOURS, len(xy)))
+    distance, near = scipy.spatial.KDTree(xy).query(xy, k=min(_NEIGHBOURS, len(xy)))
     away = xy[near[:, 1:]] - xy[:, None]
     turns = np.array([[1, 0], [0, 1], [-1, 0], [0, -1], [1, 1], [-1, -1], [1, -1], [-1, 1]])
     support = np.zeros(len(xy), np.intp)
@@ -125,7 +125,7 @@ def _seeds(xy: Array) -> Iterator[tuple[int, Array]]:
     if not len(well):
         return
     # Lattices of texture are small: begin where most seeds are.
-    crowd = KDTree(xy[well]).query_ball_point(
+    crowd = scipy.spatial.KDTree(xy[well]).query_ball_point(
         xy[well], 6 * float(np.median(distance[:, 1])), return_length=True
     )
     for k in well[np.argsort(-crowd, kind="stable")[:_SEEDS]]:
@@ -139,14 +139,14 @@ def _grown(xy: Array, seed: int, steps: Array, shape: tuple[int, ...]) -> tuple[
     """
     if np.linalg.det(steps) > 0:
         steps = steps * [1.0, -1.0]
-    tree, extent = KDTree(xy), int(np.ceil(np.sqrt(len(xy)))) + 4
+    tree, extent = scipy.spatial.KDTree(xy), int(np.ceil(np.sqrt(len(xy)))) + 4
     nodes, rows = np.zeros((1, 2), np.intp), np.array([seed])
     matrix = np.column_stack([np.vstack([steps, np.zeros(2)]), np.append(xy[seed], 1.0)])
     mapping, off = started(matrix, 1, shape), np.zeros((1, 2))
     for _ in range(3 * extent):
         beside = np.unique((nodes[:, None] + _BESIDE).reshape(-1, 2), axis=0)
         beside = beside[(np.abs(beside) <= extent).all(axis=1)]
-        nearest = KDTree(nodes).query(beside)[1]
+        nearest = scipy.spatial.KDTree(nodes).query(beside)[1]
         at = beside.astype(np.float64)
         # Distortion, and the wider gaps beside lines, displace a node as they do the nearest one.
         predicted = images_of(mapping, at) + off[nearest]

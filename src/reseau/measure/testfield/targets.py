@@ -22,9 +22,10 @@ from ...io import TestfieldDesign
 from ...optics import Chain
 from ...optics.formation import PixelResponse
 from ..matching import FormedShape, Matches, MatchOptions, Shape, ShapeSubset, Window, match
-from .compiled import add_windows, attenuate, bends, illumination, without_own
+from .compiled import add_windows
 from .lattice import median
 from .lattice_mapping import images_of, slope_of
+from .light import attenuate, bends, illumination, without_own
 from .line_profiles import blur_of
 from .motion import MovedShape, steps_of
 from .target_images import form_targets

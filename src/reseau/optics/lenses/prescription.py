@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from ...core.data import Array, Mask
 from ...core.errors import UsageError
@@ -294,10 +294,16 @@ class Layout:
             Whether the axes are turned before they are shifted, and then about z, y, x.
         """
         if tilt_first:
-            self.axes = self.axes @ Rotation.from_euler("ZYX", tilt_deg[::-1], degrees=True).as_matrix()
+            self.axes = (
+                self.axes
+                @ scipy.spatial.transform.Rotation.from_euler("ZYX", tilt_deg[::-1], degrees=True).as_matrix()
+            )
         self.vertex = self.vertex + self.axes[:, :2] @ np.asarray(decentre, dtype=float)
         if not tilt_first:
-            self.axes = self.axes @ Rotation.from_euler("XYZ", tilt_deg, degrees=True).as_matrix()
+            self.axes = (
+                self.axes
+                @ scipy.spatial.transform.Rotation.from_euler("XYZ", tilt_deg, degrees=True).as_matrix()
+            )
 
 
 def in_order(rows: Sequence[tuple[float, float, Medium]]) -> tuple[Surface, ...]:

@@ -20,8 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.linalg
-from scipy.interpolate import RegularGridInterpolator
+import scipy
 
 from ...adjust import Contribution, Simulated, UncertaintyBudget, propagate, simulate
 from ...calibration import Calibration, CameraMapping, projection_field
@@ -442,7 +441,7 @@ def _lacking(calibration: Calibration, xy: Array) -> Array:
     own = projection_field(lens, len(errors.x), len(errors.y)).sigma
     beyond = np.nan_to_num(np.maximum(errors.total**2 - own**2, 0.0))
     at = np.clip(xy, 0.0, [errors.x[-1], errors.y[-1]])
-    found: Array = RegularGridInterpolator((errors.y, errors.x), beyond)(at[:, ::-1])
+    found: Array = scipy.interpolate.RegularGridInterpolator((errors.y, errors.x), beyond)(at[:, ::-1])
     return found
 
 

@@ -1,4 +1,4 @@
-"""Compiled robust adjustment of linear problems, compared with the general one."""
+"""Robust adjustment of linear problems, compared with the general one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reseau.adjust import BatchOptions, adjust_batch, weight_function
-from reseau.adjust.compiled import reweighted
+from reseau.adjust.reweighted import reweighted
 
 
 @pytest.mark.parametrize("most", [1, 5, 30])
