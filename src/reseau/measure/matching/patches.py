@@ -113,7 +113,7 @@ def windows(values: NDArray[Any], centre: Rows, half: tuple[int, int]) -> NDArra
     (h, w), (right, down) = values.shape, half
     rows = np.clip(centre[:, 1:] + np.arange(-down, down + 1), 0, h - 1)
     columns = np.clip(centre[:, :1] + np.arange(-right, right + 1), 0, w - 1)
-    return values[rows[:, :, None], columns[:, None]]
+    return np.asarray(values[rows[:, :, None], columns[:, None]])
 
 
 class Patches:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...core.data import Array, Rows
+from ...core.data import Array, Mask, Rows
 
 __all__ = ["attenuate", "bends", "curved", "illumination", "without_own"]
 
@@ -39,7 +39,7 @@ def attenuate(free: Array, contrast: Array, size: Array) -> None:
     free[rows, columns] = missing
 
 
-def bends(grey: Array, total: Array, near: Array, sign: float, limit: float) -> Array:
+def bends(grey: Array, total: Array, near: Mask, sign: float, limit: float) -> Array:
     """Differences (n,) of pixels from the mean of both neighbours in the row, where the formed image is flat.
 
     Parameters
