@@ -181,9 +181,10 @@ def refine(
         write_whole(out, content)
     if report is not None:
         write_whole(report, page)
-    if true is not None and done.instrument is not None and done.photo_iii:
+    unit = "" if done.instrument is None else done.instrument.unit
+    if true is not None and done.photo_iii:
         points = done.true_points()
-        as_text = canonical_json(points_document(points, done.instrument.unit, "object"))
+        as_text = canonical_json(points_document(points, unit, "object"))
         write_whole(true, as_text if true.suffix.lower() == ".json" else points.to_csv())
     if as_json:
         say(content)
@@ -192,10 +193,10 @@ def refine(
         _say_first(files.photo_i, done.photo_i, done.reseau)
     if done.photo_ii is not None and files.photo_ii is not None:
         _say_second(files.photo_ii, done.photo_ii)
-    if done.again is not None and files.photo_ii is not None and done.instrument is not None:
-        _say_again(files.photo_ii, done.again, done.instrument.unit)
+    if done.again is not None and files.photo_ii is not None:
+        _say_again(files.photo_ii, done.again, unit)
     for name, body in zip(done.names, done.photo_iii, strict=True):
-        say(f"{name}: {len(body.true)} points in {done.instrument.unit}\n")
+        say(f"{name}: {len(body.true)} points in {unit}\n")
         _say_notes(body.notes)
         if true is None:
             say(body.true.to_csv())

@@ -234,7 +234,7 @@ def lay_deltille(grey: NDArray[np.float32], corners: SixSectors, design: BoardDe
     design : BoardDesign
         A deltille.
     """
-    found: Placed | Failure = failed(0, _LATTICE)
+    found = failed(0, _LATTICE)
     for few in _by_strength(corners):
         laid = _laid(grey, few, design)
         if not isinstance(laid, Failure):

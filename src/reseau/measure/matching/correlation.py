@@ -104,7 +104,7 @@ def with_alike_errors(found: Matches, centres: Array | None = None) -> Matches:
     for (down, right), r in correlation.items():
         kernel[_LAGS + down, _LAGS + right] = kernel[_LAGS - down, _LAGS - right] = r
     plain = found.influence * found.noise[:, None, None, None]
-    known = np.isfinite(plain).all(axis=(1, 2, 3))[:, None, None, None]
+    known = np.asarray(np.isfinite(plain).all(axis=(1, 2, 3), keepdims=True))
     plain = np.where(known, plain, 0.0)
     own = plain * np.sqrt(variance)[_classes(_activity(found.influence), limits)][:, None]
     largest = np.abs(own).max(axis=(1, 2, 3), initial=0.0)
@@ -211,9 +211,9 @@ def _neighbours(unit: Array, shown: Mask, activity: Array, free: Array, both_way
     power = squares / count / (1 - taken)
     for before, after in ((np.s_[:, :, :-1], np.s_[:, :, 1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         total = float((quiet[before] * quiet[after]).sum())
-        number = np.count_nonzero(even[before] & even[after])
-        r = total / max(number, 1) / power + _TAKEN * taken
-        if (abs(r) if both_ways else r) > max(_LEAST, _SIGNIFICANT / np.sqrt(max(number, 1))):
+        number = max(int(np.count_nonzero(even[before] & even[after])), 1)
+        r = total / number / power + _TAKEN * taken
+        if (abs(r) if both_ways else r) > max(_LEAST, _SIGNIFICANT / np.sqrt(number)):
             return True
     return False
 

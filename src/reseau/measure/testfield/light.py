@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
 
 __all__ = ["attenuate", "bends", "curved", "illumination", "without_own"]
 
 
-def without_own(total: Array, first: Array, own: Array, sign: float, others: Array) -> None:
+def without_own(
+    total: NDArray[Any], first: Rows, own: NDArray[Any], sign: float, others: NDArray[Any]
+) -> None:
     """Fill the light (k, r, c) of other marks in windows: `sign` times the total (h, w) without the own.
 
     `first` (k, 2) are column and row of the first pixels; the border of the frame continues beyond it.
@@ -21,7 +26,7 @@ def without_own(total: Array, first: Array, own: Array, sign: float, others: Arr
     others *= sign
 
 
-def attenuate(free: Array, contrast: Array, size: Array) -> None:
+def attenuate(free: NDArray[Any], contrast: Array, size: Array) -> None:
     """Replace the free share of pixels (h, w) by the light that is missing there.
 
     Parameters
@@ -39,7 +44,7 @@ def attenuate(free: Array, contrast: Array, size: Array) -> None:
     free[rows, columns] = missing
 
 
-def bends(grey: Array, total: Array, near: Mask, sign: float, limit: float) -> Array:
+def bends(grey: NDArray[Any], total: NDArray[Any], near: Mask, sign: float, limit: float) -> Array:
     """Differences (n,) of pixels from the mean of both neighbours in the row, where the formed image is flat.
 
     Parameters
