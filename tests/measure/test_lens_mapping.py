@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from reseau.core.data import Array
-from reseau.measure.reseau.plane_lens import distorted, projected
 from reseau.measure.reseau.lens_mapping import lens_through, mapping_through
+from reseau.measure.reseau.plane_lens import distorted, projected
 from reseau.measure.reseau.plane_mapping import plane_through
 from reseau.measure.testfield.lattice_mapping import second_order, slope_of
 

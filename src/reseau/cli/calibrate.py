@@ -31,6 +31,7 @@ from .common import (
     CameraChoice,
     Computing,
     Reading,
+    compile_first,
     overlay_files,
     progress,
     remark_lines,
@@ -246,7 +247,7 @@ def calibrate(
     from ..core.provenance import sha256_of
     from ..exchange import read_target
     from ..execution import Outputs
-    from ..io import write_whole
+    from ..io import BoardDesign, write_whole
     from ..io.photographs import read_exif
     from ..measure import TestfieldOptions
     from ..procedures.calibration import calibrate_camera
@@ -259,6 +260,8 @@ def calibrate(
     drawn = {} if overlay is None else overlay_files(overlay, files)
     distance = positive(distance)
     automatic = str(design) == "auto"
+    if automatic and not computing.cluster:
+        compile_first("auto", computing.jobs)
     target = _found_target(files, reading) if automatic else read_target(design)
     others = {path.name: read_lens(path) for path in against or []}
     if others and taken:
@@ -276,6 +279,8 @@ def calibrate(
     }  # fmt: skip
     # Overlays are drawn while photographs are measured.
     kept = Outputs(computing.store, about) if computing.store and not drawn else None
+    if not automatic and not computing.cluster:
+        compile_first("board" if isinstance(target, BoardDesign) else "calibrate", computing.jobs)
     with executor, progress("measuring", len(files)) as step:
         said, frames = photographs_of(
             list(photographs.items()), read, one_lens=not taken, store=computing.store

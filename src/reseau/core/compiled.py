@@ -131,6 +131,12 @@ class Compiled(Kernel[P, R]):
                 self._dispatcher = self._dispatcher or _entry(self)
         return self._dispatcher
 
+    def kept(self, types: tuple[Any, ...]) -> bool:
+        """Whether a folder keeps it, compiled for types of arguments."""
+        made = self.dispatcher
+        name = made._cache.file(types, made.targetctx.codegen())
+        return any((folder / name).exists() for folder in folders())
+
     def compile(self, types: tuple[Any, ...]) -> bool:
         """Compile it for types of arguments; return whether it had not been before."""
         made = self.dispatcher
