@@ -64,6 +64,7 @@ $(VENV)/bin/python:
 
 $(VENV)/.core: $(VENV)/bin/python pyproject.toml constraints.txt
 	$(PIP) -e '.[bench]'
+	$(BIN)/reseau compile demo
 	touch $@
 
 $(VENV)/.test: $(VENV)/.core

@@ -395,7 +395,7 @@ def test_wrong_use_is_refused_before_anything_moves(rig: FieldRig, session: Sess
     run = rig.acquisition(session)
     with pytest.raises(UsageError, match=r"has no axis height; use tilt, roll, camera_roll"):
         carry_out(run, plans.poses(run, [Step("a", {"height": 1.0})]))
-    with pytest.raises(UsageError, match="has no UltrasonicScanner"):
+    with pytest.raises(UsageError, match="has no scanner; add one"):
         carry_out(run, plans.scan(run))
     with pytest.raises(UsageError, match="needs an operator"):
         carry_out(run, plans.oscilloscope(run))

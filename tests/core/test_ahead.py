@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -27,12 +28,12 @@ def test_every_loop_of_the_list_is_a_compiled_function_of_as_many_arguments(loop
 
 def test_loops_are_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    one = next(loop for loop in main_loops() if loop.function.endswith("components:part_sums"))
+    one = next(loop for loop in main_loops() if loop.function.endswith("compiled_filter:filtered"))
     command = [
         sys.executable,
         "-c",
         "from reseau.core.ahead import *; from reseau.core.executors import Here\n"
-        f"print(compile_ahead(Here(), {{'components': [main_loops()[{main_loops().index(one)}]]}}))",
+        f"print(compile_ahead(Here(), {{'filter': [main_loops()[{main_loops().index(one)}]]}}))",
     ]
     said = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2)]
     assert "compiled=1, found=0" in said[0]
@@ -40,10 +41,22 @@ def test_loops_are_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert len(list((tmp_path / "reseau").glob("*.nbc"))) == 1
 
 
+def test_what_is_missing_is_compiled_before_a_job_and_is_then_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    one = replace(next(loop for loop in main_loops() if loop.function.endswith(":filtered")), jobs=("one",))
+    monkeypatch.setattr(ahead, "main_loops", lambda: (one,))
+    assert ahead.missing_loops("other") == []
+    assert ahead.missing_loops("one") == [one]
+    compile_ahead(Here(), by_module([one]))
+    assert ahead.missing_loops("one") == []
+
+
 def test_a_list_that_is_older_than_the_code_is_named_with_what_to_do() -> None:
-    older = Loop("reseau.measure.reseau.components:part_sums", {}, ["float64"])
-    with pytest.raises(InputError, match=r"components cannot be compiled as it says.*loops\.py"):
-        compile_ahead(Here(), {"components": [older]})
+    older = Loop("reseau.measure.compiled_filter:filtered", {}, ["float64"])
+    with pytest.raises(InputError, match=r"filter cannot be compiled as it says.*loops\.py"):
+        compile_ahead(Here(), {"filter": [older]})
 
 
 def test_modules_have_all_loops() -> None:

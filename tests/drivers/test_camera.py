@@ -339,7 +339,7 @@ def test_missing_aravis_raises_with_instructions(monkeypatch: pytest.MonkeyPatch
     library = importlib.import_module("reseau_drivers.camera.aravis")._library
     library.cache_clear()
     monkeypatch.setitem(sys.modules, "gi", None)
-    message = r"Aravis is not installed .*; install gir1.2-aravis-0.8, and pip install reseau\[aravis\]"
+    message = r"Aravis is not installed .*; install gir1.2-aravis-0.8, and pip install 'reseau\[aravis\]'"
     with pytest.raises(UsageError, match=message):
         cameras.aravis_cameras()
     with pytest.raises(UsageError, match=message):

@@ -30,6 +30,7 @@ from .common import (
     CameraChoice,
     Computing,
     Reading,
+    compile_first,
     overlay_files,
     progress,
     remark_lines,
@@ -239,7 +240,7 @@ def calibrate(
     from ..core.failure import Code, Failure
     from ..core.provenance import Provenance, sha256_of
     from ..exchange import read_target
-    from ..io import write_whole
+    from ..io import BoardDesign, write_whole
     from ..measure import TestfieldOptions
     from ..procedures.calibrating import calibrate_photographs
     from ..procedures.calibration_folder import checked_output, folder_beside, write_calibrated
@@ -254,6 +255,9 @@ def calibrate(
     if others and taken:
         raise UsageError("requires one camera", where="--against", do="compare the cameras one by one")
     options, lens = adjustment.options(), camera.options()
+    if not computing.cluster:
+        job = "auto" if target is None else "board" if isinstance(target, BoardDesign) else "calibrate"
+        compile_first(job, computing.jobs)
     with executor, progress("measuring", len(files)) as step:
         found = calibrate_photographs(
             photographs, target, image_size, lens, options, taken,

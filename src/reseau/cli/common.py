@@ -15,6 +15,7 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import EstimationError, InputError, UsageError
+from ..core.notice import before_compiling
 
 if TYPE_CHECKING:
     from ..archive import Archive
@@ -253,6 +254,19 @@ def say_files_left_out(paths: Iterable[Path]) -> None:
         line = files_left_out(path) if path.is_dir() else ""
         if line:
             typer.echo(f"note: {line}", err=True)
+
+
+def compile_first(job: str, jobs: int | None = None) -> None:
+    """Compile what a job calls and this processor has not compiled yet, with a bar of its own."""
+    from ..core.ahead import by_module, compile_ahead, missing_loops
+    from ..execution import executor_at
+
+    modules = by_module(missing_loops(job))
+    if modules:
+        before_compiling(lambda: None)  # the bar says it
+        title = "compiling for this processor, once"
+        with executor_at(jobs, parts=len(modules)) as executor, progress(title, len(modules)) as step:
+            compile_ahead(executor, modules, lambda _: step())
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core import vocabulary as v
-from .common import progress, say
+from .common import compile_first, progress, say
 
 if TYPE_CHECKING:
     from ..sessions.demo import TestfieldSession
@@ -24,6 +24,7 @@ def demo(
     from ..report.summary import comparison_table
     from ..sessions.demo import STEPS, run_demo
 
+    compile_first("demo")
     with progress("taking photographs", STEPS) as step:
         done = run_demo(out, seed, step)
     if as_json:

@@ -20,7 +20,7 @@ from .errors import InputError
 from .executors import Executor
 from .failure import Code, Failure
 
-__all__ = ["LOOPS", "Ahead", "Loop", "by_module", "compile_ahead", "main_loops"]
+__all__ = ["LOOPS", "Ahead", "Loop", "by_module", "compile_ahead", "main_loops", "missing_loops"]
 
 LOOPS = Path(__file__).with_name("ahead.json")
 
@@ -83,13 +83,28 @@ def main_loops() -> tuple[Loop, ...]:
     return tuple(Loop(**entry | {"jobs": tuple(entry["jobs"])}) for entry in content)
 
 
+def missing_loops(job: str) -> list[Loop]:
+    """Return the loops of a job that have not been compiled for this processor.
+
+    Examples
+    --------
+    >>> missing_loops("none")
+    []
+    """
+    return [
+        loop
+        for loop in main_loops()
+        if job in loop.jobs and not loop.compiled().kept(types_of(loop.arguments))
+    ]
+
+
 def by_module(loops: Iterable[Loop]) -> dict[str, list[Loop]]:
     """Return loops by their modules, in the order given.
 
     Examples
     --------
-    >>> len(by_module(main_loops())["reseau.adjust.compiled"])
-    1
+    >>> len(by_module(main_loops())["reseau.optics.compiled"])
+    4
     """
     modules: dict[str, list[Loop]] = {}
     for loop in loops:

@@ -16,7 +16,8 @@ it calls. So code that was changed never runs in its old form, and a copy, anoth
 with other times of its files finds what is there. A process waits for what another one compiles.
 
 Kernels are compiled with each loop that calls them, and not kept by themselves: from the disk they could not
-be inlined. One that allocates no array is compiled without counting references, which would take ten times as
+be inlined. A kernel is compiled for each literal number that it is called with: give ``np.intp(0)``, not 0.
+One that allocates no array is compiled without counting references, which would take ten times as
 long as its arithmetic; therefore it indexes arrays in tuples by element, and takes no row out of them.
 """
 
@@ -130,6 +131,12 @@ class Compiled(Kernel[P, R]):
             with _building:
                 self._dispatcher = self._dispatcher or _entry(self)
         return self._dispatcher
+
+    def kept(self, types: tuple[Any, ...]) -> bool:
+        """Whether a folder keeps it, compiled for types of arguments."""
+        made = self.dispatcher
+        name = made._cache.file(types, made.targetctx.codegen())
+        return any((folder / name).exists() for folder in folders())
 
     def compile(self, types: tuple[Any, ...]) -> bool:
         """Compile it for types of arguments; return whether it had not been before."""

@@ -126,8 +126,8 @@ def _responses(
     n: int,
     sigma: np.float32,
     half: np.float32,
-    whole: int,
-    complete: bool,
+    whole: Any,
+    complete: Any,
     first: Single,
     work: Single,
     out: Single,
@@ -231,8 +231,8 @@ def formed(
                 f = generators[m]
                 normals[n, m] = (f[0, 0] * u + f[0, 1] * v) * dy[n] - (f[1, 0] * u + f[1, 1] * v) * dx[n]
             n += 1
-        tall = _responses(y[:n], high, sigma[k], half, 1, count > 1, first_y, work, of_y)
-        broad = _responses(x[:n], wide, sigma[k], half, 8, True, first_x, work, of_x)
+        tall = _responses(y[:n], high, sigma[k], half, np.intp(1), count > 1, first_y, work, of_y)
+        broad = _responses(x[:n], wide, sigma[k], half, np.intp(8), np.bool_(True), first_x, work, of_x)
         row, behind[:] = wide + broad, f32(0)
         part = high * row
         sums[: count * part] = f32(0)

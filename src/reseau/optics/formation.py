@@ -326,10 +326,11 @@ class PixelResponse:
 def _compiled_orders(pixels: Array, points: Array, sigma: Array | float) -> list[Array]:
     """Integral, value and derivative of the response of adjacent pixels (k, c) to light at points (k, j)."""
     count = np.broadcast_shapes(pixels.shape[:1], points.shape[:1])[0]
-    width = np.broadcast_to(np.asarray(sigma, dtype=np.float64), (count, 1, 1))[:, 0, 0]
+    width = np.broadcast_to(np.asarray(sigma, dtype=np.float64), (count, 1, 1))[:, 0, 0].copy()
     out = np.empty((3, count, points.shape[1], pixels.shape[1]))
-    first = np.broadcast_to(pixels[:, 0].astype(np.float64), (count,))
-    responses(np.broadcast_to(points, (count, points.shape[1])), first, width, out)
+    first = np.broadcast_to(pixels[:, 0], (count,)).astype(np.float64)
+    # Of one layout: another one would be compiled again.
+    responses(np.broadcast_to(points, (count, points.shape[1])).copy(), first, width, out)
     return list(out)
 
 

@@ -7,8 +7,8 @@ PhotoModeler itself the numbers are typed (Camera Viewer).
 
 from __future__ import annotations
 
+from html import escape
 from pathlib import Path
-from xml.sax.saxutils import escape
 
 from ...bundle import Camera
 from ...core.errors import FormatError
@@ -76,7 +76,7 @@ def write_dbat(camera: PlainCamera) -> str:
     c, x0, y0, k1, k2, k3, p1, p2 = camera.of(*BROWN)
     aspect = camera.pitch_mm[1] / camera.pitch_mm[0]
     entries = {
-        "id": "1", "name": escape(camera.name), "unit": "mm", "sensor": f"{wide!r},{tall!r}",
+        "id": "1", "name": escape(camera.name, quote=False), "unit": "mm", "sensor": f"{wide!r},{tall!r}",
         "image": f"{camera.width},{camera.height}", "aspect": repr(aspect), "focal": repr(c), "model": "3",
         "nK": "3", "nP": "2", "cc": repr(c), "pp": f"{(x0 + wide / 2) * aspect!r},{tall / 2 - y0!r}",
         "K": f"{k1!r},{k2!r},{k3!r}", "P": f"{p1!r},{p2!r}", "skew": "0",

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
 from .candidates import Saddles
-from .compiled_tags import next_corners, seen_edges
 
 __all__ = ["SEARCHES", "read_tags", "tag_outlines", "with_seen_edges"]
 
@@ -46,8 +45,91 @@ _EDGE = 0.35
 
 def with_seen_edges(grey: NDArray[np.float32], saddles: Saddles, radius: float = _NEAR_PX) -> Saddles:
     """Saddles with the directions in which their edges are seen, which second derivatives do not show."""
-    edges = seen_edges(grey, saddles.xy, saddles.edges, radius, _PLACES)
+    edges = _seen_edges(grey, saddles, radius)
     return Saddles(saddles.xy, edges, saddles.strength)
+
+
+def _seen_edges(grey: NDArray[np.float32], saddles: Saddles, radius: float) -> Array:
+    """Directions of the edges (n, 2) of saddles by where a circle around them crosses their own grey value.
+
+    Second derivatives of a blurred corner are those of a right angle, whatever its angle is. Where the circle
+    does not cross four times, the given directions remain.
+    """
+    angle, found = 2 * np.pi * np.arange(_PLACES + 1) / _PLACES, saddles.edges.copy()
+    x, y = saddles.xy.T[:, :, None]
+    level = _level(grey, x + radius * np.cos(angle), y + radius * np.sin(angle)) - _level(grey, x, y)
+    crossed = (level[:, 1:] > 0) != (level[:, :-1] > 0)
+    rows = np.flatnonzero(crossed.sum(axis=1) == 4)
+    place = np.nonzero(crossed[rows])[1].reshape(-1, 4)
+    before, after = (np.take_along_axis(level[rows], place + k, axis=1) for k in (0, 1))
+    at = 2 * np.pi * (place + before / (before - after)) / _PLACES
+    # Both crossings of one line, half a turn apart; the first line is where bright begins.
+    one, other = at[:, :2], at[:, 2:] - np.pi
+    line = one + ((other - one + np.pi) % (2 * np.pi) - np.pi) / 2
+    # The bright sector extends from the first to the second, less than half a turn.
+    found[rows] = np.where(after[:, :1] > 0, line, line[:, ::-1] - [np.pi, 0.0])
+    return found
+
+
+def _level(grey: NDArray[np.float32], x: Array, y: Array) -> Array:
+    """Grey values between pixels; those of the border beyond it."""
+    x, y = np.clip(x, 0.0, grey.shape[1] - 1.001), np.clip(y, 0.0, grey.shape[0] - 1.001)
+    i, j = y.astype(np.intp), x.astype(np.intp)
+    u, v = x - j, y - i
+    above = (1 - u) * grey[i, j] + u * grey[i, j + 1]
+    level: Array = (1 - v) * above + v * ((1 - u) * grey[i + 1, j] + u * grey[i + 1, j + 1])
+    return level
+
+
+def _are_edges(grey: NDArray[np.float32], start: Array, end: Array) -> Mask:
+    """Whether lines (m) are dark on the right, seen in the image, and bright on the left, all along."""
+    (x, y), (dx, dy) = start.T[:, :, None], (end - start).T[:, :, None]
+    off, share = np.maximum(_BESIDE, 1.5 / np.hypot(dx, dy)), np.linspace(0.12, 0.88, _ALONG)
+    x, y = x + share * dx, y + share * dy
+    # A quarter turn of x into y: to the right in the image.
+    right, left = ((x + side * off * dy, y - side * off * dx) for side in (1, -1))
+    contrast = _level(grey, *right) - _level(grey, *left)
+    least = contrast.min(axis=1)
+    return np.asarray((least > 0) & (least > _EDGE * np.median(contrast, axis=1)))
+
+
+def _next_corners(
+    grey: NDArray[np.float32], saddles: Saddles, leaves: Array, arrives: Array, near: Rows
+) -> Rows:
+    """The corner (2 n,) to which the edge of each sector leads, -1 for none.
+
+    Parameters
+    ----------
+    grey, saddles
+        As of :func:`tag_outlines`; each saddle is a corner twice, with one dark sector and the other.
+    leaves, arrives : ndarray (2 n,)
+        Directions of the edges of the sectors, x into y.
+    near : ndarray of int (n, k)
+        Saddles around each, the nearest first.
+    """
+    n, after, xy = len(saddles), np.full(len(leaves), -1, np.intp), saddles.xy
+    x, y = np.moveaxis(xy[near] - xy[:, None], 2, 0)
+    along = np.cos(leaves).reshape(2, n, 1) * x + np.sin(leaves).reshape(2, n, 1) * y
+    aimed = (along >= np.cos(_AIMED) * np.hypot(x, y)) & (
+        saddles.strength[near] >= _STRONG * saddles.strength[:, None]
+    )
+    sector, corner, place = np.nonzero(aimed)
+    own, other = sector * n + corner, near[corner, place]
+    to = np.stack([other, other + n], axis=1)
+    back = np.arctan2(y[corner, place], x[corner, place])[:, None] + np.pi
+    fits = _apart(back, arrives[to]) < _AIMED
+    fits &= _apart(leaves[own][:, None] + np.pi, arrives[to]) < _PARALLEL
+    some = np.flatnonzero(fits.any(axis=1))
+    some = some[_are_edges(grey, xy[corner[some]], xy[other[some]])]
+    rows, nearest = np.unique(own[some], return_index=True)
+    some = some[nearest]
+    after[rows] = np.where(fits[some, 0], to[some, 0], to[some, 1])
+    return after
+
+
+def _apart(a: Array, b: Array) -> Array:
+    """Angles between directions, 0 to π."""
+    return np.asarray(np.abs((a - b + np.pi) % (2 * np.pi) - np.pi))
 
 
 def tag_outlines(grey: NDArray[np.float32], saddles: Saddles, weak: float, radius: float) -> Rows:
@@ -75,8 +157,7 @@ def tag_outlines(grey: NDArray[np.float32], saddles: Saddles, weak: float, radiu
     # that is clockwise in the image leaves along the former and arrives against the latter.
     leaves, arrives = (second + turn).ravel(), (first + np.pi + turn).ravel()
     near = scipy.spatial.KDTree(saddles.xy).query(saddles.xy, k=min(_NEIGHBOURS + 1, count))[1][:, 1:]
-    limits, edge = (_AIMED, _PARALLEL, _STRONG), (_ALONG, _BESIDE, _EDGE)
-    after = next_corners(grey, saddles.xy, saddles.strength, leaves, arrives, near, limits, edge)
+    after = _next_corners(grey, saddles, leaves, arrives, near)
     cycle = [np.arange(2 * count)]
     for _ in range(4):
         cycle.append(np.where(cycle[-1] < 0, -1, after[cycle[-1]]))

@@ -66,7 +66,7 @@ def _formed(
     """Background, contrast and grey values (n,) of a window of which `share` (n,) is covered."""
     n, ground = len(share), len(monomials)
     plane[:], contrast[:] = 0.0, x[_CONTRAST]
-    add_weighted(x, _LEVEL, monomials, plane)
+    add_weighted(x, np.intp(_LEVEL), monomials, plane)
     add_weighted(x, _LEVEL + ground, across, contrast)
     if dark:
         for i in range(n):
@@ -222,7 +222,7 @@ def _fill_gradient(
     multiply(factors[0], off, part)
     for m in range(len(slopes)):
         at = m if m <= _WIDTH else len(gradient) - forms + m - 3
-        gradient[at] = -product(slopes[m], part, 0, n)
+        gradient[at] = -product(slopes[m], part, np.intp(0), n)
     gradient[_WIDTH] *= widening
     multiply(factors[1], off, part)
     total = 0.0
@@ -230,10 +230,10 @@ def _fill_gradient(
         total += part[i]
     gradient[_CONTRAST] = -total
     for m in range(len(across)):
-        gradient[_LEVEL + ground + m] = -product(across[m], part, 0, n)
+        gradient[_LEVEL + ground + m] = -product(across[m], part, np.intp(0), n)
     multiply(factors[2], off, part)
     for m in range(ground):
-        gradient[_LEVEL + m] = -product(monomials[m], part, 0, n)
+        gradient[_LEVEL + m] = -product(monomials[m], part, np.intp(0), n)
 
 
 @compiled
@@ -257,7 +257,7 @@ def _fill_influence(
         end = min(begin + len(part), n)
         some = part[: end - begin]
         for m in range(2):
-            fill_weighted(first[m], 0, jacobian, begin, some)
+            fill_weighted(first[m], np.intp(0), jacobian, begin, some)
             multiply(some, root[begin:end], on_position[m, begin:end])
         if not positive:
             continue
@@ -351,7 +351,7 @@ def linearised(
             for m in range(u):
                 without_common(jacobian[m], along, heavy, columns, part)
             _unweighted(left, root, residuals[k])
-        cost = product(left, left, 0, n)
+        cost = product(left, left, np.intp(0), n)
         for m in range(u):
             cost += prior[m] * (mean[k, m] - x[k, m]) ** 2
         fill_normal(jacobian, normals[k])
@@ -457,7 +457,7 @@ def _extrapolated(
         steps[m] = trial[m] - x[m]
     for m in range(len(slopes)):
         steps[u + m] = steps[m if m <= _WIDTH else u - forms + m - 3] * f32(widened if m == _WIDTH else 1.0)
-    add_weighted(steps, 0, jacobian, off)
+    add_weighted(steps, np.intp(0), jacobian, off)
     _unweighted(off, root, residuals)
     add_weighted(steps, u, slopes, share)
     assign(x, trial)
@@ -503,7 +503,7 @@ def advanced(
         if len(slope):
             without_common(left, slope[k], weighted[k], columns, part)
             _unweighted(left, root, grey)
-        cost = product(left, left, 0, n)
+        cost = product(left, left, np.intp(0), n)
         for m in range(u):
             cost += prior[m] * (trial[k, m] - mean[k, m]) ** 2
         gain = (iteration[k, _COST] - cost) / max(iteration[k, _PREDICTED], _TINY)

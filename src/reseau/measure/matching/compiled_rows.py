@@ -16,6 +16,7 @@ from ...core.compiled import compiled
 __all__ = [
     "TOGETHER",
     "Floats",
+    "Index",
     "add_squares",
     "add_weighted",
     "factorised",
@@ -28,6 +29,8 @@ __all__ = [
 ]
 
 Floats = NDArray[Any]
+Index = int | np.signedinteger[Any]
+"""A number as `np.intp` keeps a constant from a specialisation of its own."""
 
 _SINGULAR = 1e-12
 """As in :mod:`reseau.adjust.batch`."""
@@ -39,7 +42,7 @@ _ANY_ORDER = frozenset({"reassoc", "nsz", "contract"})
 
 
 @compiled
-def product(a: Floats, b: Floats, begin: int, end: int) -> float:
+def product(a: Floats, b: Floats, begin: Index, end: Index) -> float:
     """Scalar product of a part, as four sums side by side: each waits for its own last addition only.
 
     A slice of an array would take longer than its product.
@@ -117,7 +120,7 @@ def multiply(a: Floats, b: Floats, out: Floats) -> None:
 
 
 @compiled
-def add_weighted(factors: Floats, begin: int, rows: Floats, out: Floats) -> None:
+def add_weighted(factors: Floats, begin: Index, rows: Floats, out: Floats) -> None:
     """Add `rows` (m, n), times factors from `begin` on, to `out` (n,): three at a time, each of them once."""
     m, n = 0, len(out)
     while m + 3 <= len(rows):
@@ -146,7 +149,7 @@ def _add_one(a: float, one: Floats, out: Floats) -> None:
 
 
 @compiled
-def fill_weighted(factors: Floats, first: int, rows: Floats, begin: int, out: Floats) -> None:
+def fill_weighted(factors: Floats, first: Index, rows: Floats, begin: Index, out: Floats) -> None:
     """Fill `out` (k,) with columns of `rows` (m, n) from `begin` on, times factors (m,) from `first` on."""
     out[:] = f32(0)
     m, end = first, begin + len(out)
