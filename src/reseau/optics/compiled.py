@@ -169,7 +169,7 @@ def _responses(
         for j in range(len(points)):
             k = (j + 1) * stride - 1
             integral[k], value[k], slope[k] = f32(1), f32(0), f32(0)
-    return stride
+    return int(stride)
 
 
 @compiled(fastmath=_FREE)
