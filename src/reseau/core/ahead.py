@@ -7,7 +7,6 @@ costs the time of its compilation at its first call, and nothing else.
 
 from __future__ import annotations
 
-import gc
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from .compiled import Compiled, folders, named, types_of
 from .errors import InputError
 from .executors import Executor
 from .failure import Code, Failure
+from .lazy import without_collecting
 
 __all__ = ["LOOPS", "Ahead", "Loop", "by_module", "compile_ahead", "main_loops", "missing_loops"]
 
@@ -104,7 +104,7 @@ def by_module(loops: Iterable[Loop]) -> dict[str, list[Loop]]:
     Examples
     --------
     >>> len(by_module(main_loops())["reseau.optics.compiled"])
-    4
+    2
     """
     modules: dict[str, list[Loop]] = {}
     for loop in loops:
@@ -150,12 +150,8 @@ def compile_ahead(
 
 def _group(loops: Sequence[Loop]) -> int | Failure:
     """Compile loops of a module; the number of those that had not been compiled before."""
-    collects = gc.isenabled()
-    gc.disable()  # a compiler makes so many objects that looking for circles takes a tenth of its time
     try:
-        return sum(loop.compiled().compile(types_of(loop.arguments)) for loop in loops)
+        with without_collecting():
+            return sum(loop.compiled().compile(types_of(loop.arguments)) for loop in loops)
     except Exception as error:  # Numba's are not ours to name
         return Failure(" ".join(str(error).split())[:300], Code.CRASHED)
-    finally:
-        if collects:
-            gc.enable()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
-__all__ = ["above", "lazily"]
+__all__ = ["above", "lazily", "without_collecting"]
 
 
 def above(place: str) -> Any:
@@ -29,6 +31,18 @@ def above(place: str) -> Any:
     """
     module, _, name = place.partition(":")
     return getattr(import_module(module), name)
+
+
+@contextmanager
+def without_collecting() -> Iterator[None]:
+    """Look for no circles of objects while many are made that stay: imports and compilers make so many."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 def lazily(package: str, places: Mapping[str, str]) -> Callable[[str], Any]:
@@ -54,7 +68,8 @@ def lazily(package: str, places: Mapping[str, str]) -> Callable[[str], Any]:
     def get(name: str) -> Any:
         if name not in places:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        found = getattr(import_module(places[name], package), name)
+        with without_collecting():
+            found = getattr(import_module(places[name], package), name)
         setattr(sys.modules[package], name, found)
         return found
 
