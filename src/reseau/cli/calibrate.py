@@ -60,7 +60,7 @@ class _Camera(CameraChoice):
         "brown with --pitch-mm, otherwise opencv. An unknown name lists all.",
     ] = ""
     side: Annotated[
-        Literal["object", "image"] | None,
+        Literal["image", "object"] | None,
         Option("Side of Brown's distortion. Default: object.", Group.CAMERA),
     ] = None
     model_option: Annotated[
