@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.adjust import BatchOptions, BatchReason, adjust_batch
+from reseau.adjust import BatchOptions, BatchReason, adjust_batch, weight_function
 from reseau.core.errors import UsageError
 
 T = np.linspace(0.0, 4.0, 40)
@@ -145,6 +145,18 @@ def test_reweighting_is_robust_against_a_corner_of_wrong_pixels():
     # The robust estimates differ from those of the clean data by little more than their own noise.
     assert np.abs((robust.estimates - clean.estimates) / clean.sigma).max() < 2.0
     assert np.abs((plain.estimates - clean.estimates) / clean.sigma).max() > 10.0
+
+
+def test_a_robust_problem_without_misfit_is_solved_exactly():
+    design = np.stack([np.ones(5), np.arange(5.0)], axis=1)
+    fit = adjust_batch(
+        lambda x, rows: (x @ design.T, np.broadcast_to(design, (len(rows), *design.shape))),
+        np.zeros((2, 2)),
+        np.array([[1.0, 3, 5, 7, 9], [0, 0, 0, 0, 0]]),
+        prior=(np.zeros((2, 2)), np.full(2, 1e6)),
+        options=BatchOptions(reweight=weight_function("tukey"), max_iterations=20, tolerance=1e-9),
+    )
+    np.testing.assert_allclose(fit.estimates, [[1, 2], [0, 0]], rtol=0, atol=1e-8)
 
 
 def test_a_problem_that_reaches_the_iteration_limit_is_reported():

@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ...adjust.reweighted import reweighted
+from ...adjust import BatchOptions, adjust_batch, weight_function
 from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
 from ...optics import Chain
@@ -406,10 +406,19 @@ def _solved(mapping: Chain, design: Array, observed: Array, sigma_px: float) -> 
     The projectivity is kept. The coefficients of the polynomial are linear: all of them in one problem, or
     those of x and those of y, which share a design matrix (n, u), in two.
     """
+    none, most = np.zeros((len(observed), design.shape[1])), np.full(design.shape[1], _MOST_PX / sigma_px)
+
+    def images(x: Array, rows: Rows) -> tuple[Array, Array]:
+        return x @ design.T, np.broadcast_to(design, (len(rows), *design.shape))
+
     with one_thread():
-        given = np.ascontiguousarray(design), np.ascontiguousarray(observed)
-        added, residuals = reweighted(*given, (sigma_px / _MOST_PX) ** 2, 0.1 * sigma_px, 5)
-    return with_coefficients(mapping, added), residuals
+        fit = adjust_batch(
+            images, none, observed, prior=(none, most),
+            options=BatchOptions(
+                max_iterations=5, tolerance=0.1 * sigma_px, reweight=weight_function("tukey")
+            ),
+        )  # fmt: skip
+    return with_coefficients(mapping, fit.estimates), fit.residuals
 
 
 def _darkness_along(
