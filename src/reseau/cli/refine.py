@@ -156,6 +156,7 @@ def refine(
         None if path is None else ReseauDesign.read(path) for path in (files.reseau, files.test_object)
     )
     stored = None if files.calibration is None else read_calibration(files.calibration)
+    # With one thread results do not depend on the number of processors.
     with one_thread(), progress("correcting", len(photographs.given)) as step:
 
         def seen(path: Path, photo: Frame | ImagePoints, result: Any) -> None:
@@ -164,7 +165,7 @@ def refine(
 
         found = refine_photographs(
             photographs, grid, rods, stored, files.options(), read=read_photo, seen=seen
-        )  # results do not depend on the number of processors
+        )
     done = required(found, found.where if isinstance(found, Failure) else "")
     provenance = files.provenance()
     if stored is None:

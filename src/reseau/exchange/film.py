@@ -13,6 +13,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -95,7 +96,8 @@ def read_film_marks(path: Path | str, design: ReseauDesign | None = None) -> Fil
     ('ul', array([-18.,  12.]))
     """
     path = Path(path)
-    text, schema = _schema_of(path)
+    text, content = _document(path)
+    schema = content.get("schema")
     if schema == FiducialOrientation.SCHEMA:
         return _of_fiducials(FiducialOrientation.parse(text, where=path))
     if schema == FrameOrientation.SCHEMA:
@@ -127,22 +129,26 @@ def film_files(paths: Iterable[Path]) -> list[Path]:
     for path in paths:
         inside = [path]
         if path.is_dir():
-            inside = [each for each in sorted(path.glob("*.json")) if _schema_of(each)[1] in _SCHEMAS]
-            inside = [each for each in inside if json.loads(read_text(each)).get("status") != "declined"]
+            contents = {each: _document(each)[1] for each in sorted(path.glob("*.json"))}
+            inside = [
+                each
+                for each, content in contents.items()
+                if content.get("schema") in _SCHEMAS and content.get("status") != "declined"
+            ]
             if not inside:
                 raise InputError("has no oriented scan", where=path, do="use `reseau orient --out`")
         found += inside
     return found
 
 
-def _schema_of(path: Path) -> tuple[str, str | None]:
-    """The text of a document, and its schema."""
+def _document(path: Path) -> tuple[str, dict[str, Any]]:
+    """The text of a document, and its keys; none of another JSON value."""
     text = read_text(path)
     try:
         content = json.loads(text)
     except ValueError as error:
         raise FormatError(f"is not JSON ({error})", where=path) from None
-    return text, content.get("schema") if isinstance(content, dict) else None
+    return text, content if isinstance(content, dict) else {}
 
 
 def _of_fiducials(found: FiducialOrientation) -> FilmMarks:

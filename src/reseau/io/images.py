@@ -56,7 +56,6 @@ _DECODED = 50_000_000
 """Bytes of decoded strips or tiles that are kept: windows side by side cross the same ones."""
 _HELP = "convert it to grey or RGB of 8 or 16 bit"
 _AGAIN = "copy or scan it again"
-_CODECS = "pip install 'reseau[photographs]'"
 _BY_OPENCV = (5, 7, 8, 32946)
 """Compressions LZW, JPEG and Deflate of a TIFF, which OpenCV decodes, too."""
 
@@ -366,9 +365,13 @@ def _further_pages(tiff: Any, path: Path) -> tuple[str, ...]:
 def _damaged(path: Path, error: Exception) -> ImageError:
     # A message of tifffile, or an import, where its optional package is not installed.
     if isinstance(error, ImportError) or "imagecodecs" in str(error):
-        what = "is a TIFF in a compression that needs imagecodecs, which is not installed"
-        return ImageError(what, where=path, do=_CODECS)
+        return _needs_imagecodecs(path)
     return ImageError(f"is a damaged TIFF ({error})", where=path, do=_AGAIN)
+
+
+def _needs_imagecodecs(path: Path) -> ImageError:
+    what = "is a TIFF in a compression that needs imagecodecs, which is not installed"
+    return ImageError(what, where=path, do="pip install 'reseau[photographs]'")
 
 
 def _usable(page: Any, path: Path) -> float:
@@ -527,7 +530,7 @@ def _decoded_at_once(page: Any, path: Path) -> Window:
                 page.dtype,
                 (page.imagelength, page.imagewidth, _colours(page)),
             ):
-                raise _damaged(path, ImportError("imagecodecs"))
+                raise _needs_imagecodecs(path)
             # Blue comes first, and black is zero in images of 8 bit, whatever the file says.
             inverted = page.photometric == 0 and page.dtype == np.uint8
             kept.append(255 - pixels if inverted else pixels[:, :, ::-1])

@@ -155,7 +155,6 @@ def calibration_folder(
     InputError
         When a file cannot be written.
     """
-    folder.mkdir(exist_ok=True)
     written = [("report.html", "report")]
     step("report")
     write_whole(folder / "report.html", page)

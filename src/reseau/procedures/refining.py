@@ -15,7 +15,7 @@ from ..core.errors import UsageError
 from ..core.failure import Failure
 from ..io import ReseauDesign
 from ..measure import PinOptions, ReseauOptions
-from .oscilloscope import PhotoI, PhotoII, StillStandard, photo_i, photo_ii, photo_iii, still_standard_in
+from .oscilloscope import photo_i, photo_ii, photo_iii, still_standard_in
 from .refined import Refined
 
 __all__ = ["Photographs", "RefineOptions", "refine_photographs"]
@@ -132,18 +132,19 @@ def refine_photographs(
         return found
 
     tests = {"alpha": options.alpha, "check": options.check}
-    first: PhotoI | Failure | None = None
-    second: PhotoII | Failure | None = None
-    again: StillStandard | Failure | None = None
-    instrument: InstrumentCorrection | None = None
+    first = second = again = instrument = None
     if calibration is None:
         assert reseau is not None
         grid = reseau
         first = found_in(photographs.first, photo_i, grid, **tests)
-        if not isinstance(first, Failure) and first is not None and test_object is not None:
+        if isinstance(first, Failure):
+            return first
+        if test_object is not None:
             about = grid, test_object, first.camera
             second = found_in(photographs.second, photo_ii, *about, pins=options.pins, **tests)
-        instrument = None if second is None or isinstance(second, Failure) else second.instrument
+            if isinstance(second, Failure):
+                return second
+            instrument = second.instrument
     else:
         instrument, grid, rods = InstrumentCorrection.from_calibration(calibration)
         if photographs.second is not None:
@@ -151,19 +152,15 @@ def refine_photographs(
                 photographs.second, still_standard_in, instrument, grid, test_object or rods,
                 pins=options.pins, same_object=test_object is None, alpha=options.alpha,
             )  # fmt: skip
+            if isinstance(again, Failure):
+                return again
         test_object = test_object or rods
-    for step in (first, second, again):
-        if isinstance(step, Failure):
-            return step
     bodies = []
     for photo in photographs.third:
         body = found_in(photo, photo_iii, instrument, grid, points=options.points)
         if isinstance(body, Failure):
             return body
         bodies.append(body)
-    assert not isinstance(first, Failure)
-    assert not isinstance(second, Failure)
-    assert not isinstance(again, Failure)
     return Refined(first, second, tuple(bodies), grid, test_object, again, instrument, photographs.given)
 
 

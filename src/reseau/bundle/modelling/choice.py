@@ -579,8 +579,7 @@ class _Search:
         predicted = float(np.sqrt(one.squares.sum() / information.count))
         p, more = np.nan, abs(one.parameters - chosen.parameters)
         if (own.within(self.pick) or self.pick.within(own)) and more > 0:
-            richer = max(one, chosen, key=lambda each: each.parameters)
-            f = abs(one.cost - chosen.cost) / more / richer.variance
+            f = abs(one.cost - chosen.cost) / more / one.richer(chosen).variance
             p = float(scipy.special.fdtrc(more, max(left, 1.0), f))
         found = Compared(
             own, "", sigma0, one.cost, length, predicted, p, **self._difference(own, one, chosen)

@@ -78,6 +78,10 @@ class Prediction:
         """Logarithm of the density of each image (m,), with a variance factor."""
         return self.log_det - self.squares / (2 * variance)
 
+    def richer(self, other: Prediction) -> Prediction:
+        """The one of both whose camera has more parameters."""
+        return max(self, other, key=lambda one: one.parameters)
+
     def better(self, other: Prediction) -> float:
         """Logarithm of how much better than another it predicts, as far as images agree in that.
 
@@ -85,7 +89,7 @@ class Prediction:
         counts. With a gain G = χ²/2, what an image tells has the variance χ² altogether; images that are
         predicted worse show how large it is, and χ² is smaller by the same factor: G² / Σ (d < 0) d².
         """
-        variance = max(self, other, key=lambda one: one.parameters).variance
+        variance = self.richer(other).variance
         each = self.log_density(variance) - other.log_density(variance)
         gain, worse = float(each.sum()), float((np.minimum(each, 0.0) ** 2).sum())
         return min(gain, gain**2 / worse) if gain > 0 and worse > 0 else gain
