@@ -149,6 +149,26 @@ def image_points(cam: Camera, rotation: Array, x0: Array, xyz: Array) -> Array:
     return project(mapping_of(cam), Pose(matrix_to_vector(rotation), x0), xyz).xy
 
 
+def seen_from(
+    centres: Array, targets: Array, xyz: Array, control: int, own: Camera | None = None, seed: int = 4
+) -> Network:
+    """Images from given places towards given targets."""
+    own = own or camera()
+    base = world(images=len(centres), points=len(xyz), control=control).network
+    turn = [looking_at(x0, t, 0.0) for x0, t in zip(centres, targets, strict=True)]
+    xy = np.stack([image_points(own, r, x0, xyz) for r, x0 in zip(turn, centres, strict=True)])
+    with np.errstate(invalid="ignore"):
+        inside = (xy > 0).all(axis=2) & (xy < [639, 479]).all(axis=2)
+    image, point = np.nonzero(inside)
+    noise = np.random.default_rng(seed).normal(0, 0.05, (len(image), 2))
+    known = np.arange(len(xyz))[:, None] < control
+    return replace(
+        base, cameras=(own,), image_of=image, point_of=point, xy=xy[inside] + noise,
+        cov=np.tile(0.0025 * np.eye(2), (len(image), 1, 1)), xyz=np.where(known, xyz, np.nan),
+        datum="control" if control else "free",
+    )  # fmt: skip
+
+
 def mapped(cam: Camera) -> Camera:
     """The same camera by its mapping of :mod:`reseau.optics`, which is not compiled."""
     return replace(cam, model="mapping", mapping=mapping_of(cam), values=np.array(mapping_of(cam).values))

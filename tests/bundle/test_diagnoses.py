@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.bundle import Camera, Network, Options, Result, adjust_network
+from reseau.bundle import Network, Options, Result, adjust_network
 from reseau.core.data import Array
 from reseau.core.failure import Code
 from reseau.exchange import read_network
@@ -53,31 +53,11 @@ def observed() -> Network:
     return replace(world.noisy(1), sigma=sigma)
 
 
-def seen_from(
-    centres: Array, targets: Array, xyz: Array, control: int, camera: Camera | None = None
-) -> Network:
-    """Images from given places towards given targets."""
-    camera = camera or networks.camera()
-    base = networks.world(images=len(centres), points=len(xyz), control=control).network
-    turn = [networks.looking_at(x0, t, 0.0) for x0, t in zip(centres, targets, strict=True)]
-    xy = np.stack([networks.image_points(camera, r, x0, xyz) for r, x0 in zip(turn, centres, strict=True)])
-    with np.errstate(invalid="ignore"):
-        inside = (xy > 0).all(axis=2) & (xy < [639, 479]).all(axis=2)
-    image, point = np.nonzero(inside)
-    noise = np.random.default_rng(4).normal(0, 0.05, (len(image), 2))
-    known = np.arange(len(xyz))[:, None] < control
-    return replace(
-        base, cameras=(camera,), image_of=image, point_of=point, xy=xy[inside] + noise,
-        cov=np.tile(0.0025 * np.eye(2), (len(image), 1, 1)), xyz=np.where(known, xyz, np.nan),
-        datum="control" if control else "free",
-    )  # fmt: skip
-
-
 def one_station() -> Network:
     rng = np.random.default_rng(5)
     xyz = rng.uniform(-3, 3, (80, 3)) + np.array([0, 0, 9.0])
     targets = np.array([[x, y, 9.0] for x in (-1.5, 0, 1.5) for y in (-1.0, 1.0)])
-    return seen_from(np.zeros((6, 3)), targets, xyz, 0)
+    return networks.seen_from(np.zeros((6, 3)), targets, xyz, 0)
 
 
 def long_lens() -> Network:
@@ -88,7 +68,7 @@ def long_lens() -> Network:
     camera = networks.camera(free=())
     values = camera.values.copy()
     values[0], values[1:] = 40.0, 0.0
-    return seen_from(centres, centres * [1, 1, 0], xyz, 0, replace(camera, values=values))
+    return networks.seen_from(centres, centres * [1, 1, 0], xyz, 0, replace(camera, values=values))
 
 
 def plane(tilt: float, seed: int = 6) -> Network:
@@ -102,7 +82,7 @@ def plane(tilt: float, seed: int = 6) -> Network:
     centres = centres + np.tan(tilt) * height[:, None] * np.stack(
         [np.cos(angle), np.sin(angle), 0 * angle], axis=1
     )
-    return seen_from(centres, aim, xyz, 36, networks.camera(free=("c", "x0", "y0", "K1")))
+    return networks.seen_from(centres, aim, xyz, 36, networks.camera(free=("c", "x0", "y0", "K1")))
 
 
 def uneven_board() -> Network:

@@ -32,6 +32,7 @@ from .modelling import (
     Kind,
     ModelChoice,
     Options,
+    RotationOnly,
     Selection,
     adjust_network,
     calibration_of,
@@ -45,6 +46,7 @@ from .modelling import (
     held_as_designed,
     problem_of,
     reweighted,
+    rotation_only,
     search_model,
     with_estimates,
 )
@@ -92,6 +94,7 @@ __all__ = [
     "ResultDocument",
     "Rig",
     "RigEstimate",
+    "RotationOnly",
     "Selection",
     "Shutter",
     "Stage",
@@ -121,6 +124,7 @@ __all__ = [
     "projection_field_at",
     "regularised",
     "reweighted",
+    "rotation_only",
     "search_model",
     "with_estimates",
 ]

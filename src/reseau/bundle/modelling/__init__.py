@@ -5,6 +5,7 @@ from .board import BoardChoice, BoardModel, choose_board, held_as_designed
 from .calibration import calibration_of, with_estimates
 from .candidates import Candidate, camera_candidates
 from .choice import Compared, ModelChoice, choose_model, choose_models
+from .one_station import RotationOnly, rotation_only
 from .search import (
     Kind,
     Selection,
@@ -23,6 +24,7 @@ __all__ = [
     "Kind",
     "ModelChoice",
     "Options",
+    "RotationOnly",
     "Selection",
     "adjust_network",
     "calibration_of",
@@ -36,6 +38,7 @@ __all__ = [
     "held_as_designed",
     "problem_of",
     "reweighted",
+    "rotation_only",
     "search_model",
     "with_estimates",
 ]

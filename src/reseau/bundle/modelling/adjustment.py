@@ -33,6 +33,7 @@ from ..solver.datum import Similarity
 from ..solver.problem import LAST_ROUND
 from ..solver.unknowns import Unknowns
 from ..solver.values import Values
+from .one_station import one_station
 from .rejection import MANY, bent_plane, many_rejected, suspects, without_gross_errors
 from .startup import RETRIED, adjusted_in_steps, lost_images, settled
 
@@ -40,8 +41,6 @@ __all__ = ["Options", "adjust_network", "problem_of"]
 
 # Relative sigma of a principal distance that is hardly determined.
 _WEAK = 3e-3
-# Relative sigma of points with depth.
-_DEEP = 0.02
 # Iterations of an adjustment with values that are not plausible.
 _FEW = 30
 # Median angle (rad) between the orientations of an exposure by its images that were not taken at once.
@@ -304,9 +303,11 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
         _, of_control = (None, []) if grave else _control(problem, fit)
     n = len(network.xy)
     rejected = np.asarray(fit.rejected[: 2 * n].reshape(n, 2).any(axis=1))
+    without_depth = None if grave else one_station(problem, fit)
+    if without_depth is not None:
+        return without_depth
+    found = [remark for remark in found if remark.code is not Code.ONE_STATION]
     bare = Result(network, fit, rejected, steps)
-    if _has_depth(bare):
-        found = [remark for remark in found if remark.code is not Code.ONE_STATION]
     if not grave:
         found += _doubts(problem, fit, of_control, given)
         found += [] if of_control else _rejected_control(network, rejected)
@@ -333,15 +334,6 @@ def _within_the_images(problem: BundleProblem) -> BundleProblem:
     weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
     weights[2 * rows] = weights[2 * rows + 1] = 0.0
     return problem.with_weights(weights)
-
-
-def _has_depth(result: Result) -> bool:
-    """Whether points are determined to a small part of their distance, in spite of narrow rays."""
-    points, images = result.fit.usable.points, result.fit.usable.images
-    middle = result.fit.values.x0[images].mean(axis=0)
-    sigma = np.sqrt((result.point_sigma[points] ** 2).sum(axis=1))
-    away = np.linalg.norm(result.fit.values.xyz[points] - middle, axis=1)
-    return bool(np.median(sigma / away) < _DEEP)
 
 
 def _rejected_control(network: Network, rejected: Mask) -> list[Remark]:
@@ -554,8 +546,12 @@ def _control_of_failed(problem: BundleProblem) -> list[Remark]:
 
 
 def _explained(failure: Failure, problem: BundleProblem, found: list[Remark]) -> Failure:
-    """Add the cause to the reason of a failure."""
+    """Add the cause to the reason of a failure, or say that there is no depth."""
     network = problem.network
+    if failure.code in RETRIED and all(remark.code is Code.ONE_STATION for remark in found):
+        without_depth = one_station(problem, None)
+        if without_depth is not None:
+            return without_depth
     if failure.code is Code.NO_DATUM and not found:
         return failure
     if failure.code in RETRIED and not found:

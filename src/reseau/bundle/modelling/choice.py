@@ -41,16 +41,10 @@ from .candidates import (
     with_parallel_rays,
 )
 from .determined import mapping_of, result_of
-from .left_out import Information, Prediction, information_of
+from .left_out import ODDS, Information, Prediction, information_of
 
 __all__ = ["Compared", "ModelChoice", "choose_model", "choose_models"]
 
-# A model with more parameters predicts better by more than chance where it makes the images that are left out
-# ten times as probable, and as many times more as there are such models, one of which could do so by chance.
-# One parameter too many makes them ten times as probable in 1 % of cases: the logarithm is (χ² − 2) / 2 with
-# one degree of freedom (Stone 1977, J. R. Statist. Soc. B 39), and χ² > 2 + 2 ln 10 has this probability. So
-# have several.
-_ODDS = np.log(10.0)
 _LEVEL = 0.01
 # Least number of images, of which one is left out.
 _LEAST = 3
@@ -342,7 +336,7 @@ def _alone(
             key=lambda fit: fit.cost,
             default=search.fit,
         )
-        if search.fit.cost - fresh.cost > 2 * _ODDS * search.variance:
+        if search.fit.cost - fresh.cost > 2 * ODDS * search.variance:
             better = _Search(every, 0, pitch_known).from_fit(fresh)
             search = search if isinstance(better, Failure) else better
     if options.outliers == "reject":
@@ -527,7 +521,7 @@ class _Search:
         order = sorted(found, key=lambda each: found[each].parameters)
         for k, each in enumerate(order):
             better = [found[richer].better(found[each]) for richer in order[k:]]
-            if max(better) <= _ODDS + np.log(len(better)):
+            if max(better) <= ODDS + np.log(len(better)):
                 return each
         # Too few images to leave one out.
         usual = camera_model(self.start.model).usual
