@@ -31,9 +31,6 @@ _OUTSIDE = 0.01
 _TINY = 0.02
 # Part of the coordinates that are negative where they are from the middle of the image.
 _FROM_MIDDLE = 0.2
-# Misfit of rays after the best rotation, in their spread, that is no parallax; pairs of images tested, points
-# of a pair, and smallest rotation that counts as another view (rad).
-_PARALLAX, _PAIRS, _COMMON = 0.03, 40, 6
 # Points are on a line, or in a plane, to this part of their extent.
 _FLAT = 1e-3
 # Half angle of view below which shifts and rotations during the read-out have the same effect.
@@ -77,9 +74,7 @@ def causes(network: Network) -> list[Remark]:
         # Directions follow from these values.
         return found
     uv = directions(network)
-    return [
-        *_copies(network), *_stations(network, uv), *_one_station(network, uv), *_lines(network, uv)
-    ]  # fmt: skip
+    return [*_copies(network), *_stations(network, uv), *_lines(network, uv)]
 
 
 def _camera(camera: Camera) -> list[Remark]:
@@ -322,54 +317,12 @@ def _stations(network: Network, uv: Array) -> list[Remark]:
     ]
 
 
-def _one_station(network: Network, uv: Array) -> list[Remark]:
-    """All images from one station: the rays of each pair agree after a rotation; there is no depth."""
-    m = len(network.images)
-    if m < 2 or finite(network.xyz).sum() >= 4 or network.refraction is not None:
-        return []
-    if network.parallel.any() or network.shutters.any():
-        return []
-    seen = _by_image(network, finite(uv))
-    tested = 0
-    for a, b in _spread_pairs(m):
-        _, left, right = np.intersect1d(
-            network.point_of[seen[a]], network.point_of[seen[b]], assume_unique=True, return_indices=True
-        )
-        if len(left) < _COMMON:
-            continue
-        one, other = (_unit(uv[rows]) for rows in (seen[a][left], seen[b][right]))
-        u, _, vt = np.linalg.svd(other.T @ one)
-        turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        misfit = float(np.sqrt(np.median(((other - one @ turn.T) ** 2).sum(axis=1))))
-        spread = float(np.sqrt(((one - one.mean(axis=0)) ** 2).sum(axis=1).mean()))
-        if not misfit < _PARALLAX * spread:
-            return []
-        tested += 1
-    if tested < min(2, m - 1):
-        return []
-    return [
-        Remark(
-            "all images are from one station: the rays agree after rotations of the camera alone, so that "
-            "points have no depth; take images from different places",
-            Code.ONE_STATION,
-        )
-    ]
-
-
 def _by_image(network: Network, chosen: Mask) -> list[Rows]:
     """Rows of the chosen image points of each image."""
     rows = np.flatnonzero(chosen)
     rows = rows[np.argsort(network.image_of[rows], kind="stable")]
     count = np.bincount(network.image_of[rows], minlength=len(network.images))
     return [part.astype(np.intp) for part in np.split(rows, np.cumsum(count)[:-1])]
-
-
-def _spread_pairs(m: int) -> list[tuple[int, int]]:
-    """Pairs of images, at most `_PAIRS`, spread over all."""
-    pairs = [(i, j) for step in (1, m // 2, 2, m // 3) if step for i in range(m) for j in [(i + step) % m]]
-    pairs = [pair for pair in dict.fromkeys((min(p), max(p)) for p in pairs) if pair[0] != pair[1]]
-    at = np.unique(np.linspace(0, len(pairs) - 1, _PAIRS).astype(int))
-    return [pairs[int(k)] for k in at] if pairs else []
 
 
 def _unit(uv: Array) -> Array:

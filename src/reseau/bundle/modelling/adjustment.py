@@ -306,7 +306,6 @@ def adjust_network(network: Network, options: Options | None = None) -> Result |
     without_depth = None if grave else one_station(problem, fit)
     if without_depth is not None:
         return without_depth
-    found = [remark for remark in found if remark.code is not Code.ONE_STATION]
     bare = Result(network, fit, rejected, steps)
     if not grave:
         found += _doubts(problem, fit, of_control, given)
@@ -548,7 +547,7 @@ def _control_of_failed(problem: BundleProblem) -> list[Remark]:
 def _explained(failure: Failure, problem: BundleProblem, found: list[Remark]) -> Failure:
     """Add the cause to the reason of a failure, or say that there is no depth."""
     network = problem.network
-    if failure.code in RETRIED and all(remark.code is Code.ONE_STATION for remark in found):
+    if not found:
         without_depth = one_station(problem, None)
         if without_depth is not None:
             return without_depth

@@ -34,6 +34,8 @@ __all__ = ["RotationOnly", "one_station", "rotation_only"]
 
 # Iterations, decrease of vᵀPv that ends them, damping at first, and that at which nothing becomes better.
 _STEPS, _SMALL, _DAMPING, _STUCK = 60, 1e-9, 1e-3, 1e9
+# Level of the test that rotations explain what nothing else does, with the given standard deviations.
+_LEVEL = 1e-3
 # Images and points of a large network that are compared.
 _IMAGES, _POINTS = 40, 400
 
@@ -380,6 +382,9 @@ def one_station(problem: BundleProblem, fit: BundleFit | None) -> Failure | None
     rows = _twice_seen(problem, images, _some(seen, _POINTS))
     turned = rotation_only(problem, rows) if len(np.unique(network.image_of[rows])) > 1 else None
     if not turned:
+        return None
+    if fit is None and turned.cost > scipy.special.chdtri(max(turned.redundancy, 1), _LEVEL):
+        # Neither: nothing explains these image points.
         return None
     with_depth = float((_weights(problem)[rows] @ problem.misfits_at_start()[rows] ** 2).sum())
     m, p = (int(finite(part).sum()) for part in (turned.rotation, turned.direction))
