@@ -138,8 +138,10 @@ def errors_page() -> str:
         "# Errors and warnings",
         "",
         "Every message is one line: where, what is wrong, what to do. A command ends with the "
-        "exit status 0 when it succeeded, 1 when there is no result, and 2 when an argument or a "
-        "file cannot be used.",
+        "exit status 0 when it succeeded, 1 when there is no result, 2 when an argument or a file "
+        "cannot be used, and 3 when everything was written, but the result contradicts itself: "
+        "observations contradict each other for a reason other than chance, or a value cannot be. "
+        "The reason is said first; `status` of documents and results is then `contradictory`.",
         "",
         "## Codes",
         "",

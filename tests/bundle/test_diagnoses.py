@@ -60,6 +60,14 @@ def one_station() -> Network:
     return networks.seen_from(np.zeros((6, 3)), targets, xyz, 0)
 
 
+def parallel_views() -> Network:
+    """A relief seen by a long lens from far stations, all with the same view."""
+    rng = np.random.default_rng(3)
+    xyz = rng.uniform(-1, 1, (60, 3)) * [3.0, 2.0, 0.5]
+    centres = np.array([[x, y, 12.0] for x in (-1.0, 0.0, 1.0) for y in (-0.6, 0.6)])
+    return networks.seen_from(centres, centres * [1, 1, 0], xyz, 0, networks.camera(free=("c",)))
+
+
 def long_lens() -> Network:
     """A nearly flat relief seen at right angles from stations along a line, by a lens of ten degrees."""
     rng = np.random.default_rng(8)
@@ -304,7 +312,24 @@ BROKEN = [
     Broken(
         "x and y exchanged", lambda: mapped(block(), lambda xy: xy[:, ::-1]), Code.OUTSIDE, ("exchanged",)
     ),
+    Broken(
+        "one of two distances in centimetres",
+        lambda: (
+            lambda n: replace(
+                n, distance_of=n.distance_of[:2], distance=n.distance[:2] * [[1.0, 1.0], [0.1, 1.0]]
+            )
+        )(free_block()),
+        Code.DOUBTFUL_CONTROL,
+        ("contradict each other", "cannot be decided"),
+    ),
+    Broken(
+        "control in metres, declared as millimetres",
+        lambda: (lambda n: replace(n, xyz=n.xyz * 1e-3))(block()),
+        Code.IMPLAUSIBLE,
+        ("nearer than the principal distance",),
+    ),
     # Geometry that determines nothing.
+    Broken("parallel views", parallel_views, Code.NOT_IDENTIFIED, ("tilted against each other",)),
     Broken("one station", one_station, Code.ONE_STATION, ("from one station",)),
     Broken(
         "a plane seen frontally", lambda: plane(0.0), Code.FRONTAL, ("frontally", "c cannot be separated")

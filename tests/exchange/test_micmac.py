@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reseau.core.errors import FormatError
+from reseau.core.errors import FormatError, UsageError
 from reseau.exchange import read_network
 from reseau.optics.poses import rotation_matrix
 
@@ -100,7 +100,30 @@ def test_binary_homologous_points_are_those_of_the_text(tmp_path: Path) -> None:
         read_network(of_binary)
 
 
-def test_control_points_are_read_with_their_uncertainties(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("uncertainty", "factor", "sigma"),
+    [
+        ("0.1 0.1 0.2", None, [0.1, 0.1, 0.2]),
+        ("0.1 0.1 0.2", 2.0, [0.2, 0.2, 0.4]),
+        ("1 1 1", 0.01, 3 * [0.01]),
+    ],
+)
+def test_control_points_have_their_uncertainties_times_the_factor(
+    uncertainty: str, factor: float | None, sigma: list[float], tmp_path: Path
+) -> None:
+    network = read_network(with_control(tmp_path, uncertainty), control_sigma=factor)
+    assert (network.points, network.role) == (("P",), ("control",))
+    assert network.xyz.tolist() == [[1, 2, 3]]
+    np.testing.assert_allclose(network.sigma, [sigma], rtol=1e-12)
+
+
+def test_the_default_uncertainty_of_one_is_asked_about(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"the uncertainty 1, .*: --control-sigma"):
+        read_network(with_control(tmp_path, "1 1 1"))
+
+
+def with_control(tmp_path: Path, uncertainty: str) -> Path:
+    """A project with a control point in two images."""
     own = project(tmp_path)
     marks = "".join(
         f"<MesureAppuiFlottant1Im><NameIm>{name}.tif</NameIm><OneMesureAF1I><NamePt>P</NamePt>"
@@ -109,13 +132,10 @@ def test_control_points_are_read_with_their_uncertainties(tmp_path: Path) -> Non
     )
     (tmp_path / "Mes-S2D.xml").write_text(f"<SetOfMesureAppuisFlottants>{marks}</SetOfMesureAppuisFlottants>")
     (tmp_path / "Pts.xml").write_text(
-        "<DicoAppuisFlottant><OneAppuisDAF><Pt>1 2 3</Pt><NamePt>P</NamePt><Incertitude>0.1 0.1 0.2"
+        f"<DicoAppuisFlottant><OneAppuisDAF><Pt>1 2 3</Pt><NamePt>P</NamePt><Incertitude>{uncertainty}"
         "</Incertitude></OneAppuisDAF></DicoAppuisFlottant>"
     )
-    network = read_network(own)
-    assert (network.points, network.role) == (("P",), ("control",))
-    assert network.xyz.tolist() == [[1, 2, 3]]
-    assert network.sigma.tolist() == [[0.1, 0.1, 0.2]]
+    return own
 
 
 @pytest.mark.parametrize(

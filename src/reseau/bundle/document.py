@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -285,8 +285,8 @@ class CrossValidation(Strict):
 class ResultDocument(Document):
     """The result of a bundle adjustment, ``reseau-bundle/1``, in columns; null for undetermined values.
 
-    Keys after `warnings` are omitted where they do not apply. Files of earlier versions have neither
-    `warning_codes` nor `provenance`.
+    Keys after `warnings` are omitted where they do not apply. Files of earlier versions have none of
+    `warning_codes`, `status` and `provenance`.
 
     Examples
     --------
@@ -310,6 +310,7 @@ class ResultDocument(Document):
     global_test: GlobalTestResult | None
     warnings: tuple[str, ...]
     warning_codes: tuple[str, ...] | None = None
+    status: Literal["ok", "contradictory"] | None = None
     left_out: LeftOut | None = None
     distances: DistancesResult | None = None
     bases: DistancesResult | None = None
@@ -371,6 +372,7 @@ class ResultDocument(Document):
             ),
             warnings=tuple(remark.text for remark in result.warnings),
             warning_codes=tuple(remark.code.value for remark in result.warnings),
+            status=result.status,
             **more,
             **_model_search(result),
         )  # fmt: skip

@@ -23,7 +23,7 @@ from .bundle_options import (
     say_rig,
     say_turntable,
 )
-from .common import progress, required, say
+from .common import ended, progress, required, say
 
 if TYPE_CHECKING:
     from ..bundle import Network, Result
@@ -63,6 +63,7 @@ def bundle(
         Option("What defines position, orientation and scale.", Group.ADJUSTMENT),
     ] = None,
     sigma_px: v.SigmaPx | None = None,
+    control_sigma: v.ControlSigma | None = None,
     reject: v.Reject = False,
     alpha: Annotated[v.Alpha, "Here of data snooping."] = 0.001,
     components: v.Components | None = None,
@@ -100,7 +101,10 @@ def bundle(
     outputs(convert, None)
     distance = positive(distance)
     calibrations = _calibrations(camera_calibration or [])
-    content = _with_settings(read_network(network, calibrations), free, fix, control, datum, sigma_px)
+    read = read_network(network, calibrations, control_sigma=control_sigma)
+    for line in read.notes:
+        typer.echo(f"note: {line}", err=True)
+    content = _with_settings(read, free, fix, control, datum, sigma_px)
     if convert is not None:
         network_document(content).write(convert)
         return
@@ -113,7 +117,7 @@ def bundle(
         result = required(found, network)
     settings = {"reject": reject, "alpha": alpha, "components": components,
                 "eliminate": eliminate, "free": free, "fix": fix, "datum": datum,
-                "sigma_px": sigma_px, "memory_gb": memory_gb}  # fmt: skip
+                "sigma_px": sigma_px, "control_sigma": control_sigma, "memory_gb": memory_gb}  # fmt: skip
     settings = {key: value for key, value in settings.items() if key in _ALWAYS or value not in (None, ())}
     more = [*calibrations.values(), *([] if control is None else [control])]
     hashes = {file.name: sha256_of(file) for file in more}
@@ -132,6 +136,7 @@ def bundle(
         say(document.to_json())
     else:
         _say(network, result)
+    ended(result.status)
 
 
 def _export(result: Result, path: Path) -> None:
@@ -203,6 +208,8 @@ def _say(path: Path, result: Result) -> None:
         f"redundancy {result.redundancy}\n"
         f"sigma0 {result.sigma0:.4g} after {result.fit.iterations} iterations{left_out}\n"
     )
+    if result.contradiction is not None:
+        say(f"contradictory: {result.contradiction}\n")
     for c, camera in enumerate(result.cameras.values()):
         if camera.parameters:
             say(f"camera {camera.id}\n")
@@ -220,4 +227,5 @@ def _say(path: Path, result: Result) -> None:
     say_model(result)
     say_left_out(result)
     for warning in result.warnings:
-        say(f"warning: {warning}\n")
+        if warning is not result.contradiction:
+            say(f"warning: {warning}\n")

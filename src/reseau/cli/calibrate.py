@@ -31,6 +31,7 @@ from .common import (
     Computing,
     Reading,
     compile_first,
+    ended,
     overlay_files,
     progress,
     remark_lines,
@@ -295,11 +296,12 @@ def calibrate(
             written = write_calibrated(place, done, calibrations, page, step)
     if as_json:
         say("".join(calibration.to_json() for calibration in calibrations))
-        return
-    _say(done, differences, distance)
-    if written:
-        say(f"written: {place}\n")
-        say("".join(f"  {name:26} {what}\n" for name, what in written))
+    else:
+        _say(done, differences, distance)
+        if written:
+            say(f"written: {place}\n")
+            say("".join(f"  {name:26} {what}\n" for name, what in written))
+    ended(done.result.status)
 
 
 def _note(line: str) -> None:

@@ -114,6 +114,12 @@ class CameraChoice:
         return CameraOptions(self.model, self.free, self.pitch_mm)
 
 
+def ended(status: str) -> None:
+    """End a command whose result contradicts itself with the exit status 3, after everything was written."""
+    if status == "contradictory":
+        raise typer.Exit(3)
+
+
 SessionName = Annotated[str, typer.Argument(help="Name of the session.")]
 
 

@@ -136,6 +136,14 @@ FNumber = Annotated[
 SigmaPx = Annotated[
     float, Option("Standard deviation of all image coordinates (px).", Group.ADJUSTMENT, least=1e-6)
 ]
+ControlSigma = Annotated[
+    float,
+    Option(
+        "Standard deviation of control points, in the unit of the network; of MicMac's the factor on them.",
+        Group.ADJUSTMENT,
+        least=1e-9,
+    ),
+]
 Alpha = Annotated[float, Option("Significance level of a single test.", Group.ADJUSTMENT)]
 Reject = Annotated[bool, Option("Reject gross errors by data snooping.", Group.ADJUSTMENT)]
 Components = Annotated[

@@ -78,13 +78,17 @@ def read_colmap(folder: Path | str) -> Network:
     if not images or not points:
         raise FormatError("contains no images or no points", where=folder)
     rows, order = {name: j for j, name in enumerate(points)}, {name: c for c, name in enumerate(cameras)}
-    image_of, point_of, xy = list[int](), list[int](), list[Array]()
+    image_of, point_of, xy, twice = list[int](), list[int](), list[Array](), 0
     for i, image in enumerate(images):
         known = set[str]()
         for at, name in zip(image.xy, image.points, strict=True):
             # A point with two observations in an image is a wrong match: only the first is used; features
             # without a point are not.
-            if name in rows and name not in known:
+            if name not in rows:
+                continue
+            if name in known:
+                twice += 1
+            else:
                 known.add(name)
                 image_of.append(i)
                 point_of.append(rows[name])
@@ -103,6 +107,9 @@ def read_colmap(folder: Path | str) -> Network:
         np.array(list(points.values())),
         (np.array(image_of, np.intp), np.array(point_of, np.intp), pixels, np.ones(pixels.shape)),
         files=names,
+        notes=(f"{folder}: {twice} second observations of a point in the same image left out",)
+        if twice
+        else (),
     )
 
 

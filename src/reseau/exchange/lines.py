@@ -75,6 +75,7 @@ def network_of(
     *,
     files: tuple[str | None, ...] | None = None,
     unit: str = "",
+    notes: tuple[str, ...] = (),
 ) -> Network:
     """Create a free network with approximate coordinates and poses of another program.
 
@@ -84,6 +85,8 @@ def network_of(
         Rotation vectors.
     observations : tuple
         Rows of images and of points (n,), coordinates (n, 2) and standard deviations (n, 2), px.
+    notes : tuple of str
+        What was assumed or left out.
     """
     image_of, point_of, xy, sigma = observations
     cov = np.zeros((len(xy), 2, 2))
@@ -109,5 +112,6 @@ def network_of(
         datum_points=np.ones(p, dtype=bool),
         groups=(None,) * m,
         files=files or (None,) * m,
+        notes=notes,
         unit=unit,
     )

@@ -9,8 +9,10 @@ image coordinate is the centre of a pixel, as ours.
 
 The distortion (``eConvApero_DistM2C``) is added to the ideal image point, as by Brown's camera with the
 distortion on the object side; ``eConvApero_DistC2M`` is the reverse. The files say nothing of the pixel size:
-lengths are those of a sensor 36 mm wide. Coefficients beyond the fifth radial one, and a centre of distortion
-beside the principal point, are not read: the parameters are approximate values.
+lengths are in pixels. ``GCPConvert`` writes an uncertainty of 1 for all control points, and Campari
+multiplies uncertainties by the factor of its option ``GCP``: it must be given then. Coefficients beyond the
+fifth radial one, and a centre of distortion beside the principal point, are not read: the parameters are
+approximate values.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ import scipy
 
 from ..bundle import Camera, Network
 from ..core.data import Array, Mask, Rows
-from ..core.errors import FormatError
+from ..core.errors import FormatError, UsageError
 from ..io import read_text
 from ..optics import camera_model
 from ..optics.poses import matrix_to_vector
@@ -34,10 +36,6 @@ from .markup import Node, read_markup
 __all__ = ["is_micmac", "read_micmac"]
 
 _PATTERN = "Orientation-*.xml"
-# Width of the sensor (mm), of which the files say nothing.
-_SENSOR = 36.0
-# Powers of a length in the denominator of the coefficients.
-_POWER = {"P1": 1, "P2": 1} | {f"K{k}": 2 * k for k in range(1, 6)}
 _SIDES = {"eConvApero_DistM2C": "object", "eConvApero_DistC2M": "image"}
 
 
@@ -58,13 +56,15 @@ def is_micmac(folder: Path) -> bool:
     return any(folder.glob(_PATTERN))
 
 
-def read_micmac(path: Path | str) -> Network:
+def read_micmac(path: Path | str, control_sigma: float | None = None) -> Network:
     r"""Read a network from a folder of orientations, and what lies beside it.
 
     Parameters
     ----------
     path : path
         The folder ``Ori-NAME``.
+    control_sigma : float, optional
+        Factor on the uncertainties of the control points, as in Campari.
 
     Raises
     ------
@@ -73,6 +73,8 @@ def read_micmac(path: Path | str) -> Network:
     FormatError
         When a file is not as described, the model of the distortion is another one, or there are no image
         points.
+    UsageError
+        When all uncertainties of control points are 1, and no factor is given.
 
     Examples
     --------
@@ -133,6 +135,12 @@ def read_micmac(path: Path | str) -> Network:
     xyz, sigma = np.full((len(names), 3), np.nan), np.full((len(names), 3), np.nan)
     for name, (place, spread) in given.items():
         xyz[at[name]], sigma[at[name]] = place, spread
+    if control_sigma is None and (sigma == 1).any() and ((sigma == 1) | np.isnan(sigma)).all():
+        raise UsageError(
+            "gives all control points the uncertainty 1, which is GCPConvert's default for Campari's factor",
+            where=path, do="say how good they are: --control-sigma, 0.01 for 1 cm",
+        )  # fmt: skip
+    sigma *= control_sigma or 1.0
     network = network_of(
         tuple(cameras), tuple(images), np.array(camera_of, dtype=np.intp),
         matrix_to_vector(np.array(turns)), np.array(centres), names, xyz,
@@ -154,7 +162,7 @@ def _interior_file(folder: Path, named: str, by: Path) -> Path:
 
 
 def _camera(inside: Node, name: str) -> Camera:
-    """Brown's camera, held as Campari does, with a pixel size for the width of a usual sensor."""
+    """Brown's camera, held as Campari does, in pixels."""
     convention = inside.need("KnownConv").text
     if convention not in _SIDES:
         raise FormatError(f"has the convention {convention!r}", where=inside.where)
@@ -162,14 +170,12 @@ def _camera(inside: Node, name: str) -> Camera:
     pp, focal = inside.need("PP").numbers(2), inside.value("F")
     if not (focal > 0 and width > 0 and height > 0):
         raise FormatError(f"has the focal length {focal:g}", where=inside.where)
-    pitch = _SENSOR / max(width, height)
-    lengths = {"c": focal, "x0": pp[0] - (width - 1) / 2, "y0": (height - 1) / 2 - pp[1]}
-    values = {name: pitch * value for name, value in lengths.items()}
+    values = {"c": focal, "x0": pp[0] - (width - 1) / 2, "y0": (height - 1) / 2 - pp[1]}
     for element in inside.all("CalibDistortion"):
-        values |= {name: value / pitch ** _POWER.get(name, 0) for name, value in _distortion(element).items()}
+        values |= _distortion(element)
     model = camera_model("brown_higher" if values.get("K4", 0.0) or values.get("K5", 0.0) else "brown")
     column, options = np.array([values.get(key, 0.0) for key in model.names]), {"side": _SIDES[convention]}
-    return Camera(name, width, height, (pitch, pitch), model.name, column, (), options)
+    return Camera(name, width, height, (1.0, 1.0), model.name, column, (), options)
 
 
 def _distortion(element: Node) -> dict[str, float]:

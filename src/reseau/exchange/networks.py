@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Set
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from ..bundle import Camera, Network, Result, calibrated_camera, film_camera, with_estimates
 from ..bundle.network import network_document
@@ -34,7 +37,12 @@ _BINARY_OR_XML: tuple[tuple[Callable[[bytes], bool], Callable[[Path], Network]],
 )
 
 
-def read_network(path: Path | str, calibrations: Mapping[str, Path | str] | None = None) -> Network:
+def read_network(
+    path: Path | str,
+    calibrations: Mapping[str, Path | str] | None = None,
+    *,
+    control_sigma: float | None = None,
+) -> Network:
     """Read a network of this project or of another program, recognised by its content.
 
     Parameters
@@ -45,6 +53,9 @@ def read_network(path: Path | str, calibrations: Mapping[str, Path | str] | None
         Calibration files by the id of a camera, in place of its entry in the network. Their parameters are
         observations with their joint covariance. The orientation of a film frame replaces pixel size and
         principal point of the entry; its other parameters stay.
+    control_sigma : float, optional
+        Standard deviation of control points, in the unit of the network; for MicMac the factor on their
+        uncertainties, as in Campari.
 
     Raises
     ------
@@ -64,7 +75,10 @@ def read_network(path: Path | str, calibrations: Mapping[str, Path | str] | None
     """
     path, given = Path(path), dict(calibrations or {})
     if path.is_dir() or path.suffix.lower() != ".json":
-        network = read_foreign(path)
+        if path.is_dir() and is_micmac(path):
+            network = read_micmac(path, control_sigma)
+        else:
+            network = _with_control_sigma(read_foreign(path), control_sigma)
         # With a pitch of one, the principal distance is in pixels.
         known = {camera.id: camera for camera in network.cameras}
         with_size = {name: camera for name, camera in known.items() if camera.pitch_mm != (1.0, 1.0)}
@@ -85,7 +99,14 @@ def read_network(path: Path | str, calibrations: Mapping[str, Path | str] | None
         if isinstance(entry, CalibratedCameraEntry | FilmCameraEntry) and entry.id not in given
     }
     cameras |= _chosen(given, {entry.id for entry in document.cameras}, with_size)
-    return Network.from_document(document, cameras)
+    return _with_control_sigma(Network.from_document(document, cameras), control_sigma)
+
+
+def _with_control_sigma(network: Network, sigma: float | None) -> Network:
+    """The network with one standard deviation of all known coordinates of points."""
+    if sigma is None:
+        return network
+    return replace(network, sigma=np.where(np.isnan(network.sigma), np.nan, sigma))
 
 
 def _chosen(

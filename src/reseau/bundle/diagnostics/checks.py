@@ -13,11 +13,12 @@ from ...core.errors import UsageError
 from ...core.failure import Code, Remark
 from ..network import Network
 from ..solver import BundleFit
+from .evidence import ODDS
 from .patterns import CommonPattern, by_place, common_pattern
 from .regularisation import regularised
 from .result import Result
 
-__all__ = ["LISTED", "checks", "in_images", "listed", "unmodelled_pattern"]
+__all__ = ["LISTED", "checks", "in_images", "listed", "perspective", "unmodelled_pattern"]
 
 LISTED = 8
 SHOWN = 3
@@ -31,6 +32,8 @@ _MIN_REDUNDANCY = 5.0
 _MIN_IMAGES = 3
 # Size of a corner as a fraction of width and height.
 _CORNER = 0.2
+# Millimetres in a unit of object space.
+_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 # Points are in a plane where their extent across it is this part of the largest.
 _PLANE = 1e-4
 
@@ -147,6 +150,8 @@ def checks(result: Result) -> list[Remark]:
     """
     network, fit = result.network, result.fit
     return [
+        *_too_near(result),
+        *_without_perspective(result),
         *_gaps(result),
         *_not_converged(result),
         *_global(result),
@@ -480,6 +485,66 @@ def _parallel(network: Network, fit: BundleFit) -> list[Remark]:
             "plane, have the same image points; one of them was chosen for each image"
         )
         found.append(Remark(text, Code.NOT_IDENTIFIED))
+    return found
+
+
+def perspective(result: Result, camera: int) -> tuple[float, bool]:
+    """Return the reciprocal focal length of a camera in its sigmas, and whether it predicts better than zero.
+
+    Examples
+    --------
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> perspective(adjust_network(example_network()), 0)[1]
+    True
+    """
+    model = result.network.cameras[camera].registered
+    names, _, values = result.camera_columns(camera)
+    sigma = np.sqrt(np.diag(result.formal_camera_covariance(camera)))
+    scales = () if model is None or model.parallel else model.of_role("scale")
+    ratios = [abs(v) / s for name, v, s in zip(names, values, sigma, strict=True) if name in scales and s > 0]
+    size = float(min(ratios, default=np.inf))
+    return size, bool(0.5 * size**2 - 1 > ODDS)
+
+
+def _without_perspective(result: Result) -> list[Remark]:
+    """Cameras of which parallel rays predict the image points as well."""
+    return [
+        Remark(
+            f"{camera.label}: parallel rays predict the image points as well as perspective (the reciprocal "
+            f"of the focal length is {size:.2g} times its sigma): neither focal length nor distances are "
+            "determined; take images from nearer, or tilted against each other, or hold the focal length",
+            Code.NOT_IDENTIFIED,
+        )
+        for c, camera in enumerate(result.network.cameras)
+        for size, seen in [perspective(result, c)]
+        if not seen
+    ]
+
+
+def _too_near(result: Result) -> list[Remark]:
+    """Points nearer than the principal distance: no lens forms an image of them."""
+    network, values, found = result.network, result.fit.values, list[Remark]()
+    if not (network.held.any() or network.observed.any() or len(network.distance)):
+        return []
+    for c, camera in enumerate(network.cameras):
+        model, unit = camera.registered, _MM.get(network.unit)
+        if model is None or unit is None or not model.needs_pitch or camera.in_pixels or camera.parallel:
+            continue
+        own = result.fit.usable.observations & (network.camera_of[network.image_of] == c)
+        image, point = network.image_of[own], network.point_of[own]
+        away = np.einsum("ni,ni->n", values.rotation[image, 2], values.xyz[point] - values.x0[image])
+        scales = model.of_role("scale")
+        focal = [v for name, v in zip(camera.names, values.cameras[c], strict=False) if name in scales]
+        near = float(np.median(away)) if len(away) else np.inf
+        if unit * near < min(focal, default=0.0):
+            found.append(
+                Remark(
+                    f"{camera.label}: the points are {near:.3g} {network.unit} away, nearer than the "
+                    f"principal distance ({min(focal):.3g} mm): no lens forms an image of them; are the "
+                    "coordinates in another unit?",
+                    Code.IMPLAUSIBLE,
+                )
+            )
     return found
 
 

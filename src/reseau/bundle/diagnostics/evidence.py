@@ -26,6 +26,7 @@ from ..solver import BundleFit
 from ..solver.normal import SEGMENTS
 
 __all__ = [
+    "ODDS",
     "Effect",
     "Scores",
     "lower_factor",
@@ -37,6 +38,11 @@ __all__ = [
     "used_rows",
 ]
 
+ODDS = np.log(10.0)
+"""Logarithm of how much better a model with more parameters must predict what is left out: ten times, and as
+many times more as there are such models, one of which could do so by chance. One parameter too many does in
+1 % of cases: the logarithm is (χ² − 2) / 2 with one degree of freedom (Stone 1977, J. R. Statist. Soc. B 39),
+and χ² > 2 + 2 ln 10 has this probability. So have several."""
 _SIZES = np.geomspace(0.02, 2000.0, 24)
 """Root mean square displacements that a cause may have, in standard deviations of the image points."""
 _LOG_RANGE = 2 * np.log(100.0**2)

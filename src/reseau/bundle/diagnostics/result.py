@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ...adjust.significance import CoefficientTest, GlobalTest, ratio_test
 from ...core.data import Array, Mask, Rows
 from ...core.display import Display, Table
 from ...core.errors import UsageError
-from ...core.failure import Estimated, Remark
+from ...core.failure import Code, Estimated, Remark
 from ...optics.cameras import distortion_names
 from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
 from ..network import Network
@@ -42,6 +42,11 @@ __all__ = ["Eliminated", "Result"]
 _STEP = 1e-6
 # Minimum redundancy of an image for a variance factor.
 _UNCONTROLLED = 1e-6
+# What cannot be, and what contradicts the rest where residuals are too large.
+_IMPOSSIBLE = frozenset({Code.IMPLAUSIBLE, Code.NOT_CONVERGED})
+_DOUBTFUL = frozenset(
+    {Code.DOUBTFUL_CONTROL, Code.GROSS_ERRORS, Code.INCONSISTENT, Code.OUTSIDE, Code.READINGS}
+)
 
 
 @dataclass(frozen=True)
@@ -127,6 +132,23 @@ class Result(Estimated, Display):
     def redundancy(self) -> int:
         """Number of observations minus unknowns plus datum constraints."""
         return self.fit.redundancy
+
+    @property
+    def contradiction(self) -> Remark | None:
+        """What contradicts the rest, the foremost; None where nothing does.
+
+        Values that cannot be, and an adjustment that has not converged; observations that are doubtful for a
+        reason other than chance, where residuals are larger than their sigmas say.
+        """
+        test = self.global_test()
+        too_large = test is not None and not test.passed and self.sigma0 > 1
+        codes = _IMPOSSIBLE | _DOUBTFUL if too_large else _IMPOSSIBLE
+        return next((remark for remark in self.warnings if remark.code in codes), None)
+
+    @property
+    def status(self) -> Literal["ok", "contradictory"]:
+        """Whether the result contradicts itself; commands then end with the exit status 3."""
+        return "ok" if self.contradiction is None else "contradictory"
 
     def global_test(self, alpha: float = 0.05) -> GlobalTest | None:
         """Test the variance factor against one; None without redundancy."""

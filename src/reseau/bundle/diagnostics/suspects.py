@@ -13,12 +13,13 @@ from dataclasses import replace
 import numpy as np
 
 from ...adjust import critical_w
-from ...core.data import Rows
+from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure, Remark
 from ..network import Camera, Network
 from ..network.network import finite
 from ..solver import BundleFit, BundleProblem
 from .checks import listed
+from .evidence import ODDS
 
 __all__ = ["contradicting", "doubtful_parameters", "grouped", "without_false_bars"]
 
@@ -80,12 +81,39 @@ def contradicting(problem: BundleProblem, fit: BundleFit) -> tuple[BundleProblem
             break
         off = float(np.abs(again.residuals[own[worst]]))
         found.append((int(element[worst]), float(w[worst]), off))
+        others = _instead(problem, current, weights, again, own, element, w > critical, worst)
+        if others:
+            # One of them is wrong; without a further observation it cannot be said which.
+            found += [(other, float(w[element == other].max()), np.nan) for other in others]
+            found[-1 - len(others)] = (int(element[worst]), float(w[worst]), np.nan)
+            break
         weights, current = trial, again
     named = [one for one in found if one[0] < lengths]
     false = [k for k, _, off in named if np.isfinite(off)]
     weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
     weights[own[np.isin(element, false)]] = 0.0
     return problem.with_weights(weights) if false else problem, _lengths(network, named)
+
+
+def _instead(
+    problem: BundleProblem,
+    fit: BundleFit,
+    weights: Array,
+    without: BundleFit,
+    own: Rows,
+    element: Rows,
+    suspected: Mask,
+    worst: int,
+) -> list[int]:
+    """Elements that explain as well as the worst, where they are left out in its stead."""
+    found = []
+    for other in np.unique(element[suspected & (element != element[worst])]).tolist():
+        trial = weights.copy()
+        trial[own[element == other]] = 0.0
+        again = problem.continued(fit).with_weights(trial).adjusted()
+        if not isinstance(again, Failure) and 0.5 * (again.cost - without.cost) / without.variance < ODDS:
+            found.append(int(other))
+    return found
 
 
 def without_false_bars(problem: BundleProblem) -> tuple[BundleProblem, list[Remark]]:
@@ -142,14 +170,23 @@ def _lengths(network: Network, found: list[tuple[int, float, float]]) -> list[Re
     if network.rig is not None:
         ends += [tuple(network.cameras[c].label for c in pair) for pair in network.rig.base_of]
         length += network.rig.base[:, 0].tolist()
-    names = []
+    names, alike = [], []
     for k, w, off in found:
         if k >= len(ends):
             continue
         by = "" if np.isnan(off) else f", by {off:.3g} {network.unit} from the others"
+        alike += [f"{ends[k][0]} to {ends[k][1]} ({length[k]:g} {network.unit})"] if np.isnan(off) else []
         names.append(f"{ends[k][0]} to {ends[k][1]} ({length[k]:g} {network.unit}{by}, w {w:.1f})")
     if not names:
         return []
+    if len(alike) > 1:
+        return [
+            Remark(
+                f"the distances {listed(alike)} contradict each other, and without any one of them all "
+                "agrees: which is wrong cannot be decided; measure one more",
+                Code.DOUBTFUL_CONTROL,
+            )
+        ]
     verb = "contradicts" if len(names) == 1 else "contradict"
     return [
         Remark(

@@ -544,6 +544,33 @@ def _control_of_failed(problem: BundleProblem) -> list[Remark]:
     return [Remark(shape.doubt(), Code.DOUBTFUL_CONTROL)]
 
 
+def _focal_length(problem: BundleProblem) -> list[Remark]:
+    """Focal lengths that the images do not determine: held as given, they predict all image points."""
+    scales = [() if c.registered is None else c.registered.of_role("scale") for c in problem.network.cameras]
+    cameras = tuple(
+        replace(camera, free=tuple(name for name in camera.free if name not in names))
+        for camera, names in zip(problem.network.cameras, scales, strict=True)
+    )
+    held = [
+        f"{old.label} {name} {old.parameters[name]:g} {old.unit_of(name)}"
+        for old, new in zip(problem.network.cameras, cameras, strict=True)
+        for name in old.free
+        if name not in new.free
+    ]
+    if not held:
+        return []
+    fit = replace(problem, network=replace(problem.network, cameras=cameras)).adjusted()
+    if isinstance(fit, Failure) or fit.redundancy < 1 or not fit.global_test().passed:
+        return []
+    return [
+        Remark(
+            f"with {listed(held)} held, all image points are explained (sigma0 {fit.sigma0:.3g}): images do "
+            "not determine it; take images from nearer, or tilted against each other, or hold it",
+            Code.NOT_IDENTIFIED,
+        )
+    ]
+
+
 def _explained(failure: Failure, problem: BundleProblem, found: list[Remark]) -> Failure:
     """Add the cause to the reason of a failure, or say that there is no depth."""
     network = problem.network
@@ -554,7 +581,7 @@ def _explained(failure: Failure, problem: BundleProblem, found: list[Remark]) ->
     if failure.code is Code.NO_DATUM and not found:
         return failure
     if failure.code in RETRIED and not found:
-        found = motion_of_narrow_lens(network)
+        found = motion_of_narrow_lens(network) or _focal_length(problem)
     if not found:
         start = problem.start
         found = seen_frontally(network, start.rotation, start.xyz, finite(start.x0))

@@ -16,7 +16,7 @@ from ..network import Additional, Camera, Network
 from ..network.network import finite
 from ..solver import BundleFit
 from .adjustment import Options, adjust_network, problem_of
-from .determined import result_of, whole_camera
+from .determined import whole_camera
 from .left_out import with_camera
 from .startup import adjusted_in_steps
 
@@ -28,7 +28,6 @@ __all__ = [
     "camera_candidates",
     "families",
     "first_fit",
-    "perspective",
     "surface",
     "wider_model",
     "with_parallel_rays",
@@ -296,16 +295,6 @@ def _checked(fit: BundleFit | Failure, camera: int) -> BundleFit | Failure:
     if not np.isfinite(whole_camera(fit, camera).inverse(network.xy[own])).all():
         return Failure("the image folds within the observations", Code.NOT_IDENTIFIED)
     return fit
-
-
-def perspective(fit: BundleFit, camera: int) -> float:
-    """The reciprocal of a focal length in its standard deviations."""
-    own, result = fit.problem.network.cameras[camera], result_of(fit)
-    names, _, values = result.camera_columns(camera)
-    sigma = np.sqrt(np.diag(result.formal_camera_covariance(camera)))
-    scales = () if own.registered is None else own.registered.of_role("scale")
-    ratios = [abs(v) / s for name, v, s in zip(names, values, sigma, strict=True) if name in scales]
-    return float(min(ratios, default=np.inf))
 
 
 def surface(fit: BundleFit, camera: int) -> Candidate | None:

@@ -23,7 +23,8 @@ from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Code, Estimated, Failure
 from ...optics.cameras import camera_model
-from ..diagnostics.checks import unmodelled_pattern
+from ..diagnostics.checks import perspective, unmodelled_pattern
+from ..diagnostics.evidence import ODDS
 from ..network import Camera, Network
 from ..solver import BundleFit
 from .adjustment import Options, adjust_network
@@ -35,13 +36,12 @@ from .candidates import (
     camera_candidates,
     families,
     first_fit,
-    perspective,
     surface,
     wider_model,
     with_parallel_rays,
 )
 from .determined import mapping_of, result_of
-from .left_out import ODDS, Information, Prediction, information_of
+from .left_out import Information, Prediction, information_of
 
 __all__ = ["Compared", "ModelChoice", "choose_model", "choose_models"]
 
@@ -50,8 +50,6 @@ _LEVEL = 0.01
 _LEAST = 3
 # Images, and image points of each, beyond which a choice takes longer and becomes no better.
 _IMAGES, _POINTS = 60, 200
-# Size of the reciprocal of a focal length, in standard deviations, above which there is perspective.
-_SIGNIFICANT = 2.6
 # Places along the longer side at which cameras are compared.
 _ACROSS = 13
 
@@ -452,9 +450,9 @@ class _Search:
                 self.declined[each] = (
                     "not needed: the usual models leave no pattern that images have in common"
                 )
-        size = perspective(fit, self.camera)
+        size, seen = perspective(result_of(fit), self.camera)
         for each in parallel:
-            if size > _SIGNIFICANT:
+            if seen:
                 self.declined[each] = (
                     f"perspective is significant: 1/focal length is {size:.3g} times its sigma"
                 )

@@ -34,14 +34,8 @@ from ..solver.linear import Linear
 from ..solver.normal import SEGMENTS
 from .determined import whole_camera
 
-__all__ = ["ODDS", "Information", "Prediction", "information_of", "with_camera"]
+__all__ = ["Information", "Prediction", "information_of", "with_camera"]
 
-# A model with more parameters predicts better by more than chance where it makes the images that are left out
-# ten times as probable, and as many times more as there are such models, one of which could do so by chance.
-# One parameter too many makes them ten times as probable in 1 % of cases: the logarithm is (χ² − 2) / 2 with
-# one degree of freedom (Stone 1977, J. R. Statist. Soc. B 39), and χ² > 2 + 2 ln 10 has this probability. So
-# have several.
-ODDS = np.log(10.0)
 # Variance that is added to directions which an image alone determines, relative to that of its coordinates:
 # they predict nothing, and the same for all cameras.
 _NOTHING = 1e-6

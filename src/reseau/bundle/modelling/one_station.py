@@ -25,10 +25,10 @@ from ...core.failure import Code, Estimated, Failure
 from ...core.numbers import measured
 from ...optics.poses import rotation_matrix
 from ..diagnostics import CameraEstimate
+from ..diagnostics.evidence import ODDS
 from ..network import Network
 from ..network.network import finite
 from ..solver import BundleFit, BundleProblem
-from .left_out import ODDS
 
 __all__ = ["RotationOnly", "one_station", "rotation_only"]
 
@@ -211,7 +211,8 @@ class _Rotations:
             normal, side, points = self._reduced(state)
             before = cost
             while damping < _STUCK:
-                step = np.linalg.lstsq(normal + damping * np.diag(np.diag(normal)), side, rcond=None)[0]
+                damped = normal + damping * np.diag(np.diag(normal))
+                step: Array = scipy.linalg.lstsq(damped, side)[0]
                 new = self._moved(state, step, points)
                 now = self.cost(new)
                 if now < cost:
@@ -221,7 +222,8 @@ class _Rotations:
             if before - cost <= _SMALL * cost:
                 break
         k = len(state.cameras)
-        return state, cost, np.linalg.pinv(self._reduced(state)[0], hermitian=True)[:k, :k]
+        cofactors = _inverted(self._reduced(state)[0])
+        return state, cost, cofactors[:k, :k]
 
     def _reduced(self, state: _State) -> tuple[Array, Array, tuple[Array, ...]]:
         """Normal equations of cameras and rotations, directions eliminated; what gives these back.
@@ -229,7 +231,7 @@ class _Rotations:
         The first image defines the system and does not turn.
         """
         off, by_camera, turn, by_direction = self.misfits(state, slopes=True)
-        tangent = np.linalg.svd(state.direction[:, None, :])[2][:, 1:]
+        tangent: Array = np.asarray(np.linalg.svd(state.direction[:, None, :])[2][:, 1:], dtype=np.float64)
         b = by_direction @ np.swapaxes(tangent[self.point], 1, 2)
         n, m, p, k = len(off), len(state.rotation), len(state.direction), by_camera.shape[2]
         a = np.zeros((n, 2, k + 3 * m))
@@ -243,7 +245,7 @@ class _Rotations:
         )
         own = np.zeros((p, 2, 2))
         np.add.at(own, self.point, np.swapaxes(b, 1, 2) @ b)
-        inverse = np.linalg.pinv(own, hermitian=True)
+        inverse = _inverted(own)
         between = np.asarray(plain.T @ a).reshape(p, 2, -1)
         right = np.asarray(plain.T @ off.ravel()).reshape(p, 2)
         normal = a.T @ a - np.einsum("pik,pij,pjl->kl", between, inverse, between, optimize=True)
@@ -263,6 +265,11 @@ class _Rotations:
             state.cameras + step[:k], rotation_matrix(turn) @ state.rotation,
             direction / np.linalg.norm(direction, axis=1)[:, None],
         )  # fmt: skip
+
+
+def _inverted(matrices: Array) -> Array:
+    """Pseudo-inverses of symmetric matrices."""
+    return np.asarray(np.linalg.pinv(matrices, hermitian=True), dtype=np.float64)
 
 
 def _cross(vectors: Array) -> Array:

@@ -82,6 +82,8 @@ class Network(Display):
     motion : ndarray (m, 6), optional
         Velocities and rotation rates of images of cameras with a shutter: observed, held or approximate
         values; zero by default. See :mod:`reseau.bundle.network.shutter`.
+    notes : tuple of str
+        What was assumed or left out when it was read.
 
     Examples
     --------
@@ -118,6 +120,7 @@ class Network(Display):
     rig: Rig | None = None
     refraction: Refraction | None = None
     motion: Array | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         m, p, n = len(self.images), len(self.points), len(self.image_of)
