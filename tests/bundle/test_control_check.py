@@ -13,7 +13,7 @@ from reseau.core.data import Array
 from reseau.core.failure import Code
 
 from . import networks
-from .test_diagnoses import seen_from
+from .networks import seen_from
 
 # Half the side of a plane figure of 49 points, m, and its deflection at the middle of an edge.
 HALF, DEFLECTION = 1.0, 0.02

@@ -148,8 +148,12 @@ def test_gross_errors_are_named_and_rejected(reseau: Run, network: Callable[...,
     table = json.loads(path.read_text())["observations"]
     where = (table["image"][17], table["point"][17])
     status, out, _ = reseau("bundle", path, "--json")
-    assert status == 0
-    assert any(f"in image {where[0]}: point {where[1]}" in warning for warning in json.loads(out)["warnings"])
+    found = json.loads(out)
+    # The result is written, and contradicts itself.
+    assert (status, found["status"]) == (3, "contradictory")
+    assert any(f"in image {where[0]}: point {where[1]}" in warning for warning in found["warnings"])
+    status, out, _ = reseau("bundle", path)
+    assert (status, out.splitlines()[2][:15]) == (3, "contradictory: ")
     status, out, _ = reseau("bundle", path, "--reject", "--json")
     assert status == 0
     found = json.loads(out)
@@ -231,7 +235,7 @@ def test_swapped_control_points_are_reported(
     pair: tuple[int, int], reseau: Run, network: Callable[..., Path]
 ) -> None:
     status, out, err = reseau("bundle", network(swap("xyz", *pair)), "--json")
-    message = " ".join(json.loads(out)["warnings"]) if status == 0 else err
+    message = " ".join(json.loads(out)["warnings"]) if status == 3 else err
     # The control is a symmetric plane figure: the other pair would do as well.
     assert f"p{pair[0]} and p{pair[1]}" in message
     assert "exchanged" in message
@@ -248,7 +252,7 @@ def test_the_document_is_read_back_with_its_provenance(
     assert list(document.provenance["inputs"]) == ["network.json"]
     older = json.loads(out.read_text("utf-8"))
     assert list(older)[-1] == "provenance"
-    del older["provenance"], older["warning_codes"]
+    del older["provenance"], older["warning_codes"], older["status"]
     assert ResultDocument.parse(json.dumps(older), where="older").to_dict() == older
 
 

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import scipy
 
 from ...adjust import VarianceComponents
 from ...adjust.outliers import SnoopingStep
@@ -44,9 +45,7 @@ _STEP = 1e-6
 _UNCONTROLLED = 1e-6
 # What cannot be, and what contradicts the rest where residuals are too large.
 _IMPOSSIBLE = frozenset({Code.IMPLAUSIBLE, Code.NOT_CONVERGED})
-_DOUBTFUL = frozenset(
-    {Code.DOUBTFUL_CONTROL, Code.GROSS_ERRORS, Code.INCONSISTENT, Code.OUTSIDE, Code.READINGS}
-)
+_DOUBTFUL = frozenset({Code.DOUBTFUL_CONTROL, Code.INCONSISTENT, Code.OUTSIDE, Code.READINGS})
 
 
 @dataclass(frozen=True)
@@ -137,13 +136,24 @@ class Result(Estimated, Display):
     def contradiction(self) -> Remark | None:
         """What contradicts the rest, the foremost; None where nothing does.
 
-        Values that cannot be, and an adjustment that has not converged; observations that are doubtful for a
-        reason other than chance, where residuals are larger than their sigmas say.
+        Values that cannot be, and an adjustment that has not converged; where residuals are larger than their
+        sigmas say, observations that are doubtful for a reason other than chance, and single image points
+        that have most of what vᵀPv is too large.
         """
-        test = self.global_test()
-        too_large = test is not None and not test.passed and self.sigma0 > 1
-        codes = _IMPOSSIBLE | _DOUBTFUL if too_large else _IMPOSSIBLE
+        test, codes = self.global_test(), _IMPOSSIBLE
+        if test is not None and not test.passed and self.sigma0 > 1:
+            codes = codes | _DOUBTFUL
+            if self._gross_part > 0.5:
+                codes = codes | {Code.GROSS_ERRORS}
         return next((remark for remark in self.warnings if remark.code in codes), None)
+
+    @property
+    def _gross_part(self) -> float:
+        """Part of what vᵀPv is too large that single image points have, of which none has as much by chance."""
+        v = np.nan_to_num(self.residuals[self._kept])
+        square = np.einsum("ni,nij,nj->n", v, np.linalg.inv(self.network.cov[self._kept]), v)
+        gross = square > scipy.special.chdtri(2, 0.01 / max(len(square), 1))
+        return float(square[gross].sum() / max(self.fit.cost - self.redundancy, 1e-300))
 
     @property
     def status(self) -> Literal["ok", "contradictory"]:

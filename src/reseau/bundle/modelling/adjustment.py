@@ -581,10 +581,12 @@ def _explained(failure: Failure, problem: BundleProblem, found: list[Remark]) ->
     if failure.code is Code.NO_DATUM and not found:
         return failure
     if failure.code in RETRIED and not found:
-        found = motion_of_narrow_lens(network) or _focal_length(problem)
+        found = motion_of_narrow_lens(network)
     if not found:
         start = problem.start
         found = seen_frontally(network, start.rotation, start.xyz, finite(start.x0))
+    if failure.code in RETRIED and not found:
+        found = _focal_length(problem)
     if not found and network.datum == "control":
         found = _control_of_failed(problem)
     if not found and failure.code is not Code.TOO_FEW_POINTS and len(problem.observations) <= MANY:
