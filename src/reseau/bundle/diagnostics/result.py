@@ -149,7 +149,7 @@ class Result(Estimated, Display):
 
     @property
     def _gross_part(self) -> float:
-        """Part of what vᵀPv is too large that single image points have, of which none has as much by chance."""
+        """Part of what vᵀPv is too large that single image points have, more each than by chance."""
         v = np.nan_to_num(self.residuals[self._kept])
         square = np.einsum("ni,nij,nj->n", v, np.linalg.inv(self.network.cov[self._kept]), v)
         gross = square > scipy.special.chdtri(2, 0.01 / max(len(square), 1))
