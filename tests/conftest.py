@@ -1,4 +1,4 @@
-"""Shared by the tests: reference data, which is not part of the project, archives, and no limits of time."""
+"""Shared by the tests: reference data, not part of the project, archives, kept pictures, no time limits."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import sqlalchemy as sa
 from hypothesis import settings
 
 from reseau.archive import Archive
+
+from . import kept
 
 # A loaded machine, or code that is compiled at its first call, is not an error.
 settings.register_profile("untimed", deadline=None)
@@ -63,3 +65,12 @@ def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[], Archi
 def assets(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Keep images of readings out of the project."""
     os.environ["RESEAU_ASSETS"] = str(tmp_path_factory.mktemp("assets"))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def pictures(request: pytest.FixtureRequest) -> None:
+    """Keep drawn pictures in pytest's cache."""
+    cache: pytest.Cache | None = getattr(request.config, "cache", None)
+    if cache is not None:
+        kept.FOLDER = cache.mkdir("pictures")
+        kept.clear_unused(kept.FOLDER)

@@ -66,7 +66,9 @@ class Print:
             # Ink to the left of and below each crossing of lines.
             total = np.zeros_like(filled)
             total[1:, 1:] = filled[:-1, :-1].cumsum(axis=0).cumsum(axis=1)
-            known |= {"lines": lines, "total": total}
+            # Share of ink in each cell between lines, and in those around them.
+            shares = np.pad(filled[:-1, :-1] / np.outer(*map(np.diff, lines)), 1)
+            known |= {"lines": lines, "total": total, "shares": shares}
         object.__setattr__(self, "_known", known)
 
     _known: Any = field(init=False, repr=False, default=None)
@@ -83,6 +85,22 @@ class Print:
         low = (1 - u) * t[i, j] + u * t[i + 1, j]
         return np.asarray((1 - v) * low + v * ((1 - u) * t[i, j + 1] + u * t[i + 1, j + 1]))
 
+    def _ink(self, x: Array, y: Array, half: list[Array]) -> Array:
+        """Shares (h, w) of black rectangles in samples that reach by `half` along both axes."""
+        inside, cell = np.ones(x.shape, dtype=bool), []
+        for line, at, reach in zip(self._known["lines"], (x, y), half, strict=True):
+            k = np.searchsorted(line, at, side="right")
+            ends = np.concatenate([[-np.inf], line, [np.inf]])
+            inside &= (at - reach >= ends[k]) & (at + reach <= ends[k + 1])
+            cell.append(k)
+        # Most samples are in one cell; only those over a line need an integral.
+        ink = self._known["shares"][cell[0], cell[1]]
+        x, y, p, q = (at[~inside] for at in (x, y, *half))
+        a, b, c, d = x - p, y - q, x + p, y + q
+        whole = self._below(c, d) - self._below(a, d) - self._below(c, b) + self._below(a, b)
+        ink[~inside] = np.clip(whole / np.maximum((c - a) * (d - b), 1e-12), 0, 1)
+        return np.asarray(ink)
+
     def printed(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Shares (h, w) of paper, and of ink on it, at places that follow each other closely."""
         half = [per_sample(at) / 2 for at in (x, y)]
@@ -90,11 +108,9 @@ class Print:
         paper = np.ones(x.shape)
         for at, a, b, reach in ((x, low[0], high[0], half[0]), (y, low[1], high[1], half[1])):
             paper *= edge(np.minimum(at - a, b - at), 2 * reach)
-        ink = np.zeros(x.shape)
-        if len(self.black):
-            (a, c), (b, d) = ((at - reach, at + reach) for at, reach in zip((x, y), half, strict=True))
-            whole = self._below(c, d) - self._below(a, d) - self._below(c, b) + self._below(a, b)
-            ink = np.clip(whole / np.maximum((c - a) * (d - b), 1e-12), 0, 1)
+        if not paper.any():
+            return paper, np.zeros(x.shape)
+        ink = self._ink(x, y, half) if len(self.black) else np.zeros(x.shape)
         # Where a disk is follows from few samples.
         few = [at[::_COARSE, ::_COARSE] for at in (x, y)]
         apart = sum(np.abs(np.gradient(at)).max(axis=0) for at in few) if min(few[0].shape) > 1 else np.inf

@@ -22,3 +22,10 @@ def test_the_limit_ends_with_the_outermost_context() -> None:
                 assert threads() == {1}
             assert threads() == {1}
         assert threads() == before
+
+
+def test_the_limit_decorates_a_function() -> None:
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):
+        before = threads()
+        assert one_thread()(threads)() == {1}
+        assert threads() == before

@@ -23,6 +23,7 @@ from reseau.measure import BoardOptions, BoardResult, measure_board, measure_tag
 from reseau.measure.boards.placement import numbered
 from reseau.measure.testfield.lattice_mapping import started
 
+from .. import kept
 from .board_pictures import picture
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -176,7 +177,7 @@ def test_few_large_marks_through_a_lens_have_the_sigmas_of_their_errors(
     design: BoardDesign, printed: prints.Print, seed: int
 ) -> None:
     view = View(printed, *pose(seed, printed, nearer=1.15), seed=seed)
-    found = measured(Frame(view.picture(), 255.0, "lens"), design)
+    found = measured(Frame(kept.picture(view), 255.0, "lens"), design)
     assert 20 <= found.found < 45
     error = renamed(found, view.truth)
     assert 0.75 < over_sigmas(found, error) < 1.3
@@ -199,7 +200,7 @@ def test_large_circles_through_a_wide_lens_or_in_part_have_the_sigmas_of_their_e
     turn, place = pose(seed, printed, nearer=nearer)
     shift = np.append(np.random.default_rng(seed - 110).uniform(-60, 60, 2), 0.0) if not wide else 0.0
     view = (Wide if wide else View)(printed, turn, place * [1, 1, 0.55 if wide else 1] + shift, seed=seed)
-    found = measured(Frame(view.picture(), 255.0, "lens"), design)
+    found = measured(Frame(kept.picture(view), 255.0, "lens"), design)
     error = renamed(found, view.truth)
     assert 0.4 < over_sigmas(found, error) < 1.3
     assert np.abs(in_sigmas(found, error)).max() < 4.5
@@ -222,7 +223,7 @@ def test_corners_beside_the_markers_read_are_found_to_the_margin_of_a_wide_view(
     """A polynomial through the markers read is up to 40 px aside of the other corners."""
     turn, place = pose(51, printed, nearer=1.7)
     view = Wide(printed, turn, place * [1, 1, 0.55], seed=901)
-    found = measured(Frame(view.picture(), 255.0, "wide"), design)
+    found = measured(Frame(kept.picture(view), 255.0, "wide"), design)
     sight = ((view.truth > 6) & (view.truth < [960 - 7, 720 - 7])).all(axis=1)
     assert found.ok[sight].all()
     error = (found.xy - view.truth)[found.ok]
@@ -243,7 +244,7 @@ def test_a_lattice_grows_through_the_many_saddles_of_sharpened_edges_behind_a_wi
     design, printed = board("chess", 9, 7, 30.0), prints.chess(9, 7, 30.0)
     turn, place = pose(seed, printed, nearer=1.5)
     view = Action(printed, turn, place * [1, 1, 0.5], seed=seed, sharpening=1.5, noise=0.5, jpeg=90)
-    found = measured(Frame(view.picture(), 255.0, "action"), design)
+    found = measured(Frame(kept.picture(view), 255.0, "action"), design)
     sight = ((view.truth > 8) & (view.truth < [960 - 9, 720 - 9])).all(axis=1)
     # The frame shows a part of the pattern, which fits shifted, too.
     assert found.found == sight.sum()
@@ -266,7 +267,7 @@ def test_tags_are_read_behind_motion_and_where_two_fill_the_frame(
     design = board("aprilgrid", *shape, 1.3 * size, size=size, dictionary=dictionary, border_bits=border)
     turn, place = pose(seed, printed, nearer=nearer)
     view = View(printed, turn, place, seed=seed, motion=motion)
-    found = measured(Frame(view.picture(), 255.0, "tags"), design)
+    found = measured(Frame(kept.picture(view), 255.0, "tags"), design)
     sight = ((view.truth > 6) & (view.truth < [960 - 7, 720 - 7])).all(axis=1)
     assert found.ok[sight].all()
     error = (found.xy - view.truth)[found.ok]
@@ -291,7 +292,7 @@ def test_a_corner_from_which_sharpening_reaches_beyond_the_frame_is_declined() -
     """What the filter took from there is unknown: one at 1.4 px from the border was off by 25 sigma."""
     printed = prints.chess(10, 7, 25.0)
     view = View(printed, *pose(0, printed), sharpening=1.2)
-    found = measured(Frame(view.picture(), 255.0, "sharpened"), board("chess", 10, 7, 25.0))
+    found = measured(Frame(kept.picture(view), 255.0, "sharpened"), board("chess", 10, 7, 25.0))
     error = (found.xy - view.truth)[found.ok]
     assert found.found >= 40
     assert np.abs(in_sigmas(found, error)).max() < 4.5
@@ -315,7 +316,7 @@ def test_sharpened_pictures_have_the_sigmas_of_their_errors(
 ) -> None:
     """Noise that sharpening has made opposite in neighbouring pixels cancels."""
     view = View(printed, *pose(seed, printed), seed=10 * seed, sharpening=1.2)
-    found = measured(Frame(view.picture(), 255.0, "sharpened"), design)
+    found = measured(Frame(kept.picture(view), 255.0, "sharpened"), design)
     error = renamed(found, view.truth)
     assert found.found >= 40
     assert np.abs(in_sigmas(found, error)).max() < 4.5
@@ -327,7 +328,7 @@ def test_corners_on_paper_that_is_saturated_everywhere_are_measured_to_their_sig
     printed = prints.aprilgrid(6, 6, 22.0, 0.3, "DICT_APRILTAG_36h11", 2)
     view = View(printed, *pose(1, printed), seed=10, light=340.0)
     found = measured(
-        Frame(view.picture(), 255.0, "bright"), board("aprilgrid", 6, 6, 28.6, size=22.0, border_bits=2)
+        Frame(kept.picture(view), 255.0, "bright"), board("aprilgrid", 6, 6, 28.6, size=22.0, border_bits=2)
     )
     assert found.found >= 132
     error = (found.xy - view.truth)[found.ok]
@@ -355,7 +356,7 @@ def test_corners_of_markers_on_saturated_paper_have_the_sigmas_of_their_errors(
     printed = prints.markers(6, 5, 30.0, 10.0, family)
     view = View(printed, *pose(seed, printed), seed=10 * seed, light=light)
     design = board("markers", 6, 5, 40.0, size=30.0, dictionary=family)
-    found = measured(Frame(view.picture(), 255.0, "bright"), design)
+    found = measured(Frame(kept.picture(view), 255.0, "bright"), design)
     error = renamed(found, view.truth)
     assert found.found >= least
     assert np.sqrt((error**2).mean()) < 0.07
@@ -370,7 +371,7 @@ def test_circles_cut_by_the_border_are_right_where_a_filter_does_not_know_what_i
     middle = turn @ np.append(printed.xy.mean(axis=0), 0.0)
     view = View(printed, turn, np.array([0.0, 0.0, 330.0]) - middle, blur=0.8, noise=0.0)
     top = int(np.sort(view.truth[:, 1])[:9].mean()) - 25
-    part, truth = view.picture()[top:].astype(float), view.truth - [0, top]
+    part, truth = kept.picture(view)[top:].astype(float), view.truth - [0, top]
     grey = cv2.GaussianBlur(part, (0, 0), 0.6, borderType=cv2.BORDER_REPLICATE)
     grey = np.rint(grey + np.random.default_rng(0).normal(0, 1.5, grey.shape)).clip(0, 255)
     found = measured(Frame(grey.astype(np.uint8), 255.0, "cut"), design)
@@ -397,7 +398,7 @@ def test_errors_behind_a_fisheye_are_those_of_their_sigmas(
     """Neither the mapping of a lens nor a polynomial describes it; with their curvatures z was up to 18."""
     turn, place = pose(60, printed, most_tilt_deg=30.0)
     view = Fisheye(printed, turn, place * [1, 1, 0.45], seed=980)
-    found = measured(Frame(view.picture(), 255.0, "fisheye"), design)
+    found = measured(Frame(kept.picture(view), 255.0, "fisheye"), design)
     sight = ((view.truth > 8) & (view.truth < [960 - 9, 720 - 9])).all(axis=1)
     assert found.found > 0.85 * sight.sum()
     error = renamed(found, view.truth)
@@ -416,7 +417,7 @@ def test_markers_far_from_the_axis_of_a_fisheye_name_the_corners_of_a_board(kind
         printed = prints.aprilgrid(6, 4, 25.0, 0.2, "DICT_APRILTAG_36h11", 1)
     turn, place = pose(61, printed, most_tilt_deg=40.0, nearer=1.3)
     view = Fisheye(printed, turn, place * [1, 1, 0.3], seed=3)
-    found = measured(Frame(view.picture(), 255.0, "fisheye"), design)
+    found = measured(Frame(kept.picture(view), 255.0, "fisheye"), design)
     sight = ((view.truth > 8) & (view.truth < [960 - 9, 720 - 9])).all(axis=1)
     assert found.ok[sight].mean() > 0.9
     error = (found.xy - view.truth)[found.ok]
@@ -430,7 +431,7 @@ def test_separate_markers_are_measured_to_the_margin_of_a_wide_view() -> None:
     turn, place = pose(50, printed, nearer=1.7)
     view = Wide(printed, turn, place * [1, 1, 0.55], seed=900)
     found = measured(
-        Frame(view.picture(), 255.0, "wide"),
+        Frame(kept.picture(view), 255.0, "wide"),
         board("markers", 6, 5, 40.0, size=30.0, dictionary="DICT_4X4_100"),
     )
     sight = ((view.truth > 6) & (view.truth < [960 - 7, 720 - 7])).all(axis=1)
@@ -451,7 +452,7 @@ def test_corners_of_separate_tags_are_where_they_are_although_their_edges_are_sh
         board("markers", 6, 5, 40.0, size=30.0, dictionary=APRIL_FAMILY),
     )
     view = views(condition, seed + 1, printed)[seed]
-    found = measured(Frame(view.picture(), 255.0, condition), design)
+    found = measured(Frame(kept.picture(view), 255.0, condition), design)
     near = np.hypot(*(found.xy[found.ok, None] - view.truth).transpose(2, 0, 1)).argmin(axis=1)
     error = found.xy[found.ok] - view.truth[near]
     sigma = np.sqrt(np.diagonal(found.cov[found.ok], axis1=1, axis2=2))
@@ -469,7 +470,7 @@ def test_the_curve_of_a_camera_is_learnt_from_few_circles(seed: int) -> None:
     was not certain; positions were then 0.004 px aside in one direction, two sigmas.
     """
     view = views("gamma", seed + 1, CLOSE_PRINT)[seed]
-    found = measured(Frame(view.picture(), 255.0, "gamma"), CLOSE)
+    found = measured(Frame(kept.picture(view), 255.0, "gamma"), CLOSE)
     assert Code.NONLINEAR in [note.code for note in found.notes]
     error = renamed(found, view.truth)
     assert over_sigmas(found, error) < 1.25
@@ -485,13 +486,13 @@ def test_corners_of_a_deltille_are_measured_to_their_sigmas_and_named(
 ) -> None:
     """Also where a part is seen: that this contains two borders of the grid."""
     view = View(DELTILLE_PRINT, *pose(seed, DELTILLE_PRINT, nearer=nearer), seed=seed, blur=blur)
-    found = measured(Frame(view.picture(), 255.0, "deltille"), DELTILLE)
+    found = measured(Frame(kept.picture(view), 255.0, "deltille"), DELTILLE)
     assert found.found > 40
     error = (found.xy - view.truth)[found.ok]
     assert np.sqrt((error**2).mean()) < (0.004 if blur < 1 else 0.01)
     assert 0.8 < over_sigmas(found, error) < 1.25
     assert np.abs(error.mean(axis=0)).max() < 0.002  # no half pixel
-    chess = measure_board(Frame(view.picture(), 255.0, "deltille"), CHESS)
+    chess = measure_board(Frame(kept.picture(view), 255.0, "deltille"), CHESS)
     assert isinstance(chess, Failure)
 
 
@@ -501,7 +502,7 @@ def test_a_deltille_seen_at_60_degrees_is_numbered(k: int, least: int) -> None:
     _, place = pose(90 + k, DELTILLE_PRINT, nearer=1.2)
     tilt = cv2.Rodrigues(np.deg2rad(60) * np.array([np.cos(k), np.sin(k), 0.0]))[0]
     view = View(DELTILLE_PRINT, tilt @ np.diag([1.0, -1, -1]), place, seed=940 + k)
-    found = measured(Frame(view.picture(), 255.0, "steep"), DELTILLE)
+    found = measured(Frame(kept.picture(view), 255.0, "steep"), DELTILLE)
     assert found.found >= least
     assert not [note for note in found.notes if note.code is Code.AMBIGUOUS]
     error = (found.xy - view.truth)[found.ok]
@@ -512,7 +513,7 @@ def test_a_deltille_seen_at_60_degrees_is_numbered(k: int, least: int) -> None:
 def test_a_deltille_seen_in_part_is_not_taken_for_places_beside_its_corners() -> None:
     """In a frame that was shortened, weaker places on edges are in a lattice, too, with more nodes."""
     view = views("cropped", 1, DELTILLE_PRINT)[0]
-    found = measured(Frame(view.picture(), 255.0, "cropped"), DELTILLE)
+    found = measured(Frame(kept.picture(view), 255.0, "cropped"), DELTILLE)
     assert found.found == 15
     error = renamed(found, view.truth)
     assert np.abs(error).max() < 0.012
@@ -529,7 +530,7 @@ def puzzle_picture() -> tuple[Frame, Array]:
     signs = dot_signs(PUZZLE)
     printed = prints.puzzle(22.0, signs[1::2, 2:-1:2].T > 0, signs[2:-1:2, 1::2].T > 0, dark_first=False)
     view = View(printed, *pose(2, printed, nearer=1.2), seed=2)
-    return Frame(view.picture(), 255.0, "puzzle"), view.truth
+    return Frame(kept.picture(view), 255.0, "puzzle"), view.truth
 
 
 def test_a_puzzleboard_has_the_bits_that_its_authors_print() -> None:
@@ -591,7 +592,7 @@ def test_dots_tell_which_part_of_the_code_of_all_puzzleboards_is_seen() -> None:
 
 def test_dots_tell_which_part_of_a_chessboard_is_seen() -> None:
     view = View(DOTTED_PRINT, *pose(2, DOTTED_PRINT, nearer=1.2), seed=2)
-    frame, node = Frame(view.picture(), 255.0, "dots"), DOTTED.nodes.tolist()
+    frame, node = Frame(kept.picture(view), 255.0, "dots"), DOTTED.nodes.tolist()
     found = measured(frame, DOTTED)
     assert not found.notes
     error = (found.xy - view.truth)[found.ok]

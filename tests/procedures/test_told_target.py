@@ -17,6 +17,7 @@ from reseau.procedures.calibration import calibrate_camera
 from reseau.procedures.target_measurement import drawing_overlays, measurer_of
 from reseau.procedures.told_target import TargetMeasured, measured_as_shown
 
+from .. import kept
 from ..measure.board_pictures import picture
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -79,7 +80,7 @@ def test_the_board_that_photographs_show_is_measured_in_place_of_the_told_one(
 def test_a_deltille_told_too_large_has_no_points_that_do_not_exist() -> None:
     printed = prints.Deltille(7, 8, 20.0)
     frames = [
-        replace(Frame(View(printed, *pose(k, printed, nearer=0.7), seed=k).picture(), 255.0), name=str(k))
+        replace(Frame(kept.picture(View(printed, *pose(k, printed, nearer=0.7), seed=k)), 255.0), name=str(k))
         for k in (1, 2)
     ]
     told = board("deltille", 7, 9, 20.0)

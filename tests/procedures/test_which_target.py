@@ -19,6 +19,7 @@ from reseau.procedures.exposures import of_another_lens
 from reseau.procedures.target_measurement import Measurer, measurer_of
 from reseau.procedures.which_target import Design, designs_beside, which_target
 
+from .. import kept
 from ..measure.board_pictures import picture
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -101,7 +102,7 @@ def test_a_puzzleboard_is_found_by_the_parts_that_photographs_show(start: tuple[
     bits = signs[1::2, 2:-1:2].T > 0, signs[2:-1:2, 1::2].T > 0
     printed = prints.puzzle(22.0, *bits, dark_first=sum(start) % 2 == 0)
     view = View(printed, *pose(3, printed, nearer=0.7), seed=3)
-    whole, parts = Frame(view.picture(), 255.0), []
+    whole, parts = Frame(kept.picture(view), 255.0), []
     # Columns of corners 0 to 6, and 4 to 10.
     for columns in (slice(0, 7), slice(4, 11)):
         xy = view.truth.reshape(8, 11, 2)[:, columns].reshape(-1, 2)
@@ -132,7 +133,7 @@ def test_boards_that_are_drawn_by_default_are_known() -> None:
         (prints.markers(7, 10, 18.4, 4.6, "DICT_5X5_100"), "markers on A4"),
         (prints.Deltille(7, 10, 20.0), "deltille on A4"),
     ):
-        frame = Frame(View(printed, *pose(3, printed), seed=3).picture(), 255.0)
+        frame = Frame(kept.picture(View(printed, *pose(3, printed), seed=3)), 255.0)
         found = which_target([frame], boards)
         assert not isinstance(found, Failure)
         # The same on other paper differs in its size alone.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ContextDecorator
 from functools import cache
 from threading import local
 from typing import Any
@@ -35,7 +36,7 @@ def _keep_freed_memory() -> None:
     np.empty(_KEPT - 2**14, np.uint8)
 
 
-class _OneThread(local):
+class _OneThread(local, ContextDecorator):
     """The limit of each thread: set when its first context is entered, removed when that is left."""
 
     def __init__(self) -> None:
@@ -58,7 +59,7 @@ _ONE_THREAD = _OneThread()
 
 
 def one_thread() -> _OneThread:
-    """A context in which BLAS uses one thread.
+    """A context, or decorator of a function, in which BLAS uses one thread.
 
     On a busy machine two threads wait for each other: an adjustment of 3000 observations and 200 parameters
     took 0.1 s with one thread and 7.7 s with two. Entering the context takes about ten microseconds, within
@@ -68,6 +69,8 @@ def one_thread() -> _OneThread:
     --------
     >>> with one_thread():
     ...     pass
+    >>> @one_thread()
+    ... def adjusted() -> None: ...
     """
     return _ONE_THREAD
 

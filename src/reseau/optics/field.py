@@ -19,6 +19,7 @@ import scipy
 
 from ..core.data import Array
 from ..core.errors import UsageError
+from ..core.threads import one_thread
 
 __all__ = ["SmoothField", "monomials", "trend_degree"]
 
@@ -74,6 +75,7 @@ class SmoothField:
     _solutions: tuple[tuple[Array, Array, Array], ...]
 
     @classmethod
+    @one_thread()
     def fit(
         cls,
         source: Array,

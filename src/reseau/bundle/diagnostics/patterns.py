@@ -24,6 +24,7 @@ import scipy
 from ...core.data import Array, Rows
 from ...core.display import Display
 from ...core.errors import UsageError
+from ...core.threads import one_thread
 from ..solver.normal import SEGMENTS
 from .result import Result
 
@@ -179,6 +180,7 @@ def by_place(result: Result, camera: int, across: int = 12, down: int | None = N
     return key
 
 
+@one_thread()
 def common_pattern(result: Result, key: Rows) -> CommonPattern:
     """Test and map the common shifts of classes of image points.
 

@@ -17,6 +17,8 @@ from ...core.data import Array, Mask, Rows
 from ...core.display import Display, Table
 from ...core.errors import UsageError
 from ...core.failure import Code, Estimated, Remark
+from ...core.failure import Estimated, Remark
+from ...core.threads import one_thread
 from ...optics.cameras import distortion_names
 from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
 from ..network import Network
@@ -307,6 +309,7 @@ class Result(Estimated, Display):
         )  # fmt: skip
 
     @cached_property
+    @one_thread()
     def rig(self) -> RigEstimate | None:
         """Relative orientations of the cameras of a rig; None without one."""
         linear, places = self.fit.linear, self.fit.values.rig

@@ -24,6 +24,7 @@ import numpy as np
 import scipy
 
 from ...core.data import Array, Rows
+from ...core.threads import one_thread
 from ..solver import BundleFit
 from ..solver.system import residuals
 from .evidence import (
@@ -321,6 +322,7 @@ def _looked_at(fit: BundleFit) -> Rows:
     return images if len(images) <= _MOST else images[np.linspace(0, len(images) - 1, _MOST).astype(int)]
 
 
+@one_thread()
 def shared_errors(fit: BundleFit) -> SharedErrors | None:
     """Estimate what the points of each image have in common.
 

@@ -19,6 +19,7 @@ from ...calibration import Cause
 from ...calibration.camera import by_rotation, places, projection_slopes, referred
 from ...core.data import Array, Rows
 from ...core.failure import Failure
+from ...core.threads import one_thread
 from ..diagnostics import Result, camera_mapping
 from ..diagnostics.evidence import Scores, scores, too_large, used_rows
 from .alternatives import alternatives
@@ -166,6 +167,7 @@ class _Error:
         return found * self.form.units
 
 
+@one_thread()
 def explain(result: Result, misnamed: Misnamed | None = None) -> Explanation:
     """Find what is wrong in an adjusted network.
 

@@ -16,6 +16,7 @@ import numpy as np
 import scipy
 
 from ...core.data import Array, Mask, Rows
+from ...core.threads import one_thread
 from ...optics import PlaneMapping
 from ..network import Network
 
@@ -112,6 +113,7 @@ class _Image:
     sense: float
 
 
+@one_thread()
 def misnamed(
     network: Network, lenses: Sequence[PlaneMapping] | None = None, before: Misnamed | None = None
 ) -> Misnamed | None:

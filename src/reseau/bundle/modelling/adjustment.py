@@ -13,6 +13,7 @@ from ...core import vocabulary as v
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
+from ...core.threads import one_thread
 from ..diagnostics import ControlCheck, ControlShape, Result, checked_control, checks, control_shape
 from ..diagnostics.causes import (
     causes,
@@ -229,6 +230,7 @@ def _not_at_once(
     return network, (Remark(text, Code.INCONSISTENT),)
 
 
+@one_thread()
 def adjust_network(network: Network, options: Options | None = None) -> Result | Failure:
     """Adjust a network of images.
 
