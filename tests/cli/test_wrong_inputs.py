@@ -219,7 +219,7 @@ calibrate grey -d missing.json
 calibrate grey -d field.json --out photo.png
     2 photo.png: has the suffix '.png'; use .json…
 calibrate grey -d field.json --out no/folder
-    2 no/folder: cannot be written (No such file or directory); choose another folder or file by --out
+    2 no/folder: its folder does not exist; create the folder first
 calibrate TABLES --pitch-mm 0.027 --free c,fx
     2 fx: is not one of c, x0, y0, K1, K2, K3, P1, P2, B1, B2
 calibrate TABLES --model brwon

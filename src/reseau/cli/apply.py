@@ -9,9 +9,10 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
+from ..core.files import writable
 from ..core.options import Option
 from .calibrations import time_of
-from .common import Place, progress, say, say_files_left_out, suffix_of, writable
+from .common import Place, progress, say, say_files_left_out
 
 if TYPE_CHECKING:
     from ..calibration import Calibration
@@ -234,7 +235,7 @@ def _points(
     """Correct points; for a camera, to pixels of the undistorted image, or to directions."""
     from ..io import write_whole
 
-    suffix = ".csv" if out is None else suffix_of(writable(out), (".csv", ".json"))
+    suffix = ".csv" if out is None else writable(out, ".csv", ".json").suffix.lower()
     found = applied.points(source, inverse=inverse, directions=directions)
     if out is not None:
         write_whole(out, found.to_json() if suffix == ".json" else found.to_csv())
@@ -310,7 +311,7 @@ def _image(applied: Application, source: Path, out: Path | None, as_json: bool) 
     kind = applied.calibration.kind
     suffix = {"camera": "undistorted", "film_frame": "frame", "fiducials": "frame"}.get(kind, "corrected")
     out = out or source.with_name(f"{source.stem}-{suffix}{source.suffix}")
-    suffix_of(writable(out), _IMAGES)
+    writable(out, *_IMAGES)
     with progress(f"resampling {source.name}", 0) as step:
         raster, camera, provenance = applied.image(source, out, step)
     if as_json:
@@ -336,7 +337,7 @@ def _frame(
     from ..core.provenance import canonical_json
 
     out = out or source.with_name(f"{source.stem}-corrected.tif")
-    suffix = suffix_of(writable(out), (".tif", ".tiff", ".png"))
+    suffix = writable(out, ".tif", ".tiff", ".png").suffix.lower()
     found = applied.frame(source, out, None if exposure_ms is None else 1000 * exposure_ms)
     if as_json:
         content = {"image": str(out), "dn_per_step": found.dn_per_step, "full_scale_dn": found.full_scale}

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from ..core import vocabulary as v
-from .common import Reading, orientation, suffix_of, writable
+from ..core.files import writable
+from .common import Reading, orientation
 from .measure import BY_DESIGN, NOT_NOMINAL, Image, Output, Task
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ def blurred(
     from ..measure import ReseauOptions, measure_reseau
     from ..procedures.blurred import calibrated_by, measure_blurred_frame, pose_in_network
 
-    kind = "" if figure is None else suffix_of(writable(figure), (".svg", ".png", ".pdf"))
+    kind = "" if figure is None else writable(figure, ".svg", ".png", ".pdf").suffix.lower()
     task = Task(image, output, "targets", "deviations from the orientation")
     target, optics = read_design(design), read_lens(lens)
     if isinstance(target, BoardDesign):

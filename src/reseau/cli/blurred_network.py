@@ -56,6 +56,7 @@ def blurred_network(
     """Measure the blurred targets of a network by rays and adjust it, until sigma0 no longer falls."""
     from ..bundle import ResultDocument
     from ..core.errors import UsageError
+    from ..core.files import empty_folder
     from ..core.provenance import Provenance, sha256_of
     from ..exchange import calibration_files, read_network
     from ..execution import executor_at
@@ -65,8 +66,7 @@ def blurred_network(
     from ..procedures.blurred_network import NetworkOptions, final_document, measure_blurred_network
     from ..report.blurred_network import blurred_network_report
 
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError("exists already", where=out, do="give a new or an empty folder")
+    empty_folder(out)
     document, content = Network1.read(network), read_network(network)
     lenses, fill = _lenses(content, lens, matching)
     space = SpaceTargets.read(targets)

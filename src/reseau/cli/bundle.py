@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from ..core import vocabulary as v
+from ..core.files import writable
 from ..core.options import Group, Option
 from .bundle_options import (
     level_of,
-    outputs,
     positive,
     say_left_out,
     say_model,
@@ -96,8 +96,9 @@ def bundle(
     from ..io import write_whole
 
     level_of(alpha, "--alpha")
-    outputs(out, report)
-    outputs(convert, None)
+    writable(out, ".json")
+    writable(report, ".html")
+    writable(convert, ".json")
     distance = positive(distance)
     calibrations = _calibrations(camera_calibration or [])
     content = _with_settings(read_network(network, calibrations), free, fix, control, datum, sigma_px)

@@ -12,7 +12,8 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
-from .common import CameraChoice, say, writable
+from ..core.files import writable
+from .common import CameraChoice, say
 from .declared import Commands
 
 if TYPE_CHECKING:
