@@ -9,7 +9,7 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
-from ..core.files import writable
+from ..core.files import made_folder, writable
 from ..core.options import Option
 from .calibrations import time_of
 from .common import Place, progress, say, say_files_left_out
@@ -268,10 +268,7 @@ def _folder(applied: Application, source: Path, out: Path | None, as_json: bool,
         raise UsageError("is the folder of the images", where=out, do="choose another one")
     images = photographs_in(source)
     say_files_left_out([source])
-    try:
-        out.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be created ({error.strerror})", where=out) from None
+    made_folder(out)
     done = 0
     for image in images:
         suffix = image.suffix if image.suffix.lower() in _IMAGES else ".png"

@@ -49,7 +49,7 @@ def blurred_network(
     jobs: v.Jobs | None = None,
 ) -> None:
     """Measure the blurred targets of a network by rays and adjust it, until sigma0 no longer falls."""
-    from ..core.files import empty_folder
+    from ..core.files import empty_folder, made_folder
     from ..core.provenance import Provenance, sha256_of
     from ..exchange import calibration_files, read_network
     from ..execution import executor_at
@@ -78,9 +78,8 @@ def blurred_network(
         {**vars(matching), "initial": initial, "keep_sharp": keep_sharp},
     )
     page = blurred_network_report(found, title=network.name, provenance=provenance)
-    out.mkdir(parents=True, exist_ok=True)
     for name, text in (network_documents(found, document, provenance) | {"report.html": page}).items():
-        write_whole(out / name, text)
+        write_whole(made_folder(out) / name, text)
     _say(found, out)
 
 

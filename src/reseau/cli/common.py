@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from ..core import vocabulary as v
-from ..core.errors import EstimationError, InputError, UsageError
-from ..core.files import writable
+from ..core.errors import EstimationError, UsageError
+from ..core.files import made_folder, writable
 from ..core.notice import before_compiling
 
 if TYPE_CHECKING:
@@ -171,11 +171,7 @@ def overlay_files(path: Path, images: Sequence[Path]) -> dict[Path, Path]:
         for i, stem in enumerate(stems)
     ]
     if path.is_dir() or not path.suffix:
-        try:
-            path.mkdir(exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot be created ({error.strerror})", where=path) from None
-        files = [path / f"{name}-overlay.png" for name in names]
+        files = [made_folder(path) / f"{name}-overlay.png" for name in names]
     else:
         writable(path, ".png")
         one = len(shown) == 1

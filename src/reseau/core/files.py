@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from .errors import InputError, UsageError
 
-__all__ = ["empty_folder", "split_frame", "writable", "write_whole"]
+__all__ = ["empty_folder", "made_folder", "split_frame", "writable", "write_whole"]
 
 P = TypeVar("P", bound=Path | None)
 
@@ -76,6 +76,26 @@ def empty_folder(path: Path, do: str = "give a new or an empty folder") -> Path:
     """
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise UsageError("is not empty", where=path, do=do)
+    return path
+
+
+def made_folder(path: Path) -> Path:
+    """Make a folder and those that contain it, where they are not there, and return its path.
+
+    Raises
+    ------
+    InputError
+        When it cannot be made.
+
+    Examples
+    --------
+    >>> made_folder(Path("src")).name
+    'src'
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be created ({error.strerror})", where=path) from None
     return path
 
 
