@@ -141,9 +141,9 @@ measure reseau missing.png -d design.json --out o.json
 measure reseau none -d design.json --out o.json
     2 none: cannot be read (Is a directory)
 measure reseau black.png -d design.json --out o.json
-    2 black.png: is all black; check exposure and shutter
+    1 black.png: is all black; check exposure and shutter
 measure reseau white.png -d design.json --out o.json
-    2 white.png: is all saturated; check exposure and shutter
+    1 white.png: is all saturated; check exposure and shutter
 measure reseau noise.png -d design.json --out o.json
     1 noise.png: design 'disks' was not found in the frame of 360×300 px (0 of 63 marks agree with it)
 measure reseau small.png -d design.json --out o.json
@@ -197,7 +197,7 @@ refine --photo-i few.csv --reseau design.json --out K.json
 refine --photo-i noise.png --reseau design.json --out K.json
     1 noise.png: design 'disks' was not found in the frame of 360×300 px (0 of 63 marks agree with it)
 refine --photo-i black.png --reseau design.json --out K.json
-    2 black.png: is all black; check exposure and shutter
+    1 black.png: is all black; check exposure and shutter
 refine --photo-ii photo.png --reseau design.json
     2 refine: needs PHOTO I and its reseau, or a calibration
 calibrate

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from ..core.data import Array, Frame, ImagePoints, Mask
-from ..core.errors import ImageError, UsageError
-from ..core.failure import Code, Failure
+from ..core.errors import UsageError
+from ..core.failure import Failure
 from ..core.files import empty_folder, made_folder
 from ..io.images import read_image, write_image
 from ..measure.points import Measured
@@ -153,10 +153,7 @@ class Watching:
 
     def _measured(self, frame: Frame) -> ImagePoints | None:
         """The points of a frame, which becomes the current one."""
-        try:
-            self._current = self._measure(frame)
-        except ImageError as error:  # too dark, or overexposed: the next frame may be good
-            self._current = Failure(error.what, Code.DECLINED)
+        self._current = self._measure(frame)
         return None if isinstance(self._current, Failure) else self._current.points
 
     def _objection(self, points: ImagePoints | None, width: int) -> str:
