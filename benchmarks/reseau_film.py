@@ -37,7 +37,7 @@ MOST_MM = 0.01
 def _design() -> ReseauDesign:
     """Crosses at 10 mm; O and S lie in the strip that both halves show."""
     cross = Mark(shape="cross", size=2 * ARM, line_width=LINE)
-    film = regular_reseau(9, 15, 10.0, cross)
+    film = regular_reseau(15, 9, 10.0, cross)
     named = {tuple(xy.tolist()): name for name, xy in zip(film.ids, film.xy, strict=True)}
     return film.model_copy(update={"origin": named[0.0, 0.0], "axis": named[10.0, 0.0], "polarity": "dark"})
 
@@ -99,13 +99,13 @@ def _halves(seed: int) -> bool:
     design, strip, rasters = _design(), [], []
     for side in (-1, 1):
         grey, scanned, _ = half(side, seed, design)
-        # Seen from the front: y is up in the design, down in the image.
+        # Seen from the front.
         frame = Frame(grey.astype(np.uint8), 255.0)
         shown = [
             p for p, xy in zip(design.points, scanned(design.xy), strict=True) if _within(xy, grey.shape)
         ]
         part = design.model_copy(update={"points": tuple(shown)})
-        found = measure_reseau(frame, part, ReseauOptions(mirrored=True, max_rotation_deg=20.0))
+        found = measure_reseau(frame, part, ReseauOptions(mirrored=False, max_rotation_deg=20.0))
         if isinstance(found, Failure):
             print(f"  {seed} {side:+d}: declined: {found.reason}")
             return False
