@@ -1,6 +1,7 @@
 """A reseau on film scanned in two halves, as that of KH-9: crosses, deformation of the film, common raster.
 
-Run from the checkout: ``python benchmarks/reseau_film.py [--count N]``. A terrain with dark crosses at 10 mm
+Run from the checkout: ``python benchmarks/reseau_film.py [--count N]``; ``--write FOLDER`` writes the first
+film, for ``docs/howto/reseau-on-film.md``. A terrain with dark crosses at 10 mm
 is drawn as a function of position with ``benchmarks/worlds/pixels.py``, which shares no formation of images
 with the project. The film is stretched, bent and shrunk unevenly; each half is scanned with a rotation of its
 own, grain and noise. Printed for each half: crosses measured, rms of their errors, errors over sigmas; rms of
@@ -13,6 +14,8 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -25,6 +28,7 @@ from reseau.core.data import Frame, ImagePoints
 from reseau.core.failure import Failure
 from reseau.designs import regular_reseau
 from reseau.io import Mark, ReseauDesign
+from reseau.io.images import write_image
 from reseau.measure import ReseauOptions, measure_reseau
 from reseau.refine import correct_camera
 
@@ -37,7 +41,7 @@ MOST_MM = 0.01
 def _design() -> ReseauDesign:
     """Crosses at 10 mm; O and S lie in the strip that both halves show."""
     cross = Mark(shape="cross", size=2 * ARM, line_width=LINE)
-    film = regular_reseau(9, 15, 10.0, cross)
+    film = regular_reseau(15, 9, 10.0, cross)
     named = {tuple(xy.tolist()): name for name, xy in zip(film.ids, film.xy, strict=True)}
     return film.model_copy(update={"origin": named[0.0, 0.0], "axis": named[10.0, 0.0], "polarity": "dark"})
 
@@ -95,17 +99,22 @@ def half(side: int, seed: int, design: ReseauDesign) -> tuple[Array, Any, Any]:
     return np.clip(np.rint(grey), 0, 255), lambda mm: _deformed(mm, bend) @ matrix.T + shift, film
 
 
-def _halves(seed: int) -> bool:
-    design, strip, rasters = _design(), [], []
+def _scans(seed: int, design: ReseauDesign) -> Iterator[tuple[Array, ReseauDesign, Any]]:
+    """Grey values of both halves, the crosses that each shows, and where millimetres are in it."""
     for side in (-1, 1):
         grey, scanned, _ = half(side, seed, design)
-        # Seen from the front: y is up in the design, down in the image.
-        frame = Frame(grey.astype(np.uint8), 255.0)
         shown = [
             p for p, xy in zip(design.points, scanned(design.xy), strict=True) if _within(xy, grey.shape)
         ]
-        part = design.model_copy(update={"points": tuple(shown)})
-        found = measure_reseau(frame, part, ReseauOptions(mirrored=True, max_rotation_deg=20.0))
+        yield grey, design.model_copy(update={"points": tuple(shown)}), scanned
+
+
+def _halves(seed: int) -> bool:
+    strip, rasters = [], []
+    for side, (grey, part, scanned) in zip((-1, 1), _scans(seed, _design()), strict=True):
+        # Seen from the front.
+        frame = Frame(grey.astype(np.uint8), 255.0)
+        found = measure_reseau(frame, part, ReseauOptions(mirrored=False, max_rotation_deg=20.0))
         if isinstance(found, Failure):
             print(f"  {seed} {side:+d}: declined: {found.reason}")
             return False
@@ -121,7 +130,8 @@ def _halves(seed: int) -> bool:
         between = between[[_within(xy, grey.shape) for xy in scanned(between)]]
         left = camera.model(camera.photo_system(scanned(between))) - between
         print(
-            f"  {seed} {side:+d}: {len(marks)} of {len(shown)} crosses, {np.sqrt(np.mean(error**2)):.3f} px, "
+            f"  {seed} {side:+d}: {len(marks)} of {len(part.ids)} crosses, "
+            f"{np.sqrt(np.mean(error**2)):.3f} px, "
             f"errors ÷ sigmas {np.sqrt(np.mean(ratio**2)):.2f} (at most {np.abs(ratio).max():.1f}), "
             f"film corrected to {1000 * np.sqrt(np.mean(left**2)):.1f} µm"
         )
@@ -145,7 +155,14 @@ def _within(xy: Array, shape: tuple[int, ...]) -> bool:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--count", type=int, default=2, help="films")
+    parser.add_argument("--write", type=Path, help="folder for the scans of the first film and their designs")
     given = parser.parse_args()
+    if given.write is not None:
+        given.write.mkdir(parents=True, exist_ok=True)
+        for name, (grey, part, _) in zip(("left", "right"), _scans(0, _design()), strict=True):
+            write_image(given.write / f"{name}.tif", grey.astype(np.uint8))
+            part.model_copy(update={"name": name}).write(given.write / f"{name}.json")
+        return 0
     print("reseau on film, two halves")
     return 0 if all(list(map(_halves, range(given.count)))) else 1
 

@@ -1,11 +1,11 @@
 """Draws pictures of the README, the tours and the how-to pages, for light and, with `-dark`, for dark pages.
 
     python docs/figures.py calibration
-    python docs/figures.py tour-camera|seen|blurred|underwater|fiducial-marks FOLDER
+    python docs/figures.py tour-camera|seen|blurred|underwater|fiducial-marks|reseau-on-film FOLDER
 
 The first is drawn by `docs/desk.py`. The others show results of pages: the folder is the one in which the
 commands of `docs/tours/camera.md`, `blurred.md`, `blurred-under-water.md` or of
-`docs/howto/fiducial-marks.md` were followed.
+`docs/howto/fiducial-marks.md` and `reseau-on-film.md` were followed.
 """
 
 from __future__ import annotations
@@ -146,6 +146,24 @@ def fiducial_marks(folder: Path) -> Figure:
     return figure
 
 
+def reseau_on_film(folder: Path) -> Figure:
+    """What was measured in one half of a film, and both halves in one raster."""
+    seen = cv2.cvtColor(cv2.imread(str(folder / "left-marks.png")), cv2.COLOR_BGR2RGB)
+    left, right = (reseau.read_image(folder / f"{name}-corrected.tif").pixels for name in ("left", "right"))
+    column = 610  # as the command printed: (76.4 - 15.4) mm at 10 px/mm; both begin at 46.3 mm
+    both = np.zeros((max(len(left), len(right)), column + right.shape[1]), left.dtype)
+    both[: len(left), : left.shape[1]] = left
+    both[: len(right), column:] = right
+    figure = Figure(figsize=(9.0, 3.2), layout="constrained")
+    one, whole = figure.subplots(1, 2, width_ratios=(1, 1.6))
+    one.imshow(seen)
+    whole.imshow(both, cmap="gray", vmin=0, vmax=255)
+    whole.axvline(column, color=ACCENT, linewidth=0.8)
+    for axes in (one, whole):
+        axes.set_axis_off()
+    return figure
+
+
 def main() -> None:
     """Draw the picture that is named."""
     parser = argparse.ArgumentParser(description="Pictures of the README and the tours.")
@@ -166,6 +184,7 @@ TOURS = {
     "blurred": blurred,
     "underwater": underwater,
     "fiducial-marks": fiducial_marks,
+    "reseau-on-film": reseau_on_film,
 }
 
 if __name__ == "__main__":

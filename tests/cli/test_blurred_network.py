@@ -111,4 +111,4 @@ def test_a_user_measures_a_network_from_files(reseau: Run, tmp_path: Path) -> No
         lens_file(tmp_path), "-o", tmp_path / "out",
     )  # fmt: skip
     assert again[0] == 2
-    assert "exists already" in again[2]
+    assert "is not empty" in again[2]

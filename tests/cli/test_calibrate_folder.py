@@ -64,10 +64,10 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_measured(
     (tmp_path / "taken").touch()
     status, out, err = reseau("calibrate", photos, "-o", tmp_path / "taken")
     assert (status, out) == (2, "")
-    assert "taken: cannot be written (File exists); choose another folder or file by --out" in err
+    assert "taken: is a file; give the name of a folder" in err
     status, _, err = reseau("calibrate", photos, "-o", tmp_path / "none" / "results")
     assert status == 2
-    assert "results: cannot be written (No such file or directory)" in err
+    assert "results: its folder does not exist; create the folder first" in err
     status, _, err = reseau("calibrate", photos, "-o", tmp_path / "camera.yml")
     assert status == 2
     assert "camera.yml: has the suffix '.yml'; use .json for the calibration alone, or a name without" in err

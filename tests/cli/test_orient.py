@@ -177,6 +177,28 @@ def test_without_a_resolution_tag_the_scale_is_that_of_the_format(tmp_path: Path
     assert json.loads(out)["px_per_mm"] == pytest.approx([300 / 25.4] * 2, rel=0.005)
 
 
+def test_the_frames_of_a_roll_are_resampled_by_one_command(roll: Path, tmp_path: Path, reseau: Run) -> None:
+    reseau("orient", roll, "--format-mm", "36x24", "--out", tmp_path / "oriented", "--jobs", 1, "--no-marked")
+    (tmp_path / "oriented" / "3.json").unlink()
+    alone = reseau(
+        "apply", tmp_path / "oriented" / "1.json", roll / "1.tif", "--scale", 5, "-o", tmp_path / "one.tif"
+    )
+    status, out, err = reseau(
+        "apply", tmp_path / "oriented", roll, "--scale", 5, "--out", tmp_path / "frames"
+    )
+    assert status == alone[0] == 0
+    assert err == f"left out: 3.tif: is not oriented in {tmp_path / 'oriented'}\n"
+    assert [path.name for path in sorted((tmp_path / "frames").iterdir())] == [
+        f"{k}.tif" for k in (0, 1, 2, 4)
+    ]
+    assert len(out.splitlines()) == 4
+    one, same = tifffile.imread(tmp_path / "one.tif"), tifffile.imread(tmp_path / "frames" / "1.tif")
+    assert (one == same).all()
+    wrong = reseau("apply", tmp_path / "oriented", roll / "1.tif")
+    assert (wrong[0], wrong[2].count("\n")) == (2, 1)
+    assert "is a folder of orientations; give the folder of the scans" in wrong[2]
+
+
 def test_every_frame_of_a_strip_is_oriented(tmp_path: Path, reseau: Run) -> None:
     frames = [FilmFrame(seed, dpi=300) for seed in range(3)]
     height = min(frame.shape[0] for frame in frames)

@@ -96,7 +96,7 @@ def test_unmeasurable_images_are_reported_in_one_line(
     write_image(tmp_path / "blank.png", noise)
     for arguments, expected, reason in (
         ((image, "-d", tmp_path / "disks.json"), 2, "disk"),
-        ((tmp_path / "dark.png", "-d", design), 2, "is all black"),
+        ((tmp_path / "dark.png", "-d", design), 1, "is all black"),
         ((tmp_path / "blank.png", "-d", design), 1, "not found"),
         ((image, "-d", tmp_path / "none.json"), 2, "none.json"),
     ):

@@ -140,7 +140,7 @@ def test_watching_the_simulated_bench_leaves_frames_for_a_calibration(
     assert "3 frames in photos; next: reseau calibrate photos --design field.json" in printed.out
     assert sorted(file.name for file in Path("photos").iterdir()) == ["001.png", "002.png", "003.png"]
     assert run(["watch", "--design", "field.json", "-o", "photos"]) == 2
-    assert "photos: is not empty; give a new folder, or --resume" in capsys.readouterr().err
+    assert "photos: is not empty; give a new folder, or resume an earlier session" in capsys.readouterr().err
 
     def lost(number: int) -> None:  # the camera goes away after the fourth frame
         if len(list(Path("photos").iterdir())) == 4:
@@ -282,7 +282,7 @@ def test_a_signal_at_any_moment_loses_no_frame_and_ends_with_what_was_taken(
 
     monkeypatch.setattr("reseau.cli.watch._bench", lambda *_: Alone())
     monkeypatch.setattr("reseau.procedures.target_measurement.measurer_of", lambda _: measured)
-    monkeypatch.setattr("reseau.io.images.write_image", written)
+    monkeypatch.setattr("reseau.procedures.watching.write_image", written)
     shown = LivePage.show
     monkeypatch.setattr(LivePage, "show", lambda *given: (at("show"), shown(*given)))
     before = signal.getsignal(number)

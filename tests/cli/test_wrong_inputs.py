@@ -141,9 +141,9 @@ measure reseau missing.png -d design.json --out o.json
 measure reseau none -d design.json --out o.json
     2 none: cannot be read (Is a directory)
 measure reseau black.png -d design.json --out o.json
-    2 black.png: is all black; check exposure and shutter
+    1 black.png: is all black; check exposure and shutter
 measure reseau white.png -d design.json --out o.json
-    2 white.png: is all saturated; check exposure and shutter
+    1 white.png: is all saturated; check exposure and shutter
 measure reseau noise.png -d design.json --out o.json
     1 noise.png: design 'disks' was not found in the frame of 360×300 px (0 of 63 marks agree with it)
 measure reseau small.png -d design.json --out o.json
@@ -197,7 +197,7 @@ refine --photo-i few.csv --reseau design.json --out K.json
 refine --photo-i noise.png --reseau design.json --out K.json
     1 noise.png: design 'disks' was not found in the frame of 360×300 px (0 of 63 marks agree with it)
 refine --photo-i black.png --reseau design.json --out K.json
-    2 black.png: is all black; check exposure and shutter
+    1 black.png: is all black; check exposure and shutter
 refine --photo-ii photo.png --reseau design.json
     2 refine: needs PHOTO I and its reseau, or a calibration
 calibrate
@@ -219,7 +219,7 @@ calibrate grey -d missing.json
 calibrate grey -d field.json --out photo.png
     2 photo.png: has the suffix '.png'; use .json…
 calibrate grey -d field.json --out no/folder
-    2 no/folder: cannot be written (No such file or directory); choose another folder or file by --out
+    2 no/folder: its folder does not exist; create the folder first
 calibrate TABLES --pitch-mm 0.027 --free c,fx
     2 fx: is not one of c, x0, y0, K1, K2, K3, P1, P2, B1, B2
 calibrate TABLES --model brwon

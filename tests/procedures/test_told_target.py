@@ -25,6 +25,7 @@ from worlds import prints
 from worlds.sheets import View, pose
 
 CHESS = board("chess", 7, 6, 24.0)
+LONG = board("chess", 10, 7, 24.0)
 CHARUCO = board("charuco", 7, 6, 24.0)
 LEGACY = board("charuco", 7, 6, 24.0, legacy=True)
 APRIL = board("aprilgrid", 5, 4, 30.0, border_bits=2)
@@ -59,6 +60,12 @@ def measured(printed: BoardDesign, told: BoardDesign) -> TargetMeasured:
         (APRIL, {"pitch": 40.0}, "in other proportions than was told: pitch 30.0 in place of 40.0"),
         (CIRCLES, {"columns": 8}, "columns 7 in place of 8; calibrated"),
         (SHIFTED, {"rows": 6}, "rows 5 in place of 6; calibrated"),
+        (LONG, {"columns": 9}, "columns 10 in place of 9; calibrated"),
+        (LONG, {"rows": 6}, "rows 7 in place of 6; calibrated"),
+        (CIRCLES, {"columns": 6}, "columns 7 in place of 6; calibrated"),
+        (CIRCLES, {"rows": 4}, "rows 5 in place of 4; calibrated"),
+        (SHIFTED, {"rows": 4}, "rows 5 in place of 4; calibrated"),
+        (SHIFTED, {"columns": 2}, "columns 3 in place of 2; calibrated"),
         (CIRCLES.model_copy(update={"polarity": "bright"}), {"polarity": "dark"}, "bright in place of dark"),
     ],
 )  # fmt: skip
@@ -77,15 +84,16 @@ def test_the_board_that_photographs_show_is_measured_in_place_of_the_told_one(
         assert len(each.found) > 0.9 * len(printed.ids)
 
 
-def test_a_deltille_told_too_large_has_no_points_that_do_not_exist() -> None:
+@pytest.mark.parametrize("told", [(7, 9), (7, 7), (6, 8)], ids=["too large", "a row less", "a column less"])
+def test_a_deltille_told_wrongly_is_measured_as_it_is_printed(told: tuple[int, int]) -> None:
     printed = prints.Deltille(7, 8, 20.0)
     frames = [
         replace(Frame(kept.picture(View(printed, *pose(k, printed, nearer=0.7), seed=k)), 255.0), name=str(k))
         for k in (1, 2)
     ]
-    told = board("deltille", 7, 9, 20.0)
-    found = measured_as_shown(frames, told, measurer_of(told))
-    assert found.corrected == told.model_copy(update={"rows": 8})
+    design = board("deltille", *told, 20.0)
+    found = measured_as_shown(frames, design, measurer_of(design))
+    assert found.corrected == design.model_copy(update={"columns": 7, "rows": 8})
     for each in found.photographs:
         assert not isinstance(each.found, Failure)
         assert 40 < len(each.found) <= 56

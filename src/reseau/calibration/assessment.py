@@ -225,14 +225,11 @@ class ErrorMap(Strict):
         formal : bool
             Whether to draw the formal standard deviations.
         """
-        from ..core.figures import draw_contours, image_axes, new_axes
+        from ..core.figures import draw_contours
 
-        axes = new_axes(axes)
         xy, drawn = self._finely(self.formal if formal else self.total)
-        draw_contours(axes, xy, drawn, scale=np.stack([self.total, self.formal]))
-        what = "formal σ of the projection" if formal else "error of the projection"
-        image_axes(axes, self.x[-1] + 1, self.y[-1] + 1, f"{what} / px")
-        return axes
+        title = f"{'formal σ' if formal else 'error'} of the projection / px"
+        return draw_contours(axes, xy, drawn, title, np.stack([self.total, self.formal]))
 
 
 class Assessment(Strict):

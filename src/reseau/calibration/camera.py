@@ -260,13 +260,9 @@ class ProjectionField:
         axes : matplotlib Axes, optional
             Axes to draw into; by default those of a new figure.
         """
-        from ..core.figures import draw_contours, image_axes, new_axes
+        from ..core.figures import draw_contours
 
-        axes = new_axes(axes)
-        draw_contours(axes, self.xy, self.sigma)
-        width, height = self.xy[-1, -1] + 1
-        image_axes(axes, width, height, "σ of the projection, worst direction / px")
-        return axes
+        return draw_contours(axes, self.xy, self.sigma, "σ of the projection, worst direction / px")
 
 
 def projection_field(lens: CameraMapping, across: int = 25, down: int | None = None) -> ProjectionField:

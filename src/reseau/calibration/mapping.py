@@ -189,11 +189,10 @@ class CalibratedMapping(ABC):
         UsageError
             When the size of the images is not known.
         """
-        from ..core.figures import draw_contours, image_axes, new_axes
+        from ..core.figures import draw_contours
 
         if self.size is None:
             raise UsageError("does not contain the size of its images", where="calibration")
-        axes = new_axes(axes)
         width, height = self.size
         down = max(2, round(across * height / width))
         grid = np.stack(
@@ -204,10 +203,9 @@ class CalibratedMapping(ABC):
         known = np.isfinite(cov).all(axis=(1, 2))
         sigma = np.full(len(cov), np.nan)
         sigma[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(cov[known])[:, 1], 0.0))
-        draw_contours(axes, grid, sigma.reshape(down, across))
         unit = "" if self.unit == "1" else f" / {self.unit}"
-        image_axes(axes, width, height, f"σ of the {self.system} coordinates{unit}")
-        return axes
+        title = f"σ of the {self.system} coordinates{unit}"
+        return draw_contours(axes, grid, sigma.reshape(down, across), title)
 
     def check_size(self, width: int, height: int, where: object) -> None:
         """Refuse an image of another size than the calibrated one.

@@ -440,22 +440,7 @@ def undistort(
     scale: float = 1.0,
     alpha: float | None = None,
 ) -> NDArray[Any]:
-    """Return an image without the distortion of a camera.
-
-    Parameters
-    ----------
-    image : ndarray (h, w) or (h, w, channels)
-        The image, with channels in any order.
-    calibration : Calibration
-        That of the camera.
-    fov, scale, alpha
-        As for :meth:`CorrectedImage.undistorted`.
-
-    Raises
-    ------
-    UsageError
-        When the calibration is of another kind, or the image of another size.
-    """
+    """Return an image without the distortion of a camera; see :meth:`reseau.Calibration.undistort`."""
     lens = calibration.mapping()
     if not isinstance(lens, CameraMapping):
         raise UsageError(calibration.not_of("camera"), where=f"calibration {calibration.name}")

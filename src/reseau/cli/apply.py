@@ -9,13 +9,14 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
+from ..core.files import made_folder, writable
 from ..core.options import Option
 from .calibrations import time_of
-from .common import Place, progress, say, say_files_left_out, suffix_of, writable
+from .common import Place, progress, say, say_files_left_out
 
 if TYPE_CHECKING:
     from ..calibration import Calibration
-    from ..procedures.applying import Application
+    from ..procedures.applying import Application, View
 
 __all__ = ["apply"]
 
@@ -33,8 +34,8 @@ def apply(
     calibration: Annotated[
         Path,
         typer.Argument(
-            help="Calibration of a camera, an oscilloscope, a film frame, fiducial marks or a sensor; "
-            "with --archive the name of a configuration."
+            help="Calibration of a camera, an oscilloscope, a film frame, fiducial marks or a sensor; for a "
+            "folder of scans the one that `reseau orient` wrote; with --archive the name of a configuration."
         ),
     ],
     source: Annotated[
@@ -117,11 +118,14 @@ def apply(
     for name, given in in_archive.items():
         if given is not None:
             raise UsageError("needs --archive, and the name of a configuration", where=name)
+    view = View(_fov(fov), scale, opencv_alpha)
+    if calibration.is_dir() and archive is None:
+        _roll(calibration, source, view, out, as_json)
+        return
     if archive is None or from_file:
         stored, origin = read_calibration(calibration), {calibration.name: sha256_of(calibration)}
     else:
         stored, origin = _in_force(archive, objects, str(calibration), at)
-    view = View(_fov(fov), scale, opencv_alpha)
     if opencv_alpha is not None and fov != "keep":
         raise UsageError("cannot be combined", where="--fov and --opencv-alpha")
     of_camera = {
@@ -153,7 +157,11 @@ def apply(
     elif stored.kind == "sensor":
         _frame(applied, source, out, exposure_ms, as_json)
     elif source.is_dir():
-        _folder(applied, source, out, as_json, calibration)
+        from ..procedures.exposures import photographs_in
+
+        say_files_left_out([source])
+        images = [(path, path.stem, applied) for path in photographs_in(source)]
+        _folder(images, source, out, as_json, calibration)
     elif source.suffix.lower() in VIDEOS:
         _video(applied, source, out)
     else:
@@ -234,7 +242,7 @@ def _points(
     """Correct points; for a camera, to pixels of the undistorted image, or to directions."""
     from ..io import write_whole
 
-    suffix = ".csv" if out is None else suffix_of(writable(out), (".csv", ".json"))
+    suffix = ".csv" if out is None else writable(out, ".csv", ".json").suffix.lower()
     found = applied.points(source, inverse=inverse, directions=directions)
     if out is not None:
         write_whole(out, found.to_json() if suffix == ".json" else found.to_csv())
@@ -257,26 +265,40 @@ def _tables(applied: Application, path: Path) -> None:
         say(f"ffmpeg -i video.mp4 {tables} -lavfi remap undistorted.mp4\n")
 
 
-def _folder(applied: Application, source: Path, out: Path | None, as_json: bool, calibration: Path) -> None:
+def _roll(orientations: Path, source: Path | None, view: View, out: Path | None, as_json: bool) -> None:
+    """Resample the oriented frames of a folder of scans."""
+    from ..procedures.applying import oriented_roll
+
+    if source is None or not source.is_dir():
+        raise UsageError("is a folder of orientations", where=orientations, do="give the folder of the scans")
+    frames: list[tuple[Path, str, Application]] = []
+    for scan, found in oriented_roll(orientations, source, view):
+        frames += [(scan, name, applied) for name, applied in found]
+        if not found:
+            typer.echo(f"left out: {scan.name}: is not oriented in {orientations}", err=True)
+    _folder(frames, source, out or source.with_name(f"{source.resolve().name}-frames"), as_json, orientations)
+
+
+def _folder(
+    images: list[tuple[Path, str, Application]],
+    source: Path,
+    out: Path | None,
+    as_json: bool,
+    calibration: Path,
+) -> None:
     """Resample the images of a folder into another; one that cannot be read costs one line."""
     from ..core.errors import ImageError, InputError
-    from ..procedures.exposures import photographs_in
 
     out = out or source.with_name(f"{source.resolve().name}-undistorted")
     if out.resolve() == source.resolve():
         raise UsageError("is the folder of the images", where=out, do="choose another one")
-    images = photographs_in(source)
-    say_files_left_out([source])
-    try:
-        out.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be created ({error.strerror})", where=out) from None
+    made_folder(out)
     done = 0
-    for image in images:
+    for image, name, applied in images:
         suffix = image.suffix if image.suffix.lower() in _IMAGES else ".png"
         try:
-            _spare([calibration], [out / f"{image.stem}.json"])
-            _image(applied, image, out / f"{image.stem}{suffix}", as_json)
+            _spare([calibration], [out / f"{name}.json"])
+            _image(applied, image, out / f"{name}{suffix}", as_json)
             done += 1
         except (ImageError, UsageError) as error:
             typer.echo(f"left out: {error}", err=True)
@@ -310,7 +332,7 @@ def _image(applied: Application, source: Path, out: Path | None, as_json: bool) 
     kind = applied.calibration.kind
     suffix = {"camera": "undistorted", "film_frame": "frame", "fiducials": "frame"}.get(kind, "corrected")
     out = out or source.with_name(f"{source.stem}-{suffix}{source.suffix}")
-    suffix_of(writable(out), _IMAGES)
+    writable(out, *_IMAGES)
     with progress(f"resampling {source.name}", 0) as step:
         raster, camera, provenance = applied.image(source, out, step)
     if as_json:
@@ -336,7 +358,7 @@ def _frame(
     from ..core.provenance import canonical_json
 
     out = out or source.with_name(f"{source.stem}-corrected.tif")
-    suffix = suffix_of(writable(out), (".tif", ".tiff", ".png"))
+    suffix = writable(out, ".tif", ".tiff", ".png").suffix.lower()
     found = applied.frame(source, out, None if exposure_ms is None else 1000 * exposure_ms)
     if as_json:
         content = {"image": str(out), "dn_per_step": found.dn_per_step, "full_scale_dn": found.full_scale}

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..core import vocabulary as v
-from .common import Computing, Place, SessionName, progress, required, say, suffix_of, writable
+from ..core.files import writable
+from .common import Computing, Place, SessionName, progress, required, say
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ def export(
     """Export a session to a zip file: frames, results and a table of contents."""
     from ..archive import export as exported
 
-    suffix_of(writable(out), (".zip",))
+    writable(out, ".zip")
     with place.open() as found:
         count = exported(found.session(session), out)
     say(f"{out}: {count} files\n")

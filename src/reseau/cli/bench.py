@@ -10,10 +10,11 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
+from ..core.files import writable
 from ..core.options import Option
 from . import bench_by_hand as by_hand
 from .bench_features import features
-from .common import say, writable
+from .common import say
 from .declared import Commands
 
 __all__ = ["app"]
@@ -151,8 +152,7 @@ def sim(
     from ..capture import plugin
     from ..io import write_whole
 
-    if out is not None:
-        writable(out)
+    writable(out)
     options: dict[str, Any] = {"table": controller, "family": family, "camera": scene or None}
     options |= {"scanner": scanners}
     options |= {"repeatable": repeatable, "flat": flat, "cameras": cameras}

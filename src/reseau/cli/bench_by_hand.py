@@ -14,8 +14,9 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import InputError, ReseauError, StateError, UsageError
+from ..core.files import writable
 from ..core.options import Option
-from .common import say, writable
+from .common import say
 
 if TYPE_CHECKING:
     from ..capture import Bench
@@ -276,8 +277,7 @@ def expose(
 
     if auto and exposure_us is not None:
         raise UsageError("cannot be combined with --auto", where="--exposure-us")
-    if out is not None:
-        writable(out)
+    writable(out)
     with held_one(bench, Camera, camera, "reseau bench expose") as found:
         # Others set the exposure of the bench file again, when they connect.
         if exposure_us is not None:

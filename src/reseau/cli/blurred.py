@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Annotated, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ..core import vocabulary as v
-from .common import Reading, orientation, suffix_of, writable
+from ..core.files import writable
+from .common import Reading, orientation
 from .measure import BY_DESIGN, NOT_NOMINAL, Image, Output, Task
 
 if TYPE_CHECKING:
     from ..core.data import Frame
-    from ..exchange import Lens
-    from ..measure.blurred import BlurredOptions, BlurredResult
-    from ..optics.lenses import LensCamera, RayMap
+    from ..core.failure import Failure
+    from ..measure.blurred import BlurredResult
+    from ..procedures.blurred_files import BlurredImaging
 
 __all__ = ["BESIDE_RAYS", "Matching", "blurred"]
 
@@ -36,17 +37,12 @@ class Matching:
     psf_px: Annotated[v.PsfPx, BESIDE_RAYS] = 0.5
     search_px: v.SearchPx = 6.0
 
-    def camera(self, lens: Lens, size: tuple[int, int]) -> LensCamera:
-        """Return the lens with a sensor of a size in pixels."""
-        from ..procedures.blurred import lens_camera
+    def imaging(self, lens: Path | None) -> BlurredImaging:
+        """Return what forms the images, with the lens of a file."""
+        from ..exchange import read_lens
+        from ..procedures.blurred_files import BlurredImaging
 
-        return lens_camera(lens, size, pitch_mm=self.pitch_mm, distance=self.focus, f_number=self.f_number)
-
-    def options(self, polarity: Literal["dark", "bright"], fill: float) -> BlurredOptions:
-        """Return the options of the measurement."""
-        from ..measure.blurred import BlurredOptions
-
-        return BlurredOptions(polarity=polarity, psf_px=self.psf_px, search_px=self.search_px, fill=fill)
+        return BlurredImaging(None if lens is None else read_lens(lens), **vars(self))
 
 
 def blurred(
@@ -82,38 +78,20 @@ def blurred(
 
     The images of the targets are formed by rays through the lens and matched with the photograph.
     """
-    from ..core.errors import UsageError
     from ..core.failure import Failure
-    from ..exchange import read_lens, read_network
-    from ..io import BoardDesign, ReseauDesign
+    from ..exchange import read_network
     from ..io.reading import read_design
-    from ..measure import ReseauOptions, measure_reseau
-    from ..procedures.blurred import calibrated_by, measure_blurred_frame, pose_in_network
+    from ..measure import ReseauOptions
+    from ..procedures.blurred_files import measure_blurred_photograph
 
-    kind = "" if figure is None else suffix_of(writable(figure), (".svg", ".png", ".pdf"))
+    kind = "" if figure is None else writable(figure, ".svg", ".png", ".pdf").suffix.lower()
     task = Task(image, output, "targets", "deviations from the orientation")
-    target, optics = read_design(design), read_lens(lens)
-    if isinstance(target, BoardDesign):
-        raise UsageError("is a board", where=design, do="give a testfield or a reseau")
-    fill = 1.0 if optics.sensor is None else optics.sensor.fill
-    options = matching.options(target.polarity, fill)
+    target, imaging = read_design(design), matching.imaging(lens)
     block = None if network is None else read_network(network)
-    sharp = None
-    if block is None:  # a network determines the orientation: names need no help
-        target = target.from_behind() if mirrored else target
-        if isinstance(target, ReseauDesign):
-            # Where the targets lie is predicted in the design as the image shows it.
-            turned = ReseauOptions(**orientation(None if mirrored is None else False, max_rotation_deg))
-            sharp = partial(measure_reseau, design=target, options=turned)
+    turned = ReseauOptions(**orientation(mirrored, max_rotation_deg))
 
     def measured(frame: Frame) -> BlurredResult | Failure:
-        view: RayMap = matching.camera(optics, (frame.width, frame.height))
-        pose = None
-        if block is not None:
-            pose, view = pose_in_network(block, image.name, target), calibrated_by(view, block, image.name)
-        found = measure_blurred_frame(
-            frame, target, view, pose, options, sharp=sharp, focus_sigma_mm=focus_sigma_mm
-        )
+        found = measure_blurred_photograph(frame, target, imaging, block, image.name, turned, focus_sigma_mm)
         if isinstance(found, Failure):
             return found
         if figure is not None:
@@ -121,7 +99,8 @@ def blurred(
             from ..core.files import write_whole
             from ..report.blurred import blurred_figure
 
-            drawn = blurred_figure(frame, found.camera, found.targets, found.measured, fill=options.fill)
+            fill = imaging.options(target.polarity).fill
+            drawn = blurred_figure(frame, found.camera, found.targets, found.measured, fill=fill)
             write_whole(figure, to_bytes(drawn, kind[1:], dpi=150))
         return found.measured
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from ..core import vocabulary as v
+from ..core.files import writable
 from ..core.options import Group, Option
 from .bundle_options import (
     level_of,
-    outputs,
     positive,
     say_left_out,
     say_model,
@@ -97,8 +97,9 @@ def bundle(
     from ..io import write_whole
 
     level_of(alpha, "--alpha")
-    outputs(out, report)
-    outputs(convert, None)
+    writable(out, ".json")
+    writable(report, ".html")
+    writable(convert, ".json")
     distance = positive(distance)
     calibrations = _calibrations(camera_calibration or [])
     read = read_network(network, calibrations, control_sigma=control_sigma)

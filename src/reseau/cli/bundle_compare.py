@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..core import vocabulary as v
+from ..core.files import writable
 from .bundle_options import say_difference
-from .common import say, suffix_of, writable
+from .common import say
 
 if TYPE_CHECKING:
     from ..calibration import CameraMapping, FieldDifference
@@ -32,9 +33,8 @@ def compare(
     from ..core.provenance import canonical_json
     from ..io import write_whole
 
-    for path, suffixes in ((out, (".json",)), (figure, (".svg",))):
-        if path is not None:
-            suffix_of(writable(path), suffixes)
+    writable(out, ".json")
+    writable(figure, ".svg")
     found = calibration_difference(read_lens(first), read_lens(second), places)
     document = canonical_json(_document(first, second, found))
     if figure is not None:

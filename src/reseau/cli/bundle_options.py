@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .common import say, suffix_of, writable
+from .common import say
 
 if TYPE_CHECKING:
     from ..bundle import (
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "level_of",
-    "outputs",
     "positive",
     "say_difference",
     "say_left_out",
@@ -53,21 +51,6 @@ def level_of(value: float | None, name: str) -> float | None:
     if value is not None and not 0 < value < 1:
         raise UsageError(f"{value:g} is not between 0 and 1", where=name)
     return value
-
-
-def outputs(out: Path | None, report: Path | None) -> None:
-    """Check before the computation that result and report can be written.
-
-    Raises
-    ------
-    InputError
-        When a folder does not exist.
-    UsageError
-        When a suffix is wrong.
-    """
-    for path, suffixes in ((out, (".json",)), (report, (".html",))):
-        if path is not None:
-            suffix_of(writable(path), suffixes)
 
 
 def positive(distances: list[float] | None) -> list[float]:

@@ -10,11 +10,11 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
+from ..core.files import writable
 from ..core.options import Group, Option
 from .bundle_compare import read_lens
 from .bundle_options import (
     level_of,
-    outputs,
     positive,
     say_difference,
     say_left_out,
@@ -248,7 +248,7 @@ def calibrate(
 
     place = out if out is not None or as_json else folder_beside(files)
     place = None if place is None else checked_output(place)
-    outputs(None, report)
+    writable(report, ".html")
     drawn = {} if overlay is None else overlay_files(overlay, files)
     distance = positive(distance)
     target = None if str(design) == "auto" else read_target(design)

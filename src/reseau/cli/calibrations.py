@@ -12,8 +12,9 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import EstimationError, UsageError
+from ..core.files import writable
 from ..core.options import Option
-from .common import Place, say, suffix_of, writable
+from .common import Place, say
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -169,7 +170,7 @@ def show(
 
     time, entered = time_of(at, "--at") or datetime.now(UTC), time_of(known, "--known")
     if out is not None:
-        suffix_of(writable(out), (".json",))
+        writable(out, ".json")
         if name is None:
             raise UsageError("needs the name of a configuration", where="--out")
     rows: list[dict[str, Any]] = []
@@ -339,7 +340,7 @@ def function(
     from ..core.failure import Failure
     from ..service import CovariateTable, FunctionOptions
 
-    suffix_of(writable(out), (".json",))
+    writable(out, ".json")
     if covariates is None and not recorded:
         raise UsageError("none were given", where="covariates", do="give --covariates or --recorded")
     with _opened(place) as opened:
@@ -369,7 +370,7 @@ def at(
     """Write the calibration at given values of the covariates, with what their uncertainties add."""
     from ..service import CalibrationFunction
 
-    suffix_of(writable(out), (".json",))
+    writable(out, ".json")
     values, sigmas = {}, {}
     for key, text in map(_pair, covariate):
         value, sign, sigma = text.replace("+-", "±").partition("±")

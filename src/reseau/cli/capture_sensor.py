@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..core import vocabulary as v
+from ..core.files import writable
 from ..core.options import Option
 from .acquisition import Where, ask_operator, conduct
-from .common import say, writable
+from .common import say
 from .sensor import event, lines
 
 if TYPE_CHECKING:
@@ -35,8 +36,7 @@ def sensor(
     yes: Annotated[bool, Option("Do not prompt.")] = False,
 ) -> None:
     """Calibrate a camera's sensor: dark signal, response, linearity, noise, gain, full well, defects, MTF."""
-    if out is not None:
-        writable(out)
+    writable(out)
 
     def parameters(bench: Bench) -> SensorParameters:
         from ..sessions import SensorParameters

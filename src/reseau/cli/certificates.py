@@ -13,9 +13,10 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
+from ..core.files import writable
 from ..core.options import Option
 from .calibrations import time_of
-from .common import Place, say, suffix_of, writable
+from .common import Place, say
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ def create(
     from ..io import write_whole
     from ..service.certificates import CertificateData, certify, dcc_of, html_of, pdf_of, sign
 
-    kinds = [suffix_of(writable(each), (".pdf", ".xml", ".html")) for each in out]
+    kinds = [writable(each, ".pdf", ".xml", ".html").suffix.lower() for each in out]
     if len(set(kinds)) < len(kinds):
         raise UsageError("has two files of one kind", where="--out")
     if (signing_key is None) != (signing_certificate is None):
@@ -248,8 +249,7 @@ def uncertainty(
         uncertainty_of,
     )
 
-    if out is not None:
-        suffix_of(writable(out), (".json",))
+    writable(out, ".json")
     given: CertificateData | None = None if data is None else CertificateData.read(data)
     found = _find(source, place)
     sources = uncertainty_of(found.calibration, found.earlier, given)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from ..core import vocabulary as v
-from ..core.errors import EstimationError, InputError, UsageError
+from ..core.errors import EstimationError, UsageError
+from ..core.files import made_folder, writable
 from ..core.notice import before_compiling
 
 if TYPE_CHECKING:
@@ -151,41 +151,6 @@ def required(found: T | Failure, where: object) -> T:
     return found
 
 
-def writable(path: Path) -> Path:
-    """Return the path if a file can be written there; called before the computation.
-
-    Raises
-    ------
-    InputError
-        If the folder does not exist, or nothing can be written there.
-    """
-    if not path.parent.is_dir():
-        raise InputError("its folder does not exist", where=path, do="create the folder first")
-    if path.is_dir():
-        raise InputError("is a folder", where=path, do="give the name of a file")
-    if not os.access(path.parent, os.W_OK):
-        raise InputError("its folder is write-protected", where=path, do="choose another one")
-    return path
-
-
-def suffix_of(path: Path, allowed: tuple[str, ...]) -> str:
-    """Return the suffix of an output file.
-
-    Raises
-    ------
-    UsageError
-        If the suffix is not allowed.
-    """
-    suffix = path.suffix.lower()
-    if suffix not in allowed:
-        raise UsageError(
-            f"has the suffix {suffix!r}" if suffix else "has no suffix",
-            where=path,
-            do=f"use {', '.join(allowed)}",
-        )
-    return suffix
-
-
 def overlay_files(path: Path, images: Sequence[Path]) -> dict[Path, Path]:
     """Return the overlay of each image: the PNG that is named, or one for each image in a folder.
 
@@ -212,13 +177,9 @@ def overlay_files(path: Path, images: Sequence[Path]) -> dict[Path, Path]:
         for i, stem in enumerate(stems)
     ]
     if path.is_dir() or not path.suffix:
-        try:
-            path.mkdir(exist_ok=True)
-        except OSError as error:
-            raise InputError(f"cannot be created ({error.strerror})", where=path) from None
-        files = [path / f"{name}-overlay.png" for name in names]
+        files = [made_folder(path) / f"{name}-overlay.png" for name in names]
     else:
-        suffix_of(writable(path), (".png",))
+        writable(path, ".png")
         one = len(shown) == 1
         files = [path if one else path.with_name(f"{path.stem}-{name}.png") for name in names]
     for file in files:

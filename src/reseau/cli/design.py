@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ..core import vocabulary as v
+from ..core.files import writable
 from ..core.options import Option
-from .common import say, suffix_of, writable
+from .common import say
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -138,7 +139,7 @@ def fiducials(
     if out is None or str(out) == "-":
         say(design.to_json())
     else:
-        suffix_of(writable(out), (".json",))
+        writable(out, ".json")
         design.write(out)
         say(f"{out}: {design.name}, {len(design.points)} marks; {design.source}\n")
 
@@ -309,9 +310,9 @@ def _write(design: Drawable, drawn: Drawn, what: str) -> None:
     svg, pdf, paper = (
         (drawn.svg, drawn.pdf, drawn.paper) if isinstance(drawn, Printed) else (None, None, "own")
     )
-    for path, suffix in ((svg, ".svg"), (pdf, ".pdf"), (out, ".json")):
-        if path is not None:
-            suffix_of(writable(path), (suffix,))
+    writable(svg, ".svg")
+    writable(pdf, ".pdf")
+    writable(out, ".json")
     files: dict[Path, str | bytes] = {}
     if svg is not None or pdf is not None:
         from ..designs.drawing import design_pdf, design_svg

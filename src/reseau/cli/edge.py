@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..core import vocabulary as v
-from .common import Reading, overlay_files, progress, required, say, suffix_of, writable
+from ..core.files import writable
+from .common import Reading, overlay_files, progress, required, say
 from .measure import Output
 
 if TYPE_CHECKING:
@@ -34,9 +35,8 @@ def edge(
 
     regions = region or []
     out, overlay = output.out, output.overlay
-    suffix = ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
-    if report is not None:
-        writable(report)
+    suffix = ".json" if out is None else writable(out, ".json", ".csv").suffix.lower()
+    writable(report)
     picture = overlay_files(overlay, [image])[image] if overlay is not None else None
     frame = reading.frame(image)
     options = {"regions": regions or None, "channel": reading.channel}

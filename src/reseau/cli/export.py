@@ -9,7 +9,8 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
-from .common import say, suffix_of, writable
+from ..core.files import writable
+from .common import say
 
 __all__ = ["export"]
 
@@ -55,8 +56,7 @@ def export(
 
     if micmac is None and metashape is None:
         raise UsageError("nothing to write", where="reseau export", do="give --to, --micmac or --metashape")
-    if metashape is not None:
-        suffix_of(writable(metashape), (".py",))
+    writable(metashape, ".py")
     grid = None if design is None else ReseauDesign.read(design)
     marks = [read_film_marks(path, grid) for path in film_files(files)]
     if len({each.image for each in marks}) < len(marks):

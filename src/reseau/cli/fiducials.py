@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from ..core import vocabulary as v
-from .common import overlay_files, progress, required, say, suffix_of, writable
+from ..core.files import writable
+from .common import overlay_files, progress, required, say
 from .measure import Output
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def fiducials(
     from ..measure.fiducials import FiducialOptions, measure_fiducials
 
     out, overlay = output.out, output.overlay
-    suffix = ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
+    suffix = ".json" if out is None else writable(out, ".json", ".csv").suffix.lower()
     drawn = None if overlay is None else overlay_files(overlay, [scan])[scan]
     named = design.parent == Path() and not design.suffix and not design.exists()
     camera = aerial_camera(design.name) if named else FiducialDesign.read(design)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..core import vocabulary as v
-from .common import Reading, orientation, overlay_files, progress, required, say, suffix_of, writable
+from ..core.files import writable
+from .common import Reading, orientation, overlay_files, progress, required, say
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -181,7 +182,7 @@ class Task:
             marks,
             spread,
         )
-        self.suffix = ".json" if out is None else suffix_of(writable(out), (".json", ".csv"))
+        self.suffix = ".json" if out is None else writable(out, ".json", ".csv").suffix.lower()
         self.overlay = overlay_files(overlay, [image])[image] if overlay is not None else None
 
     def run(self, reading: Reading, measure: Callable[[Frame], Any]) -> None:

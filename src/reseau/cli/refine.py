@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..core import vocabulary as v
+from ..core.files import writable
 from ..core.options import Option
 from .common import (
     orientation,
@@ -21,8 +22,6 @@ from .common import (
     read_photo,
     required,
     say,
-    suffix_of,
-    writable,
 )
 from .measure import BY_DESIGN, NOT_NOMINAL
 
@@ -147,9 +146,9 @@ def refine(
     from ..io import ReseauDesign, points_document, write_whole
     from ..procedures.refining import Photographs, refine_photographs
 
-    for path, suffixes in ((out, (".json",)), (report, (".html",)), (true, (".csv", ".json"))):
-        if path is not None:
-            suffix_of(writable(path), suffixes)
+    writable(out, ".json")
+    writable(report, ".html")
+    writable(true, ".csv", ".json")
     assert files.overlays is not None  # their names are checked before anything is computed
     photographs = Photographs(files.photo_i, files.photo_ii, files.photo_iii)
     grid, rods = (

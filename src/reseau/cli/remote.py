@@ -12,7 +12,8 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
-from .common import CameraChoice, say, writable
+from ..core.files import made_folder, writable
+from .common import CameraChoice, say
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -77,7 +78,7 @@ def show(
     with service.client() as client:
         found = client.get(f"/sessions/{quote(name, safe='')}")
         if out is not None:
-            out.mkdir(exist_ok=True)
+            made_folder(out)
             for each in {r["name"]: r for r in found["results"]}.values():
                 path = out / Path(each["name"]).name
                 path.write_bytes(client.file(f"/sessions/{quote(name, safe='')}/results/{each['id']}/file"))

@@ -13,9 +13,10 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import ReseauError, UsageError
+from ..core.files import writable
 from ..core.options import Option
 from .calibrations import say_decision, time_of
-from .common import Place, say, suffix_of, writable
+from .common import Place, say
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ def export(
     from ..io import write_whole
     from ..service import Schedules
 
-    suffix_of(writable(out), (".ics",))
+    writable(out, ".ics")
     with place.open() as found:
         write_whole(out, Schedules(found).feed(name))
 

@@ -10,7 +10,8 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import EstimationError, UsageError
-from .common import probability, progress, say, writable
+from ..core.files import writable
+from .common import probability, progress, say
 
 if TYPE_CHECKING:
     from ..calibration.document import Calibration
@@ -53,9 +54,8 @@ def sensor(
     from ..procedures.sensor_files import add_files
     from ..report.sensor import sensor_report
 
-    for path in (out, report):
-        if path is not None:
-            writable(path)
+    writable(out)
+    writable(report)
     given = _exposures(series, {"light": light, "dark": dark, "edge": edge})
     called = name or (series.stem if series is not None else "sensor")
     root = None if series is None else series if series.is_dir() else series.parent

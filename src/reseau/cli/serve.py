@@ -11,8 +11,9 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
+from ..core.files import writable
 from ..core.options import Option
-from .common import Place, say, writable
+from .common import Place, say
 from .declared import Commands
 
 if TYPE_CHECKING:

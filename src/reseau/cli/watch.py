@@ -20,11 +20,9 @@ from .common import CameraChoice, say
 
 if TYPE_CHECKING:
     from ..capture import Bench
+    from ..core.data import Frame
 
 __all__ = ["watch"]
-
-_LEAST = 3
-"""Frames without which there is no calibration."""
 
 
 def watch(
@@ -48,39 +46,26 @@ def watch(
     from ..core.errors import InputError, InstrumentError
     from ..exchange import read_target
     from ..instruments import Camera
-    from ..io.images import read_image, write_image
-    from ..procedures.exposures import photographs_in
     from ..procedures.target_measurement import measurer_of
-    from ..procedures.watching import Watching
+    from ..procedures.watching import WatchedFolder, Watching
     from ..service.live import LivePage
 
-    target = read_target(design)
-    if count < _LEAST:
-        raise UsageError(f"is {count}, not at least {_LEAST}", where="--count")
-    options = model.options()
+    target, options = read_target(design), model.options()
     if options.automatic:
         raise UsageError("is chosen from all photographs", where="--model auto", do="give it to calibrate")
-    before = photographs_in(out) if resume and out.is_dir() and any(out.iterdir()) else []
-    if out.exists() and not before and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError("is not empty", where=out, do="give a new folder, or --resume")
     instruments = _bench(bench, camera)
-    chosen = None if camera is None or camera.startswith("/dev/") else camera
-    source = instruments.one(Camera, chosen)
+    source = instruments.one(Camera, None if camera is None or camera.startswith("/dev/") else camera)
     # The axes of the bench are free to be moved from elsewhere meanwhile.
     instruments, watching = instruments.part([source.name]), Watching(target, measurer_of(target), options)
-    for path in before:
-        declined = watching.resume(read_image(path), path.name)
-        if declined is not None:
-            typer.echo(f"left out: {path.name}: {declined.reason}", err=True)
-    kept, failed = watching.frames, None
-    number = max((int(path.stem) for path in before if path.stem.isdecimal()), default=0)
+    photographs, failed = WatchedFolder(out, watching, count, resume), None
+    for name, declined in photographs.left_out.items():
+        typer.echo(f"left out: {name}: {declined.reason}", err=True)
     with (
         instruments.lock("reseau watch"),
         instruments,
         LivePage(f"{source.name}: {target.name}", port) as page,
         _Ending() as ending,
     ):
-        out.mkdir(parents=True, exist_ok=True)
         typer.echo(f"{page.url}  (Ctrl-C ends)", err=True)
         if window and _has_display():
             webbrowser.open(page.url)
@@ -90,17 +75,20 @@ def watch(
             if not steered:
                 typer.echo(f"warning: {steered.why}", err=True)
         end = time.monotonic() + (seconds or float("inf"))
+
+        def expose() -> Frame:
+            with ending.at_once():
+                frame: Frame = source.expose().frame
+            return frame
+
+        def over() -> bool:
+            return ending.asked or time.monotonic() >= end
+
         try:
-            while kept < count and time.monotonic() < end and not ending.asked:
-                with ending.at_once():
-                    frame = source.expose().frame
-                name = f"{number + 1:03d}.png"
-                seen = watching.on_frame(frame, name)
-                if seen.taken:
-                    write_image(out / name, frame.pixels)
-                    number, kept = number + 1, kept + 1
+            for frame, seen, path in photographs.taken(expose, over):
+                if path is not None:
                     reached = "".join(f"  {key} {value:.2g}" for key, value in seen.sigmas.items())
-                    say(f"{out / name}: {len(seen.xy)} points{reached}\n")
+                    say(f"{path}: {len(seen.xy)} points{reached}\n")
                 page.show(frame, seen, count)
         except KeyboardInterrupt:
             pass
@@ -108,10 +96,11 @@ def watch(
             failed = error
     for line in watching.verdict:
         say(f"{line}\n")
-    if kept < _LEAST:
-        say(f"{kept or 'no'} frame{'s' * (kept != 1)} in {out}, too few to calibrate; --resume continues\n")
+    kept = f"{watching.frames or 'no'} frame{'s' * (watching.frames != 1)} in {out}"
+    if photographs.enough:
+        say(f"{kept}; next: reseau calibrate {out} --design {design}\n")
     else:
-        say(f"{kept} frames in {out}; next: reseau calibrate {out} --design {design}\n")
+        say(f"{kept}, too few to calibrate; --resume continues\n")
     if failed is not None:
         raise failed
 

@@ -367,21 +367,25 @@ def draw_picture(axes: Axes, pixels: NDArray[Any]) -> None:
     )
 
 
-def draw_contours(axes: Axes, xy: Array, sigma: Array, scale: Array | None = None) -> None:
+def draw_contours(
+    axes: Axes | None, xy: Array, sigma: Array, title: str = "", scale: Array | None = None
+) -> Axes:
     """Draw contours of positive values over an image, y down, at levels 1, 2, 5 …, and a colour bar.
 
     Parameters
     ----------
-    axes : Axes
-        Axes to draw into.
+    axes : Axes or None
+        Axes to draw into; without any those of a new figure.
     xy : ndarray (rows, columns, 2)
-        Places, pixels.
+        Places, pixels, from edge to edge of the image.
     sigma : ndarray (rows, columns)
         Values; NaN where there is none.
+    title : str
+        Title of the axes.
     scale : ndarray, optional
         Values whose levels are taken, those of another map beside it.
     """
-    x, y = xy[0, :, 0], xy[:, 0, 1]
+    axes, x, y = new_axes(axes), xy[0, :, 0], xy[:, 0, 1]
     levels = contour_levels(sigma if scale is None else scale)
     shown = np.ma.masked_invalid(sigma)
     # Each step of the levels is one of the colours, however far apart they are.
@@ -389,12 +393,11 @@ def draw_contours(axes: Axes, xy: Array, sigma: Array, scale: Array | None = Non
     filled = axes.contourf(x, y, shown, levels=levels, cmap=_SHADES, norm=norm, extend="both")
     lines = axes.contour(x, y, shown, levels=levels, colors=INK, linewidths=0.5)
     axes.clabel(lines, fontsize=7.5, fmt="%g")
-    axes.set_aspect("equal")
-    axes.set_xlim(x[0], x[-1])
-    axes.set_ylim(y[-1], y[0])
+    image_axes(axes, x[-1] + 1, y[-1] + 1, title)
     if axes.figure is not None:
         bar = axes.figure.colorbar(filled, ax=axes, shrink=0.8, ticks=levels, format="%g")
         bar.outline.set_linewidth(0.6)
+    return axes
 
 
 def contour_levels(values: Array) -> list[float]:

@@ -6,10 +6,97 @@ import os
 import re
 from contextlib import suppress
 from pathlib import Path
+from typing import TypeVar
 
-from .errors import InputError
+from .errors import InputError, UsageError
 
-__all__ = ["split_frame", "write_whole"]
+__all__ = ["empty_folder", "made_folder", "split_frame", "writable", "write_whole"]
+
+P = TypeVar("P", bound=Path | None)
+
+
+def writable(path: P, *suffixes: str, folder: bool = False) -> P:
+    """Return the path if a file can be written there; nothing is made: called before a computation.
+
+    Parameters
+    ----------
+    path : Path or None
+        None is returned as it is.
+    *suffixes : str
+        What its name may end in; by default anything.
+    folder : bool
+        Whether it is a folder of files, which may be there already.
+
+    Raises
+    ------
+    InputError
+        When the folder does not exist, or nothing can be written there.
+    UsageError
+        When the suffix is another one.
+
+    Examples
+    --------
+    >>> writable(Path("camera.yml"), ".json")
+    Traceback (most recent call last):
+    ...
+    reseau.core.errors.UsageError: camera.yml: has the suffix '.yml'; use .json
+    """
+    if path is None:
+        return path
+    there = path.is_dir()
+    inside = path if there and folder else path.parent
+    if not inside.is_dir():
+        raise InputError("its folder does not exist", where=path, do="create the folder first")
+    if there and not folder:
+        raise InputError("is a folder", where=path, do="give the name of a file")
+    if path.exists() and folder and not there:
+        raise InputError("is a file", where=path, do="give the name of a folder")
+    if not os.access(inside, os.W_OK):
+        raise InputError("its folder is write-protected", where=path, do="choose another one")
+    if suffixes and path.suffix.lower() not in suffixes:
+        what = f"has the suffix {path.suffix!r}" if path.suffix else "has no suffix"
+        raise UsageError(what, where=path, do=f"use {', '.join(suffixes)}")
+    return path
+
+
+def empty_folder(path: Path, do: str = "give a new or an empty folder") -> Path:
+    """Return the path if there is nothing there, or an empty folder.
+
+    Raises
+    ------
+    UsageError
+        When there is something; `do` says what helps.
+
+    Examples
+    --------
+    >>> empty_folder(Path("src"))
+    Traceback (most recent call last):
+    ...
+    reseau.core.errors.UsageError: src: is not empty; give a new or an empty folder
+    """
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise UsageError("is not empty", where=path, do=do)
+    return path
+
+
+def made_folder(path: Path) -> Path:
+    """Make a folder and those that contain it, where they are not there, and return its path.
+
+    Raises
+    ------
+    InputError
+        When it cannot be made.
+
+    Examples
+    --------
+    >>> made_folder(Path("src")).name
+    'src'
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be created ({error.strerror})", where=path) from None
+    return path
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

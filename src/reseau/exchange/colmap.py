@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..bundle import Camera, Network, Result, camera_mapping
 from ..core.data import Array
 from ..core.errors import FormatError, UsageError
+from ..core.files import made_folder
 from ..io import read_text, write_whole
 from ..optics import camera_model
 from ..optics.poses import matrix_to_vector
@@ -179,7 +180,7 @@ def write_colmap(result: Result, folder: Path | str) -> dict[str, Exported]:
         track = " ".join(f"{network.image_of[k] + 1} {place[k]}" for k in rows)
         error = float(size[rows].mean()) if len(rows) else -1.0
         points.append(f"{j + 1} {_words(fit.values.xyz[j])} 128 128 128 {error!r} {track}")
-    folder.mkdir(parents=True, exist_ok=True)
+    made_folder(folder)
     for name, text in (("cameras", cameras), ("images", lines), ("points3D", points)):
         write_whole(folder / f"{name}.txt", "".join(f"{line}\n" for line in text))
     return written

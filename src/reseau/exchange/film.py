@@ -20,6 +20,7 @@ import numpy as np
 from ..calibration import FiducialMapping, FilmFrameMapping, calibration_of_fiducials, calibration_of_frame
 from ..core.data import Array
 from ..core.errors import FormatError, InputError, UsageError
+from ..core.files import made_folder
 from ..io import CORNERS, FiducialOrientation, FrameOrientation, ReseauDesign, ReseauMeasurement
 from ..io.document import read_text, write_whole
 
@@ -223,10 +224,7 @@ def write_micmac(folder: Path | str, scans: Sequence[FilmMarks]) -> list[Path]:
     names, mm = tuple(camera), np.array(list(camera.values()))
     down = np.stack([mm[:, 0] - mm[:, 0].min(), mm[:, 1].max() - mm[:, 1]], axis=1)
     inner = Path(folder) / _FOLDER
-    try:
-        inner.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be written to ({error.strerror})", where=inner) from None
+    made_folder(inner)
     files = [inner / f"MeasuresIm-{scan.image}.xml" for scan in scans]
     for file, scan in zip(files, scans, strict=True):
         write_whole(file, _xml(scan.image, scan.names, scan.xy))

@@ -12,7 +12,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ..core.data import Array, Frame, Mask
-from ..core.errors import ImageError
+from ..core.failure import Code, Failure
 
 __all__ = ["Screened", "inner_pixels", "lost_in_blocks", "quiet_noise", "screen"]
 
@@ -53,7 +53,7 @@ class Screened:
     noise: float
 
 
-def screen(frame: Frame, run: int | None, *, noisy: bool = True) -> Screened:
+def screen(frame: Frame, run: int | None, *, noisy: bool = True) -> Screened | Failure:
     """Find the valid pixels of a frame, level its borders, and estimate its noise.
 
     Parameters
@@ -67,29 +67,29 @@ def screen(frame: Frame, run: int | None, *, noisy: bool = True) -> Screened:
     noisy : bool
         Whether the noise is estimated; otherwise it is NaN. Needed where pixels may be lost.
 
-    Raises
-    ------
-    ImageError
-        When all pixels have the same grey value, or almost all are black or saturated.
+    Returns
+    -------
+    Screened or Failure
+        A failure when all pixels have the same grey value, or almost all are black or saturated.
     """
     pixels = frame.pixels
     low, high = float(pixels.min()), float(pixels.max())
     if low == high:
-        colour = "black" if low == 0 else "saturated" if high >= frame.full_scale else "of one grey"
-        raise ImageError(f"is all {colour}", where=frame.name, do="check exposure and shutter")
+        full = high >= frame.full_scale
+        colour = "black" if low == 0 else "saturated" if full else "of one grey"
+        code = Code.SATURATED if full else Code.LOW_CONTRAST
+        return Failure(f"is all {colour}; check exposure and shutter", code, frame.name)
     if (share := float(np.mean(pixels >= frame.full_scale))) > 0.9:
-        raise ImageError(
-            f"is saturated over {share:.0%} of its area", where=frame.name, do="reduce the exposure"
-        )
+        why = f"is saturated over {share:.0%} of its area; reduce the exposure"
+        return Failure(why, Code.SATURATED, frame.name)
     grey = pixels.astype(np.float32)
     if run is None:
         valid = np.ones(pixels.shape, dtype=bool)
         return Screened(grey, valid, _noise(pixels, None) if noisy else np.nan)
     valid = ~_lost(pixels, run)
     if (share := float(np.mean(valid & (pixels > low)))) < 0.02:
-        raise ImageError(
-            f"is black over {1 - share:.0%} of its area", where=frame.name, do="increase the exposure"
-        )
+        why = f"is black over {1 - share:.0%} of its area; increase the exposure"
+        return Failure(why, Code.LOW_CONTRAST, frame.name)
     noise = _noise(pixels, valid)
     valid &= ~_spikes(grey, noise)
     return Screened(_level_borders(grey, valid), valid, noise)

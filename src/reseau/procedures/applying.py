@@ -20,6 +20,7 @@ from ..calibration import (
     FilmFrameMapping,
     InstrumentCorrection,
     SensorCorrection,
+    read_calibration,
     required_use,
     undistort_video,
     undistorted_camera,
@@ -30,10 +31,12 @@ from ..calibration.raster import planes_of
 from ..core.data import ImagePoints
 from ..core.errors import UsageError
 from ..core.provenance import Provenance, canonical_json, sha256_of
+from ..exchange.film import film_files
 from ..io import POINTS, points_document, points_of, read_measurement, read_text
 from ..io.images import open_scan, read_image, write_image
+from .exposures import photographs_in
 
-__all__ = ["Application", "AppliedFrame", "AppliedPoints", "View"]
+__all__ = ["Application", "AppliedFrame", "AppliedPoints", "View", "oriented_roll"]
 
 
 class View(NamedTuple):
@@ -343,6 +346,50 @@ class Application:
         used = self.mapping.exposure_us if exposure_us is None else exposure_us
         provenance = Provenance({source.name: frame.sha256, **self.origin}, {"exposure_us": used})
         return AppliedFrame(found.width, found.height, step, found.full_scale, provenance)
+
+
+def oriented_roll(
+    orientations: Path, scans: Path, view: View | None = None
+) -> list[tuple[Path, list[tuple[str, Application]]]]:
+    """Return the scans of a folder, each with the frames that `reseau orient` found in it.
+
+    Parameters
+    ----------
+    orientations : Path
+        Folder that `reseau orient` wrote.
+    scans : Path
+        Folder of the scans.
+    view : View, optional
+        Resolution of corrected images.
+
+    Returns
+    -------
+    list of (Path, list)
+        Each scan with the names of its frames and their orientations; without any where it was declined.
+
+    Raises
+    ------
+    InputError
+        When a folder has no orientation, or no photograph.
+    UsageError
+        When the orientations are those of other scans.
+
+    Examples
+    --------
+    >>> oriented_roll(Path("docs"), Path("docs"))
+    Traceback (most recent call last):
+    ...
+    reseau.core.errors.InputError: docs: has no oriented scan; use `reseau orient --out`
+    """
+    frames: dict[str, list[tuple[str, Application]]] = {}
+    for file in film_files([orientations]):
+        calibration = read_calibration(file)
+        applied = Application.of(calibration, view, origin={file.name: sha256_of(file)})
+        frames.setdefault(str(calibration.model.get("image")), []).append((file.stem, applied))
+    found = [(path, frames.get(path.name, [])) for path in photographs_in(scans)]
+    if not any(own for _, own in found):
+        raise UsageError(f"has no scan that is oriented in {orientations}", where=scans)
+    return found
 
 
 def _read(source: Path, system: str, camera: Mapping[str, Any]) -> ImagePoints:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ..archive import Verdict
-from ..bundle import Network, ResultDocument
+from ..bundle import Network
 from ..core.data import Frame
 from ..core.environment import Surroundings
 from ..core.errors import EstimationError
@@ -19,8 +18,8 @@ from ..exchange import Lens
 from ..io.network import Network1
 from ..io.targets import SpaceTargets
 from ..measure.ordinary import ordinary_coordinates
-from .blurred import lens_camera
-from .blurred_network import BlurredNetwork, NetworkOptions, final_document, measure_blurred_network
+from .blurred_files import BlurredImaging, network_documents
+from .blurred_network import BlurredNetwork, NetworkOptions, measure_blurred_network
 from .testfield import P, Place
 
 __all__ = ["BlurredProcedure"]
@@ -121,12 +120,8 @@ class BlurredProcedure:
             network = self.network
             taken = np.array([name in self._frames for name in network.images])
             network = network.select(taken[network.image_of])
-            cameras = {
-                camera.id: lens_camera(self.lens, (camera.width, camera.height)) for camera in network.cameras
-            }
-            matching = replace(self.options.matching, polarity=self.targets.polarity)
-            options = replace(self.options, matching=matching)
-            found = measure_blurred_network(network, self._frames, self.targets, cameras, options)
+            cameras = BlurredImaging(self.lens).cameras(network)
+            found = measure_blurred_network(network, self._frames, self.targets, cameras, self.options)
             self._found = len(self._frames), found
         return self._found[1]
 
@@ -141,10 +136,4 @@ class BlurredProcedure:
         found = self.measured()
         if isinstance(found, Failure):
             raise EstimationError(found.reason, where=self.name)
-        results = {
-            f"round-{number}.json": ResultDocument.of(entry.result, provenance=self.provenance).to_json()
-            for number, entry in enumerate(found.rounds)
-        }
-        results["result.json"] = ResultDocument.of(found.result, provenance=self.provenance).to_json()
-        results["network.json"] = final_document(self.document, found).to_json()
-        return results
+        return network_documents(found, self.document, self.provenance)

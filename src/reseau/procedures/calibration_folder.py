@@ -11,7 +11,8 @@ import numpy as np
 
 from ..calibration import Calibration, CameraMapping, CorrectedImage, Use, write_corrected
 from ..calibration.raster import planes_of
-from ..core.errors import InputError, UsageError
+from ..core.errors import UsageError
+from ..core.files import writable
 from ..exchange import export_calibration, export_rig
 from ..exchange.calibrations import formats_holding
 from ..io import write_whole
@@ -67,14 +68,7 @@ def checked_output(path: Path) -> Path:
             do="use .json for the calibration alone, or a name without suffix for a folder with the files of "
             "all programs",
         )  # fmt: skip
-    where, do = path if path.is_dir() else path.parent, "choose another folder or file by --out"
-    if not where.is_dir():
-        raise InputError("cannot be written (No such file or directory)", where=path, do=do)
-    if path.exists() and not path.suffix and not path.is_dir():
-        raise InputError("cannot be written (File exists)", where=path, do=do)
-    if not os.access(where, os.W_OK):
-        raise InputError("cannot be written (Permission denied)", where=path, do=do)
-    return path
+    return writable(path, folder=path.is_dir() or not path.suffix)
 
 
 def write_calibrated(

@@ -339,8 +339,10 @@ def photo_iii(
         marks, shown = seen.points, seen
         hidden = seen.shadow(reseau, photo.pixels.shape)
         if points is None:
-            measured = find_pins(photo, pins, hidden=hidden)
-            points = measured.points
+            echoes = find_pins(photo, pins, hidden=hidden)
+            if isinstance(echoes, Failure):
+                return echoes
+            measured, points = echoes, echoes.points
         body = points
     else:
         body = photo

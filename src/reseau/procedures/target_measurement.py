@@ -222,8 +222,6 @@ def _points(measure: Measurer, photograph: Frame | Unread) -> MeasuredPhotograph
     size = frame.width, frame.height
     try:
         found = measure(frame)
-    except ImageError as error:
-        return MeasuredPhotograph(name, Failure(error.reason, Code.DECLINED, where=name), size, frame.notes)
     except (np.linalg.LinAlgError, cv2.error) as error:
         # One photograph must not end the measurement of the others.
         reason = f"could not be measured ({type(error).__name__}); please report it with the image"

@@ -7,20 +7,24 @@ the target lies elsewhere in the image than in all frames taken before.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from ..core.data import Array, Frame, ImagePoints, Mask
-from ..core.errors import ImageError
-from ..core.failure import Code, Failure
+from ..core.errors import UsageError
+from ..core.failure import Failure
+from ..core.files import empty_folder, made_folder
+from ..io.images import read_image, write_image
 from ..measure.points import Measured
 from .calibration_options import CameraOptions, PlaneDesign
+from .exposures import photographs_in
 from .target_measurement import Measurer
 from .testfield import TestfieldProcedure
 
-__all__ = ["Seen", "Watching"]
+__all__ = ["Seen", "WatchedFolder", "Watching"]
 
 _ACROSS, _DOWN = 12, 9
 _LEAST_IMAGES, _LEAST_POINTS = 3, 12
@@ -149,10 +153,7 @@ class Watching:
 
     def _measured(self, frame: Frame) -> ImagePoints | None:
         """The points of a frame, which becomes the current one."""
-        try:
-            self._current = self._measure(frame)
-        except ImageError as error:  # too dark, or overexposed: the next frame may be good
-            self._current = Failure(error.what, Code.DECLINED)
+        self._current = self._measure(frame)
         return None if isinstance(self._current, Failure) else self._current.points
 
     def _objection(self, points: ImagePoints | None, width: int) -> str:
@@ -184,6 +185,81 @@ class Watching:
         if len(self._taken) >= _LEAST_IMAGES:
             found = self._procedure.calibrated()
             self._verdict = (found.reason,) if isinstance(found, Failure) else assess(found.result).lines
+
+
+class WatchedFolder:
+    """The photographs that a live picture leaves in a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        New or empty, unless an earlier session is resumed; it is made when frames are taken.
+    watching : Watching
+        Decides which frames are taken.
+    count : int
+        Frames that are wanted.
+    resume : bool
+        Whether the frames of an earlier session that the folder holds are used.
+
+    Attributes
+    ----------
+    left_out : dict of str to Failure
+        Frames of the earlier session that cannot be measured.
+
+    Raises
+    ------
+    UsageError
+        When the folder is not empty, or fewer frames are wanted than a calibration needs.
+
+    Examples
+    --------
+    >>> from reseau.designs import board
+    >>> from reseau.procedures.target_measurement import measurer_of
+    >>> design = board("charuco", 7, 6, 24.0)
+    >>> watching = Watching(design, measurer_of(design), CameraOptions())
+    >>> WatchedFolder(Path("src"), watching)
+    Traceback (most recent call last):
+    ...
+    reseau.core.errors.UsageError: src: is not empty; give a new folder, or resume an earlier session
+    """
+
+    def __init__(self, folder: Path, watching: Watching, count: int = 15, resume: bool = False) -> None:
+        if count < _LEAST_IMAGES:
+            raise UsageError(f"is {count}, not at least {_LEAST_IMAGES}", where="count")
+        self.folder, self.count, self._watching, self._number = folder, count, watching, 0
+        self.left_out: dict[str, Failure] = {}
+        if not resume:
+            empty_folder(folder, "give a new folder, or resume an earlier session")
+        elif folder.is_dir() and any(folder.iterdir()):
+            for path in photographs_in(folder):
+                self._number = max(self._number, int(path.stem) if path.stem.isdecimal() else 0)
+                declined = watching.resume(read_image(path), path.name)
+                if declined is not None:
+                    self.left_out[path.name] = declined
+
+    def taken(
+        self, expose: Callable[[], Frame], over: Callable[[], bool] = lambda: False
+    ) -> Iterator[tuple[Frame, Seen, Path | None]]:
+        """Look at frames until as many as wanted are taken, or it is over.
+
+        Yields
+        ------
+        (Frame, Seen, Path or None)
+            Each frame, what it showed, and the file in which it was written if it was taken.
+        """
+        made_folder(self.folder)
+        while self._watching.frames < self.count and not over():
+            frame, path = expose(), self.folder / f"{self._number + 1:03d}.png"
+            seen = self._watching.on_frame(frame, path.name)
+            if seen.taken:
+                write_image(path, frame.pixels)
+                self._number += 1
+            yield frame, seen, path if seen.taken else None
+
+    @property
+    def enough(self) -> bool:
+        """Whether there are as many frames as a calibration needs."""
+        return self._watching.frames >= _LEAST_IMAGES
 
 
 def _sigma(points: ImagePoints) -> float:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ..archive import Archive, verify
 from ..core.errors import ArchiveError, InputError, UsageError
+from ..core.files import empty_folder
 
 __all__ = ["Counted", "backup", "restore", "state_beside", "upgrade_archive"]
 
@@ -93,8 +94,7 @@ def restore(source: Path, archive: Path, state: Path) -> Counted:
 
 
 def _copied(archive: Path, state: Path, to: Path, to_state: Path, new: Path) -> Counted:
-    if new.exists() and any(new.iterdir()):
-        raise UsageError("is not empty", where=new, do="name a new folder")
+    empty_folder(new)
     try:
         to.mkdir(parents=True, exist_ok=True)
         to_state.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -18,6 +18,7 @@ from ..archive import objects_at
 from ..core import vocabulary as v
 from ..core.errors import EstimationError, InputError, ReseauError, UsageError
 from ..core.failure import Failure
+from ..core.files import made_folder
 from ..core.provenance import Provenance, canonical_json, sha256_of
 from ..execution import Executor
 from ..io import FrameCorners, FrameOrientation, FrameOutcome, RollSummary, write_whole
@@ -162,10 +163,7 @@ def _required(found: FrameOrientation | Failure, image: Path) -> FrameOrientatio
 
 
 def _prepare(out: Path) -> None:
-    try:
-        (out / "provenance").mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be written to ({error.strerror})", where=out) from None
+    made_folder(out / "provenance")
 
 
 def _options(job: ScanJob) -> FrameOptions:

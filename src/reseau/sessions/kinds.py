@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from ..archive import Session, Verdict
 from ..capture import Acquisition, BenchFile, Limits, Plan, Procedure, Step, plans, spread
@@ -361,7 +361,7 @@ def _blurred(run: Acquisition, given: BlurredParameters) -> Plan:
     return plans.poses(run, given.poses(), given.average, given.checks)
 
 
-def _read_blurred(text: str, name: str, where: object) -> object:
+def _read_blurred(text: str, name: str, where: object) -> Any:
     """An input of a session of blurred targets."""
     from ..io import LensDocument
     from ..io.network import Network1
@@ -374,20 +374,17 @@ def _read_blurred(text: str, name: str, where: object) -> object:
 def _blurred_procedure(session: Session, given: BlurredParameters) -> BlurredProcedure:
     from ..bundle import Network
     from ..exchange import Lens
-    from ..measure.blurred import BlurredOptions
+    from ..procedures.blurred_files import BlurredImaging
     from ..procedures.blurred_network import NetworkOptions
     from ..procedures.blurred_session import BlurredProcedure
 
-    document, targets, lens = (_read_blurred(session.input(name), name, name) for name in _OF_BLURRED)
-    sensor = lens.sensor  # type: ignore[attr-defined]
-    matching = BlurredOptions(
-        psf_px=given.psf_px, search_px=given.search_px, fill=1.0 if sensor is None else sensor.fill
-    )
+    document, targets, read = (_read_blurred(session.input(name), name, name) for name in _OF_BLURRED)
+    lens = Lens(read.prescription(), read.sensor)
+    imaging = BlurredImaging(lens, psf_px=given.psf_px, search_px=given.search_px)
     options = {key: value for key, value in session.parameters.items() if key != "steps"}
     return BlurredProcedure(
-        cast(Any, document), Network.from_document(cast(Any, document)), cast(Any, targets),
-        Lens(lens.prescription(), sensor),  # type: ignore[attr-defined]
-        NetworkOptions(matching, given.rounds, initial=given.initial),
+        document, Network.from_document(document), targets, lens,
+        NetworkOptions(imaging.options(targets.polarity), given.rounds, initial=given.initial),
         name=session.name, parameters=options, inputs=_hashes(session),
     )  # fmt: skip
 

@@ -17,7 +17,6 @@ from ...core.data import Array, Mask, Rows
 from ...core.display import Display, Table
 from ...core.errors import UsageError
 from ...core.failure import Code, Estimated, Remark
-from ...core.failure import Estimated, Remark
 from ...core.threads import one_thread
 from ...optics.cameras import distortion_names
 from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix

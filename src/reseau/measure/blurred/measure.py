@@ -20,7 +20,7 @@ from ...optics.formation import Outline, PixelResponse
 from ...optics.lenses import PlaneTarget, PupilElements, RayImage, RayMap, RaySurrogate, ray_image, ray_images
 from ..matching import Matches, MatchOptions, grey_variance, match, with_alike_errors
 from ..points import Measured, Reason
-from ..screening import screen
+from ..screening import Screened, screen
 from .shapes import RayShapes
 
 __all__ = [
@@ -278,9 +278,14 @@ class Run:
         options: BlurredOptions,
     ) -> None:
         self.frame, self.camera, self.ids, self.targets, self.options = frame, camera, ids, targets, options
-        self.screened = screen(frame, None)
-        n = len(ids)
-        self.why = Reason("", Code.DECLINED).repeated(n)
+        screened, n = screen(frame, None), len(ids)
+        self.blank = screened if isinstance(screened, Failure) else None
+        if isinstance(screened, Failure):
+            screened = Screened(
+                frame.pixels.astype(np.float32), np.zeros(frame.pixels.shape, dtype=bool), np.nan
+            )
+        self.screened, reason = screened, "" if self.blank is None else self.blank.reason
+        self.why = Reason(reason, Code.DECLINED).repeated(n)
         self.predicted = np.full((n, 2), np.nan)
         self.columns: dict[str, Array] = {
             name: np.full(n, np.nan) for name in ("contrast", "t", "noise", "psf_px", "blur_px")
@@ -295,7 +300,8 @@ class Run:
         """Form, find, match and judge all targets."""
         rings, elements, images = self._images()
         self.elements, self.images = elements, images
-        seen = np.array([k for k, image in enumerate(images) if image is not None], dtype=np.intp)
+        lit = images if self.blank is None else []
+        seen = np.array([k for k, image in enumerate(lit) if image is not None], dtype=np.intp)
         seen = self._apart(seen)
         start = np.full((len(self.ids), 2), np.nan)
         for k in seen:

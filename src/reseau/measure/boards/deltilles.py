@@ -300,8 +300,8 @@ def _laid(grey: NDArray[np.float32], corners: SixSectors, design: BoardDesign) -
     cost = cost_of(float(levels[3:].mean()), float(levels[:3].mean()))
 
     def missed(missing: Array) -> Array:
-        levels = _levels(grey, mapping, missing)
-        return cost(levels, _crossed(levels))
+        levels, close = (_levels(grey, mapping, missing, part) for part in (1.0, _CLOSE))
+        return cost(levels, _crossed(levels) | _crossed(close))
 
     # The print may end within the triangles beside its outer corners.
     between = float(np.median(_levels(grey, mapping, nodes, _CLOSE), axis=0).mean())

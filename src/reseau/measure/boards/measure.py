@@ -121,11 +121,6 @@ def measure_board(
     BoardResult or Failure
         A failure (falsy) if the board is not found in the frame.
 
-    Raises
-    ------
-    ImageError
-        When the frame is all black, saturated, or of one grey.
-
     Notes
     -----
     Derived in ``docs/mathematics/boards.md``.
@@ -166,11 +161,6 @@ def puzzle_part(frame: Frame) -> PuzzlePart | Failure:
     PuzzlePart or Failure
         A failure (falsy) if there is no PuzzleBoard, or too little of one.
 
-    Raises
-    ------
-    ImageError
-        When the frame is all black, saturated, or of one grey.
-
     Examples
     --------
     >>> noise = np.random.default_rng(0).normal(100, 2, (80, 80))
@@ -179,6 +169,8 @@ def puzzle_part(frame: Frame) -> PuzzlePart | Failure:
     """
     with one_thread():
         screened = screen(frame, None)
+        if isinstance(screened, Failure):
+            return screened
         return find_puzzle(screened.grey, find_saddles(screened.grey, screened.noise))
 
 
@@ -203,6 +195,8 @@ def _unmirrored(found: BoardResult | Failure, width: int) -> BoardResult | Failu
 
 def _measured(frame: Frame, design: BoardDesign, options: BoardOptions) -> BoardResult | Failure:
     screened = screen(frame, None)
+    if isinstance(screened, Failure):
+        return screened
     placed = _placed(frame, screened, design)
     if isinstance(placed, Failure):
         return Failure(

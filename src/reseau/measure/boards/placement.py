@@ -303,7 +303,20 @@ def numbered(
             )
         if puzzle and len(found) * scipy.special.bdtr(wrong, total, 0.5) > _CHANCE:
             return Failure(f"{total} dots are too few to tell which part it is", Code.NOT_IDENTIFIED)
-    if score < _FITS * min(len(nodes), len(numbers)):
+    inverse = np.rint(np.linalg.inv(turn)).astype(np.intp)
+
+    def seen_at(line: NDArray[np.intp]) -> Array:
+        """Places in the lattice found of columns and rows of the design."""
+        at = line @ matrix.T // (2 if design.staggered else 1) - least
+        return np.asarray((at - moved) @ inverse.T, dtype=np.float64)
+
+    def goes_on(beyond: Array) -> Mask:
+        found = np.array([tuple(node) in known for node in beyond.astype(np.intp).tolist()])
+        # The last ones of a print are seen, but not always found.
+        return found | (cost(beyond) == 0) if cost is not None and found.any() else found
+
+    more = any(_mostly(seen_at(line), mapping, shape, goes_on) for line in _lines_around(design))
+    if score < _FITS * min(len(nodes), len(numbers)) or (more and design.kind != "puzzle"):
         return Failure(
             f"{len(nodes)} points in a lattice were found; the board has others, or more beside them",
             Code.OTHER_DESIGN,
@@ -313,9 +326,8 @@ def numbered(
     inside = ((place >= 0) & (place < size)).all(axis=1)
     of = np.where(inside, index[tuple(np.where(inside[:, None], place, 0).T)], -1)
     there = of >= 0
-    inverse = np.rint(np.linalg.inv(turn)).astype(np.intp)
-    lines = [(numbers[line] - moved) @ inverse.T for line in _lines_beside(design, of[there])]
-    if ends is not None and any(_ends(line.astype(np.float64), mapping, shape, ends) for line in lines):
+    lines = [seen_at(design.nodes[line]) for line in _lines_beside(design, of[there])]
+    if ends is not None and any(_mostly(line, mapping, shape, ends) for line in lines):
         return Failure(
             f"{there.sum()} points in a lattice were found, and nothing beside them where the board has more",
             Code.OTHER_DESIGN,
@@ -340,11 +352,21 @@ def _lines_beside(design: BoardDesign, found: Rows) -> list[Rows]:
     return lines
 
 
-def _ends(nodes: Array, mapping: Chain, shape: tuple[int, int], ends: Callable[[Array], Mask]) -> bool:
-    """Whether the pattern ends at most nodes (n, 2) of a line that are in sight with what surrounds them."""
+def _lines_around(design: BoardDesign) -> list[NDArray[np.intp]]:
+    """Columns and rows (m, 2) of the lines that a larger board would have beside those of the design."""
+    lines, step = list[NDArray[np.intp]](), 2 if design.staggered else 1
+    for axis, sign in product(range(2), (1, -1)):
+        moved = design.nodes + sign * step * np.eye(2, dtype=np.intp)[axis]
+        beyond = sign * moved[:, axis] - (sign * design.nodes[:, axis]).max()
+        lines.append(moved[(beyond > 0) & (beyond <= (step if axis == 0 else 1))])
+    return lines
+
+
+def _mostly(nodes: Array, mapping: Chain, shape: tuple[int, int], holds: Callable[[Array], Mask]) -> bool:
+    """Whether it holds at most nodes (n, 2) of a line that are in sight with what surrounds them."""
     where = images_of(mapping, (nodes[:, None] + _AROUND).reshape(-1, 2)).reshape(-1, 4, 2)
     nodes = nodes[((where > 2) & (where < np.array(shape[::-1]) - 3)).all(axis=(1, 2))]
-    return bool(len(nodes) and ends(nodes).mean() > 0.5)
+    return bool(len(nodes) and holds(nodes).mean() > 0.5)
 
 
 def _to_lattice(design: BoardDesign, turn: Integers, shift: Integers) -> tuple[Array, Array]:
@@ -393,7 +415,7 @@ def lay_circles(grey: NDArray[np.float32], disks: Disks, design: BoardDesign) ->
     numbers = design.nodes @ _lattice_of(design).T // (2 if design.asymmetric else 1)
     step = design.pitch * (np.sqrt(2) if design.asymmetric else 1.0)
     disks = disks.strongest(MOST_DISKS * len(numbers))
-    extent = int(np.ptp(numbers, axis=0).max()) + 1
+    extent = int(np.ptp(numbers, axis=0).max()) + 2
     best: tuple[Array, Rows, Chain] | None = None
     again = False
     for seed in disk_seeds(disks, 2 * step / design.size):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.data import Array, Frame, Rows
+from ...core.failure import Failure
 from ...core.threads import one_thread
 from ...designs.boards import board
 from ...io.board import BoardDesign, BoardKind
@@ -56,11 +57,6 @@ def boards_shown(frame: Frame) -> list[BoardDesign]:
     frame : Frame
         A photograph.
 
-    Raises
-    ------
-    ImageError
-        When the frame is all black, saturated, or of one grey.
-
     Examples
     --------
     >>> squares = np.indices((5, 6)).sum(axis=0) % 2 * 160 + 30
@@ -72,6 +68,8 @@ def boards_shown(frame: Frame) -> list[BoardDesign]:
     """
     with one_thread():
         screened = screen(frame, None)
+        if isinstance(screened, Failure):
+            return []
         grey, saddles = screened.grey, find_saddles(screened.grey, screened.noise)
         marked = _marked(markers_of_any_dictionary(frame, grey, saddles), grey.shape)
         if marked:

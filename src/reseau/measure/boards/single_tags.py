@@ -57,8 +57,6 @@ def measure_tags(
     ------
     UsageError
         When OpenCV has no such dictionary.
-    ImageError
-        When the frame is all black, saturated, or of one grey.
 
     Examples
     --------

@@ -18,7 +18,7 @@ import numpy as np
 
 from ...core import vocabulary as v
 from ...core.data import Array, Frame, ImagePoints, Mask, Rows
-from ...core.failure import Code
+from ...core.failure import Code, Failure
 from ...core.overlaid import Overlaid
 from ..matching import MatchOptions
 from ..points import Reason
@@ -203,7 +203,7 @@ def find_pins(
     options: PinOptions | None = None,
     others: Sequence[Frame] = (),
     hidden: Mask | None = None,
-) -> PinDetections:
+) -> PinDetections | Failure:
     """Find every arc-like point reflector of a frame.
 
     Parameters
@@ -221,13 +221,8 @@ def find_pins(
 
     Returns
     -------
-    PinDetections
-        Pins, and rejected spots.
-
-    Raises
-    ------
-    ImageError
-        When the frame is all black, saturated, or of one grey.
+    PinDetections or Failure
+        Pins, and rejected spots; a failure when the frame is all black, saturated, or of one grey.
 
     Examples
     --------
@@ -243,6 +238,8 @@ def find_pins(
     """
     o = options or PinOptions()
     screened = screen(frame, run=None)
+    if isinstance(screened, Failure):
+        return screened
     longest = o.max_length_px or max(_LONG_PX, 0.06 * float(np.hypot(*frame.pixels.shape)))
     ground = ground_of(screened.grey, max(15, round(_GROUND_LENGTHS * longest)))
     blur = None

@@ -164,10 +164,6 @@ def measure_pins(
     PinResult or Failure
         A failure (falsy) if the pattern of the rods is not found among the echoes.
 
-    Raises
-    ------
-    ImageError
-        When the frame is all black, saturated, or of one grey.
     UsageError
         When the marks of the design are not rods, or fewer than four have coordinates.
 
@@ -209,6 +205,8 @@ def measure_pins(
             "has its points on one line, which does not show where they are", where=f"design {design.name}"
         )
     seen = find_pins(frame, o, others, hidden)
+    if isinstance(seen, Failure):
+        return seen
     echoes = np.flatnonzero(seen.ok)
     layout = _placed_pattern(design, known, seen.xy[echoes], o)
     if isinstance(layout, Failure):

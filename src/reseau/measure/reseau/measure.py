@@ -160,10 +160,6 @@ def measure_reseau(
     ReseauResult or Failure
         A failure (falsy) if the design is not found in the frame.
 
-    Raises
-    ------
-    ImageError
-        When the frame is all black, saturated, or of one grey.
     UsageError
         When the design has neither coordinates nor nominal positions, or all its points lie on one line.
 

@@ -105,13 +105,10 @@ def place(frame: Frame, design: ReseauDesign, source: Array, options: PlacingOpt
     -------
     Placement or Failure
         A failure if the design is not found.
-
-    Raises
-    ------
-    ImageError
-        When the frame is all black, saturated, or of one grey.
     """
     best = _placed(frame, design, source, options)
+    if isinstance(best, Failure):
+        return best
     if options.nominal is not None and options.within_px is None:
         best = _despite_nominal(best, source, options)
     marks = 0 if best is None else int((best.assignment.candidate >= 0).sum())
@@ -127,7 +124,9 @@ def place(frame: Frame, design: ReseauDesign, source: Array, options: PlacingOpt
     return best
 
 
-def _placed(frame: Frame, design: ReseauDesign, source: Array, options: PlacingOptions) -> Placement | None:
+def _placed(
+    frame: Frame, design: ReseauDesign, source: Array, options: PlacingOptions
+) -> Placement | Failure | None:
     """The best position over all sizes and rotations of a mark."""
     mark = design.mark
     size = mark.line_width if mark.shape == "line-grid" else mark.size
@@ -140,6 +139,8 @@ def _placed(frame: Frame, design: ReseauDesign, source: Array, options: PlacingO
             sizes = tuple(size for _, size in sorted(strengths, reverse=True)[:2])
         for mark_px in sizes:
             screened = screen(frame, run=max(15, round(4 * mark_px)))
+            if isinstance(screened, Failure):
+                return screened
             template = _template(
                 design, mark_px, options.psf_px, _axes(design, source, options.nominal, turn)
             )

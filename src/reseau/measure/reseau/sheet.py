@@ -79,6 +79,8 @@ def measure_sheet(frame: Frame, design: ReseauDesign, options: ReseauOptions) ->
 
 def _measured(frame: Frame, design: ReseauDesign, options: ReseauOptions) -> dict[str, Any] | Failure:
     screened = screen(frame, None)
+    if isinstance(screened, Failure):
+        return screened
     grey = screened.grey if design.polarity == "dark" else -screened.grey
     placed, disks = _placed(grey, screened, design, options.mirrored)
     if isinstance(placed, Failure):

@@ -178,10 +178,6 @@ def measure_testfield(
     TestfieldResult or Failure
         A failure (falsy) if the design is not found in the frame.
 
-    Raises
-    ------
-    ImageError
-        When the frame is all of one grey, or almost all saturated.
     UsageError
         When the squares of the design do not consist of sixteen targets in a grid.
 
@@ -216,6 +212,8 @@ def measure_testfield(
 
 def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) -> TestfieldResult | Failure:
     screened = screen(frame, None, noisy=False)
+    if isinstance(screened, Failure):
+        return screened
     grey = screened.grey if design.polarity == "dark" else -screened.grey
     original = SearchedFrame(screened.grey, grey, design, options.psf_px, PixelResponse(options.fill))
     seen, read = original, original.read()

@@ -14,7 +14,7 @@ from fastapi import FastAPI, Request
 from ...core.errors import UsageError
 from ...core.memory import share_freed_memory
 from ...core.version import __version__
-from . import accounts, benches, calibrations, files, history, operations, pages, sessions
+from . import accounts, benches, calibrations, comparisons, files, history, operations, pages, sessions
 from .access import principal_of
 from .answers import add_error_handlers
 from .guard import Guard, log
@@ -54,6 +54,7 @@ def create_app(service: Service) -> Any:
         accounts.router,
         sessions.router,
         calibrations.router,
+        comparisons.router,
         history.router,
         files.router,
         benches.router,

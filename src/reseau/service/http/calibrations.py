@@ -1,4 +1,4 @@
-"""Operations on configurations and their calibrations: verdicts, comparison, decisions, certificates."""
+"""Operations on configurations and their calibrations: verdicts, decisions, certificates."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import hashlib
 import io
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal
-from urllib.parse import quote
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Request, Response
 from pydantic import AwareDatetime, ConfigDict, Field
 
 from ...calibration import Assessment
@@ -27,27 +25,22 @@ if TYPE_CHECKING:
     from ..inforce import Configurations, Decision
 
 __all__ = [
+    "SVG",
     "ConfigurationRow",
-    "calibrated",
     "calibration_detail",
-    "choices",
-    "chosen",
-    "comparison",
     "configuration_detail",
+    "decision_row",
+    "known_configurations",
     "listed",
     "router",
+    "the_configuration",
+    "the_decision",
 ]
 
 router = APIRouter(tags=["calibrations"], responses=refusals(400, 401, 403, 404, 409, 422, 503))
 
 Name = Annotated[str, Path(max_length=200, description="Name of the configuration.")]
 Key = Annotated[str, Path(max_length=100, description="Decision, by its name or the start of its key.")]
-One = Annotated[
-    str,
-    Query(min_length=1, max_length=300, description="`CONFIGURATION/KEY`, or a session with a calibration."),
-]
-_MOST_CHOICES = 100
-"""Latest sessions among which those with a calibration can be chosen on the page."""
 SVG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/svg+xml": {}}, "description": "The figure"}
 }  # fmt: skip
@@ -152,18 +145,6 @@ class CalibrationDetail(Answer):
     figures: list[str]
 
 
-class Comparison(Answer):
-    """Difference of two calibrations over the image."""
-
-    first: str
-    second: str
-    greatest: float
-    rms: float
-    unit: str
-    p: float
-    parameters: list[tuple[str, float | None, float | None]]
-
-
 class NewConfiguration(Answer):
     """A configuration by its parts."""
 
@@ -262,27 +243,29 @@ class Reviewed(Answer):
     failed: dict[str, str]
 
 
-def _known(service: Service) -> Configurations:
+def known_configurations(service: Service) -> Configurations:
+    """Return the configurations of the archive."""
     from ..inforce import Configurations
 
     return Configurations(service.archive)
 
 
-def _the(service: Service, name: str) -> Configurations:
-    """Configurations, of which one has this name.
+def the_configuration(service: Service, name: str) -> Configurations:
+    """Return the configurations of the archive, one of which has this name.
 
     Raises
     ------
     NotFound
         If none has.
     """
-    known = _known(service)
+    known = known_configurations(service)
     if name not in known.names():
         raise NotFound("is not a configuration of this archive", where=name)
     return known
 
 
-def _decision(known: Configurations, name: str, key: str) -> Decision:
+def the_decision(known: Configurations, name: str, key: str) -> Decision:
+    """Return a decision by its name or the start of its key; raise NotFound if there is none."""
     try:
         return known.decision(name, key)
     except UsageError as error:
@@ -300,7 +283,8 @@ def _session_of(service: Service, decision: Decision) -> str | None:
         return None
 
 
-def _row(service: Service, decision: Decision) -> DecisionRow:
+def decision_row(service: Service, decision: Decision) -> DecisionRow:
+    """Return a decision as it is answered."""
     session = _session_of(service, decision)
     return DecisionRow(
         key=decision.key, name=decision.name or session or f"{decision.since:%-d %B %Y %H:%M} UTC",
@@ -317,7 +301,7 @@ def _in_force(service: Service, known: Configurations, name: str, now: datetime)
     applied = known.applied(name, now)
     if applied is None:
         return None
-    row = _row(service, known.decision(name, applied.key))
+    row = decision_row(service, known.decision(name, applied.key))
     return InForce(key=applied.key, name=row.name, since=applied.since.isoformat(), why=applied.why)
 
 
@@ -325,7 +309,7 @@ def listed(service: Service) -> list[ConfigurationRow]:
     """Return all configurations."""
 
     def compute() -> list[ConfigurationRow]:
-        known, now = _known(service), service.archive.clock()
+        known, now = known_configurations(service), service.archive.clock()
         found = []
         for name in known.names():
             history = known.history(name)
@@ -342,12 +326,12 @@ def listed(service: Service) -> list[ConfigurationRow]:
 
 def configuration_detail(service: Service, name: str) -> ConfigurationDetail:
     """Return a configuration with its history."""
-    known = _the(service, name)
+    known = the_configuration(service, name)
     history = known.history(name)
     return ConfigurationDetail(
         name=name, parts=known.parts(name), in_force=_in_force(service, known, name, service.archive.clock()),
         decisions=len(history), to_review=sum(d.outcome == "needs review" for d in history),
-        history=[_row(service, each) for each in reversed(history)],
+        history=[decision_row(service, each) for each in reversed(history)],
         events=[EventRow(at=at.isoformat(), what=what) for at, what in known.events(name)],
     )  # fmt: skip
 
@@ -359,7 +343,7 @@ def verdict_of(calibration: Calibration) -> list[str]:
 
 def rules_of(service: Service, name: str) -> dict[str, Any] | None:
     """Return the rules by which a configuration was judged last."""
-    history = _the(service, name).history(name)
+    history = the_configuration(service, name).history(name)
     return dict(history[-1].judgement.rules) if history else None
 
 
@@ -367,8 +351,8 @@ def calibration_detail(service: Service, name: str, key: str) -> CalibrationDeta
     """Return a calibration and the decision on it."""
     from ...core.numbers import measured
 
-    known = _the(service, name)
-    decision = _decision(known, name, key)
+    known = the_configuration(service, name)
+    decision = the_decision(known, name, key)
     found = known.calibration(name, decision.key)
     matrix, names = found.covariance.matrix, found.covariance.names
     pairs = []
@@ -380,7 +364,7 @@ def calibration_detail(service: Service, name: str, key: str) -> CalibrationDeta
     pairs.sort(key=lambda pair: -abs(pair[2]))
     return CalibrationDetail(
         verdict=verdict_of(found), assessment=found.assessment,
-        configuration=name, decision=_row(service, decision), kind=found.kind, name=found.name,
+        configuration=name, decision=decision_row(service, decision), kind=found.kind, name=found.name,
         sigma0=found.sigma0, redundancy=found.redundancy,
         parameters=[
             ParameterRow(
@@ -395,91 +379,6 @@ def calibration_detail(service: Service, name: str, key: str) -> CalibrationDeta
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Chosen:
-    """A calibration that is compared: its key or session, what people call it, and its page."""
-
-    key: str
-    title: str
-    page: str
-    calibration: Calibration
-
-
-def chosen(service: Service, text: str) -> Chosen:
-    """Return a calibration: `CONFIGURATION/KEY`, or the name of a session that has one.
-
-    Raises
-    ------
-    NotFound
-        If there is none.
-    """
-    from ... import sessions as kinds
-
-    name, slash, key = text.rpartition("/")
-    if not slash:
-        session = the_session(service, text)
-        return Chosen(text, text, f"/sessions/{quote(text, safe='')}", kinds.calibration_of(session))
-    known = _the(service, name)
-    decision = _decision(known, name, key)
-    page = f"/calibrations/{quote(name, safe='')}/{decision.key}"
-    title = f"{name}: {_row(service, decision).name}"
-    return Chosen(decision.key, title, page, known.calibration(name, decision.key))
-
-
-def choices(service: Service) -> list[tuple[str, str]]:
-    """Return what can be compared: the text that :func:`chosen` takes, and what people call it."""
-
-    def compute() -> list[tuple[str, str]]:
-        found, judged = list[tuple[str, str]](), set[str | None]()
-        known = _known(service)
-        for name in known.names():
-            rows = [_row(service, each) for each in reversed(known.history(name))]
-            found += [(f"{name}/{each.key}", f"{name}: {each.name}") for each in rows]
-            judged |= {each.session for each in rows}
-        others = [each for each in calibrated(service) if each not in judged]
-        return found + [(each, f"session {each}") for each in others]
-
-    return service.current("choices", compute)
-
-
-def calibrated(service: Service) -> list[str]:
-    """Return the latest sessions with a calibration."""
-    found = service.archive.sessions(last=_MOST_CHOICES, result="calibration.json")
-    return [each.name for each in reversed(found)]
-
-
-def comparison(first: Chosen, second: Chosen) -> tuple[Comparison, Any]:
-    """Return the difference of two calibrations, and its field if they are cameras."""
-    import numpy as np
-
-    from ...calibration import CameraMapping, calibration_difference
-    from ..rules import difference
-
-    old, new = first.calibration, second.calibration
-    found = difference(new, old)
-    field = None
-    rms, p = found.greatest, float(getattr(found, "p", float("nan")))
-    if new.kind == old.kind == "camera":
-        field = calibration_difference(
-            CameraMapping.from_calibration(old), CameraMapping.from_calibration(new)
-        )
-        rms, p = float(np.sqrt(np.nanmean((field.difference**2).sum(axis=-1)))), field.p
-    every = dict.fromkeys([*old.parameters, *new.parameters])
-    values = [
-        (
-            each,
-            old.parameters[each].value if each in old.parameters else None,
-            new.parameters[each].value if each in new.parameters else None,
-        )
-        for each in every
-    ]
-    answer = Comparison(
-        first=first.key, second=second.key, greatest=found.greatest, rms=rms, unit=found.unit, p=p,
-        parameters=values,
-    )  # fmt: skip
-    return answer, field
-
-
 @router.get("/configurations")
 def configurations(who: Reading, service: Here) -> list[ConfigurationRow]:
     """Configurations of instruments, with the calibration in force of each."""
@@ -490,7 +389,7 @@ def configurations(who: Reading, service: Here) -> list[ConfigurationRow]:
 def define(given: NewConfiguration, who: Administering, service: Here) -> Done:
     """Define a configuration by its parts."""
     with service.audited(who, "define configuration", given.name, {"parts": given.parts}):
-        _known(service).define(given.name, given.parts)
+        known_configurations(service).define(given.name, given.parts)
     return Done(done="defined")
 
 
@@ -507,7 +406,7 @@ def decide(name: Name, given: NewDecision, who: Administering, service: Here) ->
     from ...calibration import Calibration
     from ..rules import AcceptanceRules
 
-    known = _the(service, name)
+    known = the_configuration(service, name)
     if (given.session is None) == (given.calibration is None):
         raise UsageError("give one of them", where="session, calibration")
     rules = AcceptanceRules.from_content(dict(given.rules), where="rules")
@@ -524,7 +423,7 @@ def decide(name: Name, given: NewDecision, who: Administering, service: Here) ->
         made = known.decide(name, calibration, rules, since=since, by=who.name, comment=comment)
         if given.name.strip():
             made = known.rename(name, made.key, given.name, by=who.name)
-    return _row(service, made)
+    return decision_row(service, made)
 
 
 @router.get("/configurations/{name}/decisions/{key}")
@@ -538,8 +437,8 @@ def decision(name: Name, key: Key, who: Reading, service: Here) -> CalibrationDe
 )
 def document(request: Request, name: Name, key: Key, who: Reading, service: Here) -> Response:
     """The calibration as a document, `reseau-calibration/1`."""
-    known = _the(service, name)
-    found = known.calibration(name, _decision(known, name, key).key)
+    known = the_configuration(service, name)
+    found = known.calibration(name, the_decision(known, name, key).key)
     content = found.to_json().encode("utf-8")
     return file_answer(
         request, io.BytesIO(content), f"{name} {key}.json", hashlib.sha256(content).hexdigest()
@@ -558,8 +457,8 @@ def figure(
     service: Here,
 ) -> Response:
     """The uncertainty of the projection over the image, or the distortion."""
-    known = _the(service, name)
-    decision = _decision(known, name, key)
+    known = the_configuration(service, name)
+    decision = the_decision(known, name, key)
     calibration = known.calibration(name, decision.key)
     return picture_answer(
         request, lambda: _drawn(calibration, figure), "image/svg+xml", f"{decision.key}-{figure}"
@@ -581,35 +480,16 @@ def _drawn(calibration: Calibration, figure: str) -> str:
     return drawn[0]
 
 
-@router.get("/comparisons")
-def compare(first: One, second: One, who: Reading, service: Here) -> Comparison:
-    """The difference of any two calibrations over the image, and its significance."""
-    return comparison(chosen(service, first), chosen(service, second))[0]
-
-
-@router.get("/comparisons/figure.svg", response_class=Response, responses=SVG)
-def compare_figure(request: Request, first: One, second: One, who: Reading, service: Here) -> Response:
-    """The difference of two calibrations of cameras, as arrows over its uncertainty."""
-    from ...report.fields import difference_figure
-
-    one, two = chosen(service, first), chosen(service, second)
-    _, field = comparison(one, two)
-    if field is None:
-        raise NotFound("are not of cameras", where=f"{first}, {second}")
-    tag = hashlib.sha256(f"{one.calibration.to_json()}{two.calibration.to_json()}".encode()).hexdigest()[:32]
-    return picture_answer(request, lambda: difference_figure(field), "image/svg+xml", tag)
-
-
 def _audited(
     service: Service, who: Any, action: str, name: str, key: str, facts: dict[str, Any],
     do: Callable[[Configurations, str], object],
 ) -> DecisionRow:  # fmt: skip
     """Do something about a decision, recorded, and return the decision."""
-    known = _the(service, name)
-    full = _decision(known, name, key).key
+    known = the_configuration(service, name)
+    full = the_decision(known, name, key).key
     with service.audited(who, action, f"{name} {full}", facts):
         do(known, full)
-    return _row(service, known.decision(name, full))
+    return decision_row(service, known.decision(name, full))
 
 
 @router.post("/configurations/{name}/decisions/{key}/review")
@@ -666,7 +546,7 @@ def roll_back(name: Name, key: Key, given: Return, who: Administering, service: 
 @router.post("/configurations/{name}/events", status_code=201)
 def service_event(name: Name, given: ServiceEvent, who: Operating, service: Here) -> Done:
     """Note a service event: from then on no calibration applies, and a run is due at once."""
-    known = _the(service, name)
+    known = the_configuration(service, name)
     with service.audited(who, "service event", name, {"what": given.what, "at": given.at}):
         known.event(name, given.what, at=given.at, by=who.name)
     return Done(done="noted")
@@ -687,8 +567,8 @@ def certificate(name: Name, key: Key, given: CertificateOrder, who: Administerin
     with optional():
         from ..certificates import CertificateData, certify, dcc_of, html_of, pdf_of, sign
 
-    known, keys = _the(service, name), service.options
-    decision = _decision(known, name, key)
+    known, keys = the_configuration(service, name), service.options
+    decision = the_decision(known, name, key)
 
     def xml(pages: str = "") -> bytes:
         content = dcc_of(made, pages)

@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field
 from ...core.errors import UsageError
 from .access import Administering, Here, NotFound, Operating, Reading
 from .answers import Answer, Done, refusals
-from .calibrations import SVG, _the
+from .calibrations import SVG, the_configuration
 from .service import Service
 from .stored import picture_answer
 
@@ -152,7 +152,7 @@ def drift_of(service: Service, name: str, chart: str = "cusum", rate: float = 0.
     """Return the control charts of a configuration."""
     from ..charts import ChartOptions
 
-    known = _the(service, name)
+    known = the_configuration(service, name)
     options = ChartOptions(kind=chart, rate=rate)  # type: ignore[arg-type]
     return service.current(f"drift {name} {chart} {rate}", lambda: known.drift(name, options))
 
@@ -167,7 +167,7 @@ def _answer(service: Service, name: str, made: Drift) -> DriftAnswer:
     import math
 
     charts = made.charts
-    since = {each.key: each.since.isoformat() for each in _the(service, name).history(name)}
+    since = {each.key: each.since.isoformat() for each in the_configuration(service, name).history(name)}
     signals = [
         Signal(
             calibration=made.keys[run], parameter=made.names[k],
@@ -192,7 +192,9 @@ def _answer(service: Service, name: str, made: Drift) -> DriftAnswer:
             (made.keys[run], made.names[k], verdict)
             for run, k, verdict in (() if made.explanation is None else made.explanation.verdicts)
         ],
-        recorded=service.current(f"conditions {name}", lambda: _the(service, name).conditions(name)),
+        recorded=service.current(
+            f"conditions {name}", lambda: the_configuration(service, name).conditions(name)
+        ),
         limit=charts.limits.limit if math.isfinite(charts.limits.limit) else None,
         single=charts.limits.single, conversion_px=made.conversion_px,
     )  # fmt: skip
@@ -253,7 +255,7 @@ def explained(
     """Control charts that tell drift that covariates explain from drift; nothing is stored."""
     from ..charts import ChartOptions
 
-    known = _the(service, name)
+    known = the_configuration(service, name)
     if bool(given.table) == bool(given.recorded):
         raise UsageError("are neither or twice given", where="covariates", do="give `table` or `recorded`")
     table = known.recorded(name, given.recorded) if given.recorded else _table(given)
@@ -309,7 +311,7 @@ def drift_figure(
     def draw() -> str:
         return control_figure(
             made.names, times, made.values, made.charts.expected, made.charts.sigma, made.charts.alarm,
-            _the(service, name).events(name)[-1:],
+            the_configuration(service, name).events(name)[-1:],
         )  # fmt: skip
 
     return picture_answer(request, draw, "image/svg+xml", f"{made.keys[-1]}-{len(made.keys)}-{chart}-{rate}")

@@ -16,7 +16,7 @@ from ...archive import Session
 from ...core.errors import ReseauError
 from ...core.vocabulary import names
 from ...io.photographs import PHOTOGRAPHS
-from . import accounts, benches, calibrations, history, operations, sessions
+from . import accounts, benches, calibrations, comparisons, history, operations, sessions
 from .access import Administering, Here, NotFound, Reading, Unknown, csrf_of, principal_of, service_of
 from .service import Service
 
@@ -298,7 +298,7 @@ def configuration_page(request: Request, name: str, who: Reading, service: Here)
             drift = None
     return _rendered(
         request, "configuration.html.j2", c=found, charted=drift is not None, drift=drift,
-        sessions=calibrations.calibrated(service), rules=_last_rules(service, name),
+        sessions=comparisons.calibrated(service), rules=_last_rules(service, name),
     )  # fmt: skip
 
 
@@ -319,13 +319,13 @@ def compare_page(
     second: Annotated[str, Query(max_length=300)] = "",
 ) -> Response:
     """Any two calibrations."""
-    every = calibrations.choices(service)
+    every = comparisons.choices(service)
     content: dict[str, Any] = {"c": None, "choices": every, "first": first, "second": second}
     if first and second:
-        one, two = calibrations.chosen(service, first), calibrations.chosen(service, second)
+        one, two = comparisons.chosen(service, first), comparisons.chosen(service, second)
         content |= {"one": one, "two": two}
         try:
-            content["c"], field = calibrations.comparison(one, two)
+            content["c"], field = comparisons.comparison(one, two)
             content["drawn"] = field is not None
         except ReseauError as error:  # such as an oscilloscope and a camera
             content["why"] = str(error)

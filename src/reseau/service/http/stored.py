@@ -125,7 +125,7 @@ def marks_of(session: Session, archived: ArchivedFrame) -> tuple[Frame, Marks, s
     """
     import numpy as np
 
-    from ...core.errors import ImageError, UsageError
+    from ...core.errors import UsageError
     from ...core.failure import Failure
     from ...io import parse_design
     from ...measure import TestfieldOptions
@@ -139,10 +139,7 @@ def marks_of(session: Session, archived: ArchivedFrame) -> tuple[Frame, Marks, s
     given = present_keys(session.parameters)
     options = TestfieldOptions(row_jitter_px=given.get("row_jitter_px", 0.0), fill=given.get("fill", 1.0))
     frame = session.picture(archived)
-    try:
-        found: Any = measurer_of(parse_design(session.input(names[0]), names[0]), options)(frame)
-    except ImageError as error:
-        return frame, Marks((), np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)), error.what
+    found: Any = measurer_of(parse_design(session.input(names[0]), names[0]), options)(frame)
     if isinstance(found, Failure):
         return frame, Marks((), np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)), found.reason
     points = found.points
