@@ -21,6 +21,8 @@ from reseau.instruments import (
     quantity,
 )
 
+from .reference import References, Reported
+
 __all__ = ["Axis", "AxisPlan", "Controller", "Table", "TableSettings"]
 
 _POLL_S, _HALT_S = 0.02, 1.0
@@ -118,6 +120,9 @@ class AxisPlan:
 class Controller(Protocol):
     """Motion controller; positions are in the unit of the :class:`AxisPlan`."""
 
+    references: References
+    """What is known of the references of its axes; it notes there what voids them."""
+
     @property
     def checked(self) -> bool:
         """Whether answers carry a checksum; otherwise a state at rest counts once a second one agrees."""
@@ -143,8 +148,8 @@ class Controller(Protocol):
     def halt(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Stop the axis."""
 
-    def state(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
-        """Return the state of the axis."""
+    def state(self, plan: AxisPlan, deadline: Deadline) -> Reported:
+        """Return what it reports of the axis."""
 
 
 @dataclass(frozen=True)
@@ -294,6 +299,7 @@ class Table(Device[TableSettings]):
 
     def _open(self, deadline: Deadline) -> None:
         self._controller.open(deadline)
+        self._controller.references.connected()
 
     def _disconnect(self) -> None:
         self._controller.close()
@@ -324,7 +330,9 @@ class Table(Device[TableSettings]):
             state = self.state(key, deadline.left_or_minimum)
             found[key] = "; ".join(
                 (
-                    f"{state.position:g} {self.plans[key].unit}" if state.homed else "not homed",
+                    f"{state.position:g} {self.plans[key].unit}"
+                    if state.homed
+                    else f"not homed: {state.reference}",
                     *state.faults,
                 )
             )
@@ -346,11 +354,11 @@ class Table(Device[TableSettings]):
 
     def _confirmed(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
         """The state of an axis; without checksums a second answer confirms one at rest: bits may turn."""
-        state = self._controller.state(plan, deadline)
+        state = self._judged(plan, deadline)
         if self._controller.checked or state.moving or state.faults:
             return state
         for _ in range(_CONFIRMATIONS):
-            before, state = state, self._controller.state(plan, deadline)
+            before, state = state, self._judged(plan, deadline)
             if state.moving or state.faults:
                 return state
             near = abs(state.position - before.position) <= plan.tolerance
@@ -359,6 +367,12 @@ class Table(Device[TableSettings]):
         raise ProtocolError(
             f"reports positions of {plan.name} that contradict each other", do="check the cable"
         )
+
+    def _judged(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
+        """What the controller reports, with what is known of the reference."""
+        found = self._controller.state(plan, deadline)
+        homed, how = self._controller.references.judged(plan.name, found.referenced)
+        return AxisState(found.position, found.moving, homed, found.faults, how)
 
     def home(self, axis: str, seconds: float | None = None) -> AxisState:
         """Find the reference of an axis; required before any movement.
@@ -375,10 +389,14 @@ class Table(Device[TableSettings]):
         deadline = Deadline(self.MOVE_S if seconds is None else seconds)
         with self._exchange(command, deadline.left) as time:
             self._require_unstopped(command)
+            self._controller.references.searching(axis)
             self._controller.begin_home(plan, time)
-        state = self._wait_until_stopped(axis, plan, deadline, command)
+        self._wait_until_stopped(axis, plan, deadline, command)
+        self._controller.references.found(axis)
+        state = self._retrying(lambda: self.state(axis, max(0.05, deadline.at_most(self._seconds))))()
         if not state.homed:
-            raise StateError("did not find its reference", where=self.name, command=command)
+            why = f"did not find its reference: {state.reference}"
+            raise StateError(why, where=self.name, command=command)
         with self._exchange(command, max(_POLL_S, deadline.at_most(self._seconds))) as time:
             # Some controllers accept a speed only after homing.
             self._controller.set_speed(plan, self.settings.speed, time)
@@ -412,7 +430,8 @@ class Table(Device[TableSettings]):
         deadline = Deadline(self.MOVE_S if seconds is None else seconds)
         state = self.state(axis, deadline.at_most(self._seconds))
         if not state.homed:
-            raise StateError("is not homed", where=self.name, command=command, do=f"home {axis} first")
+            why = f"is not homed: {state.reference}"
+            raise StateError(why, where=self.name, command=command, do=f"home {axis} first")
         before = (
             [position - plan.backlash] if plan.backlash and state.position > position - plan.backlash else []
         )
@@ -422,7 +441,8 @@ class Table(Device[TableSettings]):
                 self._controller.begin_move(plan, target, time)
             state = self._wait_until_stopped(axis, plan, deadline, command)
         if not state.homed:
-            raise StateError("lost its reference", where=self.name, command=command, do=f"home {axis} again")
+            why = f"lost its reference: {state.reference}"
+            raise StateError(why, where=self.name, command=command, do=f"home {axis} again")
         if abs(state.position - position) > plan.tolerance:
             raise StateError(f"stopped at {state.position:g} {plan.unit}", where=self.name, command=command)
         return state
