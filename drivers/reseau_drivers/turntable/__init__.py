@@ -64,7 +64,7 @@ def zaber(
     settings : mapping, optional
         Values for :class:`TableSettings`.
     **options
-        Further arguments of :class:`Table`.
+        Further arguments of :class:`Table`, as `keep_out`.
 
     Examples
     --------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol, Self
 
@@ -22,6 +22,7 @@ from reseau.instruments import (
 )
 
 from .reference import References, Reported
+from .zones import EVERYWHERE, NOWHERE, KeepOut, Span
 
 __all__ = ["Axis", "AxisPlan", "Controller", "Table", "TableSettings"]
 
@@ -270,6 +271,8 @@ class Table(Device[TableSettings]):
         Time limit of an exchange that does not specify one (s); a move has one minute.
     limits : mapping, optional
         Limits of settings.
+    keep_out : sequence of mapping
+        Zones in which axes must not be together: the lowest and highest position of each.
 
     Examples
     --------
@@ -291,8 +294,10 @@ class Table(Device[TableSettings]):
         *,
         seconds: float = 5.0,
         limits: Limits | None = None,
+        keep_out: Sequence[Mapping[str, Sequence[float]]] = (),
     ) -> None:
         super().__init__(name, settings or TableSettings(), seconds=seconds, limits=limits)
+        self._zones = KeepOut(keep_out, plans)
         self._controller = controller
         self.plans = {key: replace(plan, name=key) for key, plan in plans.items()}
         self.axes: dict[str, Axis] = {key: Axis(self, key) for key in plans}
@@ -374,11 +379,19 @@ class Table(Device[TableSettings]):
         homed, how = self._controller.references.judged(plan.name, found.referenced)
         return AxisState(found.position, found.moving, homed, found.faults, how)
 
+    def _stands(self, axis: str) -> Span | None:
+        """Where an axis stands; None if it moves, or that is not known."""
+        state, tolerance = self.state(axis), self.plans[axis].tolerance
+        known = state.homed and not state.moving
+        return (state.position - tolerance, state.position + tolerance) if known else None
+
     def home(self, axis: str, seconds: float | None = None) -> AxisState:
         """Find the reference of an axis; required before any movement.
 
         Raises
         ------
+        SettingError
+            If the axis can enter a zone to be kept out of, with others that have a reference.
         StateError
             If the axis stalled, reached a limit switch, or was stopped.
         DeadlineError
@@ -387,11 +400,12 @@ class Table(Device[TableSettings]):
         command, plan = f"home {axis}", self._plan(axis)
         self._begin(command)
         deadline = Deadline(self.MOVE_S if seconds is None else seconds)
-        with self._exchange(command, deadline.left) as time:
-            self._require_unstopped(command)
-            self._controller.references.searching(axis)
-            self._controller.begin_home(plan, time)
-        self._wait_until_stopped(axis, plan, deadline, command)
+        with self._zones.crossed(axis, EVERYWHERE, lambda each: self._stands(each) or NOWHERE):
+            with self._exchange(command, deadline.left) as time:
+                self._require_unstopped(command)
+                self._controller.references.searching(axis)
+                self._controller.begin_home(plan, time)
+            self._wait_until_stopped(axis, plan, deadline, command)
         self._controller.references.found(axis)
         state = self._retrying(lambda: self.state(axis, max(0.05, deadline.at_most(self._seconds))))()
         if not state.homed:
@@ -417,7 +431,8 @@ class Table(Device[TableSettings]):
         Raises
         ------
         SettingError
-            If the position is outside the soft limits; nothing moves then.
+            If the position is outside the soft limits, or the way to it enters a zone to be kept out of;
+            nothing moves then.
         StateError
             If the axis is not homed, stalled, reached a limit switch, was stopped, or did not arrive at the
             target.
@@ -435,11 +450,12 @@ class Table(Device[TableSettings]):
         before = (
             [position - plan.backlash] if plan.backlash and state.position > position - plan.backlash else []
         )
-        for target in (*before, position):
-            with self._exchange(command, deadline.at_most(self._seconds)) as time:
-                self._require_unstopped(command)
-                self._controller.begin_move(plan, target, time)
-            state = self._wait_until_stopped(axis, plan, deadline, command)
+        with self._zones.crossed(axis, (state.position, *before, position), self._stands):
+            for target in (*before, position):
+                with self._exchange(command, deadline.at_most(self._seconds)) as time:
+                    self._require_unstopped(command)
+                    self._controller.begin_move(plan, target, time)
+                state = self._wait_until_stopped(axis, plan, deadline, command)
         if not state.homed:
             why = f"lost its reference: {state.reference}"
             raise StateError(why, where=self.name, command=command, do=f"home {axis} again")
