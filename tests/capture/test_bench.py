@@ -141,7 +141,7 @@ def test_check_reports_every_failure_and_sets_the_exit_status(
         assert found["scanner"]["identity"] == "Blue Robotics Ping360"
         assert found["scanner"]["firmware"] == "3.1.1"
         assert found["scanner"]["line"].startswith("200 samples")
-        assert found["table"]["tilt"] == "not homed"
+        assert found["table"]["tilt"] == "not homed: the controller reports none"
         assert found["oscilloscope"]["error"] == "none"
         assert [each["name"] for each in document["instruments"]] == list(simulated.machines)
         for script in simulated.scripts.values():

@@ -12,6 +12,7 @@ from reseau.core.errors import (
     ConnectionLost,
     DeadlineError,
     ProtocolError,
+    RefusedError,
     SettingError,
     StateError,
     UsageError,
@@ -114,11 +115,13 @@ def test_a_movement_that_ends_short_is_an_error(which: int, kind: str, message: 
         assert table.move("tilt", 40.0).position == pytest.approx(40.0, abs=2e-3)
 
 
-@pytest.mark.parametrize(("name", "value"), [("$22", "0"), ("$13", "1")])
-def test_a_grbl_that_is_set_otherwise_is_declined(name: str, value: str) -> None:
-    board = GrblController(1, settings={name: value})
-    with pytest.raises(StateError, match=rf"\{name} is {value}"):
+def test_a_grbl_that_is_set_otherwise_is_declined() -> None:
+    board = GrblController(1, settings={"$13": "1"})
+    with pytest.raises(StateError, match=r"\$13 is 1"):
         grbl("table", _in_process(board), axes={"tilt": {}}).connect()
+    board = GrblController(1, settings={"$22": "0"})
+    with pytest.raises(RefusedError, match=r"homing is not enabled \(\$22\)"):
+        grbl("table", _in_process(board), axes={"tilt": {}}).home("tilt")
     board = GrblController(1, settings={"$10": "0"})
     with pytest.raises(ProtocolError, match=r"set \$10=1"):
         grbl("table", _in_process(board), axes={"tilt": {}}).state("tilt")
@@ -335,3 +338,46 @@ def test_wrong_plans_and_addresses_are_refused() -> None:
         zaber("table", "/dev/no-such-port", axes={"tilt": {}}).connect()
     with pytest.raises(ConnectionLost, match="cannot be reached"):
         zaber("table", "tcp://127.0.0.1:1", axes={"tilt": {}}).connect()
+
+
+def _guarded(**more: Any) -> Table:
+    chain = ZaberChain([2], high=100_000.0)
+    axes = {"tilt": {"per_unit": 1000.0, "high": 90.0}, "roll": {"axis": 2, "per_unit": 1000.0, "high": 90.0}}
+    zone = {"tilt": [40.0, 60.0], "roll": [50.0, 90.0]}
+    link = InProcess(lambda: FaultyConnection(chain))
+    return zaber("table", link, axes=axes, settings={"speed": 500.0}, **{"keep_out": [zone], **more})
+
+
+def test_axes_are_never_together_in_a_zone_to_be_kept_out_of() -> None:
+    with _guarded() as table:
+        table.home("tilt")
+        with pytest.raises(StateError, match="where roll is, is not known; home roll first"):
+            table.move("tilt", 70.0)
+        table.home("roll")
+        table.move("tilt", 70.0)  # through the zone of tilt, while roll is outside of its own
+        table.move("roll", 80.0)
+        for target in (50.0, 20.0):  # into the zone, and through it
+            with pytest.raises(SettingError, match=r"tilt 40…60, roll 50…90\); move roll out of 50…90 first"):
+                table.move("tilt", target)
+        with pytest.raises(SettingError, match="would enter the zone"):
+            table.home("tilt")
+        assert table.state("tilt").position == 70.0
+
+
+def test_a_movement_under_way_counts_as_everywhere_on_its_way() -> None:
+    with _guarded() as table:
+        table.home("tilt")
+        table.home("roll")
+        table.configure(speed=40.0)
+        under_way = table.axes["tilt"].set(80.0)
+        time.sleep(0.2)
+        with pytest.raises(SettingError, match="move tilt out of 40…60 first"):
+            table.move("roll", 70.0)
+        assert under_way.exception(10.0) is None
+        table.move("roll", 70.0)
+
+
+def test_a_zone_names_axes_of_the_table() -> None:
+    for zone in ({}, {"pan": [0, 1]}, {"tilt": [2, 1]}, {"tilt": [1]}):
+        with pytest.raises(SettingError, match="keep_out"):
+            _guarded(keep_out=[zone])

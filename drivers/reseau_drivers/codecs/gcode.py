@@ -26,6 +26,7 @@ __all__ = [
     "Error",
     "Message",
     "Ok",
+    "Outdated",
     "Report",
     "Resend",
     "Said",
@@ -73,12 +74,24 @@ ALARMS: dict[int, str] = {
     7: "the safety door was opened during homing",
     8: "homing did not clear the limit switch",
     9: "homing did not find the limit switch",
+    10: "the emergency stop was pressed",
+    11: "it is to be homed first",
+    12: "a limit switch is closed",
+    13: "the probe is protected",
+    14: "the spindle reports an error",
+    15: "homing did not find the second limit switch of an axis with two motors",
+    16: "its self-test failed",
+    17: "a motor reports a fault",
+    18: "homing failed",
 }
-"""Codes of ``ALARM:``."""
+"""Codes of ``ALARM:``; from 10 those of grblHAL."""
 
 _WORD = re.compile(r"([A-Z])\s*([-+]?\d*\.?\d+|[-+]?\d+\.)")
 _NUMBERED = re.compile(rb"\s*N(-?\d+)\s*(.*?)\s*\*(\d{1,3})\s*")
 _REPORT = re.compile(r"<([A-Z][a-z]+)(?::(\d+))?((?:\|[^|<>]+)*)>")
+_OUTDATED = re.compile(r"<[A-Z][a-z]+,[MW]Pos:[^|<>]*>|\[G\d[^:\]]*\]")
+"""Status, and modes of the parser, as GRBL up to 0.9 gives them."""
+_BANNER = re.compile(r"start|grbl\S* \S+ .*\[.*", re.IGNORECASE)
 
 
 def checksum(line: bytes) -> int:
@@ -213,6 +226,13 @@ class Banner:
 
 
 @dataclass(frozen=True)
+class Outdated:
+    """An answer of GRBL up to 0.9, which has no states in detail."""
+
+    text: str
+
+
+@dataclass(frozen=True)
 class Busy:
     """Marlin has not finished a line."""
 
@@ -233,7 +253,7 @@ class Report:
     Parameters
     ----------
     state : str
-        Idle, Run, Hold, Jog, Alarm, Door, Check, Home or Sleep.
+        Idle, Run, Hold, Jog, Alarm, Door, Check, Home or Sleep; of grblHAL also Tool.
     substate : int
         Detail of Hold and Door; 0 where there is none.
     fields : dict of str to tuple of float
@@ -252,7 +272,7 @@ class Said:
     text: str
 
 
-Message = Ok | Error | Alarm | Banner | Busy | Resend | Report | Said
+Message = Ok | Error | Alarm | Banner | Outdated | Busy | Resend | Report | Said
 
 
 def decode(line: bytes) -> Message:
@@ -272,6 +292,8 @@ def decode(line: bytes) -> Message:
     """
     if not line.isascii() or not (text := line.decode().strip()).isprintable():
         raise ProtocolError(f"not a line of text: {excerpt(line)}")
+    if _OUTDATED.fullmatch(text):
+        return Outdated(text)
     if text.startswith("<"):
         return _report(text)
     if text == "ok" or text.startswith("ok "):
@@ -284,7 +306,7 @@ def decode(line: bytes) -> Message:
         return Resend(int(found[1]))
     if found := re.match(r"(?:echo:\s*)?busy:\s*(.*)", text):
         return Busy(found[1])
-    if text.startswith("Grbl ") or text == "start":
+    if _BANNER.fullmatch(text):
         return Banner(text)
     return Said(text)
 

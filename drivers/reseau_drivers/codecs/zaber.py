@@ -19,6 +19,8 @@ from .stream import LineMessageDecoder, excerpt
 __all__ = [
     "FAULTS",
     "LIMIT",
+    "UNREFERENCED",
+    "UNRELIABLE",
     "Alert",
     "Command",
     "Info",
@@ -36,15 +38,35 @@ LIMIT = 512
 
 FAULTS: dict[str, str] = {
     "FF": "a critical error switched the driver off",
-    "FN": "the power is not connected",
+    "FN": "the peripheral is not supported",
+    "FZ": "the peripheral is not activated",
+    "FH": "the emergency stop was pressed",
+    "FV": "the supply is out of range: the driver is off",
     "FO": "the driver is off",
+    "FC": "inrush of current: the driver is off",
+    "FM": "the motor is too hot",
     "FD": "the driver is off: it was overloaded",
-    "FS": "the axis stalled",
-    "FT": "the driver is too hot",
-    "FB": "the motion was stopped by an obstacle",
+    "FQ": "the encoder failed: the position is unreliable",
+    "FI": "the index mark was not where it should be",
+    "FA": "the analogue encoder lost its synchronisation",
+    "FR": "the limit of overdrive was exceeded: the driver is off",
+    "FS": "the axis stalled and stopped",
+    "FB": "a stream left its bounds",
+    "FP": "the axis left its interpolated path",
     "FE": "a limit switch was reached",
+    "FT": "the twist of axes in lockstep is excessive",
+    "WL": "a limit switch closed unexpectedly",
+    "WV": "the supply is out of range",
+    "WT": "the controller is too hot",
+    "WS": "the axis stalled, and recovered",
+    "WM": "the axis was displaced at rest",
+    "WP": "the type of its calibration is not valid",
 }
-"""Warning flags of movements that did not reach their target, with their meaning."""
+"""Fault and warning flags of an axis that may not be where it says, or will not move, with their meaning."""
+UNREFERENCED = ("WR", "WH")
+"""Flags of an axis without a reference: no reference position, not homed."""
+UNRELIABLE = frozenset({"FF", "FN", "FZ", "FV", "FQ", "FI", "FA", "FS", "FP", "FT", "WL", "WS", "WM"})
+"""Flags after which positions are those of the axis only once it is homed again."""
 
 _REPLY = re.compile(rb"(\d{1,2}) (\d)(?: (\d{2}))? (OK|RJ) (IDLE|BUSY) ([A-Z]{2}|--) ([ -~]+)")
 _INFO = re.compile(rb"(\d{1,2}) (\d)(?: (\d{2}))? ([ -~]*)")

@@ -14,6 +14,7 @@ from .grbl import Grbl
 from .hand import ByHand, HandTable, Marker
 from .kinesis import Kinesis, MotorKind, kinesis_ports
 from .marlin import Marlin
+from .reference import References
 from .smc100 import Smc100
 from .table import Axis, AxisPlan, Table, TableSettings
 from .zaber import Zaber
@@ -27,6 +28,7 @@ __all__ = [
     "Kinesis",
     "Marker",
     "Marlin",
+    "References",
     "Smc100",
     "Table",
     "TableSettings",
@@ -62,7 +64,7 @@ def zaber(
     settings : mapping, optional
         Values for :class:`TableSettings`.
     **options
-        Further arguments of :class:`Table`.
+        Further arguments of :class:`Table`, as `keep_out`.
 
     Examples
     --------

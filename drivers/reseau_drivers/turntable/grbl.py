@@ -1,10 +1,12 @@
 """GRBL controllers: all axes behind one connection.
 
-Source: see :mod:`reseau_drivers.codecs.gcode`. After power-on GRBL is locked until it has homed, provided
-that homing is enabled (``$22=1``): the driver insists on that, because the lock is how it knows that
-positions have a reference. It never unlocks by ``$X``. Positions are machine positions, which must be
-reported (``$10=1``) in millimetres (``$13=0``); those of GRBL are negative as a rule, and so are the limits
-of its axes.
+Source: see :mod:`reseau_drivers.codecs.gcode`. GRBL and FluidNC do not tell whether they have homed: Idle is
+no evidence, because the lock after a start is an option, and ``$X`` opens it. The driver therefore marks a
+GRBL 1.1 that has homed, by the tool number T111, which every start and reset sets to 0 (`gc_init`), and which
+has no other effect. grblHAL tells by the field ``H`` of its status, with a bit for each axis where axes home
+singly. Others count as homed only in the connection that has homed them. The driver never unlocks by ``$X``.
+Positions are machine positions, which must be reported (``$10=1``) in millimetres (``$13=0``); those of GRBL
+are negative as a rule, and so are the limits of its axes.
 """
 
 from __future__ import annotations
@@ -12,28 +14,33 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 
 from reseau.core.errors import ProtocolError, RefusedError, StateError
-from reseau.instruments import AxisState, Deadline, Identity
+from reseau.instruments import Deadline, Identity
 
-from ..codecs.gcode import Alarm, Banner, Error, Message, Ok, Report, Said, encode
+from ..codecs.gcode import Alarm, Banner, Error, Message, Ok, Outdated, Report, Said, encode
 from ..link import Link
 from .gcode import Lines, letter_of, until
+from .reference import References, Reported
 from .table import AxisPlan
 
 __all__ = ["Grbl"]
 
-_STATUS, _HOLD, _RESET = b"?", b"!", b"\x18"
+_STATUS, _HOLD, _RESET, _FULL_STATUS = b"?", b"!", b"\x18", b"\x87"
+"""Bytes that are obeyed at once; the last one is known to grblHAL only."""
+_MARK = "T111"
+"""Tool number of a GRBL that has homed."""
 _MOVING = ("Run", "Jog", "Home")
 _STATES = ("8", "9", "13")
 """Errors that mean: not allowed in this state."""
 _FAULTS = {"Door": "the safety door is open", "Check": "check mode ($C): nothing moves", "Sleep": "it sleeps"}
+_KNOWN = {"Idle", "Run", "Jog", "Hold", "Home", "Alarm", "Tool", *_FAULTS}
 _BOOT_S, _BEGINS_S, _POLL_S = 4.0, 2.0, 0.01
-_REQUIRED = {"$22": ("1", "homing"), "$13": ("0", "reports in millimetres")}
 
 
 class Grbl:
-    """Controller with GRBL 1.1, or firmware that keeps to its protocol.
+    """Controller with GRBL 1.1, or firmware that keeps to its protocol: grblHAL, FluidNC.
 
     `AxisPlan.axis` is 1 for X, 2 for Y and so on; `AxisPlan.per_unit` the number of GRBL's millimetres (or
     degrees) per unit.
@@ -61,11 +68,17 @@ class Grbl:
         self._alarm: Alarm | None = None
         self._acknowledged = False
         """Whether an `ok` came that no line waited for: that of a search for the reference."""
+        self._searching = self._underway = False
+        self._version: list[str] = []
+        self._told: tuple[float, ...] = ()
+        """Field H of the last status that had one."""
+        self._marked = False
+        self.references = References()
 
     def open(self, deadline: Deadline) -> None:
         """Open the connection; what is left of an earlier one is discarded at the first query."""
         self._link.open(deadline)
-        self._synchronised = self._suitable = False
+        self._forget()
 
     def close(self) -> None:
         """Close the connection."""
@@ -76,11 +89,7 @@ class Grbl:
         for plan in plans.values():
             letter_of(plan)
         self._ready(deadline)
-        try:
-            said = self._exchange("$I", deadline)
-        except StateError:
-            return Identity("GRBL", "")
-        version = next((text for text in said if text.startswith("[VER:")), "[VER:]")[5:].rstrip("]")
+        version = next((text for text in self._version if text.startswith("[VER:")), "[VER:]")[5:].rstrip("]")
         firmware, _, name = version.partition(":")
         return Identity("GRBL", name, "", firmware)
 
@@ -99,7 +108,10 @@ class Grbl:
             found = self._link.query(order + _STATUS, _report_or_refusal, deadline.part(self._answer_s))
             if isinstance(found, Error):
                 raise _refusal(found, "$H")
+            if isinstance(found, Alarm):
+                raise StateError(f"refused the search: {found.meaning}", command="$H")
             homes = isinstance(found, Report) and found.state == "Home"
+            self._searching = True
             if homes or isinstance(found, Ok) or self._acknowledged:
                 return
             order = b""
@@ -108,6 +120,9 @@ class Grbl:
 
     def begin_move(self, plan: AxisPlan, position: float, deadline: Deadline) -> None:
         """Start a movement, in machine coordinates."""
+        if not self._still_marked(deadline):
+            raise StateError("has started anew", do=f"home {plan.name} again")
+        self._underway = True
         target = f"{letter_of(plan)}{position * plan.per_unit:.4f}"
         feed = self._speed.get(plan.name, 1.0) * plan.per_unit * 60
         self._line(f"G21 G90 G53 G1 {target} F{feed:.3f}", deadline)
@@ -122,10 +137,13 @@ class Grbl:
                     raise StateError("does not stop", do="switch it off")
                 time.sleep(deadline.at_most(_POLL_S))
         if state.state in ("Home", "Hold", "Door"):
+            marked = self._marked
             self._reset(deadline)
+            if marked and self._report(deadline).state == "Idle":
+                self._mark(deadline)
 
-    def state(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
-        """Return the state of the axis."""
+    def state(self, plan: AxisPlan, deadline: Deadline) -> Reported:
+        """Return what it reports of the axis."""
         self._ready(deadline)
         found = self._report(deadline)
         positions = found.fields.get("MPos", ())
@@ -133,12 +151,50 @@ class Grbl:
             what = f"reports {len(positions)} machine positions, not that of {letter_of(plan)}"
             raise ProtocolError(what, do="set $10=1")
         faults = [_FAULTS[found.state]] if found.state in _FAULTS else []
+        if found.state not in _KNOWN:
+            faults.append(f"its state is {found.state}, which is not known")
         if found.state == "Hold" and not _moves(found):
             faults.append("it is paused by a feed hold")
         if found.state == "Alarm" and self._alarm is not None:
             faults.append(self._alarm.meaning)
-        homed = found.state not in ("Alarm", "Home", "Sleep")
-        return AxisState(positions[plan.axis - 1] / plan.per_unit, _moves(found), homed, tuple(faults))
+        if found.state == "Alarm" and self.references.judged(plan.name, None)[0]:
+            self.references.void(self._alarm.meaning if self._alarm else "the controller is locked")
+        if self._underway and found.state == "Idle":
+            self._underway = False
+            self._still_marked(deadline)
+        if self._searching and found.state == "Idle":
+            self._searching = False
+            self._mark(deadline)
+        return Reported(
+            positions[plan.axis - 1] / plan.per_unit, _moves(found), self._tells(plan, found), tuple(faults)
+        )
+
+    def _tells(self, plan: AxisPlan, report: Report) -> bool | None:
+        """Whether it says that an axis has its reference; None: it does not tell."""
+        if report.state in ("Alarm", "Home", "Sleep"):
+            return False
+        if len(self._told) == 2:
+            return bool(int(self._told[1]) >> (plan.axis - 1) & 1)
+        if self._told:
+            return self._told[0] == 1
+        return True if self._marked else None
+
+    def _mark(self, deadline: Deadline) -> None:
+        """Mark a GRBL 1.1 that has homed; of others a reset is not known to remove the mark."""
+        said = " ".join(self._version)
+        if "[VER:1.1" in said and "FIRMWARE:" not in said and "FluidNC" not in said and not self._told:
+            with suppress(RefusedError):
+                self._exchange(_MARK, deadline)
+            self._synchronise(deadline)
+
+    def _still_marked(self, deadline: Deadline) -> bool:
+        """Whether it bears its mark as before: a start that was not heard leaves none."""
+        if self._marked:
+            self._synchronise(deadline)
+            if not self._marked:
+                self.references.void("the controller has started anew")
+                return False
+        return True
 
     def _ready(self, deadline: Deadline) -> None:
         """Make sure that answers belong to their lines, and that GRBL is set as the driver needs it."""
@@ -146,17 +202,22 @@ class Grbl:
             boot = deadline.part(_BOOT_S)
             until(lambda: self._synchronise(boot), lambda: boot.expired)
             self._synchronised = True
-        # It reports its settings at rest only; while it moves it has its reference.
+        # It reports version and settings at rest only.
         if not self._suitable and self._report(deadline).state in ("Idle", "Alarm"):
-            said = self._exchange("$$", deadline)
-            settings = dict(text.split("=", 1) for text in said if text.startswith("$") and "=" in text)
-            for name, (value, what) in _REQUIRED.items():
-                if settings.get(name) != value:
-                    found = settings.get(name, "not reported")
-                    raise StateError(
-                        f"{what}: {name} is {found}, not {value}", do=f"send {name}={value} to it"
-                    )
+            self._version = self._exchange("$I", deadline)
+            settings = dict(text.split("=", 1) for text in self._exchange("$$", deadline) if "=" in text)
+            inches = settings.get("$13", "0").split()  # some add a description
+            if inches[:1] != ["0"]:
+                what = f"reports in millimetres: $13 is {' '.join(inches)}, not 0"
+                raise StateError(what, do="send $13=0 to it")
+            if any("FIRMWARE:grblHAL" in text for text in self._version) and not self._told:
+                self._report(deadline, _FULL_STATUS)
             self._suitable = True
+
+    def _forget(self) -> None:
+        """Forget what is known of this connection, or of a controller that has started anew."""
+        self._synchronised = self._suitable = self._searching = False
+        self._marked, self._told = False, ()
 
     def _synchronise(self, deadline: Deadline) -> None:
         """Discard answers to earlier lines: none is left after the parser's state, asked for only here."""
@@ -164,24 +225,28 @@ class Grbl:
 
         def ends(message: Message) -> bool:
             nonlocal heard
-            heard = heard or (isinstance(message, Said) and message.text.startswith("[GC:"))
-            return heard and isinstance(message, Ok)
+            if isinstance(message, Said) and message.text.startswith("[GC:"):
+                heard, self._marked = True, _MARK in message.text.rstrip("]").split()
+            return (heard and isinstance(message, Ok)) or isinstance(message, Outdated)
 
-        self._link.query(b"\n" + encode("$G"), ends, deadline.part(self._answer_s))
+        _require_current(self._link.query(b"\n" + encode("$G"), ends, deadline.part(self._answer_s)))
 
     def _reset(self, deadline: Deadline) -> None:
+        self._marked = False
         self._link.query(
             _RESET, lambda message: isinstance(message, Banner), deadline.part(max(self._answer_s, 1.0))
         )
 
-    def _report(self, deadline: Deadline) -> Report:
+    def _report(self, deadline: Deadline, ask: bytes = _STATUS) -> Report:
         found = self._link.query(
-            _STATUS, lambda message: isinstance(message, Report), deadline.part(self._answer_s)
+            ask, lambda message: isinstance(message, Report | Outdated), deadline.part(self._answer_s)
         )
+        _require_current(found)
         if not isinstance(found, Report) or not all(
             math.isfinite(value) for values in found.fields.values() for value in values
         ):
             raise ProtocolError(f"sent {found}, which is no status")
+        self._overheard(found)
         return found
 
     def _line(self, line: str, deadline: Deadline) -> list[str]:
@@ -195,11 +260,13 @@ class Grbl:
         def ends(message: Message) -> bool:
             if isinstance(message, Said):
                 said.append(message.text)
-            return isinstance(message, Ok | Error | Banner)
+            return isinstance(message, Ok | Error | Banner | Alarm)
 
         found = self._link.query(encode(line), ends, deadline.part(self._answer_s))
-        if isinstance(found, Banner):
-            raise StateError("has started anew", command=line, do="home it again")
+        if isinstance(found, Banner | Alarm):
+            self._overheard(found)
+            what = "has started anew" if isinstance(found, Banner) else found.meaning
+            raise StateError(what, command=line, do="home it again")
         if isinstance(found, Error):
             raise _refusal(found, line)
         return said
@@ -207,11 +274,22 @@ class Grbl:
     def _overheard(self, message: Message) -> None:
         if isinstance(message, Alarm):
             self._alarm = message
+            self.references.void(message.meaning)
+        if isinstance(message, Banner):
+            self._forget()
+            self.references.void("the controller has started anew")
+        if isinstance(message, Report):
+            self._told = message.fields.get("H", self._told)
         self._acknowledged = self._acknowledged or isinstance(message, Ok)
 
 
 def _report_or_refusal(message: Message) -> bool:
-    return isinstance(message, Report | Error | Ok)
+    return isinstance(message, Report | Error | Ok | Alarm)
+
+
+def _require_current(message: Message) -> None:
+    if isinstance(message, Outdated):
+        raise StateError("speaks as GRBL up to 0.9 does", do="install GRBL 1.1 on it")
 
 
 def _moves(report: Report) -> bool:

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reseau.core.errors import InstrumentError, SettingError, StateError
-from reseau.instruments import AxisState, Camera, Deadline, Identity, Instrument
+from reseau.instruments import Camera, Deadline, Identity, Instrument
 
+from .reference import References, Reported
 from .table import AxisPlan, Table
 
 __all__ = ["ByHand", "HandTable", "Marker", "Person", "marker_position"]
@@ -162,6 +163,7 @@ class ByHand:
         self._person, self._markers = person, dict(markers)
         self.camera: Camera | None = None
         self._stands: dict[str, float] = {}
+        self.references = References()
 
     def open(self, deadline: Deadline) -> None:
         """Do nothing: each request makes its own connection."""
@@ -199,11 +201,11 @@ class ByHand:
     def halt(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Do nothing: nothing moves by itself."""
 
-    def state(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
+    def state(self, plan: AxisPlan, deadline: Deadline) -> Reported:
         """Return where the axis was last read to stand; a marker is looked at each time."""
         if plan.name not in self._stands or plan.name in self._markers:
             self.begin_home(plan, deadline)
-        return AxisState(self._stands[plan.name], moving=False, homed=True)
+        return Reported(self._stands[plan.name], moving=False, referenced=True)
 
     def _set(self, plan: AxisPlan, request: str, deadline: Deadline) -> float:
         if plan.name in self._markers:

@@ -14,7 +14,7 @@ from typing import Literal
 from serial.tools import list_ports
 
 from reseau.core.errors import ProtocolError, SettingError, StateError
-from reseau.instruments import AxisState, Deadline, Identity
+from reseau.instruments import Deadline, Identity
 
 from ..codecs.apt import (
     HOST,
@@ -33,6 +33,7 @@ from ..codecs.apt import (
     encode_velocities,
 )
 from ..link import Link, MessageLink
+from .reference import References, Reported
 from .table import AxisPlan
 
 __all__ = ["MOTORS", "Kinesis", "MotorKind", "kinesis_ports"]
@@ -49,6 +50,7 @@ _BEGINS_S = 2.0
 """Time in which an order must show in the status (s)."""
 _POLL_S = 0.01
 _STEPPERS = ("stepper",)
+_OFF = "the motor is switched off"
 _CUBE_USB = (0x0403, 0xFAF0)
 """Vendor and product of the USB converters in Thorlabs' controllers."""
 
@@ -90,6 +92,7 @@ class Kinesis:
         self._links = [_Cube(link, answer_s) for link in links]
         self._motor, self._rack = motor, rack
         self._targets: dict[tuple[int, int], int] = {}
+        self.references = References()
         # Steppers without an encoder report STATUS, the others DC_STATUS.
         stepper = motor in _STEPPERS
         self._request, self._status = (
@@ -157,12 +160,12 @@ class Kinesis:
                 raise StateError("does not stop", do="switch it off")
             time.sleep(deadline.at_most(_POLL_S))
 
-    def state(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
-        """Return the state of the axis."""
+    def state(self, plan: AxisPlan, deadline: Deadline) -> Reported:
+        """Return what it reports of the axis."""
         counts, bits = self._ask(plan, deadline)
         faults = []
         if Bits.ENABLED not in bits:
-            faults.append("the motor is switched off")
+            faults.append(_OFF)
         if Bits.POSITION_ERROR in bits:
             faults.append("the axis does not follow: it stalled")
         # At its reference a stage may stand on a switch: that is an end only where it was to go farther.
@@ -170,7 +173,10 @@ class Kinesis:
         short = abs(target - counts) > plan.tolerance * plan.per_unit
         if short and not bits.moving and bits & (Bits.LIMIT_FORWARD | Bits.LIMIT_REVERSE):
             faults.append("a limit switch was reached")
-        return AxisState(counts / plan.per_unit, bits.moving, Bits.HOMED in bits, tuple(faults))
+        lost = [what for what in faults if what != _OFF] if self._motor in _STEPPERS else []
+        if lost:  # steps are counted as they are sent, whether the motor follows or not
+            self.references.void(lost[0], plan.name)
+        return Reported(counts / plan.per_unit, bits.moving, Bits.HOMED in bits, tuple(faults))
 
     def _at(self, device: int) -> tuple[_Cube, int]:
         """Connection and address of a controller."""
@@ -251,7 +257,9 @@ class _Cube:
 
     def _exchange(self, message: Message, answer: Id, deadline: Deadline) -> Message:
         def answers(found: Message) -> bool:
-            same = found.id == answer and found.source == message.destination
+            # Some T-Cubes give 0 as their address; there is only one device at a USB connection of its own.
+            sources = (message.destination, 0) if message.destination == USB else (message.destination,)
+            same = found.id == answer and found.source in sources
             return same and (answer == Id.INFO or found.channel == message.parameters[0])
 
         found = self._link.query(encode(message), answers, deadline.part(self._answer_s))

@@ -2,9 +2,10 @@
 
 Source: see :mod:`reseau_drivers.codecs.gcode`. Lines carry numbers and checksums. The position is that of the
 step counters (``Count`` of M114, steps per unit of M92): what M114 reports before it is where the controller
-wants to go, and an axis stands where both agree. Marlin does not tell whether it has homed. The driver
-therefore marks a controller that has, by a feed rate of 101 % (M220), which is 100 % after every start; it
-takes this into account in the speed.
+wants to go, and an axis stands where both agree. Marlin does not tell which axes have homed. The driver
+therefore marks them by the feed rate (M220), which is 100 % after every start: 1 % more for X, 2 % for Y,
+4 % for Z and so on; it takes this into account in the speed. M410 stops without deceleration, after which
+steppers are expected to be out of position (G-code reference): what it stopped has no reference.
 """
 
 from __future__ import annotations
@@ -15,17 +16,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from reseau.core.errors import DeadlineError, InstrumentError, ProtocolError, RefusedError, StateError
-from reseau.instruments import AxisState, Deadline, Identity
+from reseau.instruments import Deadline, Identity
 
-from ..codecs.gcode import Banner, Busy, Error, Message, Ok, Resend, Said, encode_numbered
+from ..codecs.gcode import AXES, Banner, Busy, Error, Message, Ok, Resend, Said, encode_numbered
 from ..link import Link
 from .gcode import Lines, letter_of, until
+from .reference import References, Reported
 from .table import AxisPlan
 
 __all__ = ["Marlin"]
 
-_HOMED, _FRESH = 101, 100
-"""Feed rates (%) of a controller that has homed, and of one that has just started."""
+_FRESH = 100
+"""Feed rate (%) of a controller that has just started."""
 _BOOT_S, _SILENT_S, _STANDS_S, _POLL_S = 6.0, 4.0, 1.0, 0.01
 _RESENDS = 3
 _ROUNDED = 0.006
@@ -72,6 +74,9 @@ class Marlin:
         self._homing: _Homing | None = None
         self._counts: dict[str, tuple[float, float]] = {}
         self._endstop = ""
+        self._underway: set[str] = set()
+        self._percent = _FRESH
+        self.references = References()
 
     def open(self, deadline: Deadline) -> None:
         """Open the connection; what is left of an earlier one is discarded at the first query."""
@@ -98,9 +103,8 @@ class Marlin:
     def begin_home(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Start the search for the reference of an axis; motors stay on from then on."""
         self._line("M84 S0", deadline)
-        letter, others = letter_of(plan), self._marked(deadline)
-        if not others:
-            self._line(f"M220 S{_FRESH}", deadline)
+        letter = letter_of(plan)
+        self._mark(self._marks(deadline) & ~_bit(letter), deadline)
         self._endstop = ""
         # Its `ok` comes when it has ended.
         self._ready(deadline)
@@ -115,9 +119,9 @@ class Marlin:
         self._counts.pop(letter, None)
         for line in ("G21", "G90"):
             self._line(line, deadline)
-        said = self._line(
-            f"G1 {letter}{position * plan.per_unit:.4f} F{feed * _FRESH / _HOMED:.3f}", deadline
-        )
+        feed *= _FRESH / max(1, self._percent)
+        self._underway.add(letter)
+        said = self._line(f"G1 {letter}{position * plan.per_unit:.4f} F{feed:.3f}", deadline)
         if any(re.search(r"Home [A-Z]+ First", text) for text in said):
             raise StateError("is not homed", do=f"home {plan.name} first")
 
@@ -131,18 +135,22 @@ class Marlin:
             self._link.send(b"M410\n", deadline.part(self._answer_s))
         else:
             self._line("M410", deadline)
+        if self._underway:
+            self._underway.clear()
+            self.references.void("it was stopped without deceleration, where steps are lost")
+            self._mark(0, deadline)
         while self._state(plan, deadline).moving:
             if deadline.expired:
                 raise StateError("does not stop", do="switch it off")
             time.sleep(deadline.at_most(_POLL_S))
 
-    def state(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
+    def state(self, plan: AxisPlan, deadline: Deadline) -> Reported:
         """Return the state of the axis."""
         if self._homing is not None and not self._homed(self._homing, deadline):
-            return AxisState(float("nan"), moving=True, homed=False)
+            return Reported(float("nan"), moving=True, referenced=False)
         return self._state(plan, deadline)
 
-    def _state(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
+    def _state(self, plan: AxisPlan, deadline: Deadline) -> Reported:
         letter = letter_of(plan)
         target, count = self._positions(letter, deadline)
         position = count / self._steps[letter]
@@ -157,7 +165,14 @@ class Marlin:
                 faults, moving = (*faults, stands), False
         else:
             self._counts.pop(letter, None)
-        return AxisState(position / plan.per_unit, moving, self._marked(deadline), faults)
+        marks = self._marks(deadline)
+        if faults:
+            self.references.void(faults[0], plan.name)
+            if marks & _bit(letter):
+                self._mark(marks := marks & ~_bit(letter), deadline)
+        if not moving:
+            self._underway.discard(letter)
+        return Reported(position / plan.per_unit, moving, bool(marks & _bit(letter)), faults)
 
     def _homed(self, homing: _Homing, deadline: Deadline) -> bool:
         """Whether the search for the reference has ended; its end is marked."""
@@ -175,19 +190,25 @@ class Marlin:
             return False
         self._homing = None
         if isinstance(found, Ok):
-            self._line(f"M220 S{_HOMED}", deadline)
+            self._mark(self._marks(deadline) | _bit(homing.letter), deadline)
             return True
         self._synchronised = False
         what = found.meaning if isinstance(found, Error) else "has started anew"
         raise StateError(what, command=f"G28 {homing.letter}")
 
-    def _marked(self, deadline: Deadline) -> bool:
-        """Whether the controller bears the mark of one that has homed."""
+    def _mark(self, axes: int, deadline: Deadline) -> None:
+        """Mark which axes have homed."""
+        self._line(f"M220 S{_FRESH + axes}", deadline)
+
+    def _marks(self, deadline: Deadline) -> int:
+        """Which axes have homed, a bit for each; none where the feed rate is no such mark."""
         said = self._line("M220", deadline)
         found = next((each for each in map(re.compile(r"FR:\s*(\d+)%").search, said) if each), None)
         if found is None:
             raise ProtocolError(f"does not tell its feed rate: {said}")
-        return int(found[1]) == _HOMED
+        self._percent = int(found[1])
+        axes = self._percent - _FRESH
+        return axes if 0 < axes < 1 << len(AXES) else 0
 
     def _positions(self, letter: str, deadline: Deadline) -> tuple[float, float]:
         """Where an axis is to be (mm), and its step counter."""
@@ -271,10 +292,18 @@ class Marlin:
         while isinstance(found := ask(), Busy):
             ask = lambda: self._link.receive(ends, deadline.part(max(self._answer_s, _SILENT_S)))  # noqa: E731
         if isinstance(found, Banner):
+            self._overheard(found)
             self._synchronised = False
             raise StateError("has started anew", do="home it again")
         return heard
 
     def _overheard(self, message: Message) -> None:
+        if isinstance(message, Banner):
+            self.references.void("the controller has started anew")
         if isinstance(message, Said) and "endstops hit" in message.text:
             self._endstop = message.text.partition("hit:")[2].strip()
+
+
+def _bit(letter: str) -> int:
+    """The mark of an axis."""
+    return 1 << AXES.index(letter)

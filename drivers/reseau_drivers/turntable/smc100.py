@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from reseau.core.errors import ProtocolError, RefusedError, StateError
-from reseau.instruments import AxisState, Deadline, Identity
+from reseau.instruments import Deadline, Identity
 
 from ..codecs.smc100 import ERRORS, LIMIT, Line, Phase, decode, decode_status, encode
 from ..codecs.stream import LineDecoder
 from ..link import Link, MessageLink
+from .reference import References, Reported
 from .table import AxisPlan
 
 __all__ = ["Smc100"]
@@ -43,6 +44,7 @@ class Smc100:
     def __init__(self, link: Link, answer_s: float = 1.0) -> None:
         self._answer_s = answer_s
         self._link: MessageLink[bytes] = MessageLink(link, LineDecoder(limit=LIMIT))
+        self.references = References()
 
     def open(self, deadline: Deadline) -> None:
         """Open the connection; pending answers are discarded at the first query."""
@@ -84,8 +86,8 @@ class Smc100:
         if decode_status(self._query(plan, "TS", deadline)).phase is not Phase.NOT_REFERENCED:
             self._send(plan, "ST", "", deadline)
 
-    def state(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
-        """Return the state of the axis."""
+    def state(self, plan: AxisPlan, deadline: Deadline) -> Reported:
+        """Return what it reports of the axis."""
         status = decode_status(self._query(plan, "TS", deadline))
         answer = self._query(plan, "TP", deadline)
         try:
@@ -97,7 +99,7 @@ class Smc100:
             faults = (*faults, "the motor is disabled")
         moving = phase in (Phase.HOMING, Phase.MOVING, Phase.JOGGING)
         homed = phase in (Phase.READY, Phase.MOVING, Phase.DISABLED, Phase.JOGGING)
-        return AxisState(position, moving, homed, faults)
+        return Reported(position, moving, homed, faults)
 
     def _send(self, plan: AxisPlan, name: str, value: str, deadline: Deadline) -> None:
         """Send a command and query whether it was accepted."""

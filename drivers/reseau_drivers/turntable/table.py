@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol, Self
 
@@ -20,6 +20,9 @@ from reseau.instruments import (
     Status,
     quantity,
 )
+
+from .reference import References, Reported
+from .zones import EVERYWHERE, NOWHERE, KeepOut, Span
 
 __all__ = ["Axis", "AxisPlan", "Controller", "Table", "TableSettings"]
 
@@ -118,6 +121,9 @@ class AxisPlan:
 class Controller(Protocol):
     """Motion controller; positions are in the unit of the :class:`AxisPlan`."""
 
+    references: References
+    """What is known of the references of its axes; it notes there what voids them."""
+
     @property
     def checked(self) -> bool:
         """Whether answers carry a checksum; otherwise a state at rest counts once a second one agrees."""
@@ -143,8 +149,8 @@ class Controller(Protocol):
     def halt(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Stop the axis."""
 
-    def state(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
-        """Return the state of the axis."""
+    def state(self, plan: AxisPlan, deadline: Deadline) -> Reported:
+        """Return what it reports of the axis."""
 
 
 @dataclass(frozen=True)
@@ -265,6 +271,8 @@ class Table(Device[TableSettings]):
         Time limit of an exchange that does not specify one (s); a move has one minute.
     limits : mapping, optional
         Limits of settings.
+    keep_out : sequence of mapping
+        Zones in which axes must not be together: the lowest and highest position of each.
 
     Examples
     --------
@@ -286,14 +294,17 @@ class Table(Device[TableSettings]):
         *,
         seconds: float = 5.0,
         limits: Limits | None = None,
+        keep_out: Sequence[Mapping[str, Sequence[float]]] = (),
     ) -> None:
         super().__init__(name, settings or TableSettings(), seconds=seconds, limits=limits)
+        self._zones = KeepOut(keep_out, plans)
         self._controller = controller
         self.plans = {key: replace(plan, name=key) for key, plan in plans.items()}
         self.axes: dict[str, Axis] = {key: Axis(self, key) for key in plans}
 
     def _open(self, deadline: Deadline) -> None:
         self._controller.open(deadline)
+        self._controller.references.connected()
 
     def _disconnect(self) -> None:
         self._controller.close()
@@ -324,7 +335,9 @@ class Table(Device[TableSettings]):
             state = self.state(key, deadline.left_or_minimum)
             found[key] = "; ".join(
                 (
-                    f"{state.position:g} {self.plans[key].unit}" if state.homed else "not homed",
+                    f"{state.position:g} {self.plans[key].unit}"
+                    if state.homed
+                    else f"not homed: {state.reference}",
                     *state.faults,
                 )
             )
@@ -346,11 +359,11 @@ class Table(Device[TableSettings]):
 
     def _confirmed(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
         """The state of an axis; without checksums a second answer confirms one at rest: bits may turn."""
-        state = self._controller.state(plan, deadline)
+        state = self._judged(plan, deadline)
         if self._controller.checked or state.moving or state.faults:
             return state
         for _ in range(_CONFIRMATIONS):
-            before, state = state, self._controller.state(plan, deadline)
+            before, state = state, self._judged(plan, deadline)
             if state.moving or state.faults:
                 return state
             near = abs(state.position - before.position) <= plan.tolerance
@@ -360,11 +373,25 @@ class Table(Device[TableSettings]):
             f"reports positions of {plan.name} that contradict each other", do="check the cable"
         )
 
+    def _judged(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
+        """What the controller reports, with what is known of the reference."""
+        found = self._controller.state(plan, deadline)
+        homed, how = self._controller.references.judged(plan.name, found.referenced)
+        return AxisState(found.position, found.moving, homed, found.faults, how)
+
+    def _stands(self, axis: str) -> Span | None:
+        """Where an axis stands; None if it moves, or that is not known."""
+        state, tolerance = self.state(axis), self.plans[axis].tolerance
+        known = state.homed and not state.moving
+        return (state.position - tolerance, state.position + tolerance) if known else None
+
     def home(self, axis: str, seconds: float | None = None) -> AxisState:
         """Find the reference of an axis; required before any movement.
 
         Raises
         ------
+        SettingError
+            If the axis can enter a zone to be kept out of, with others that have a reference.
         StateError
             If the axis stalled, reached a limit switch, or was stopped.
         DeadlineError
@@ -373,12 +400,17 @@ class Table(Device[TableSettings]):
         command, plan = f"home {axis}", self._plan(axis)
         self._begin(command)
         deadline = Deadline(self.MOVE_S if seconds is None else seconds)
-        with self._exchange(command, deadline.left) as time:
-            self._require_unstopped(command)
-            self._controller.begin_home(plan, time)
-        state = self._wait_until_stopped(axis, plan, deadline, command)
+        with self._zones.crossed(axis, EVERYWHERE, lambda each: self._stands(each) or NOWHERE):
+            with self._exchange(command, deadline.left) as time:
+                self._require_unstopped(command)
+                self._controller.references.searching(axis)
+                self._controller.begin_home(plan, time)
+            self._wait_until_stopped(axis, plan, deadline, command)
+        self._controller.references.found(axis)
+        state = self._retrying(lambda: self.state(axis, max(0.05, deadline.at_most(self._seconds))))()
         if not state.homed:
-            raise StateError("did not find its reference", where=self.name, command=command)
+            why = f"did not find its reference: {state.reference}"
+            raise StateError(why, where=self.name, command=command)
         with self._exchange(command, max(_POLL_S, deadline.at_most(self._seconds))) as time:
             # Some controllers accept a speed only after homing.
             self._controller.set_speed(plan, self.settings.speed, time)
@@ -399,7 +431,8 @@ class Table(Device[TableSettings]):
         Raises
         ------
         SettingError
-            If the position is outside the soft limits; nothing moves then.
+            If the position is outside the soft limits, or the way to it enters a zone to be kept out of;
+            nothing moves then.
         StateError
             If the axis is not homed, stalled, reached a limit switch, was stopped, or did not arrive at the
             target.
@@ -412,17 +445,20 @@ class Table(Device[TableSettings]):
         deadline = Deadline(self.MOVE_S if seconds is None else seconds)
         state = self.state(axis, deadline.at_most(self._seconds))
         if not state.homed:
-            raise StateError("is not homed", where=self.name, command=command, do=f"home {axis} first")
+            why = f"is not homed: {state.reference}"
+            raise StateError(why, where=self.name, command=command, do=f"home {axis} first")
         before = (
             [position - plan.backlash] if plan.backlash and state.position > position - plan.backlash else []
         )
-        for target in (*before, position):
-            with self._exchange(command, deadline.at_most(self._seconds)) as time:
-                self._require_unstopped(command)
-                self._controller.begin_move(plan, target, time)
-            state = self._wait_until_stopped(axis, plan, deadline, command)
+        with self._zones.crossed(axis, (state.position, *before, position), self._stands):
+            for target in (*before, position):
+                with self._exchange(command, deadline.at_most(self._seconds)) as time:
+                    self._require_unstopped(command)
+                    self._controller.begin_move(plan, target, time)
+                state = self._wait_until_stopped(axis, plan, deadline, command)
         if not state.homed:
-            raise StateError("lost its reference", where=self.name, command=command, do=f"home {axis} again")
+            why = f"lost its reference: {state.reference}"
+            raise StateError(why, where=self.name, command=command, do=f"home {axis} again")
         if abs(state.position - position) > plan.tolerance:
             raise StateError(f"stopped at {state.position:g} {plan.unit}", where=self.name, command=command)
         return state

@@ -8,17 +8,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from reseau.core.errors import ProtocolError, RefusedError, StateError
-from reseau.instruments import AxisState, Deadline, Identity
+from reseau.instruments import Deadline, Identity
 
-from ..codecs.zaber import FAULTS, Command, Message, MessageDecoder, Reply, encode
+from ..codecs.zaber import FAULTS, UNREFERENCED, UNRELIABLE, Command, Message, MessageDecoder, Reply, encode
 from ..link import Link, MessageLink
+from .reference import References, Reported
 from .table import AxisPlan
 
 __all__ = ["Zaber"]
 
 _SPEED = 1.6384
 """Factor from steps per second to the setting ``maxspeed``."""
-_UNREFERENCED = ("WR", "WH")
 
 
 class Zaber:
@@ -43,6 +43,7 @@ class Zaber:
         self._answer_s = answer_s
         self._link: MessageLink[Message] = MessageLink(link, MessageDecoder())
         self._id = 0
+        self.references = References()
 
     def open(self, deadline: Deadline) -> None:
         """Open the connection."""
@@ -81,8 +82,8 @@ class Zaber:
         """Stop the axis."""
         self._query(plan.device, plan.axis, "stop", deadline)
 
-    def state(self, plan: AxisPlan, deadline: Deadline) -> AxisState:
-        """Return the state of the axis."""
+    def state(self, plan: AxisPlan, deadline: Deadline) -> Reported:
+        """Return what it reports of the axis; unknown flags of the kinds F and W count as faults."""
         reply = self._query(plan.device, plan.axis, "warnings", deadline)
         count, *flags = reply.data.split()
         if not count.isdigit() or int(count) != len(flags):
@@ -93,9 +94,16 @@ class Zaber:
             steps = float(position)
         except ValueError:
             raise ProtocolError(f"{position!r} is not a position") from None
-        faults = tuple(FAULTS[flag] for flag in flags if flag in FAULTS)
-        homed = not any(flag in _UNREFERENCED for flag in flags)
-        return AxisState(steps / plan.per_unit, reply.busy, homed, faults)
+        found = {
+            flag: FAULTS.get(flag, f"it reports {flag}, which is not known")
+            for flag in flags
+            if flag[0] in "FW" and flag not in UNREFERENCED
+        }
+        for flag, what in found.items():
+            if flag in UNRELIABLE or flag not in FAULTS:
+                self.references.void(what, plan.name)
+        referenced = not any(flag in UNREFERENCED for flag in flags)
+        return Reported(steps / plan.per_unit, reply.busy, referenced, tuple(found.values()))
 
     def _query(self, device: int, axis: int, words: str, deadline: Deadline) -> Reply:
         """Send a command and wait for its reply, which repeats its number."""

@@ -71,7 +71,7 @@ class GrblController(GcodeController):
     def _power_on(self) -> None:
         self._state = "Alarm" if self.settings["$22"] == "1" else "Idle"
         self._homing = self._held = False
-        self._relative, self._feed = False, 0.0
+        self._relative, self._feed, self._tool = False, 0.0, 0
         self._forget()
         self._line.clear()
 
@@ -166,6 +166,7 @@ class GrblController(GcodeController):
         self._stand()
         self._held = self._homing = False
         self._waiting.clear()
+        self._tool = 0
         if self._state == "Door":
             self._state = "Idle"
         reports, self._unasked = b"".join(self._unasked), []
@@ -219,7 +220,8 @@ class GrblController(GcodeController):
         idle = not self._moves() and not self._held
         if text == "$G":
             mode = "G91" if self._relative else "G90"
-            return 0, f"[GC:G0 G54 G17 G21 {mode} G94 M5 M9 T0 F{60 * self._feed:.0f} S0]\r\n".encode()
+            words = f"G0 G54 G17 G21 {mode} G94 M5 M9 T{self._tool} F{60 * self._feed:.0f} S0"
+            return 0, f"[GC:{words}]\r\n".encode()
         if text == "$X":
             if self._state == "Alarm":
                 self._state = "Idle"
@@ -248,6 +250,7 @@ class GrblController(GcodeController):
     def _motion(self, numbers: list[float], words: dict[str, float]) -> int:
         if 90.0 in numbers or 91.0 in numbers:
             self._relative = 91.0 in numbers
+        self._tool = int(words.get("T", self._tool))
         if "F" in words:
             if words["F"] <= 0:
                 return 22

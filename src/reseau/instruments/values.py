@@ -184,17 +184,20 @@ class AxisState:
         Whether the axis has found its reference; otherwise the position is meaningless.
     faults : tuple of str
         Reported faults: stalled, limit switch reached, driver off.
+    reference : str
+        How the reference is known, or why there is none.
 
     Examples
     --------
     >>> AxisState(30.0, moving=False, homed=True)
-    AxisState(position=30.0, moving=False, homed=True, faults=())
+    AxisState(position=30.0, moving=False, homed=True, faults=(), reference='')
     """
 
     position: float
     moving: bool
     homed: bool
     faults: tuple[str, ...] = ()
+    reference: str = ""
 
 
 @dataclass(frozen=True)
