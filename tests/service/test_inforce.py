@@ -275,6 +275,33 @@ def test_a_configuration_is_found_by_the_parts_of_a_frame(archive: Archive) -> N
         known.applied("left", datetime(2026, 3, 2))
 
 
+def test_a_key_names_its_calibration_whatever_others_are_called(archive: Archive) -> None:
+    known, first = started(archive)
+    second = known.decide("left", camera(c=8.001), RULES, since=day(7))
+    with pytest.raises(UsageError, match="form of a key"):
+        known.rename("left", first, second.key)
+    # As earlier versions allowed it.
+    archive.journal("calibrations/left").add("name", {"key": first, "name": second.key, "by": "Ada"})
+    assert known.decision("left", second.key).key == second.key
+    known.rename("left", first, second.key[:4])
+    with pytest.raises(UsageError, match="names 2 decisions"):
+        known.decision("left", second.key[:4])
+
+
+def test_a_session_is_the_origin_only_of_calibrations_among_its_results(archive: Archive) -> None:
+    known, first = started(archive)
+    session = archive.begin("monday", "frames", {"count": 1})
+    new = camera(c=8.001)
+    with pytest.raises(UsageError, match="does not have this calibration"):
+        known.decide("left", new, RULES, since=day(7), session="monday")
+    session.keep("calibration.json", new.to_json())
+    with pytest.raises(UsageError, match="does not have this calibration"):
+        known.decide("left", camera(c=8.002), RULES, since=day(7), session="monday")
+    made = known.decide("left", new, RULES, since=day(7), session="monday", comment="session tuesday")
+    assert (made.session, made.comment) == ("monday", "session tuesday")
+    assert known.decision("left", first).session is None
+
+
 def test_a_drift_of_one_parameter_is_signalled_and_named(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     with Archive.open(tmp_path / "archive", create=True) as archive:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import getpass
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -44,6 +45,9 @@ from .rules import AcceptanceRules, Judgement, Outcome, judge
 __all__ = ["Applied", "Configurations", "Decision", "Drift", "a_time", "key_of"]
 
 _PREFIX = "calibrations/"
+_KEY_LENGTH = 12
+_KEY = re.compile(rf"[0-9a-f]{{{_KEY_LENGTH}}}")
+"""The form of keys, which no name has."""
 _ACCEPTED = ("accepted", "accepted with warning")
 
 
@@ -73,6 +77,8 @@ class Decision:
         Later comments: by whom, and text.
     name : str
         The name that people gave it; empty if nobody did.
+    session : str or None
+        Session of the archive that has this calibration among its results; None if none was named.
 
     Examples
     --------
@@ -92,6 +98,7 @@ class Decision:
     review: str = ""
     comments: tuple[tuple[str, str], ...] = ()
     name: str = ""
+    session: str | None = None
 
 
 @dataclass(frozen=True)
@@ -237,6 +244,7 @@ class Configurations:
         since: datetime | None = None,
         by: str = "",
         comment: str = "",
+        session: str | None = None,
     ) -> Decision:
         """Judge a calibration by the rules, and put it in force if they accept it.
 
@@ -252,12 +260,14 @@ class Configurations:
             From when on it applies; by default the time of its session, or now.
         by, comment : str
             By whom or what (default: the user), and a comment.
+        session : str, optional
+            Session from which the calibration is, which must have it among its results.
 
         Raises
         ------
         UsageError
-            If the configuration is unknown, the rules changed without a new version, or the calibration is of
-            another instrument than the one in force.
+            If the configuration is unknown, the session does not have the calibration, the rules changed
+            without a new version, or the calibration is of another instrument than the one in force.
         """
         entries = self._entries(name)
         key = key_of(calibration)
@@ -275,9 +285,22 @@ class Configurations:
             "comment": comment,
             "judgement": judged.to_dict(),
             "compared_with": None if current is None else current.key,
+            "origin": None if session is None else self._origin(session, key),
         }
         self._journal(name).append(key, "decision", document)
         return self.decision(name, key)
+
+    def _origin(self, session: str, key: str) -> dict[str, str]:
+        """The session from which a calibration is, and the SHA-256 of the result that is its proof."""
+        from ..sessions import CALIBRATION
+
+        of = self._archive.session(session)
+        for each in of.results():
+            if each.name == CALIBRATION:
+                found = parse_calibration(of.content(each).decode("utf-8"), where=f"{session}: {each.name}")
+                if key_of(found) == key:
+                    return {"session": session, "sha256": each.sha256}
+        raise UsageError("does not have this calibration among its results", where=f"session {session}")
 
     def review(
         self, name: str, key: str, outcome: Literal["accepted", "rejected"], *, by: str = "", comment: str
@@ -321,6 +344,9 @@ class Configurations:
         decision, given = self.decision(name, key), given.strip()
         if not given:
             raise UsageError("is empty", where="name of the calibration")
+        if _KEY.fullmatch(given):
+            do = "give a name that no key can be"
+            raise UsageError("has the form of a key", where=f"name {given!r}", do=do)
         if any(each.name == given and each.key != decision.key for each in self.history(name)):
             raise UsageError("is another calibration", where=f"{name}: {given}", do="give another name")
         document = {"key": decision.key, "name": given, "by": by or _user()}
@@ -361,7 +387,7 @@ class Configurations:
         return sorted(found)
 
     def decision(self, name: str, key: str) -> Decision:
-        """Return a decision by its name, or by the start of its key.
+        """Return a decision by its key, by its name, or by the start of its key.
 
         Raises
         ------
@@ -369,8 +395,8 @@ class Configurations:
             If there is none, or several.
         """
         history = self.history(name) if key else []
-        found = [each for each in history if each.name == key]
-        found = found or [each for each in history if each.key.startswith(key)]
+        found = [each for each in history if each.key == key]
+        found = found or [each for each in history if key in (each.name, each.key[: len(key)])]
         if len(found) != 1:
             raise UsageError(f"names {len(found)} decisions", where=f"{name}: {key!r}", do="see its history")
         return found[0]
@@ -396,7 +422,7 @@ class Configurations:
                     each.key, judged.outcome if review is None else cast(Outcome, review["outcome"]),
                     _since(each), each.at, d["by"], d["comment"], judged, d["compared_with"],
                     "" if review is None else review["by"], "" if review is None else review["comment"],
-                    tuple(comments), names.get(each.key, ""),
+                    tuple(comments), names.get(each.key, ""), (d.get("origin") or {}).get("session"),
                 )
             )  # fmt: skip
         return found
@@ -568,7 +594,7 @@ def key_of(calibration: Calibration) -> str:
     12
     """
     text = calibration.model_copy(update={"times": {}}).to_json()
-    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:12]
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:_KEY_LENGTH]
 
 
 def a_time(given: datetime) -> datetime:

@@ -302,13 +302,20 @@ def test_a_session_is_judged_by_rules_through_the_api(one: Served) -> None:
         "needs review",
         "monday",
     )
+    # A comment is no proof of a session; the session is named and has the calibration.
+    document = client.get(f"/api/1/configurations/judged/decisions/{made.json()['key']}/calibration.json")
+    forged = document.json()
+    forged["parameters"]["c"]["value"] = 99.0
+    given = {"calibration": forged, "rules": rules, "comment": "session monday"}
+    answer = client.post("/api/1/configurations/judged/decisions", json=given).json()
+    assert (answer["session"], answer["comment"]) == (None, "session monday")
     pairs = [["judged", made.json()["key"]], ["judged", "ffff"]]
     bulk = client.post(
         "/api/1/reviews", json={"decisions": pairs, "outcome": "rejected", "comment": "a test"}
     )
     assert list(bulk.json()["failed"]) == ["judged ffff"]
     history = client.get("/api/1/configurations/judged").json()["history"]
-    assert history[0]["outcome"] == "rejected"
+    assert history[-1]["outcome"] == "rejected"
     wrong = client.post(
         "/api/1/configurations/judged/decisions", json={"session": "monday", "rules": {"a": 1}}
     )
@@ -326,6 +333,10 @@ def test_a_calibration_has_the_name_that_somebody_gives_it(one: Served) -> None:
     named = client.post(f"{LEFT}/decisions/{key}/name", json={"name": "after the new lens"})
     assert named.json()["name"] == "after the new lens"
     assert client.get(f"{LEFT}/decisions/after the new lens").json()["decision"]["key"] == key
+    # Names are no keys, whose calibration is asked for by programs.
+    other = history[4]["key"]
+    as_key = client.post(f"{LEFT}/decisions/{key}/name", json={"name": other})
+    assert (as_key.status_code, as_key.json()["error"]["where"]) == (422, f"name '{other}'")
     taken = {"name": "after the new lens"}
     assert client.post(f"{LEFT}/decisions/{history[4]['key']}/name", json=taken).status_code == 422
     assert "after the new lens" in client.get("/calibrations/left").text

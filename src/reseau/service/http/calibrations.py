@@ -81,7 +81,7 @@ class FindingRow(Answer):
 
 
 class DecisionRow(Answer):
-    """A decision on a calibration; `session` is where it comes from, if the archive knows that.
+    """A decision on a calibration; `session` is the one of the archive that has it among its results.
 
     Without a name that somebody gave it, `name` is that of its session, or says when it began.
     """
@@ -289,27 +289,15 @@ def _decision(known: Configurations, name: str, key: str) -> Decision:
         raise NotFound(error.what, where=error.where) from None
 
 
-def _session_of(service: Service, decision: Decision) -> str | None:
-    """Session of a calibration, as the comment of its decision says."""
-    if not decision.comment.startswith("session "):
-        return None
-    name = decision.comment.removeprefix("session ").partition("; ")[0]
-    try:
-        return the_session(service, name).name
-    except ReseauError:
-        return None
-
-
-def _row(service: Service, decision: Decision) -> DecisionRow:
-    session = _session_of(service, decision)
+def _row(decision: Decision) -> DecisionRow:
     return DecisionRow(
-        key=decision.key, name=decision.name or session or f"{decision.since:%-d %B %Y %H:%M} UTC",
+        key=decision.key, name=decision.name or decision.session or f"{decision.since:%-d %B %Y %H:%M} UTC",
         outcome=decision.outcome, since=decision.since.isoformat(),
         at=decision.at.isoformat(), by=decision.by, comment=decision.comment,
         compared_with=decision.compared_with,
         findings=[FindingRow(rule=f.rule, level=f.level, text=f.text) for f in decision.judgement.findings],
         reviewed_by=decision.reviewed_by, review=decision.review, comments=list(decision.comments),
-        session=session,
+        session=decision.session,
     )  # fmt: skip
 
 
@@ -317,7 +305,7 @@ def _in_force(service: Service, known: Configurations, name: str, now: datetime)
     applied = known.applied(name, now)
     if applied is None:
         return None
-    row = _row(service, known.decision(name, applied.key))
+    row = _row(known.decision(name, applied.key))
     return InForce(key=applied.key, name=row.name, since=applied.since.isoformat(), why=applied.why)
 
 
@@ -347,7 +335,7 @@ def configuration_detail(service: Service, name: str) -> ConfigurationDetail:
     return ConfigurationDetail(
         name=name, parts=known.parts(name), in_force=_in_force(service, known, name, service.archive.clock()),
         decisions=len(history), to_review=sum(d.outcome == "needs review" for d in history),
-        history=[_row(service, each) for each in reversed(history)],
+        history=[_row(each) for each in reversed(history)],
         events=[EventRow(at=at.isoformat(), what=what) for at, what in known.events(name)],
     )  # fmt: skip
 
@@ -380,7 +368,7 @@ def calibration_detail(service: Service, name: str, key: str) -> CalibrationDeta
     pairs.sort(key=lambda pair: -abs(pair[2]))
     return CalibrationDetail(
         verdict=verdict_of(found), assessment=found.assessment,
-        configuration=name, decision=_row(service, decision), kind=found.kind, name=found.name,
+        configuration=name, decision=_row(decision), kind=found.kind, name=found.name,
         sigma0=found.sigma0, redundancy=found.redundancy,
         parameters=[
             ParameterRow(
@@ -422,7 +410,7 @@ def chosen(service: Service, text: str) -> Chosen:
     known = _the(service, name)
     decision = _decision(known, name, key)
     page = f"/calibrations/{quote(name, safe='')}/{decision.key}"
-    title = f"{name}: {_row(service, decision).name}"
+    title = f"{name}: {_row(decision).name}"
     return Chosen(decision.key, title, page, known.calibration(name, decision.key))
 
 
@@ -433,7 +421,7 @@ def choices(service: Service) -> list[tuple[str, str]]:
         found, judged = list[tuple[str, str]](), set[str | None]()
         known = _known(service)
         for name in known.names():
-            rows = [_row(service, each) for each in reversed(known.history(name))]
+            rows = [_row(each) for each in reversed(known.history(name))]
             found += [(f"{name}/{each.key}", f"{name}: {each.name}") for each in rows]
             judged |= {each.session for each in rows}
         others = [each for each in calibrated(service) if each not in judged]
@@ -511,20 +499,21 @@ def decide(name: Name, given: NewDecision, who: Administering, service: Here) ->
     if (given.session is None) == (given.calibration is None):
         raise UsageError("give one of them", where="session, calibration")
     rules = AcceptanceRules.from_content(dict(given.rules), where="rules")
-    since, comment = given.since, given.comment
+    since = given.since
     if given.session is not None:
         session = the_session(service, given.session)
         calibration, since = kinds.calibration_of(session), since or session.begun
-        comment = f"session {given.session}" + (f"; {comment}" if comment else "")
     else:
         assert given.calibration is not None
         calibration = Calibration.from_content(dict(given.calibration), where="calibration")
     facts = {"session": given.session, "rules": rules.version, "calibration": calibration.name}
     with service.audited(who, "decide", name, facts):
-        made = known.decide(name, calibration, rules, since=since, by=who.name, comment=comment)
+        made = known.decide(
+            name, calibration, rules, since=since, by=who.name, comment=given.comment, session=given.session
+        )
         if given.name.strip():
             made = known.rename(name, made.key, given.name, by=who.name)
-    return _row(service, made)
+    return _row(made)
 
 
 @router.get("/configurations/{name}/decisions/{key}")
@@ -609,7 +598,7 @@ def _audited(
     full = _decision(known, name, key).key
     with service.audited(who, action, f"{name} {full}", facts):
         do(known, full)
-    return _row(service, known.decision(name, full))
+    return _row(known.decision(name, full))
 
 
 @router.post("/configurations/{name}/decisions/{key}/review")
