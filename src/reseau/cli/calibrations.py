@@ -222,6 +222,9 @@ def _row(made: Decision) -> dict[str, Any]:
         "at": made.at.isoformat(),
         "judgement": made.judgement.to_dict(),
         "comments": [list(each) for each in made.comments],
+        "earlier": [
+            {"by": by, "at": at.isoformat(), "judgement": judged.to_dict()} for by, at, judged in made.earlier
+        ],
     }
 
 
@@ -236,6 +239,9 @@ def say_decision(made: Decision, as_json: bool) -> None:
     say(f"{made.key}  {made.since:%Y-%m-%d %H:%M}Z  {made.outcome}, {by}\n")
     for each in made.judgement.findings:
         say(f"  {each.level:<8} {each.text}\n")
+    for who, at, judged in made.earlier:
+        rules = judged.rules["version"]
+        say(f"  {at:%Y-%m-%d %H:%M}Z {judged.outcome}, by {who}, rules {rules}\n")
     if made.session:
         say(f"  of the session {made.session}\n")
     if made.reviewed_by:

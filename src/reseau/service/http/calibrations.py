@@ -80,6 +80,15 @@ class FindingRow(Answer):
     text: str
 
 
+class EarlierRow(Answer):
+    """A judgement by an earlier version of the rules."""
+
+    at: str
+    by: str
+    outcome: str
+    rules: int
+
+
 class DecisionRow(Answer):
     """A decision on a calibration; `session` is the one of the archive that has it among its results.
 
@@ -99,6 +108,7 @@ class DecisionRow(Answer):
     review: str
     comments: list[tuple[str, str]]
     session: str | None
+    earlier: list[EarlierRow]
 
 
 class EventRow(Answer):
@@ -298,6 +308,10 @@ def _row(decision: Decision) -> DecisionRow:
         findings=[FindingRow(rule=f.rule, level=f.level, text=f.text) for f in decision.judgement.findings],
         reviewed_by=decision.reviewed_by, review=decision.review, comments=list(decision.comments),
         session=decision.session,
+        earlier=[
+            EarlierRow(at=at.isoformat(), by=by, outcome=judged.outcome, rules=int(str(judged.rules["version"])))
+            for by, at, judged in decision.earlier
+        ],
     )  # fmt: skip
 
 
