@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 import threading
+import time
 import uuid
 import zipfile
 from collections.abc import Callable
@@ -31,7 +32,7 @@ from reseau.archive import (
     verify,
 )
 from reseau.core.data import Frame
-from reseau.core.errors import ArchiveError
+from reseau.core.errors import ArchiveError, UsageError
 
 
 def frame(seed: int = 0, dtype: type = np.uint8) -> Frame:
@@ -114,8 +115,9 @@ def test_a_name_is_unique_and_an_unknown_one_is_refused(opened: Callable[[], Arc
             archive.begin("s", "frames", {})
         with pytest.raises(ArchiveError, match="is not a session"):
             archive.session("t")
-        with pytest.raises(ArchiveError, match="is not a valid name"):
-            archive.begin("../s", "frames", {})
+        for name in ("../s", "a\\b", "", " ", " a", ".a", "a\nb", "a\0b"):
+            with pytest.raises(UsageError, match="is not a valid name"):
+                archive.begin(name, "frames", {})
 
 
 def test_a_session_contains_its_inputs_from_the_beginning(opened: Callable[[], Archive]) -> None:
@@ -154,6 +156,13 @@ def test_verification_finds_changed_missing_and_unindexed_files(tmp_path: Path) 
         assert [line.split(":")[0] for line in found.damaged] == ["s/0/frame", "s/1/frame"]
         assert "SHA-256 differs" in found.damaged[0]
         assert len(found.unknown) == 1
+        # One killed process has left a temporary file; another one is writing.
+        folder = Path(objects.place) / "ab"
+        folder.mkdir(exist_ok=True)
+        for name, age_s in ((".left", 3600.0), (".writing", 0.0)):
+            (folder / name).write_bytes(b"half")
+            os.utime(folder / name, (time.time() - age_s,) * 2)
+        assert verify(archive).temporary == (str(folder / ".left"),)
         with pytest.raises(ArchiveError, match="backup"):
             session.picture(kept[0])
         # Storing the same again mends it.

@@ -123,6 +123,14 @@ def test_a_model_that_a_format_lacks_is_converted_with_its_differences(
     assert difference[inside].max() < 1.1 * done.greatest_px
 
 
+@pytest.mark.parametrize("number", ["-" * 100_000, "[" * 100_000, "1e999"])
+def test_a_file_of_mrcal_that_no_parser_can_take_is_refused(tmp_path: Path, number: str) -> None:
+    path = tmp_path / "c.cameramodel"
+    path.write_text(f"{{'lensmodel': 'LENSMODEL_OPENCV8', 'intrinsics': [], 'imagersize': [{number}, 1]}}")
+    with pytest.raises(FormatError, match="no complete lensmodel"):
+        import_calibration(path)
+
+
 @pytest.mark.parametrize("form", ["opencv", "kalibr", "mrcal", "dbat"])
 def test_a_camera_with_parallel_rays_is_refused_by_the_name_of_the_format(form: str, tmp_path: Path) -> None:
     given = calibration("photo")

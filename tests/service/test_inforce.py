@@ -251,6 +251,36 @@ def test_the_same_calibration_is_judged_once(archive: Archive) -> None:
     assert len(known.history("left")) == 2
 
 
+def test_a_calibration_is_judged_again_by_other_rules_and_its_history_is_kept(archive: Archive) -> None:
+    known, first = started(archive)
+    strict = RULES.model_copy(update={"version": 2, "redundancy": 100_000})
+    loose = RULES.model_copy(update={"version": 3})
+    new = camera(c=8.0001)
+
+    def applied() -> str:
+        found = known.applied("left", day(8))
+        assert found is not None
+        return found.key
+
+    key = known.decide("left", new, RULES, since=day(7)).key
+    assert applied() == key
+    made = known.decide("left", new, strict, since=day(9))
+    assert (made.outcome, made.since, applied()) == ("rejected", day(7), first)
+    made = known.decide("left", new, loose, by="Bob")
+    assert (made.outcome, made.by, made.compared_with, applied()) == ("accepted", "Bob", first, key)
+    assert [(each.outcome, each.rules["version"]) for _, _, each in made.earlier] == [
+        ("accepted", 1), ("rejected", 2),
+    ]  # fmt: skip
+    # What a person decided is decided again where the new rules leave it open.
+    open_rules = RULES.model_copy(update={"version": 4, "image": Limits(warning=1e-3, action=1e-3)})
+    assert known.decide("left", new, open_rules).outcome == "needs review"
+    assert applied() == first
+    assert known.review("left", key, "accepted", by="Ada", comment="sound").reviewed_by == "Ada"
+    assert applied() == key
+    assert known.decide("left", new, loose.model_copy(update={"version": 5})).reviewed_by == ""
+    assert len(known.history("left")) == 2
+
+
 def test_rules_that_changed_need_a_new_version(archive: Archive) -> None:
     known, _ = started(archive)
     changed = RULES.model_copy(update={"redundancy": 20})
@@ -273,6 +303,33 @@ def test_a_configuration_is_found_by_the_parts_of_a_frame(archive: Archive) -> N
         known.define("again", {"camera": "DMK 33", "lens": "8 mm f/8"})
     with pytest.raises(UsageError, match="no time zone"):
         known.applied("left", datetime(2026, 3, 2))
+
+
+def test_a_key_names_its_calibration_whatever_others_are_called(archive: Archive) -> None:
+    known, first = started(archive)
+    second = known.decide("left", camera(c=8.001), RULES, since=day(7))
+    with pytest.raises(UsageError, match="form of a key"):
+        known.rename("left", first, second.key)
+    # As earlier versions allowed it.
+    archive.journal("calibrations/left").add("name", {"key": first, "name": second.key, "by": "Ada"})
+    assert known.decision("left", second.key).key == second.key
+    known.rename("left", first, second.key[:4])
+    with pytest.raises(UsageError, match="names 2 decisions"):
+        known.decision("left", second.key[:4])
+
+
+def test_a_session_is_the_origin_only_of_calibrations_among_its_results(archive: Archive) -> None:
+    known, first = started(archive)
+    session = archive.begin("monday", "frames", {"count": 1})
+    new = camera(c=8.001)
+    with pytest.raises(UsageError, match="does not have this calibration"):
+        known.decide("left", new, RULES, since=day(7), session="monday")
+    session.keep("calibration.json", new.to_json())
+    with pytest.raises(UsageError, match="does not have this calibration"):
+        known.decide("left", camera(c=8.002), RULES, since=day(7), session="monday")
+    made = known.decide("left", new, RULES, since=day(7), session="monday", comment="session tuesday")
+    assert (made.session, made.comment) == ("monday", "session tuesday")
+    assert known.decision("left", first).session is None
 
 
 def test_a_drift_of_one_parameter_is_signalled_and_named(tmp_path: Path) -> None:

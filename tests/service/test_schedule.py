@@ -113,12 +113,71 @@ def test_times_that_a_change_of_the_clock_skips_or_repeats_occur_once() -> None:
         ("FREQ=WEEKLY;COUNT=3", "Mars/Olympus", "'Mars/Olympus': is not a time zone"),
         ("FREQ=WEEKLY;UNTIL=soon", "UTC", "UNTIL: 'SOON' is not a date and time"),
         ("COUNT=3", "UTC", "is no rule of RFC 5545"),
+        ("FREQ=WEEKLY;COUNT=many", "UTC", "is no rule of RFC 5545"),
+        ("FREQ=SECONDLY;COUNT=2;BYSETPOS=1", "UTC", "BYSETPOS needs a frequency of a day or longer"),
+        *(
+            (f"{rule};BYMONTH=2;BYMONTHDAY=30;COUNT=2", "UTC", "no occurrence within ten years")
+            for rule in (
+                "FREQ=SECONDLY",
+                "FREQ=SECONDLY;BYHOUR=3",
+                "FREQ=HOURLY;INTERVAL=5",
+                "FREQ=DAILY",
+                "FREQ=WEEKLY",
+                "FREQ=MONTHLY",
+                "FREQ=YEARLY",
+            )
+        ),
+        # Every 16 s from 08:00:00 on, which never is a second 4 of the first minute after three.
+        ("FREQ=SECONDLY;INTERVAL=16;BYHOUR=3;BYMINUTE=0;BYSECOND=4;COUNT=2", "UTC", "within ten years"),
+        ("FREQ=YEARLY;INTERVAL=11;COUNT=2", "UTC", "no occurrence within ten years after 2026-03-02 08:00"),
         ("FREQ=HOURLY;COUNT=1000000", "UTC", "has more than 100000 occurrences"),
     ],
 )
 def test_unusable_rules_are_refused_in_one_line(rule: str, zone: str, part: str) -> None:
     with pytest.raises(UsageError, match=part):
-        Recurrence(rule, datetime(2026, 3, 2, 8), zone).occurrences()
+        Recurrence(rule, datetime(2026, 3, 2, 8), zone)
+
+
+def test_frequencies_below_a_day_are_expanded_as_by_the_library_that_goes_step_by_step() -> None:
+    from dateutil.rrule import rrulestr
+
+    rng = np.random.default_rng(3)
+    for _ in range(60):
+        parts = [f"FREQ={rng.choice(['HOURLY', 'MINUTELY', 'SECONDLY'])};INTERVAL={rng.integers(1, 40)}"]
+        for name, low, high in (
+            ("BYHOUR", 0, 24),
+            ("BYMINUTE", 0, 60),
+            ("BYSECOND", 0, 60),
+            ("BYMONTH", 1, 13),
+        ):
+            if rng.random() < 0.3:
+                parts.append(f"{name}={','.join(str(k) for k in range(low, high, int(rng.integers(2, 6))))}")
+        if rng.random() < 0.3:
+            parts.append("BYDAY=MO,WE,FR")
+        rule, begun = ";".join(parts) + ";COUNT=30", datetime(2026, 3, 2, 8, 7, 12)
+        try:
+            start = rrulestr(rule, dtstart=begun)[0]
+        except ValueError:  # it has found that the rule has no occurrence
+            continue
+        expected = [each.replace(tzinfo=UTC) for each in rrulestr(rule, dtstart=start)]
+        assert Recurrence(rule, start, "UTC").occurrences() == expected, rule
+
+
+@pytest.mark.parametrize(
+    ("rule", "expected"),
+    [
+        (
+            "FREQ=MINUTELY;INTERVAL=30;BYHOUR=8,9;COUNT=5",
+            ["02 08:00", "02 08:30", "02 09:00", "02 09:30", "03 08:00"],
+        ),
+        ("FREQ=HOURLY;INTERVAL=5;BYMINUTE=0,15;COUNT=4", ["02 08:00", "02 08:15", "02 13:00", "02 13:15"]),
+        ("FREQ=HOURLY;INTERVAL=25;BYDAY=MO,TH;COUNT=3", ["02 08:00", "05 11:00", "09 15:00"]),
+        ("FREQ=YEARLY;INTERVAL=20;UNTIL=20300101T000000Z", ["02 08:00"]),
+    ],
+)
+def test_rules_below_a_day_and_with_rare_occurrences_are_expanded(rule: str, expected: list[str]) -> None:
+    found = Recurrence(rule, datetime(2026, 3, 2, 8), "UTC").occurrences()
+    assert [f"{each:%d %H:%M}" for each in found] == expected
 
 
 WEEKLY = Schedule(name="weekly", recalibration="left", configuration="left", rule="FREQ=WEEKLY;COUNT=52",

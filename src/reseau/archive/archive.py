@@ -11,7 +11,7 @@ from typing import Any, Self
 import sqlalchemy as sa
 from sqlalchemy.engine import Engine
 
-from ..core.errors import ArchiveError
+from ..core.errors import ArchiveError, UsageError
 from ..core.version import __version__
 from . import schema
 from .journal import Journal, journals
@@ -137,11 +137,14 @@ class Archive:
 
         Raises
         ------
+        UsageError
+            If the name cannot be one.
         ArchiveError
             If there is a session of this name, or it cannot be stored.
         """
-        if not name or any(c in name for c in "/\\\0") or name.startswith("."):
-            raise ArchiveError("is not a valid name of a session", where=repr(name), do="leave out slashes")
+        if not name.isprintable() or name != name.strip() or name[:1] in ("", ".") or set(name) & set("/\\"):
+            do = "use printable characters without slashes, not a space or a dot first"
+            raise UsageError("is not a valid name of a session", where=repr(name), do=do)
         files = {}
         for role, text in (inputs or {}).items():
             data, suffix = text.encode("utf-8"), Path(role).suffix

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
+import time
 import uuid
 from collections.abc import Iterator
 from contextlib import suppress
@@ -16,6 +17,8 @@ from ..core.provenance import sha256_of
 
 __all__ = ["LocalObjects", "Objects", "RemoteObjects", "objects_at"]
 
+_LONGEST_WRITE_S = 600.0
+"""Time after which a temporary file is no longer that of a process that is writing it."""
 _MOST_CHECKED = 10_000
 """Files of which is remembered that they were checked."""
 
@@ -47,6 +50,9 @@ class Objects(Protocol):
 
     def names(self) -> Iterator[tuple[str, str]]:
         """Return SHA-256 and suffix of all files."""
+
+    def left_over(self) -> Iterator[str]:
+        """Return the paths of temporary files of killed processes."""
 
     def write_record(self, key: str, data: bytes) -> None:
         """Write a record durably, in place of an earlier one; its name is a SHA-256."""
@@ -210,6 +216,13 @@ class LocalObjects:
                 if len(path.stem) == 64 and not path.name.startswith("."):
                     yield path.stem, path.suffix
 
+    def left_over(self) -> Iterator[str]:
+        """Return the paths of temporary files of killed processes: nobody has written to them for long."""
+        for path in sorted(self.folder.glob("*/.*")):
+            with suppress(FileNotFoundError):  # it has got its name meanwhile
+                if time.time() - path.stat().st_mtime > _LONGEST_WRITE_S:
+                    yield str(path)
+
 
 class RemoteObjects:
     """An object store supported by fsspec: ``s3://bucket/folder``, ``memory://folder`` and others.
@@ -324,6 +337,10 @@ class RemoteObjects:
             stem, dot, suffix = path.rpartition("/")[2].partition(".")
             if len(stem) == 64:
                 yield stem, dot + suffix
+
+    def left_over(self) -> Iterator[str]:
+        """Return nothing: object stores write atomically."""
+        return iter(())
 
     def _asked(self, question: Any) -> Any:
         try:

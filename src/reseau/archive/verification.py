@@ -26,6 +26,8 @@ class Verified:
     unknown : tuple of str
         Files that are not in the index: their process was killed after writing them. They are harmless;
         resuming the session adds them.
+    temporary : tuple of str
+        Files that a killed process left half written, by their path. They can be deleted.
 
     Examples
     --------
@@ -37,6 +39,7 @@ class Verified:
     size: int
     damaged: tuple[str, ...]
     unknown: tuple[str, ...]
+    temporary: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
         return not self.damaged
@@ -74,4 +77,4 @@ def verify(archive: Archive, step: Callable[[str], None] = lambda name: None) ->
     unknown = tuple(
         f"{sha256}{suffix}" for sha256, suffix in archive.objects.names() if (sha256, suffix) not in known
     )
-    return Verified(len(known), total, tuple(damaged), unknown)
+    return Verified(len(known), total, tuple(damaged), unknown, tuple(archive.objects.left_over()))

@@ -83,6 +83,9 @@ def verify(place: Place, as_json: v.AsJson = False) -> None:
         say("".join(f"  {line}\n" for line in result.damaged))
         if result.unknown:
             say(f"{len(result.unknown)} unindexed files left by killed processes (harmless)\n")
+        if result.temporary:
+            say(f"{len(result.temporary)} temporary files left by killed processes, which can be deleted:\n")
+            say("".join(f"  {line}\n" for line in result.temporary))
     raise typer.Exit(0 if result else 1)
 
 

@@ -84,6 +84,9 @@ def decide(
     rules: v.Rules,
     place: Place,
     since: Annotated[v.Since | None, "Default: the time of its session, or now."] = None,
+    session: Annotated[
+        str | None, Option("Session of the archive from which it is, which is checked.", value="NAME")
+    ] = None,
     by: v.By = "",
     comment: v.Comment = "",
     as_json: v.AsJson = False,
@@ -94,7 +97,9 @@ def decide(
 
     new, judged_by = read_calibration(calibration), AcceptanceRules.read(rules)
     with _opened(place) as found:
-        made = found.decide(name, new, judged_by, since=time_of(since, "--since"), by=by, comment=comment)
+        made = found.decide(
+            name, new, judged_by, since=time_of(since, "--since"), by=by, comment=comment, session=session
+        )
     say_decision(made, as_json)
     raise typer.Exit(0 if made.outcome.startswith("accepted") else 1)
 
@@ -218,6 +223,9 @@ def _row(made: Decision) -> dict[str, Any]:
         "at": made.at.isoformat(),
         "judgement": made.judgement.to_dict(),
         "comments": [list(each) for each in made.comments],
+        "earlier": [
+            {"by": by, "at": at.isoformat(), "judgement": judged.to_dict()} for by, at, judged in made.earlier
+        ],
     }
 
 
@@ -232,6 +240,11 @@ def say_decision(made: Decision, as_json: bool) -> None:
     say(f"{made.key}  {made.since:%Y-%m-%d %H:%M}Z  {made.outcome}, {by}\n")
     for each in made.judgement.findings:
         say(f"  {each.level:<8} {each.text}\n")
+    for who, at, judged in made.earlier:
+        rules = judged.rules["version"]
+        say(f"  {at:%Y-%m-%d %H:%M}Z {judged.outcome}, by {who}, rules {rules}\n")
+    if made.session:
+        say(f"  of the session {made.session}\n")
     if made.reviewed_by:
         say(f"  reviewed by {made.reviewed_by}: {made.review}\n")
     for who, text in (*([(made.by, made.comment)] if made.comment else []), *made.comments):

@@ -201,6 +201,14 @@ def _asked_password() -> str:
     return first
 
 
+def _asked_code() -> str:
+    """A code of an authenticator, from the console or a pipe."""
+    if not sys.stdin.isatty():
+        return sys.stdin.readline()
+    code: str = typer.prompt("Code that the authenticator shows")
+    return code
+
+
 @user_app.command("add")
 def add_user(
     name: Annotated[str, typer.Argument(help="Name of the user.")],
@@ -252,6 +260,7 @@ def change_user(
             found.set_password(name, _asked_password())
         if one_time:
             say(f"{found.require_code(name)}\n")
+            found.confirm_code(name, _asked_code())
         elif one_time is False:
             found.waive_code(name)
 
@@ -261,7 +270,7 @@ def remove_user(
     name: Annotated[str, typer.Argument(help="Name of the user.")],
     known: Registered,
 ) -> None:
-    """Remove a user; their logins end."""
+    """Remove a user; their logins and tokens end."""
     with known.open() as found:
         found.remove_user(name)
 
@@ -271,13 +280,16 @@ def create_token(
     name: Annotated[str, typer.Argument(help="Name of the token.")],
     known: Registered,
     scope: v.Scope = "read",
+    user: Annotated[
+        str, typer.Option(help="Whose it is: it may do at most what they may, and ends with them.")
+    ] = "local",
     days: Annotated[int, typer.Option(min=1, max=731, help="How long it lasts.")] = 90,
 ) -> None:
     """Create a token for a program, and print it; it is not kept."""
     from datetime import timedelta
 
     with known.open() as found:
-        say(found.create_token(name, scope, timedelta(days=days), "console") + "\n")
+        say(found.create_token(name, scope, timedelta(days=days), user) + "\n")
 
 
 @token_app.command("list")
@@ -286,7 +298,7 @@ def list_tokens(known: Registered) -> None:
     with known.open() as found:
         for each in found.tokens():
             ended = f"revoked {each.revoked:%Y-%m-%d}" if each.revoked else f"until {each.expires:%Y-%m-%d}"
-            say(f"{each.name}: {each.scope}, by {each.made_by}, {ended}\n")
+            say(f"{each.name}: {each.scope}, of {each.user}, {ended}\n")
 
 
 @token_app.command("revoke")

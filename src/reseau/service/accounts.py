@@ -1,8 +1,10 @@
 """Users, tokens and logins of the service, in a database of their own.
 
 Passwords are kept as argon2id, tokens and cookies as SHA-256: both are random numbers of 256 bits, which need
-no slow hash. One-time passwords are those of RFC 6238; each is accepted once. What a login may do is its
-scope: `read`, `operate` (move, acquire, upload) or `administer` (decide on calibrations, users, tokens).
+no slow hash. One-time passwords are those of RFC 6238; each is accepted once, and they are required when the
+first one was right. What a login may do is its scope: `read`, `operate` (move, acquire, upload) or
+`administer` (decide on calibrations, users, tokens). A token belongs to a user, may do at most what the user
+may, and ends with the user.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import secrets
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -23,20 +25,30 @@ from urllib.parse import quote
 import sqlalchemy as sa
 
 from ..archive.records import utc, utc_now
-from ..core.errors import ArchiveError, ReseauError, UsageError
+from ..core.errors import ArchiveError, UsageError
 from ..core.optional import optional
+from .attempts import RefusedLogin, attempts_table, count_attempt, forget_attempt
 
-__all__ = ["SCOPES", "Accounts", "Principal", "RefusedLogin", "Scope", "Token", "User", "one_time_code"]
+__all__ = [
+    "LOCAL",
+    "SCOPES",
+    "Accounts",
+    "Principal",
+    "RefusedLogin",
+    "Scope",
+    "Token",
+    "User",
+    "one_time_code",
+]
 
 Scope = Literal["read", "operate", "administer"]
 SCOPES: tuple[Scope, ...] = ("read", "operate", "administer")
 """Scopes in ascending order; each includes those before it."""
 
+LOCAL = "local"
+"""The user of the service on its machine, who has its files and needs no password."""
 _LEAST_PASSWORD = 12
-_FREE, _FIRST_S, _LONGEST_S = 5, 30.0, 3600.0
-"""Failures without a wait, the first wait, and the longest one, which doubles from failure to failure."""
-_BY_ADDRESS, _WINDOW = 30, timedelta(minutes=10)
-_LOGIN, _IDLE = timedelta(hours=12), timedelta(hours=2)
+_LOGIN, _IDLE, _KNOWN = timedelta(hours=12), timedelta(hours=2), timedelta(days=365)
 _PERIOD_S, _DIGITS, _DRIFT = 30, 6, 1
 _SKEW = timedelta(minutes=1)
 
@@ -51,6 +63,7 @@ _users = sa.Table(
     sa.Column("password", sa.Text, nullable=False),
     sa.Column("scope", sa.Text, nullable=False),
     sa.Column("secret", sa.Text),
+    sa.Column("pending", sa.Text),
     sa.Column("last_step", sa.BigInteger),
     sa.Column("created", sa.DateTime(timezone=True), nullable=False),
 )
@@ -60,7 +73,7 @@ _tokens = sa.Table(
     sa.Column("name", sa.Text, primary_key=True),
     sa.Column("hash", sa.String(64), nullable=False, unique=True),
     sa.Column("scope", sa.Text, nullable=False),
-    sa.Column("made_by", sa.Text, nullable=False),
+    sa.Column("user", sa.Text, nullable=False),
     sa.Column("created", sa.DateTime(timezone=True), nullable=False),
     sa.Column("expires", sa.DateTime(timezone=True), nullable=False),
     sa.Column("revoked", sa.DateTime(timezone=True)),
@@ -74,34 +87,26 @@ _logins = sa.Table(
     sa.Column("created", sa.DateTime(timezone=True), nullable=False),
     sa.Column("seen", sa.DateTime(timezone=True), nullable=False),
 )
-_failures = sa.Table(
-    "failures",
+_devices = sa.Table(
+    "devices",
     _metadata,
-    sa.Column("id", sa.Integer, primary_key=True),
-    sa.Column("who", sa.Text, nullable=False, index=True),
-    sa.Column("at", sa.DateTime(timezone=True), nullable=False),
+    sa.Column("hash", sa.String(64), primary_key=True),
+    sa.Column("user", sa.Text, nullable=False),
+    sa.Column("created", sa.DateTime(timezone=True), nullable=False),
 )
+attempts_table(_metadata)
 
-_VERSION = 2
+_VERSION = 3
 _UPGRADES: dict[int, tuple[str, ...]] = {
     1: ("ALTER TABLE users ADD COLUMN last_step BIGINT",),
+    2: (
+        "ALTER TABLE users ADD COLUMN pending TEXT",
+        'ALTER TABLE tokens RENAME COLUMN made_by TO "user"',
+        f"UPDATE tokens SET \"user\" = '{LOCAL}' WHERE \"user\" = 'console'",
+        "DROP TABLE failures",
+    ),
 }
 """Statements that lead from a version of the schema to the next one."""
-
-
-class RefusedLogin(ReseauError):
-    """A login that was refused; the message does not say what was wrong.
-
-    Parameters
-    ----------
-    wait_s : float
-        Time after which the next attempt is considered (s).
-    """
-
-    def __init__(self, wait_s: float = 0.0) -> None:
-        self.wait_s = wait_s
-        what = "name, password or code is wrong" if not wait_s else f"too many attempts: wait {wait_s:.0f} s"
-        super().__init__(what, where="login")
 
 
 @dataclass(frozen=True)
@@ -111,11 +116,13 @@ class Principal:
     Parameters
     ----------
     name : str
-        User, or name of the token.
+        The user; of a token the one to whom it belongs.
     scope : {"read", "operate", "administer"}
         What they may do.
     via : {"login", "token", "local"}
         How they are known.
+    token : str
+        Name of the token.
 
     Examples
     --------
@@ -126,6 +133,12 @@ class Principal:
     name: str
     scope: Scope
     via: Literal["login", "token", "local"]
+    token: str = field(default="", repr=False)
+
+    @property
+    def known_by(self) -> str:
+        """How they are known, with the name of the token."""
+        return f"{self.via} {self.token}".strip()
 
     def may(self, scope: Scope) -> bool:
         """Whether the scope includes another one."""
@@ -160,7 +173,7 @@ class Token:
 
     name: str
     scope: Scope
-    made_by: str
+    user: str
     created: datetime
     expires: datetime
     revoked: datetime | None
@@ -233,10 +246,11 @@ class Accounts:
         # Checked in place of an unknown user's, so that the time does not tell that there is none.
         self._nobody = self._hasher.hash(secrets.token_hex(8))
         with self._connected() as connection:
-            there = sa.inspect(connection).has_table("users")
-            _metadata.create_all(connection)
-            known = connection.scalar(sa.select(_about.c.value).where(_about.c.key == "version"))
-            version = int(known) if known else (1 if there else _VERSION)
+            tables = sa.inspect(connection)
+            known = None
+            if tables.has_table("about"):
+                known = connection.scalar(sa.select(_about.c.value).where(_about.c.key == "version"))
+            version = int(known) if known else (1 if tables.has_table("users") else _VERSION)
             if version > _VERSION:
                 raise ArchiveError(f"is of a later version ({version})", where="accounts", do="update reseau")
             if version < _VERSION and not upgrade:
@@ -246,6 +260,7 @@ class Accounts:
             for each in range(version, _VERSION):
                 for statement in _UPGRADES[each]:
                     connection.execute(sa.text(statement))
+            _metadata.create_all(connection)
             if not known or version < _VERSION:
                 connection.execute(_about.delete().where(_about.c.key == "version"))
                 connection.execute(_about.insert().values(key="version", value=str(_VERSION)))
@@ -304,25 +319,51 @@ class Accounts:
         self._change(name, scope=scope)
 
     def require_code(self, name: str) -> str:
-        """Require a one-time password from now on; return the address for an authenticator."""
+        """Prepare a one-time password; return the address for an authenticator.
+
+        It is required from when on :meth:`confirm_code` was given a code of the authenticator.
+        """
         secret = base64.b32encode(secrets.token_bytes(20)).decode()
-        self._change(name, secret=secret, last_step=None)
+        self._change(name, ends=False, pending=secret)
         return f"otpauth://totp/reseau:{quote(name)}?secret={secret}&issuer=reseau"
+
+    def confirm_code(self, name: str, code: str) -> None:
+        """Require one-time passwords from now on, of the authenticator that shows this one.
+
+        Raises
+        ------
+        UsageError
+            If the code is not that of the authenticator, or none was prepared.
+        """
+        with self._connected() as connection:
+            pending = connection.scalar(sa.select(_users.c.pending).where(_users.c.name == name))
+        step = None if pending is None else _step_of(pending, None, code, self._clock())
+        if step is None:
+            do = "use the address that was shown last, and the present code"
+            raise UsageError("is not the code of the authenticator", where=name, do=do)
+        self._change(name, secret=pending, pending=None, last_step=step)
 
     def waive_code(self, name: str) -> None:
         """Require no one-time password any more."""
-        self._change(name, secret=None, last_step=None)
+        self._change(name, secret=None, pending=None, last_step=None)
 
     def remove_user(self, name: str) -> None:
-        """Remove a user with their logins."""
+        """Remove a user with their logins; their tokens are revoked."""
         self._change(name, scope="read")
+        t, now = _tokens.c, self._clock()
         with self._connected() as connection:
+            connection.execute(
+                _tokens.update().where(t.user == name, t.revoked.is_(None)).values(revoked=now)
+            )
+            connection.execute(_devices.delete().where(_devices.c.user == name))
             connection.execute(_users.delete().where(_users.c.name == name))
 
-    def _change(self, name: str, **values: Any) -> None:
+    def _change(self, name: str, *, ends: bool = True, **values: Any) -> None:
+        """Change a user; by default their logins end."""
         with self._connected() as connection:
             done = connection.execute(_users.update().where(_users.c.name == name).values(values))
-            connection.execute(_logins.delete().where(_logins.c.user == name))
+            if ends:
+                connection.execute(_logins.delete().where(_logins.c.user == name))
         if not done.rowcount:
             raise UsageError("is no user", where=name)
 
@@ -333,8 +374,27 @@ class Accounts:
 
     # Logins.
 
-    def log_in(self, name: str, password: str, code: str = "", address: str = "") -> str:
-        """Check a password, and return the value of a cookie.
+    def log_in(self, name: str, password: str, code: str = "", address: str = "", device: str = "") -> str:
+        """Check a password and a code, and return the value of a cookie; see :meth:`check`.
+
+        Raises
+        ------
+        RefusedLogin
+            If it is wrong, or there were too many attempts.
+        """
+        return self.begin_login(name, self.check(name, password, code, address, device))
+
+    def check(self, name: str, password: str, code: str = "", address: str = "", device: str = "") -> Scope:
+        """Check a password, and the code of a user who needs one; return what the user may do.
+
+        Parameters
+        ----------
+        name, password, code
+            As the user gave them.
+        address : str
+            From where.
+        device : str
+            Value of the cookie of a browser that is known; see :meth:`remember`.
 
         Raises
         ------
@@ -343,10 +403,9 @@ class Accounts:
         """
         from argon2.exceptions import Argon2Error, InvalidHashError
 
-        now = self._clock()
-        wait = max(self._wait(f"user {name}", now), self._wait_address(address, now))
-        if wait > 0:
-            raise RefusedLogin(wait)
+        now, known = self._clock(), _hash(device) if self.remembers(name, device) else ""
+        with self._connected() as connection:  # rolled back where it is refused
+            counted = count_attempt(connection, name, address, known, now)
         u = _users.c
         with self._connected() as connection:
             row = connection.execute(
@@ -357,13 +416,29 @@ class Accounts:
         except (Argon2Error, InvalidHashError):
             good = False
         if not good or row is None or not self._code_fits(name, row.secret, row.last_step, code, now):
-            with self._connected() as connection:
-                for who in {f"user {name}", f"address {address}"}:
-                    connection.execute(_failures.insert().values(who=who, at=now))
             raise RefusedLogin
         with self._connected() as connection:
-            connection.execute(_failures.delete().where(_failures.c.who == f"user {name}"))
-        return self.begin_login(name, row.scope)
+            forget_attempt(connection, counted)
+        scope: Scope = row.scope
+        return scope
+
+    def remember(self, name: str) -> str:
+        """Return the value of a cookie by which the browser of a user is known when they log in again.
+
+        It lets nobody in: others who try the name of the user do not keep out who has it.
+        """
+        now, device = self._clock(), secrets.token_urlsafe(32)
+        with self._connected() as connection:
+            connection.execute(_devices.delete().where(_devices.c.created < now - _KNOWN))
+            connection.execute(_devices.insert().values(hash=_hash(device), user=name, created=now))
+        return device
+
+    def remembers(self, name: str, device: str) -> bool:
+        """Whether a user has logged in before in a browser."""
+        d = _devices.c
+        query = sa.select(d.hash).where(d.hash == _hash(device), d.user == name)
+        with self._connected() as connection:
+            return bool(device) and connection.scalar(query) is not None
 
     def begin_login(self, name: str, scope: Scope) -> str:
         """Begin a login of somebody who is known already, and return the value of a cookie."""
@@ -391,63 +466,33 @@ class Accounts:
                 return None
             if abs(now - seen) > _SKEW:
                 connection.execute(_logins.update().where(_logins.c.hash == row.hash).values(seen=now))
-        return Principal(row.user, row.scope, "local" if row.user == "local" else "login")
+        return Principal(row.user, row.scope, "local" if row.user == LOCAL else "login")
 
     def log_out(self, cookie: str) -> None:
         """End a login."""
         with self._connected() as connection:
             connection.execute(_logins.delete().where(_logins.c.hash == _hash(cookie)))
 
-    def _wait(self, who: str, now: datetime) -> float:
-        """Seconds until the next attempt of a user is considered."""
-        count, last = self._failed(who)
-        if last is None or count < _FREE:
-            return 0.0
-        wait = min(_FIRST_S * 2.0 ** (count - _FREE), _LONGEST_S)
-        # A failure in the future: the clock was set back.
-        return max(0.0, wait - max(0.0, (now - last).total_seconds()))
-
-    def _wait_address(self, address: str, now: datetime) -> float:
-        """Seconds until the next attempt from an address is considered."""
-        f = _failures.c
-        with self._connected() as connection:
-            connection.execute(_failures.delete().where(f.at < now - timedelta(days=1)))
-            count = connection.scalar(
-                sa.select(sa.func.count()).where(f.who == f"address {address}", f.at > now - _WINDOW)
-            )
-        return _WINDOW.total_seconds() if address and (count or 0) >= _BY_ADDRESS else 0.0
-
-    def _failed(self, who: str) -> tuple[int, datetime | None]:
-        f = _failures.c
-        with self._connected() as connection:
-            count, last = connection.execute(
-                sa.select(sa.func.count(), sa.func.max(f.at)).where(f.who == who)
-            ).one()
-        return count, None if last is None else utc(last)
-
     def _code_fits(self, name: str, secret: str | None, last: int | None, code: str, now: datetime) -> bool:
         """Whether a one-time password is right, and was not used before."""
         if secret is None:
             return True
-        step = int(now.timestamp()) // _PERIOD_S
-        for each in range(step - _DRIFT, step + _DRIFT + 1):
-            if (last is None or each > last) and hmac.compare_digest(
-                one_time_code(secret, each), code.strip()
-            ):
-                unused = (_users.c.last_step.is_(None)) | (_users.c.last_step < each)
-                with self._connected() as connection:
-                    done = connection.execute(
-                        _users.update().where(_users.c.name == name, unused).values(last_step=each)
-                    )
-                return bool(done.rowcount)
-        return False
+        step = _step_of(secret, last, code, now)
+        if step is None:
+            return False
+        unused = (_users.c.last_step.is_(None)) | (_users.c.last_step < step)
+        with self._connected() as connection:
+            done = connection.execute(
+                _users.update().where(_users.c.name == name, unused).values(last_step=step)
+            )
+        return bool(done.rowcount)
 
     # Tokens.
 
     def tokens(self) -> list[Token]:
         """Return all tokens, also those that have ended."""
         t = _tokens.c
-        query = sa.select(t.name, t.scope, t.made_by, t.created, t.expires, t.revoked).order_by(t.created)
+        query = sa.select(t.name, t.scope, t.user, t.created, t.expires, t.revoked).order_by(t.created)
         with self._connected() as connection:
             rows = connection.execute(query).all()
         return [
@@ -455,13 +500,14 @@ class Accounts:
             for name, scope, by, made, ends, gone in rows
         ]
 
-    def create_token(self, name: str, scope: Scope, lasts: timedelta, by: str) -> str:
-        """Create a token, and return its secret, which is shown this once.
+    def create_token(self, name: str, scope: Scope, lasts: timedelta, user: str = LOCAL) -> str:
+        """Create a token of a user, and return its secret, which is shown this once.
 
         Raises
         ------
         UsageError
-            If there is or was one of this name, or it would last longer than two years.
+            If there is or was one of this name, it would last longer than two years, or there is no such
+            user, or one who may do less.
         """
         _named(name)
         _scoped(scope)
@@ -469,9 +515,14 @@ class Accounts:
             raise UsageError("does not last from 1 to 731 days", where=f"token {name}")
         if name in {each.name for each in self.tokens()}:
             raise UsageError("is a token already", where=name, do="use another name")
+        allowed = self._scope_of(user)
+        if allowed is None:
+            raise UsageError("is no user", where=user)
+        if SCOPES.index(scope) > SCOPES.index(allowed):
+            raise UsageError(f"may {allowed} and have no token to {scope}", where=user)
         secret, now = f"reseau_{secrets.token_urlsafe(32)}", self._clock()
         row = {
-            "name": name, "hash": _hash(secret), "scope": scope, "made_by": by, "created": now,
+            "name": name, "hash": _hash(secret), "scope": scope, "user": user, "created": now,
             "expires": now + lasts,
         }  # fmt: skip
         with self._connected() as connection:
@@ -502,7 +553,28 @@ class Accounts:
             return None
         if not utc(row.created) - _SKEW <= now < utc(row.expires):
             return None
-        return Principal(row.name, row.scope, "token")
+        allowed = self._scope_of(row.user)
+        if allowed is None:
+            return None
+        return Principal(row.user, min(row.scope, allowed, key=SCOPES.index), "token", row.name)
+
+    def _scope_of(self, user: str) -> Scope | None:
+        """What a user may do now; None if there is no such user."""
+        if user == LOCAL:
+            return "administer"
+        with self._connected() as connection:
+            found: Scope | None = connection.scalar(sa.select(_users.c.scope).where(_users.c.name == user))
+        return found
+
+
+def _step_of(secret: str, last: int | None, code: str, now: datetime) -> int | None:
+    """The time step whose one-time password a code is, after the last one used; None if it is none."""
+    step = int(now.timestamp()) // _PERIOD_S
+    for each in range(step - _DRIFT, step + _DRIFT + 1):
+        right = one_time_code(secret, each).encode()
+        if (last is None or each > last) and hmac.compare_digest(right, code.strip().encode()):
+            return each
+    return None
 
 
 def _hash(secret: str) -> str:
@@ -510,7 +582,7 @@ def _hash(secret: str) -> str:
 
 
 def _named(name: str) -> None:
-    if not name.strip() or len(name) > 80 or not name.isprintable() or name == "local":
+    if not name.strip() or len(name) > 80 or not name.isprintable() or name == LOCAL:
         raise UsageError("is no name", where=repr(name), do="use up to 80 printable characters")
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import getpass
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -44,6 +45,9 @@ from .rules import AcceptanceRules, Judgement, Outcome, judge
 __all__ = ["Applied", "Configurations", "Decision", "Drift", "a_time", "key_of"]
 
 _PREFIX = "calibrations/"
+_KEY_LENGTH = 12
+_KEY = re.compile(rf"[0-9a-f]{{{_KEY_LENGTH}}}")
+"""The form of keys, which no name has."""
 _ACCEPTED = ("accepted", "accepted with warning")
 
 
@@ -73,6 +77,10 @@ class Decision:
         Later comments: by whom, and text.
     name : str
         The name that people gave it; empty if nobody did.
+    session : str or None
+        Session of the archive that has this calibration among its results; None if none was named.
+    earlier : tuple of (str, datetime, Judgement)
+        Judgements by earlier versions of the rules: by whom, and when.
 
     Examples
     --------
@@ -92,6 +100,8 @@ class Decision:
     review: str = ""
     comments: tuple[tuple[str, str], ...] = ()
     name: str = ""
+    session: str | None = None
+    earlier: tuple[tuple[str, datetime, Judgement], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -237,6 +247,7 @@ class Configurations:
         since: datetime | None = None,
         by: str = "",
         comment: str = "",
+        session: str | None = None,
     ) -> Decision:
         """Judge a calibration by the rules, and put it in force if they accept it.
 
@@ -245,29 +256,39 @@ class Configurations:
         name : str
             Configuration.
         calibration : Calibration
-            The calibration; the same one is judged once.
+            The calibration; the same one is judged again if the rules have another version.
         rules : AcceptanceRules
             The rules.
         since : datetime, optional
             From when on it applies; by default the time of its session, or now.
         by, comment : str
             By whom or what (default: the user), and a comment.
+        session : str, optional
+            Session from which the calibration is, which must have it among its results.
 
         Raises
         ------
         UsageError
-            If the configuration is unknown, the rules changed without a new version, or the calibration is of
-            another instrument than the one in force.
+            If the configuration is unknown, the session does not have the calibration, the rules changed
+            without a new version, or the calibration is of another instrument than the one in force.
         """
         entries = self._entries(name)
         key = key_of(calibration)
-        if any(each.key == key for each in entries):
+        made = [each for each in entries if key in (each.key, each.document.get("key")) and _judges(each)]
+        if made and made[-1].document["judgement"]["rules"]["version"] == rules.version:
             return self.decision(name, key)
         _same_version(entries, rules, name)
         begun = calibration.times.get("begun")
         start = a_time(since or (datetime.fromisoformat(begun) if begun else self._archive.clock()))
-        current = self.applied(name, start)
+        if made:
+            start = _since(made[0])
+        current = self._applied(name, [each for each in entries if each not in made], start)
         judged = judge(calibration, None if current is None else current.calibration, rules)
+        if made:
+            document = {"key": key, "by": by or _user(), "comment": comment, "judgement": judged.to_dict()}
+            document["compared_with"] = None if current is None else current.key
+            self._journal(name).append(f"{key} again {len(made)}", "judged again", document)
+            return self.decision(name, key)
         document = {
             "calibration": calibration.to_json(),
             "since": start.isoformat(),
@@ -275,9 +296,22 @@ class Configurations:
             "comment": comment,
             "judgement": judged.to_dict(),
             "compared_with": None if current is None else current.key,
+            "origin": None if session is None else self._origin(session, key),
         }
         self._journal(name).append(key, "decision", document)
         return self.decision(name, key)
+
+    def _origin(self, session: str, key: str) -> dict[str, str]:
+        """The session from which a calibration is, and the SHA-256 of the result that is its proof."""
+        from ..sessions import CALIBRATION
+
+        of = self._archive.session(session)
+        for each in of.results():
+            if each.name == CALIBRATION:
+                found = parse_calibration(of.content(each).decode("utf-8"), where=f"{session}: {each.name}")
+                if key_of(found) == key:
+                    return {"session": session, "sha256": each.sha256}
+        raise UsageError("does not have this calibration among its results", where=f"session {session}")
 
     def review(
         self, name: str, key: str, outcome: Literal["accepted", "rejected"], *, by: str = "", comment: str
@@ -299,7 +333,8 @@ class Configurations:
         if not comment.strip():
             raise UsageError("needs a reason", where=f"review of {key}", do="give a comment")
         document = {"key": decision.key, "outcome": outcome, "by": by or _user(), "comment": comment}
-        if self._journal(name).append(f"review {decision.key}", "review", document) is None:
+        again = f" {len(decision.earlier)}" if decision.earlier else ""
+        if self._journal(name).append(f"review {decision.key}{again}", "review", document) is None:
             raise UsageError("has been reviewed", where=key)
         return self.decision(name, key)
 
@@ -321,6 +356,9 @@ class Configurations:
         decision, given = self.decision(name, key), given.strip()
         if not given:
             raise UsageError("is empty", where="name of the calibration")
+        if _KEY.fullmatch(given):
+            do = "give a name that no key can be"
+            raise UsageError("has the form of a key", where=f"name {given!r}", do=do)
         if any(each.name == given and each.key != decision.key for each in self.history(name)):
             raise UsageError("is another calibration", where=f"{name}: {given}", do="give another name")
         document = {"key": decision.key, "name": given, "by": by or _user()}
@@ -361,7 +399,7 @@ class Configurations:
         return sorted(found)
 
     def decision(self, name: str, key: str) -> Decision:
-        """Return a decision by its name, or by the start of its key.
+        """Return a decision by its key, by its name, or by the start of its key.
 
         Raises
         ------
@@ -369,8 +407,8 @@ class Configurations:
             If there is none, or several.
         """
         history = self.history(name) if key else []
-        found = [each for each in history if each.name == key]
-        found = found or [each for each in history if each.key.startswith(key)]
+        found = [each for each in history if each.key == key]
+        found = found or [each for each in history if key in (each.name, each.key[: len(key)])]
         if len(found) != 1:
             raise UsageError(f"names {len(found)} decisions", where=f"{name}: {key!r}", do="see its history")
         return found[0]
@@ -378,25 +416,26 @@ class Configurations:
     def history(self, name: str) -> list[Decision]:
         """Return all decisions in the order in which they were made."""
         entries = self._entries(name)
-        reviews = {each.document["key"]: each.document for each in entries if each.kind == "review"}
         names = {each.document["key"]: each.document["name"] for each in entries if each.kind == "name"}
         found = []
         for each in entries:
             if each.kind != "decision":
                 continue
-            d, review = each.document, reviews.get(each.key)
-            judged = Judgement.from_content(dict(d["judgement"]), where=f"decision {each.key}")
-            comments = [
-                (o.document["by"], o.document["comment"])
-                for o in entries
-                if o.kind == "comment" and o.document["key"] == each.key
-            ]
+            own = [o for o in entries if o is each or o.document.get("key") == each.key]
+            judging = [o for o in own if _judges(o)]
+            last = judging[-1].document
+            # A review is of the judgement before it.
+            review = next((o.document for o in own[own.index(judging[-1]) :] if o.kind == "review"), None)
+            earlier = [(o.document["by"], o.at, _judgement(o)) for o in judging[:-1]]
+            d, judged = each.document, _judgement(judging[-1])
+            comments = [(o.document["by"], o.document["comment"]) for o in own if o.kind == "comment"]
             found.append(
                 Decision(
                     each.key, judged.outcome if review is None else cast(Outcome, review["outcome"]),
-                    _since(each), each.at, d["by"], d["comment"], judged, d["compared_with"],
+                    _since(each), judging[-1].at, last["by"], last["comment"], judged, last["compared_with"],
                     "" if review is None else review["by"], "" if review is None else review["comment"],
-                    tuple(comments), names.get(each.key, ""),
+                    tuple(comments), names.get(each.key, ""), (d.get("origin") or {}).get("session"),
+                    tuple(earlier),
                 )
             )  # fmt: skip
         return found
@@ -420,7 +459,12 @@ class Configurations:
         """
         time = a_time(at)
         last = None if known is None else a_time(known)
-        entries = [each for each in self._entries(name) if last is None or each.at <= last]
+        return self._applied(
+            name, [each for each in self._entries(name) if last is None or each.at <= last], time
+        )
+
+    def _applied(self, name: str, entries: Sequence[Entry], time: datetime) -> Applied | None:
+        """The calibration that applies at a time, by some entries."""
         current = [each for each in _effects(entries) if each[0] <= time]
         if not current:
             return None
@@ -568,7 +612,7 @@ def key_of(calibration: Calibration) -> str:
     12
     """
     text = calibration.model_copy(update={"times": {}}).to_json()
-    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:12]
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:_KEY_LENGTH]
 
 
 def a_time(given: datetime) -> datetime:
@@ -596,6 +640,14 @@ def _user() -> str:
         return "unknown"
 
 
+def _judges(entry: Entry) -> bool:
+    return entry.kind in ("decision", "judged again")
+
+
+def _judgement(entry: Entry) -> Judgement:
+    return Judgement.from_content(dict(entry.document["judgement"]), where=f"decision {entry.key}")
+
+
 def _since(entry: Entry) -> datetime:
     return datetime.fromisoformat(entry.document["since"])
 
@@ -609,9 +661,12 @@ def _effects(entries: Sequence[Entry]) -> list[_Effect]:
     since_of = {each.key: _since(each) for each in entries if each.kind == "decision"}
     for each in entries:
         d, n = each.document, each.number
-        if each.kind == "decision" and d["judgement"]["outcome"] in _ACCEPTED:
-            found.append((since_of[each.key], n, each.key, "decision"))
-        elif each.kind == "review" and d["outcome"] in _ACCEPTED:
+        if _judges(each):
+            key = d.get("key", each.key)
+            found = [effect for effect in found if effect[2] != key or effect[3] == "return"]
+            if key in since_of and d["judgement"]["outcome"] in _ACCEPTED:
+                found.append((since_of[key], n, key, "decision"))
+        elif each.kind == "review" and d["outcome"] in _ACCEPTED and d["key"] in since_of:
             found.append((since_of[d["key"]], n, d["key"], "review"))
         elif each.kind == "return":
             found = [effect for effect in found if effect[0] < _since(each)]
@@ -624,7 +679,7 @@ def _effects(entries: Sequence[Entry]) -> list[_Effect]:
 def _same_version(entries: Sequence[Entry], rules: AcceptanceRules, name: str) -> None:
     """Refuse rules that changed but kept their version."""
     for each in entries:
-        if each.kind == "decision":
+        if _judges(each):
             used = each.document["judgement"]["rules"]
             if used["version"] == rules.version and used != rules.to_dict():
                 raise UsageError(

@@ -198,7 +198,7 @@ class Recalibrations:
         calibration = sessions.calibration_of(found)
         decision = Configurations(self._archive).decide(
             made.configuration, calibration, rules, since=found.begun, by=f"recalibration {name}",
-            comment=f"session {title}",
+            session=title,
         )  # fmt: skip
         return Recalibrated(title, calibration, decision)
 

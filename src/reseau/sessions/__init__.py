@@ -12,6 +12,7 @@ True
 """
 
 from .conducting import (
+    CALIBRATION,
     begin,
     calibration_of,
     capture,
@@ -39,6 +40,7 @@ from .parameters import (
 )
 
 __all__ = [
+    "CALIBRATION",
     "CORNERS",
     "KINDS",
     "OF_FILES",

@@ -40,9 +40,7 @@ def populate(folder: Path) -> None:
         sessions.capture(monday, rig.bench)
         known = Configurations(archive)
         known.define("vidicon", {"camera": "vidicon"})
-        known.decide(
-            "vidicon", sessions.calibration_of(monday), FIELD_RULES, by="Ada", comment="session monday"
-        )
+        known.decide("vidicon", sessions.calibration_of(monday), FIELD_RULES, by="Ada", session="monday")
         known.define("left", {"camera": "DMK 33", "lens": "8 mm"})
         for k in range(12):
             off = 1e-6 * k + 2e-5 * (-1) ** k + (2e-3 if k > 9 else 0.0)

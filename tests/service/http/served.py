@@ -38,7 +38,7 @@ class Served:
             from datetime import timedelta
 
             name = f"{scope} {len(self.service.accounts.tokens())}"
-            made = self.service.accounts.create_token(name, scope, timedelta(days=1), "test")  # type: ignore[arg-type]
+            made = self.service.accounts.create_token(name, scope, timedelta(days=1))  # type: ignore[arg-type]
             headers["Authorization"] = f"Bearer {made}"
         return TestClient(
             self.app, ORIGIN, raise_server_exceptions=False, follow_redirects=False, headers=headers,

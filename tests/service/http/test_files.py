@@ -130,6 +130,13 @@ def test_what_cannot_be_calibrated_is_refused_in_one_line_and_leaves_no_session(
     assert client.get("/api/1/sessions/refused").status_code == 404
 
 
+@pytest.mark.parametrize("name", ["a/b", " ", "a\nb", ".a", "a\\b"])
+def test_an_upload_under_a_name_that_is_none_is_refused_as_a_wrong_input(one: Served, name: str) -> None:
+    answer = sent(one.client("operate"), name, {"a.png": b"x"})
+    assert (answer.status_code, answer.json()["error"]["code"]) == (422, "usage")
+    assert "valid name of a session" in answer.json()["error"]["text"]
+
+
 def test_an_upload_without_a_usable_photograph_fails_with_a_reason(one: Served) -> None:
     client = one.client("operate")
     begun = sent(client, "nothing", {f"{k}.jpg": b"nothing" for k in range(3)})

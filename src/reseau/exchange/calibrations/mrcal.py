@@ -68,7 +68,8 @@ def read(text: str, path: Path) -> PlainCamera:
         content = ast.literal_eval(text.strip())
         model, numbers = str(content["lensmodel"]), [float(v) for v in content["intrinsics"]]
         width, height = (int(v) for v in content["imagersize"])
-    except (SyntaxError, ValueError, KeyError, TypeError):
+    except (SyntaxError, ValueError, KeyError, TypeError, OverflowError, MemoryError, RecursionError):
+        # The last two: of the parser, where signs or brackets are nested too deeply.
         raise FormatError("has no complete lensmodel, intrinsics and imagersize", where=path) from None
     if model.startswith(_SPLINED) or model == _STEREOGRAPHIC:
         return _stereographic(path, model, numbers, (width, height))

@@ -10,7 +10,7 @@ from typing import Annotated
 from fastapi import Depends, Request
 
 from ...core.errors import ReseauError
-from ..accounts import Principal, Scope
+from ..accounts import LOCAL, Principal, Scope
 from .options import is_loopback
 from .service import Service
 
@@ -22,6 +22,7 @@ __all__ = [
     "Operating",
     "Reading",
     "Unknown",
+    "by_cookie",
     "csrf_of",
     "operating",
     "principal_of",
@@ -64,17 +65,26 @@ def csrf_of(cookie: str) -> str:
     return hashlib.sha256(b"csrf of " + cookie.encode("utf-8", "replace")).hexdigest()
 
 
+def by_cookie(request: Request) -> bool:
+    """Whether a request is let in, if at all, by its cookie, which browsers send without being asked."""
+    return not _header(request)
+
+
+def _header(request: Request) -> str:
+    return request.headers.get("authorization", "").strip()
+
+
 def principal_of(request: Request) -> Principal | None:
     """Return who makes a request, or None."""
     service = service_of(request)
-    kind, _, secret = request.headers.get("authorization", "").partition(" ")
+    kind, _, secret = _header(request).partition(" ")
     if kind:
         if kind.lower() != "bearer":
             return None
         client = request.client
         local = client is not None and is_loopback(client.host) and not service.options.proxy
         if local and hmac.compare_digest(secret.encode(), service.state.local_token().encode()):
-            return Principal("local", "administer", "local")
+            return Principal(LOCAL, "administer", "local")
         return service.accounts.of_token(secret)
     cookie = request.cookies.get(service.cookie)
     return None if cookie is None else service.accounts.of_cookie(cookie)
@@ -87,7 +97,7 @@ def _needs(scope: Scope) -> Callable[[Request], Principal]:
             raise Unknown("needs a token or a login", where=request.url.path)
         request.state.who = who.name
         service = service_of(request)
-        if request.method in _UNSAFE and "authorization" not in request.headers:
+        if request.method in _UNSAFE and by_cookie(request):
             given = request.headers.get("x-csrf-token", "")
             if not hmac.compare_digest(
                 given.encode(), csrf_of(request.cookies.get(service.cookie, "")).encode()

@@ -8,14 +8,15 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import ConfigDict, Field
 
-from ..accounts import RefusedLogin, Scope
-from .access import Administering, Forbidden, Here, NotFound, Operating, Reading, csrf_of
+from ..accounts import Principal, RefusedLogin, Scope
+from .access import Administering, Forbidden, Here, NotFound, Operating, Reading, by_cookie, csrf_of
 from .answers import Answer, Done, refusals
 
 __all__ = ["router", "set_cookie"]
 
 router = APIRouter(tags=["accounts"], responses=refusals(400, 401, 403, 422, 503))
 
+_KNOWN_S = 365 * 86400
 Named = Annotated[str, Path(max_length=80, description="Its name.")]
 
 
@@ -45,15 +46,26 @@ class Login(Answer):
     )
 
 
-class NewPassword(Answer):
+class Confirmed(Answer):
+    """My password, and my code if I need one: whoever finds a browser in which I am logged in has neither."""
+
+    my_password: str = Field(default="", max_length=1000, description="Present password; needed in a login.")
+    my_code: str = Field(default="", max_length=10, description="Of my authenticator, if I need one.")
+
+
+class NewPassword(Confirmed):
     """The present password, and a new one."""
 
-    password: str = Field(max_length=1000)
     new: str = Field(min_length=12, max_length=1000)
-    code: str = Field(default="", max_length=10)
 
 
-class NewUser(Answer):
+class Code(Answer):
+    """A code of the new authenticator."""
+
+    code: str = Field(min_length=1, max_length=10)
+
+
+class NewUser(Confirmed):
     """A user."""
 
     name: str = Field(min_length=1, max_length=80)
@@ -77,8 +89,8 @@ class UserAnswer(Answer):
     created: str
 
 
-class NewToken(Answer):
-    """A token."""
+class NewToken(Confirmed):
+    """A token of mine, which may do at most what I may."""
 
     name: str = Field(min_length=1, max_length=80)
     scope: Scope = "read"
@@ -94,7 +106,7 @@ class TokenAnswer(Answer):
 
     name: str
     scope: Scope
-    made_by: str
+    user: str
     created: str
     expires: str
     revoked: str | None
@@ -115,18 +127,52 @@ class Entry(Answer):
 
 def set_cookie(response: Response, service: Here, value: str) -> None:
     """Give a browser the cookie of a login: for our own pages only, and not for scripts."""
+    _set(response, service, service.cookie, value, 12 * 3600)
+
+
+def _set(response: Response, service: Here, name: str, value: str, lasts_s: int) -> None:
     response.set_cookie(
-        service.cookie, value, max_age=12 * 3600, path="/", httponly=True, samesite="strict",
+        name, value, max_age=lasts_s, path="/", httponly=True, samesite="strict",
         secure=service.options.encrypted,
     )  # fmt: skip
+
+
+def _confirmed(request: Request, given: Confirmed, who: Principal, service: Here) -> None:
+    """Refuse a change of accounts by a token, and by a login without its password.
+
+    A program of the user of the service on this machine needs none: it has the files of the accounts.
+    """
+    if who.via == "token":
+        raise Forbidden("changes no account: log in", where=f"token {who.token}")
+    if who.via == "login":
+        address = request.client.host if request.client else ""
+        device = request.cookies.get(_device(service), "")
+        try:
+            service.accounts.check(who.name, given.my_password, given.my_code, address, device)
+        except RefusedLogin as error:
+            if error.wait_s:
+                raise
+            raise Forbidden("my_password or my_code is wrong", where=who.name) from None
+
+
+def _with_password(who: Principal) -> str:
+    """Name of a user who has a password."""
+    if who.via != "login":
+        raise Forbidden("has no password", where=who.name)
+    return who.name
+
+
+def _device(service: Here) -> str:
+    """Name of the cookie by which a browser is known in which somebody has logged in before."""
+    return f"{service.cookie}-known"
 
 
 @router.get("/me")
 def me(request: Request, who: Reading, service: Here) -> Me:
     """Who I am, and what I may do."""
     cookie = request.cookies.get(service.cookie, "")
-    bearer = "authorization" in request.headers
-    return Me(name=who.name, scope=who.scope, via=who.via, csrf=None if bearer else csrf_of(cookie))
+    csrf = csrf_of(cookie) if by_cookie(request) else None
+    return Me(name=who.name, scope=who.scope, via=who.via, csrf=csrf)
 
 
 @router.post("/login", responses=refusals(429))
@@ -136,14 +182,18 @@ def login(request: Request, response: Response, given: Login, service: Here) -> 
     if "origin" not in request.headers and "sec-fetch-site" not in request.headers:
         raise Forbidden("needs the header Origin", where="login")
     address = request.client.host if request.client else ""
+    device = request.cookies.get(_device(service), "")
     try:
-        cookie = service.accounts.log_in(given.name, given.password, given.code, address)
+        cookie = service.accounts.log_in(given.name, given.password, given.code, address, device)
     except RefusedLogin as error:
         service.meters.logins.labels("wait" if error.wait_s else "refused").inc()
         service.audit.record(given.name[:80], "login", "login refused", "service", {"address": address})
         raise
     service.meters.logins.labels("done").inc()
     set_cookie(response, service, cookie)
+    if not service.accounts.remembers(given.name, device):
+        device = service.accounts.remember(given.name)
+        _set(response, service, _device(service), device, _KNOWN_S)
     return Done(done="logged in")
 
 
@@ -158,22 +208,29 @@ def logout(request: Request, response: Response, who: Reading, service: Here) ->
 @router.put("/me/password", responses=refusals(429))
 def change_password(request: Request, given: NewPassword, who: Reading, service: Here) -> Done:
     """Change my password; all my logins end."""
-    if who.via != "login":
-        raise Forbidden("has no password", where=who.name)
-    address = request.client.host if request.client else ""
-    service.accounts.log_in(who.name, given.password, given.code, address)
-    with service.audited(who, "change password", f"user {who.name}"):
-        service.accounts.set_password(who.name, given.new)
+    name = _with_password(who)
+    _confirmed(request, given, who, service)
+    with service.audited(who, "change password", f"user {name}"):
+        service.accounts.set_password(name, given.new)
     return Done(done="changed; log in again")
 
 
-@router.post("/me/one-time")
-def require_code(who: Reading, service: Here) -> Secret:
-    """Require a one-time password for my logins; the secret is an address for an authenticator."""
-    if who.via != "login":
-        raise Forbidden("has no password", where=who.name)
-    with service.audited(who, "require one-time password", f"user {who.name}"):
-        return Secret(name=who.name, secret=service.accounts.require_code(who.name))
+@router.post("/me/one-time", responses=refusals(429))
+def require_code(request: Request, given: Confirmed, who: Reading, service: Here) -> Secret:
+    """Prepare one-time passwords; the secret, an address for an authenticator, counts when confirmed."""
+    name = _with_password(who)
+    _confirmed(request, given, who, service)
+    with service.audited(who, "prepare one-time password", f"user {name}"):
+        return Secret(name=name, secret=service.accounts.require_code(name))
+
+
+@router.post("/me/one-time/confirm")
+def confirm_code(given: Code, who: Reading, service: Here) -> Done:
+    """Require one-time passwords for my logins from now on, of the authenticator that shows this code."""
+    name = _with_password(who)
+    with service.audited(who, "require one-time password", f"user {name}"):
+        service.accounts.confirm_code(name, given.code)
+    return Done(done="required; log in again")
 
 
 @router.get("/users")
@@ -185,37 +242,43 @@ def users(who: Administering, service: Here) -> list[UserAnswer]:
     ]
 
 
-@router.post("/users", status_code=201)
-def add_user(given: NewUser, who: Administering, service: Here) -> Done:
+@router.post("/users", status_code=201, responses=refusals(429))
+def add_user(request: Request, given: NewUser, who: Administering, service: Here) -> Done:
     """Add a user."""
+    _confirmed(request, given, who, service)
     with service.audited(who, "add user", f"user {given.name}", {"scope": given.scope}):
         service.accounts.add_user(given.name, given.password, given.scope)
     return Done(done="added")
 
 
-@router.delete("/users/{name}")
-def remove_user(name: Named, who: Administering, service: Here) -> Done:
-    """Remove a user, and end their logins."""
+@router.post("/users/{name}/removal", responses=refusals(429))
+def remove_user(request: Request, name: Named, given: Confirmed, who: Administering, service: Here) -> Done:
+    """Remove a user, end their logins, and revoke their tokens."""
+    _confirmed(request, given, who, service)
     with service.audited(who, "remove user", f"user {name}"):
         service.accounts.remove_user(name)
     return Done(done="removed")
 
 
 @router.get("/tokens")
-def tokens(who: Administering, service: Here) -> list[TokenAnswer]:
-    """All tokens, also those that have ended; without their secrets."""
+def tokens(who: Reading, service: Here) -> list[TokenAnswer]:
+    """My tokens, also those that have ended; without their secrets. Administrators see all."""
     return [
         TokenAnswer(
-            name=t.name, scope=t.scope, made_by=t.made_by, created=t.created.isoformat(),
+            name=t.name, scope=t.scope, user=t.user, created=t.created.isoformat(),
             expires=t.expires.isoformat(), revoked=None if t.revoked is None else t.revoked.isoformat(),
         )
         for t in service.accounts.tokens()
+        if t.user == who.name or who.may("administer")
     ]  # fmt: skip
 
 
-@router.post("/tokens", status_code=201)
-def create_token(given: NewToken, who: Administering, service: Here) -> Secret:
-    """Create a token for a program; its secret is shown this once."""
+@router.post("/tokens", status_code=201, responses=refusals(429))
+def create_token(request: Request, given: NewToken, who: Reading, service: Here) -> Secret:
+    """Create a token of mine for a program; its secret is shown this once."""
+    if not who.may(given.scope):
+        raise Forbidden(f"may {who.scope} and have no token to {given.scope}", where=who.name)
+    _confirmed(request, given, who, service)
     with service.audited(
         who, "create token", f"token {given.name}", {"scope": given.scope, "days": given.days}
     ):
@@ -224,9 +287,9 @@ def create_token(given: NewToken, who: Administering, service: Here) -> Secret:
 
 
 @router.delete("/tokens/{name}", responses=refusals(404))
-def revoke_token(name: Named, who: Administering, service: Here) -> Done:
-    """Revoke a token."""
-    if name not in {each.name for each in service.accounts.tokens()}:
+def revoke_token(name: Named, who: Reading, service: Here) -> Done:
+    """Revoke a token of mine; administrators revoke any."""
+    if name not in {each.name for each in tokens(who, service)}:
         raise NotFound("is no token", where=name)
     with service.audited(who, "revoke token", f"token {name}"):
         service.accounts.revoke_token(name)

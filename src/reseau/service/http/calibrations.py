@@ -73,8 +73,17 @@ class FindingRow(Answer):
     text: str
 
 
+class EarlierRow(Answer):
+    """A judgement by an earlier version of the rules."""
+
+    at: str
+    by: str
+    outcome: str
+    rules: int
+
+
 class DecisionRow(Answer):
-    """A decision on a calibration; `session` is where it comes from, if the archive knows that.
+    """A decision on a calibration; `session` is the one of the archive that has it among its results.
 
     Without a name that somebody gave it, `name` is that of its session, or says when it began.
     """
@@ -92,6 +101,7 @@ class DecisionRow(Answer):
     review: str
     comments: list[tuple[str, str]]
     session: str | None
+    earlier: list[EarlierRow]
 
 
 class EventRow(Answer):
@@ -272,28 +282,20 @@ def the_decision(known: Configurations, name: str, key: str) -> Decision:
         raise NotFound(error.what, where=error.where) from None
 
 
-def _session_of(service: Service, decision: Decision) -> str | None:
-    """Session of a calibration, as the comment of its decision says."""
-    if not decision.comment.startswith("session "):
-        return None
-    name = decision.comment.removeprefix("session ").partition("; ")[0]
-    try:
-        return the_session(service, name).name
-    except ReseauError:
-        return None
-
-
-def decision_row(service: Service, decision: Decision) -> DecisionRow:
+def decision_row(decision: Decision) -> DecisionRow:
     """Return a decision as it is answered."""
-    session = _session_of(service, decision)
     return DecisionRow(
-        key=decision.key, name=decision.name or session or f"{decision.since:%-d %B %Y %H:%M} UTC",
+        key=decision.key, name=decision.name or decision.session or f"{decision.since:%-d %B %Y %H:%M} UTC",
         outcome=decision.outcome, since=decision.since.isoformat(),
         at=decision.at.isoformat(), by=decision.by, comment=decision.comment,
         compared_with=decision.compared_with,
         findings=[FindingRow(rule=f.rule, level=f.level, text=f.text) for f in decision.judgement.findings],
         reviewed_by=decision.reviewed_by, review=decision.review, comments=list(decision.comments),
-        session=session,
+        session=decision.session,
+        earlier=[
+            EarlierRow(at=at.isoformat(), by=by, outcome=judged.outcome, rules=int(str(judged.rules["version"])))
+            for by, at, judged in decision.earlier
+        ],
     )  # fmt: skip
 
 
@@ -301,7 +303,7 @@ def _in_force(service: Service, known: Configurations, name: str, now: datetime)
     applied = known.applied(name, now)
     if applied is None:
         return None
-    row = decision_row(service, known.decision(name, applied.key))
+    row = decision_row(known.decision(name, applied.key))
     return InForce(key=applied.key, name=row.name, since=applied.since.isoformat(), why=applied.why)
 
 
@@ -331,7 +333,7 @@ def configuration_detail(service: Service, name: str) -> ConfigurationDetail:
     return ConfigurationDetail(
         name=name, parts=known.parts(name), in_force=_in_force(service, known, name, service.archive.clock()),
         decisions=len(history), to_review=sum(d.outcome == "needs review" for d in history),
-        history=[decision_row(service, each) for each in reversed(history)],
+        history=[decision_row(each) for each in reversed(history)],
         events=[EventRow(at=at.isoformat(), what=what) for at, what in known.events(name)],
     )  # fmt: skip
 
@@ -364,7 +366,7 @@ def calibration_detail(service: Service, name: str, key: str) -> CalibrationDeta
     pairs.sort(key=lambda pair: -abs(pair[2]))
     return CalibrationDetail(
         verdict=verdict_of(found), assessment=found.assessment,
-        configuration=name, decision=decision_row(service, decision), kind=found.kind, name=found.name,
+        configuration=name, decision=decision_row(decision), kind=found.kind, name=found.name,
         sigma0=found.sigma0, redundancy=found.redundancy,
         parameters=[
             ParameterRow(
@@ -377,6 +379,91 @@ def calibration_detail(service: Service, name: str, key: str) -> CalibrationDeta
         tests=list(found.tests), validity=found.validity, provenance=found.provenance,
         figures=["uncertainty", "distortion"] if found.kind == "camera" else [],
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A calibration that is compared: its key or session, what people call it, and its page."""
+
+    key: str
+    title: str
+    page: str
+    calibration: Calibration
+
+
+def chosen(service: Service, text: str) -> Chosen:
+    """Return a calibration: `CONFIGURATION/KEY`, or the name of a session that has one.
+
+    Raises
+    ------
+    NotFound
+        If there is none.
+    """
+    from ... import sessions as kinds
+
+    name, slash, key = text.rpartition("/")
+    if not slash:
+        session = the_session(service, text)
+        return Chosen(text, text, f"/sessions/{quote(text, safe='')}", kinds.calibration_of(session))
+    known = _the(service, name)
+    decision = _decision(known, name, key)
+    page = f"/calibrations/{quote(name, safe='')}/{decision.key}"
+    title = f"{name}: {decision_row(decision).name}"
+    return Chosen(decision.key, title, page, known.calibration(name, decision.key))
+
+
+def choices(service: Service) -> list[tuple[str, str]]:
+    """Return what can be compared: the text that :func:`chosen` takes, and what people call it."""
+
+    def compute() -> list[tuple[str, str]]:
+        found, judged = list[tuple[str, str]](), set[str | None]()
+        known = _known(service)
+        for name in known.names():
+            rows = [decision_row(each) for each in reversed(known.history(name))]
+            found += [(f"{name}/{each.key}", f"{name}: {each.name}") for each in rows]
+            judged |= {each.session for each in rows}
+        others = [each for each in calibrated(service) if each not in judged]
+        return found + [(each, f"session {each}") for each in others]
+
+    return service.current("choices", compute)
+
+
+def calibrated(service: Service) -> list[str]:
+    """Return the latest sessions with a calibration."""
+    found = service.archive.sessions(last=_MOST_CHOICES, result="calibration.json")
+    return [each.name for each in reversed(found)]
+
+
+def comparison(first: Chosen, second: Chosen) -> tuple[Comparison, Any]:
+    """Return the difference of two calibrations, and its field if they are cameras."""
+    import numpy as np
+
+    from ...calibration import CameraMapping, calibration_difference
+    from ..rules import difference
+
+    old, new = first.calibration, second.calibration
+    found = difference(new, old)
+    field = None
+    rms, p = found.greatest, float(getattr(found, "p", float("nan")))
+    if new.kind == old.kind == "camera":
+        field = calibration_difference(
+            CameraMapping.from_calibration(old), CameraMapping.from_calibration(new)
+        )
+        rms, p = float(np.sqrt(np.nanmean((field.difference**2).sum(axis=-1)))), field.p
+    every = dict.fromkeys([*old.parameters, *new.parameters])
+    values = [
+        (
+            each,
+            old.parameters[each].value if each in old.parameters else None,
+            new.parameters[each].value if each in new.parameters else None,
+        )
+        for each in every
+    ]
+    answer = Comparison(
+        first=first.key, second=second.key, greatest=found.greatest, rms=rms, unit=found.unit, p=p,
+        parameters=values,
+    )  # fmt: skip
+    return answer, field
 
 
 @router.get("/configurations")
@@ -410,20 +497,21 @@ def decide(name: Name, given: NewDecision, who: Administering, service: Here) ->
     if (given.session is None) == (given.calibration is None):
         raise UsageError("give one of them", where="session, calibration")
     rules = AcceptanceRules.from_content(dict(given.rules), where="rules")
-    since, comment = given.since, given.comment
+    since = given.since
     if given.session is not None:
         session = the_session(service, given.session)
         calibration, since = kinds.calibration_of(session), since or session.begun
-        comment = f"session {given.session}" + (f"; {comment}" if comment else "")
     else:
         assert given.calibration is not None
         calibration = Calibration.from_content(dict(given.calibration), where="calibration")
     facts = {"session": given.session, "rules": rules.version, "calibration": calibration.name}
     with service.audited(who, "decide", name, facts):
-        made = known.decide(name, calibration, rules, since=since, by=who.name, comment=comment)
+        made = known.decide(
+            name, calibration, rules, since=since, by=who.name, comment=given.comment, session=given.session
+        )
         if given.name.strip():
             made = known.rename(name, made.key, given.name, by=who.name)
-    return decision_row(service, made)
+    return decision_row(made)
 
 
 @router.get("/configurations/{name}/decisions/{key}")
@@ -489,7 +577,7 @@ def _audited(
     full = the_decision(known, name, key).key
     with service.audited(who, action, f"{name} {full}", facts):
         do(known, full)
-    return decision_row(service, known.decision(name, full))
+    return decision_row(known.decision(name, full))
 
 
 @router.post("/configurations/{name}/decisions/{key}/review")

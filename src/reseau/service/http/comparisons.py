@@ -70,7 +70,7 @@ def chosen(service: Service, text: str) -> Chosen:
     known = the_configuration(service, name)
     decision = the_decision(known, name, key)
     page = f"/calibrations/{quote(name, safe='')}/{decision.key}"
-    title = f"{name}: {decision_row(service, decision).name}"
+    title = f"{name}: {decision_row(decision).name}"
     return Chosen(decision.key, title, page, known.calibration(name, decision.key))
 
 
@@ -81,7 +81,7 @@ def choices(service: Service) -> list[tuple[str, str]]:
         found, judged = list[tuple[str, str]](), set[str | None]()
         known = known_configurations(service)
         for name in known.names():
-            rows = [decision_row(service, each) for each in reversed(known.history(name))]
+            rows = [decision_row(each) for each in reversed(known.history(name))]
             found += [(f"{name}/{each.key}", f"{name}: {each.name}") for each in rows]
             judged |= {each.session for each in rows}
         others = [each for each in calibrated(service) if each not in judged]

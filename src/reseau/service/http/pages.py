@@ -379,11 +379,9 @@ def history_page(request: Request, who: Reading, service: Here) -> Response:
 
 @router.get("/account")
 def account(request: Request, who: Reading, service: Here) -> Response:
-    """My account; for administrators all users and tokens."""
-    found: dict[str, Any] = {"users": [], "tokens": []}
-    if who.may("administer"):
-        found = {"users": accounts.users(who, service), "tokens": accounts.tokens(who, service)}
-    return _rendered(request, "account.html.j2", **found)
+    """My account and my tokens; for administrators all users and tokens."""
+    users = accounts.users(who, service) if who.may("administer") else []
+    return _rendered(request, "account.html.j2", users=users, tokens=accounts.tokens(who, service))
 
 
 @router.get("/audit")

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ...archive import Archive
 from ...core.errors import ReseauError, UsageError
 from ...core.memory import keep_loaded
-from ..accounts import Accounts, Principal
+from ..accounts import LOCAL, Accounts, Principal
 from ..audit import Audit
 from ..state import StateFolder
 from .events import Events
@@ -173,7 +173,7 @@ class Service:
     def enter(self, code: str) -> str | None:
         """Return the cookie for an entry code; None if it was used or is too old."""
         until = self._entries.pop(code, 0.0)
-        return self.accounts.begin_login("local", "administer") if time.monotonic() < until else None
+        return self.accounts.begin_login(LOCAL, "administer") if time.monotonic() < until else None
 
     def current(self, name: str, compute: Callable[[], T]) -> T:
         """Return what follows from journals and sessions, computed again when these or the minute change.
@@ -211,12 +211,12 @@ class Service:
         ArchiveError
             If it cannot be recorded; it must not be done then.
         """
-        entry = self.audit.record(who.name, who.via, action, about, facts)
+        entry = self.audit.record(who.name, who.known_by, action, about, facts)
         try:
             yield
         except ReseauError as error:
             why = {"of": entry.number, "why": str(error)}
-            self.audit.record(who.name, who.via, f"{action} failed", about, why)
+            self.audit.record(who.name, who.known_by, f"{action} failed", about, why)
             raise
 
     @staticmethod
@@ -242,7 +242,7 @@ class Service:
 
         def record() -> None:
             with suppress(ReseauError):
-                self.audit.record(who.name, who.via, action, about)
+                self.audit.record(who.name, who.known_by, action, about)
 
         self._later.submit(record)
 
