@@ -285,9 +285,11 @@ class Configurations:
         current = self._applied(name, [each for each in entries if each not in made], start)
         judged = judge(calibration, None if current is None else current.calibration, rules)
         if made:
-            document = {"key": key, "by": by or _user(), "comment": comment, "judgement": judged.to_dict()}
-            document["compared_with"] = None if current is None else current.key
-            self._journal(name).append(f"{key} again {len(made)}", "judged again", document)
+            again = {
+                "key": key, "by": by or _user(), "comment": comment, "judgement": judged.to_dict(),
+                "compared_with": None if current is None else current.key,
+            }  # fmt: skip
+            self._journal(name).append(f"{key} again {len(made)}", "judged again", again)
             return self.decision(name, key)
         document = {
             "calibration": calibration.to_json(),

@@ -81,11 +81,11 @@ def contradicting(problem: BundleProblem, fit: BundleFit) -> tuple[BundleProblem
             break
         off = float(np.abs(again.residuals[own[worst]]))
         found.append((int(element[worst]), float(w[worst]), off))
-        others = _instead(problem, current, weights, again, own, element, w > critical, worst)
-        if others:
+        instead = _instead(problem, current, weights, again, own, element, w > critical, worst)
+        if instead:
             # One of them is wrong; without a further observation it cannot be said which.
-            found += [(other, float(w[element == other].max()), np.nan) for other in others]
-            found[-1 - len(others)] = (int(element[worst]), float(w[worst]), np.nan)
+            found += [(other, float(w[element == other].max()), np.nan) for other in instead]
+            found[-1 - len(instead)] = (int(element[worst]), float(w[worst]), np.nan)
             break
         weights, current = trial, again
     named = [one for one in found if one[0] < lengths]

@@ -293,8 +293,8 @@ def decision_row(decision: Decision) -> DecisionRow:
         reviewed_by=decision.reviewed_by, review=decision.review, comments=list(decision.comments),
         session=decision.session,
         earlier=[
-            EarlierRow(at=at.isoformat(), by=by, outcome=judged.outcome, rules=int(str(judged.rules["version"])))
-            for by, at, judged in decision.earlier
+            EarlierRow(at=at.isoformat(), by=by, outcome=each.outcome, rules=int(str(each.rules["version"])))
+            for by, at, each in decision.earlier
         ],
     )  # fmt: skip
 
@@ -379,91 +379,6 @@ def calibration_detail(service: Service, name: str, key: str) -> CalibrationDeta
         tests=list(found.tests), validity=found.validity, provenance=found.provenance,
         figures=["uncertainty", "distortion"] if found.kind == "camera" else [],
     )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Chosen:
-    """A calibration that is compared: its key or session, what people call it, and its page."""
-
-    key: str
-    title: str
-    page: str
-    calibration: Calibration
-
-
-def chosen(service: Service, text: str) -> Chosen:
-    """Return a calibration: `CONFIGURATION/KEY`, or the name of a session that has one.
-
-    Raises
-    ------
-    NotFound
-        If there is none.
-    """
-    from ... import sessions as kinds
-
-    name, slash, key = text.rpartition("/")
-    if not slash:
-        session = the_session(service, text)
-        return Chosen(text, text, f"/sessions/{quote(text, safe='')}", kinds.calibration_of(session))
-    known = _the(service, name)
-    decision = _decision(known, name, key)
-    page = f"/calibrations/{quote(name, safe='')}/{decision.key}"
-    title = f"{name}: {decision_row(decision).name}"
-    return Chosen(decision.key, title, page, known.calibration(name, decision.key))
-
-
-def choices(service: Service) -> list[tuple[str, str]]:
-    """Return what can be compared: the text that :func:`chosen` takes, and what people call it."""
-
-    def compute() -> list[tuple[str, str]]:
-        found, judged = list[tuple[str, str]](), set[str | None]()
-        known = _known(service)
-        for name in known.names():
-            rows = [decision_row(each) for each in reversed(known.history(name))]
-            found += [(f"{name}/{each.key}", f"{name}: {each.name}") for each in rows]
-            judged |= {each.session for each in rows}
-        others = [each for each in calibrated(service) if each not in judged]
-        return found + [(each, f"session {each}") for each in others]
-
-    return service.current("choices", compute)
-
-
-def calibrated(service: Service) -> list[str]:
-    """Return the latest sessions with a calibration."""
-    found = service.archive.sessions(last=_MOST_CHOICES, result="calibration.json")
-    return [each.name for each in reversed(found)]
-
-
-def comparison(first: Chosen, second: Chosen) -> tuple[Comparison, Any]:
-    """Return the difference of two calibrations, and its field if they are cameras."""
-    import numpy as np
-
-    from ...calibration import CameraMapping, calibration_difference
-    from ..rules import difference
-
-    old, new = first.calibration, second.calibration
-    found = difference(new, old)
-    field = None
-    rms, p = found.greatest, float(getattr(found, "p", float("nan")))
-    if new.kind == old.kind == "camera":
-        field = calibration_difference(
-            CameraMapping.from_calibration(old), CameraMapping.from_calibration(new)
-        )
-        rms, p = float(np.sqrt(np.nanmean((field.difference**2).sum(axis=-1)))), field.p
-    every = dict.fromkeys([*old.parameters, *new.parameters])
-    values = [
-        (
-            each,
-            old.parameters[each].value if each in old.parameters else None,
-            new.parameters[each].value if each in new.parameters else None,
-        )
-        for each in every
-    ]
-    answer = Comparison(
-        first=first.key, second=second.key, greatest=found.greatest, rms=rms, unit=found.unit, p=p,
-        parameters=values,
-    )  # fmt: skip
-    return answer, field
 
 
 @router.get("/configurations")
