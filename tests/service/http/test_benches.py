@@ -465,7 +465,7 @@ def test_positions_are_reported_while_an_axis_moves_and_who_moves_it(one: Served
     other, seen = one.client(), set[float]()
     until(lambda: other.get(BENCH).json()["moving"])
     while (told := other.get(BENCH).json()["moving"]) and mover.is_alive():
-        assert told.startswith("roll to 100 deg, by operate")
+        assert told.startswith("roll to 100 deg, by local")
         seen.add(other.get(f"{BENCH}/axes").json()["roll"]["position"])
         time.sleep(0.1)
     mover.join(60)
