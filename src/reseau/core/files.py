@@ -66,13 +66,6 @@ def empty_folder(path: Path, do: str = "give a new or an empty folder") -> Path:
     ------
     UsageError
         When there is something; `do` says what helps.
-
-    Examples
-    --------
-    >>> empty_folder(Path("src"))
-    Traceback (most recent call last):
-    ...
-    reseau.core.errors.UsageError: src: is not empty; give a new or an empty folder
     """
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise UsageError("is not empty", where=path, do=do)
@@ -86,11 +79,6 @@ def made_folder(path: Path) -> Path:
     ------
     InputError
         When it cannot be made.
-
-    Examples
-    --------
-    >>> made_folder(Path("src")).name
-    'src'
     """
     try:
         path.mkdir(parents=True, exist_ok=True)

@@ -156,34 +156,12 @@ def measure_blurred_photograph(
 
 
 def photographs_of_network(folder: Path, network: Network) -> dict[str, Path]:
-    """Find the photographs of the images of a network in a folder.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder.
-    network : Network
-        Names its files, or the photographs are called as its images, with or without suffix.
-
-    Returns
-    -------
-    dict of str to Path
-        Photographs by the names of the images; images without one are left out.
+    """Return the photographs of a folder by the images of a network: its files, or called as the images.
 
     Raises
     ------
-    UsageError
-        When it is not a folder, or has none of them.
-    InputError
-        When it has no photograph.
-
-    Examples
-    --------
-    >>> from reseau.bundle import example_network
-    >>> photographs_of_network(Path("no/folder"), example_network())
-    Traceback (most recent call last):
-    ...
-    reseau.core.errors.UsageError: no/folder: is not a folder
+    UsageError, InputError
+        When it is not a folder, or has no photograph of an image of the network.
     """
     if not folder.is_dir():
         raise UsageError("is not a folder", where=folder)
@@ -200,28 +178,7 @@ def photographs_of_network(folder: Path, network: Network) -> dict[str, Path]:
 
 
 def network_documents(found: BlurredNetwork, document: Network1, provenance: Provenance) -> dict[str, str]:
-    """Return the documents of a network of blurred targets by the names of their files.
-
-    Parameters
-    ----------
-    found : BlurredNetwork
-        What was measured.
-    document : Network1
-        The network that was measured.
-    provenance : Provenance
-        Inputs and parameters.
-
-    Examples
-    --------
-    >>> from reseau.bundle import adjust_network, example_network
-    >>> from reseau.bundle.network import network_document
-    >>> import numpy as np
-    >>> from reseau.procedures.blurred_network import BlurredRound
-    >>> network, none = example_network(), np.zeros(160, dtype=bool)
-    >>> found = BlurredNetwork((BlurredRound(adjust_network(network), {}, none, ~none, none, 0.0),), 0)
-    >>> list(network_documents(found, network_document(network), Provenance()))
-    ['round-0.json', 'result.json', 'network.json']
-    """
+    """Return every round, the final result and the final network by the names of their files."""
     results = {f"round-{number}.json": entry.result for number, entry in enumerate(found.rounds)}
     written = {
         name: ResultDocument.of(each, provenance=provenance).to_json()

@@ -59,8 +59,8 @@ _REACHED, _SEEN, _SAMPLES = 0.12, 0.4, 20
 that must be seen; and the number of these parts."""
 _STATUS = {"oriented": 2, "three-edges": 1, "declined": 0}
 """Rank of each status."""
-_REMEDY = "scan it with more contrast"
-"""What helps if edges are uncertain."""
+_REMEDY, _FLAT = "scan it with more contrast", "hold the film flat and parallel to the sensor"
+"""What helps if edges are uncertain, and if they are not straight."""
 _SLANT = float(np.deg2rad(0.7))
 """Standard deviation of the rotation angle of a tilted copying camera, radians."""
 _MOST_W = 4.0
@@ -532,14 +532,14 @@ def _judged(
     lines = adjust_lines(corners, measured.data, shape, measured.rejected)
     if isinstance(lines, Failure):
         return replace(base, why=lines.reason, edges=_reports(measured, None), code=lines.code)
-    worst, slant, code = np.abs(np.nan_to_num(lines.shape_w)).max(), "", None
+    (w, h), slant, code = guess.format_mm, "", None
+    worst = np.abs(np.nan_to_num(lines.shape_w)).max()
     if worst > _MOST_W and not missing and (seen := _slanted(corners, measured, shape)):
         lines, converging = seen
         worst, code = 0.0, Code.TILTED
         slant = f"seen at an angle: opposite edges converge by {np.rad2deg(converging):.1f}°"
     base = replace(base, lines=lines, edges=_reports(measured, lines), why=slant, code=code)
     if worst > _MOST_W:
-        w, h = guess.format_mm
         return replace(
             base,
             lines=None,
@@ -556,12 +556,13 @@ def _judged(
         why = f"{missing[0]} edge: {reason}; its position follows from the format"
         return replace(base, status="three-edges", why=why, code=Code.EDGE_MISSING)
     scale = max(base.px_per_mm or (0.0, 0.0))
-    if (most := float(sigma.max())) > max(
-        _MOST_SIGMA_PX, _MOST_SIGMA_MM * scale, _MOST_SIGMA_WIDTHS * measured.width
-    ):
+    limit = max(_MOST_SIGMA_PX, _MOST_SIGMA_MM * scale, _MOST_SIGMA_WIDTHS * measured.width)
+    if (most := float(sigma.max())) > limit:
         wavy = [EDGES[k] for k, data in enumerate(measured.data) if data is not None and data.wave > most / 2]
-        remedy = f"the {wavy[0]} edge is no straight or evenly bowed line" if wavy else _REMEDY
-        why = f"a corner would have a standard deviation of {most:.2f} px; {remedy}"
+        remedy = f"the {wavy[0]} edge is no straight or evenly bowed line; {_FLAT}" if wavy else _REMEDY
+        mm = f"{1000 * most / scale:.2g} µm of {w:g}x{h:g} mm, " if scale else ""
+        size = f"{most:.2f} px ({mm}at most {limit:.2f} px)"
+        why = f"a corner would have a standard deviation of {size}; {remedy}"
         return replace(base, lines=None, why=why, code=Code.UNCERTAIN)
     known = _resolution(scan, options, guess.format_mm)
     own = float(np.mean(base.px_per_mm or (1.0, 1.0)))
