@@ -8,10 +8,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import scipy.linalg  # noqa: F401  # loads a library of its own beside that of NumPy
 import sqlalchemy as sa
 from hypothesis import settings
 
 from reseau.archive import Archive
+from reseau.core.threads import always_one_thread
 
 from . import kept
 
@@ -20,6 +22,11 @@ settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
 _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+# Workers share the processors: so do the commands that tests start.
+always_one_thread()
+os.environ |= {name: os.environ.get(name, "1") for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
 
 
 @pytest.fixture(scope="session")
