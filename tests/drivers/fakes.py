@@ -8,12 +8,12 @@ from __future__ import annotations
 import re
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from reseau.instruments import Deadline
 
-__all__ = ["GrblBoard", "Receiver", "TCube", "Wire", "ZaberStage"]
+__all__ = ["GrblBoard", "Lines", "Receiver", "TCube", "Wire", "ZaberStage"]
 
 
 class Receiver(Protocol):
@@ -58,6 +58,28 @@ class Wire:
         if not said:
             time.sleep(deadline.at_most(0.002))
         return said
+
+
+class Lines:
+    """Answers lines, by how they begin; other lines are not answered.
+
+    Parameters
+    ----------
+    answers : mapping of str to bytes
+        Answers, as they are sent.
+    """
+
+    def __init__(self, answers: Mapping[str, bytes]) -> None:
+        self.answers, self.heard, self._line = dict(answers), list[str](), b""
+
+    def receive(self, data: bytes) -> bytes:
+        """Answer the lines that end in these bytes."""
+        *lines, self._line = (self._line + data).split(b"\n")
+        texts = [line.decode().strip() for line in lines]
+        self.heard += texts
+        return b"".join(
+            said for text in texts for known, said in self.answers.items() if text.startswith(known)
+        )
 
 
 class GrblBoard:

@@ -67,7 +67,7 @@ def test_impossible_values_are_refused(value: float) -> None:
     machine = ScpiSensor(lambda: AIR | {"temperature": value})
     with (
         environment_scpi("air", InProcess(lambda: FaultyConnection(machine)), quantities=QUERIES) as air,
-        pytest.raises(InstrumentError, match=r"temperature|not a number"),
+        pytest.raises(InstrumentError, match=r"temperature|TEMP"),
     ):
         air.environment()
 

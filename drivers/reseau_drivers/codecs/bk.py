@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 from reseau.core.errors import ProtocolError
 
+from .numbers import number
 from .stream import Damaged, excerpt
 
 __all__ = ["PORT", "GrabbedFrame", "MessageDecoder", "encode", "encode_frame", "numbers", "parse_frame"]
@@ -175,9 +176,7 @@ def numbers(content: bytes, name: str) -> tuple[float, ...]:
     (640.0, 480.0)
     """
     prefix = f"DATA:{name} ".encode("ascii")
-    try:
-        if not content.startswith(prefix):
-            raise ValueError
-        return tuple(float(value) for value in content[len(prefix) :].rstrip(b"; ").split(b","))
-    except ValueError:
-        raise ProtocolError(f"not an answer to {name}: {excerpt(content)}") from None
+    if not content.startswith(prefix):
+        raise ProtocolError(f"not an answer to {name}: {excerpt(content)}")
+    values = content[len(prefix) :].rstrip(b"; ").decode("latin-1").split(",")
+    return tuple(number(value) for value in values)

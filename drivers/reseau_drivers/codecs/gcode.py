@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 from reseau.core.errors import ProtocolError, SettingError
 
+from .numbers import number
 from .stream import LineMessageDecoder, excerpt
 
 __all__ = [
@@ -319,8 +320,10 @@ def _report(text: str) -> Report:
     for each in filter(None, found[3].split("|")):
         name, _, values = each.partition(":")
         try:
-            fields[name] = tuple(float(value) for value in values.split(","))
-        except ValueError:  # switches that are closed are letters
+            fields[name] = tuple(number(value) for value in values.split(","))
+        except ProtocolError:  # switches that are closed are letters
+            if name == "MPos":
+                raise
             fields[name] = ()
     return Report(found[1], int(found[2] or 0), fields)
 

@@ -11,6 +11,7 @@ from typing import Literal
 
 from reseau.core.errors import ProtocolError, SettingError
 
+from .numbers import number
 from .stream import excerpt
 
 __all__ = ["Checksum", "Sentence", "checksum", "with_checksum"]
@@ -93,10 +94,7 @@ class Sentence:
         content = self._content(line) if self._checksum == "xor" else line
         if not content.isascii() or (found := self._pattern.fullmatch(content.decode().strip())) is None:
             raise ProtocolError(f"not a line with values: {excerpt(line)}")
-        try:
-            return {name: float(text) for name, text in found.groupdict().items() if text is not None}
-        except ValueError:
-            raise ProtocolError(f"a value that is no number: {excerpt(line)}") from None
+        return {name: number(text) for name, text in found.groupdict().items() if text is not None}
 
     @staticmethod
     def _content(line: bytes) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from typing import Literal
 
@@ -10,15 +9,15 @@ from reseau.core.errors import DeadlineError, ProtocolError, SettingError
 from reseau.instruments import Deadline, Identity
 
 from ..codecs import modbus
+from ..codecs.numbers import number
 from ..codecs.sentence import Sentence
-from ..codecs.stream import LineDecoder, excerpt
+from ..codecs.stream import LineDecoder
 from ..link import Link, MessageLink
 
 __all__ = ["Framing", "LineProbe", "ModbusProbe", "Register", "ScpiProbe"]
 
 Framing = Literal["rtu", "tcp"]
 
-_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[Ee][-+]?\d+)?)\s*[^\d\s]*\s*")
 _LONGEST = 512
 
 
@@ -82,11 +81,7 @@ class ScpiProbe:
         return {name: self._number(query, deadline) for name, query in self._queries.items()}
 
     def _number(self, query: str, deadline: Deadline) -> float:
-        line = self._ask(query, lambda line: True, deadline)
-        found = _NUMBER.fullmatch(line.decode("ascii", "replace"))
-        if found is None:
-            raise ProtocolError(f"{excerpt(line)} is not a number", command=query)
-        return float(found[1])
+        return number(self._ask(query, lambda line: True, deadline).decode("latin-1"), None, to=query)
 
     def _ask(self, query: str, is_answer: Callable[[bytes], bool], deadline: Deadline) -> bytes:
         return self._link.query(query.encode("ascii") + b"\n", is_answer, deadline.part(self._answer_s))

@@ -6,11 +6,10 @@ family.
 
 from __future__ import annotations
 
-import math
 import re
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
 from typing import Literal
@@ -20,8 +19,11 @@ import numpy as np
 from reseau.core.data import Array
 from reseau.core.errors import ProtocolError
 
+from ..codecs.numbers import INFINITE
+
 __all__ = [
     "DIALECTS",
+    "UNITS",
     "Dialect",
     "Step",
     "WaveformDialect",
@@ -64,6 +66,8 @@ class WaveformDialect:
     piece : str
         Command before each block, if the samples come in several blocks; ``{at}`` is the index of the first
         sample.
+    more : tuple of int
+        Numbers of further fields that the answers of `scale` may have.
     """
 
     setup: tuple[str, ...]
@@ -77,6 +81,7 @@ class WaveformDialect:
     fields: Mapping[str, tuple[int, str]] = field(default_factory=dict)
     wide: tuple[str, str] | None = None
     piece: str = ""
+    more: tuple[int, ...] = (0,)
 
     def sampled(self, numbers: Numbers) -> tuple[str, str]:
         """Return the command for the sample width, and the data type."""
@@ -124,6 +129,8 @@ class Dialect:
         return next(maker for maker in _MAKERS if self.name.startswith(maker))
 
 
+UNITS = {"vdiv": "V", "ofst": "V", "rate": "Sa/s", "tdiv": "s"}
+"""Units that may follow numbers, by their names."""
 _TEN = "- - points - dx x0 - dy y0 yref"
 """The ten numbers of a Keysight or Rigol preamble: format, type, points, count, x, y."""
 
@@ -157,7 +164,8 @@ def _curve(group: str, **more: str) -> WaveformDialect:
 
 
 _KEYSIGHT = _with_preamble("u1", ":WAVeform:UNSigned ON")
-_INFINIIUM = _with_preamble("i1", ":WAVeform:STReaming OFF")
+# Coupling, ranges, date and the like follow; the number of segments in segmented memory.
+_INFINIIUM = replace(_with_preamble("i1", ":WAVeform:STReaming OFF"), more=(0, 14, 15))
 _RIGOL = _with_preamble("u1", ":WAVeform:MODE NORMal", shifted=True)
 _SIGLENT = WaveformDialect(
     ("CHDR OFF", "WFSU SP,0,NP,0,FP,0"),
@@ -373,7 +381,7 @@ def fields_of(block: bytes, dialect: WaveformDialect) -> Numbers:
     except struct.error:
         raise ProtocolError(f"a preamble of {len(block)} bytes is too short") from None
     divisors = (found.get("codes", 1.0), found.get("dx", 1.0))
-    if not all(math.isfinite(value) for value in found.values()) or min(divisors) <= 0:
+    if not all(abs(value) < INFINITE for value in found.values()) or min(divisors) <= 0:
         raise ProtocolError(f"the preamble contains invalid numbers: {found}")
     return found
 
@@ -384,12 +392,15 @@ def samples_of(data: bytes, dialect: WaveformDialect, numbers: Numbers) -> Array
     Raises
     ------
     ProtocolError
-        If the number of samples differs from the announced one.
+        If the number of samples differs from the announced one, or some have no value.
     """
     dtype = np.dtype(dialect.sampled(numbers)[1])
     if len(data) % dtype.itemsize:
         raise ProtocolError(f"{len(data)} bytes are not a whole number of samples")
     codes = np.frombuffer(data, dtype).astype(np.float64)
-    if "points" in numbers and len(codes) != int(numbers["points"]):
+    if "points" in numbers and len(codes) != numbers["points"]:
         raise ProtocolError(f"received {len(codes)} samples; {numbers['points']:g} were announced")
-    return dialect.volts(codes, numbers)
+    volts = dialect.volts(codes, numbers)
+    if not np.all(np.abs(volts) < INFINITE):
+        raise ProtocolError("some samples stand for no value", do="is the channel on?")
+    return volts

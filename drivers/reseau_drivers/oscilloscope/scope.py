@@ -12,10 +12,11 @@ from reseau.core.errors import DeadlineError, ProtocolError, RefusedError
 from reseau.instruments import Deadline, Device, Identity, Limits, ScreenPicture, Settings, Waveform, quantity
 from reseau.instruments.values import now
 
-from ..codecs.ieee488 import LARGEST, error_entry, missing_bytes, parse_block, picture
+from ..codecs.ieee488 import LARGEST, Header, error_entry, missing_bytes, parse_block, picture
+from ..codecs.numbers import numbers
 from ..codecs.stream import excerpt
 from ..link import Link
-from .dialects import Dialect, WaveformDialect, candidates_of, dialect_of, fields_of, samples_of
+from .dialects import UNITS, Dialect, WaveformDialect, candidates_of, dialect_of, fields_of, samples_of
 
 __all__ = ["Oscilloscope", "OscilloscopeSettings"]
 
@@ -191,33 +192,36 @@ class Oscilloscope(Device[OscilloscopeSettings]):
             asked = now()
             for command in dialect.setup:
                 self._send(command.format(n=channel), deadline)
-            numbers: dict[str, float] = {}
+            scale: dict[str, float] = {}
             for names, question in dialect.scale.items():
-                numbers |= _numbers(names, self._query(question.format(n=channel), deadline))
+                asked_for = question.format(n=channel)
+                scale |= _numbers(names, self._query(asked_for, deadline), asked_for, dialect.more)
             if dialect.preamble:
-                numbers |= fields_of(parse_block(self._fetch(dialect.preamble, deadline)), dialect)
-            data = self._samples(dialect, numbers, channel, deadline)
+                scale |= fields_of(parse_block(self._fetch(dialect.preamble, deadline)), dialect)
+            data = self._samples(dialect, scale, channel, deadline)
+            if not data:
+                raise ProtocolError(f"sent no samples of channel {channel}", do="switch the channel on")
             try:
-                volts = samples_of(data, dialect, numbers)
-                start, step = dialect.start(numbers), dialect.step(numbers)
+                volts = samples_of(data, dialect, scale)
+                start, step = dialect.start(scale), dialect.step(scale)
             except ZeroDivisionError:
                 raise ProtocolError("the waveform has no extent in time") from None
             return Waveform(volts, start, step, channel, asked)
 
     def _samples(
-        self, dialect: WaveformDialect, numbers: dict[str, float], channel: int, deadline: Deadline
+        self, dialect: WaveformDialect, scale: dict[str, float], channel: int, deadline: Deadline
     ) -> bytes:
         """Return the samples of a waveform, from as many blocks as needed."""
-        command, dtype = dialect.sampled(numbers)
+        command, dtype = dialect.sampled(scale)
         if command:
             self._send(command, deadline)
         question = dialect.data.format(n=channel)
         if not dialect.piece:
             return parse_block(self._fetch(question, deadline))
         data, size = b"", np.dtype(dtype).itemsize
-        wanted = size * int(numbers["points"])
+        wanted = size * int(scale["points"])
         if not 0 < wanted <= LARGEST:
-            raise ProtocolError(f"announces {numbers['points']:g} samples")
+            raise ProtocolError(f"announces {scale['points']:g} samples")
         while len(data) < wanted:
             self._send(dialect.piece.format(at=len(data) // size), deadline)
             piece = parse_block(self._fetch(question, deadline))
@@ -301,15 +305,15 @@ def _start_of_binary(data: bytearray) -> int:
     return sign if word.endswith(b",") and word.isascii() else start
 
 
-def _numbers(names: str, answer: str) -> dict[str, float]:
-    """Parse an answer with commas into numbers by name."""
-    wanted, found = names.split(), answer.split(",")
-    if len(found) < len(wanted):
-        raise ProtocolError(f"{answer!r} has fewer than {len(wanted)} numbers")
-    try:
-        return {name: float(text) for name, text in zip(wanted, found, strict=False) if name != "-"}
-    except ValueError:
-        raise ProtocolError(f"{answer!r} does not consist of numbers") from None
+def _numbers(names: str, answer: str, question: str, more: tuple[int, ...]) -> dict[str, float]:
+    """Parse an answer, which may repeat the header of its question, into numbers by name."""
+    wanted = names.split()
+    header, space, rest = answer.partition(" ")
+    if space and header[:1].isalpha() and Header(question).matches(f"{header}?"):
+        answer = rest
+    unit = UNITS.get(names, "")
+    found = numbers(answer, *(len(wanted) + each for each in more), unit=unit, to=question)
+    return {name: value for name, value in zip(wanted, found, strict=True) if name != "-"}
 
 
 def _verify_png(data: bytes) -> None:

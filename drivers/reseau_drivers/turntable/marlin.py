@@ -32,7 +32,7 @@ _BOOT_S, _SILENT_S, _STANDS_S, _POLL_S = 6.0, 4.0, 1.0, 0.01
 _RESENDS = 3
 _ROUNDED = 0.006
 """M114 reports positions with two decimals."""
-_PAIR = re.compile(r"([A-Z]):\s*(-?\d+(?:\.\d+)?)")
+_PAIR = re.compile(r"([A-Z]):\s*(-?\d+(?:\.\d+)?)(?=\s|$)")
 
 
 @dataclass
@@ -252,7 +252,7 @@ class Marlin:
 
     def _steps_per_unit(self, deadline: Deadline) -> dict[str, float]:
         for text in self._exchange("M92", deadline):
-            if found := dict(re.findall(r"([XYZABC])(\d+(?:\.\d+)?)", text.partition("M92")[2])):
+            if found := dict(re.findall(r"([XYZABC])(\d+(?:\.\d+)?)(?=\s|$)", text.partition("M92")[2])):
                 return {letter: float(steps) for letter, steps in found.items() if float(steps) > 0}
         raise ProtocolError("does not tell its steps per unit (M92)")
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from reseau.core.errors import ProtocolError, RefusedError, StateError
 from reseau.instruments import Deadline, Identity
 
+from ..codecs.numbers import number
 from ..codecs.smc100 import ERRORS, LIMIT, Line, Phase, decode, decode_status, encode
 from ..codecs.stream import LineDecoder
 from ..link import Link, MessageLink
@@ -89,11 +90,7 @@ class Smc100:
     def state(self, plan: AxisPlan, deadline: Deadline) -> Reported:
         """Return what it reports of the axis."""
         status = decode_status(self._query(plan, "TS", deadline))
-        answer = self._query(plan, "TP", deadline)
-        try:
-            position = float(answer) / plan.per_unit
-        except ValueError:
-            raise ProtocolError(f"{answer!r} is not a position") from None
+        position = number(self._query(plan, "TP", deadline)) / plan.per_unit
         phase, faults = status.phase, status.error_texts
         if phase is Phase.DISABLED:
             faults = (*faults, "the motor is disabled")

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from reseau.core.errors import ProtocolError, RefusedError, StateError
 from reseau.instruments import Deadline, Identity
 
+from ..codecs.numbers import number
 from ..codecs.zaber import FAULTS, UNREFERENCED, UNRELIABLE, Command, Message, MessageDecoder, Reply, encode
 from ..link import Link, MessageLink
 from .reference import References, Reported
@@ -90,10 +91,6 @@ class Zaber:
             raise ProtocolError(f"{reply.data!r} is not a list of warnings")
         # Query the movement first: a position read before it could be an intermediate one.
         position = self._query(plan.device, plan.axis, "get pos", deadline).data
-        try:
-            steps = float(position)
-        except ValueError:
-            raise ProtocolError(f"{position!r} is not a position") from None
         found = {
             flag: FAULTS.get(flag, f"it reports {flag}, which is not known")
             for flag in flags
@@ -103,7 +100,7 @@ class Zaber:
             if flag in UNRELIABLE or flag not in FAULTS:
                 self.references.void(what, plan.name)
         referenced = not any(flag in UNREFERENCED for flag in flags)
-        return Reported(steps / plan.per_unit, reply.busy, referenced, tuple(found.values()))
+        return Reported(number(position) / plan.per_unit, reply.busy, referenced, tuple(found.values()))
 
     def _query(self, device: int, axis: int, words: str, deadline: Deadline) -> Reply:
         """Send a command and wait for its reply, which repeats its number."""
