@@ -309,7 +309,9 @@ def _row(decision: Decision) -> DecisionRow:
         reviewed_by=decision.reviewed_by, review=decision.review, comments=list(decision.comments),
         session=decision.session,
         earlier=[
-            EarlierRow(at=at.isoformat(), by=by, outcome=judged.outcome, rules=int(str(judged.rules["version"])))
+            EarlierRow(
+                at=at.isoformat(), by=by, outcome=judged.outcome, rules=int(str(judged.rules["version"]))
+            )
             for by, at, judged in decision.earlier
         ],
     )  # fmt: skip
@@ -455,7 +457,7 @@ def comparison(first: Chosen, second: Chosen) -> tuple[Comparison, Any]:
     import numpy as np
 
     from ...calibration import CameraMapping, calibration_difference
-    from ..rules import difference
+    from ..fields import difference
 
     old, new = first.calibration, second.calibration
     found = difference(new, old)
