@@ -1,8 +1,9 @@
-"""Control charts of recalibrations: run lengths, joint false alarms without drift, delays with drift.
+"""Recalibrations: run lengths of charts, joint false alarms, delays, and acceptance against a reference.
 
     python benchmarks/recalibration.py --part lengths     # run lengths compared with r-cran-spc (Debian)
     python benchmarks/recalibration.py --part false       # years without drift
     python benchmarks/recalibration.py --part delays      # shifts with known and with estimated parameters
+    python benchmarks/recalibration.py --part acceptance  # years of 52 runs beside a reference calibration
 
 A bench has ten parameters and the norm of the field over the image, which is that of their differences from
 the first run. Series are AR(1); parameters are independent, or correlated by 0.5 and −0.9 as K1, K2, K3 are.
@@ -24,6 +25,7 @@ from reseau.core.data import Array
 from reseau.execution import Executor
 from reseau.service.charts import ChartOptions, KnownSeries, monitor
 from reseau.service.runlength import Cusum, Ewma, Prerun, Shewhart
+from reseau.service.trend import RunHistory, explain_runs
 
 PARAMETERS, YEAR, AT_ONCE = 10, 52, 2500
 SHIFTS = (0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0)
@@ -194,11 +196,94 @@ def _delays(count: int, seed: int, case: tuple[str, int, float]) -> str:
     return f"  {name:<30}{line}"
 
 
+SIGMA, WEEKS = 0.3, 53
+"""Largest standard deviation of a run over the image, in limits; runs with the reference."""
+HAPPENINGS = (
+    ("stable", 0.0), ("creeping", 0.05), ("creeping", 0.1), ("creeping", 0.2), ("creeping", 0.5),
+    ("jump", 2.0), ("jump", 3.0), ("temperature", 0.4), ("temperature", 0.3), ("lens exchanged", 10.0),
+    ("other target", 3.0),
+)  # fmt: skip
+"""What happens, and how large it is in limits: a week, at once, at most in the year."""
+
+
+def error_fields() -> Array:
+    """Fields (49, 2, 4) of the errors of a run: scale, both offsets, distortion; orthogonal, in limits."""
+    x, y = (each.ravel() for each in np.meshgrid(*[np.linspace(-1.0, 1.0, 7)] * 2))
+    one, r2 = np.ones_like(x), x**2 + y**2
+    pairs = ((x, y), (0.7 * one, 0 * x), (0 * x, 0.7 * one), (0.5 * x * r2, 0.5 * y * r2))
+    root = np.stack([np.stack(pair, axis=1) for pair in pairs], axis=2)
+    largest = np.linalg.eigvalsh(root @ np.swapaxes(root, 1, 2))[:, -1].max()
+    u, s, _ = np.linalg.svd((SIGMA / np.sqrt(largest) * root).reshape(-1, 4), full_matrices=False)
+    return np.asarray((u * s).reshape(-1, 2, 4))
+
+
+def acceptance(executor: Executor, count: int) -> None:
+    """Simulate years of weekly runs in which something happens, each accepted or not as by `judge`."""
+    print(
+        f"acceptance against a reference: years of 52 runs, errors of a run {SIGMA} limits, four directions"
+    )
+    for kind, size in HAPPENINGS:
+        jobs = [(kind, size, seed) for seed in range(count)]
+        found = np.array(list(outcomes(executor, a_year, jobs, together=20)))
+        missed, held, accepted, first, announced = found.T
+        line = (
+            f"  {kind:<15}{size:5.2f}   missed {100 * missed.mean():5.1f} %   false {held.mean():5.3f} a year"
+        )
+        line += f"   accepted {100 * np.nanmean(accepted):5.1f} %"
+        for name, values in (("held at", first), ("announced at", announced)):
+            there = values[np.isfinite(values)]
+            if len(there):
+                low, middle, high = np.quantile(there, [0.01, 0.5, 0.99])
+                line += f"   {name} {middle:.2f} ({low:.2f} to {high:.2f})"
+        print(line, flush=True)
+
+
+def a_year(job: tuple[str, float, int]) -> tuple[float, float, float, float, float]:
+    """A year: whether a run beyond limit and two sigma was accepted; runs held back that are nearer to the
+    reference than limit less two sigma; part of the runs accepted without a warning; drift at which one was
+    held back, and announced, first."""
+    kind, size, seed = job
+    rng, basis, weeks = np.random.default_rng(seed), error_fields(), np.arange(WEEKS)
+    direction = rng.normal(size=4)
+    direction /= np.hypot(*(basis @ direction).T).max()
+    drift = {
+        "stable": 0.0 * weeks, "creeping": size * weeks, "jump": size * (weeks >= 20),
+        "temperature": size * np.sin(2 * np.pi * weeks / 52), "lens exchanged": size * (weeks >= 20),
+        "other target": size * (weeks % 10 == 9),
+    }[kind]  # fmt: skip
+    values = rng.normal(size=(WEEKS, 4)) + drift[:, None] * direction
+    values -= values[0]
+    in_force, runs, missed, false, sound = 0, [0], False, 0, list[bool]()
+    first = announced = np.nan
+    for week in range(1, WEEKS):
+        rows, true = [*runs, week], abs(drift[week])
+        covs = np.repeat(np.eye(4)[None], len(rows), axis=0)
+        said = explain_runs(
+            RunHistory(7.0 * np.array(rows), values[rows], covs, basis), 1.0, runs.index(in_force)
+        )
+        rejected = said.beyond(1.0, step=True) > 0.5 and said.p < 0.01
+        held = rejected or said.beyond(1.0) > 0.5 or said.beyond(1.0, step=True) > 0.5
+        sound.append(not held and said.p >= 0.01 and said.beyond(0.5) <= 0.5)
+        if not rejected:
+            runs.append(week)
+        if held:
+            first = true if np.isnan(first) else first
+            false += true < 1 - 2 * SIGMA
+        else:
+            in_force = week
+            missed |= true > 1 + 2 * SIGMA
+        if len(rows) > 4 and said.creeping > 0.5 and said.size()[0] >= 0.5 and np.isnan(announced):
+            announced = true
+        if held and kind == "creeping" and true > 1 + 2 * SIGMA:
+            break
+    return float(missed), float(false), float(np.mean(sound)), float(first), float(announced)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--part", choices=("lengths", "false", "delays"))
+    parser.add_argument("--part", choices=("lengths", "false", "delays", "acceptance"))
     parser.add_argument("--years", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=1)
     add_options(parser)
@@ -211,6 +296,8 @@ def main() -> None:
             false_alarms(executor, given.years, given.seed)
         if given.part in (None, "delays"):
             delays(executor, 5000, given.seed)
+        if given.part in (None, "acceptance"):
+            acceptance(executor, 200)
     print(f"{time.monotonic() - start:.0f} s")
 
 

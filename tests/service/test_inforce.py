@@ -15,7 +15,7 @@ from reseau.calibration import Calibration, Covariance, Quantity
 from reseau.cli import run
 from reseau.core.errors import FormatError, UsageError
 from reseau.service import AcceptanceRules, Configurations, Limits, judge
-from reseau.service.rules import difference
+from reseau.service.fields import difference
 
 START = datetime(2026, 3, 2, 8, 0, tzinfo=UTC)
 RULES = AcceptanceRules(version=1, image=Limits(warning=0.1, action=0.4))
@@ -100,7 +100,7 @@ def started(archive: Archive) -> tuple[Configurations, str]:
         (camera(c=8.0005, scale=5.0), "accepted", None),
         (camera(c=8.005), "accepted with warning", "image"),
         (camera(c=8.05), "rejected", "image"),
-        (camera(c=8.012, scale=60.0), "needs review", "image"),
+        (camera(c=8.012, scale=60.0), "needs review", "resolution"),
         (camera(scale=1500.0), "needs review", "resolution"),
         (camera(redundancy=3), "rejected", "redundancy"),
         (camera(extent=(200.0, 10.0, 500.0, 470.0)), "rejected", "coverage"),
@@ -330,6 +330,39 @@ def test_a_session_is_the_origin_only_of_calibrations_among_its_results(archive:
     made = known.decide("left", new, RULES, since=day(7), session="monday", comment="session tuesday")
     assert (made.session, made.comment) == ("monday", "session tuesday")
     assert known.decision("left", first).session is None
+
+
+def test_a_creeping_drift_is_announced_and_held_back_and_counts_from_the_reference(archive: Archive) -> None:
+    known, _ = started(archive)
+    rng, made = np.random.default_rng(5), []
+    for k in range(1, 13):  # 0.06 px a week, of which 0.4 px are allowed
+        values = {key: FIRST[key] + SIGMA[key] * rng.normal() for key in SIGMA}
+        values["c"] += 0.0012 * k
+        made.append(known.decide("left", camera(**values), RULES, since=day(7 * k)))
+    px = [0.06 * k for k in range(1, 13)]
+    held = [d.outcome == "needs review" for d in made]
+    assert not any(h for h, size in zip(held, px, strict=True) if size < 0.38)
+    assert all(h for h, size in zip(held, px, strict=True) if size > 0.44)
+    trends = [[f.text for f in d.judgement.findings if f.rule == "trend"] for d in made]
+    assert [bool(each) for each in trends[:6]] == [False, False, False, True, True, True]
+    # Six weeks and five days after the first one.
+    assert "reaches the limit of 0.4 px about 2026-04-1" in trends[4][0]
+    last = made[5].key
+    with pytest.raises(UsageError, match="was not accepted"):
+        known.set_reference("left", made[-1].key, comment="new")
+    known.set_reference("left", last, by="Ada", comment="the lens was fixed")
+    assert known.reference("left") == last
+    values = {key: FIRST[key] for key in SIGMA} | {"c": 8.0 + 0.0012 * 6}
+    assert known.decide("left", camera(**values, name="again"), RULES, since=day(91)).outcome != "rejected"
+
+
+def test_a_stable_camera_is_accepted(archive: Archive) -> None:
+    known, _ = started(archive)
+    rng, found = np.random.default_rng(6), []
+    for k in range(1, 21):
+        values = {key: FIRST[key] + 8 * SIGMA[key] * rng.normal() for key in SIGMA}
+        found.append(known.decide("left", camera(scale=8.0, **values), RULES, since=day(7 * k)).outcome)
+    assert found.count("accepted") >= 19, found
 
 
 def test_a_drift_of_one_parameter_is_signalled_and_named(tmp_path: Path) -> None:

@@ -52,6 +52,8 @@ class FieldDifference(Display):
         spread.
     dof : float
         Degrees of freedom of the covariances: their scale is an estimate.
+    root : ndarray (rows * columns, 2, k), optional
+        A root of the covariance of all differences together.
 
     Examples
     --------
@@ -70,6 +72,7 @@ class FieldDifference(Display):
     statistic: float
     degrees: float
     dof: float = float("inf")
+    root: Array | None = None
 
     @property
     def size(self) -> Array:
@@ -219,13 +222,15 @@ def calibration_difference(
     statistic, degrees = _statistic(root, off)
     difference, cov = np.full((len(xy), 2), np.nan), np.full((len(xy), 2, 2), np.nan)
     difference[rows], cov[rows] = off, root @ np.swapaxes(root, 1, 2)
+    every = np.full((len(xy), *root.shape[1:]), np.nan)
+    every[rows] = root
     # The camera is rotated in the opposite sense to its rays.
     angle = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
     if parallel:
         angle[:2] = 0.0
     return FieldDifference(
         xy.reshape(*shape, 2), difference.reshape(*shape, 2), cov.reshape(*shape, 2, 2), angle, statistic,
-        degrees, _joint_dof(first, second, by_first, by_second),
+        degrees, _joint_dof(first, second, by_first, by_second), every,
     )  # fmt: skip
 
 

@@ -149,6 +149,19 @@ def return_(
 
 
 @app.command()
+def reference(
+    name: Name,
+    key: Key,
+    comment: v.Comment,
+    place: Place,
+    by: v.By = "",
+) -> None:
+    """Let the drift of later calibrations count from an accepted one on. Default: the first one accepted."""
+    with _opened(place) as found:
+        found.set_reference(name, key, by=by, comment=comment)
+
+
+@app.command()
 def event(
     name: Name,
     what: Annotated[str, typer.Argument(help="What happened: lens changed, camera dropped.")],

@@ -162,6 +162,9 @@ class Alarms:
                     said = "was rejected" if each.outcome == "rejected" else "needs a review"
                     which = f"{each.since:%Y-%m-%d %H:%M}Z ({each.name or each.key})"
                     found[f"calibration {name} {each.key}"] = f"{name}: the calibration of {which} {said}"
+            trend = [f for f in history[-1].judgement.findings if f.rule == "trend"] if history else []
+            if trend:
+                found[f"trend {name} {known.reference(name)}"] = f"{name}: {trend[0].text}"
             events = known.events(name)
             since = events[-1][0] if events else None
             if not [d for d in history if d.outcome != "rejected" and (since is None or d.since >= since)]:

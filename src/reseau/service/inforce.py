@@ -12,7 +12,6 @@ import getpass
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal, cast
 
@@ -29,17 +28,17 @@ from ..calibration import (
 from ..core.data import Array
 from ..core.errors import UsageError
 from ..core.failure import Failure
-from .charts import ChartOptions, Monitored, monitor
+from .charts import ChartOptions, monitor
 from .covariates import (
     CalibrationFunction,
     CovariateTable,
-    Explanation,
     FunctionOptions,
     conditions_of,
     explain,
     fit_function,
     series_of,
 )
+from .decisions import Applied, Decision, Drift
 from .rules import AcceptanceRules, Judgement, Outcome, judge
 
 __all__ = ["Applied", "Configurations", "Decision", "Drift", "a_time", "key_of"]
@@ -49,119 +48,6 @@ _KEY_LENGTH = 12
 _KEY = re.compile(rf"[0-9a-f]{{{_KEY_LENGTH}}}")
 """The form of keys, which no name has."""
 _ACCEPTED = ("accepted", "accepted with warning")
-
-
-@dataclass(frozen=True)
-class Decision:
-    """A decision on a calibration of a configuration.
-
-    Parameters
-    ----------
-    key : str
-        Start of the SHA-256 of the calibration, by which the decision is named.
-    outcome : {"accepted", "accepted with warning", "rejected", "needs review"}
-        The outcome by the rules, or by a person where these left it open.
-    since : datetime
-        From when on the calibration applies, if it was accepted.
-    at : datetime
-        When it was decided.
-    by, comment : str
-        By whom or what, and why.
-    judgement : Judgement
-        Findings, with the rules by which it was judged.
-    compared_with : str or None
-        Key of the calibration in force it was compared with.
-    reviewed_by, review : str
-        Who reviewed it, and the reason; empty if nobody did.
-    comments : tuple of (str, str)
-        Later comments: by whom, and text.
-    name : str
-        The name that people gave it; empty if nobody did.
-    session : str or None
-        Session of the archive that has this calibration among its results; None if none was named.
-    earlier : tuple of (str, datetime, Judgement)
-        Judgements by earlier versions of the rules: by whom, and when.
-
-    Examples
-    --------
-    >>> Decision.__dataclass_fields__["outcome"].name
-    'outcome'
-    """
-
-    key: str
-    outcome: Outcome
-    since: datetime
-    at: datetime
-    by: str
-    comment: str
-    judgement: Judgement
-    compared_with: str | None
-    reviewed_by: str = ""
-    review: str = ""
-    comments: tuple[tuple[str, str], ...] = ()
-    name: str = ""
-    session: str | None = None
-    earlier: tuple[tuple[str, datetime, Judgement], ...] = ()
-
-
-@dataclass(frozen=True)
-class Applied:
-    """The calibration that applies to a configuration at a time.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    key : str
-        Name of its decision.
-    since : datetime
-        From when on it applies.
-    why : {"decision", "review", "return"}
-        What put it in force.
-
-    Examples
-    --------
-    >>> Applied.__dataclass_fields__["why"].name
-    'why'
-    """
-
-    calibration: Calibration
-    key: str
-    since: datetime
-    why: Literal["decision", "review", "return"]
-
-
-@dataclass(frozen=True, eq=False)
-class Drift:
-    """Control charts of the calibrations of a configuration since its last service event.
-
-    Parameters
-    ----------
-    keys : tuple of str (n,)
-        Decisions on the calibrations, in time order; rejected ones are left out.
-    names : tuple of str (c,)
-        Parameters, and for a camera the norm of the field.
-    values : ndarray (n, c)
-        Their values; of the norm the power 2/3 of the rms difference from the first calibration, px.
-    charts : Monitored
-        The charts.
-    explanation : Explanation, optional
-        Which signals covariates explain.
-    conversion_px : float
-        Largest error over the image of calibrations that were converted to the model of the last one.
-
-    Examples
-    --------
-    >>> Drift(("4f2a",), ("c",), np.array([[8.0]]), monitor(np.array([[8.0]]))).keys
-    ('4f2a',)
-    """
-
-    keys: tuple[str, ...]
-    names: tuple[str, ...]
-    values: Array
-    charts: Monitored
-    explanation: Explanation | None = None
-    conversion_px: float = 0.0
 
 
 class Configurations:
@@ -283,7 +169,10 @@ class Configurations:
         if made:
             start = _since(made[0])
         current = self._applied(name, [each for each in entries if each not in made], start)
-        judged = judge(calibration, None if current is None else current.calibration, rules)
+        judged = judge(
+            calibration, None if current is None else current.calibration, rules,
+            () if current is None else self._runs(name, current, start, key), start,
+        )  # fmt: skip
         if made:
             again = {
                 "key": key, "by": by or _user(), "comment": comment, "judgement": judged.to_dict(),
@@ -302,6 +191,49 @@ class Configurations:
         }
         self._journal(name).append(key, "decision", document)
         return self.decision(name, key)
+
+    def reference(self, name: str) -> str | None:
+        """Return the key of the reference since the last service event: one that was set, or the first."""
+        start = max((time for time, _ in self.events(name)), default=datetime.min.replace(tzinfo=UTC))
+        own = [each for each in self.history(name) if each.outcome in _ACCEPTED and each.since >= start]
+        keys = {each.key for each in own}
+        given = [e.document["key"] for e in self._entries(name, "reference") if e.document["key"] in keys]
+        first = min(own, key=lambda each: (each.since, each.at), default=None)
+        return given[-1] if given else None if first is None else first.key
+
+    def set_reference(self, name: str, key: str, *, by: str = "", comment: str) -> None:
+        """Let the drift of the later calibrations count from an accepted one on.
+
+        Raises
+        ------
+        UsageError
+            If it was not accepted, or no reason is given.
+        """
+        decision = self.decision(name, key)
+        if decision.outcome not in _ACCEPTED:
+            raise UsageError(f"was not accepted ({decision.outcome})", where=key)
+        if not comment.strip():
+            raise UsageError("needs a reason", where=f"reference {key}", do="give a comment")
+        document = {"key": decision.key, "by": by or _user(), "comment": comment}
+        self._journal(name).add("reference", document)
+
+    def _runs(
+        self, name: str, current: Applied, until: datetime, but: str
+    ) -> list[tuple[datetime, Calibration]]:
+        """Calibrations from the reference to a time, without rejected ones; with the one in force."""
+        history = [each for each in self.history(name) if each.key != but]
+        of, reference = {each.key: each for each in history}, self.reference(name)
+        start = of[reference].since if reference in of else current.since
+        rows = sorted(
+            (each.since, each.key)
+            for each in history
+            if start <= each.since <= until and (each.outcome != "rejected" or each.key == current.key)
+        )
+        rows.sort(key=lambda each: each[1] != reference)
+        if current.key not in {key for _, key in rows}:
+            rows = [(current.since, current.key)]
+        found = self._calibrations(name, [key for _, key in rows])
+        return [(since, each) for (since, _), each in zip(rows, found, strict=True)]
 
     def _origin(self, session: str, key: str) -> dict[str, str]:
         """The session from which a calibration is, and the SHA-256 of the result that is its proof."""
@@ -683,7 +615,8 @@ def _same_version(entries: Sequence[Entry], rules: AcceptanceRules, name: str) -
     for each in entries:
         if _judges(each):
             used = each.document["judgement"]["rules"]
-            if used["version"] == rules.version and used != rules.to_dict():
+            same = used["version"] == rules.version
+            if same and AcceptanceRules.from_content(dict(used), where="rules") != rules:
                 raise UsageError(
                     f"differ from those of version {rules.version} used before", where=f"{name}: rules",
                     do="increase `version`",

@@ -1,54 +1,57 @@
 """Rules by which a new calibration is accepted, and the decision that follows from them.
 
 Three kinds of rules. *Complete*: is the calibration determined well enough to be judged at all? *Practical*:
-does it differ from the one in force by more than a tolerance, over the image and in object space?
-*Statistical*: is the difference significant, with the covariances of both (congruence test)? Each has two
-limits, for a warning and for action.
+has the instrument changed by more than a tolerance, over the image and in object space, since the calibration
+in force, and since the reference? What is a change, and not an error of a run, is what competing models of
+all runs say (:mod:`~reseau.service.trend`). *Statistical*: is the difference significant, with the
+covariances of both (congruence test)? Each has two limits, for a warning and for action.
 
-========================  ======================  =======================
-difference                not significant         significant
-========================  ======================  =======================
-below the warning limit   accepted                accepted with warning
-below the action limit    accepted with warning   accepted with warning
-above the action limit    needs review            rejected
-========================  ======================  =======================
+=====================================  ======================  =======================
+change since the one in force          not significant         significant
+=====================================  ======================  =======================
+below the warning limit                accepted                accepted with warning
+below the action limit                 accepted with warning   accepted with warning
+above the action limit                 needs review            rejected
+=====================================  ======================  =======================
 
-An incomplete calibration is rejected. Without one in force, or where the tolerance is smaller than what the
-calibrations can resolve, a person must decide.
+An incomplete calibration is rejected. A person must decide without one in force, where the instrument has
+drifted from its reference by more than the limit, and where the tolerance is smaller than what the
+calibrations can resolve.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Self
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from typing import Any, ClassVar, Literal, Self, cast
 
 import numpy as np
-import scipy
 from pydantic import Field, model_validator
 
-from ..calibration import Calibration, CameraMapping, calibration_difference, in_model_of
-from ..core.data import Array
+from ..calibration import Calibration, in_model_of
 from ..core.errors import UsageError
 from ..io import Document, Strict
+from .fields import change, difference
+from .trend import History, RunHistory, explain_runs
 
 __all__ = [
     "AcceptanceRules",
-    "Difference",
     "Finding",
     "Judgement",
     "Limits",
     "Outcome",
-    "difference",
     "judge",
 ]
 
 Outcome = Literal["accepted", "accepted with warning", "rejected", "needs review"]
 Level = Literal["ok", "warning", "action"]
 
-_PLACES = 17
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _RESOLVED = 2.0
 """Standard deviations of the difference that a tolerance must at least have."""
-_RANK = 1e-6
+_MORE_LIKELY = 0.5
+_ANNOUNCED, _RUNS = 0.5, 4
+"""Part of the limit from which on, and runs after which, a trend is announced."""
 
 
 class Limits(Strict):
@@ -77,6 +80,8 @@ class AcceptanceRules(Document):
         Increased with every change; decisions keep the rules they were made by.
     image : Limits
         Largest difference over the image, in the unit of `unit` (pixels, for a camera).
+    total : Limits, optional
+        Largest drift since the reference calibration, in the same unit; by default as `image`.
     object : Limits, optional
         Largest difference in object space at `distance_mm` from a camera, mm.
     significance : Limits
@@ -99,6 +104,7 @@ class AcceptanceRules(Document):
 
     version: int = Field(ge=1)
     image: Limits
+    total: Limits | None = None
     object: Limits | None = None
     distance_mm: float | None = Field(default=None, gt=0)
     significance: Limits = Limits(warning=0.01, action=0.001)
@@ -115,7 +121,7 @@ class AcceptanceRules(Document):
             raise ValueError("`significance.action` is above `significance.warning`")
         if self.significance.warning >= 1:
             raise ValueError("`significance.warning` is not below 1")
-        for name, limits in (("image", self.image), ("object", self.object)):
+        for name, limits in (("image", self.image), ("total", self.total), ("object", self.object)):
             if limits is not None and limits.action < limits.warning:
                 raise ValueError(f"`{name}.action` is below `{name}.warning`")
         if (self.object is None) != (self.distance_mm is None):
@@ -139,34 +145,6 @@ class Finding(Strict):
     text: str
 
 
-@dataclass(frozen=True, eq=False)
-class Difference:
-    """Difference of two calibrations over image and object space.
-
-    Parameters
-    ----------
-    greatest, sigma : float
-        Largest difference, and the largest standard deviation of the difference.
-    unit : str
-        Their unit.
-    by_distance : float or None
-        Largest difference of directions (rad) of a camera.
-    p : float
-        Probability of a difference at least as large between calibrations of the same instrument.
-
-    Examples
-    --------
-    >>> Difference(0.02, 0.01, "px", 1e-5, 0.4).greatest
-    0.02
-    """
-
-    greatest: float
-    sigma: float
-    unit: str
-    by_distance: float | None
-    p: float
-
-
 class Judgement(Document):
     """How a calibration was judged, ``reseau-judgement/1``: outcome, findings, and the rules used.
 
@@ -184,87 +162,13 @@ class Judgement(Document):
     rules: dict[str, object]
 
 
-def difference(new: Calibration, old: Calibration) -> Difference:
-    """Compare two calibrations of one instrument as fields, with the covariances of both.
-
-    Calibrations of a camera may be of different models, and are compared after the rotation that brings their
-    rays together. Of an oscilloscope or a film frame the corrected positions are compared.
-
-    Raises
-    ------
-    UsageError
-        If they are of different kinds, image sizes or units, or have no common field.
-
-    Examples
-    --------
-    >>> from reseau.service.covariates import example_calibration
-    >>> found = difference(example_calibration(8.001), example_calibration(8.0))
-    >>> round(found.greatest, 3), found.unit
-    (0.05, 'px')
-    """
-    if new.kind != old.kind:
-        raise UsageError(f"is of the kind {new.kind}, {old.name} of {old.kind}", where=new.name)
-    if new.kind == "camera":
-        return _of_cameras(CameraMapping.from_calibration(new), CameraMapping.from_calibration(old))
-    if new.kind == "sensor":
-        raise UsageError("has no field of positions to compare", where=new.name)
-    return _of_positions(new, old)
-
-
-def _of_cameras(new: CameraMapping, old: CameraMapping) -> Difference:
-    found = calibration_difference(old, new, _PLACES)
-    off = found.difference.reshape(-1, 2)
-    _, slope, _ = old.derivatives(found.xy.reshape(-1, 2))
-    return Difference(
-        greatest=float(np.nanmax(np.hypot(*off.T))),
-        sigma=float(np.nanmax(found.sigma)),
-        unit="px",
-        by_distance=float(np.nanmax(np.linalg.norm(np.einsum("nij,nj->ni", slope, off), axis=1))),
-        p=found.p,
-    )
-
-
-def _of_positions(new: Calibration, old: Calibration) -> Difference:
-    """Differences of corrected positions over the part of the image that both cover."""
-    first, second = old.mapping(), new.mapping()
-    if first.unit != second.unit or first.size != second.size:
-        raise UsageError(
-            f"maps images of {second.size} px to {second.unit}, {old.name} {first.size} px to {first.unit}",
-            where=new.name,
-        )
-    extents = np.array([each.validity.get("extent", [np.nan] * 4) for each in (old, new)], dtype=np.float64)
-    low, high = extents[:, :2].max(axis=0), extents[:, 2:].min(axis=0)
-    if not (high > low).all():
-        raise UsageError(f"covers no part of the image that {old.name} covers", where=new.name)
-    grid = np.meshgrid(np.linspace(low[0], high[0], _PLACES), np.linspace(low[1], high[1], _PLACES))
-    xy = np.stack(grid, axis=-1).reshape(-1, 2)
-    (a, _, by_a), (b, _, by_b) = first.derivatives(xy), second.derivatives(xy)
-    known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
-    if not known.any():
-        raise UsageError(f"maps no position that {old.name} maps", where=new.name)
-    off = (b - a)[known]
-    roots = [by[known] @ _root(m.parameter_covariance) for by, m in ((by_a, first), (by_b, second))]
-    root = np.concatenate(roots, axis=2)
-    cov = root @ np.swapaxes(root, 1, 2)
-    u, s, _ = np.linalg.svd(root.reshape(2 * len(root), -1), full_matrices=False)
-    keep = s > _RANK * s[0]
-    statistic = float((((u.T @ off.ravel())[keep] / s[keep]) ** 2).sum())
-    return Difference(
-        greatest=float(np.hypot(*off.T).max()),
-        sigma=float(np.sqrt(np.linalg.eigvalsh(cov)[:, -1].max())),
-        unit=first.unit,
-        by_distance=None,
-        p=float(scipy.special.chdtrc(int(keep.sum()), statistic)),
-    )
-
-
-def _root(covariance: Array) -> Array:
-    values, vectors = np.linalg.eigh(covariance)
-    found: Array = vectors * np.sqrt(np.maximum(values, 0.0))
-    return found
-
-
-def judge(new: Calibration, in_force: Calibration | None, rules: AcceptanceRules) -> Judgement:
+def judge(
+    new: Calibration,
+    in_force: Calibration | None,
+    rules: AcceptanceRules,
+    history: Sequence[tuple[datetime, Calibration]] = (),
+    at: datetime | None = None,
+) -> Judgement:
     """Judge a new calibration by the rules.
 
     Parameters
@@ -275,6 +179,10 @@ def judge(new: Calibration, in_force: Calibration | None, rules: AcceptanceRules
         The one in force, if there is one.
     rules : AcceptanceRules
         The rules.
+    history : sequence of (datetime, Calibration)
+        Runs from the reference on, in the order of their times, with the calibration in force among them.
+    at : datetime, optional
+        Time of the new calibration, after them.
 
     Raises
     ------
@@ -293,7 +201,7 @@ def judge(new: Calibration, in_force: Calibration | None, rules: AcceptanceRules
     """
     if rules.object is not None and new.kind != "camera":
         raise UsageError(f"applies to cameras, not to {new.kind}", where="rule `object`")
-    findings = _complete(new, rules)
+    findings = _complete(new, in_force, rules)
     if any(each.level == "action" for each in findings):
         return _judged("rejected", findings, rules)
     if in_force is None:
@@ -303,13 +211,25 @@ def judge(new: Calibration, in_force: Calibration | None, rules: AcceptanceRules
     if new.kind == "camera" and new.model != in_force.model:
         findings.append(_of_models(new, in_force, rules))
     found = difference(new, in_force)
-    sizes = [_practical("image", found.greatest, found.unit, rules.image)]
+    runs = [*history] if history and at else [(_EPOCH, in_force)]
+    now = at if history and at else _EPOCH + timedelta(weeks=1)
+    total = rules.total or rules.image
+    own = next(k for k, (_, each) in enumerate(runs) if each == in_force)
+    known = _history(new, runs, now)
+    said = explain_runs(known, total.action, own)
+    sizes = [_step(said, known.outside, found.greatest, found.unit, rules.image)]
     if rules.object is not None and found.by_distance is not None:
         assert rules.distance_mm is not None
-        sizes.append(_practical("object", found.by_distance * rules.distance_mm, "mm", rules.object))
+        part = min(1.0, sizes[0].value / found.greatest) if found.greatest > 0 else 0.0
+        size = part * found.by_distance * rules.distance_mm
+        text = f"change of {size:.3g} mm, limits {rules.object.warning:g} and {rules.object.action:g} mm"
+        sizes.append(_finding("object", rules.object.level(size), size, rules.object, text))
     practical = _worst(*(each.level for each in sizes))
-    findings += [*sizes, _significance(found.p, rules.significance)]
+    findings += [*sizes, _significance(said.p, rules.significance)]
     significant = findings[-1].level != "ok"
+    if len(runs) > 1:
+        findings += _since_reference(said, runs[0][0], now, len(runs) + 1, found.unit, total)
+    drifted = any(each.rule == "drift" and each.level == "action" for each in findings)
     unresolved = found.sigma * _RESOLVED > rules.image.action
     if unresolved:
         text = f"the tolerance of {rules.image.action:g} {found.unit} is below the resolution of the "
@@ -320,7 +240,7 @@ def judge(new: Calibration, in_force: Calibration | None, rules: AcceptanceRules
         )
     if practical == "action" and significant:
         outcome: Outcome = "rejected"
-    elif practical == "action" or unresolved:
+    elif practical == "action" or unresolved or drifted:
         outcome = "needs review"
     else:
         outcome = "accepted" if all(each.level == "ok" for each in findings) else "accepted with warning"
@@ -349,10 +269,52 @@ def _worst(*levels: Level) -> Level:
     return max(levels, key=order.index)
 
 
-def _practical(rule: str, value: float, unit: str, limits: Limits) -> Finding:
-    level = limits.level(value)
-    limit = limits.warning if level == "ok" else limits.action if level == "action" else limits.warning
-    text = f"largest difference {value:.3g} {unit}, limits {limits.warning:g} and {limits.action:g} {unit}"
+def _history(new: Calibration, runs: Sequence[tuple[datetime, Calibration]], now: datetime) -> RunHistory:
+    """The runs and the new calibration, as differences from the first."""
+    reference = runs[0][1]
+    changes = [change(each, reference) for each in (*(each for _, each in runs), new)]
+    days = np.array([(time - runs[0][0]).total_seconds() / 86400 for time in (*(t for t, _ in runs), now)])
+    # Runs of one moment follow each other.
+    days = np.maximum.accumulate(days) + 1e-6 * np.arange(len(days))
+    return RunHistory.of(days, np.array([each.off for each in changes]), [each.root for each in changes])
+
+
+def _level(said: History, limits: Limits, *, step: bool) -> Level:
+    for level, limit in (("action", limits.action), ("warning", limits.warning)):
+        if said.beyond(limit, step=step) > _MORE_LIKELY:
+            return cast(Level, level)
+    return "ok"
+
+
+def _step(said: History, outside: float, greatest: float, unit: str, limits: Limits) -> Finding:
+    """The change since the calibration in force."""
+    size, sigma = said.size(step=True)
+    level = _worst(_level(said, limits, step=True), limits.level(outside))
+    text = f"largest difference {greatest:.3g} {unit}, a change of {max(size, outside):.2g} ± {sigma:.2g} "
+    text += f"{unit}, limits {limits.warning:g} and {limits.action:g} {unit}"
+    return _finding("image", level, max(size, outside), limits, text)
+
+
+def _since_reference(
+    said: History, begun: datetime, now: datetime, count: int, unit: str, limits: Limits
+) -> list[Finding]:
+    """The drift since the reference, and when a trend will reach the limit."""
+    size, sigma = said.size()
+    level = _level(said, limits, step=False)
+    text = f"drift of {size:.2g} ± {sigma:.2g} {unit} since the reference of {begun:%Y-%m-%d}, "
+    text += f"limits {limits.warning:g} and {limits.action:g} {unit}"
+    found = [_finding("drift", level, size, limits, text)]
+    left = limits.action - size
+    if count > _RUNS and said.creeping > _MORE_LIKELY and size >= _ANNOUNCED * limits.action and left > 0:
+        when = now + timedelta(days=min(left / said.rate_day, 36525.0))
+        text = f"creeps by {7 * said.rate_day:.2g} {unit} a week, and reaches the limit of "
+        text += f"{limits.action:g} {unit} about {when:%Y-%m-%d}"
+        found.append(_finding("trend", "warning", size, limits, text))
+    return found
+
+
+def _finding(rule: str, level: Level, value: float, limits: Limits, text: str) -> Finding:
+    limit = limits.action if level == "action" else limits.warning
     return Finding(rule=rule, level=level, value=value, limit=limit, text=text)
 
 
@@ -364,7 +326,7 @@ def _significance(p: float, limits: Limits) -> Finding:
     )
 
 
-def _complete(new: Calibration, rules: AcceptanceRules) -> list[Finding]:
+def _complete(new: Calibration, in_force: Calibration | None, rules: AcceptanceRules) -> list[Finding]:
     """Findings of redundancy, coverage and warnings."""
     level: Level = "ok" if new.redundancy >= rules.redundancy else "action"
     findings = [
@@ -387,7 +349,9 @@ def _complete(new: Calibration, rules: AcceptanceRules) -> list[Finding]:
     refused = [code for code in codes if code in rules.refused_warnings]
     if codes:
         text = f"warnings: {', '.join(codes)}"
-        found: Level = "action" if refused else "warning"
+        # What the calibration in force has, too, is nothing new.
+        known = () if in_force is None else in_force.validity.get("warning_codes", ())
+        found: Level = "action" if refused else "warning" if set(codes) - set(known) else "ok"
         findings.append(
             Finding(rule="warnings", level=found, value=float(len(refused)), limit=0.0, text=text)
         )
