@@ -101,7 +101,7 @@ def comparison(first: Chosen, second: Chosen) -> tuple[Comparison, Any]:
     import numpy as np
 
     from ...calibration import CameraMapping, calibration_difference
-    from ..rules import difference
+    from ..fields import difference
 
     old, new = first.calibration, second.calibration
     found = difference(new, old)
