@@ -65,8 +65,13 @@ def calibrated(
     return calibrate_camera(images, DESIGN, lambda frame: None, SIZE, model, options).required()  # type: ignore[arg-type, return-value]
 
 
-def test_a_covered_and_accurate_calibration_is_usable_for_measurement() -> None:
-    found = calibrated(measured()).assessments["camera"]
+@pytest.fixture(scope="module")
+def sound() -> Calibrated:
+    return calibrated(measured())
+
+
+def test_a_covered_and_accurate_calibration_is_usable_for_measurement(sound: Calibrated) -> None:
+    found = sound.assessments["camera"]
     assert found.use is Use.MEASUREMENT
     assert found.fits
     assert found.uncovered == ()
@@ -82,9 +87,9 @@ def test_a_covered_and_accurate_calibration_is_usable_for_measurement() -> None:
 
 
 @pytest.mark.parametrize("k3", [0.0, 0.02])
-def test_the_error_that_is_stated_holds_for_a_lens_with_more_terms(k3: float) -> None:
+def test_the_error_that_is_stated_holds_for_a_lens_with_more_terms(k3: float, sound: Calibrated) -> None:
     """What k1 and k2 make of k3 is right where points are, and wrong by ten sigmas in the corners."""
-    result = calibrated(measured(k3=k3))
+    result = calibrated(measured(k3=k3)) if k3 else sound
     found = result.assessments["camera"]
     true = dict(zip(("fx", "fy", "cx", "cy"), MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True))
     lens = OpenCV.from_parameters(true | {"k1": -0.2, "k2": 0.05, "k3": k3})
@@ -108,7 +113,6 @@ def test_photographs_with_another_zoom_are_named_and_not_made_up_for_by_another_
     assert found.causes[0].code == "other-camera"
     assert found.next_photograph is None
     assert "; some photographs have another zoom, size or crop (" in found.lines[0]
-    assert calibrated(measured()).assessments["camera"].fits
 
 
 def test_a_bent_target_that_is_held_flat_is_no_fault_of_the_photographs() -> None:
@@ -188,8 +192,10 @@ def test_frontal_photographs_are_not_usable() -> None:
     assert "towards the camera" in found.next_photograph.text
 
 
-def test_the_calibration_contains_the_verdict_and_keeps_it_in_its_file(tmp_path: Path) -> None:
-    done = calibrated(measured())
+def test_the_calibration_contains_the_verdict_and_keeps_it_in_its_file(
+    tmp_path: Path, sound: Calibrated
+) -> None:
+    done = sound
     done.write(tmp_path / "c.json")
     again = Calibration.read(tmp_path / "c.json")
     assert again.assessment == done.assessment == done.assessments["camera"]
