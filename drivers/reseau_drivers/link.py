@@ -26,7 +26,10 @@ _CHUNK = 65536
 
 
 class Link(Protocol):
-    """Stream of bytes to an instrument; simulators in the same process implement it too."""
+    """Stream of bytes to an instrument; simulators in the same process implement it too.
+
+    Links whose protocol has an end of messages have an attribute `ended`: whether the last bytes end one.
+    """
 
     def open(self, deadline: Deadline) -> None:
         """Open the stream; an open one is closed before and its data are discarded."""

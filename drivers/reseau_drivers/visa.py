@@ -14,6 +14,7 @@ import queue
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from importlib.util import find_spec
 from typing import Any
 
 import pyvisa
@@ -117,10 +118,17 @@ class VisaLink:
         self._name = resource
         self._resource: Any = None
         self._worker: _Worker | None = None
+        self._bare: bool | None = None
+        self.ended = False
+        """Whether the bytes read last end a message."""
 
     def open(self, deadline: Deadline) -> None:
         """Open the resource; an open one is closed before."""
         self.close()
+        self._bare, self.ended = None, False
+        if self._name.upper().startswith("VICP") and find_spec("pyvicp") is None:
+            do = "pip install pyvicp; or set its remote control to LXI and write TCPIP::host::inst0::INSTR"
+            raise ConnectionLost(f"{self._name} needs the package pyvicp", do=do)
         manager, self._worker = _resource_manager(), _Worker()
         opened: list[Any] = []
 
@@ -175,16 +183,25 @@ class VisaLink:
         return bool(int(status) & _MESSAGE_AVAILABLE)
 
     def read(self, deadline: Deadline) -> bytes:
-        """Return the bytes received; none when the deadline passes."""
+        """Return the bytes received; none when the deadline passes.
 
-        def work() -> bytes:
-            data, _ = self._resource.visalib.read(self._resource.session, _READ)
-            return bytes(data)
+        An instrument whose first message ends without a newline ends all of them so: each gets one.
+        From any other, a message without a newline is a part of one.
+        """
 
+        def work() -> tuple[bytes, Any]:
+            data, status = self._resource.visalib.read(self._resource.session, _READ)
+            return bytes(data), status
+
+        self.ended = False
         try:
-            return bytes(self._do(work, deadline, "read"))
+            data, status = self._do(work, deadline, "read")
         except DeadlineError:
             return b""
+        self.ended = status != constants.StatusCode.success_max_count_read
+        if self._bare is None and self.ended:
+            self._bare = not data.endswith(b"\n")
+        return data + b"\n" if self.ended and self._bare and not data.endswith(b"\n") else data
 
     def _do(self, work: Callable[[], Any], deadline: Deadline, what: str) -> Any:
         worker = self._worker

@@ -394,3 +394,33 @@ def test_unknown_exposure_and_period_widen_the_interval() -> None:
     device.period = uapi.Interval(0, 0)
     with v4l2("camera", device.open) as camera, pytest.raises(DeadlineError, match="may have started before"):
         camera.expose(0.4)
+
+
+class _Fields:
+    """A node whose driver chooses the order of fields itself, of the format or of a buffer (Motion#1548)."""
+
+    def __init__(self, node: Any, request: int, at: int, order: int) -> None:
+        self._node, self._request, self._at, self._order = node, request, at, order
+
+    def ioctl(self, request: int, data: bytearray) -> None:
+        self._node.ioctl(request, data)
+        if request == self._request:
+            data[self._at : self._at + 4] = self._order.to_bytes(4, "little")
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._node, name)
+
+
+@pytest.mark.parametrize(("request_", "at"), [(uapi.S_FMT, 20), (uapi.DQBUF, 16)], ids=["format", "buffer"])
+@pytest.mark.parametrize("order", range(11))
+def test_fields_are_not_taken_for_frames(device: VideoCamera, request_: int, at: int, order: int) -> None:
+    """Numbers of videodev2.h: 0 any, 1 none, then 2…9 fields; 10 is none of them."""
+    camera = v4l2("camera", lambda: _Fields(device.open(), request_, at, order), seconds=1.0)
+    try:
+        if order > 1:
+            with pytest.raises(RefusedError, match=r"delivers fields, not whole frames .*progressive"):
+                camera.expose()
+        else:
+            assert camera.expose().frame.pixels.shape == (64, 96)
+    finally:
+        camera.close()

@@ -105,9 +105,9 @@ def test_a_file_that_is_wrong_is_named(file: str, content: str, message: str, tm
     assert Path(file).stem in str(error.value)
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
+def test_without_detections_it_is_said_that_detection_comes_first(tmp_path: Path) -> None:
     (written(tmp_path) / "cal" / "cam2.tif_targets").unlink()
-    with pytest.raises(InputError, match=r"cam2\.tif_targets"):
+    with pytest.raises(InputError, match=r"cam2\.tif_targets: .*not been detected yet; run Detection"):
         read_foreign(tmp_path)
 
 

@@ -279,6 +279,7 @@ class V4l2:
                 raise ProtocolError(f"delivered a buffer {buffer.index}, of {len(self._maps)}")
             data = self._maps[buffer.index][: buffer.used]
             self._ask(uapi.QBUF, uapi.Buffer(buffer.index).build())
+        _require_whole(buffer.field)
         sequence = self._numbers.next(buffer.sequence)
         if sequence is None:
             return None
@@ -375,6 +376,7 @@ class V4l2:
                 f"not {width}×{height} {settings.format}",
                 do=f"it offers {offered}",
             )
+        _require_whole(accepted.field)
         self._format = accepted
 
     def _region(self) -> uapi.Selection:
@@ -499,3 +501,11 @@ class V4l2:
         except ValueError:
             # Another thread has unmapped the memory.
             raise ConnectionLost("was closed during the call") from None
+
+
+def _require_whole(field: int) -> None:
+    """Refuse fields, and frames of fields: their rows are of two times, or every second one is missing."""
+    name = uapi.FIELDS[field] if field < len(uapi.FIELDS) else str(field)
+    if name not in ("NONE", "ANY"):
+        do = "set the source to progressive scan: rows of two times are not measured"
+        raise RefusedError(f"delivers fields, not whole frames (field order {name})", do=do)

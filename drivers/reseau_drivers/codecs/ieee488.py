@@ -1,10 +1,11 @@
 """IEEE 488.2 for oscilloscopes: program messages, answers, and blocks of binary data.
 
-Source: IEEE 488.2-1992, sections 7.6 (program data) and 8.7.9 (definite length arbitrary block response
-data); SCPI 1999.0, volume 1, section 6 (short and long form of headers) and 21.8 (the error queue). A block
-is ``#``, one digit n, n digits of its length, and as many bytes. Pictures are sent as a block or as the bare
-file; their end follows from the length of the block, from the chunk ``IEND`` of a PNG, or from the size field
-of a BMP, never from a terminator.
+Source: IEEE 488.2-1992, sections 7.6 (program data), 8.7.9 and 8.7.10 (definite and indefinite length
+arbitrary block response data); SCPI 1999.0, volume 1, section 6 (short and long form of headers) and 21.8
+(the error queue). A block is ``#``, one digit n, n digits of its length, and as many bytes; ``#(length)``
+where the length has ten digits or more; ``#0`` where the end of the message ends it. Pictures are sent as a
+block or as the bare file; their end follows from the length of the block, from the chunk ``IEND`` of a PNG,
+or from the size field of a BMP, never from a terminator.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ LARGEST = 64_000_000
 """Largest size of an accepted answer (bytes)."""
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-_BLOCK = re.compile(rb"#([1-9])")
+_BLOCK = re.compile(rb"#(?:([1-9])|\((\d{1,12})\))")
+_INDEFINITE = b"#0"
 
 
 def block(data: bytes) -> bytes:
@@ -51,15 +53,15 @@ def _block_span(data: bytes) -> tuple[int, int] | None:
     """Return start and end of the content of a block; None while its header is incomplete."""
     head = _BLOCK.match(data)
     if head is None:
-        if len(data) < 2 and data in (b"", b"#"):
+        if data in (b"", b"#") or re.fullmatch(rb"#\(\d{0,12}", data):
             return None
         raise ProtocolError(f"not a block: {excerpt(data)}")
-    digits = data[2 : 2 + int(head[1])]
+    digits = head[2] or data[2 : 2 + int(head[1])]
     if digits and not digits.isdigit():
         raise ProtocolError(f"not a block: {excerpt(data)}")
-    if len(digits) < int(head[1]):
+    if head[1] and len(digits) < int(head[1]):
         return None
-    start, length = 2 + len(digits), int(digits)
+    start, length = head.end() + (len(digits) if head[1] else 0), int(digits)
     if length > LARGEST:
         raise ProtocolError(f"announces {length} bytes; at most {LARGEST} are accepted")
     return start, start + length
@@ -78,13 +80,15 @@ def _png_end(data: bytes) -> int | None:
     return None
 
 
-def missing_bytes(data: bytes) -> int | None:
+def missing_bytes(data: bytes, ended: bool = False) -> int | None:
     r"""Return the number of bytes missing from a binary answer; 0 if it is complete.
 
     Parameters
     ----------
     data : bytes
         Start of a block, a PNG or a BMP.
+    ended : bool
+        Whether the message ends here; of streams that is not known.
 
     Returns
     -------
@@ -104,6 +108,11 @@ def missing_bytes(data: bytes) -> int | None:
     end: int | None
     if not data:
         return None
+    if data[:2] == _INDEFINITE:
+        inner = data[2:]
+        if inner[:1] in (b"B", _PNG[:1]) and _is_picture(inner):
+            return missing_bytes(inner)
+        return 0 if ended else None
     if data[:1] == b"#":
         span = _block_span(data)
         end = None if span is None else span[1]
@@ -120,6 +129,10 @@ def missing_bytes(data: bytes) -> int | None:
     return None if end is None else max(0, end - len(data))
 
 
+def _is_picture(data: bytes) -> bool:
+    return data[:8] == _PNG or data[:2] == b"BM"
+
+
 def parse_block(data: bytes) -> bytes:
     """Return the content of a block.
 
@@ -128,6 +141,8 @@ def parse_block(data: bytes) -> bytes:
     ProtocolError
         If it is not a block, or is incomplete.
     """
+    if data[:2] == _INDEFINITE:
+        return data[2:].removesuffix(b"\n")
     span = _block_span(data)
     if span is None or len(data) < span[1]:
         raise ProtocolError(f"an incomplete block: {excerpt(data)}")
@@ -143,7 +158,7 @@ def picture(data: bytes) -> bytes:
         If it is not a picture, or is incomplete.
     """
     inner = parse_block(data) if data[:1] == b"#" else data
-    if inner[:8] != _PNG and inner[:2] != b"BM":
+    if not _is_picture(inner):
         raise ProtocolError(f"not a picture: {excerpt(data)}")
     lacking = missing_bytes(inner)
     if lacking != 0:

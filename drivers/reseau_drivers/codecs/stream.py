@@ -62,7 +62,8 @@ class LineDecoder:
     Parameters
     ----------
     end : bytes
-        Byte that ends a line; carriage returns and line feeds around a line are removed.
+        Byte that ends a line; carriage returns, line feeds and NUL around it are removed, and a byte order
+        mark before it.
     limit : int
         Largest size of a line (bytes). A longer one is damaged, and is skipped up to its end.
 
@@ -92,7 +93,7 @@ class LineDecoder:
             line = bytes(self._partial) + piece
             skipped, self._skipping = self._skipping, False
             self._partial.clear()
-            stripped = line.strip(b"\r\n")
+            stripped = line.removeprefix(b"\xef\xbb\xbf").strip(b"\r\n\0")
             if skipped:
                 continue
             if len(stripped) > self._limit:

@@ -17,6 +17,7 @@ __all__ = [
     "EXPOSURE_ABSOLUTE",
     "EXPOSURE_AUTO",
     "EXPOSURE_MANUAL",
+    "FIELDS",
     "GAIN",
     "G_CTRL",
     "G_FMT",
@@ -72,6 +73,12 @@ BRIGHTNESS, AUTOGAIN, GAIN = 0x980900, 0x980912, 0x980913
 EXPOSURE_AUTO, EXPOSURE_ABSOLUTE = 0x9A0901, 0x9A0902
 EXPOSURE_MANUAL = 1
 """Value of EXPOSURE_AUTO: EXPOSURE_ABSOLUTE sets the exposure time, in units of 100 µs."""
+
+FIELDS = (
+    "ANY", "NONE", "TOP", "BOTTOM", "INTERLACED", "SEQ_TB", "SEQ_BT", "ALTERNATE", "INTERLACED_TB",
+    "INTERLACED_BT",
+)  # fmt: skip
+"""Orders of fields: NONE are whole frames; all from TOP on have half of the rows, or rows of two times."""
 
 _NEXT = 0x80000000
 
@@ -157,7 +164,7 @@ class Format:
     size : int
         Largest size of a frame (bytes).
     field : int
-        0 any, 1 progressive.
+        Order of fields; see `FIELDS`.
     """
 
     width: int
@@ -308,6 +315,8 @@ class Buffer:
         Frame number, 32 bits.
     offset, length : int
         Position and size of the memory (bytes).
+    field : int
+        Order of fields in it; see `FIELDS`.
     """
 
     index: int = 0
@@ -317,6 +326,7 @@ class Buffer:
     sequence: int = 0
     offset: int = 0
     length: int = 0
+    field: int = 1
 
     ERROR, MONOTONIC, CLOCKS = 0x40, 0x2000, 0xE000
     START_OF_EXPOSURE, SOURCES = 0x10000, 0x70000
@@ -324,14 +334,16 @@ class Buffer:
     @classmethod
     def parse(cls, data: bytes) -> Self:
         """Decode the structure."""
-        index, _, used, flags, _, seconds, micros = struct.unpack_from("<IIIII4xqq", data)
+        index, _, used, flags, field, seconds, micros = struct.unpack_from("<IIIII4xqq", data)
         (sequence,) = struct.unpack_from("<I", data, 56)
         offset, length = struct.unpack_from("<I4xI", data, 64)
-        return cls(index, used, flags, (seconds * 1_000_000 + micros) * 1000, sequence, offset, length)
+        return cls(index, used, flags, (seconds * 1_000_000 + micros) * 1000, sequence, offset, length, field)
 
     def build(self) -> bytearray:
         """Encode the structure."""
         seconds, micros = divmod(self.stamp_ns // 1000, 1_000_000)
-        head = struct.pack("<IIIII4xqq", self.index, CAPTURE, self.used, self.flags, 1, seconds, micros)
+        head = struct.pack(
+            "<IIIII4xqq", self.index, CAPTURE, self.used, self.flags, self.field, seconds, micros
+        )
         tail = struct.pack("<IIQI", self.sequence, MMAP, self.offset, self.length)
         return bytearray(head + bytes(16) + tail).ljust(88, b"\0")

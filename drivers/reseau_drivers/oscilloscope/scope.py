@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from dataclasses import dataclass
 from typing import Any
@@ -23,6 +24,8 @@ __all__ = ["Oscilloscope", "OscilloscopeSettings"]
 _TRIAL_S = 3.0
 """Time in which an instrument of an unknown model must send a picture."""
 _LONGEST_LINE = 65536
+_LINE = re.compile(rb"[\r\n\0]*(?:\xef\xbb\xbf)?([^\r\n\0]+)[\r\n\0]")
+"""A line, after a byte order mark: it ends with LF, CR or NUL."""
 
 
 @dataclass(frozen=True)
@@ -262,9 +265,9 @@ class Oscilloscope(Device[OscilloscopeSettings]):
     def _query(self, text: str, deadline: Deadline) -> str:
         self._start_query(text, deadline)
         while True:
-            line, newline, _ = self._received.lstrip(b"\r\n").partition(b"\n")
-            if newline:
-                return line.strip().decode("latin-1")
+            line = _LINE.match(self._received)
+            if line is not None:
+                return line[1].strip().decode("latin-1")
             if len(self._received) > _LONGEST_LINE:
                 raise ProtocolError(f"the answer to {text} does not end: {excerpt(bytes(self._received))}")
             self._receive(deadline, text)
@@ -276,7 +279,8 @@ class Oscilloscope(Device[OscilloscopeSettings]):
             # Parse again only when the missing bytes have arrived: a picture is large.
             if self._received and not lacking:
                 start = _start_of_binary(self._received)
-                lacking = missing_bytes(bytes(self._received[start:]))
+                ended = getattr(self._link, "ended", False)
+                lacking = missing_bytes(bytes(self._received[start:]), ended)
                 if lacking == 0:
                     return bytes(self._received[start:])
             before = len(self._received)

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..bundle import Camera, Network
 from ..core.data import Array, Rows
-from ..core.errors import FormatError
+from ..core.errors import FormatError, InputError
 from ..io import read_text
 from ..optics.poses import matrix_to_vector
 from ..optics.refraction import RefractedRays, Refraction, RefractiveIndex, Window
@@ -240,6 +240,9 @@ def _directions(refraction: Refraction | None, turn: Array, x0: Array, xyz: Arra
 def _detections(image: Path) -> Array:
     """Image coordinates (n, 2) of the detections of an image."""
     path = image.with_name(f"{image.name}_targets")
+    if not path.is_file():
+        what = f"does not exist: the targets of {image.name} have not been detected yet"
+        raise InputError(what, where=path, do="run Detection of OpenPTV's calibration first, which writes it")
     lines = read_text(path).splitlines()
     rows = [numbers(line.split()[:8], 8, path, k + 2) for k, line in enumerate(lines[1:]) if line.strip()]
     # Counted from the corner of the first pixel.
