@@ -81,6 +81,7 @@ ENTRIES = (
     Entry("cameras", "Camera models", "cameras.py --part projections", ("OpenCV", "mrcal", "COLMAP")),
     Entry("calibrations", "Calibrations of the same corners", "cameras.py --part calibrations",
           ("OpenCV", "mrcal", "COLMAP"), "chessboard_stereo"),
+    Entry("degenerate", "Networks of a camera that only turned, or nearly", "degenerate.py --count 200"),
     Entry("causes", "Causes of misfit that are named", "causes.py --sound 100"),
     Entry("intervals", "Intervals with errors that images have in common",
           "intervals.py --seeds 40 --images 6 20"),

@@ -3,12 +3,11 @@
 Images from one station have directions in place of points: three unknowns an image, two a point (Hartley
 1997, Int. J. Comput. Vision 22, "Self-calibration of stationary cameras"). A linearised covariance of points
 presumes that the base is real. Both adjustments are therefore compared by what they predict of image points
-that are left out, where the variance is as unknown as they are: the logarithm of the density is
-
-    −½ n ln(vᵀPv) − n u / (n − u − 1)
-
-with n observations and u unknowns (Hurvich & Tsai 1989, Biometrika 76). The covariance of a base that is not
-there is no help: it is small where the depths fit the errors of the image points.
+that are left out: vᵀPv of rotations alone is larger by two variances for each unknown more that pays (Stone
+1977, J. R. Statist. Soc. B 39). Parallaxes are products of shifts a (3m) and depths b (p). Where there is no
+base they fit more of the errors than as many unknowns would: a matrix of noise has a largest singular value
+of √3m + √p (Davidson & Szarek 2001), so that 3m + p + 2 √(3mp) degrees of freedom are lost (Ye 1998, J. Am.
+Statist. Assoc. 93).
 """
 
 from __future__ import annotations
@@ -395,13 +394,16 @@ def one_station(problem: BundleProblem, fit: BundleFit | None) -> Failure | None
         return None
     with_depth = float((_weights(problem)[rows] @ problem.misfits_at_start()[rows] ** 2).sum())
     m, p = (int(finite(part).sum()) for part in (turned.rotation, turned.direction))
-    # Beside three shifts an image and a depth a point, less position and scale of the whole.
-    count, without = turned.observations, turned.observations - turned.redundancy
-    unknowns = without + 3 * m + p - 4
-    if unknowns + 1 >= count:
+    if turned.cost < with_depth:
+        # The model with depth contains the other: its adjustment has not found its minimum.
         return None
-    gain = 0.5 * count * np.log(turned.cost / with_depth)
-    gain -= count * (unknowns / (count - unknowns - 1) - without / (count - without - 1))
+    # Three shifts an image and a depth a point, less position and scale of the whole, and what they fit of
+    # errors together where there is no base: the largest singular value of noise is √a + √b.
+    unknowns = 3 * m + p - 4 + 2 * np.sqrt(3 * m * p)
+    redundancy = turned.redundancy - (3 * m + p - 4)
+    if redundancy < 1:
+        return None
+    gain = (turned.cost - with_depth) / (2 * with_depth / redundancy) - unknowns
     if gain > ODDS:
         return None
     turned = rotation_only(problem) or turned
