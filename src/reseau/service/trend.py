@@ -179,9 +179,10 @@ def explain_runs(runs: RunHistory, limit: float, in_force: int) -> History:
     since = np.concatenate([[0.0], _since(shape, days)])[model]
     creeping = kinds == 1
     rate = float((weights * total[0] / (days[-1] - since))[creeping].sum())
+    stable, creeps, changed = (float(weights[kinds == each].sum()) for each in (0, 1, 2))
     return History(
-        *(float(weights[kinds == each].sum()) for each in (0, 1, 2)), scale,
-        float(scipy.special.chdtrc(r, statistic)), rate / max(float(weights[creeping].sum()), 1e-300),
+        stable, creeps, changed, scale,
+        float(scipy.special.chdtrc(r, statistic)), rate / max(creeps, 1e-300),
         weights, total, step,
     )  # fmt: skip
 
