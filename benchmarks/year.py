@@ -293,7 +293,7 @@ class Year:
         runs = self.schedules.runs("weekly", ahead=0)
         weekly = [run for run in runs if not run.key.startswith("event")]
         events = [run for run in runs if run.key.startswith("event")]
-        decisions = {each.comment.removeprefix("session "): each for each in self.known.history(NAME)}
+        decisions = {each.session: each for each in self.known.history(NAME)}
         done = {k: decisions[f"weekly-{run.key}"] for k, run in enumerate(weekly) if run.state == "done"}
         outcomes = [done[k].outcome if k in done else run.state for k, run in enumerate(weekly)]
         missing = sorted(set(range(weeks)) - set(done))
