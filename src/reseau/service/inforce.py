@@ -173,20 +173,20 @@ class Configurations:
             calibration, None if current is None else current.calibration, rules,
             () if current is None else self._runs(name, current, start, key), start,
         )  # fmt: skip
+        said = {
+            "by": by or _user(),
+            "comment": comment,
+            "judgement": judged.to_dict(),
+            "compared_with": None if current is None else current.key,
+        }
         if made:
-            again = {
-                "key": key, "by": by or _user(), "comment": comment, "judgement": judged.to_dict(),
-                "compared_with": None if current is None else current.key,
-            }  # fmt: skip
+            again = {"key": key, **said}
             self._journal(name).append(f"{key} again {len(made)}", "judged again", again)
             return self.decision(name, key)
         document = {
             "calibration": calibration.to_json(),
             "since": start.isoformat(),
-            "by": by or _user(),
-            "comment": comment,
-            "judgement": judged.to_dict(),
-            "compared_with": None if current is None else current.key,
+            **said,
             "origin": None if session is None else self._origin(session, key),
         }
         self._journal(name).append(key, "decision", document)

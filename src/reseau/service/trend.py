@@ -182,7 +182,7 @@ def explain_runs(runs: RunHistory, limit: float, in_force: int) -> History:
     stable, creeps, changed = (float(weights[kinds == each].sum()) for each in (0, 1, 2))
     return History(
         stable, creeps, changed, scale,
-        float(scipy.special.chdtrc(r, statistic)), rate / max(float(weights[creeping].sum()), 1e-300),
+        float(scipy.special.chdtrc(r, statistic)), rate / max(creeps, 1e-300),
         weights, total, step,
     )  # fmt: skip
 
