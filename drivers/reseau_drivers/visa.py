@@ -201,7 +201,8 @@ class VisaLink:
         self.ended = status != constants.StatusCode.success_max_count_read
         if self._bare is None and self.ended:
             self._bare = not data.endswith(b"\n")
-        return data + b"\n" if self.ended and self._bare and not data.endswith(b"\n") else data
+        answer: bytes = data
+        return answer + b"\n" if self.ended and self._bare and not answer.endswith(b"\n") else answer
 
     def _do(self, work: Callable[[], Any], deadline: Deadline, what: str) -> Any:
         worker = self._worker
