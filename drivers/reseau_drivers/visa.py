@@ -189,15 +189,14 @@ class VisaLink:
         From any other, a message without a newline is a part of one.
         """
 
-        def work() -> tuple[bytes, Any]:
-            data, status = self._resource.visalib.read(self._resource.session, _READ)
-            return bytes(data), status
-
         self.ended = False
         try:
-            data, status = self._do(work, deadline, "read")
+            read = self._do(
+                lambda: self._resource.visalib.read(self._resource.session, _READ), deadline, "read"
+            )
         except DeadlineError:
             return b""
+        data, status = bytes(read[0]), read[1]
         self.ended = status != constants.StatusCode.success_max_count_read
         if self._bare is None and self.ended:
             self._bare = not data.endswith(b"\n")

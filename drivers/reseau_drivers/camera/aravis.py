@@ -464,7 +464,7 @@ class Aravis:
                 f"sent {width}×{height} pixels of format {buffer.get_image_pixel_format():#x}, not "
                 f"{self._size[0]}×{self._size[1]} {self._settings.format}"
             )
-        stride = width * layout.stored + int(buffer.get_image_padding()[0])
+        stride = layout.row(width) + int(buffer.get_image_padding()[0])
         exposure_ns, gain = self._exposure_ns, self._gain
         if buffer.has_chunks() and "ExposureTime" in self._chunks:
             exposure_ns = int(self._parser.get_float_value(buffer, "ChunkExposureTime") * 1000)

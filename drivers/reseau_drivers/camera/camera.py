@@ -67,7 +67,7 @@ class RawFrame:
     pattern : str
         Colour pattern; empty for grey.
     raw : bytes
-        Original frame if the grey values do not contain all of it (YUYV, MJPEG).
+        Original frame if the grey values do not contain all of it (YUYV, UYVY, NV12, MJPEG).
     sequence : int
         Frame number, counted without wrapping.
     began : TimeInterval

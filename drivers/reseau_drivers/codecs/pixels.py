@@ -18,6 +18,12 @@ from reseau.core.errors import ProtocolError
 __all__ = ["GENICAM", "VIDEO", "PixelFormat", "decode", "encode", "size_of"]
 
 
+_PACKED = {
+    ("p", 10): (4, 5), ("p", 12): (2, 3), ("gige", 10): (2, 3), ("gige", 12): (2, 3), ("mipi", 10): (4, 5),
+    ("mipi", 12): (2, 3),
+}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class PixelFormat:
     """Memory layout of grey values.
@@ -29,15 +35,38 @@ class PixelFormat:
     bits : int
         Significant bits of a grey value, in the low bits of its bytes.
     stored : int
-        Bytes per pixel; 0 for compressed frames.
+        Bytes per pixel; 0 for packed and compressed frames.
     pattern : str
-        Colour pattern of raw data: filters of the first two rows (RGGB …), YUYV or MJPEG; empty for grey.
+        Colour pattern of raw data: filters of the first two rows (RGGB …), YUYV, UYVY, NV12 or MJPEG; empty
+        for grey.
+    packed : str
+        How pixels share bytes: ``p``, a stream of bits from the lowest on; ``gige``, two pixels in three
+        bytes, the middle one with the low bits of both; ``mipi``, the last byte with the low bits of all.
     """
 
     code: str | int
     bits: int
     stored: int
     pattern: str = ""
+    packed: str = ""
+
+    @property
+    def group(self) -> tuple[int, int]:
+        """Pixels that share bytes, and the number of these bytes."""
+        return _PACKED[self.packed, self.bits] if self.packed else (1, self.stored)
+
+    def row(self, width: int) -> int:
+        """Return the number of bytes of a row, without padding; 0 if compressed.
+
+        Raises
+        ------
+        ProtocolError
+            If the row ends within bytes that pixels share.
+        """
+        pixels, size = self.group
+        if width % pixels:
+            raise ProtocolError(f"rows of {width} pixels end within a byte", do=f"set a multiple of {pixels}")
+        return width // pixels * size
 
     @property
     def full_scale(self) -> float:
@@ -50,19 +79,46 @@ class PixelFormat:
         return np.dtype(np.uint8 if self.bits <= 8 else "<u2")
 
 
+_BAYER = {"GR": "GRBG", "RG": "RGGB", "GB": "GBRG", "BG": "BGGR"}
+
+
+def _video(bits: int, stored: int, codes: str, packed: str = "") -> dict[str, PixelFormat]:
+    """Mosaics of V4L2, by their codes in the order of `_BAYER`."""
+    return {
+        f"S{pattern}{bits}{'P' if packed else ''}": PixelFormat(code, bits, stored, pattern, packed)
+        for pattern, code in zip(_BAYER.values(), codes.split(), strict=True)
+    }
+
+
 VIDEO: dict[str, PixelFormat] = {
     "GREY": PixelFormat("GREY", 8, 1),
     "Y10": PixelFormat("Y10 ", 10, 2),
     "Y12": PixelFormat("Y12 ", 12, 2),
+    "Y14": PixelFormat("Y14 ", 14, 2),
     "Y16": PixelFormat("Y16 ", 16, 2),
+    "Y10P": PixelFormat("Y10P", 10, 0, packed="mipi"),
     "YUYV": PixelFormat("YUYV", 8, 2, "YUYV"),
+    "UYVY": PixelFormat("UYVY", 8, 2, "UYVY"),
+    "NV12": PixelFormat("NV12", 8, 1, "NV12"),
     "MJPEG": PixelFormat("MJPG", 8, 0, "MJPEG"),
-    "SRGGB8": PixelFormat("RGGB", 8, 1, "RGGB"),
-    "SGRBG8": PixelFormat("GRBG", 8, 1, "GRBG"),
-    "SGBRG8": PixelFormat("GBRG", 8, 1, "GBRG"),
-    "SBGGR8": PixelFormat("BA81", 8, 1, "BGGR"),
+    **_video(8, 1, "GRBG RGGB GBRG BA81"),
+    **_video(10, 2, "BA10 RG10 GB10 BG10"),
+    **_video(12, 2, "BA12 RG12 GB12 BG12"),
+    **_video(14, 2, "GR14 RG14 GB14 BG14"),
+    **_video(16, 2, "GR16 RG16 GB16 BYR2"),
+    **_video(10, 0, "pgAA pRAA pGAA pBAA", "mipi"),
+    **_video(12, 0, "pgCC pRCC pGCC pBCC", "mipi"),
 }
 """Formats of V4L2, by the names of its documentation."""
+
+
+def _genicam(name: str, bits: int, stored: int, *codes: int, packed: str = "") -> dict[str, PixelFormat]:
+    """Mosaics of GenICam, by their codes in the order of `_BAYER`."""
+    return {
+        f"Bayer{each}{name}": PixelFormat(code, bits, stored, pattern, packed)
+        for (each, pattern), code in zip(_BAYER.items(), codes, strict=True)
+    }
+
 
 GENICAM: dict[str, PixelFormat] = {
     "Mono8": PixelFormat(0x01080001, 8, 1),
@@ -70,28 +126,31 @@ GENICAM: dict[str, PixelFormat] = {
     "Mono12": PixelFormat(0x01100005, 12, 2),
     "Mono14": PixelFormat(0x01100025, 14, 2),
     "Mono16": PixelFormat(0x01100007, 16, 2),
-    "BayerGR8": PixelFormat(0x01080008, 8, 1, "GRBG"),
-    "BayerRG8": PixelFormat(0x01080009, 8, 1, "RGGB"),
-    "BayerGB8": PixelFormat(0x0108000A, 8, 1, "GBRG"),
-    "BayerBG8": PixelFormat(0x0108000B, 8, 1, "BGGR"),
-    "BayerGR12": PixelFormat(0x01100010, 12, 2, "GRBG"),
-    "BayerRG12": PixelFormat(0x01100011, 12, 2, "RGGB"),
-    "BayerGB12": PixelFormat(0x01100012, 12, 2, "GBRG"),
-    "BayerBG12": PixelFormat(0x01100013, 12, 2, "BGGR"),
+    "Mono10p": PixelFormat(0x010A0046, 10, 0, packed="p"),
+    "Mono12p": PixelFormat(0x010C0047, 12, 0, packed="p"),
+    "Mono10Packed": PixelFormat(0x010C0004, 10, 0, packed="gige"),
+    "Mono12Packed": PixelFormat(0x010C0006, 12, 0, packed="gige"),
+    **_genicam("8", 8, 1, *range(0x01080008, 0x0108000C)),
+    **_genicam("10", 10, 2, *range(0x0110000C, 0x01100010)),
+    **_genicam("12", 12, 2, *range(0x01100010, 0x01100014)),
+    **_genicam("16", 16, 2, *range(0x0110002E, 0x01100032)),
+    **_genicam("10p", 10, 0, 0x010A0056, 0x010A0058, 0x010A0054, 0x010A0052, packed="p"),
+    **_genicam("12p", 12, 0, 0x010C0057, 0x010C0059, 0x010C0055, 0x010C0053, packed="p"),
+    **_genicam("10Packed", 10, 0, *range(0x010C0026, 0x010C002A), packed="gige"),
+    **_genicam("12Packed", 12, 0, *range(0x010C002A, 0x010C002E), packed="gige"),
 }
 """Formats of GenICam, by the names of the convention."""
 
 
 def size_of(layout: PixelFormat, width: int, height: int, stride: int = 0) -> int:
     """Return the size of a frame with rows `stride` bytes apart (bytes); 0 if compressed."""
-    if not layout.stored:
-        return 0
-    row = width * layout.stored
-    return (height - 1) * max(stride, row) + row
+    row = layout.row(width)
+    rows = height * 3 // 2 if layout.pattern == "NV12" else height  # colours are below the luminance
+    return (rows - 1) * max(stride, row) + row if row else 0
 
 
 def decode(layout: PixelFormat, width: int, height: int, data: bytes, stride: int = 0) -> NDArray[Any]:
-    """Decode the grey values of a frame: luminance of YUYV and MJPEG, all raw pixels of a mosaic.
+    """Decode the grey values of a frame: luminance of YUYV, UYVY, NV12 and MJPEG, all raw pixels of a mosaic.
 
     Parameters
     ----------
@@ -121,20 +180,41 @@ def decode(layout: PixelFormat, width: int, height: int, data: bytes, stride: in
     >>> decode(VIDEO["YUYV"], 2, 1, bytes([16, 128, 235, 128]))
     array([[ 16, 235]], dtype=uint8)
     """
-    if not layout.stored:
+    if layout.pattern == "MJPEG":
         return _jpeg(width, height, data)
     need = size_of(layout, width, height, stride)
     if len(data) < need or min(width, height) < 1:
         raise ProtocolError(f"a frame of {width}×{height} pixels has {len(data)} of {need} bytes")
-    row = max(stride, width * layout.stored)
+    size = layout.row(width)
     raw = np.frombuffer(data, np.uint8, need)
-    rows = np.lib.stride_tricks.as_strided(raw, (height, width * layout.stored), (row, 1), writeable=False)
-    if layout.pattern == "YUYV":
-        return rows[:, ::2]
+    rows = np.lib.stride_tricks.as_strided(raw, (height, size), (max(stride, size), 1), writeable=False)
+    if layout.pattern in ("YUYV", "UYVY"):
+        return rows[:, layout.pattern == "UYVY" :: 2]
+    if layout.packed:
+        return _unpacked(layout, rows)
     pixels = rows if layout.stored == 1 else _words(rows)
     if layout.stored == 2 and layout.bits < 16 and int(pixels.max()) >> layout.bits:
         raise ProtocolError(f"a frame of {layout.bits} bits contains the grey value {int(pixels.max())}")
     return pixels
+
+
+def _unpacked(layout: PixelFormat, rows: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """Grey values of pixels that share bytes."""
+    pixels, size = layout.group
+    shared = rows.reshape(len(rows), -1, size)
+    found = np.empty((*shared.shape[:2], pixels), np.uint16)
+    low = layout.bits - 8
+    for k in range(pixels):
+        if layout.packed == "p":
+            first, shift = divmod(k * layout.bits, 8)
+            word = shared[..., first].astype(np.uint16) | shared[..., first + 1].astype(np.uint16) << 8
+            found[..., k] = word >> shift & (1 << layout.bits) - 1
+        else:
+            gige = layout.packed == "gige"
+            high, rest = shared[..., 2 * k if gige else k], shared[..., 1 if gige else -1]
+            bits = rest >> (4 if gige else low) * k & (1 << low) - 1
+            found[..., k] = high.astype(np.uint16) << low | bits
+    return found.reshape(len(rows), -1)
 
 
 def _words(rows: NDArray[np.uint8]) -> NDArray[Any]:
@@ -158,17 +238,21 @@ def _jpeg(width: int, height: int, data: bytes) -> NDArray[Any]:
 
 
 def encode(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
-    r"""Encode grey values as a camera with this format sends them; YUYV is encoded without colour.
+    r"""Encode grey values as a camera with this format sends them, with neutral colours; none that is packed.
 
     Examples
     --------
     >>> encode(VIDEO["Y16"], np.array([[1, 256]], np.uint16))
     b'\x01\x00\x00\x01'
     """
-    if layout.pattern == "YUYV":
+    if layout.pattern in ("YUYV", "UYVY"):
         coloured = np.full((*pixels.shape, 2), 128, np.uint8)
-        coloured[..., 0] = pixels
+        coloured[..., layout.pattern.index("Y")] = pixels
         return coloured.tobytes()
+    if layout.pattern == "NV12":
+        return pixels.tobytes() + bytes([128]) * (pixels.size // 2)
+    if layout.packed:
+        raise ProtocolError("packed formats are not encoded")
     if not layout.stored:
         return bytes(cv2.imencode(".jpg", pixels.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 95])[1])
     return pixels.astype(layout.dtype).tobytes()

@@ -19,7 +19,9 @@ import numpy as np
 from reseau.core.data import Array
 from reseau.core.errors import ProtocolError
 
+from ..codecs.ieee488 import picture
 from ..codecs.numbers import INFINITE
+from .screens import bytes_of_colours, runs_of_colours
 
 __all__ = [
     "DIALECTS",
@@ -35,7 +37,8 @@ __all__ = [
 
 Numbers = dict[str, float]
 Step = tuple[Literal["send", "query", "fetch"], str]
-"""``send`` a command; ``query``: wait for a line and ignore it; ``fetch`` a picture or block."""
+"""``send`` a command, where ``{port}`` is the port that it is connected to;
+``query``: wait for a line and ignore it; ``fetch`` a picture or block."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,8 @@ class Dialect:
         Command that stops the acquisition.
     errors : str
         Query for the oldest error; empty if there is no error queue.
+    decode : callable
+        Makes a PNG or BMP file from the answer with the picture.
 
     Examples
     --------
@@ -122,6 +127,7 @@ class Dialect:
     setup: tuple[str, ...] = ()
     halt: str = ":STOP"
     errors: str = ":SYSTem:ERRor?"
+    decode: Callable[[bytes], bytes] = picture
 
     @property
     def maker(self) -> str:
@@ -167,6 +173,23 @@ _KEYSIGHT = _with_preamble("u1", ":WAVeform:UNSigned ON")
 # Coupling, ranges, date and the like follow; the number of segments in segmented memory.
 _INFINIIUM = replace(_with_preamble("i1", ":WAVeform:STReaming OFF"), more=(0, 14, 15))
 _RIGOL = _with_preamble("u1", ":WAVeform:MODE NORMal", shifted=True)
+_RIGOL_E = WaveformDialect(
+    (":WAVeform:POINts:MODE NORMal",),
+    MappingProxyType(
+        {
+            "vdiv": ":CHANnel{n}:SCALe?",
+            "ofst": ":CHANnel{n}:OFFSet?",
+            "tdiv": ":TIMebase:SCALe?",
+            "delay": ":TIMebase:OFFSet?",
+        }
+    ),
+    ":WAVeform:DATA? CHANnel{n}",
+    "u1",
+    # 125 is the middle of the screen, and a smaller number is higher; 600 samples are twelve divisions.
+    lambda codes, f: (125 - codes) * f["vdiv"] / 25 - f["ofst"],
+    start=lambda f: f["delay"] - 6 * f["tdiv"],
+    step=lambda f: f["tdiv"] / 50,
+)
 _SIGLENT = WaveformDialect(
     ("CHDR OFF", "WFSU SP,0,NP,0,FP,0"),
     MappingProxyType({"vdiv": "C{n}:VDIV?", "ofst": "C{n}:OFST?", "rate": "SARA?", "tdiv": "TDIV?"}),
@@ -242,6 +265,14 @@ DIALECTS: tuple[Dialect, ...] = (
         _KEYSIGHT,
     ),
     Dialect("Rigol 1000Z", r"(DS|MSO)1\d{3}Z", (("fetch", ":DISPlay:DATA? ON,0,PNG"),), _RIGOL),
+    Dialect(
+        "Rigol DS1000D and DS1000E",
+        r"DS1\d{3}[CDEM]+\b",
+        (("fetch", ":LCD:DATA?"),),
+        _RIGOL_E,
+        errors="",
+        decode=bytes_of_colours,
+    ),
     Dialect("Rigol", r"(DS|MSO|DHO|MHO|HDO)\d", (("fetch", ":DISPlay:DATA?"),), _RIGOL),
     _no_queue(
         "Siglent with PRINt",
@@ -260,6 +291,26 @@ DIALECTS: tuple[Dialect, ...] = (
             ("send", 'FILESystem:DELEte "C:/Temp/reseau.png"'),
         ),
         _TEKTRONIX,
+    ),
+    _tektronix(
+        "Tektronix with Windows",
+        r"(MSO|DPO)5\d{3}B?\b|(DPO|DSA|MSO)7\d{3,4}",
+        (
+            ("send", "HARDCopy:PORT FILE"),
+            ("send", "EXPort:FORMat PNG"),
+            ("send", 'HARDCopy:FILEName "C:\\TEMP\\RESEAU.PNG"'),
+            ("send", "HARDCopy STARt"),
+            ("query", "*OPC?"),
+            ("fetch", 'FILESystem:READFile "C:\\TEMP\\RESEAU.PNG"'),
+            ("send", 'FILESystem:DELEte "C:\\TEMP\\RESEAU.PNG"'),
+        ),
+        _TEKTRONIX,
+    ),
+    _tektronix(
+        "Tektronix TDS 200",
+        r"TDS ?2[1-4]\d\b",
+        _hardcopy("BMP", "{port}"),
+        _TEKTRONIX_TDS,
     ),
     _tektronix(
         "Tektronix TDS 3000",
@@ -297,10 +348,31 @@ DIALECTS: tuple[Dialect, ...] = (
         _ROHDE,
     ),
     Dialect(
+        "Rohde & Schwarz handheld",
+        r"RTH",
+        (
+            ("send", "HCOPy:LANGuage PNG"),
+            ("send", "MMEMory:NAME '/media/SD/reseau.png'"),
+            ("send", "HCOPy:IMMediate"),
+            ("query", "*OPC?"),
+            ("fetch", "MMEMory:DATA? '/media/SD/reseau.png'"),
+            ("send", "MMEMory:DELete '/media/SD/reseau.png'"),
+        ),
+        _ROHDE,
+    ),
+    Dialect(
         "Rohde & Schwarz",
-        r"RTB|RTM|RTA|RTC|RTH|HMO",
+        r"RTB|RTM|RTA|RTC|HMO",
         (("send", "HCOPy:FORMat PNG"), ("fetch", "HCOPy:DATA?")),
         _ROHDE,
+    ),
+    _no_queue("LeCroy T3DSO", r"T3DSO", (("fetch", "SCDP"),), _SIGLENT),
+    Dialect(
+        "GW Instek",
+        r"GDS-?[123]\d{3}|MSO-?2\d{3}|MDO-?2\d{3}",
+        (("fetch", ":DISPlay:OUTPut?"),),
+        errors="",
+        decode=runs_of_colours,
     ),
     _no_queue(
         "LeCroy",
@@ -315,7 +387,8 @@ _MAKERS = {
     "Siglent": ("SIGLENT", r"SDM|SDG|SPD|SSA|SSG|SVA|SDL"),
     "Tektronix": ("TEKTRONIX", r"DMM|AFG|AWG|PWS|RSA|PA"),
     "Rohde & Schwarz": ("ROHDE|HAMEG", r"HMC|NG|FP|FS|SM|HMP|UDS"),
-    "LeCroy": ("LECROY|TELEDYNE", r"WAVESTATION|T3|WS\d{4}"),
+    "LeCroy": ("LECROY|TELEDYNE", r"WAVESTATION|T3(?!DSO)|WS(20[125]|3(08|12|16))2\b"),
+    "GW Instek": ("GW|GOOD WILL|INSTEK", r"GDM|GPP|PSW|GPD|AFG|MFG|GSP|PPH"),
     "Keithley": ("KEITHLEY", ""),
 }
 """Makers as in the names of their dialects: what ``*IDN?`` begins with, and models that are no oscilloscopes:

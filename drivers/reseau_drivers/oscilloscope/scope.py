@@ -13,10 +13,10 @@ from reseau.core.errors import DeadlineError, ProtocolError, RefusedError
 from reseau.instruments import Deadline, Device, Identity, Limits, ScreenPicture, Settings, Waveform, quantity
 from reseau.instruments.values import now
 
-from ..codecs.ieee488 import LARGEST, Header, error_entry, missing_bytes, parse_block, picture
+from ..codecs.ieee488 import LARGEST, Header, error_entry, missing_bytes, parse_block
 from ..codecs.numbers import numbers
 from ..codecs.stream import excerpt
-from ..link import Link
+from ..link import Link, SerialLink
 from .dialects import UNITS, Dialect, WaveformDialect, candidates_of, dialect_of, fields_of, samples_of
 
 __all__ = ["Oscilloscope", "OscilloscopeSettings"]
@@ -79,6 +79,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
     ) -> None:
         super().__init__(name, settings or OscilloscopeSettings(), seconds=seconds, limits=limits)
         self._link, self._forced_dialect, self._dialect = link, dialect, dialect
+        self._serial = isinstance(link, SerialLink)
         self._idn, self._received, self._answer_pending = "", bytearray(), False
 
     @property
@@ -162,11 +163,11 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         data = b""
         for how, text in dialect.screen:
             if how == "send":
-                self._send(text, deadline)
+                self._send(text.format(port="RS232" if self._serial else "GPIb"), deadline)
             elif how == "query":
                 self._query(text, deadline)
             else:
-                data = picture(self._fetch(text, deadline))
+                data = dialect.decode(self._fetch(text, deadline))
         _verify_png(data)
         return data
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -132,7 +135,7 @@ def test_intervals_and_regions() -> None:
     assert uapi.Selection.parse(region) == uapi.Selection(16, 32, 640, 480)
 
 
-@pytest.mark.parametrize("name", ["GREY", "Y10", "Y12", "Y16", "YUYV", "SRGGB8"])
+@pytest.mark.parametrize("name", ["GREY", "Y10", "Y12", "Y16", "YUYV", "UYVY", "NV12", "SRGGB8", "SBGGR16"])
 def test_grey_values_round_trip(name: str) -> None:
     layout, rng = VIDEO[name], np.random.default_rng(3)
     pixels = rng.integers(0, int(layout.full_scale) + 1, (5, 6)).astype(layout.dtype)
@@ -175,5 +178,73 @@ def test_a_jpeg_gives_the_luminance_of_its_decoder() -> None:
 def test_genicam_numbers_contain_the_bits_per_pixel() -> None:
     for name, layout in GENICAM.items():
         assert isinstance(layout.code, int)
-        assert (layout.code >> 16 & 0xFF) == 8 * layout.stored, name
+        pixels, size = layout.group
+        assert (layout.code >> 16 & 0xFF) == 8 * size // pixels, name
         assert int("".join(c for c in name if c.isdigit())) == layout.bits
+
+
+HEADER = Path("/usr/include/linux/videodev2.h")
+
+
+@pytest.mark.skipif(not HEADER.exists(), reason="needs linux-libc-dev")
+def test_all_formats_of_video_have_the_codes_of_the_kernel() -> None:
+    found = re.findall(
+        r"V4L2_PIX_FMT_(\w+)\s+v4l2_fourcc\('(.)', *'(.)', *'(.)', *'(.)'\)", HEADER.read_text()
+    )
+    known = {name: "".join(letters) for name, *letters in found}
+    for name, layout in VIDEO.items():
+        assert known[name] == layout.code, name
+
+
+def _stream(bits: int, pixels: list[int]) -> bytes:
+    """PFNC, formats with p: each pixel begins with its lowest bit, in the lowest bit that is free."""
+    text = "".join(format(value, f"0{bits}b")[::-1] for value in pixels)
+    return bytes(int(text[k : k + 8][::-1], 2) for k in range(0, len(text), 8))
+
+
+def _gige(bits: int, pixels: list[int]) -> bytes:
+    """GigE Vision 1.2, 26.1: the high bits of both pixels, with the low ones of both in the byte between."""
+    low = bits - 8
+    return b"".join(
+        bytes([a >> low, (a & (1 << low) - 1) | (b & (1 << low) - 1) << 4, b >> low])
+        for a, b in zip(pixels[::2], pixels[1::2], strict=True)
+    )
+
+
+def _mipi(bits: int, pixels: list[int]) -> bytes:
+    """The kernel's SRGGB10P and SRGGB12P: the high bits of the pixels, then the low bits of all of them."""
+    low = bits - 8
+    found = b""
+    for k in range(0, len(pixels), 8 // low):
+        some = pixels[k : k + 8 // low]
+        rest = sum((value & (1 << low) - 1) << low * n for n, value in enumerate(some))
+        found += bytes([value >> low for value in some]) + bytes([rest])
+    return found
+
+
+PACKERS = {"p": _stream, "gige": _gige, "mipi": _mipi}
+PACKED = {name: layout for name, layout in (GENICAM | VIDEO).items() if layout.packed}
+
+
+@pytest.mark.parametrize("name", PACKED)
+def test_pixels_that_share_bytes_are_those_that_were_packed(name: str) -> None:
+    layout = PACKED[name]
+    pixels = np.random.default_rng(11).integers(0, 1 << layout.bits, (5, 8))
+    rows = [PACKERS[layout.packed](layout.bits, row.tolist()) for row in pixels]
+    assert len(rows[0]) == layout.row(8)
+    assert (decode(layout, 8, 5, b"".join(rows)) == pixels).all()
+    padded = b"".join(row + b"\xff" * 3 for row in rows)
+    assert (decode(layout, 8, 5, padded, len(rows[0]) + 3) == pixels).all()
+    with pytest.raises(ProtocolError):
+        decode(layout, 8, 5, b"".join(rows)[:-1])
+    with pytest.raises(ProtocolError, match="set a multiple of"):
+        decode(layout, 7, 5, b"".join(rows))
+
+
+def test_packed_pixels_of_the_documents() -> None:
+    """The kernel's table of SRGGB10P; PFNC's figure of Mono10p."""
+    assert decode(VIDEO["SRGGB10P"], 4, 1, bytes([0xFF, 0, 0x80, 1, 0b11_00_01_10])).tolist() == [
+        [0x3FE, 1, 0x200, 7]
+    ]
+    assert decode(GENICAM["Mono10p"], 4, 1, bytes([0x01, 0x08, 0x30, 0x00, 0x01])).tolist() == [[1, 2, 3, 4]]
+    assert decode(GENICAM["Mono12Packed"], 2, 1, bytes([0x12, 0x63, 0x45])).tolist() == [[0x123, 0x456]]
