@@ -164,8 +164,8 @@ def main() -> None:
     found = np.array([case.outcome for case in cases])
     for name, of in (
         ("rotations predict as well (λ up to 1 an unknown)", ratio <= 1),
-        ("λ from 1 to 2", (ratio > 1) & (ratio <= 2)),
-        ("λ above 2", ratio > 2),
+        ("λ from 1 to 4", (ratio > 1) & (ratio <= 4)),
+        ("λ above 4", ratio > 4),
     ):
         code, count = found[of], max(int(of.sum()), 1)
         said = int((code == "one-station").sum())
