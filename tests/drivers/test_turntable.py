@@ -136,6 +136,30 @@ def test_a_target_that_marlin_shortens_is_an_error() -> None:
             table.move("tilt", 60.0)
 
 
+def test_marlin_keeps_a_reference_for_each_axis_and_none_after_an_abrupt_stop() -> None:
+    """G-code reference, M410: without deceleration, steppers are expected to be out of position."""
+    printer = MarlinController(2, high=100.0, speed=900.0)
+    axes = {"tilt": {"high": 100.0}, "roll": {"axis": 2, "high": 100.0}}
+    with marlin("table", _in_process(printer), axes=axes) as table:
+        table.configure(speed=100.0)
+        table.home("roll")
+        assert [table.state(axis).homed for axis in axes] == [False, True]
+        with pytest.raises(StateError, match="home tilt first"):
+            table.move("tilt", 10.0)
+        table.home("tilt")
+        table.stop()
+        assert [table.state(axis).homed for axis in axes] == [True, True]
+        table.configure(speed=20.0)
+        moving = table.axes["tilt"].set(90.0)
+        time.sleep(0.3)
+        table.stop()
+        assert isinstance(moving.exception(5.0), StateError)
+        assert not any(table.state(axis).homed for axis in axes)
+    with marlin("table", _in_process(printer), axes=axes) as table:
+        assert not table.state("tilt").homed
+    assert printer.violations == []
+
+
 def test_search_for_the_reference_can_be_stopped() -> None:
     for table, machine in boards({"high": 100.0}):
         with table:

@@ -412,7 +412,7 @@ def candidates_of(identity: str) -> tuple[Dialect, ...]:
     Examples
     --------
     >>> [dialect.name for dialect in candidates_of("RIGOL TECHNOLOGIES,XYZ9,1,1")]
-    ['Rigol 1000Z', 'Rigol']
+    ['Rigol 1000Z', 'Rigol DS1000D and DS1000E', 'Rigol']
     """
     for maker, (_, others) in _MAKERS.items():
         if _is(maker, others, identity):

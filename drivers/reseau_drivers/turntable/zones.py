@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from threading import Lock
 
 from reseau.core.errors import SettingError, StateError
 
@@ -53,7 +53,7 @@ class KeepOut:
                 raise SettingError(what, where="keep_out")
             self._zones.append({axis: (float(span[0]), float(span[1])) for axis, span in zone.items()})
         self._underway: dict[str, Span] = {}
-        self._lock = Lock()
+        self._lock = threading.Lock()
 
     @contextmanager
     def crossed(
