@@ -126,7 +126,7 @@ ENTRIES = (
 
 SUBJECTS = {
     "peers-cameras": ("Cameras and networks, beside peers", (
-        "bundle", "cameras", "calibrations", "causes", "intervals", "halves", "model-choice",
+        "bundle", "cameras", "calibrations", "degenerate", "causes", "intervals", "halves", "model-choice",
         "next-photograph", "stereo", "refraction", "water", "nist")),
     "peers-targets": ("Targets and boards, beside peers", (
         "disks", "testfield", "boards", "other-boards", "drawn-boards", "reseau-simulated", "reseau",

@@ -136,7 +136,7 @@ def move(
         there = by_hand.targets(found, wanted, relative=relative)
         lost = [axis for axis in there if not found.state(axis).homed]
         if lost:
-            why = f"has no reference: {found.state(lost[0]).reference}"
+            why = ": ".join(filter(None, ["has no reference", found.state(lost[0]).reference]))
             raise StateError(why, where=lost[0], do=f"run `reseau bench home {' '.join(lost)}`")
         by_hand.move(found, there)
         _say_axes(found)
