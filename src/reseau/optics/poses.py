@@ -20,6 +20,7 @@ __all__ = [
     "Pose",
     "Projection",
     "angles_to_matrix",
+    "cross_matrix",
     "matrix_to_angles",
     "matrix_to_vector",
     "project",
@@ -33,8 +34,14 @@ _VIEW = np.diag([1.0, -1.0, -1.0])
 _SMALL_ANGLE = 0.5
 
 
-def _cross_matrix(vectors: Array) -> Array:
-    """[v]× of vectors (..., 3): [v]× w = v × w."""
+def cross_matrix(vectors: Array) -> Array:
+    """Matrices [v]× (..., 3, 3) of vectors (..., 3): [v]× w = v × w.
+
+    Examples
+    --------
+    >>> (cross_matrix(np.array([0.0, 0.0, 1.0])) @ [1.0, 0.0, 0.0]).tolist()
+    [0.0, 1.0, 0.0]
+    """
     matrix = np.zeros((*vectors.shape, 3))
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -z, y, -x
@@ -69,7 +76,7 @@ def rotation_matrix(r: ArrayLike) -> Array:
     vectors = np.asarray(r, dtype=np.float64)
     theta = np.linalg.norm(vectors, axis=-1)[..., None, None]
     a, b, _ = _coefficients(theta)
-    k = _cross_matrix(vectors)
+    k = cross_matrix(vectors)
     matrix: Array = np.eye(3) + a * k + b * (k @ k)
     return matrix
 
@@ -102,11 +109,11 @@ def rotate(r: ArrayLike, vectors: ArrayLike) -> tuple[Array, Array]:
     rotation, x = np.asarray(r, dtype=np.float64), np.asarray(vectors, dtype=np.float64)
     theta = np.linalg.norm(rotation, axis=-1)[..., None, None]
     _, b, c = _coefficients(theta)
-    k = _cross_matrix(rotation)
+    k = cross_matrix(rotation)
     jacobian = np.eye(3) - b * k + c * (k @ k)
     matrix = rotation_matrix(rotation)
     value: Array = (matrix @ x[..., None])[..., 0]
-    return value, -matrix @ _cross_matrix(x) @ jacobian
+    return value, -matrix @ cross_matrix(x) @ jacobian
 
 
 def matrix_to_vector(matrix: ArrayLike) -> Array:

@@ -79,14 +79,14 @@ def contradicting(problem: BundleProblem, fit: BundleFit) -> tuple[BundleProblem
             # The datum depends on it, so that it cannot be said which is wrong.
             found.append((int(element[worst]), float(w[worst]), np.nan))
             break
-        off = float(np.abs(again.residuals[own[worst]]))
-        found.append((int(element[worst]), float(w[worst]), off))
         instead = _instead(problem, current, weights, again, own, element, w > critical, worst)
         if instead:
             # One of them is wrong; without a further observation it cannot be said which.
-            found += [(other, float(w[element == other].max()), np.nan) for other in instead]
-            found[-1 - len(instead)] = (int(element[worst]), float(w[worst]), np.nan)
+            alike = [int(element[worst]), *instead]
+            found += [(each, float(w[element == each].max()), np.nan) for each in alike]
             break
+        off = float(np.abs(again.residuals[own[worst]]))
+        found.append((int(element[worst]), float(w[worst]), off))
         weights, current = trial, again
     named = [one for one in found if one[0] < lengths]
     false = [k for k, _, off in named if np.isfinite(off)]

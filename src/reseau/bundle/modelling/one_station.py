@@ -22,11 +22,12 @@ from ...core.data import Array, Mask, Rows
 from ...core.display import Display
 from ...core.failure import Code, Estimated, Failure
 from ...core.numbers import measured
-from ...optics.poses import rotation_matrix
+from ...optics.poses import cross_matrix, rotation_matrix
 from ..diagnostics import CameraEstimate
 from ..diagnostics.evidence import ODDS
 from ..network import Network
 from ..network.network import finite
+from ..network.stage import nearest_rotation
 from ..solver import BundleFit, BundleProblem
 
 __all__ = ["RotationOnly", "one_station", "rotation_only"]
@@ -116,6 +117,11 @@ class _Rotations:
         return self.problem.network
 
     @property
+    def camera(self) -> Rows:
+        """Camera of each image point."""
+        return self.network.camera_of[self.network.image_of[self.rows]]
+
+    @property
     def free(self) -> list[Rows]:
         """Rows of the free parameters of each camera."""
         return [
@@ -127,9 +133,8 @@ class _Rotations:
         values, network = self.problem.start, self.network
         every = [values.cameras[c, : len(camera.values)] for c, camera in enumerate(network.cameras)]
         uv = np.full((len(self.rows), 2), np.nan)
-        camera_of = network.camera_of[network.image_of[self.rows]]
         for c, camera in enumerate(network.cameras):
-            own = camera_of == c
+            own = self.camera == c
             uv[own] = camera.bare_mapping(every[c]).inverse(network.xy[self.rows[own]])
         rays = np.nan_to_num(np.column_stack([uv, np.ones(len(uv))]))
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -148,42 +153,35 @@ class _Rotations:
             left.remove(nearest)
             order.append(nearest)
             own = np.flatnonzero((self.image == nearest) & known)
-            u, _, vt = np.linalg.svd(rays[own].T @ sums[self.point[own]])
-            rotation[nearest] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+            rotation[nearest] = nearest_rotation(rays[own].T @ sums[self.point[own]])
         free = [own[k] for own, k in zip(every, self.free, strict=True)]
         size = np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
         return _State(np.concatenate(free), rotation, sums / size)
 
-    def misfits(self, state: _State, slopes: bool = False) -> tuple[Array, Array, Array, Array]:
-        """Weighted misfits (n, 2), derivatives by cameras (n, 2, k), rotations and directions (n, 2, 3)."""
+    def misfits(self, state: _State) -> tuple[Array, Array, Array, Array]:
+        """Weighted misfits (n, 2), derivatives by cameras (n, 2, k), rotations and directions (n, 2, 3).
+
+        Misfits are infinite where a point is not before its camera.
+        """
         network, n = self.network, len(self.rows)
         seen = np.einsum("nij,nj->ni", state.rotation[self.image], state.direction[self.point])
         uv = seen[:, :2] / seen[:, 2:]
-        off, by_ray, begin = np.zeros((n, 2)), np.zeros((n, 2, 3)), 0
-        by_camera = np.zeros((n, 2, len(state.cameras) if slopes else 0))
-        camera_of = network.camera_of[network.image_of[self.rows]]
+        plane = np.zeros((n, 2, 3))
+        plane[:, 0, 0] = plane[:, 1, 1] = 1 / seen[:, 2]
+        plane[:, :, 2] = -uv / seen[:, 2:]
+        off, by_ray, by_camera, begin = np.zeros((n, 2)), plane, np.zeros((n, 2, len(state.cameras))), 0
         for c, (camera, free) in enumerate(zip(network.cameras, self.free, strict=True)):
             values = np.array(self.problem.start.cameras[c, : len(camera.values)])
             values[free] = state.cameras[begin : begin + len(free)]
-            own, mapping = np.flatnonzero(camera_of == c), camera.bare_mapping(values)
-            if slopes:
-                found = mapping.derivatives(uv[own])
-                off[own] = network.xy[self.rows[own]] - found.value
-                by_camera[own, :, begin : begin + len(free)] = found.d_parameters[:, :, free]
-                plane = np.zeros((len(own), 2, 3))
-                plane[:, 0, 0] = plane[:, 1, 1] = 1 / seen[own, 2]
-                plane[:, :, 2] = -uv[own] / seen[own, 2:]
-                by_ray[own] = found.d_xy @ plane
-            else:
-                off[own] = network.xy[self.rows[own]] - mapping(uv[own])
+            own = np.flatnonzero(self.camera == c)
+            found = camera.bare_mapping(values).derivatives(uv[own])
+            off[own] = network.xy[self.rows[own]] - found.value
+            by_camera[own, :, begin : begin + len(free)] = found.d_parameters[:, :, free]
+            by_ray[own] = found.d_xy @ plane[own]
             begin += len(free)
-        behind = (seen[:, 2] <= 0) | ~np.isfinite(off).all(axis=1)
-        off[behind] = np.inf
-        weighted = (self.root @ off[:, :, None])[:, :, 0] if not behind.any() else off
-        if not slopes:
-            return weighted, by_camera, by_ray, by_ray
-        by_ray = self.root @ by_ray
-        turn = -by_ray @ _cross(seen)
+        weighted, by_ray = (self.root @ off[:, :, None])[:, :, 0], self.root @ by_ray
+        weighted[(seen[:, 2] <= 0) | ~np.isfinite(weighted).all(axis=1)] = np.inf
+        turn = -by_ray @ cross_matrix(seen)
         return weighted, self.root @ by_camera, turn, by_ray @ state.rotation[self.image]
 
     def observed(self, cameras: Array) -> tuple[Array, Array]:
@@ -196,6 +194,7 @@ class _Rotations:
         return np.concatenate(weight), np.concatenate(given) - cameras
 
     def cost(self, state: _State) -> float:
+        """Return vᵀPv; infinite where a point is not before its camera."""
         weight, left = self.observed(state.cameras)
         with np.errstate(all="ignore"):
             return float((self.misfits(state)[0] ** 2).sum() + weight @ left**2)
@@ -229,7 +228,7 @@ class _Rotations:
 
         The first image defines the system and does not turn.
         """
-        off, by_camera, turn, by_direction = self.misfits(state, slopes=True)
+        off, by_camera, turn, by_direction = self.misfits(state)
         tangent: Array = np.asarray(np.linalg.svd(state.direction[:, None, :])[2][:, 1:], dtype=np.float64)
         b = by_direction @ np.swapaxes(tangent[self.point], 1, 2)
         n, m, p, k = len(off), len(state.rotation), len(state.direction), by_camera.shape[2]
@@ -269,11 +268,6 @@ class _Rotations:
 def _inverted(matrices: Array) -> Array:
     """Pseudo-inverses of symmetric matrices."""
     return np.asarray(np.linalg.pinv(matrices, hermitian=True), dtype=np.float64)
-
-
-def _cross(vectors: Array) -> Array:
-    """Matrices of the vector product (n, 3, 3)."""
-    return np.asarray(np.cross(vectors[:, None, :], np.eye(3)[None]).swapaxes(1, 2))
 
 
 def rotation_only(problem: BundleProblem, rows: Rows | None = None) -> RotationOnly | Failure:
