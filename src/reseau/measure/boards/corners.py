@@ -22,7 +22,7 @@ from ..compiled_filter import filtered
 from ..matching import GrownOutline, Matches, Shape, Window
 from ..points import Reason
 from ..reseau.lens_mapping import UNFIT, mapping_through
-from ..reseau.mark_windows import ENOUGH, Located
+from ..reseau.mark_windows import BESIDE, ENOUGH, Located
 from ..reseau.marks import ReseauOptions
 from ..reseau.plane_marks import PlaneMarks, intact
 from ..response import sharpened_from_px
@@ -30,6 +30,7 @@ from ..screening import Screened
 from ..testfield.lattice_mapping import images_of, second_order
 from .candidates import ended, levels_at
 from .compiled_corners import add_images, pixels_around
+from .shadows import pixels_alike, shaded
 
 __all__ = ["BORDER_PX", "CornerMarks", "CornerShape", "DeltilleMarks", "Sectors"]
 
@@ -166,6 +167,7 @@ class CornerMarks(PlaneMarks):
         if not self.balanced:
             # What is not known of the camera shifts them: it is learnt from more.
             self.sampled = _SAMPLED_OF_TAGS
+        self.crossed = np.zeros(len(self.xy), dtype=bool)  # by edges that nothing explains
         self.widths = np.full(len(self.xy), np.nan)  # of the point-spread function at corners, if it varies
 
     def _curvature(self, mapping: Chain, rows: Rows) -> Array:
@@ -345,6 +347,36 @@ class CornerMarks(PlaneMarks):
             cov=found.cov + shift @ cofactor @ np.swapaxes(shift, 1, 2),
         )
 
+    def _in_shadows(self, rows: Rows, found: Matches) -> Matches:
+        """See :class:`PlaneMarks`: shadows make objections to some corners, and displace others."""
+        objected = np.any([mask for mask, _ in self._objections(rows, found)], axis=0)
+        plain = intact(found) & ~objected
+        if not (objected & (found.rejected > 0)).any() or plain.sum() < ENOUGH or not self.balanced:
+            return found
+        noise, ink = float(np.median(found.noise[plain])), float(np.median(found.contrast[plain]))
+        alike = pixels_alike(found.residuals[plain])
+        start = self.start[rows] = np.where(plain[:, None], found.xy, self.mapping(self.at[rows]))
+        images, reach = self._images(rows)
+        high, wide = (n // 2 for n in found.residuals.shape[1:])
+        beside = self.beside()
+        for part, half in self._windows(reach):
+            half = min(half[0], wide), min(half[1], high)
+            x, y = self.pixels(rows[part], half)
+            window, region = self.window(rows[part], half), self._region(rows[part], half)
+            used = (
+                self.screened.valid[y, x] & (x == window.columns[:, None, :]) & (y == window.rows[:, :, None])
+            )
+            used &= True if region is None else region
+            if beside is not None:
+                used &= np.abs(beside[y, x]) < BESIDE
+            own = shaded(
+                self.screened.grey[y, x], used, self._shape(images, part), window, start[part], ink,
+                (self.look.psf_px, self.look.psf_log_sigma), self._form_sigma(), noise, alike,
+            )  # fmt: skip
+            found = own.instead_of(found, part)
+            self.crossed[rows[part]] = ~own.converged
+        return found
+
     def _width(self, at: Array) -> Array:
         """Widths (m,) of the point-spread function at places of the lattice; if it varies, those near."""
         known = np.flatnonzero(np.isfinite(self.widths))
@@ -383,7 +415,11 @@ class CornerMarks(PlaneMarks):
             "the pattern ends there: paper is where a dark square should be", Code.OTHER_DESIGN
         )
         outer = (self._single(rows), beyond_pattern)
-        return [border, outer, (unseen, hidden), *super()._objections(rows, found), (flat, seen)]
+        crossed = (
+            self.crossed[rows],
+            Reason("edges of shadows, or of something else, cross it", Code.DISTURBED),
+        )
+        return [border, outer, crossed, (unseen, hidden), *super()._objections(rows, found), (flat, seen)]
 
     def _single(self, rows: Rows) -> Mask:
         """Which corners, not found before, are those of a single square where two should meet."""
