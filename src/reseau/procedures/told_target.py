@@ -79,10 +79,13 @@ def measured_as_shown(
     if not isinstance(design, BoardDesign):
         return TargetMeasured(tuple(done))
     notes = tuple(filter(None, [unusual_size(design)]))
+    # Where a part of the told board may be hidden, a smaller board may be seen whole.
     against = {
-        each.name for each in done if isinstance(each.found, Failure) and each.found.code in _CONTRADICT
+        each.name
+        for each in done
+        if not each.certain or (isinstance(each.found, Failure) and each.found.code in _CONTRADICT)
     }
-    if len(against) <= sum(not isinstance(each.found, Failure) for each in done):
+    if len(against) <= sum(each.certain and not isinstance(each.found, Failure) for each in done):
         return TargetMeasured(tuple(done), None, notes)
     other = corrected(_frames(seen, against), design)
     if isinstance(other, Failure):

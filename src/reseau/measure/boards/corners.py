@@ -370,7 +370,7 @@ class CornerMarks(PlaneMarks):
             if beside is not None:
                 used &= np.abs(beside[y, x]) < BESIDE
             own = shaded(
-                self.screened.grey[y, x], used, self._shape(images, part), window, start[part], ink,
+                self.screened.grey[y, x].astype(np.float64), used, self._shape(images, part), window, start[part], ink,
                 (self.look.psf_px, self.look.psf_log_sigma), self._form_sigma(), noise, alike,
             )  # fmt: skip
             found = own.instead_of(found, part)

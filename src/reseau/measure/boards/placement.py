@@ -436,22 +436,25 @@ def lay_circles(grey: NDArray[np.float32], disks: Disks, design: BoardDesign) ->
         return failed(0 if best is None else len(best[0]), f"{width} in a lattice")
     nodes, rows, mapping = best
 
-    def seen(nodes: Array) -> tuple[Array, Array]:
-        """How much darker nodes are than the middles of the meshes around them, and these."""
+    def seen(nodes: Array) -> tuple[Array, Array, Array]:
+        """How much darker nodes are than meshes around them, their levels, and the brightest mesh."""
         around, centre = (sector_levels(grey, mapping, nodes, share) for share in (0.5, 0.0))
-        beside = np.median(around, axis=1)
-        return np.asarray(beside - centre[:, 0]), beside
+        level = centre[:, 0]
+        return np.asarray(np.median(around, axis=1) - level), level, around.max(axis=1)
 
-    circle, paper = (float(np.median(each)) for each in seen(nodes))
+    circle, _, paper = (float(np.median(each)) for each in seen(nodes))
 
-    def ended(beyond: Array) -> Mask:
-        """Whether there is paper in the place of a circle: what hides circles is seldom as bright."""
-        darker, beside = seen(beyond)
-        return np.asarray((darker < circle / 2) & (beside - darker > paper - circle / 2))
+    def gone(beyond: Array, *, beside: bool) -> Mask:
+        """Whether there is no circle, but paper, in its place or beside it: a hand would hide both."""
+        darker, level, brightest = seen(beyond)
+        return np.asarray((darker < circle / 2) & ((brightest if beside else level) > paper - circle / 2))
 
     def cost(missing: Array) -> Array:
         # Those that are blurred or cut by something are seen, but not found as disks.
-        return _costs(seen(missing)[0] > circle / 2, ended(missing))
+        return _costs(seen(missing)[0] > circle / 2, gone(missing, beside=False))
+
+    def ended(beyond: Array) -> Mask:
+        return gone(beyond, beside=True)
 
     known = nodes.astype(np.intp), disks.xy[rows], mapping, shape
     return numbered(design, *known, None, cost, ends=ended)

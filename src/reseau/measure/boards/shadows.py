@@ -142,9 +142,15 @@ def shaded(
     problem = _Windows(grey, used, shape, window, xy, ink, psf, form_sigma, noise)
     k, n = len(xy), used.sum(axis=(1, 2))
     found = Shaded(
-        np.zeros(k, dtype=np.intp), xy.copy(), np.full((k, 2, 2), np.nan), *np.full((3, k), np.nan),
-        np.zeros(k, dtype=bool), np.full(used.shape, np.nan),
-    )  # fmt: skip
+        edges=np.zeros(k, dtype=np.intp),
+        xy=xy.copy(),
+        cov=np.full((k, 2, 2), np.nan),
+        psf_px=np.full(k, np.nan),
+        ink=np.full(k, np.nan),
+        noise=np.full(k, np.nan),
+        converged=np.zeros(k, dtype=bool),
+        residuals=np.full(used.shape, np.nan),
+    )
     x, rows, criterion = problem.start(), np.arange(k), np.full(k, np.inf)
     unlike = np.zeros(k, dtype=bool)
     for count in range(_EDGES + 1):
@@ -260,7 +266,7 @@ class _Windows:
         """Parameters (m, u) with the edge that explains most of what is left, and the squares it explains."""
         image, slopes = self.image(x, rows)
         every = max(1, int(self.used[rows].sum(axis=1).min(initial=_PIXELS) // _PIXELS))
-        image, slopes, used = (each[:, ::every] for each in (image, slopes, self.used[rows]))
+        image, slopes, used = image[:, ::every], slopes[:, ::every], self.used[rows, ::every]
         base, _ = np.linalg.qr(slopes[:, :, self.light] * used[..., None])
         across = np.swapaxes(base, 1, 2)
         left = np.where(used, self.grey[rows][:, ::every] - image, 0.0)

@@ -88,8 +88,8 @@ def moving(u: Array, row: Array, motion: Array) -> tuple[Array, Array, Array]:
     row : ndarray (n,)
         Rows in which the points are seen, from the middle one.
     motion : ndarray (8,)
-        Change of the projectivity with the row v: u becomes (u + v (A u + b)) / (1 + v c · u); the elements of
-        A, b and c in this order.
+        Change of the projectivity with the row v: u becomes (u + v (A u + b)) / (1 + v c · u); the elements
+        of A, b and c in this order.
 
     Returns
     -------
