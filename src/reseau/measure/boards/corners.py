@@ -369,10 +369,22 @@ class CornerMarks(PlaneMarks):
             used &= True if region is None else region
             if beside is not None:
                 used &= np.abs(beside[y, x]) < BESIDE
+            grey, psf = (
+                self.screened.grey[y, x].astype(np.float64),
+                (self.look.psf_px, self.look.psf_log_sigma),
+            )
             own = shaded(
-                self.screened.grey[y, x].astype(np.float64), used, self._shape(images, part), window, start[part], ink,
-                (self.look.psf_px, self.look.psf_log_sigma), self._form_sigma(), noise, alike,
-            )  # fmt: skip
+                grey,
+                used,
+                self._shape(images, part),
+                window,
+                start[part],
+                ink,
+                psf,
+                self._form_sigma(),
+                noise,
+                alike,
+            )
             found = own.instead_of(found, part)
             self.crossed[rows[part]] = ~own.converged
         return found
