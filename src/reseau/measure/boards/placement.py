@@ -210,7 +210,7 @@ def cost_of(ink: float, paper: float) -> Callable[[Array, Mask], Array]:
     limits = paper - 0.25 * (paper - ink), ink + 0.25 * (paper - ink)
 
     def cost(levels: Array, there: Mask) -> Array:
-        return _costs(there, ((levels > limits[0]) | (levels < limits[1])).all(axis=1))
+        return _costs(there, np.asarray(((levels > limits[0]) | (levels < limits[1])).all(axis=1)))
 
     return cost
 
