@@ -208,7 +208,7 @@ def measure_pins(
     if isinstance(seen, Failure):
         return seen
     echoes = np.flatnonzero(seen.ok)
-    layout = _placed_pattern(design, known, seen.xy[echoes], o)
+    layout = _placed_pattern(design, known, seen, o)
     if isinstance(layout, Failure):
         return Failure(
             f"the rods of design {design.name!r} were not found: {layout.reason}",
@@ -222,7 +222,9 @@ def measure_pins(
     return _with_slanted(work.result(design.ids, known), design, echoes, layout.gate_px)
 
 
-def _placed_pattern(design: ReseauDesign, known: Rows, seen: Array, o: PinOptions) -> Layout | Failure:
+def _placed_pattern(
+    design: ReseauDesign, known: Rows, found: PinDetections, o: PinOptions
+) -> Layout | Failure:
     """The rods fitted to the echoes, from nominal positions if the design has them.
 
     Echoes on the segments of slanted wires support a position; only the rods are in the result.
@@ -232,13 +234,16 @@ def _placed_pattern(design: ReseauDesign, known: Rows, seen: Array, o: PinOption
     ends = design.segments[rows]
     wires = Wires(tuple(design.ids[i] for i in rows), ends[:, 0], ends[:, 1])
     nominal = design.nominal_px[known]
-    options = LayoutOptions(
-        o.gate, float(np.deg2rad(o.max_rotation_deg)), None if o.mirrored is None else True
-    )
+    seen, mirrored = found.xy[found.ok], None if o.mirrored is None else True
+    options = LayoutOptions(o.gate, float(np.deg2rad(o.max_rotation_deg)), mirrored, found.direction)
     start = nominal if np.isfinite(nominal).all() else None
     if start is not None:
         start = np.concatenate([start, np.full((len(slanted), 2), np.nan)])
     layout = lay_wires(wires, seen, options, start)
+    if isinstance(layout, Failure) and start is not None:
+        # The photograph may be turned or mirrored against the one in which the nominal positions were read.
+        anywhere = lay_wires(wires, seen, options)
+        layout = layout if isinstance(anywhere, Failure) else anywhere
     return layout if isinstance(layout, Failure) else replace(layout, row=layout.row[: len(known)])
 
 
