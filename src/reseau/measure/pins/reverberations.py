@@ -1,10 +1,10 @@
-"""Reverberations: second echoes of one reflector, a fixed spacing behind the first and weaker by a fixed ratio.
+"""Reverberations: second echoes of one reflector, behind the first by a fixed spacing and weaker by a ratio.
 
 Three explanations of a frame compete. Either its spots are unrelated; then a spot lies behind another one by
-chance, as dense as spots are. Or reflectors stand at equal spacings, as the rods of a lattice; then they are as
-strong as those in front of them. Or the instrument repeats each echo: then *every* echo that is strong enough
-has a weaker second one at the spacing, unless a wire hides it, and an echo without one contradicts. Points of a
-body that happen to lie behind others explain some pairs; they do not explain that none is missing.
+chance, as dense as spots are. Or reflectors stand at equal spacings, as the rods of a lattice; then they are
+as strong as those in front of them. Or the instrument repeats each echo: then *every* echo that is strong
+enough has a weaker second one at the spacing, unless a wire hides it, and an echo without one contradicts.
+Points of a body that happen to lie behind others explain some pairs, but not that none is missing.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _FAINTER = 0.35
 _RATIOS = np.log(np.geomspace(0.08, 0.65, 12))
 """Ratios of strengths that are tried, equally likely before."""
 _FIRST_ODDS = np.log(1000.0)
-"""What the instrument that repeats its echoes must explain better, beyond the number of its spacings tried."""
+"""What an instrument that repeats its echoes must explain better, beyond the number of spacings tried."""
 _DECIDED = np.log(20.0)
 """Logarithm of the odds from which a spot is a point, or a second echo; between, it may be either."""
 
