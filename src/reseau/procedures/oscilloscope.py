@@ -38,7 +38,7 @@ from ..refine import (
     register,
     still_standard,
 )
-from ..refine.remarks import of_the_camera, of_the_change, of_the_object
+from ..refine.remarks import of_gross_errors, of_the_camera, of_the_change, of_the_object
 from .oscilloscope_frames import declined_rods, middles_of_echoes, notes_of, pins_in, reseau_in, shared_errors
 
 __all__ = [
@@ -82,7 +82,7 @@ class PhotoI(_Corrected):
     @property
     def notes(self) -> tuple[Remark, ...]:
         """Warnings for the user."""
-        return () if self.measured is None else self.measured.notes
+        return of_gross_errors("marks", self.camera.gross) + notes_of(self.measured)
 
 
 def photo_i(
