@@ -71,7 +71,7 @@ class PinOptions:
         Largest length of a pin's arc; by default 6 % of the frame's diagonal, at least 40 px. Longer spots
         are edges of the sector, the face of the transducer or interfaces.
     most_tilt_deg : float
-        Largest tilt of an arc against the common direction of the echoes.
+        Largest tilt of an arc against the rows of the frame, or the common direction of its echoes.
     least_strength : float
         Minimum brightness over the background, as a share of that of the brightest echo.
     least_correlation : float
@@ -457,8 +457,9 @@ class _Judge:
         """Objections to spots from their own images, the most serious first."""
         o, e = self.options, self.echoes
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
-        steep = (e.tilt[at] - self.direction + np.pi / 2) % np.pi - np.pi / 2
-        upright = np.abs(steep) > np.deg2rad(o.most_tilt_deg)
+        # Against the rows, or the common direction, which few echoes tell roughly.
+        steep = np.abs((e.tilt[at] - [[0.0], [self.direction]] + np.pi / 2) % np.pi - np.pi / 2).min(axis=0)
+        upright = steep > np.deg2rad(o.most_tilt_deg)
         upright &= e.length[at] > _UPRIGHT_FROM * e.thickness[at]
         moved = np.hypot(*(found.xy - e.xy[at]).T) > np.maximum(3.0, 0.5 * e.length[at])
         border = np.array([self.frame.width, self.frame.height]) - 1
