@@ -4,13 +4,12 @@ Run from the checkout: ``python benchmarks/screens.py [--count 34] [--first 1000
 worlds are those of `worlds.echo_screens`, one of each kind in turn. Printed for each kind: sets that were
 refused; the share of the visible points (less than half hidden, brighter than five times the noise) of PHOTO
 III that were delivered, where refused sets count as none; errors over sigmas of points and of both groups;
-points beyond 5 sigma and 0.02 mm; points that are none, as reverberations are; sets with a note on deviations.
+points beyond 5 sigma and 0.02 mm; points that are none, as reverberations are; sets noted as inconsistent.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from reseau.core.data import Array, Frame
 from reseau.core.failure import Code
-from reseau.measure import find_pins
+from reseau.designs import regular_reseau
+from reseau.io import Mark
+from reseau.measure import find_pins, measure_reseau
 from reseau.measure.pins.assignment import assign
 from reseau.measure.pins.reverberations import Reverberations, find_reverberations
 
@@ -91,3 +94,35 @@ def test_rods_of_a_hidden_row_do_not_take_what_lies_behind_them():
     found = assign(rods, noisy, cov, np.arange(42), rods * 1.1, 16.0, np.zeros(42))
     assert np.flatnonzero(found.row < 0).tolist() == wrong
     assert sorted(found.excluded) == wrong
+
+
+def test_a_bowed_wire_hides_what_lies_behind_its_middle():
+    bow, width, px = 0.6, 0.4, 8.0
+    x, y = np.meshgrid(np.linspace(-24, 24, 7), np.linspace(-18, 18, 6))
+
+    def course(place: Array, along: Array) -> Array:
+        return np.asarray(place + bow * (1 - (along / 18) ** 2))
+
+    design = regular_reseau(7, 6, 8.0, Mark(shape="line-grid", line_width=width))
+    crossings = np.stack([course(x.ravel(), y.ravel()), y.ravel()], axis=1)
+    points = tuple(
+        point.model_copy(update={"x": a, "y": b})
+        for point, (a, b) in zip(design.points, crossings.tolist(), strict=True)
+    )
+    u, v = np.meshgrid((np.arange(480) - 240) / px, -(np.arange(380) - 190) / px)
+    away = np.minimum(
+        np.abs(u[..., None] - course(x[0], v[..., None])).min(axis=-1),
+        np.abs(v[..., None] - y[:, 0]).min(axis=-1),
+    )
+    pixels = cv2.GaussianBlur(60 + 110 * np.clip((away - width / 2) * px + 0.5, 0, 1), (0, 0), 0.8)
+    pixels = pixels + np.random.default_rng(0).normal(0, 1, pixels.shape)
+    made = design.model_copy(update={"points": points, "polarity": "dark"})
+    hidden = measure_reseau(Frame(pixels, 255.0), made).required().shadow(made, pixels.shape)
+    middle = y[1:, 0] - 3.6
+    column, row = (
+        np.rint(c).astype(int)
+        for c in np.broadcast_arrays(240 + px * course(x[0], middle[:, None]), 190 - px * middle[:, None])
+    )
+    assert hidden[row, column].all()
+    for side in (-5, 5):  # the wire is 3.2 px wide, and its blur 2 px on either side
+        assert not hidden[row, column + side].any()
