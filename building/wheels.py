@@ -1,9 +1,9 @@
 """Build wheels that carry machine code, so that nobody who installs one waits for a compiler.
 
-This is the backend that ``pyproject.toml`` names: hatchling, and for wheels its hook below, which compiles the
-loops of the main jobs for the usual processors of the platform (x86-64 with AVX2, arm64). Compiling needs what
-the package needs; checkouts that are installed to be edited are not compiled here. Machine code belongs to a
-version of Python and to one of Numba, so each has its own wheel.
+This is the backend that ``pyproject.toml`` names: hatchling, and for wheels its hook below, which compiles
+the loops of the main jobs for the usual processors of the platform (x86-64 with AVX2, arm64). Compiling needs
+what the package needs; checkouts that are installed to be edited are not compiled here. Machine code belongs
+to a version of Python and to one of Numba, so each has its own wheel.
 """
 
 from __future__ import annotations

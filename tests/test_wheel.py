@@ -53,7 +53,9 @@ def test_the_wheel_contains_every_file_of_the_packages(wheel: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_the_wheel_runs_the_demo_in_a_clean_environment_and_compiles_nothing(wheel: Path, tmp_path: Path) -> None:
+def test_the_wheel_runs_the_demo_in_a_clean_environment_and_compiles_nothing(
+    wheel: Path, tmp_path: Path
+) -> None:
     venv.create(tmp_path / "venv", with_pip=True)
     scripts = tmp_path / "venv" / ("Scripts" if os.name == "nt" else "bin")
     pip(scripts / "python", "install", "--quiet", "-c", "constraints.txt", f"{wheel}[bench]")

@@ -388,7 +388,7 @@ def folders() -> list[Path]:
     beside = package / "__pycache__" / "compiled"
     exists = next(each for each in (beside, beside.parent, package) if each.is_dir())
     found = [package / DELIVERED] if (package / DELIVERED).is_dir() else []
-    return [*found, beside] if os.access(exists, os.W_OK) else [*found, beside, _own() / "reseau" / "compiled"]
+    return [*found, beside, *([] if os.access(exists, os.W_OK) else [_own() / "reseau" / "compiled"])]
 
 
 @cache
@@ -466,7 +466,7 @@ class _Kept:
         self._release()
 
     def files(self, signature: Any, codegen: Any) -> list[str]:
-        """Return the names of the files for a signature: of this processor, and of the usual one that it is."""
+        """Return the names of the files for a signature: of this processor, and of the usual one."""
         types = [_spelled(_described(each)) for each in _arguments(signature)]
         own = codegen.magic_tuple()
         usual = usual_processor()
