@@ -33,6 +33,9 @@ __all__ = ["PlaneTarget", "RayImage", "counted_image", "image_scale", "ray_image
 _TOGETHER = 40_000
 """Largest number of rays of one wavelength in one call, for the sake of memory."""
 
+_UNSEEN = 1e-4
+"""Shift of an image, pixels, below which the shares of elements count as even: two outlines less to form."""
+
 _GRID = np.array([[u, v] for u in (-1.0, 0.0, 1.0) for v in (-1.0, 0.0, 1.0)])
 
 
@@ -312,10 +315,11 @@ def _assembled(
     outline = nodes.oriented()
     side = 1.0 if np.array_equal(outline.dxy, nodes.dxy) else -1.0
     changes = side * uneven.T[:, :, None, None] * tangents
-    spot = coefficients[:, 0]
-    away = spot - share @ spot
+    away = coefficients[:, 0] - share @ coefficients[:, 0]
+    if np.hypot(*((uneven * away).sum(axis=1) @ away)) < _UNSEEN:
+        changes = changes[:0]
     blur = float(np.sqrt(share @ (away**2).sum(axis=1)))
-    return RayImage(outline, point, blur, falloff, changes.reshape(2, -1, 2))
+    return RayImage(outline, point, blur, falloff, changes.reshape(len(changes), len(outline.xy), 2))
 
 
 def counted_image(
