@@ -351,8 +351,9 @@ class Run:
             lines = lines[(lines >= 0) & (lines < self.frame.height)]
             inside = np.ix_(lines.astype(np.intp), columns.astype(np.intp))
             grey, valid = self.screened.grey[inside].ravel(), self.screened.valid[inside].ravel()
-            gridded = shape.at(k, np.zeros(count))
-            parts = gridded.derivatives(xy, width, columns, lines, PixelResponse(o.fill))
+            where = xy, width, columns, lines, PixelResponse(o.fill)
+            formed = {"bright": shape.bright, "parts": shape.at(k, np.zeros(count))}
+            parts = shape.images[k].formed(*where, derivatives=True, **formed)
             parts = parts.reshape(len(parts), -1)
             u, v = (at.ravel() for at in np.meshgrid((columns - xy[0]) / half, (lines - xy[1]) / half))
             light = np.stack([np.ones_like(u), u, v, parts[0]], axis=1)[valid]
@@ -413,7 +414,8 @@ class Run:
         """Image (r, c) of a target at a place, in a window around the nearest pixel."""
         across: Array = np.rint(xy) + np.arange(-half, half + 1.0)[:, None]
         response = PixelResponse(self.options.fill)
-        return image.gridded.image(xy, self.options.psf_px, across[:, 0], across[:, 1], response)
+        bright = self.options.polarity == "bright"
+        return image.formed(xy, self.options.psf_px, across[:, 0], across[:, 1], response, bright=bright)
 
     def _found(self, k: int, image: RayImage) -> Array:
         """Approximate position of a target by correlation within the range of search; NaN if not found."""
@@ -442,8 +444,9 @@ class Run:
     def _shape(
         self, rows: Rows, images: list[RayImage], elements: PupilElements, varied: Varied | None
     ) -> RayShapes:
+        bright = self.options.polarity == "bright"
         if varied is None:
-            return RayShapes(tuple(images))
+            return RayShapes(tuple(images), bright=bright)
         steps = _STEP * np.diag(varied.sigma)
         beside = [(varied.camera(step), varied.camera(-step), 2 * float(step.sum())) for step in steps]
         motions = []
@@ -456,7 +459,7 @@ class Run:
                 lit = np.asarray(a.dxy.any(axis=1) & b.dxy.any(axis=1))[:, None] / by
                 changes.append((lit * (a.xy - b.xy), lit * (a.dxy - b.dxy)))
             motions.append(Outline(*(np.stack(part) for part in zip(*changes, strict=True))))
-        return RayShapes(tuple(images), tuple(motions))
+        return RayShapes(tuple(images), tuple(motions), bright=bright)
 
     def _matched(self, shape: RayShapes, start: Array, half: int) -> Matches:
         o = self.options
