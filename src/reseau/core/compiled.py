@@ -46,18 +46,6 @@ from .exclusive import lock_file
 from .files import write_whole
 from .notice import compiles
 
-__all__ = [
-    "Compiled",
-    "Instruction",
-    "Kernel",
-    "compiled",
-    "folders",
-    "kernel",
-    "listed",
-    "named",
-    "types_of",
-]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
