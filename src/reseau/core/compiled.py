@@ -50,20 +50,6 @@ from .exclusive import lock_file
 from .files import write_whole
 from .notice import compiles
 
-__all__ = [
-    "DELIVERED",
-    "Compiled",
-    "Instruction",
-    "Kernel",
-    "compiled",
-    "folders",
-    "kernel",
-    "listed",
-    "named",
-    "types_of",
-    "usual_processor",
-]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
