@@ -1,9 +1,10 @@
 """Image files: one reader for whole frames and for windows of scans, and a writer.
 
-Accepted files: PNG, JPEG and BMP as OpenCV decodes them, WebP, GIF, AVIF, JPEG 2000, PGM and PPM by Pillow, and a page of a
-TIFF (``scan.tif#2`` is the second, ``scan.tif`` the first) with grey or RGB samples of 1, 8 or 16 bit, signed
-16 bit, or floating point, uncompressed or in a compression that tifffile decodes; and a frame of a DICOM
-file, see :mod:`reseau.io.dicom`. Other grey values are never rescaled; an alpha channel is ignored, and so is
+Accepted files: PNG, JPEG and BMP as OpenCV decodes them; WebP, GIF, AVIF, JPEG 2000, plain PGM and PPM as
+Pillow does, of an animation the first picture; and a page of a TIFF (``scan.tif#2`` is the second,
+``scan.tif`` the first) with grey or RGB samples of 1, 8 or 16 bit, signed 16 bit, or floating point,
+uncompressed or in a compression that tifffile decodes; and a frame of a DICOM file, see
+:mod:`reseau.io.dicom`. Other grey values are never rescaled; an alpha channel is ignored, and so is
 an orientation tag: pixel coordinates are those of the sensor. A colour profile does not change grey values:
 its curve is given beside them.
 
