@@ -25,10 +25,9 @@ from reseau.service import Configurations
 from reseau.service.certificates import CertificateData, certify, html_of, measurement_budget, verify
 from reseau.service.certificates.budget import simulate_measurement, uncertainty_of
 from reseau.service.certificates.certificate import Certificate
-from reseau.service.certificates.dcc import dcc_of
+from reseau.service.certificates.dcc import dcc_of, digital_unit
 from reseau.service.certificates.page import pdf_of
 from reseau.service.certificates.signature import sign
-from reseau.service.certificates.units import digital_unit
 
 from .test_inforce import RULES, SIGMA, camera, started
 
