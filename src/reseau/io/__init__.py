@@ -18,12 +18,14 @@ from .fiducials import (
 from .frame import (
     CORNERS,
     EDGES,
+    FormatCandidate,
     FrameCorners,
     FrameOrientation,
     FrameOutcome,
     FrameTransform,
     MeasuredCorner,
     MeasuredEdge,
+    RivalEdge,
     RollSummary,
 )
 from .lens import LensDocument, LensSensor
@@ -46,6 +48,7 @@ __all__ = [
     "FiducialPoint",
     "FieldLines",
     "FieldTargets",
+    "FormatCandidate",
     "FrameCorners",
     "FrameOrientation",
     "FrameOutcome",
@@ -63,6 +66,7 @@ __all__ = [
     "ReseauDesign",
     "ReseauMeasurement",
     "Rings",
+    "RivalEdge",
     "RollSummary",
     "Strict",
     "TestfieldDesign",
