@@ -70,6 +70,7 @@ def without_gross_errors(
     if isinstance(first, Failure):
         return first
     fit, steps, left = first
+    steps = (*_of_gross_errors(problem, fit, steps, alpha), *steps)
     # Images that no pose explains are not even begun with.
     left = [*left, *(int(i) for i in lost_images(problem.network, fit.values.x0, fit.values.xyz))]
     if not left:
@@ -77,6 +78,26 @@ def without_gross_errors(
     names = listed(problem.network.images[i] for i in left)
     text = f"most points of image{'s' * (len(left) > 1)} {names} contradict the others: left out as a whole"
     return fit, steps, [Remark(text, Code.GROSS_ERRORS)]
+
+
+def _of_gross_errors(
+    problem: BundleProblem, fit: BundleFit, steps: tuple[SnoopingStep, ...], alpha: float
+) -> list[SnoopingStep]:
+    """Test values of image points that were left out before data snooping, by their misfits in the end."""
+    n = 2 * len(problem.network.xy)
+    given = np.ones(n) if problem.weights is None else problem.weights[:n]
+    gross = np.asarray(fit.rejected[:n]) & (given > 0) & np.isfinite(fit.residuals[:n])
+    gross[[step.index[0] for step in steps if step.index[0] < n]] = False
+    rows = np.flatnonzero(gross.reshape(-1, 2).all(axis=1))
+    if not len(rows) or fit.redundancy < 2:
+        return []
+    v = fit.residuals[:n].reshape(-1, 2)[rows]
+    v = np.abs(np.einsum("nij,nj->ni", np.linalg.inv(np.linalg.cholesky(problem.network.cov[rows])), v))
+    worst, critical = v.argmax(axis=1), critical_tau(alpha, fit.redundancy)
+    return [
+        SnoopingStep((int(2 * row + k),), float(size[k] / fit.sigma0), critical, restored=False)
+        for row, size, k in zip(rows, v, worst, strict=True)
+    ]
 
 
 def _used(fit: BundleFit) -> int:
