@@ -14,7 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
+import scipy
 
 from ...core import vocabulary as v
 from ...core.data import Array, Frame, ImagePoints, Mask, Rows
@@ -24,7 +26,7 @@ from ..matching import MatchOptions
 from ..points import Reason
 from ..screening import Screened, screen
 from .arcs import ArcMatches
-from .echoes import Echoes, find_echoes, ground_of
+from .echoes import Echoes, Grey, find_echoes, ground_of
 from .forms import match_arcs
 from .graphics import bridged, find_cuts, is_sharp, looks_drawn, same_in_all, series
 from .reverberations import find_reverberations
@@ -49,6 +51,10 @@ _IN_ROWS = (
 _TOO_UNCERTAIN = Reason("too uncertain", Code.UNCERTAIN)
 _HALF_SEEN = (Code.HIDDEN, Code.UNCERTAIN, Code.OVERLAPPING, Code.OUTSIDE)
 """Why an echo may not be measured and have a reverberation all the same."""
+_ECHO_PX = 6.0, 1.8
+"""Usual size of an echo (one sigma) along and across, pixels, over which its brightness is averaged."""
+_MOST_BY_CHANCE = 0.5
+"""Largest number of spots as bright as an echo that chance makes in its frame."""
 _STATIC = 0.7
 """Share of a spot that must be the same in all frames for it to be a static graphic."""
 
@@ -284,13 +290,47 @@ def _judge(
         if (dim := falloff(ground, hidden, screened.noise)) is not None:
             screened, ground = replace(screened, grey=screened.grey / dim), ground / dim
     light = screened.grey - ground
+    screened = replace(screened, noise=max(screened.noise, _texture(light, _lit(screened.valid, hidden))))
     least = max(2.5 * screened.noise, 0.05 * o.least_strength * float(light.max()))
     covered = find_cuts(light, screened.noise, o.most_wire_px)
     if hidden is not None:
         covered |= hidden
     echoes = find_echoes(bridged(light, covered), o.smoothing_px, least)
     open_ = replace(screened, valid=screened.valid & ~covered)
-    return _Judge(frame, open_, echoes, longest, least, o, others, blur)
+    judge = _Judge(frame, open_, echoes, longest, least, o, others, blur)
+    judge.by_chance = _by_chance(bridged(light, covered), echoes, _lit(screened.valid & ~covered, hidden))
+    return judge
+
+
+def _lit(valid: Mask, hidden: Mask | None) -> Mask:
+    """Pixels between the echoes: those that are seen, within the extent of a reseau."""
+    if hidden is None or not hidden.any():
+        return valid
+    row, column = (np.flatnonzero(hidden.any(axis=axis)) for axis in (1, 0))
+    seen = np.zeros_like(valid)
+    seen[row[0] : row[-1], column[0] : column[-1]] = True
+    return np.asarray(seen & valid & ~hidden)
+
+
+def _texture(light: Grey, lit: Mask) -> float:
+    """Standard deviation of what is between the echoes, speckle and grain of film included."""
+    values = light[lit]
+    return 1.4826 * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
+
+
+def _by_chance(light: Grey, echoes: Echoes, lit: Mask) -> Array:
+    """How many spots (m,) as bright as each one, over the size of an echo, what is between echoes makes.
+
+    Speckle is as bright as echoes, and smaller. Averaged over an echo, its brightness above the median falls
+    off exponentially at most.
+    """
+    along, across = _ECHO_PX
+    even = cv2.GaussianBlur(light, (0, 0), along, sigmaY=across)
+    middle, upper = np.quantile(even[lit], [0.5, 0.75]).tolist() if lit.any() else (0.0, 1.0)
+    scale = max(upper - middle, 1e-6) / np.log(2)
+    places = lit.sum() / (4 * np.pi * along * across)
+    brightest = scipy.ndimage.maximum(even, echoes.owner, np.arange(len(echoes)))
+    return np.asarray(0.5 * places * np.exp(-np.maximum(np.asarray(brightest) - middle, 0) / scale))
 
 
 class _Judge:
@@ -311,6 +351,7 @@ class _Judge:
         self.frame, self.screened, self.echoes, self.options = frame, screened, echoes, options
         self.longest, self.least = longest, least
         self.direction = self._direction()
+        self.by_chance = np.zeros(len(echoes))
         self.still = same_in_all(frame, others)
         self.why = np.full(len(echoes), "", dtype=object)
 
@@ -335,6 +376,10 @@ class _Judge:
             (sharp, Reason("sharp all around: drawn by the instrument", Code.DRAWN)),
             (e.joined > o.most_touching, Reason("touches another spot", Code.OVERLAPPING)),
             (self._static(), Reason("the same in all frames", Code.DRAWN)),
+            (
+                self.by_chance > _MOST_BY_CHANCE,
+                Reason("no brighter than speckle or grain", Code.LOW_CONTRAST),
+            ),
         ]
         drawn = sharp | looks_drawn(e)
         coarse += zip(series(e, drawn), _IN_ROWS, strict=True)

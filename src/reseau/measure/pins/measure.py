@@ -325,7 +325,7 @@ class _Rods:
 
     def result(self, ids: tuple[str, ...], known: Rows) -> PinResult:
         """Spread results over all rods of the design, including those without coordinates."""
-        n, found = len(ids), self.row >= 0
+        n, found = len(ids), np.flatnonzero(self.row >= 0)
         at = self.echoes[self.row[found]]
         why = Reason("the design has no coordinates of it", Code.NO_COORDINATES).repeated(n)
         why[known] = [self._reason(i) for i in range(len(known))]
@@ -336,7 +336,7 @@ class _Rods:
             return full
 
         ok = np.zeros(n, dtype=bool)
-        ok[known] = found
+        ok[known[found]] = True
         predicted = np.full((n, 2), np.nan)
         predicted[known] = self.predicted
         expected = self.seen.cov[at] + self.tolerance_px[found, None, None] ** 2 * np.eye(2)
@@ -352,7 +352,8 @@ class _Rods:
             deviation=spread(self.deviation[found]),
             **{name: spread(getattr(self.seen, name)[at]) for name in _COLUMNS},
             detections=self.seen,
-            notes=self.notes + deviating(self.deviation[found], expected),
+            notes=self.notes
+            + deviating([self.ids[i] for i in found], self.source[found], self.seen.xy[at], expected),
         )
 
     def _reason(self, rod: int) -> str:

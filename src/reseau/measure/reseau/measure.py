@@ -247,7 +247,8 @@ def measure_reseau(
             where=frame.name,
             places=judged.xy[judged.why == ""],
         )
-    notes += deviating(judged.deviation, judged.cov)
+    good = np.where((judged.why == "")[:, None], judged.xy, np.nan)
+    notes += deviating([design.ids[i] for i in known], source[known], good, judged.cov)
     result = _columns(frame, design, known, at, found, judged, measurement.field, notes)
     if use_nominal and options.nominal_within_px is None and _astray(frame, result, nominal):
         return _without_nominal(frame, design, result, options)
