@@ -41,17 +41,6 @@ from ..io import Document, Strict, read_text
 from ..io.refraction import RefractionEntry
 from .lock import BenchLock
 
-__all__ = [
-    "ROLES",
-    "Bench",
-    "BenchFile",
-    "Checked",
-    "InstrumentEntry",
-    "drivers",
-    "found_instruments",
-    "plugin",
-]
-
 T = TypeVar("T")
 
 

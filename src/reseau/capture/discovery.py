@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 
 from ..core.errors import ReseauError
 
-__all__ = ["bench_text"]
-
 _DRIVERS = {
     "aravis": ("camera", "aravis"),
     "video": ("camera", "v4l2"),

@@ -17,8 +17,6 @@ from .bench_features import features
 from .common import say
 from .declared import Commands
 
-__all__ = ["app"]
-
 app = Commands(help="Find, check, simulate, and use instruments by hand.")
 
 app.command()(by_hand.status)
@@ -39,7 +37,9 @@ def list_(
     ] = None,
 ) -> None:
     """Search for cameras, VISA instruments and serial ports, and list the installed drivers."""
-    from ..capture import bench_text, drivers, found_instruments
+    from ..capture import found_instruments
+    from ..capture.bench import drivers
+    from ..capture.discovery import bench_text
     from ..core.provenance import canonical_json
     from ..io import write_whole
 

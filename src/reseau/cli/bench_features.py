@@ -12,8 +12,6 @@ from ..core.errors import UsageError
 from .bench_by_hand import held_one
 from .common import say
 
-__all__ = ["features"]
-
 
 def features(
     search: Annotated[

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from ..measure.blurred import BlurredResult
     from ..procedures.blurred_files import BlurredImaging
 
-__all__ = ["BESIDE_RAYS", "Matching", "blurred"]
 
 BESIDE_RAYS = "Here what blurs beside the rays: sensor and diffraction."
 

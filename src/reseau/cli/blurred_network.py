@@ -14,8 +14,6 @@ from .common import Reading, progress, required, say
 if TYPE_CHECKING:
     from ..procedures.blurred_network import BlurredNetwork
 
-__all__ = ["blurred_network"]
-
 
 def blurred_network(
     network: Annotated[

@@ -15,9 +15,9 @@ from .declared import Commands
 
 if TYPE_CHECKING:
     from ..capture import Bench
-    from ..sessions import BlurredParameters, TestfieldParameters
+    from ..sessions import TestfieldParameters
+    from ..sessions.parameters import BlurredParameters
 
-__all__ = ["app"]
 
 app = Commands(
     help="Acquire frames on a bench. Each frame is archived before the next exposure.",
@@ -107,7 +107,8 @@ def coded_field(
     levels = _numbers(on_stage.heights, "--heights")
 
     def parameters(bench: Bench) -> TestfieldParameters:
-        from ..capture import Goal, at_heights, paper_steps, read_steps
+        from ..capture import Goal, paper_steps
+        from ..capture.steps import at_heights, read_steps
         from ..instruments import Turntable
         from ..sessions import TestfieldParameters
 
@@ -141,8 +142,8 @@ def blurred(
     """Record targets on a frame from all poses, measure them by rays, and adjust the network."""
 
     def parameters(bench: Bench) -> BlurredParameters:
-        from ..capture import read_steps
-        from ..sessions import BlurredParameters
+        from ..capture.steps import read_steps
+        from ..sessions.parameters import BlurredParameters
 
         if poses is None:
             raise UsageError("is missing", where="--poses", do="give a CSV with the images of the network")

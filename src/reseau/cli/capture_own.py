@@ -12,8 +12,6 @@ from ..core import vocabulary as v
 from ..core.errors import UsageError
 from .acquisition import Where, conduct
 
-__all__ = ["own"]
-
 
 def own(
     where: Where,
@@ -29,7 +27,7 @@ def own(
     values = dict(_value(text) for text in set_ or ())
     if generator is not None:
         from ..io import read_text
-        from ..sessions import own_plan
+        from ..sessions.kinds import own_plan
 
         own_plan(read_text(generator), generator, values)
     how = {"set": values, "retakes": retakes, "park": {}, "camera": camera}

@@ -18,9 +18,7 @@ from .sensor import event, lines
 if TYPE_CHECKING:
     from ..archive import Session
     from ..capture import Bench
-    from ..sessions import SensorParameters
-
-__all__ = ["sensor"]
+    from ..sessions.parameters import SensorParameters
 
 
 def sensor(
@@ -39,7 +37,7 @@ def sensor(
     writable(out)
 
     def parameters(bench: Bench) -> SensorParameters:
-        from ..sessions import SensorParameters
+        from ..sessions.parameters import SensorParameters
 
         return SensorParameters.on_bench(
             bench, camera=camera, levels=levels, frames=frames, longest_us=longest_ms * 1000, edge=mtf,

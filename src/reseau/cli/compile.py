@@ -11,8 +11,6 @@ from ..core import vocabulary as v
 from ..core.errors import UsageError
 from .common import progress, say
 
-__all__ = ["compile_loops"]
-
 
 def compile_loops(
     only: Annotated[

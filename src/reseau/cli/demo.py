@@ -11,8 +11,6 @@ from .common import compile_first, progress, say
 if TYPE_CHECKING:
     from ..sessions.demo import TestfieldSession
 
-__all__ = ["demo"]
-
 
 def demo(
     out: v.Out = Path("out"),

@@ -15,7 +15,6 @@ from .measure import Output
 if TYPE_CHECKING:
     from ..io.edges import EdgesDocument
 
-__all__ = ["edge"]
 
 _SHOWN = 40
 """Most edges of which a line is printed."""

@@ -15,8 +15,6 @@ from .measure import Output
 if TYPE_CHECKING:
     from ..io import FiducialOrientation
 
-__all__ = ["fiducials"]
-
 
 def fiducials(
     scan: Annotated[Path, typer.Argument(help="Scanned photograph with its borders: TIFF, PNG, JPEG.")],

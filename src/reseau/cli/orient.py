@@ -13,10 +13,9 @@ from ..core.options import Option
 from .common import Computing, overlay_files, progress, say, say_files_left_out
 
 if TYPE_CHECKING:
-    from ..io import FrameOrientation, RollSummary
+    from ..io import FrameOrientation
+    from ..io.frame import RollSummary
     from ..sessions.film_files import OrientedFiles
-
-__all__ = ["orient"]
 
 
 def orient(

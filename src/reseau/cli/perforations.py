@@ -11,8 +11,6 @@ from ..core import vocabulary as v
 from ..core.options import Option
 from .common import overlay_files, required, say
 
-__all__ = ["perforations"]
-
 Box = tuple[float, float, float, float]
 
 

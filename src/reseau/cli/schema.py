@@ -13,7 +13,6 @@ from ..core.errors import UsageError
 if TYPE_CHECKING:
     from ..io.document import Document
 
-__all__ = ["documents", "schema"]
 
 _MODULES = (
     "bundle.document", "calibration.document", "capture.bench", "io.board", "io.design", "io.edges",

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from ..calibration.document import Calibration
     from ..procedures.sensor_files import FileExposure
 
-__all__ = ["event", "lines", "sensor"]
-
 
 def sensor(
     series: Annotated[

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from ..core.executors import Executor, Here, Processes
 from ..core.processes import cores
 
-__all__ = ["executor_at"]
-
 
 def executor_at(
     jobs: int | None = None,

@@ -26,8 +26,6 @@ from ..core.executors import Processes, crashed
 from ..core.failure import Failure
 from ..core.optional import optional
 
-__all__ = ["Cluster"]
-
 J = TypeVar("J")
 R = TypeVar("R")
 _AHEAD = 3

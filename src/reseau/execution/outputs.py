@@ -19,8 +19,6 @@ from ..core.errors import ArchiveError
 from ..core.provenance import canonical_json, sha256_of
 from ..core.version import __version__
 
-__all__ = ["Outputs"]
-
 _SCHEMA = "reseau-output/1"
 
 

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from ..core.errors import ImageError
 
-__all__ = ["coded_kind", "decoded_coded"]
-
 _JP2, _J2K = b"\0\0\0\x0cjP  \r\n\x87\n", b"\xff\x4f\xff\x51"
 
 

@@ -34,17 +34,6 @@ from .photographs import decoded_heic, decoded_raw, is_heic, is_raw
 from .profiles import curve_of_file, curve_of_profile
 from .scans import CHANNELS, Scan, Window, full_scale_of, scan_of
 
-__all__ = [
-    "MAX_PIXELS",
-    "Channel",
-    "count_pages",
-    "grey_of",
-    "luma",
-    "open_scan",
-    "read_image",
-    "write_image",
-]
-
 MAX_PIXELS = 500_000_000
 """The largest image that is read whole; its header is checked before a pixel is decoded."""
 

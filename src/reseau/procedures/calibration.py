@@ -50,8 +50,6 @@ from .target_measurement import MeasuredPhotograph, Measurer, Photograph, by_rea
 from .told_target import measured_as_shown
 from .turned_targets import named_alike, ways_to_turn
 
-__all__ = ["calibrate_camera", "first_camera", "network_of"]
-
 _LEAST_POINTS = 8
 _LEAST_IMAGES = 3
 # Relative standard deviation of a principal distance above which nothing follows from a calibration.

@@ -15,8 +15,6 @@ import numpy as np
 
 from ..core.data import Array, ImagePoints
 
-__all__ = ["copies_among", "said_of_copies"]
-
 _LEAST_COMMON = 8
 """Points in common with which photographs are compared."""
 _KNOWN = np.log(1.5)

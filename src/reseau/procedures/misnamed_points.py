@@ -11,8 +11,6 @@ from ..bundle import Camera, Misnamed, Network, Result, camera_mapping, misnamed
 from ..core.data import ImagePoints
 from ..optics import camera_model
 
-__all__ = ["LeftOut", "left_out"]
-
 _STAND_IN = "opencv"
 """Model of a camera of which only the size of its images is used."""
 

@@ -41,17 +41,6 @@ from ..refine import (
 from ..refine.remarks import of_the_camera, of_the_change, of_the_object
 from .oscilloscope_frames import declined_rods, middles_of_echoes, notes_of, pins_in, reseau_in, shared_errors
 
-__all__ = [
-    "PhotoI",
-    "PhotoII",
-    "PhotoIII",
-    "StillStandard",
-    "photo_i",
-    "photo_ii",
-    "photo_iii",
-    "still_standard_in",
-]
-
 
 class _Corrected:
     """Result of a step that did not fail."""

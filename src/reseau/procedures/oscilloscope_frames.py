@@ -23,8 +23,6 @@ from ..refine import Registration, register
 from ..refine.echoes import middles_on_screen
 from ..refine.remarks import ANOTHER_SHAPE_PX
 
-__all__ = ["declined_rods", "middles_of_echoes", "notes_of", "pins_in", "reseau_in", "shared_errors"]
-
 _STATIONARY_PX = 6.0
 """Search distance of the reseau from its position in PHOTO I; beyond it, the whole image is searched."""
 

@@ -39,8 +39,6 @@ from .target_measurement import Measurer
 from .turntable import HEIGHT, Mount
 from .z_stage import Heights
 
-__all__ = ["Place", "TestfieldProcedure"]
-
 _LEAST_IMAGES = 3
 _LEAST_EXPOSURES = 6
 """Exposures of a rig from which it is calibrated: from fewer, often frontal, ones the adjustment is long."""

@@ -22,8 +22,6 @@ from .target_measurement import (
 )
 from .which_target import corrected, described
 
-__all__ = ["TargetMeasured", "measured_as_shown"]
-
 _CONTRADICT = (Code.OTHER_DESIGN, Code.NOT_FOUND, Code.INCONSISTENT, Code.AMBIGUOUS)
 """Why a target is not measured, where a wrong design may be the reason."""
 

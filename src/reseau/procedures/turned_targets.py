@@ -20,8 +20,6 @@ from ..calibration import CameraMapping
 from ..core.data import Array, ImagePoints
 from ..io import BoardDesign
 
-__all__ = ["Way", "named_alike", "ways_to_turn"]
-
 _LEAST_COMMON, _PASSES = 12, 3
 """Points that two photographs have in common, to be compared; passes over all photographs."""
 

@@ -19,8 +19,6 @@ from ..core.failure import Code, Failure
 from ..optics import Pose
 from ..optics.poses import matrix_to_vector, rotation_matrix
 
-__all__ = ["Mount"]
-
 TILT, ROLL, CAMERA_ROLL, HEIGHT = "tilt", "roll", "camera_roll", "z"
 _WORST_DEG = 5.0
 """Largest rms deviation of poses from the mount; predictions need no better accuracy."""

@@ -16,7 +16,6 @@ from ..optics.lenses import PlaneTarget, PupilElements, RayMap, RaySurrogate, ra
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["blurred_figure"]
 
 _RINGS = 8
 

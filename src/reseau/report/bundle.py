@@ -10,7 +10,8 @@ from markupsafe import Markup
 
 from ..bundle import Result, camera_mapping, projection_field_at
 from ..bundle.network.shutter import MOTION
-from ..calibration import Assessment, CameraMapping, FieldDifference, projection_field
+from ..calibration import CameraMapping, FieldDifference, projection_field
+from ..calibration.assessment import Assessment
 from ..core.data import Frame, Rows
 from ..core.figures import nice
 from ..core.numbers import aligned, at_power, measured, plain, power
@@ -23,8 +24,6 @@ from .overlay import Marks, frame_overlay
 from .patterns import patterns_of
 from .tables import unit_text
 from .template import rendered
-
-__all__ = ["bundle_report"]
 
 _IMAGES, _CAMERAS, _PLACES = 200, 20, 45
 _PHOTOGRAPHS, _ACROSS = 8, 800

@@ -9,8 +9,6 @@ import numpy as np
 from ..bundle import Result
 from ..core.data import Array
 
-__all__ = ["components_table", "dropped_table", "images_table", "left_out_table", "worst_points"]
-
 _WORST = 20
 """Number of image points listed."""
 

@@ -11,8 +11,6 @@ from ..optics import RationalPolynomial
 from ..optics.polynomials import monomials
 from .tables import symbol
 
-__all__ = ["Equation", "equations"]
-
 Equation = tuple[str, Markup, Markup]
 """Left-hand side, right-hand side in symbols, and in numbers."""
 

@@ -37,8 +37,6 @@ from .tables import (
 )
 from .truth import RodComparison
 
-__all__ = ["photo_ii_section"]
-
 _PITCH = 0.1
 """Grid step of the distortion and length of the longest vectors, as part of the extent of the rods."""
 

@@ -10,8 +10,6 @@ from ..core.data import Mask
 from ..core.threads import one_thread
 from .series import Image32, Level, SensorSeries, saturation
 
-__all__ = ["estimate_fields", "scatter_of"]
-
 _FALSE_ALARMS = 0.5
 """Expected number of good pixels classified as defective, over a whole sensor."""
 _TESTS = 4

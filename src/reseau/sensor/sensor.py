@@ -18,8 +18,6 @@ from .fields import estimate_fields, scatter_of
 from .series import Image32, Level, SensorSeries
 from .transfer import ROUNDING, Linearity, PhotonTransfer, curve_of, fit_linearity, fit_transfer
 
-__all__ = ["SensorResult", "calibrate_sensor", "with_edge"]
-
 _FULL = 0.97
 """Share of the saturation signal above which an edge is clipped."""
 

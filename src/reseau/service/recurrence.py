@@ -13,8 +13,6 @@ import numpy as np
 from ..core.errors import UsageError
 from ..core.optional import optional
 
-__all__ = ["CalendarEvent", "Recurrence", "calendar_feed"]
-
 _MOST = 100_000
 """Largest number of occurrences of a rule."""
 _AHEAD = timedelta(days=3653)

@@ -28,20 +28,12 @@ from typing import Any, ClassVar, Literal, Self, cast
 import numpy as np
 from pydantic import Field, model_validator
 
-from ..calibration import Calibration, in_model_of
+from ..calibration import Calibration
+from ..calibration.conversion import in_model_of
 from ..core.errors import UsageError
 from ..io import Document, Strict
 from .fields import change, difference
 from .trend import History, RunHistory, explain_runs
-
-__all__ = [
-    "AcceptanceRules",
-    "Finding",
-    "Judgement",
-    "Limits",
-    "Outcome",
-    "judge",
-]
 
 Outcome = Literal["accepted", "accepted with warning", "rejected", "needs review"]
 Level = Literal["ok", "warning", "action"]

@@ -19,13 +19,12 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from ..archive import Archive, Entry, Journal
+from ..archive import Archive
+from ..archive.journal import Entry, Journal
 from ..core.errors import ArchiveError, InstrumentError, ReseauError, UsageError
 from ..io import Document
 from .inforce import Configurations, a_time
 from .recurrence import CalendarEvent, Recurrence, calendar_feed
-
-__all__ = ["Claim", "Run", "Schedule", "Schedules", "State"]
 
 _PREFIX = "schedules/"
 State = Literal["scheduled", "due", "running", "blocked", "overdue", "missed", "done", "failed"]

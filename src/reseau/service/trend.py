@@ -22,8 +22,6 @@ import scipy.special
 
 from ..core.data import Array
 
-__all__ = ["History", "RunHistory", "explain_runs"]
-
 _SCALES = np.array([1.0, 1.5, 2.2, 3.3, 5.0])
 """Scales of the errors between runs, of which each is half as probable as the one before."""
 _LEAST = 0.02

@@ -20,8 +20,6 @@ from .data import Contact
 from .units import digital_unit
 from .vocabulary import NAMESPACE, vocabulary, vocabulary_text
 
-__all__ = ["DCC", "SI", "dcc_of"]
-
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
 _XSI = "http://www.w3.org/2001/XMLSchema-instance"
 _SOURCE = {

@@ -13,8 +13,6 @@ from typing import Any
 from ...core.errors import FormatError
 from ...core.optional import optional
 
-__all__ = ["Fired", "check_rules"]
-
 _SCH = "{http://purl.oclc.org/dsdl/schematron}"
 _XSL = "{http://www.w3.org/1999/XSL/Transform}"
 

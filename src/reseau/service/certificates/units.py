@@ -9,8 +9,6 @@ from decimal import Decimal
 
 from ...core.errors import UsageError
 
-__all__ = ["DigitalUnit", "digital_unit"]
-
 # Name in D-SI and power of ten of the units that calibrations have. Pixels and grey values are counts.
 _KNOWN = {
     "1": ("", 0), "": ("", 0), "px": ("", 0), "DN": ("", 0), "e": ("", 0), "e-": ("", 0), "%": ("", -2),

@@ -18,8 +18,6 @@ from .schematron import check_rules
 from .signature import DS, signatures
 from .vocabulary import NAMESPACE, vocabulary
 
-__all__ = ["Verdict", "verify"]
-
 _SHOWN = 3
 State = Literal["passed", "failed", "not checked"]
 

@@ -8,11 +8,10 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import ConfigDict, Field
 
-from ..accounts import Principal, RefusedLogin, Scope
+from ..accounts import Principal, Scope
+from ..attempts import RefusedLogin
 from .access import Administering, Forbidden, Here, NotFound, Operating, Reading, by_cookie, csrf_of
 from .answers import Answer, Done, refusals
-
-__all__ = ["router", "set_cookie"]
 
 router = APIRouter(tags=["accounts"], responses=refusals(400, 401, 403, 422, 503))
 

@@ -19,11 +19,9 @@ from ...core.errors import (
     ReseauError,
     UsageError,
 )
-from ..accounts import RefusedLogin
+from ..attempts import RefusedLogin
 from .access import Forbidden, NotFound, Unknown
 from .guard import log
-
-__all__ = ["TOO_MANY", "Answer", "Done", "ErrorAnswer", "add_error_handlers", "refusals"]
 
 
 class Answer(BaseModel):

@@ -18,7 +18,6 @@ from .sessions import new_name
 if TYPE_CHECKING:
     from ..benches import BenchLink
 
-__all__ = ["BenchAnswer", "bench_answer", "router"]
 
 router = APIRouter(tags=["benches"], responses=refusals(400, 401, 403, 404, 409, 422, 503))
 

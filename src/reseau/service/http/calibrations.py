@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import AwareDatetime, ConfigDict, Field
 
-from ...calibration import Assessment
+from ...calibration.assessment import Assessment
 from ...core.errors import ReseauError, UsageError
 from .access import Administering, Here, NotFound, Operating, Reading
 from .answers import Answer, Done, refusals
@@ -22,20 +22,9 @@ from .stored import FILE_ANSWERS, file_answer, picture_answer
 
 if TYPE_CHECKING:
     from ...calibration import Calibration
-    from ..inforce import Configurations, Decision
+    from ..decisions import Decision
+    from ..inforce import Configurations
 
-__all__ = [
-    "SVG",
-    "ConfigurationRow",
-    "calibration_detail",
-    "configuration_detail",
-    "decision_row",
-    "known_configurations",
-    "listed",
-    "router",
-    "the_configuration",
-    "the_decision",
-]
 
 router = APIRouter(tags=["calibrations"], responses=refusals(400, 401, 403, 404, 409, 422, 503))
 
@@ -568,7 +557,10 @@ def certificate(name: Name, key: Key, given: CertificateOrder, who: Administerin
     from ...core.optional import optional
 
     with optional():
-        from ..certificates import CertificateData, certify, dcc_of, html_of, pdf_of, sign
+        from ..certificates import CertificateData, certify, html_of
+        from ..certificates.dcc import dcc_of
+        from ..certificates.page import pdf_of
+        from ..certificates.signature import sign
 
     known, keys = the_configuration(service, name), service.options
     decision = the_decision(known, name, key)

@@ -16,8 +16,6 @@ from .access import Here, NotFound, Operating, Reading
 from .answers import Answer, refusals
 from .sessions import SessionName, new_name, the_session
 
-__all__ = ["JobAnswer", "router"]
-
 router = APIRouter(tags=["files"], responses=refusals(400, 401, 403, 404, 413, 422, 503))
 
 WORDS = v.names()

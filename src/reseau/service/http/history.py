@@ -16,9 +16,8 @@ from .stored import picture_answer
 
 if TYPE_CHECKING:
     from ..covariates import CovariateTable
-    from ..inforce import Drift
+    from ..decisions import Drift
 
-__all__ = ["AlarmRow", "all_alarms", "drift_of", "router", "scheduled"]
 
 router = APIRouter(tags=["history"], responses=refusals(400, 401, 403, 404, 409, 422, 503))
 

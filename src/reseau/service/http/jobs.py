@@ -16,8 +16,6 @@ from ...core.errors import ReseauError
 from .events import Events
 from .guard import log
 
-__all__ = ["Job", "Jobs"]
-
 _LONGEST_S = 3600.0
 _KEPT = 500
 

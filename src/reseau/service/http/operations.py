@@ -16,8 +16,6 @@ from .access import Administering, Here, Reading, principal_of
 from .answers import TOO_MANY, Answer, refusals
 from .service import Service
 
-__all__ = ["audited", "open_router", "router"]
-
 router = APIRouter(tags=["service"], responses=refusals(400, 401, 403, 422, 503))
 open_router = APIRouter(tags=["service"], responses=refusals(403))
 

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from ..benches import BenchLink
     from ..tiled import TiledPublisher
 
-__all__ = ["Service"]
 
 T = TypeVar("T")
 

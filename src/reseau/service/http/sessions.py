@@ -10,7 +10,8 @@ from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic import ConfigDict
 
-from ...archive import ArchivedFrame, ArchivedResult, Session
+from ...archive import Session
+from ...archive.records import ArchivedFrame, ArchivedResult
 from ...core.errors import ArchiveError, ReseauError, UsageError
 from ..decoding import PHOTOGRAPH
 from .access import Here, NotFound, Reading, principal_of
@@ -18,8 +19,6 @@ from .answers import TOO_MANY, Answer, refusals
 from .events import BLUESKY
 from .service import Service
 from .stored import FILE_ANSWERS, file_answer, marks_of, picture_answer, preview_jpeg, result_named
-
-__all__ = ["SessionRow", "frames", "router", "rows", "session_detail", "the_session"]
 
 router = APIRouter(tags=["sessions"], responses=refusals(400, 401, 403, 404, 422, 503))
 
