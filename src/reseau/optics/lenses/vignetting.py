@@ -21,7 +21,7 @@ __all__ = ["Vignetting"]
 
 _DEGREE = 8
 """Of the polynomials of where rays pass an aperture, by where they pass the stop."""
-_RADII = 17
+_RADII = 9
 """Places along a radius of the stop at which edges of apertures are looked for."""
 _STEPS = 12
 """Bisections towards such an edge."""
@@ -92,25 +92,32 @@ class Vignetting:
         turns = np.zeros((len(_POWERS), len(directions), _DEGREE + 1))
         for term, (i, j) in enumerate(_POWERS):
             turns[term, :, i + j] = directions[:, 0] ** i * directions[:, 1] ** j
-        limiting: list[tuple[Aperture, Array]] = []
+        limiting: list[Aperture] = []
+        fits: list[Array] = []
         for k, aperture in self._apertures:
             at = traced.seen[k][:, :2].reshape(*lost.shape, 2)
-            each = aperture, np.tensordot(_fitted(at, lost), turns, 1)
-            at_nodes = lost | aperture.passes(at[..., 0], at[..., 1])
-            if not (at_nodes.all() and _passes([each], np.ones(shape)).all()):
-                limiting.append(each)
+            fit = np.tensordot(_fitted(at, lost), turns, 1).reshape(2, -1, _DEGREE + 1)
+            at_rim = aperture.passes(*fit.sum(axis=2))
+            if not (at_rim.all() and (lost | aperture.passes(at[..., 0], at[..., 1])).all()):
+                limiting.append(aperture)
+                fits.append(np.moveaxis(fit, 2, 0))
+        if not limiting:
+            return np.zeros(shape), np.ones(shape)
+        along = np.stack(fits, axis=2)
         radii = np.linspace(0, 1, _RADII)
-        opened = _passes(limiting, np.broadcast_to(radii, (*shape, _RADII)))
-        some = opened.any(axis=2)
-        first, last = opened.argmax(axis=2), _RADII - 1 - opened[..., ::-1].argmax(axis=2)
+        opened = np.stack([_passes(limiting, along, radius) for radius in radii], axis=1)
+        some = opened.any(axis=1)
+        ends = opened.argmax(axis=1), _RADII - 1 - opened[:, ::-1].argmax(axis=1)
         found = []
-        for edge, step in ((first, -1), (last, 1)):
-            inside, outside = radii[edge], radii[np.clip(edge + step, 0, _RADII - 1)]
+        for edge, step, whole in zip(ends, (-1, 1), (0, _RADII - 1), strict=True):
+            radius, cut = np.where(some, radii[edge], 0.0), np.flatnonzero(some & (edge != whole))
+            inside, outside, those = radii[edge[cut]], radii[edge[cut] + step], along[..., cut]
             for _ in range(_STEPS):
                 middle = (inside + outside) / 2
-                there = _passes(limiting, middle)
+                there = _passes(limiting, those, middle)
                 inside, outside = np.where(there, middle, inside), np.where(there, outside, middle)
-            found.append(np.where(some, inside, 0.0))
+            radius[cut] = inside
+            found.append(radius.reshape(shape))
         return found[0], found[1]
 
 
@@ -122,13 +129,10 @@ def _fitted(values: Array, lost: Mask) -> Array:
     return np.asarray(found)
 
 
-def _passes(apertures: list[tuple[Aperture, Array]], radius: Array) -> Mask:
-    """Whether all apertures let light pass at radii (n, e, …), by polynomials (2, n, e, degree) of them."""
-    every = np.ones(radius.shape, dtype=np.bool_)
-    for aperture, along in apertures:
-        x, y = np.zeros((2, *radius.shape))
-        for power in range(_DEGREE, -1, -1):
-            a, b = along[..., power].reshape(2, *radius.shape[:2], *(1,) * (radius.ndim - 2))
-            x, y = x * radius + a, y * radius + b
-        every &= aperture.passes(x, y)
-    return every
+def _passes(apertures: list[Aperture], along: Array, radius: Array) -> Mask:
+    """Whether all apertures let light pass at radii (m,), by polynomials (degree, 2, a, m) of the radius."""
+    at = along[-1]
+    for coefficients in along[-2::-1]:
+        at = at * radius + coefficients
+    passed = [aperture.passes(*at[:, k]) for k, aperture in enumerate(apertures)]
+    return np.asarray(np.logical_and.reduce(passed))
