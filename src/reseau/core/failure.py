@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from .data import Frame
 
-__all__ = ["Code", "Estimated", "Failure", "Remark"]
-
 
 class Code(StrEnum):
     """Why an estimate failed or a result carries a warning; callers branch on it, never on a text.

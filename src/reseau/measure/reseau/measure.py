@@ -24,6 +24,7 @@ from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign
 from ...optics.field import SmoothField
 from ..fitting import on_one_line
+from ..marks.judging import columns_of, spread
 from ..matching import Matches
 from ..points import Measured, Reason, deviating
 from ..screening import lost_in_blocks
@@ -420,35 +421,16 @@ def _columns(
     notes: tuple[Remark, ...],
 ) -> ReseauResult:
     """Spread results over all marks of the design, including those without coordinates."""
-    good = judged.why == ""
-    judged.xy[~good], judged.cov[~good] = np.nan, np.nan
-    n = len(design.points)
-
-    def spread(values: Array, rows: Rows) -> Array:
-        full = np.full((n, *values.shape[1:]), np.nan)
-        full[rows] = values
-        return full
-
-    ok, reasons = (
-        np.zeros(n, dtype=bool),
-        Reason("the design has no coordinates of it", Code.NO_COORDINATES).repeated(n),
-    )
-    ok[known], reasons[known] = good, judged.why
-    inside = known[at]
+    n, at = len(design.points), known[at]
+    reasons = Reason("the design has no coordinates of it", Code.NO_COORDINATES).repeated(n)
+    reasons[known] = judged.why
     return ReseauResult(
         image=frame.name,
         sha256=frame.sha256,
         ids=design.ids,
-        xy=spread(judged.xy, known),
-        cov=spread(judged.cov, known),
-        ok=ok,
-        why=tuple(reasons),
-        predicted=spread(judged.predicted, known),
-        psf_px=spread(found.psf_px, inside),
-        contrast=spread(found.contrast, inside),
-        t=spread(found.t, inside),
-        noise=spread(found.noise, inside),
-        deviation=spread(judged.deviation, known),
+        predicted=spread(judged.predicted, known, n),
+        deviation=spread(judged.deviation, known, n),
         field=field,
         notes=notes,
+        **columns_of(found, at, reasons[at], reasons),
     )
