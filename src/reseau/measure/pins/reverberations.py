@@ -185,14 +185,14 @@ class _Pairs:
         """Spots whose second echo would be strong enough, and not hidden."""
         at = self.xy + spacing * self.depth
         strong = self.log + ratio - 2 * _FAINTER > np.log(self.least)
-        return strong & ~self.hidden(at)
+        return np.asarray(strong & ~self.hidden(at))
 
     def hidden(self, at: Array) -> Mask:
         """Places (k, 2) on which nothing is found, or beyond the frame."""
         rows, columns = self.covered.shape
         x, y = np.rint(at).astype(np.intp).T
         inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-        return ~inside | self.covered[np.clip(y, 0, rows - 1), np.clip(x, 0, columns - 1)]
+        return np.asarray(~inside | self.covered[np.clip(y, 0, rows - 1), np.clip(x, 0, columns - 1)])
 
     def gain(self, spacing: float, ratio: float) -> float:
         """Logarithm of the likelihood of spots that repeat others, over that of the better rival."""
