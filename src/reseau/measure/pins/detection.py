@@ -290,7 +290,6 @@ def _judge(
         if (dim := falloff(ground, hidden, screened.noise)) is not None:
             screened, ground = replace(screened, grey=screened.grey / dim), ground / dim
     light = screened.grey - ground
-    screened = replace(screened, noise=max(screened.noise, _texture(light, _lit(screened.valid, hidden))))
     least = max(2.5 * screened.noise, 0.05 * o.least_strength * float(light.max()))
     covered = find_cuts(light, screened.noise, o.most_wire_px)
     if hidden is not None:
@@ -310,12 +309,6 @@ def _lit(valid: Mask, hidden: Mask | None) -> Mask:
     seen = np.zeros_like(valid)
     seen[row[0] : row[-1], column[0] : column[-1]] = True
     return np.asarray(seen & valid & ~hidden)
-
-
-def _texture(light: Grey, lit: Mask) -> float:
-    """Standard deviation of what is between the echoes, speckle and grain of film included."""
-    values = light[lit]
-    return 1.4826 * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
 
 
 def _by_chance(light: Grey, echoes: Echoes, lit: Mask) -> Array:
