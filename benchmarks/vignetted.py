@@ -2,10 +2,10 @@
 
 Run from the checkout: ``python benchmarks/vignetted.py [--targets N] [--draws M] [--rays R] [--rings NAME]``;
 needs nothing besides the project. Disks, dark on bright ground and bright on dark ground, are drawn by
-counting rays from the sensor (``benchmarks/worlds/counted.py``, which shares nothing with the project) through
-two lenses with the rims of their elements, in air and through a window into water; some 20 million rays for
-each target. Each is measured without noise, for the bias, and with noise of 40 dB below the contrast, even or
-of photons.
+counting rays from the sensor (``benchmarks/worlds/counted.py``, which shares nothing with the project)
+through two lenses with the rims of their elements, in air and through a window into water; some 20 million
+rays for each target. Each is measured without noise, for the bias, and with noise of 40 dB below the
+contrast, even or of photons.
 
 Reported by lens and ring of the field: the open part of the pupil, the blur, the mean error along the radius
 (bias) with its standard deviation, and errors over sigmas.
