@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.data import Array
-from ..matching.noise import LEAST, linear_variance
+from ..matching.noise import LEAST, adjusted_grey, linear_variance
 
 __all__ = ["Likeness", "Residuals"]
 
@@ -75,13 +75,7 @@ class Residuals:
     @classmethod
     def of(cls, pixels: NDArray[np.float32], start: Array, off: Array) -> Residuals:
         """Residuals (k, r, c) of windows around pixels (k, 2) of a frame."""
-        column, row = (
-            np.rint(start[:, axis]).astype(np.intp)[:, None] + np.arange(size) - size // 2
-            for axis, size in enumerate(off.shape[:0:-1])
-        )
-        h, w = pixels.shape
-        observed = pixels[np.clip(row, 0, h - 1)[:, :, None], np.clip(column, 0, w - 1)[:, None, :]]
-        return cls(observed + off, off)
+        return cls(adjusted_grey(pixels, start, off), off)
 
     def variance(self) -> tuple[float, float] | None:
         """Variance a + b·g of a grey value g by differences of residuals; None if it does not grow with g."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask
 
-__all__ = ["LEAST", "grey_variance", "linear_variance", "medians", "relative_weights"]
+__all__ = ["LEAST", "adjusted_grey", "grey_variance", "linear_variance", "medians", "relative_weights"]
 
 _ENOUGH = 8000
 """Number of pixels that show how the variance grows."""
@@ -48,17 +48,23 @@ def grey_variance(pixels: NDArray[Any], start: Array, residuals: Array) -> tuple
     >>> bool(abs(b - 0.1) < 0.03)
     True
     """
+    adjusted = adjusted_grey(pixels, start, residuals)
+    used = np.flatnonzero(np.isfinite(residuals))
+    used = used[:: max(1, len(used) // _ENOUGH)]
+    left = residuals.ravel()[used]
+    square, grey = left**2, adjusted.ravel()[used]
+    return linear_variance(grey, square)
+
+
+def adjusted_grey(pixels: NDArray[Any], start: Array, residuals: Array) -> Array:
+    """Adjusted grey values (k, rows, columns); parameters as of :func:`grey_variance`."""
     column, row = (
         np.rint(start[:, axis]).astype(np.intp)[:, None] + np.arange(size) - size // 2
         for axis, size in enumerate(residuals.shape[:0:-1])
     )
     h, w = pixels.shape
     observed = pixels[np.clip(row, 0, h - 1)[:, :, None], np.clip(column, 0, w - 1)[:, None, :]]
-    used = np.flatnonzero(np.isfinite(residuals))
-    used = used[:: max(1, len(used) // _ENOUGH)]
-    left = residuals.ravel()[used]
-    square, grey = left**2, observed.ravel()[used] + left
-    return linear_variance(grey, square)
+    return np.asarray(observed + residuals)
 
 
 def linear_variance(grey: Array, square: Array) -> tuple[float, float] | None:

@@ -28,7 +28,7 @@ from ..newton import determinant
 from .pupils import PupilElements
 from .ray_maps import CalibratedLens, LensCamera, RayMap
 
-__all__ = ["PlaneTarget", "RayImage", "counted_image", "image_scale", "ray_image", "ray_images"]
+__all__ = ["PlaneTarget", "RayImage", "image_scale", "ray_image", "ray_images"]
 
 _TOGETHER = 40_000
 """Largest number of rays of one wavelength in one call, for the sake of memory."""
@@ -320,52 +320,6 @@ def _assembled(
         changes = changes[:0]
     blur = float(np.sqrt(share @ (away**2).sum(axis=1)))
     return RayImage(outline, point, blur, falloff, changes.reshape(len(changes), len(outline.xy), 2))
-
-
-def counted_image(
-    camera: RayMap, target: PlaneTarget, elements: PupilElements, side: int, columns: Array, rows: Array
-) -> Array:
-    """Image of a target by counting rays in the pixels, as Meid 1992, section 3.1.4, describes it.
-
-    For comparison with :func:`ray_image`; it needs millions of rays.
-
-    Parameters
-    ----------
-    camera, target, elements
-        As for :func:`ray_image`.
-    side : int
-        Number of elements of the target along the side of the square around it.
-    columns, rows : ndarray (c,), (r,)
-        Adjacent pixels.
-
-    Returns
-    -------
-    ndarray (r, c)
-        Light in the pixels; their sum is 1 if all light of the target falls into them.
-
-    Examples
-    --------
-    >>> from reseau.optics.lenses import SensorPlane, ThinLens
-    >>> camera = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (0.0, 0.0)))
-    >>> disk = PlaneTarget(np.array([0.0, 0, 1000]), np.eye(3)[:, :2], Outline.circle(2.0, 0.2))
-    >>> pixels = np.arange(-20.0, 21.0)
-    >>> image = counted_image(camera, disk, PupilElements.equal_areas(3), 20, pixels, pixels)
-    >>> round(float(image.sum()), 6)
-    1.0
-    """
-    from matplotlib.path import Path
-
-    middle = (np.arange(side) + 0.5) * 2 / side - 1
-    uv = target.extent * np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 2)
-    uv = uv[Path(target.outline.xy).contains_points(uv)]
-    image, total = np.zeros((len(rows), len(columns))), 0.0
-    ends = [np.append(pixels - 0.5, pixels[-1] + 0.5) for pixels in (rows, columns)]
-    for at, weight in zip(elements.xy, elements.weights, strict=True):
-        xy, light = camera.spots(target.points(uv), PupilElements(at[None], weight[None]))
-        xy, light = xy.reshape(-1, 2), np.abs(np.nan_to_num(light) @ target.normal).ravel()
-        image += np.histogram2d(xy[:, 1], xy[:, 0], bins=ends, weights=light)[0]
-        total += float(light.sum())
-    return image / total
 
 
 def image_scale(camera: RayMap, centre: Array, axes: Array) -> Array:
