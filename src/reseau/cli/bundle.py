@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from ..bundle import Network, Result
     from ..bundle.network.network import Datum
 
-__all__ = ["bundle"]
 
 # Settings that the provenance always has.
 _ALWAYS = ("reject", "alpha", "components", "eliminate")

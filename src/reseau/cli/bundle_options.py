@@ -18,19 +18,6 @@ if TYPE_CHECKING:
     )
     from ..calibration import FieldDifference
 
-__all__ = [
-    "level_of",
-    "positive",
-    "say_difference",
-    "say_left_out",
-    "say_model",
-    "say_motion",
-    "say_parameters",
-    "say_priors",
-    "say_refraction",
-    "say_rig",
-    "say_turntable",
-]
 
 # Parameters of a camera that are printed at most.
 _MOST = 60

@@ -11,8 +11,6 @@ from typing import Annotated, Literal
 
 from .options import Declared, Group, Option, declaration
 
-__all__ = ["names"]
-
 # What is read.
 Design = Annotated[Path, Option("Design of the target.", Group.BASIC, "-d")]
 TestObject = Annotated[Path, Option("Design of the test object: its rods.")]
