@@ -143,7 +143,7 @@ def outcome(seed: int) -> Case:
         return Case(images, kind, share, str(result.code.value), 0, 0, 0, 0, said)
     own = result.cameras["C"]
     off = np.abs(own.values - true) / own.sigma
-    rejected = result.rejected
+    rejected = result.rejected | ~result.fit.usable.images[network.image_of]
     usable = result.fit.usable.observations
     v = result.fit.residuals[: 2 * len(size)].reshape(-1, 2) / sigma
     used = usable & ~gross & np.isfinite(v).all(axis=1)
