@@ -222,6 +222,11 @@ class Code(StrEnum):
         "the observations do not determine a combination of the unknowns",
         "hold one of the parameters that are named, or add observations",
     )
+    REVERBERATION = (
+        "reverberation",
+        "a second echo of a reflector, behind the first and weaker",
+        "nothing is needed; it is no point",
+    )
     SATURATED = "saturated", "the image is overexposed", "take less light, or a shorter exposure"
     SEVERAL_TARGETS = (
         "several-targets",

@@ -142,6 +142,14 @@ ControlSigma = Annotated[
         least=1e-9,
     ),
 ]
+SensorWidth = Annotated[
+    float,
+    Option(
+        "Width of the sensor (mm) of cameras of other programs whose lengths are in pixels.",
+        Group.CAMERA,
+        least=1e-3,
+    ),
+]
 Alpha = Annotated[float, Option("Significance level of a single test.", Group.ADJUSTMENT)]
 Reject = Annotated[bool, Option("Reject gross errors by data snooping.", Group.ADJUSTMENT)]
 Components = Annotated[

@@ -42,7 +42,13 @@ from ..refine import (
     still_standard,
 )
 from ..refine.echoes import middles_on_screen
-from ..refine.remarks import ANOTHER_SHAPE_PX, of_the_camera, of_the_change, of_the_object
+from ..refine.remarks import (
+    ANOTHER_SHAPE_PX,
+    of_gross_errors,
+    of_the_camera,
+    of_the_change,
+    of_the_object,
+)
 
 
 class _Corrected:
@@ -74,7 +80,7 @@ class PhotoI(_Corrected):
     @property
     def notes(self) -> tuple[Remark, ...]:
         """Warnings for the user."""
-        return () if self.measured is None else self.measured.notes
+        return of_gross_errors("marks", self.camera.gross) + notes_of(self.measured)
 
 
 def photo_i(

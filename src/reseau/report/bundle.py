@@ -483,9 +483,11 @@ def worst_points(result: Result) -> list[tuple[str, ...]]:
 
 
 def left_out_table(result: Result) -> list[tuple[str, str, str, str]]:
-    """Return the image points rejected by data snooping: image, point, test value, bound."""
+    """Return the rejected image points: image, point, test value, bound; gross errors without these."""
     return [
         (image, point, f"{value:.1f}", f"{critical:.1f}")
+        if value == value
+        else (image, point, "gross error", "")
         for image, point, value, critical in result.rejected_points()
     ]
 

@@ -19,8 +19,8 @@ from ...optics import Chain
 from ...optics.corners import Corners, corner_images
 from ...optics.formation import PixelResponse, polygons
 from ..compiled_filter import filtered
+from ..marks.judging import Objection
 from ..matching import GrownOutline, Matches, Shape, Window
-from ..points import Reason
 from ..reseau.lens_mapping import UNFIT, mapping_through
 from ..reseau.mark_windows import ENOUGH, Located
 from ..reseau.marks import ReseauOptions
@@ -358,7 +358,7 @@ class CornerMarks(PlaneMarks):
         self.look = replace(self.look, psf_px=float(np.median(first.psf_px)))
         return first
 
-    def _objections(self, rows: Rows, found: Matches) -> list[tuple[Mask, Reason]]:
+    def _objections(self, rows: Rows, found: Matches) -> list[Objection]:
         """See :class:`PlaneMarks`: where edges nearly coincide, small errors of their directions shift it."""
         _, along, _ = self._steps(rows)
         tangent = along / np.linalg.norm(along, axis=1, keepdims=True)
@@ -366,24 +366,24 @@ class CornerMarks(PlaneMarks):
         other = np.roll(tangent, 1, axis=2)
         sine = tangent[:, 0] * other[:, 1] - tangent[:, 1] * other[:, 0]
         flat = np.abs(sine).max(axis=1) < _FLAT
-        seen = Reason("seen at too flat an angle", Code.UNCERTAIN)
         # Of a corner on the border two sectors are not seen, and nothing shows an error of its edges.
         h, w = self.screened.grey.shape
         gap = np.minimum(found.xy, np.array([w - 1, h - 1]) - found.xy).min(axis=1)
         # What the kernel takes from beyond the frame is unknown.
         beyond = 0 if self.look.kernel is None else sharpened_from_px(self.look.kernel)
         near = gap < max(BORDER_PX + _BORDER * self.look.blur_px, beyond)
-        border = near, Reason("on the border of the frame", Code.OUTSIDE)
         # Without its pixels an edge is where faint tails of its blur have it.
         part = found.converged & (np.isfinite(found.residuals).sum(axis=(1, 2)) < self.own_px[rows])
         unseen = part.copy()
         unseen[part] = self._edges_seen(rows[part], found.select(part)).min(axis=1) < _LEAST_EDGE
-        hidden = Reason("an edge is hidden or saturated", Code.HIDDEN)
-        beyond_pattern = Reason(
-            "the pattern ends there: paper is where a dark square should be", Code.OTHER_DESIGN
-        )
-        outer = (self._single(rows), beyond_pattern)
-        return [border, outer, (unseen, hidden), *super()._objections(rows, found), (flat, seen)]
+        ends = "the pattern ends there: paper is where a dark square should be"
+        return [
+            (near, "on the border of the frame", Code.OUTSIDE),
+            (self._single(rows), ends, Code.OTHER_DESIGN),
+            (unseen, "an edge is hidden or saturated", Code.HIDDEN),
+            *super()._objections(rows, found),
+            (flat, "seen at too flat an angle", Code.UNCERTAIN),
+        ]
 
     def _single(self, rows: Rows) -> Mask:
         """Which corners, not found before, are those of a single square where two should meet."""

@@ -20,6 +20,7 @@ from ...core.threads import one_thread
 from ...core.tone import ToneCurve
 from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
+from ..marks.judging import Objection, columns_of, reasons_of
 from ..matching import Matches, Window
 from ..points import Measured, Reason
 from ..response import Samples
@@ -358,27 +359,10 @@ class _Measurement:
             if good.mean() < 1 - _FEW and (why == "").sum() < 1.05 * good.sum():
                 break
         found, why, predicted = self._reshaped(wanted, found, why, predicted)
-        n = len(self.at)
-        ok, reasons = (
-            np.zeros(n, dtype=bool),
-            Reason("beyond the edge of the frame", Code.OUTSIDE).repeated(n),
-        )
-        ok[wanted], reasons[wanted] = why == "", why
-
-        def spread(values: Array, keep: Mask | slice = slice(None)) -> Array:
-            full = np.full((n, *values.shape[1:]), np.nan)
-            full[wanted[keep]] = values[keep]
-            return full
-
-        good = why == ""
-        return {
-            "xy": spread(found.xy, good),
-            "cov": spread(found.cov + FORMED_PX**2 * np.eye(2), good),
-            "ok": ok,
-            "why": tuple(reasons),
-            "predicted": predicted,
-            "deviation": spread(found.xy - predicted[wanted], good),
-        } | {name: spread(getattr(found, name)) for name in ("psf_px", "contrast", "t", "noise")}
+        beyond = Reason("beyond the edge of the frame", Code.OUTSIDE).repeated(len(self.at))
+        found = replace(found, cov=found.cov + FORMED_PX**2 * np.eye(2))
+        columns = columns_of(found, wanted, why, beyond)
+        return columns | {"predicted": predicted, "deviation": columns["xy"] - predicted}
 
     def _alike(self, found: Matches, good: Mask, wanted: Rows) -> bool:
         """Whether light and sharpness of the targets are those with which their neighbours were formed."""
@@ -605,9 +589,7 @@ class _Measurement:
 
     def _judged(self, scene: Scene, wanted: Rows, found: Matches) -> tuple[Array, Array]:
         """Reason why each target is rejected, and the positions predicted by the mapping through all."""
-        why = np.full(len(wanted), "", dtype=object)
-        for mask, reason in self._objections(found):
-            why[mask & (why == "")] = reason
+        why = reasons_of(self._objections(found), len(wanted))
         mapping, good = scene.mapping, why == ""
         if good.sum() >= _LEAST_FIRST:
             mapping = refit(mapping, self.at[wanted[good]], found.xy[good], _UNMODELLED_PX)
@@ -623,18 +605,14 @@ class _Measurement:
             )
         return why, predicted
 
-    def _objections(self, found: Matches) -> list[tuple[Mask, Reason]]:
+    def _objections(self, found: Matches) -> list[Objection]:
         """Objections to targets from their own images, the most serious first."""
         o = self.options
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
         sure = found.converged & (found.t > o.least_t)
+        indistinct = "no target is distinct from its surroundings"
         if not sure.any():
-            return [
-                (
-                    np.ones(len(found), dtype=bool),
-                    Reason("no target is distinct from its surroundings", Code.LOW_CONTRAST),
-                )
-            ]
+            return [(np.ones(len(found), dtype=bool), indistinct, Code.LOW_CONTRAST)]
         amplitude = found.contrast * found.level
         width, contrast, noise, usual = (
             median(values[sure]) for values in (found.psf_px, found.contrast, found.noise, amplitude)
@@ -644,26 +622,16 @@ class _Measurement:
         # Something beside a target raises its residuals, but changes neither sharpness nor contrast nor size.
         alike = (np.abs(np.log(found.psf_px / width)) < _ALIKE) & (np.abs(found.form[:, 0]) < _ALIKE)
         alike &= np.abs(found.contrast / contrast - 1) < _ALIKE
+        unlike = found.noise > np.where(alike, _UNLIKE_BESIDE, _UNLIKE) * noise
+        blurred = np.abs(np.log(found.psf_px / width)) > np.log(_BLURRED)
         return [
-            (found.seen < _SEEN, Reason("hidden, saturated or beyond the edge of the frame", Code.HIDDEN)),
-            (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
-            (
-                ~(found.t >= o.least_t),
-                Reason("no target is distinct from its surroundings", Code.LOW_CONTRAST),
-            ),
-            (found.rejected > 0.1, Reason("partly hidden", Code.HIDDEN)),
-            (
-                found.noise > np.where(alike, _UNLIKE_BESIDE, _UNLIKE) * noise,
-                Reason("the image is not that of the target", Code.UNLIKE),
-            ),
-            (
-                np.abs(np.log(found.psf_px / width)) > np.log(_BLURRED),
-                Reason("sharpness differs from the other targets", Code.BLURRED),
-            ),
-            (
-                pale > _PALE,
-                Reason("contrast differs from the other targets", Code.UNLIKE),
-            ),
-            (np.abs(found.form[:, 0]) > _GROWN, Reason("size differs from the design", Code.UNLIKE)),
-            (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
+            (found.seen < _SEEN, "hidden, saturated or beyond the edge of the frame", Code.HIDDEN),
+            (~found.converged, "the match did not converge", Code.NOT_CONVERGED),
+            (~(found.t >= o.least_t), indistinct, Code.LOW_CONTRAST),
+            (found.rejected > 0.1, "partly hidden", Code.HIDDEN),
+            (unlike, "the image is not that of the target", Code.UNLIKE),
+            (blurred, "sharpness differs from the other targets", Code.BLURRED),
+            (pale > _PALE, "contrast differs from the other targets", Code.UNLIKE),
+            (np.abs(found.form[:, 0]) > _GROWN, "size differs from the design", Code.UNLIKE),
+            (~(sigma <= o.most_sigma_px), "too uncertain", Code.UNCERTAIN),
         ]
