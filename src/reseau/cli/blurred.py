@@ -10,7 +10,7 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.files import writable
-from .common import Reading, orientation
+from .common import Reading, orientation, progress, required, say
 from .measure import BY_DESIGN, NOT_NOMINAL, Image, Output, Task
 
 if TYPE_CHECKING:
@@ -18,11 +18,6 @@ if TYPE_CHECKING:
     from ..core.failure import Failure
     from ..measure.blurred import BlurredResult
     from ..procedures.blurred_files import BlurredImaging
-from typing import TYPE_CHECKING
-
-from .common import progress, required, say
-
-if TYPE_CHECKING:
     from ..procedures.blurred_network import BlurredNetwork
 
 

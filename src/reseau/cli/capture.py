@@ -2,38 +2,30 @@
 
 from __future__ import annotations
 
+import json
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
-
-from ..core import vocabulary as v
-from ..core.errors import UsageError
-from ..core.options import Group, Option
-from .acquisition import Where, conduct
-from .blurred import BESIDE_RAYS
-from .declared import Commands
-
-if TYPE_CHECKING:
-    from ..capture import Bench
-    from ..sessions import TestfieldParameters
-    from ..sessions.parameters import BlurredParameters
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ..core import vocabulary as v
+from ..core.errors import UsageError
 from ..core.files import writable
-from .acquisition import ask_operator
+from ..core.options import Group, Option
+from .acquisition import Where, ask_operator, conduct
+from .blurred import BESIDE_RAYS
 from .common import say
+from .declared import Commands
 from .sensor import event, lines
 
 if TYPE_CHECKING:
     from ..archive import Session
     from ..capture import Bench
-    from ..sessions.parameters import SensorParameters
-import tomllib
-from typing import Any
+    from ..sessions import TestfieldParameters
+    from ..sessions.parameters import BlurredParameters, SensorParameters
 
 app = Commands(
     help="Acquire frames on a bench. Each frame is archived before the next exposure.",

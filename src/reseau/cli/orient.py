@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from ..core import vocabulary as v
 from ..core.errors import InputError
-from ..core.options import Option
-from .common import Computing, overlay_files, progress, say, say_files_left_out
-
-if TYPE_CHECKING:
-    from ..io import FrameOrientation
-    from ..io.frame import RollSummary
-    from ..sessions.film_files import OrientedFiles
-from typing import TYPE_CHECKING, Literal
-
 from ..core.files import writable
-from .common import required
+from ..core.options import Option
+from .common import Computing, overlay_files, progress, required, say, say_files_left_out
 from .measure import Output
 
 if TYPE_CHECKING:
-    from ..io import FiducialOrientation
-from typing import Any
+    from ..io import FiducialOrientation, FrameOrientation
+    from ..io.frame import RollSummary
+    from ..sessions.film_files import OrientedFiles
 
 
 def orient(

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from ..core import vocabulary as v
-from .common import compile_first, progress, say
-
-if TYPE_CHECKING:
-    from ..sessions.demo import TestfieldSession
 import json
+import time
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..core import vocabulary as v
 from ..core.errors import UsageError
+from .common import compile_first, progress, say
 
 if TYPE_CHECKING:
     from ..io.document import Document
-import time
+    from ..sessions.demo import TestfieldSession
 
 
 def demo(

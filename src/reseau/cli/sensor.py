@@ -11,18 +11,13 @@ import typer
 from ..core import vocabulary as v
 from ..core.errors import EstimationError, UsageError
 from ..core.files import writable
-from .common import probability, progress, say
-
-if TYPE_CHECKING:
-    from ..calibration.document import Calibration
-    from ..procedures.sensor_files import FileExposure
-from typing import TYPE_CHECKING
-
-from .common import Reading, overlay_files, required
+from .common import Reading, overlay_files, probability, progress, required, say
 from .measure import Output
 
 if TYPE_CHECKING:
+    from ..calibration.document import Calibration
     from ..io.edges import EdgesDocument
+    from ..procedures.sensor_files import FileExposure
 
 
 def sensor(

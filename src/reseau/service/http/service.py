@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
+import queue
 import secrets
+import subprocess
+import sys
 import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from ...archive import Archive
 from ...core.errors import ReseauError, UsageError
@@ -27,12 +31,6 @@ from .options import ServeOptions
 if TYPE_CHECKING:
     from ..benches import BenchLink
     from ..tiled import TiledPublisher
-import json
-import queue
-import subprocess
-import sys
-from dataclasses import replace
-from typing import Literal
 
 T = TypeVar("T")
 
