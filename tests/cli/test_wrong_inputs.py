@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from reseau.calibration import Assessment, Calibration, Covariance, Quantity, Use
+from reseau.calibration import Calibration
+from reseau.calibration.assessment import Assessment, Use
+from reseau.calibration.document import Covariance, Quantity
 from reseau.designs import coded_testfield
 from reseau.io.images import write_image
 from reseau_sims import FieldBench

@@ -21,10 +21,9 @@ from .events import Display
 
 if TYPE_CHECKING:
     from ..archive import Archive, Session
-    from ..capture import Bench, Decision
+    from ..capture import Bench
+    from ..capture.engine import Decision
     from ..sessions import SessionParameters
-
-__all__ = ["Where", "ask_operator", "conduct"]
 
 
 def _from_toml(context: typer.Context, path: Path | None) -> Path | None:

@@ -11,8 +11,6 @@ from typing import Any, ParamSpec, Self, TypeVar
 
 from .common import remark_lines
 
-__all__ = ["Display"]
-
 P = ParamSpec("P")
 T = TypeVar("T")
 

@@ -18,24 +18,22 @@ from .fiducials import (
 from .frame import (
     CORNERS,
     EDGES,
+    FormatCandidate,
     FrameCorners,
     FrameOrientation,
-    FrameOutcome,
     FrameTransform,
     MeasuredCorner,
     MeasuredEdge,
-    RollSummary,
+    RivalEdge,
 )
 from .lens import LensDocument, LensSensor
-from .measurement import MeasuredPoint, PhotographPoints, PointColumns, ReseauMeasurement
-from .points import POINTS, points_document, points_of
-from .reading import is_points, read_design, read_measurement
+from .measurement import PhotographPoints, ReseauMeasurement
+from .reading import read_design
 from .testfield import SHAPES, FieldLines, FieldTargets, TestfieldDesign, parse_design
 
 __all__ = [
     "CORNERS",
     "EDGES",
-    "POINTS",
     "SHAPES",
     "BoardDesign",
     "DesignPoint",
@@ -46,9 +44,9 @@ __all__ = [
     "FiducialPoint",
     "FieldLines",
     "FieldTargets",
+    "FormatCandidate",
     "FrameCorners",
     "FrameOrientation",
-    "FrameOutcome",
     "FrameTransform",
     "LensDocument",
     "LensSensor",
@@ -57,21 +55,15 @@ __all__ = [
     "MeasuredCorner",
     "MeasuredEdge",
     "MeasuredFiducial",
-    "MeasuredPoint",
     "PhotographPoints",
-    "PointColumns",
     "ReseauDesign",
     "ReseauMeasurement",
     "Rings",
-    "RollSummary",
+    "RivalEdge",
     "Strict",
     "TestfieldDesign",
-    "is_points",
     "parse_design",
-    "points_document",
-    "points_of",
     "read_design",
-    "read_measurement",
     "read_text",
     "write_whole",
 ]

@@ -18,8 +18,6 @@ from ..core.errors import FormatError, UsageError
 from ..core.failure import Code, Failure, Remark
 from .document import Document, Strict, read_text
 
-__all__ = ["MeasuredPoint", "PhotographPoints", "PointColumns", "ReseauMeasurement"]
-
 
 class MeasuredPoint(Strict):
     """One mark, measured or not; sigmas in pixels.

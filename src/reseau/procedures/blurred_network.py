@@ -40,14 +40,6 @@ from ..optics.lenses import (
 from ..optics.refraction import RefractedRays, Refraction
 from .blurred import SPACING_PX
 
-__all__ = [
-    "BlurredNetwork",
-    "BlurredRound",
-    "NetworkOptions",
-    "final_document",
-    "measure_blurred_network",
-]
-
 _NODES = 150
 """Largest number of nodes along the size of a target."""
 _DIFFERS = 9.21

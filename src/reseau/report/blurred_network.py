@@ -14,8 +14,6 @@ from ..core.provenance import Provenance
 from ..procedures.blurred_network import BlurredNetwork, BlurredRound
 from .template import rendered
 
-__all__ = ["blurred_network_report"]
-
 _IMAGES = 40
 
 

@@ -12,8 +12,6 @@ from ..bundle import CommonPattern, Result, by_place, by_point, common_pattern
 from ..core.errors import UsageError
 from ..core.figures import ACCENT, FAINT, INK, drawing, nice, to_svg
 
-__all__ = ["patterns_of"]
-
 _PANELS, _ACROSS = 8, 4
 """Number of groups of images drawn, and number of panels side by side."""
 _SURE = 0.01

@@ -129,7 +129,11 @@ class ReseauResult(Measured):
         for family, chains in enumerate(wires.marks):
             for chain in chains:
                 ends = xy[chain[[0, -1]]]
-                inner = ends[0] + np.linspace(0, 1, 120)[:, None] * (ends[1] - ends[0])
+                # Through its marks: a wire may be bowed.
+                places = np.linspace(0, len(chain) - 1, 120)
+                inner = scipy.interpolate.make_interp_spline(
+                    np.arange(len(chain)), xy[chain], k=min(3, len(chain) - 1)
+                )(places)
                 # Wires extend to their frame; there the field is continued along its tangent.
                 beyond = (
                     np.hypot(*(ends[1] - ends[0])) / (len(chain) - 1) * wires.directions[chain[0], :, family]
@@ -243,7 +247,8 @@ def measure_reseau(
             where=frame.name,
             places=judged.xy[judged.why == ""],
         )
-    notes += deviating(judged.deviation, judged.cov)
+    good = np.where((judged.why == "")[:, None], judged.xy, np.nan)
+    notes += deviating([design.ids[i] for i in known], source[known], good, judged.cov)
     result = _columns(frame, design, known, at, found, judged, measurement.field, notes)
     if use_nominal and options.nominal_within_px is None and _astray(frame, result, nominal):
         return _without_nominal(frame, design, result, options)
