@@ -23,6 +23,7 @@ from ...optics.formation import PixelResponse
 from ..marks.judging import Objection, columns_of, reasons_of
 from ..matching import Matches, Window
 from ..plane.lattice_mapping import images_of, slope_of, stretches
+from ..plane.plane_mapping import plane_through
 from ..plane.polynomial import common_part, median, refit
 from ..points import Measured, Reason
 from ..response import Samples
@@ -140,7 +141,7 @@ class TestfieldResult(Measured):
     --------
     >>> from reseau.optics import Chain, Similarity
     >>> lattice = LatticeFit(
-    ...     Chain(Similarity(), Similarity(), ("camera.", "display.")), np.arange(2), np.arange(2), 0.02, 400
+    ...     Chain(Similarity(), Similarity(), ("camera.", "display.")), np.arange(2), np.arange(2)
     ... )
     >>> none = np.zeros((0, 16))
     >>> reading = Reading(np.zeros((0, 2), int), none, none, (), np.zeros((0, 16, 2)), none, none, 0.8)
@@ -148,8 +149,8 @@ class TestfieldResult(Measured):
     >>> xy = np.array([[40.1, 40.2], [np.nan, np.nan]])
     >>> columns = [xy, np.tile(1e-4 * np.eye(2), (2, 1, 1)), ok, ("", "outside"), xy, 0 * xy, *[one] * 4]
     >>> found = TestfieldResult("a.tif", "", ("1.01", "1.02"), *columns, lattice, reading, squares=0)
-    >>> found.found, found.points.names, found.lattice.rms_px
-    (1, ('1.01',), 0.02)
+    >>> found.found, found.points.names
+    (1, ('1.01',))
     """
 
     __test__ = False  # prevents collection by pytest
@@ -490,7 +491,10 @@ class _Measurement:
     def _learn_from(self, first: Matches, sure: Mask, rows: Rows) -> None:
         """Learn mapping, light and sharpness from matched targets."""
         scene = self.scene
-        mapping = refit(scene.mapping, self.at[rows[sure]], first.xy[sure], _UNMODELLED_PX)
+        (h, w), at, xy = scene.grey.shape, self.at[rows[sure]], first.xy[sure]
+        # A projectivity that was found at a coarse scale may be a rough one.
+        tried = refit(scene.mapping, at, xy, _UNMODELLED_PX), plane_through(at, xy, (h, w))
+        mapping = min(tried, key=lambda each: float(np.median(np.abs(images_of(each, at) - xy))))
         # In small blurred targets contrast, sharpness and size can hardly be distinguished.
         large = sure & scene.design.large[rows]
         plain = large if large.sum() >= _LEAST_FIRST else sure
