@@ -18,18 +18,19 @@ from ...core.failure import Code
 from ...optics import Chain
 from ...optics.corners import Corners, corner_images
 from ...optics.formation import PixelResponse, polygons
-from ..compiled_filter import filtered
+from ..compiled_filter import add_images, filtered
 from ..marks.judging import Objection
 from ..matching import GrownOutline, Matches, Shape, Window
-from ..reseau.lens_mapping import UNFIT, mapping_through
+from ..plane.lattice_mapping import images_of, second_order
+from ..plane.lens_mapping import UNFIT, mapping_through
+from ..plane.levels import levels_around
 from ..reseau.mark_windows import ENOUGH, Located
 from ..reseau.marks import ReseauOptions
 from ..reseau.plane_marks import PlaneMarks, intact
 from ..response import sharpened_from_px
 from ..screening import Screened
-from ..testfield.lattice_mapping import images_of, second_order
-from .candidates import ended, levels_at
-from .compiled_corners import add_images, pixels_around
+from .candidates import ended
+from .compiled_corners import pixels_around
 
 __all__ = ["BORDER_PX", "CornerMarks", "CornerShape", "DeltilleMarks", "Sectors"]
 
@@ -394,9 +395,9 @@ class CornerMarks(PlaneMarks):
         # Markers lie in bright squares, at some distance from their corners.
         shares = np.array([_BRIGHT_AT, _BRIGHT_AT, _DARK_AT, _DARK_AT])[:, None, None] * self.sectors.reach
         around = shares * np.stack([one - two, two - one, one + two, -one - two])
-        at = self.at[rows[single]] + around @ self.frame.T
-        levels = levels_at(self.screened.grey, images_of(self.mapping, at.reshape(-1, 2)).reshape(at.shape))
-        single[single] = ended(levels.T, np.ones(levels.shape[1], dtype=bool))
+        around = np.moveaxis(around, 0, 1) @ self.frame.T
+        levels = levels_around(self.screened.grey, self.mapping, self.at[rows[single]], around)
+        single[single] = ended(levels, np.ones(len(levels), dtype=bool))
         return single
 
     def _edge_seen(self, rows: Rows, found: Matches) -> Array:

@@ -18,6 +18,7 @@ from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse, coverage, mark_outline
 from ..marks.judging import Objection, judged_by_neighbours, reasons_of, robust_spread, spread
 from ..matching import SIZE, Matches, MatchOptions, grey_variance, match, with_alike_errors
+from ..plane.levels import levels_at
 from ..points import Reason
 from .assignment import spacing
 from .placement import Placement
@@ -451,14 +452,19 @@ class MarkMeasurement:
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
         along = np.swapaxes(np.concatenate([along, -along], axis=2), 1, 2)
         steps = along[:, :, None] * distance[:, None]
-        seen = _values(self.screened.grey, first.xy[:, None, None] + steps)
+        seen = levels_at(self.screened.grey, first.xy[:, None, None] + steps)
         # Blurred wires are brighter where they cross than elsewhere.
         reach = float(np.ceil(distance[-1])) + 1
         pixels = np.arange(-reach, reach + 1)
         psf_px = float(np.median(first.psf_px))
         outline = self._outline(at, replace(options, psf_px=psf_px)).oriented()
         wires = coverage(outline, pixels, pixels, psf_px, options.response)
-        formed = np.stack([_values(image, reach + each) for image, each in zip(wires, steps, strict=True)])
+        formed = np.stack(
+            [
+                levels_at(image.astype(np.float32), reach + each)
+                for image, each in zip(wires, steps, strict=True)
+            ]
+        )
         share = first.contrast[:, None, None] * formed
         profile = np.median(seen - first.level[:, None, None], axis=(0, 1)) / np.median(share, axis=(0, 1))
         profile = profile / np.median(profile[distance <= 0.7 * half])
@@ -621,14 +627,6 @@ class MarkMeasurement:
         variance = np.trace(cov, axis1=1, axis2=2) / 2 + _UNMODELLED_PX**2
         relative: Array = np.sqrt(variance / np.median(variance))
         return relative
-
-
-def _values(image: ArrayLike, xy: Array) -> Array:
-    """Values (...) of an image between its pixels, at positions (..., 2)."""
-    x, y = np.moveaxis(xy.astype(np.float32), -1, 0).reshape(2, len(xy), -1)
-    grey = np.asarray(image, dtype=np.float32)
-    values = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(values, dtype=np.float64).reshape(xy.shape[:-1])
 
 
 def _of_each(options: MatchOptions, rows: Rows) -> dict[str, Any]:

@@ -24,12 +24,12 @@ from ..matching import (
     Matches,
     with_alike_errors,
 )
+from ..plane.lattice_mapping import images_of, slope_of
+from ..plane.lens_mapping import UNFIT, free_through, mapping_through
 from ..points import Reason
 from ..screening import Screened
-from ..testfield.lattice_mapping import images_of, slope_of
 from ..testfield.targets import replaced
 from .learning import learn, weigh
-from .lens_mapping import UNFIT, free_through, mapping_through
 from .mark_windows import BESIDE, DISTURBED, ENOUGH, SEEN, Located, MarkWindows
 from .marks import ReseauOptions
 

@@ -20,12 +20,12 @@ from ...optics import Chain
 from ...optics.formation import Outline, PixelResponse, side_rule
 from ..marks.judging import Objection
 from ..matching import GrownOutline, Matches, Shape, Window
+from ..plane.lattice_mapping import images_of, second_order, slope_of
+from ..plane.plane_mapping import plane_through
 from ..screening import Screened, screen
-from ..testfield.lattice_mapping import images_of, second_order, slope_of
 from .disks import Disks, find_disks
 from .mark_windows import Located
 from .marks import ReseauOptions
-from .plane_mapping import plane_through
 from .plane_marks import PlaneMarks
 from .sheet_placement import MOST_DISKS, SheetPlacement, lay_sheet
 

@@ -22,15 +22,16 @@ from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
 from ..marks.judging import Objection, columns_of, reasons_of
 from ..matching import Matches, Window
+from ..plane.lattice_mapping import images_of, slope_of, stretches
+from ..plane.plane_mapping import plane_through
+from ..plane.polynomial import common_part, median, refit
 from ..points import Measured, Reason
 from ..response import Samples
-from ..screening import screen
+from ..screening import quiet_noise, screen
 from ..tone import FoundCurve, find_curve
-from .lattice import median
-from .lattice_fit import LatticeFit, common_part, refit
-from .lattice_mapping import images_of, slope_of, stretches
+from .lattice import LatticeFit
 from .motion import MovedShape, anisotropy, path_of, spread_of
-from .recognition import Reading, SearchedFrame
+from .recognition import Reading, SearchedFrame, shows_second
 from .target_images import form_targets
 from .targets import Light, Scene, match_targets, pixels_of_targets, replaced
 
@@ -140,7 +141,7 @@ class TestfieldResult(Measured):
     --------
     >>> from reseau.optics import Chain, Similarity
     >>> lattice = LatticeFit(
-    ...     Chain(Similarity(), Similarity(), ("camera.", "display.")), np.arange(2), np.arange(2), 0.02, 400
+    ...     Chain(Similarity(), Similarity(), ("camera.", "display.")), np.arange(2), np.arange(2)
     ... )
     >>> none = np.zeros((0, 16))
     >>> reading = Reading(np.zeros((0, 2), int), none, none, (), np.zeros((0, 16, 2)), none, none, 0.8)
@@ -148,8 +149,8 @@ class TestfieldResult(Measured):
     >>> xy = np.array([[40.1, 40.2], [np.nan, np.nan]])
     >>> columns = [xy, np.tile(1e-4 * np.eye(2), (2, 1, 1)), ok, ("", "outside"), xy, 0 * xy, *[one] * 4]
     >>> found = TestfieldResult("a.tif", "", ("1.01", "1.02"), *columns, lattice, reading, squares=0)
-    >>> found.found, found.points.names, found.lattice.rms_px
-    (1, ('1.01',), 0.02)
+    >>> found.found, found.points.names
+    (1, ('1.01',))
     """
 
     __test__ = False  # prevents collection by pytest
@@ -216,44 +217,31 @@ def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) 
     if isinstance(screened, Failure):
         return screened
     grey = screened.grey if design.polarity == "dark" else -screened.grey
-    original = SearchedFrame(screened.grey, grey, design, options.psf_px, PixelResponse(options.fill))
-    seen, read = original, original.read()
-    if isinstance(read, Failure) and read.code != Code.MIRRORED:
-        # Lines that are too thin can be between the targets only. Lines of one pixel width may be recovered
-        # from a blurred frame by sharpening, lines and targets of a few pixels in a small part of it by
-        # interpolation.
-        for other in (lambda: original, original.sharpened, original.enlarged):
-            trial = other()
-            if trial is None:
-                continue
-            again = trial.read_by_targets() if trial is original else trial.read()
-            if not isinstance(again, Failure) or again.code == Code.MIRRORED:
-                seen, read = trial, again
-                break
+    noise, response = quiet_noise(grey), PixelResponse(options.fill)
+    read = SearchedFrame(screened.grey, grey, noise, design, options.psf_px, response).read()
     if isinstance(read, Failure):
         return replace(read, where=frame.name)
-    if seen.shows_second(read):
+    if shows_second(read):
         return Failure(
             f"shows two testfields {design.name!r}; crop the image to one of them",
             Code.SEVERAL_TARGETS,
             where=frame.name,
         )
-    read = seen.original(read)
-    lattice, reading, placed = read.lattice, read.reading, read.placed
+    (lattice, reading), placed = read.original(), read.placed
     valid = screened.valid & (frame.pixels < frame.full_scale)
     size = (float(frame.width), float(frame.height))
     light = Light.through(reading.xy.reshape(-1, 2), reading.level.ravel(), reading.contrast.ravel(), size)
     scene = Scene(
         screened.grey,
         valid,
-        original.noise,
+        noise,
         design,
         lattice.mapping,
         placed.frame,
         placed.origin,
         light,
-        seen.blurred(reading.psf_px),
-        PixelResponse(options.fill),
+        reading.psf_px,
+        response,
         options.row_jitter_px,
     )
     work = _Measurement(scene, lattice, options)
@@ -266,7 +254,7 @@ def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) 
         image=frame.name,
         sha256=frame.sha256,
         ids=design.ids,
-        lattice=lattice,
+        lattice=replace(lattice, mapping=work.scene.mapping),
         reading=reading,
         squares=placed.squares,
         **work.columns(),
@@ -503,7 +491,10 @@ class _Measurement:
     def _learn_from(self, first: Matches, sure: Mask, rows: Rows) -> None:
         """Learn mapping, light and sharpness from matched targets."""
         scene = self.scene
-        mapping = refit(scene.mapping, self.at[rows[sure]], first.xy[sure], _UNMODELLED_PX)
+        (h, w), at, xy = scene.grey.shape, self.at[rows[sure]], first.xy[sure]
+        # A projectivity that was found at a coarse scale may be a rough one.
+        tried = refit(scene.mapping, at, xy, _UNMODELLED_PX), plane_through(at, xy, (h, w))
+        mapping = min(tried, key=lambda each: float(np.median(np.abs(images_of(each, at) - xy))))
         # In small blurred targets contrast, sharpness and size can hardly be distinguished.
         large = sure & scene.design.large[rows]
         plain = large if large.sum() >= _LEAST_FIRST else sure

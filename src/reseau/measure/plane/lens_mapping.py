@@ -23,8 +23,7 @@ import numpy as np
 
 from ...core.data import Array
 from ...optics import Chain, Equidistant
-from ..testfield.lattice_fit import monomials_of
-from ..testfield.lattice_mapping import (
+from .lattice_mapping import (
     degree_of,
     matrix_of,
     of_degree,
@@ -34,6 +33,7 @@ from ..testfield.lattice_mapping import (
 )
 from .plane_lens import distorted, projected
 from .plane_mapping import fisheye_of, polynomial_through
+from .polynomial import monomials_of
 
 __all__ = ["UNFIT", "FoundMapping", "free_through", "lens_through", "mapping_through"]
 
@@ -71,7 +71,7 @@ class FoundMapping:
 
     Examples
     --------
-    >>> from reseau.measure.testfield.lattice_mapping import started
+    >>> from reseau.measure.plane.lattice_mapping import started
     >>> exact = FoundMapping(started(np.eye(3), 1, (480, 640)), lambda at: np.zeros((0, *at.shape)))
     >>> exact.changes(np.zeros((5, 2))).shape
     (0, 5, 2)

@@ -20,11 +20,9 @@ from .compiled_lattice import images
 __all__ = [
     "degree_of",
     "images_of",
-    "lattice_coordinates",
     "matrix_of",
     "numbers_of",
     "of_degree",
-    "projective_slope",
     "reduced",
     "second_order",
     "slope_of",
@@ -34,11 +32,6 @@ __all__ = [
     "stretches",
     "with_coefficients",
 ]
-
-_LONGEST = 0.5
-"""Longest step, in lattice coordinates, of the inversion of a mapping."""
-_STEPS, _SHORT = 6, 1e-3
-"""Most steps of the inversion, and the longest step that ends it."""
 
 
 @lru_cache(maxsize=64)
@@ -144,31 +137,6 @@ def straightened(mapping: Chain, xy: Array) -> Array:
     back = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(matrix_of(mapping)).T
     at: Array = np.ascontiguousarray(back[:, :2] / back[:, 2:])
     return at
-
-
-def lattice_coordinates(mapping: Chain, xy: Array) -> Array:
-    """Lattice coordinates (n, 2) of image points, by Newton steps with the slope of the projectivity."""
-    at = straightened(mapping, xy)
-    zero = of_degree(mapping, degree_of(mapping)).second
-    if not len(xy) or not (mapping.second.values != zero.values).any():
-        return at
-    numbers, seen = numbers_of(mapping), np.empty(at.shape)
-    (p, q), (r, s) = projective_slope(numbers[0], at)
-    inverse = np.array([[s, -q], [-r, p]]) / (p * s - q * r)
-    for _ in range(_STEPS):
-        images(numbers, at, seen, *_NONE)
-        step = np.clip((inverse * (xy - seen).T).sum(axis=1), -_LONGEST, _LONGEST)
-        at += step.T
-        if np.abs(step).max() < _SHORT:
-            break
-    return at
-
-
-def projective_slope(matrix: Array, at: Array) -> Array:
-    """Derivatives (2, 2, n) of a projectivity (3, 3) at points (n, 2)."""
-    x, y, depth = matrix[:, :2] @ at.T + matrix[:, 2:]
-    seen = np.stack([x / depth, y / depth])[:, None]
-    return np.asarray((matrix[:2, :2, None] - seen * matrix[2, :2, None]) / depth)
 
 
 def reduced(mapping: Chain, factor: float, shift: Array) -> Chain:

@@ -1,4 +1,4 @@
-"""Images of a plane behind a lens; see :mod:`reseau.measure.reseau.lens_mapping`."""
+"""Images of a plane behind a lens; see :mod:`reseau.measure.plane.lens_mapping`."""
 
 from __future__ import annotations
 

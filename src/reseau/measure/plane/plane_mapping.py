@@ -12,8 +12,8 @@ import scipy
 
 from ...core.data import Array, Mask
 from ...optics import Chain
-from ..testfield.lattice_fit import refit
-from ..testfield.lattice_mapping import images_of, started
+from .lattice_mapping import images_of, started
+from .polynomial import refit
 
 __all__ = ["STRENGTHS", "fisheye_of", "plane_through", "polynomial_through", "projectivity_behind"]
 

@@ -1,8 +1,8 @@
-"""The mapping of a lattice and the profiles of its lines, compiled.
+"""The mapping of a lattice and the light of its lines, compiled.
 
 A mapping is given as `(matrix, coefficients, normal)`: the projectivity (3, 3); the polynomials of x and y
 (2, m) of the monomials 1, u, v, u², u v, v², … up to a degree; and the offset and scale that give u and v,
-with the strength of a fisheye between both (4,). See :mod:`reseau.measure.testfield.lattice_mapping`.
+with the strength of a fisheye between both (4,). See :mod:`reseau.measure.plane.lattice_mapping`.
 """
 
 from __future__ import annotations
@@ -17,15 +17,11 @@ from numpy.typing import NDArray
 from ...core.assign import assign
 from ...core.compiled import compiled
 
-__all__ = ["images", "monomials", "profiles", "shade_lines"]
+__all__ = ["images", "monomials", "shade_lines"]
 
 Floats = NDArray[Any]
 Mapped = tuple[Floats, Floats, Floats]
 
-_REACH = 2
-"""Pixels to either side of a line that are looked at."""
-_MOST_PX = 0.7
-"""How far a line may be off its approximate place."""
 _FAR, _PER_SIGMA = 8.0, 64
 """End of the table of the normal distribution, and entries per standard deviation; accurate to 1e-10."""
 _FLAT = 1e-3
@@ -261,79 +257,6 @@ def _crossings(nodes: Floats, high: int, wide: int, beyond: float) -> tuple[int,
             normal[k, c] = across[one, c] + part * (across[two, c] - across[one, c])
         along[k] = one + part * (two - one)
     return axis, int(lowest), place, normal, along
-
-
-@compiled
-def profiles(
-    grey: Floats, nodes: Floats, beside: Floats, blur: float
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Places of dark lines from their profiles in rows or columns.
-
-    Level, depth and shift of a profile are adjusted to the pixels around each crossing.
-
-    Parameters
-    ----------
-    grey : ndarray (h, w)
-        Grey values.
-    nodes, beside : ndarray (l, m, 2)
-        Points on the lines, and beside them at the distance of their width.
-    blur : float
-        Width (one sigma) of a blurred edge.
-
-    Returns
-    -------
-    line, along, xy, normal : ndarray (n,), (n,), (n, 2), (n, 2)
-        For each place that is determined: the line, the index of the node, not rounded, the place, and the
-        unit vector across.
-    """
-    high, wide = grey.shape
-    most = len(nodes) * max(high, wide)
-    lines, params = np.empty(most, np.intp), np.empty(most)
-    xy, normals, found = np.empty((most, 2)), np.empty((most, 2)), 0
-    design, equations, x = np.empty(3), np.empty((3, 3)), np.empty(3)
-    for line in range(len(nodes)):
-        axis, first, place, normal, along = _crossings(nodes[line], high, wide, 0.0)
-        size = high if axis == 0 else wide
-        for k in range(len(place)):
-            if not (place[k] > 0 and place[k] < size):
-                continue
-            middle, at = int(np.rint(place[k])), first + k
-            if middle < _REACH or middle + _REACH >= size:
-                continue
-            node = int(np.rint(along[k]))
-            half = (beside[line, node, 0] - nodes[line, node, 0]) * normal[k, 0]
-            half = 0.5 * abs(half + (beside[line, node, 1] - nodes[line, node, 1]) * normal[k, 1])
-            equations[:], x[:] = 0.0, 0.0
-            for i in range(middle - _REACH, middle + _REACH + 1):
-                distance = (i - place[k]) * normal[k, 1 - axis]
-                seen = float(grey[i, at] if axis == 0 else grey[at, i])
-                far, near = (distance + half) / blur, (distance - half) / blur
-                design[0], design[1] = 1.0, _normal(far) - _normal(near)
-                design[2] = math.exp(-0.5 * near * near) - math.exp(-0.5 * far * far)
-                design[2] /= math.sqrt(2 * math.pi) * blur
-                for c in range(3):
-                    x[c] += design[c] * seen
-                    for d in range(3):
-                        equations[c, d] += design[c] * design[d]
-            for c in range(3):
-                equations[c, c] += 1e-9  # regularizes where the pixels do not determine the profile
-            for c in range(3):
-                for d in range(c + 1, 3):
-                    factor = equations[d, c] / equations[c, c]
-                    x[d] -= factor * x[c]
-                    for e in range(c, 3):
-                        equations[d, e] -= factor * equations[c, e]
-            depth = (x[1] - equations[1, 2] * x[2] / equations[2, 2]) / equations[1, 1]
-            shift = x[2] / equations[2, 2] / depth
-            if not (depth < 0 and abs(shift) < _MOST_PX):
-                continue
-            lines[found], params[found] = line, along[k]
-            xy[found, axis], xy[found, 1 - axis] = at, place[k]
-            for c in range(2):
-                normals[found, c] = normal[k, c]
-                xy[found, c] += shift * normal[k, c]
-            found += 1
-    return lines[:found].copy(), params[:found].copy(), xy[:found].copy(), normals[:found].copy()
 
 
 @compiled
