@@ -34,10 +34,10 @@ def errors(result: FrameResult, frame: FilmFrame) -> Array:
 
 
 def covered(result: FrameResult, frame: FilmFrame) -> bool:
-    """Whether errors of corners are less than 5 sigma, or 0.1 px."""
+    """Whether errors of corners are less than 5 sigma, or 0.25 px."""
     assert result.lines is not None
     sigma = np.sqrt(np.diag(result.lines.covariance)).reshape(4, 2)
-    return bool((np.abs(errors(result, frame)) < np.maximum(5 * sigma, 0.1)).all())
+    return bool((np.abs(errors(result, frame)) < np.maximum(5 * sigma, 0.25)).all())
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from ..io.scans import Scan
 from ..measure.film import FrameResult
 from .template import rendered
 
-__all__ = ["contact_sheet", "frame_tile", "roll_page", "scan_overlay", "write_marked"]
+__all__ = ["contact_sheet", "frame_tile", "roll_page", "scan_overlay", "write_cut", "write_marked"]
 
 _STRIPE, _UNWRITTEN = 512, 50_000_000
 """Rows copied at a time, and bytes that are held before they are written."""
@@ -99,6 +99,31 @@ def _mark(image: NDArray[Any], xy: Array, white: float) -> None:
                 image[r, c] = 0
     if 0 <= row < h and 0 <= column < w:
         image[row, column] = white
+
+
+def write_cut(path: Path, scan: Scan, corners: Array) -> None:
+    """Write one frame of a scan upright, between its corners, with the pixels of the scan.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    scan : Scan
+        The scan.
+    corners : ndarray (4, 2)
+        Corners ul, ur, lr, ll, pixels; they become the centres of the picture's outermost pixels.
+    """
+    low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, None)
+    high = np.minimum(np.ceil(corners.max(axis=0)).astype(int) + 3, [scan.width, scan.height])
+    part = np.ascontiguousarray(scan.window(low[1], high[1], low[0], high[0]))
+    width, height = (
+        round(float(np.hypot(*(corners[1] - corners[0])))),
+        round(float(np.hypot(*(corners[3] - corners[0])))),
+    )
+    goal = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float32)
+    moved = cv2.getPerspectiveTransform((corners - low).astype(np.float32), goal)
+    cut = cv2.warpPerspective(part, moved, (width + 1, height + 1), flags=cv2.INTER_CUBIC)
+    write_image(path, cut)
 
 
 def frame_tile(scan: Scan, found: FrameOrientation) -> NDArray[np.uint8]:
