@@ -53,7 +53,7 @@ pixels hardly show the width, small errors of their model have a large part in i
 _SOFTNESS, _DIRECTIONS = 0.03, 0.04
 """Scatter of logarithmic widths from edge to edge, by focus and penumbra, and half the difference of the two
 directions of a scan, by lens and carriage; both with the heavy tails of Student's distribution."""
-LINED, _PARTLY, _SHARPENED = 0.01, 0.03, 0.01
+LINED, _PARTLY, _SHARPENED = 0.02, 0.03, 0.01
 """Prior probabilities: that a line runs beside all of an edge within a few widths of its step, that one runs
 beside a given place of it, and that what was measured is sharper than an edge can be (a scratch)."""
 _RANGE = 1.5
