@@ -66,6 +66,7 @@ def _plain(read: Callable[[Path], Network]) -> Callable[[Path, float | None], Ne
     return lambda path, sigma: _with_control_sigma(read(path), sigma)
 
 
+_THREE_COUNTS = re.compile(rb"\s*\d+[ \t]+\d+[ \t]+\d+[ \t]*[\r\n]")
 # In the order in which they are tried; the last two are numbers in lines only.
 _FORMATS = (
     _Format("MicMac", lambda at: is_micmac(at.path), read_micmac),
@@ -82,7 +83,6 @@ _FORMATS = (
         _plain(read_photomodeler),
     ),
 )  # fmt: skip
-_THREE_COUNTS = re.compile(rb"\s*\d+[ \t]+\d+[ \t]+\d+[ \t]*[\r\n]")
 
 
 def read_network(

@@ -121,7 +121,7 @@ def _network(scene: _Scene, path: Path) -> Network:
         if pose in poses:
             turns[k], x0[k] = poses[pose]
     rotation = np.where(np.isfinite(x0), matrix_to_vector(turns), np.nan)
-    names, xyz, seen = [], [], []
+    names, xyz, seen = list[str](), list[list[float]](), list[tuple[int, int, float, float]]()
     for name, place, observations in scene.points:
         seen += [(row_of[view], len(names), x[0], x[1]) for view, x in observations]
         names.append(name)
@@ -176,7 +176,7 @@ def _wrapped(entry: Mapping[str, Any]) -> dict[str, Any]:
 def _openmvg(content: Mapping[str, Any]) -> _Scene:
     def lens(entry: Mapping[str, Any]) -> _Lens:
         data = _wrapped(entry)
-        given = next((data[key] for key in data if key.startswith(("disto", "fisheye"))), [])
+        given: Any = next((data[key] for key in data if key.startswith(("disto", "fisheye"))), [])
         focal, centre = np.full(2, float(data["focal_length"])), np.array(data["principal_point"], float)
         flat = [float(v) for v in np.atleast_1d(np.array(given, dtype=np.float64))]
         return _Lens(_size(data), str(entry["value"]["polymorphic_name"]), focal, centre, flat)
@@ -190,8 +190,8 @@ def _openmvg(content: Mapping[str, Any]) -> _Scene:
     return _Scene(
         ((str(entry["key"]), lens(entry)) for entry in content["intrinsics"]),
         ((str(v["id_view"]), v["filename"], str(v["id_intrinsic"]), str(v["id_pose"])) for v in views),
-        ((str(entry["key"]), *(np.array(entry["value"][part], float) for part in ("rotation", "center")))
-         for entry in content["extrinsics"]),
+        ((str(entry["key"]), np.array(entry["value"]["rotation"], float),
+          np.array(entry["value"]["center"], float)) for entry in content["extrinsics"]),
         ((str(entry["key"]), entry["value"]["X"],
           [(str(seen["key"]), seen["value"]["x"]) for seen in entry["value"]["observations"]])
          for entry in content["structure"]),

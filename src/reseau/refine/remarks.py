@@ -101,8 +101,8 @@ def of_the_object(
     declined: Mapping[str, str] | None = None,
 ) -> tuple[Remark, ...]:
     """Remarks on the test object; `declined` gives the reasons of rods that were seen and not measured."""
-    notes, plane = [], instrument.plane
-    notes += of_gross_errors("rods", instrument.gross)
+    plane = instrument.plane
+    notes = [*of_gross_errors("rods", instrument.gross)]
     if instrument.enlarged > 1:
         text = f"residuals of the rods are {instrument.enlarged:.1f} times their standard deviations"
         notes.append(Remark(f"{text}, beyond chance; those of group B were enlarged", Code.SIGMAS_DOUBTFUL))

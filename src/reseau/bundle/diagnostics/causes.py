@@ -367,10 +367,8 @@ def _control_on_a_line(network: Network) -> list[Remark]:
     for rows in _by_image(network, np.isin(network.point_of, known)):
         if len(rows) > 2:
             own = network.xyz[network.point_of[rows]]
-            scales.append(
-                np.linalg.norm(own - own.mean(axis=0))
-                / max(np.linalg.norm(network.xy[rows] - network.xy[rows].mean(axis=0)), 1e-300)
-            )
+            extent = float(np.linalg.norm(network.xy[rows] - network.xy[rows].mean(axis=0)))
+            scales.append(np.linalg.norm(own - own.mean(axis=0)) / max(extent, 1e-300))
     if not scales:
         return []
     resolved = float(np.median(scales)) * float(np.sqrt(np.median(network.cov[:, 0, 0])))

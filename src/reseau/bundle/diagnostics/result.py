@@ -305,7 +305,7 @@ class Result(Estimated, Display):
         """Object points; what only images without a distance show has no standard deviation."""
         network = self.network
         sound = ~self._without_distance[network.image_of]
-        held = (network.held | network.observed).all(axis=1)
+        held: Mask = np.all(network.held | network.observed, axis=1)
         held[network.point_of[sound]] = True
         return PointEstimates(
             network.points,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -33,7 +33,8 @@ class Rays(NamedTuple):
 
     def of(self, rows: Rows | Mask) -> Self:
         """Some of the rays."""
-        return type(self)(*(column[rows] for column in self))
+        columns: list[Any] = [column[rows] for column in self]
+        return type(self)(*columns)
 
     def nearest(self, points: int) -> tuple[Array, Array]:
         """Points (p, 3) nearest to all their rays, and the intersection angles."""

@@ -7,7 +7,7 @@ points are those of OpenCV, applied to directions corrected for distortion.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -314,7 +314,7 @@ class _Poses(NamedTuple):
     def best(self) -> tuple[Array, Array, Mask] | None:
         """The pose that explains most, refined by its good points; None where none pays for itself."""
         k, rng = len(self.xyz), np.random.default_rng(0)
-        some = self if k <= _SCORED else self._replace(**self._part(rng.permutation(k)[:_SCORED]))
+        some = self if k <= _SCORED else self._part(rng.permutation(k)[:_SCORED])
         begin = Mixture(self.largest, 0.5, self.reach)
         poses = self._of_all()
         done, wanted = 0, float(_TRIALS[0])
@@ -332,11 +332,11 @@ class _Poses(NamedTuple):
             # So many that three good points are among them.
             wanted = min(_TRIALS[1], np.log(1e-3) / np.log(max(1.0 - good**3, 1e-12) - 1e-13))
         found = [each for pose in poses if (each := self._refined(pose, begin)) is not None]
-        gain, *pose = max(found, key=lambda each: each[0], default=(0.0, None))
-        return None if not gain > _ODDS else (pose[0], pose[1], pose[2])
+        best = max(found, key=lambda each: each[0], default=None)
+        return best[1:] if best is not None and best[0] > _ODDS else None
 
-    def _part(self, rows: Rows) -> dict[str, Array]:
-        return {"xyz": self.xyz[rows], "uv": self.uv[rows]}
+    def _part(self, rows: Rows) -> Self:
+        return self._replace(xyz=self.xyz[rows], uv=self.uv[rows])
 
     def _of_all(self) -> Array:
         """Poses (h, 6) from all points."""

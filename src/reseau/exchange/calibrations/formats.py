@@ -417,7 +417,12 @@ def _as_it_is(
         # The same model in pixels.
         if not set(own) <= {*brown.BROWN}:
             return None
-        model, own, given, options = "opencv", brown.in_pixels(own, (width, height), given), (1.0, 1.0), {}
+        model, own, given, options = (
+            "opencv",
+            brown.in_pixels(own, (width, height), (given[0], given[1])),
+            (1.0, 1.0),
+            {},
+        )
     for wanted, names in form.models:
         same = wanted.partition("_full")[0] == model.partition("_full")[0] and set(own) <= set(names)
         if plain and same and any(options == _options(wanted, side) for side in form.sides):

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.data import Array
+from ...core.data import Array, Mask
 from ..matching.noise import LEAST, adjusted_grey, linear_variance
 
 __all__ = ["Likeness", "Residuals"]
@@ -88,7 +88,7 @@ class Residuals:
         there = np.isfinite(bent) & np.isfinite(grey)
         return grey[there], bent[there] ** 2
 
-    def _blocks(self, variance: tuple[float, float], mean: float) -> tuple[Array, Array]:
+    def _blocks(self, variance: tuple[float, float], mean: float) -> tuple[Array, Mask]:
         """Squares of mean residuals of blocks, over their variance, and whether blocks are on a target."""
         k, r, c = self.off.shape
         rows, columns = r // _BLOCK * _BLOCK, c // _BLOCK * _BLOCK
@@ -111,7 +111,8 @@ class Residuals:
 
         square, within = (_BLOCK * blocks(unit)) ** 2, blocks(on)
         there = np.isfinite(square) & np.isfinite(within)
-        return square[there], within[there] > _BESIDE
+        beside: Mask = within[there] > _BESIDE
+        return square[there], beside
 
     @staticmethod
     def likeness(parts: list[Residuals]) -> Likeness:

@@ -349,8 +349,8 @@ class Run:
             inside = np.ix_(lines.astype(np.intp), columns.astype(np.intp))
             grey, valid = self.screened.grey[inside].ravel(), self.screened.valid[inside].ravel()
             where = xy, width, columns, lines, PixelResponse(o.fill)
-            formed = {"bright": shape.bright, "parts": shape.at(k, np.zeros(count))}
-            parts = shape.images[k].formed(*where, derivatives=True, **formed)
+            outlines = shape.at(k, np.zeros(count))
+            parts = shape.images[k].formed(*where, derivatives=True, bright=shape.bright, parts=outlines)
             parts = parts.reshape(len(parts), -1)
             u, v = (at.ravel() for at in np.meshgrid((columns - xy[0]) / half, (lines - xy[1]) / half))
             light = np.stack([np.ones_like(u), u, v, parts[0]], axis=1)[valid]

@@ -362,14 +362,16 @@ class _Lattice:
         """At which nodes beyond the design something is seen."""
         found: Mask = _entries(self.seen, beyond - self.low, False)
         # The last ones of a print are seen, but not always found.
-        return found | (cost(beyond) == 0) if cost is not None and found.any() else found
+        if cost is None or not found.any():
+            return found
+        return np.asarray(found | (cost(beyond) == 0), dtype=bool)
 
 
-def _entries(table: NDArray[Any], at: Array, outside: Any) -> NDArray[Any]:
+def _entries(table: NDArray[Any], at: Array | Integers, outside: Any) -> NDArray[Any]:
     """Entries (n,) of a table at places (n, 2), and what is `outside` of it."""
     at = at.astype(np.intp)
-    inside = ((at >= 0) & (at < table.shape)).all(axis=1)
-    return np.where(inside, table[tuple(np.where(inside[:, None], at, 0).T)], outside)
+    inside: Mask = np.all((at >= 0) & (at < table.shape), axis=1)
+    return np.asarray(np.where(inside, table[tuple(np.where(inside[:, None], at, 0).T)], outside))
 
 
 def _lines_beside(design: BoardDesign, found: Rows) -> list[Rows]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -199,7 +199,7 @@ class PinDetections(Overlaid):
     def turned_back(self, width: int) -> PinDetections:
         """The same spots in the frame, of this width, that was turned by 90° against the clock for them."""
         back = np.array([[0.0, -1.0], [1.0, 0.0]])
-        columns: dict[str, Array] = {"tilt": self.tilt + np.pi / 2, "cov": back @ self.cov @ back.T}
+        columns: dict[str, Any] = {"tilt": self.tilt + np.pi / 2, "cov": back @ self.cov @ back.T}
         columns |= {name: getattr(self, name) @ back.T + [width - 1.0, 0.0] for name in ("xy", "centroid")}
         if self.shared is not None:
             columns["shared"] = back @ self.shared
@@ -415,7 +415,7 @@ class _Judge:
         measured = found.converged & np.isin(self.why[at], ["", _TOO_UNCERTAIN])
         xy[at[measured]] = found.xy[measured]
         codes = np.array([getattr(why, "code", None) for why in self.why], dtype=object)
-        echo = np.isin(codes, [None, *_HALF_SEEN])
+        echo = np.array([code is None or code in _HALF_SEEN for code in codes], dtype=bool)
         seen = np.flatnonzero(echo | (codes == Code.LOW_CONTRAST))
         repeated = find_reverberations(
             xy[seen],

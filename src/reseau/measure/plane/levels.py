@@ -28,7 +28,7 @@ def levels_at(grey: NDArray[np.float32], xy: Array, how: int = cv2.INTER_LINEAR)
     at = np.clip(np.nan_to_num(xy.astype(np.float32)), 0, last).reshape(-1, 2)
     wide = max(min(len(at), _WIDE), 1)
     places = np.resize(at, (-(-len(at) // wide), wide, 2))
-    levels = cv2.remap(grey, places, None, how) if len(at) else at
+    levels = cv2.remap(grey, places, np.empty(0, np.float32), how) if len(at) else at
     return np.asarray(levels, dtype=np.float64).ravel()[: len(at)].reshape(xy.shape[:-1])
 
 

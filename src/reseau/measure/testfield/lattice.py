@@ -193,7 +193,7 @@ def _grown(xy: Array, seed: int, steps: Array, shape: tuple[int, ...]) -> tuple[
         nodes, rows, at = beside[keep], row[keep], at[keep]
         if same or len(rows) < 6 or np.ptp(nodes, axis=0).min() < 1:
             break
-        straight = projectivity_behind(at, xy[rows], shape, 0.0)[0]
+        straight = projectivity_behind(at, xy[rows], (shape[0], shape[1]), 0.0)[0]
         if straight is None or not np.isfinite(straight).all() or abs(straight[2, 2]) < 1e-9:
             break
         mapping = started(straight, 1, shape)

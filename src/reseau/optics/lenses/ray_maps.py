@@ -99,8 +99,8 @@ class ByRays(ABC):
             through, area = self.open_part(points, turned, wavelength)
             arrived, carried = self.rays(starts, through.reshape(-1, 2), wavelength)
             xy.append(arrived.reshape(*shape, 2))
-            weight = elements.weights * weight * area
-            light.append(carried.reshape(*shape, 3) * weight[..., None])
+            shares = elements.weights * weight * area
+            light.append(carried.reshape(*shape, 3) * shares[..., None])
         return np.stack(xy), np.stack(light)
 
 
