@@ -18,13 +18,11 @@ from .fiducials import (
 from .frame import (
     CORNERS,
     EDGES,
-    FormatCandidate,
     FrameCorners,
     FrameOrientation,
     FrameTransform,
     MeasuredCorner,
     MeasuredEdge,
-    RivalEdge,
 )
 from .lens import LensDocument, LensSensor
 from .measurement import PhotographPoints, ReseauMeasurement
@@ -44,7 +42,6 @@ __all__ = [
     "FiducialPoint",
     "FieldLines",
     "FieldTargets",
-    "FormatCandidate",
     "FrameCorners",
     "FrameOrientation",
     "FrameTransform",
@@ -59,7 +56,6 @@ __all__ = [
     "ReseauDesign",
     "ReseauMeasurement",
     "Rings",
-    "RivalEdge",
     "Strict",
     "TestfieldDesign",
     "parse_design",
