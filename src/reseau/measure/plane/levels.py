@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +30,7 @@ def levels_at(grey: NDArray[np.float32], xy: Array, how: int = cv2.INTER_LINEAR)
     at = np.clip(np.nan_to_num(xy.astype(np.float32)), 0, last).reshape(-1, 2)
     wide = max(min(len(at), _WIDE), 1)
     places = np.resize(at, (-(-len(at) // wide), wide, 2))
-    levels = cv2.remap(grey, places, np.empty(0, np.float32), how) if len(at) else at
+    levels = cv2.remap(grey, places, cast(Any, None), how) if len(at) else at
     return np.asarray(levels, dtype=np.float64).ravel()[: len(at)].reshape(xy.shape[:-1])
 
 
