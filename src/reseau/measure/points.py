@@ -87,15 +87,21 @@ def deviating(ids: Sequence[str], source: Array, xy: Array, cov: Array) -> tuple
         Covariances in the image.
     """
     known = np.flatnonzero(np.isfinite(xy).all(axis=1) & np.isfinite(source).all(axis=1))
-    if len(known) < 8 or on_one_line(source[known]):
+    if len(known) < 3 + _SPARE or on_one_line(source[known]):
         return ()
     sigma = np.sqrt(np.trace(cov[known], axis1=1, axis2=2) / 2)
-    fields = [
-        SmoothField.fit(source[known], xy[known], sigma=sigma / np.median(sigma), degree=degree)
-        for degree in range(1, 6)
-        if (degree + 1) * (degree + 2) // 2 + _SPARE <= len(known)
-    ]
-    best = min(fields, key=lambda one: float(np.square(one.leave_one_out()[0] / sigma[:, None]).sum()))
+    spare = {degree: len(known) - (degree + 1) * (degree + 2) // 2 for degree in range(1, 6)}
+    fields = {
+        degree: SmoothField.fit(source[known], xy[known], sigma=sigma / np.median(sigma), degree=degree)
+        for degree, freedom in spare.items()
+        if freedom >= _SPARE
+    }
+
+    def error(degree: int) -> float:
+        return float(np.square(fields[degree].leave_one_out()[0] / sigma[:, None]).sum())
+
+    degree = min(fields, key=error)
+    best = fields[degree]
     off, predicted = best.leave_one_out()
     typical, scatter = float(np.median(sigma)), float(np.sqrt(np.mean(best.noise**2)))
     if scatter > _ABOVE * typical:
@@ -108,7 +114,9 @@ def deviating(ids: Sequence[str], source: Array, xy: Array, cov: Array) -> tuple
     # The scatter is that of the sigmas, or larger; one point that is wrong enlarges it for all.
     far = np.abs(off / predicted).max(axis=1) * max(scatter / typical, 1.0)
     worst = int(far.argmax())
-    if 2 * len(known) * scipy.special.ndtr(-far[worst]) * 2 > _FALSE:
+    # The scatter is known from the points that are left, and the degree was chosen among several.
+    chance = 2 * scipy.special.stdtr(spare[degree], -far[worst])
+    if 2 * len(known) * len(fields) * chance > _FALSE:
         return ()
     away = float(np.hypot(*off[worst]))
     text = f"{ids[known[worst]]} deviates from the prediction by the others by {away:.2g} px"

@@ -26,8 +26,8 @@ def levels_at(grey: NDArray[np.float32], xy: Array, how: int = cv2.INTER_LINEAR)
     >>> levels_at(np.float32([[1, 2], [3, 4]]), np.array([[0.5, 0.0], [0.5, 1.0], [9.0, 9.0]])).tolist()
     [1.5, 3.5, 4.0]
     """
-    last = np.array(grey.shape[::-1], np.float32) - 1
-    at = np.clip(np.nan_to_num(xy.astype(np.float32)), 0, last).reshape(-1, 2)
+    last = np.array(grey.shape[::-1]) - 1.0
+    at = np.clip(np.nan_to_num(xy), 0, last).astype(np.float32).reshape(-1, 2)
     wide = max(min(len(at), _WIDE), 1)
     places = np.resize(at, (-(-len(at) // wide), wide, 2))
     levels = cv2.remap(grey, places, cast(Any, None), how) if len(at) else at
