@@ -96,13 +96,9 @@ def deviating(ids: Sequence[str], source: Array, xy: Array, cov: Array) -> tuple
         for degree, freedom in spare.items()
         if freedom >= _SPARE
     }
-
-    def error(degree: int) -> float:
-        return float(np.square(fields[degree].leave_one_out()[0] / sigma[:, None]).sum())
-
-    degree = min(fields, key=error)
-    best = fields[degree]
-    off, predicted = best.leave_one_out()
+    left = {degree: one.leave_one_out() for degree, one in fields.items()}
+    degree = min(left, key=lambda each: float(np.square(left[each][0] / sigma[:, None]).sum()))
+    best, (off, predicted) = fields[degree], left[degree]
     typical, scatter = float(np.median(sigma)), float(np.sqrt(np.mean(best.noise**2)))
     if scatter > _ABOVE * typical:
         text = (

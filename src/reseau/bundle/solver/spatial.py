@@ -7,7 +7,7 @@ points are those of OpenCV, applied to directions corrected for distortion.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -343,11 +343,16 @@ class _Poses(NamedTuple):
         _, *found, _ = cv2.solvePnPGeneric(
             self.xyz, self.uv, np.eye(3), np.zeros(0), flags=cv2.SOLVEPNP_SQPNP
         )
-        return np.array(found, dtype=np.float64).reshape(2, -1, 3).transpose(1, 0, 2).reshape(-1, 6)
+        return self._poses(found)
 
     def _of_three(self, rows: Rows) -> Array:
         """Poses (h, 6) from three points."""
         _, *found = cv2.solveP3P(self.xyz[rows], self.uv[rows], np.eye(3), np.zeros(0), cv2.SOLVEPNP_AP3P)
+        return self._poses(found)
+
+    @staticmethod
+    def _poses(found: list[Any]) -> Array:
+        """Poses (h, 6) as OpenCV returns them: vectors of all rotations, then all shifts."""
         return np.array(found, dtype=np.float64).reshape(2, -1, 3).transpose(1, 0, 2).reshape(-1, 6)
 
     def _refined(self, pose: Array, begin: Mixture) -> tuple[float, Array, Array, Mask] | None:

@@ -111,8 +111,8 @@ class Residuals:
 
         square, within = (_BLOCK * blocks(unit)) ** 2, blocks(on)
         there = np.isfinite(square) & np.isfinite(within)
-        beside: Mask = within[there] > _BESIDE
-        return square[there], beside
+        targets: Mask = within[there] > _BESIDE
+        return square[there], targets
 
     @staticmethod
     def likeness(parts: list[Residuals]) -> Likeness:

@@ -16,6 +16,7 @@ import scipy
 
 from ...core.data import Array, Mask, Rows
 from ...optics.field import SmoothField, trend_degree
+from ..marks.judging import robust_spread
 
 __all__ = ["Assignment", "assign"]
 
@@ -91,18 +92,18 @@ def assign(
         degree = max(1, min(degree, trend_degree(len(has)), 3))
         trend = SmoothField.fit(source[has], xy[found.row[has]], degree=degree, local=False)
         found.predicted = trend(source)
-        rest = np.abs(xy[found.row[has]] - found.predicted[has])
+        rest = xy[found.row[has]] - found.predicted[has]
         free = 1 - (degree + 1) * (degree + 2) / 2 / len(has)
-        scatter = 1.4826 * float(np.median(rest)) / np.sqrt(max(free, 0.1))
+        scatter = robust_spread(rest, 0.0) / np.sqrt(max(free, 0.1))
         sigma = max(scatter, float(np.median(own[found.row[has]])), sigma / 2)
         found.row = _likeliest(found.predicted, xy, cov, np.full(len(source), sigma), gate_px, tolerance_px)
         if degree == before[0] and (found.row == before[1]).all() and sigma <= 2 * scatter:
             break
         before, degree = (degree, found.row), degree + 1
     _settled(found, source, xy, cov, gate_px, tolerance_px)
+    others = xy[np.setdiff1d(np.arange(len(xy)), found.row)]
     for rod in np.flatnonzero(found.row < 0):
-        free_echoes = np.setdiff1d(np.arange(len(xy)), found.row)
-        off = np.hypot(*(xy[free_echoes] - found.predicted[rod]).T)
+        off = np.hypot(*(others - found.predicted[rod]).T)
         if len(off) and off.min() < gate_px:
             found.excluded[int(rod)] = float(off.min())
     return found

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...core.data import Array, Mask, Rows
+from ..marks.judging import robust_spread
 
 __all__ = ["Reverberations", "find_reverberations"]
 
@@ -223,7 +224,7 @@ class _Pairs:
         doubtful[second[has[(best[has] < _DECIDED) | (excess > 2.5)]]] = True
         firsts = np.setdiff1d(np.flatnonzero(self.candidate), second[has])
         usual = float(np.median(self.log[firsts])) if len(firsts) else 0.0
-        scatter = np.hypot(_FAINTER, 1.4826 * float(np.median(np.abs(self.log[firsts] - usual))))
+        scatter = np.hypot(_FAINTER, robust_spread(self.log[firsts], usual))
         # Spots behind a wire that may hide their first echo: weak, and without a second one.
         behind = self.hidden(self.xy - spacing * self.depth) & (second < 0) & (of < 0)
         for k in np.flatnonzero(behind):
