@@ -282,8 +282,7 @@ class Patches:
 
     def width(self, x: Array, at: Rows) -> Array:
         """Width of the point-spread function (m,) from its logarithm, with a lower bound."""
-        with np.errstate(over="ignore"):  # of a match that diverges, which ends there
-            width: Array = np.hypot(SHARPEST * self.psf[at], np.exp(x[:, WIDTH]))
+        width: Array = np.hypot(SHARPEST * self.psf[at], np.exp(x[:, WIDTH]))
         return width
 
     def change(self, before: Array, x: Array, at: Rows) -> Array:

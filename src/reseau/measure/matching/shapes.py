@@ -146,8 +146,7 @@ class GrownOutline:
         """Share and as many of its derivatives as `parts` asks for, (m, parts, r, c)."""
         corner = np.stack([window.columns[:, 0], window.rows[:, 0]], axis=1)
         images: Any = np.empty((len(at), parts, window.rows.shape[1], window.columns.shape[1]), np.float32)
-        with np.errstate(over="ignore"):  # of a match that diverges, which ends there
-            place, forms, sigma = (v.astype(np.float32) for v in (xy - corner, form, width))
+        place, forms, sigma = (v.astype(np.float32) for v in (xy - corner, form, width))
         # A step of an adjustment may lead to values without an image.
         finite = np.isfinite(place).all(axis=1) & np.isfinite(forms).all(axis=1) & np.isfinite(sigma)
         outlines = self.nodes.xy, self.nodes.dxy, self.generators.astype(np.float32)

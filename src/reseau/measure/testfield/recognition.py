@@ -147,6 +147,8 @@ class Reading:
         Grey value around each target, and its contrast; NaN where there is none.
     psf_px : float
         Best width of the point-spread function.
+    small : int
+        Number of further squares in sight, which are too small to be read.
     """
 
     cell: Rows
@@ -157,6 +159,7 @@ class Reading:
     level: Array
     contrast: Array
     psf_px: float
+    small: int = 0
 
 
 def read_clusters(
@@ -186,7 +189,7 @@ def read_clusters(
     code = TopologicalCode.of(design)
     decoded = code.decoded(joint)
     level, contrast = (np.where(joint == HIDDEN, np.nan, values) for values in (found.level, found.contrast))
-    return Reading(work.cell, alone, joint, decoded, work.xy, level, contrast, better)
+    return Reading(work.cell, alone, joint, decoded, work.xy, level, contrast, better, work.small)
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,6 +227,7 @@ class _Clusters:
         longest, shortest = (self.step * scale for scale in stretches(np.nan_to_num(frames)))
         legible: Mask = seen.any(axis=1) & (shortest > _LEAST_STEP_PX) & (longest < max(h, w) / 2)
         legible &= legible.sum() <= _MOST_SQUARES * len(design.centres)
+        self.small = int((seen.any(axis=1) & (shortest <= _LEAST_STEP_PX)).sum())
         self.cell, self.xy, self.visible = self.cell[legible], xy[legible], seen[legible]
         if not legible.any():
             return
@@ -536,19 +540,31 @@ class SearchedFrame:
         )
 
     def read(self) -> Read | Failure:
-        """The testfield with the squares of the design, at the coarsest scale at which it is legible."""
+        """The testfield with the squares of the design, at the coarsest scale at which all are legible.
+
+        Of those at which only some are, at the one that shows most of them.
+        """
         failure: Failure | None = None
+        best: Read | None = None
         for scale in _SCALES:
             size = scale**2 * self.grey.size
             if min(self.grey.shape) * scale < _SMALLEST_PX or (scale > 1 and size > _LARGEST_PX):
                 continue
             seen = self._scaled(scale)
             found = seen._among(extremes(seen.dark, seen.noise))
-            if not isinstance(found, Failure) or found.code == Code.MIRRORED:
+            if isinstance(found, Read):
+                if best is None or found.placed.squares > best.placed.squares:
+                    best = found
+                if not found.reading.small:
+                    return best
+                continue
+            if best is None and found.code == Code.MIRRORED:
                 return found
             # That the targets of another design were seen says more than that there are none.
             if failure is None or found.code != Code.NOT_FOUND:
                 failure = found
+        if best is not None:
+            return best
         return Failure("is too small to show a testfield", Code.NOT_FOUND) if failure is None else failure
 
     def _among(self, spots: Array) -> Read | Failure:
