@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Mapping, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,17 +34,18 @@ from .sfm import is_sfm, read_sfm
 __all__ = ["calibration_files", "read_foreign", "read_network", "write_network"]
 
 
-class _Peek(NamedTuple):
+@dataclass(frozen=True)
+class _Peek:
     """A file or folder whose format is not known."""
 
     path: Path
 
-    @property
+    @cached_property
     def head(self) -> bytes:
         """First bytes of a file."""
         return b"" if self.path.is_dir() else read_head(self.path)
 
-    @property
+    @cached_property
     def counts(self) -> list[int]:
         """Numbers of words in the first lines."""
         return [len(line.split()) for line in self.head.decode("latin-1").splitlines()[:5]]
