@@ -328,7 +328,7 @@ def speed() -> None:
     def formed(view: RayMap, target: PlaneTarget, elements: PupilElements, at: Array, half: int) -> Array:
         pixels = np.arange(-half, half + 1.0)
         image = ray_image(view, target, elements)
-        return image.gridded.image(image.point, PSF, at[0] + pixels, at[1] + pixels, PixelResponse())
+        return image.formed(image.point, PSF, at[0] + pixels, at[1] + pixels, PixelResponse())
 
     for size in (10.0, 20.0, 35.0, 60.0):
         outline = mark_outline("disk", size * PITCH * DISTANCE / 25.7, None, 0.8 * PITCH * DISTANCE / 25.7)

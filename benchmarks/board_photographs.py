@@ -28,7 +28,7 @@ from reseau.core.data import Array
 from reseau.core.failure import Failure
 from reseau.io import BoardDesign
 from reseau.measure import measure_board
-from reseau.measure.reseau.lens_mapping import mapping_through
+from reseau.measure.plane.lens_mapping import mapping_through
 
 COMMON_PX, SIGMA_PX, LEAST = 2.0, 0.05, 20
 

@@ -24,8 +24,8 @@ from parts import add_options, executor_of, main_of, outcomes
 from reseau.core.data import Array
 from reseau.execution import Executor
 from reseau.service.charts import ChartOptions, KnownSeries, monitor
+from reseau.service.rules import RunHistory, explain_runs
 from reseau.service.runlength import Cusum, Ewma, Prerun, Shewhart
-from reseau.service.trend import RunHistory, explain_runs
 
 PARAMETERS, YEAR, AT_ONCE = 10, 52, 2500
 SHIFTS = (0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0)

@@ -67,6 +67,8 @@ class Refined:
         eᵀC⁻¹e of the coefficients of a group, and their number.
     worst : str
         The point with the largest error over its sigma.
+    notes : str
+        Notes of the command.
     """
 
     name: str
@@ -81,6 +83,7 @@ class Refined:
     a: Array = field(default_factory=lambda: np.zeros(2))
     b: Array = field(default_factory=lambda: np.zeros(2))
     worst: str = ""
+    notes: str = ""
 
 
 def refined(folder: Path, name: str, keep: Path) -> Refined:
@@ -123,6 +126,9 @@ def refined(folder: Path, name: str, keep: Path) -> Refined:
         **_points(points, check),
         a=_weighted(calibration, truth["A"]),
         b=_weighted(calibration, true_group_b(calibration, truth)),
+        notes="; ".join(
+            line.strip() for line in done.stdout.splitlines() if "note:" in line and "has moved" not in line
+        ),
     )
 
 

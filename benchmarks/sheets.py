@@ -32,8 +32,9 @@ from reseau.designs import coded_testfield
 from reseau.execution import Executor
 from reseau.io import ReseauDesign, TestfieldDesign, parse_design
 from reseau.measure import measure_reseau
-from reseau.measure.testfield.lattice_fit import LatticeFit, refit
-from reseau.measure.testfield.lattice_mapping import started
+from reseau.measure.plane.lattice_mapping import started
+from reseau.measure.plane.polynomial import refit
+from reseau.measure.testfield.lattice import LatticeFit
 from reseau.measure.testfield.recognition import read_clusters
 from reseau.optics.formation import PixelResponse
 from reseau.procedures.target_measurement import measurer_of
@@ -70,7 +71,7 @@ def of_size(field: Printed, job: tuple[float, int]) -> str:
     pixels, (wide, high) = view.picture(), np.ptp(view.truth, axis=0)
     straight: Any = cv2.findHomography(at, view.truth)[0]
     mapping = refit(started(straight, 3, pixels.shape), at, view.truth, 0.03)
-    fit = LatticeFit(mapping, numbers, numbers, 0.0, len(at))
+    fit = LatticeFit(mapping, numbers, numbers)
     read = read_clusters(pixels.astype(np.float32), fit, design, view.blur, PixelResponse())
     legible = 0 if isinstance(read, Failure) else sum(map(bool, read.decoded))
     found = measured("field", view)

@@ -35,6 +35,8 @@ from reseau.execution import Processes
 from reseau.io import SHAPES
 from reseau.measure import TestfieldOptions, TestfieldResult, measure_testfield
 from reseau.measure.testfield.measure import FORMED_PX
+from reseau.measure.testfield.recognition import read_clusters
+from reseau.optics.formation import PixelResponse
 from reseau_sims import FieldBench, Photograph, Stain, Station, paper_stations
 from reseau_sims.testfield import DISTANCE_MM, JITTER_PX
 
@@ -109,7 +111,7 @@ def recordings(fields: ModuleType, seed: int, tilts: tuple[float, ...]) -> Itera
 
 
 def lines(recording: Recording) -> Array:
-    """Distances of lines from the truth at points 15 mm apart, between the outermost lines found."""
+    """Distances of lines, by the mapping through all targets, from the truth at points 15 mm apart."""
     lattice = recording.result.lattice
     found = []
     for axis, (numbers, others) in enumerate(
@@ -141,7 +143,10 @@ def true_distance(recording: Recording, xy: Array) -> Array:
 
 def misread(recording: Recording, contours: bool = False) -> Array:
     """Misclassified targets of the central squares: individually, by cluster, by contours (3,)."""
-    reading = recording.result.reading
+    pixels, lattice = recording.frame.pixels.astype(np.float32), recording.result.lattice
+    # By the mapping through all targets, in pixels of the frame.
+    reading = read_clusters(pixels, lattice, DESIGN, OPTIONS.psf_px, PixelResponse(OPTIONS.fill))
+    assert reading
     places = reading.xy.reshape(-1, 2)
     distance = np.hypot(*(places[:, None] - recording.truth.xy[CENTRAL]).transpose(2, 0, 1))
     near = distance.argmin(axis=1)

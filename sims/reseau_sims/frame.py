@@ -160,7 +160,7 @@ class SpaceFrame:
             x, y = (np.rint(at) + np.arange(-reach, reach + 1.0) for at in image.point)
             x, y = x[(x >= 0) & (x < columns)], y[(y >= 0) & (y < rows)]
             if len(x) and len(y):
-                formed = image.gridded.image(image.point, psf_px, x, y, response)
+                formed = image.formed(image.point, psf_px, x, y, response)
                 share[np.ix_(y.astype(int), x.astype(int))] += formed
         # Where images overlap, targets hide each other.
         return np.minimum(share, 1.0)

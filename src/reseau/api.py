@@ -18,16 +18,18 @@ from numpy.typing import NDArray
 from .bundle import Network, Result, ResultDocument
 from .bundle import Options as AdjustmentOptions
 from .bundle import adjust_network as _adjust
-from .calibration import Calibration, SensorCorrection
+from .calibration import Calibration
 from .calibration import read_calibration as _read_calibration
+from .calibration.sensor import SensorCorrection
 from .core.data import Frame, ImagePoints
 from .core.errors import UsageError
 from .core.failure import Failure
 from .exchange import Lens, read_network, read_target
 from .exchange import read_lens as _read_lens
-from .io import BoardDesign, ReseauDesign, TestfieldDesign, is_points, read_measurement
+from .io import BoardDesign, ReseauDesign, TestfieldDesign
 from .io.images import Channel, grey_of, open_scan
 from .io.images import read_image as _read_image
+from .io.reading import is_points, read_measurement
 from .io.scans import scan_of
 from .measure import (
     BoardOptions,
@@ -47,20 +49,6 @@ from .procedures.exposures import photographs_named
 from .procedures.film_frame import FrameOptions, FrameResult, orient_scan
 from .procedures.refined import Refined
 from .procedures.refining import Photographs, RefineOptions, refine_photographs
-
-__all__ = [
-    "Adjusted",
-    "Refined",
-    "adjust_network",
-    "calibrate",
-    "measure",
-    "orient",
-    "read_calibration",
-    "read_design",
-    "read_image",
-    "read_lens",
-    "refine",
-]
 
 T = TypeVar("T")
 

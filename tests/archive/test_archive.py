@@ -19,18 +19,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from reseau.archive import (
-    Archive,
-    LocalObjects,
-    RemoteObjects,
-    Verdict,
-    describe,
-    export,
-    frame_of,
-    schema,
-    tiff_of,
-    verify,
-)
+from reseau.archive import Archive, Verdict, schema, tiff_of
+from reseau.archive.exporting import describe, export
+from reseau.archive.objects import LocalObjects, RemoteObjects
+from reseau.archive.picture import frame_of
+from reseau.archive.verification import verify
 from reseau.core.data import Frame
 from reseau.core.errors import ArchiveError, UsageError
 

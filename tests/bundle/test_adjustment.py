@@ -44,6 +44,24 @@ def disturbed(network: Network, part: float, seed: int) -> tuple[Network, set[in
     return replace(network, xy=xy), set(bad.tolist())
 
 
+@pytest.mark.parametrize("control", [0, 6])
+def test_of_forty_percent_gross_errors_nearly_all_are_found_from_no_approximate_values(control: int) -> None:
+    datum = "control" if control else "free"
+    world = networks.world(images=10, points=60, seed=4, cameras=(SIMPLE,), control=control, datum=datum)
+    network = world.noisy(1)
+    rng = np.random.default_rng(5)
+    bad = rng.random(len(network.xy)) < 0.4
+    anywhere = rng.uniform(0, 1, network.xy.shape) * [640, 480]
+    network = replace(network, xy=np.where(bad[:, None], anywhere, network.xy))
+    result = adjust_network(network, Options(outliers="reject")).required()
+    (camera,) = result.cameras.values()
+    true = [dict(zip(SIMPLE.names, SIMPLE.values, strict=True))[name] for name in camera.parameters]
+    assert (np.abs(camera.values - true) < 6 * camera.sigma).all()
+    enough = np.bincount(network.point_of[~bad], minlength=60)[network.point_of] >= 3
+    assert (result.rejected & bad & enough).sum() >= 0.95 * (bad & enough).sum()
+    assert (result.rejected & ~bad & enough).sum() <= 0.02 * (~bad & enough).sum()
+
+
 @pytest.mark.parametrize("part", [0.01, 0.1, 0.2])
 def test_gross_errors_are_found_with_few_false_rejections(part: float) -> None:
     world = networks.world(images=8, points=60, seed=2, cameras=(SIMPLE,))

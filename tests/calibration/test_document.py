@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from reseau.calibration import Calibration, Covariance, Quantity
+from reseau.calibration import Calibration
+from reseau.calibration.document import Covariance, Quantity
 from reseau.core.errors import FormatError
 
 

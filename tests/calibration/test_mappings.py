@@ -12,14 +12,12 @@ from reseau.calibration import (
     CameraCorrection,
     CameraMapping,
     CorrectedImage,
-    Covariance,
-    Fields,
     FilmFrameMapping,
-    Quantity,
-    SensorCorrection,
     calibration_of_frame,
-    parse_calibration,
 )
+from reseau.calibration.document import Covariance, Quantity
+from reseau.calibration.reader import parse_calibration
+from reseau.calibration.sensor import Fields, SensorCorrection
 from reseau.core.data import Array, ImagePoints
 from reseau.core.errors import FormatError, UsageError
 from reseau.io import CORNERS, FrameOrientation

@@ -14,7 +14,10 @@ import pytest
 from bluesky import RunEngine
 
 from reseau.archive import Archive, Session, Verdict
-from reseau.capture import Goal, Plan, Step, at_heights, carry_out, paper_steps, plans, rerun
+from reseau.capture import Goal, Step, carry_out, paper_steps, plans
+from reseau.capture.acquisition import Plan
+from reseau.capture.engine import rerun
+from reseau.capture.steps import at_heights
 from reseau.core.data import Frame
 from reseau.core.errors import ArchiveError, EstimationError, StateError, UsageError
 from reseau.core.failure import Failure

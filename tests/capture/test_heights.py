@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from reseau.archive import Archive, Session
-from reseau.capture import Step, at_heights, carry_out, plans, rerun
+from reseau.capture import Step, carry_out, plans
+from reseau.capture.engine import rerun
+from reseau.capture.steps import at_heights
 from reseau.core.errors import EstimationError
 from reseau.procedures.calibrated import Calibrated
 from reseau_sims import FieldBench

@@ -18,7 +18,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.archive import Archive, ArchivedFrame, Session, verify
+from reseau.archive import Archive, Session
+from reseau.archive.records import ArchivedFrame
+from reseau.archive.verification import verify
 from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry, carry_out, paper_steps, plans
 from reseau.capture.bench import built
 from reseau.instruments import Instrument

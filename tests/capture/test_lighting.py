@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.capture import LightRule, level_of, steer
+from reseau.capture.lighting import LightRule, level_of, steer
 from reseau.core.data import Frame
 from reseau.core.errors import RefusedError, UsageError
 from reseau.instruments import Settings, quantity

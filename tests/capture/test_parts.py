@@ -9,7 +9,9 @@ import scipy.special
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reseau.capture import Goal, Limits, edge_sigma, exposure_fault, read_steps, readiness, shift_between
+from reseau.capture import Goal
+from reseau.capture.checks import Limits, edge_sigma, exposure_fault, readiness, shift_between
+from reseau.capture.steps import read_steps
 from reseau.core.data import Frame
 from reseau.core.errors import FormatError, UsageError
 

@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 
 from reseau import sessions
-from reseau.archive import Archive, Session, verify
+from reseau.archive import Archive, Session
+from reseau.archive.verification import verify
 from reseau.calibration import Calibration
 from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry, Step, carry_out, paper_steps, plans
 from reseau.capture.bench import built
 from reseau.core.errors import UsageError
 from reseau.instruments import CameraRig, ExposureSet, Instrument
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
-from reseau.sessions import BlurredParameters, FramesParameters, SensorParameters, TestfieldParameters
+from reseau.sessions import FramesParameters, TestfieldParameters
+from reseau.sessions.parameters import BlurredParameters, SensorParameters
 from reseau_drivers.camera import Rig, RigSettings, v4l2
 from reseau_sims.serving import SimulatedCamera, StripeScene, VideoCamera, View
 from reseau_sims.serving.bench import SEATS, SimulatedBench

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from reseau.archive import Archive, Session
-from reseau.capture import Acquisition, Bench, BenchFile, Decision, InstrumentEntry, Step, carry_out, rerun
+from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry, Step, carry_out
+from reseau.capture.engine import Decision, rerun
 from reseau.capture.plans import NO_EXPOSURE_LIMITS, SensorSeriesPlan, sensor
 from reseau.core.data import Frame
 from reseau.core.errors import DeadlineError, EstimationError, StateError

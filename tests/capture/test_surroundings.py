@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from reseau.archive import Archive, Session
-from reseau.capture import Bench, BenchFile, InstrumentEntry, Step, carry_out, plans, rerun
+from reseau.capture import Bench, BenchFile, InstrumentEntry, Step, carry_out, plans
+from reseau.capture.engine import rerun
 from reseau.core.data import Frame
 from reseau.core.errors import InstrumentError
 from reseau.instruments import Device

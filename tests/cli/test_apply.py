@@ -10,16 +10,10 @@ import numpy as np
 import pytest
 import tifffile
 
-from reseau.calibration import (
-    Assessment,
-    Calibration,
-    Covariance,
-    Fields,
-    Quantity,
-    SensorCorrection,
-    Use,
-    read_calibration,
-)
+from reseau.calibration import Calibration, read_calibration
+from reseau.calibration.assessment import Assessment, Use
+from reseau.calibration.document import Covariance, Quantity
+from reseau.calibration.sensor import Fields, SensorCorrection
 from reseau.core.data import Array
 from reseau.io import CORNERS
 from reseau.io.images import read_image, write_image

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from reseau.calibration import Assessment, Calibration, Use
+from reseau.calibration import Calibration
+from reseau.calibration.assessment import Assessment, Use
 from reseau.calibration.document import Covariance, Quantity
 
 Run = Callable[..., tuple[int, str, str]]

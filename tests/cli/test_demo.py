@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from reseau.archive import Archive, verify
+from reseau.archive import Archive
+from reseau.archive.verification import verify
 from reseau.calibration import Calibration, InstrumentCorrection
 from reseau.cli import run
 from reseau.io import ReseauDesign, ReseauMeasurement

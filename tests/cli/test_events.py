@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from reseau.cli.events import Display
+from reseau.cli.acquisition import Display
 
 
 class Terminal(io.StringIO):
@@ -76,7 +76,7 @@ def test_remaining_time_depends_only_on_frames_taken_now(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     clock = iter([0.0, *[1.0] * 8, 11.0])
-    monkeypatch.setattr("reseau.cli.events.time.monotonic", lambda: next(clock))
+    monkeypatch.setattr("reseau.cli.acquisition.time.monotonic", lambda: next(clock))
     display = Display(False, 12)
     for k in range(8):
         display.watch("frame", frame(str(k), there=True))

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reseau.calibration import Assessment, Calibration, Use
+from reseau.calibration import Calibration
+from reseau.calibration.assessment import Assessment, Use
 from reseau.io.images import write_image
 
 from ..exchange.test_calibrations import SIZE, calibration

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from reseau.io import FrameCorners, FrameOrientation, RollSummary
+from reseau.io import FrameCorners, FrameOrientation
+from reseau.io.frame import RollSummary
 from reseau_sims.filmframe import FilmFrame
 
 Run = Callable[..., tuple[int, str, str]]

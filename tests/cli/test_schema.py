@@ -11,7 +11,7 @@ import pytest
 
 import reseau
 from reseau.cli import run
-from reseau.cli.schema import documents
+from reseau.cli.program import documents
 from reseau.designs import coded_testfield
 from reseau.io.document import Document
 

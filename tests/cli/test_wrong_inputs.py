@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from reseau.calibration import Assessment, Calibration, Covariance, Quantity, Use
+from reseau.calibration import Calibration
+from reseau.calibration.assessment import Assessment, Use
+from reseau.calibration.document import Covariance, Quantity
 from reseau.designs import coded_testfield
 from reseau.io.images import write_image
 from reseau_sims import FieldBench
@@ -171,7 +173,7 @@ measure reseau photo.png -d design.json --overlay no/o.png
 measure board photo.png -d design.json
     2 design.json: has the schema 'reseau-design/1'; 'reseau-board/1' was expected
 measure testfield ramp.png -d coded.json
-    1 ramp.png: no straight lines were found
+    1 ramp.png: no spots form the lattice of a testfield
 measure fiducials scan.tif -d aerial-unit.json
     2 aerial-unit.json: `unit`: Input should be 'mm'
 measure fiducials noise.png -d aerial.json
@@ -323,7 +325,7 @@ export lens.json
 export lens.json --to ros
     2 --to FORMAT and --out FILE: must be given together
 export lens.json --to rso --out o.yaml
-    2 rso: is not one of opencv, ros, kalibr, colmap, mrcal, metashape, photomodeler, dbat, matlab, …
+    2 rso: is not one of opencv, ros, kalibr, colmap, mrcal, metashape, photomodeler, dbat, micmac, matlab, …
 export poor.json --to ros --out o.yaml
     2 calibration camera: is not usable: 0.5 px at the centre, 4 px in the corners; it is not …
 export none --micmac m

@@ -124,6 +124,20 @@ def test_a_package_that_cannot_be_written_to_is_read_and_the_users_folder_writte
     assert module.folders() == [package / "__pycache__" / "compiled"]
 
 
+def test_machine_code_for_the_usual_processor_is_run_by_this_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = module.usual_processor()
+    if usual is None:
+        pytest.skip("this processor is not the usual one of its platform")
+    folder, cache = tmp_path / "here", tmp_path / "cache"
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setenv("NUMBA_CPU_NAME", usual[0])
+        elsewhere.setenv("NUMBA_CPU_FEATURES", usual[1])
+        assert run(folder, cache) == "3.0 True"
+    assert run(folder, cache) == "3.0 False"
+
+
 def test_where_nothing_can_be_kept_it_is_compiled_all_the_same(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert run(tmp_path / "here", tmp_path / "file") == "3.0 True"

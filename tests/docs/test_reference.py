@@ -12,7 +12,7 @@ import pytest
 from typer.main import get_command
 
 from reseau.cli import app
-from reseau.cli.schema import documents
+from reseau.cli.program import documents
 from reseau.core import errors
 from reseau.core.failure import Code
 

@@ -148,3 +148,38 @@ def test_what_is_wrong_with_a_file_is_said_in_one_line(
         read_codev(path)
     assert "\n" not in str(raised.value)
     assert str(raised.value).startswith(str(path))
+
+
+LINE = "rdm; len; dim m; epd 10; wl 587.6; {more} so 0 {far}; s 50 5 {glass}; sto; s 0 93.4; si 0 0; go"
+
+
+@pytest.mark.parametrize(
+    ("far", "glass", "more"),
+    [
+        ("inf", "NBK7_SCHOTT", ""),
+        ("1e13", "1.5168:64.17", ""),
+        ("1e13", "'own'", "prv; pwl 656.2725 587.5618 486.1327; 'own' 1.51432 1.51680 1.52238; end;"),
+        ("1e13", "'own'", "prv; 'own' lau 2.2718929 -0.010108077 0.010592509 2.081697e-4 -7.647253e-6 "
+         "4.924099e-7; end;"),
+        ("1e13", "MYBK7", ""),
+    ],
+)  # fmt: skip
+def test_glasses_and_distances_in_all_their_spellings(
+    tmp_path: Path, far: str, glass: str, more: str
+) -> None:
+    """Each is BK7, of which the makers state n_d = 1.5168."""
+    (tmp_path / "own.AGF").write_text(
+        "NM MYBK7 2 517642 1.5168 64.17 0 1\nCD 1.03961212 6.00069867E-3 0.231792344 2.00179144E-2 "
+        "1.01046945 103.560653 0 0 0 0\nLD 0.3 2.5\n"
+    )
+    path = tmp_path / "lens.seq"
+    path.write_text(LINE.format(far=far, glass=glass, more=more))
+    assert read_lens(path).prescription.indices(587.5618)[1] == pytest.approx(1.5168, abs=2e-5)
+
+
+def test_a_glass_of_an_unknown_formula_is_refused_by_its_name(tmp_path: Path) -> None:
+    (tmp_path / "own.agf").write_text("NM ODD 13 1 1.5 60\nCD 1 2 3\nLD 0.3 2\n")
+    path = tmp_path / "lens.seq"
+    path.write_text(LINE.format(far="inf", glass="ODD", more=""))
+    with pytest.raises(FormatError, match="ODD"):
+        read_codev(path)

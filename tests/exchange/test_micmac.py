@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import FormatError, UsageError
-from reseau.exchange import read_network
+from reseau.exchange import export_calibration, import_calibration, read_network
 from reseau.optics.poses import rotation_matrix
 
 # A calibration, an orientation, and points that MicMac projects with both (``Verif``), from its test data.
@@ -152,3 +152,27 @@ def test_what_cannot_be_read_is_said(old: str, new: str, said: str, tmp_path: Pa
     text = CALIBRATION.replace(old, new) if old else CALIBRATION
     with pytest.raises(FormatError, match=said):
         read_network(project(tmp_path, text))
+
+
+@pytest.mark.parametrize("convention", ["eConvApero_DistM2C", "eConvApero_DistC2M"])
+def test_an_interior_orientation_is_written_back_as_it_is(tmp_path: Path, convention: str) -> None:
+    file, again = tmp_path / "AutoCal.xml", tmp_path / "again.xml"
+    radial = CALIBRATION.replace("<CoeffDist>-2.41801731114306416e-27</CoeffDist>", "")
+    file.write_text(radial.replace("eConvApero_DistM2C", convention))
+    given = import_calibration(file)
+    done = export_calibration(given, "micmac", again)
+    assert done.rms_px == 0
+    back = import_calibration(again)
+    for name, quantity in given.parameters.items():
+        assert back.parameters[name].value == pytest.approx(quantity.value, rel=1e-14)
+    assert back.model == given.model
+
+
+def test_with_the_width_of_the_sensor_lengths_are_in_millimetres(tmp_path: Path) -> None:
+    own = project(tmp_path)
+    tie(tmp_path, "a", "b", "1 2 3 4")
+    plain, sized = read_network(own).cameras[0], read_network(own, sensor_width=36.0).cameras[0]
+    assert sized.parameters["c"] == pytest.approx(2112.04115765381403 * 36 / 1728, rel=1e-12)
+    assert sized.unit_of("c") == "mm"
+    uv = np.array([[0.1, -0.2], [-0.3, 0.2]])
+    assert np.abs(sized.bare_mapping()(uv) - plain.bare_mapping()(uv)).max() < 1e-9

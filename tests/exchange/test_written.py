@@ -146,3 +146,21 @@ def test_the_command_exports_and_refuses_other_suffixes(
     assert "block.ply: has the suffix" in capsys.readouterr().err
     with pytest.raises(UsageError):
         write_network(result, tmp_path / "block.ply")
+
+
+@pytest.mark.parametrize(
+    ("line", "model"),
+    [("SIMPLE_RADIAL 1280 960 900 640 480 0.01", "SIMPLE_RADIAL"),
+     ("RADIAL 1280 960 900 640 480 0.01 -0.002", "RADIAL"),
+     ("OPENCV 1280 960 900 905 640 480 0.01 -0.002 1e-4 2e-4", "OPENCV")],
+)  # fmt: skip
+def test_a_model_of_colmap_is_written_back_as_that_model(tmp_path: Path, line: str, model: str) -> None:
+    (tmp_path / "in").mkdir()
+    write_network(adjust_network(example_network()).required(), tmp_path / "in")
+    (tmp_path / "in" / "cameras.txt").write_text(f"1 {line}\n")
+    network = read_network(tmp_path / "in")
+    (camera,) = network.cameras
+    network = replace(network, cameras=(replace(camera, free=camera.free[:1]),))
+    written = write_network(adjust_network(network).required(), tmp_path / "out")
+    assert [each.greatest_px for each in written.values()] == [0.0]
+    assert (tmp_path / "out" / "cameras.txt").read_text().split()[1] == model

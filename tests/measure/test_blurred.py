@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -221,3 +222,22 @@ def test_errors_are_as_large_as_sigmas_say() -> None:
         found = measure_blurred(photograph(2.0, seed), camera(), ["1"], [target()])
         errors.append((found.xy[0] - blurs.principal_pixel(CENTRE)) / np.sqrt(np.diagonal(found.cov[0])))
     assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.2
+
+
+def test_photon_noise_is_not_a_wrong_lens_and_a_wrong_focus_is() -> None:
+    view, at = ThinLens(50.0, 12.5, 52.9, SensorPlane((0.01, 0.01), (40.0, 40.0))), np.arange(81.0)
+    wrong = replace(view, image_distance=52.95)
+    disk = PlaneTarget(np.array([0.0, 0, 1000]), np.eye(3)[:, :2], Outline.circle(2.0, 0.05))
+    image = ray_image(view, disk, PupilElements.gauss(8))
+    light = 5 + 150 * image.formed(image.point, 0.5, at, at, PixelResponse(), bright=True)
+    right, other = [], []
+    for seed in range(40):
+        # 5.6 times as much noise in the middle of the disk as beside it.
+        noise = np.random.default_rng(seed).normal(size=light.shape) * np.sqrt(light / 20)
+        options = BlurredOptions("bright", rings=8)
+        for lens, notes in ((view, right), (wrong, other)):
+            found = measure_blurred(Frame(light + noise, 255.0), lens, ["1"], [disk], options)
+            assert found.ok.all()
+            notes.append(any("lens, focus or aperture" in str(note) for note in found.notes))
+    assert sum(right) <= 3  # of 40; 2 % are expected, and more than three with a probability of 0.8 %
+    assert sum(other) >= 38

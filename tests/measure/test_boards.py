@@ -21,7 +21,7 @@ from reseau.io import BoardDesign
 from reseau.io.images import read_image
 from reseau.measure import BoardOptions, BoardResult, measure_board, measure_tags, puzzle_part
 from reseau.measure.boards.placement import numbered
-from reseau.measure.testfield.lattice_mapping import started
+from reseau.measure.plane.lattice_mapping import started
 
 from .. import kept
 from .board_pictures import picture

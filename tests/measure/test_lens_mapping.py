@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from reseau.core.data import Array
-from reseau.measure.reseau.lens_mapping import lens_through, mapping_through
-from reseau.measure.reseau.plane_lens import distorted, moving, projected
-from reseau.measure.reseau.plane_mapping import plane_through
-from reseau.measure.testfield.lattice_mapping import second_order, slope_of
+from reseau.measure.plane.lattice_mapping import second_order, slope_of
+from reseau.measure.plane.lens_mapping import lens_through, mapping_through
+from reseau.measure.plane.plane_lens import distorted, moving, projected
+from reseau.measure.plane.plane_mapping import plane_through
 
 SHAPE, FOCAL, NOISE_PX = (1024, 1024), 380.0, 0.3
 

@@ -54,9 +54,11 @@ def test_excluded_pixels_are_not_used():
     )
 
 
-def test_too_few_residuals_give_no_noise_model():
+def test_few_residuals_are_enough_where_their_noise_grows_visibly():
     pixels, residuals = windows(A, B)
-    assert grey_variance(pixels, STARTS[:2], residuals[:2]) is None
+    assert grey_variance(pixels, STARTS[:2], residuals[:2])[1] == pytest.approx(B, rel=0.5)
+    even, residuals = windows(A, 0.0)
+    assert grey_variance(even, STARTS[:2], residuals[:2]) is None
 
 
 def test_weights_are_inverse_to_the_variances_of_a_patch_and_bounded():

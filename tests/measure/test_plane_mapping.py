@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from reseau.core.data import Array
-from reseau.measure.reseau.plane_mapping import (
+from reseau.measure.plane.plane_mapping import (
     STRENGTHS,
     fisheye_of,
     plane_through,

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from reseau.bundle import camera_mapping
-from reseau.calibration import Calibration, CameraMapping, Use, calibration_difference, projection_field
+from reseau.calibration import Calibration, CameraMapping, calibration_difference, projection_field
+from reseau.calibration.assessment import Use
 from reseau.core.data import ImagePoints
 from reseau.core.failure import Code
 from reseau.designs import coded_sheet

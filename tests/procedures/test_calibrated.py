@@ -15,7 +15,8 @@ import pytest
 
 from reseau.api import Adjusted
 from reseau.bundle import Result
-from reseau.calibration import Calibration, Use
+from reseau.calibration import Calibration
+from reseau.calibration.assessment import Use
 from reseau.core.data import ImagePoints
 from reseau.core.errors import UsageError
 from reseau.core.failure import Failure

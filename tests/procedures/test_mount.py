@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from reseau.capture import paper_steps
 from reseau.core.failure import Code, Failure
 from reseau.optics.poses import rotation_matrix
-from reseau.procedures.turntable import Mount
+from reseau.procedures.testfield import Mount
 
 POSITIONS = [step.position | {"z": 10.0 * (k % 3)} for k, step in enumerate(paper_steps())]
 

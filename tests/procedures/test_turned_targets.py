@@ -15,7 +15,7 @@ from reseau.procedures.calibration import calibrate_camera
 from reseau.procedures.calibration_options import CameraOptions
 from reseau.procedures.exposures import Taken
 from reseau.procedures.target_measurement import MeasuredPhotograph, Photograph
-from reseau.procedures.turned_targets import ways_to_turn
+from reseau.procedures.told_target import ways_to_turn
 
 SIGMA, TRUE = 0.01, {"fx": 700.0, "fy": 702.0, "cx": 402.0, "cy": 297.0}
 SIZE = (800, 600)

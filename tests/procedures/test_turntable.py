@@ -12,7 +12,7 @@ from reseau.optics import Brown, PixelGrid
 from reseau.optics.poses import project
 from reseau.procedures.calibration import calibrate_camera
 from reseau.procedures.calibration_options import CameraOptions
-from reseau.procedures.turntable import Mount
+from reseau.procedures.testfield import Mount
 
 SIGMA = 0.006
 CAMERA = Brown(side="object", grid=PixelGrid(240, 240, (0.027, 0.027))).with_values({"c": 57.5, "K1": 1.2e-3})

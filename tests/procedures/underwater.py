@@ -85,7 +85,7 @@ def project(seed: int = 0, noise: float = 1.0, columns: int = 4) -> Project:
                 continue
             at = np.rint(formed.point).astype(int)
             pixels = np.arange(-40, 41.0)
-            share = formed.gridded.image(formed.point, 0.5, at[0] + pixels, at[1] + pixels, PixelResponse())
+            share = formed.formed(formed.point, 0.5, at[0] + pixels, at[1] + pixels, PixelResponse())
             image[at[1] - 40 : at[1] + 41, at[0] - 40 : at[0] + 41] += 140 * share
             centroid = formed.point + formed.centroid
             rows.append((i, k, *formed.point, *centroid))

@@ -18,9 +18,10 @@ from reseau.core.version import __version__
 from reseau.optics import PixelGrid
 from reseau.optics.cameras import camera_model
 from reseau.procedures.assessment import assess
-from reseau.report import applied_report, oscilloscope_report
+from reseau.report import oscilloscope_report
 from reseau.report.bundle import bundle_report
 from reseau.report.bundle_figures import _radial, distortion_figure
+from reseau.report.page import applied_report
 from reseau.report.template import TEMPLATES, environment
 
 from .conftest import Bench

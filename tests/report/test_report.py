@@ -16,10 +16,10 @@ from reseau.optics import RationalPolynomial
 from reseau.procedures.oscilloscope import PhotoI, PhotoII
 from reseau.report import oscilloscope_report
 from reseau.report.comparison import compare_with_truth
-from reseau.report.equations import equations
 from reseau.report.figures import nice
 from reseau.report.maps import body_map
 from reseau.report.overview import overview_png
+from reseau.report.photo_ii import equations
 from reseau.report.truth import Known
 
 from .conftest import Bench

@@ -13,7 +13,8 @@ from scipy.special import ndtr
 from reseau.core.failure import Code, Failure
 from reseau.core.provenance import Provenance
 from reseau.report.sensor import mtf_figure, sensor_report
-from reseau.sensor import EdgeSpread, Level, SensorResult, SensorSeries, calibrate_sensor, with_edge
+from reseau.sensor import EdgeSpread, Level, SensorSeries, calibrate_sensor
+from reseau.sensor.sensor import SensorResult, with_edge
 from reseau_sims.pixels import PixelSensor
 
 EXPOSURES = (100.0, 1000.0, 2000.0, 4000.0, 6000.0, 8000.0, 12000.0, 17000.0)

@@ -13,7 +13,8 @@ from reseau.cli import run
 from reseau.core.data import Array, Frame
 from reseau.core.failure import Code, Failure
 from reseau.io.images import write_image
-from reseau.sensor import EdgeSpread, find_edges, measure_edges
+from reseau.sensor import EdgeSpread, measure_edges
+from reseau.sensor.chart import find_edges
 
 FINE = 8
 

@@ -7,11 +7,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from reseau.calibration import Calibration, SensorCorrection
+from reseau.calibration import Calibration
+from reseau.calibration.sensor import SensorCorrection
 from reseau.core.data import Array, Frame
 from reseau.core.errors import EstimationError, FormatError, UsageError
 from reseau.core.failure import Failure
-from reseau.sensor import Level, SensorResult, SensorSeries, calibrate_sensor
+from reseau.sensor import Level, SensorSeries, calibrate_sensor
+from reseau.sensor.sensor import SensorResult
 from reseau_sims.pixels import PixelSensor
 
 LIGHT = 0.25

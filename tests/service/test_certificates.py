@@ -16,25 +16,18 @@ import pytest
 
 from reseau.adjust import validate
 from reseau.archive import Archive
-from reseau.calibration import Assessment, Calibration, Use
+from reseau.calibration import Calibration
+from reseau.calibration.assessment import Assessment, Use
 from reseau.cli import run
 from reseau.core.data import ImagePoints
 from reseau.core.errors import FormatError, UsageError
 from reseau.service import Configurations
-from reseau.service.certificates import (
-    Certificate,
-    CertificateData,
-    certify,
-    dcc_of,
-    html_of,
-    measurement_budget,
-    pdf_of,
-    sign,
-    simulate_measurement,
-    uncertainty_of,
-    verify,
-)
-from reseau.service.certificates.units import digital_unit
+from reseau.service.certificates import CertificateData, certify, html_of, measurement_budget, verify
+from reseau.service.certificates.budget import simulate_measurement, uncertainty_of
+from reseau.service.certificates.certificate import Certificate
+from reseau.service.certificates.dcc import dcc_of, digital_unit
+from reseau.service.certificates.page import pdf_of
+from reseau.service.certificates.signature import sign
 
 from .test_inforce import RULES, SIGMA, camera, started
 

@@ -14,8 +14,10 @@ from reseau.calibration import read_calibration
 from reseau.cli import run
 from reseau.core.data import ImagePoints
 from reseau.core.errors import UsageError
-from reseau.service import CalibrationFunction, Configurations
-from reseau.service.certificates import measurement_budget, simulate_measurement, uncertainty_of
+from reseau.service import Configurations
+from reseau.service.certificates import measurement_budget
+from reseau.service.certificates.budget import simulate_measurement, uncertainty_of
+from reseau.service.covariates import CalibrationFunction
 
 from .test_inforce import RULES, START, camera
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from reseau.archive import Archive
-from reseau.calibration import Calibration, Covariance, Quantity
+from reseau.calibration import Calibration
+from reseau.calibration.document import Covariance, Quantity
 from reseau.cli import run
 from reseau.core.errors import FormatError, UsageError
 from reseau.service import AcceptanceRules, Configurations, Limits, judge

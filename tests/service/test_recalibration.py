@@ -20,7 +20,8 @@ import pytest
 from reseau.archive import Archive
 from reseau.cli import run
 from reseau.core.errors import InputError, StateError, UsageError
-from reseau.service import AcceptanceRules, Alarms, Configurations, Limits, Schedule, Schedules, sender
+from reseau.service import AcceptanceRules, Alarms, Configurations, Limits, Schedule, Schedules
+from reseau.service.alarms import sender
 
 from ..capture.fieldrig import TESTFIELD, FieldRig, enter, write_inputs
 from .test_inforce import RULES as CAMERA_RULES

@@ -14,8 +14,8 @@ import pytest
 
 from reseau.archive import Archive
 from reseau.core.errors import EstimationError, FormatError, StateError, UsageError
-from reseau.service import Configurations, Recurrence, Run, Schedule, Schedules
-from reseau.service.recurrence import CalendarEvent, calendar_feed
+from reseau.service import Configurations, Run, Schedule, Schedules
+from reseau.service.schedule import CalendarEvent, Recurrence, calendar_feed
 
 ZONES = (
     "UTC",

@@ -53,13 +53,13 @@ for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
 axes.view_init(22, -60)
 
 # %%
-# COLMAP's camera model has other parameters, and some more of them; the residuals are the same, and the
-# focal length is the principal distance in pixels.
+# COLMAP's camera model has other parameters, in pixels; the residuals are the same, and the principal
+# distance is that before.
 (camera,) = found.cameras.values()
 print(camera)
-sigma = camera.sigma[camera.parameters.index("fx")]
+sigma = camera.sigma[camera.parameters.index("c")]
 focal_px = first.cameras["camera"]["c"] / 0.01
-print(f"focal length {camera['fx']:.2f} ± {sigma:.2f} px, before {focal_px:.2f} px")
-assert abs(camera["fx"] - focal_px) < 3 * sigma
+print(f"focal length {camera['c']:.2f} ± {sigma:.2f} px, before {focal_px:.2f} px")
+assert abs(camera["c"] - focal_px) < 3 * sigma
 print(f"standard deviation of the image coordinates {found.sigma0:.3f} px (the files state none: 1 px)")
 assert 0.04 < found.sigma0 < 0.06

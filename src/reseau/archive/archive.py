@@ -19,8 +19,6 @@ from .objects import LocalObjects, Objects, objects_at
 from .records import Note, SessionSummary, utc, utc_now
 from .session import INPUT, Session
 
-__all__ = ["Archive"]
-
 _INDEX, _OBJECTS = "index.sqlite", "objects"
 
 

@@ -14,8 +14,6 @@ from ..core.provenance import canonical_json
 from .records import ArchivedFrame
 from .session import Session
 
-__all__ = ["describe", "export"]
-
 _SCHEMA = "reseau-session/1"
 
 

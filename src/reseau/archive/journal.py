@@ -17,8 +17,6 @@ from sqlalchemy.engine import Engine
 from . import schema
 from .records import utc, utc_now
 
-__all__ = ["Entry", "Journal", "journals"]
-
 
 @dataclass(frozen=True)
 class Entry:

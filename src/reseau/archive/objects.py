@@ -15,8 +15,6 @@ from typing import Any, BinaryIO, Protocol
 from ..core.errors import ArchiveError
 from ..core.provenance import sha256_of
 
-__all__ = ["LocalObjects", "Objects", "RemoteObjects", "objects_at"]
-
 _LONGEST_WRITE_S = 600.0
 """Time after which a temporary file is no longer that of a process that is writing it."""
 _MOST_CHECKED = 10_000

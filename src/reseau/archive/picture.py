@@ -18,8 +18,6 @@ from ..core.tone import ToneCurve
 from ..io.images import luma
 from ..io.scans import CHANNELS, Scan, scan_of
 
-__all__ = ["frame_of", "scan_in", "tiff_of"]
-
 _SCHEMA = "reseau-frame/1"
 
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
-__all__ = ["ArchivedFrame", "ArchivedResult", "Note", "SessionSummary", "Verdict", "utc", "utc_now"]
-
 
 @dataclass(frozen=True)
 class Verdict:

@@ -18,24 +18,6 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 
 from ..core.errors import ArchiveError
 
-__all__ = [
-    "connected",
-    "ends",
-    "entries",
-    "events",
-    "extend",
-    "extended",
-    "faults",
-    "frames",
-    "inputs",
-    "insert_new",
-    "make",
-    "metadata",
-    "results",
-    "sessions",
-    "verdicts",
-]
-
 metadata = sa.MetaData()
 
 _TEXT, _JSON, _TIME = sa.Text, sa.JSON, sa.DateTime(timezone=True)

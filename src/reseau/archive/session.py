@@ -21,8 +21,6 @@ from .objects import Objects
 from .picture import frame_of, scan_in, tiff_of
 from .records import ArchivedFrame, ArchivedResult, Verdict, utc, utc_now
 
-__all__ = ["INPUT", "Session"]
-
 INPUT = "input"
 """Kind of the input files of a session."""
 

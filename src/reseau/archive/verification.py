@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from ..core.errors import ArchiveError
 from .archive import Archive
 
-__all__ = ["Verified", "verify"]
-
 
 @dataclass(frozen=True)
 class Verified:

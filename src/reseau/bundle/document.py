@@ -36,10 +36,10 @@ Matrix = tuple[tuple[float, ...], ...]
 
 
 class Estimate(Strict):
-    """A parameter with its standard deviation; zero for held parameters."""
+    """A parameter with its standard deviation; zero for held parameters, null where it is not determined."""
 
     value: float
-    sigma: float
+    sigma: float | None
 
 
 class Correlation(Strict):
@@ -430,7 +430,7 @@ def _camera(result: Result, c: int) -> CameraResult:
     camera, found = result.network.cameras[c], result.camera(c)
     held = {name: Estimate(value=value, sigma=0.0) for name, value in camera.parameters.items()}
     estimated = {
-        name: Estimate(value=value, sigma=s)
+        name: Estimate(value=value, sigma=_number(s))
         for name, value, s in zip(found.parameters, found.values.tolist(), found.sigma.tolist(), strict=True)
     }
     degrees = _column(found.dof) if found.dof is not None else (None,) * len(found.parameters)

@@ -24,7 +24,6 @@ from ..optics import Pose
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Assessment", "Cause", "ErrorMap", "NextPhotograph", "Use", "required_use", "two_digits"]
 
 _DIGITS, _FINE = 4, 5
 """Significant digits of the errors in a file; places that are drawn for each of a map."""

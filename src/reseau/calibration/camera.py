@@ -24,19 +24,6 @@ from .mapping import CalibratedMapping, Target, extent_of, reasons
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = [
-    "CameraMapping",
-    "ProjectionField",
-    "by_rotation",
-    "corners_of",
-    "options_of",
-    "places",
-    "projection_field",
-    "projection_slopes",
-    "reach",
-    "referred",
-    "worst",
-]
 
 _KEYS = ("model", "width", "height", "pitch_mm", "additional", "shutter")
 """Keys of the model in a file; the others are options of the camera model."""

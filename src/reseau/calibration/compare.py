@@ -23,7 +23,6 @@ from .camera import CameraMapping, by_rotation, places, referred, worst
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["FieldDifference", "calibration_difference"]
 
 # Standard deviations, relative to the largest, that are rounding errors.
 _RANK = 1e-6

@@ -12,8 +12,6 @@ from ..optics.cameras import convert
 from .camera import CameraMapping, options_of
 from .document import Calibration, Covariance, Quantity
 
-__all__ = ["in_model_of"]
-
 
 def in_model_of(calibration: Calibration, like: Calibration) -> tuple[Calibration, float]:
     """Convert the calibration of a camera to the model of another one.

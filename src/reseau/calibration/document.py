@@ -29,19 +29,6 @@ if TYPE_CHECKING:
     from ..exchange.calibrations import Exported
     from .compare import FieldDifference
 
-__all__ = [
-    "Calibration",
-    "CameraModel",
-    "Covariance",
-    "FiducialModel",
-    "FilmFrameModel",
-    "Kind",
-    "OscilloscopeModel",
-    "Place",
-    "Quantity",
-    "SensorModel",
-    "readable_as",
-]
 
 Kind = Literal["oscilloscope", "camera", "film_frame", "fiducials", "sensor"]
 _IN_WORDS: dict[Kind, str] = {

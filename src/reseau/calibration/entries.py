@@ -11,8 +11,6 @@ from ..optics import RationalPolynomial, Similarity
 from ..optics.polynomials import monomials
 from .document import Calibration
 
-__all__ = ["system_from_dict", "system_to_dict", "tests_of", "unit_of", "with_stored_values"]
-
 
 def tests_of(elimination: Elimination) -> tuple[dict[str, Any], ...]:
     """Tests of every coefficient, dropped ones first in their order, as in a calibration file."""

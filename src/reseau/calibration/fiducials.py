@@ -15,8 +15,6 @@ from .document import Calibration, Covariance, FiducialModel, Quantity, readable
 from .film import TRANSFORMS
 from .mapping import CalibratedMapping, Target, reasons
 
-__all__ = ["FiducialMapping", "calibration_of_fiducials", "film_axes", "scan_coordinates", "scan_pixels"]
-
 
 def film_axes(rotation: int, mirrored: bool) -> Array:
     """Mapping (2, 2) from camera coordinates (x right, y up) to pixels (y down) at 1 px/mm.

@@ -14,8 +14,6 @@ from ..optics import RationalPolynomial
 from .document import Calibration, Covariance, FilmFrameModel, Quantity, readable_as
 from .mapping import CalibratedMapping, Target, reasons
 
-__all__ = ["TRANSFORMS", "FilmFrameMapping", "calibration_of_frame", "photo_coordinates"]
-
 _STEP_PX = 1e-3
 """Of the central differences by the corners; the coordinates are almost linear in them."""
 TRANSFORMS = {

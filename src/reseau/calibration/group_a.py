@@ -19,8 +19,6 @@ from .document import Calibration, Covariance, OscilloscopeModel, Quantity
 from .entries import system_from_dict, system_to_dict, unit_of, with_stored_values
 from .mapping import CalibratedMapping, Target, carried, extent_of, reasons
 
-__all__ = ["GROUPS_A_AND_B", "GROUP_A", "CameraCorrection", "Datum", "FitRecord"]
-
 GROUP_A: Final = "oscilloscope group A"
 GROUPS_A_AND_B = f"{GROUP_A} and group B"
 """Names of the models in calibration files."""

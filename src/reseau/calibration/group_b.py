@@ -22,8 +22,6 @@ from .group_a import GROUPS_A_AND_B, CameraCorrection, FitRecord
 from .local_model import LocalModel
 from .mapping import BEYOND, CalibratedMapping, Target, beyond, outside
 
-__all__ = ["InstrumentCorrection", "ObjectPlane"]
-
 _ROUNDS = 12
 
 

@@ -10,8 +10,6 @@ import numpy as np
 from ..core.data import Array
 from ..optics.field import SmoothField
 
-__all__ = ["LocalModel"]
-
 _ALPHA = 0.01
 """Level, per axis, at which a local model must be significant: subtracted without need, it adds noise."""
 

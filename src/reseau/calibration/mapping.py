@@ -14,7 +14,6 @@ from ..optics import PlaneMapping
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["BEYOND", "CalibratedMapping", "Target", "beyond", "carried"]
 
 Target = Literal["points", "images", "scans", "frames"]
 

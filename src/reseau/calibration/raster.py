@@ -24,8 +24,6 @@ from .film import FilmFrameMapping
 from .group_a import CameraCorrection
 from .mapping import BEYOND, CalibratedMapping
 
-__all__ = ["CorrectedImage", "planes_of", "undistort", "undistorted_camera", "write_corrected"]
-
 _BAND = 256
 _ROUNDING = 1e-6
 """Share of a pixel by which an extent may be smaller than a whole number of pixels through rounding."""

@@ -12,8 +12,6 @@ from .document import Calibration
 from .fiducials import calibration_of_fiducials
 from .film import calibration_of_frame
 
-__all__ = ["parse_calibration", "read_calibration"]
-
 
 def read_calibration(path: Path | str) -> Calibration:
     """Read a calibration of any kind.
@@ -39,7 +37,7 @@ def read_calibration(path: Path | str) -> Calibration:
     Examples
     --------
     >>> import tempfile
-    >>> from reseau.calibration import Covariance, Quantity
+    >>> from reseau.calibration.document import Covariance, Quantity
     >>> camera = Calibration(
     ...     kind="camera", name="ideal", sigma0=None, redundancy=0,
     ...     model={"model": "opencv", "width": 640, "height": 480, "pitch_mm": [1.0, 1.0]},

@@ -19,7 +19,6 @@ from .mapping import CalibratedMapping, Target
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Fields", "SensorCorrection", "packed", "unpacked"]
 
 _STEPS = 65535
 

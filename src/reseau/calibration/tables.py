@@ -21,8 +21,6 @@ from ..io.stacks import open_video
 from ..optics.resampling import on_lattice
 from .raster import CorrectedImage
 
-__all__ = ["remap_tables", "undistort_video", "write_tables"]
-
 _CODECS = {".avi": "MJPG", ".mkv": "mp4v", ".mp4": "mp4v", ".mov": "mp4v", ".m4v": "mp4v"}
 _NOWHERE = 65535
 """Beyond every image: ffmpeg fills such pixels."""

@@ -19,7 +19,8 @@ import numpy as np
 from bluesky import Msg
 from bluesky import plan_stubs as bps
 
-from ..archive import ArchivedFrame, Session
+from ..archive import Session
+from ..archive.records import ArchivedFrame
 from ..core.data import Frame
 from ..core.errors import (
     ConnectionLost,
@@ -44,8 +45,6 @@ from .bench import ROLES, Bench
 from .checks import Limits, Readiness, readiness
 from .judging import Judge, Procedure, Watch
 from .steps import Step
-
-__all__ = ["Acquisition", "Plan"]
 
 T = TypeVar("T")
 _TRIES = 4

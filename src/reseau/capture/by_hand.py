@@ -9,8 +9,6 @@ from ..core.errors import InstrumentError, UsageError
 from ..instruments import Turntable
 from ..instruments.protocols import Movable
 
-__all__ = ["AxisReport", "axes_of", "axis_of", "check_reach", "home", "move", "targets"]
-
 
 @dataclass(frozen=True)
 class AxisReport:

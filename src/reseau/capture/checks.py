@@ -13,18 +13,6 @@ import scipy
 from ..core.data import Array, Frame
 from ..core.errors import UsageError
 
-__all__ = [
-    "Limits",
-    "Readiness",
-    "edge_sigma",
-    "exposure_fault",
-    "exposure_of",
-    "grey_counts",
-    "readiness",
-    "shift_between",
-]
-
-
 _PIXEL = math.sqrt(1 / 12)
 _REACHES = (6, 12, 24)
 _SMOOTH = 1.5

@@ -21,14 +21,13 @@ from bluesky import plan_stubs as bps
 from bluesky import preprocessors as bpp
 from bluesky.utils import DuringTask, FailedStatus, RunEngineInterrupted
 
-from ..archive import ArchivedResult, Session
+from ..archive import Session
+from ..archive.records import ArchivedResult
 from ..core.errors import InstrumentError, ReseauError
 from ..core.threads import one_thread
 from .acquisition import Acquisition, Plan
 from .judging import Procedure
 from .steps import Step, as_taken
-
-__all__ = ["Control", "Decision", "Rerun", "carry_out", "rerun"]
 
 # An error is reported once, by the exception that is raised; the engine would print it as well.
 logging.getLogger("bluesky").addHandler(logging.NullHandler())
@@ -141,7 +140,7 @@ class Rerun:
 
     Examples
     --------
-    >>> from reseau.archive import ArchivedResult
+    >>> from reseau.archive.records import ArchivedResult
     >>> kept = ArchivedResult(1, "true.csv", "ab12", ".csv", 4, {}, {}, "reseau 0.1")
     >>> Rerun(kept, None, same=False).same
     False

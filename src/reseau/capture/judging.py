@@ -11,14 +11,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
-from ..archive import ArchivedFrame, Session, Verdict
+from ..archive import Session, Verdict
+from ..archive.records import ArchivedFrame
 from ..core.data import Frame
 from ..core.errors import EstimationError, ImageError, StateError
 from ..core.version import __version__
 from .checks import Limits, exposure_fault
 from .steps import Step, as_taken
-
-__all__ = ["Judge", "Procedure", "Watch"]
 
 _MEASURED = "measured"
 """Kind of the notes about what was measured in frames."""

@@ -10,8 +10,6 @@ from ..core.data import Frame
 from ..core.errors import RefusedError, SettingError, UsageError
 from ..instruments import Camera
 
-__all__ = ["LightRule", "Steered", "level_of", "next_light", "steer"]
-
 _SATURATED, _DARK = 0.25, 4.0
 """Factors on the exposure where the percentile is saturated, and where it is black: no more is known then."""
 _NEARER = 5

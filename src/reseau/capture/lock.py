@@ -17,8 +17,6 @@ from typing import IO, Self
 from ..core.errors import StateError
 from ..core.exclusive import lock_file
 
-__all__ = ["BenchLock", "Holder"]
-
 
 @dataclass(frozen=True)
 class Holder:

@@ -21,19 +21,6 @@ from .acquisition import Acquisition, Plan
 from .checks import Limits
 from .steps import Step
 
-__all__ = [
-    "NO_EXPOSURE_LIMITS",
-    "Goal",
-    "SensorSeriesPlan",
-    "frames",
-    "homed",
-    "oscilloscope",
-    "poses",
-    "scan",
-    "sensor",
-    "until",
-]
-
 _LEAST_GAIN = 0.01
 """Least relative decrease of a standard deviation for which another pose is taken."""
 _LEAST_POSES, _MOST_SCATTER = 6, 2.0

@@ -14,8 +14,6 @@ from ..core.environment import Condition
 from ..core.errors import FormatError
 from ..io import read_text
 
-__all__ = ["Step", "as_taken", "at_heights", "paper_steps", "read_steps", "spread"]
-
 TILT, ROLL, CAMERA_ROLL, HEIGHT = "tilt", "roll", "camera_roll", "z"
 """Axes of the testfield mount: φ, κ, κ of the camera (degrees), and the height of the board (mm)."""
 

@@ -20,28 +20,20 @@ from . import (
     archive,
     bench,
     blurred,
-    blurred_network,
     bundle,
     bundle_compare,
     calibrate,
     calibrations,
     capture,
-    capture_own,
-    capture_sensor,
     certificates,
-    compile,
-    demo,
     design,
-    edge,
     export,
-    fiducials,
     measure,
     orient,
-    perforations,
+    program,
     refine,
     remote,
     schedule,
-    schema,
     sensor,
     serve,
     watch,
@@ -58,12 +50,10 @@ app = Commands(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-measure.app.command()(perforations.perforations)
-measure.app.command()(fiducials.fiducials)
+measure.app.command()(orient.perforations)
+measure.app.command()(orient.fiducials)
 measure.app.command()(blurred.blurred)
-measure.app.command()(edge.edge)
-capture.app.command()(capture_sensor.sensor)
-capture.app.command()(capture_own.own)
+measure.app.command()(sensor.edge)
 
 # Help shows the commands in the order of the work.
 _ORDER: dict[str, dict[str, Any]] = {
@@ -72,7 +62,7 @@ _ORDER: dict[str, dict[str, Any]] = {
         "measure": measure.app,
         "refine": refine.refine,
         "orient": orient.orient,
-        "blurred": blurred_network.blurred_network,
+        "blurred": blurred.blurred_network,
         "bundle": bundle.bundle,
         "sensor": sensor.sensor,
     },
@@ -100,7 +90,7 @@ _ORDER: dict[str, dict[str, Any]] = {
         "remote": remote.app,
         "audit": serve.audit_app,
     },
-    "This program": {"demo": demo.demo, "schema": schema.schema, "compile": compile.compile_loops},
+    "This program": {"demo": program.demo, "schema": program.schema, "compile": program.compile_loops},
 }
 for _panel, _commands in _ORDER.items():
     app.add_panel(_panel, _commands)

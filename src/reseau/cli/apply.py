@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from ..calibration import Calibration
     from ..procedures.applying import Application, View
 
-__all__ = ["apply"]
 
 _IMAGES = (".tif", ".tiff", ".png", ".jpg", ".jpeg")
 _OF = {
@@ -107,7 +106,7 @@ def apply(
     """
     from ..calibration import read_calibration
     from ..core.provenance import sha256_of
-    from ..io import is_points
+    from ..io.reading import is_points
     from ..io.stacks import VIDEOS
     from ..procedures.applying import Application, View
 

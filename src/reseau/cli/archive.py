@@ -12,9 +12,8 @@ from .common import Computing, Place, SessionName, progress, required, say
 from .declared import Commands
 
 if TYPE_CHECKING:
-    from ..archive import ArchivedFrame
+    from ..archive.records import ArchivedFrame
 
-__all__ = ["app"]
 
 app = Commands(help="List, show, verify, export and recompute archived sessions.")
 
@@ -43,7 +42,7 @@ def show(
     as_json: v.AsJson = False,
 ) -> None:
     """Show a session: frames with verdicts, and results with their inputs."""
-    from ..archive import describe
+    from ..archive.exporting import describe
     from ..core.provenance import canonical_json
 
     with place.open() as found:
@@ -71,7 +70,7 @@ def _verdict(frame: ArchivedFrame) -> str:
 @app.command()
 def verify(place: Place, as_json: v.AsJson = False) -> None:
     """Read every file, and compare its SHA-256 with the index."""
-    from ..archive import verify as verified
+    from ..archive.verification import verify as verified
     from ..core.provenance import canonical_json
 
     with place.open() as found, progress("verifying", len(found.files())) as step:
@@ -96,7 +95,7 @@ def export(
     place: Place,
 ) -> None:
     """Export a session to a zip file: frames, results and a table of contents."""
-    from ..archive import export as exported
+    from ..archive.exporting import export as exported
 
     writable(out, ".zip")
     with place.open() as found:

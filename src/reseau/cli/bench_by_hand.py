@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from ..capture import Bench
     from ..instruments import Turntable
 
-__all__ = ["expose", "home", "move", "set_", "status", "stop", "watch"]
 
 _BENCH = Path("bench.toml")
 _PATIENCE_S = 15.0
@@ -268,7 +267,7 @@ def expose(
     as_json: v.AsJson = False,
 ) -> None:
     """Take a frame, and say how it is exposed and how sharp it is; it is not archived."""
-    from ..capture import LightRule, steer
+    from ..capture.lighting import LightRule, steer
     from ..core.provenance import canonical_json
     from ..instruments import Camera
     from ..io import read_text, write_whole
@@ -316,7 +315,7 @@ def _facts(frame: Any) -> dict[str, Any]:
     """Exposure and sharpness of a frame."""
     import math
 
-    from ..capture import edge_sigma, exposure_fault, exposure_of
+    from ..capture.checks import edge_sigma, exposure_fault, exposure_of
 
     saturated, bright = exposure_of(frame)
     edge = edge_sigma(frame)

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from ..bundle import Network, Result
     from ..bundle.network.network import Datum
 
-__all__ = ["bundle"]
 
 # Settings that the provenance always has.
 _ALWAYS = ("reject", "alpha", "components", "eliminate")
@@ -64,6 +63,7 @@ def bundle(
     ] = None,
     sigma_px: v.SigmaPx | None = None,
     control_sigma: v.ControlSigma | None = None,
+    sensor_width: v.SensorWidth | None = None,
     reject: v.Reject = False,
     alpha: Annotated[v.Alpha, "Here of data snooping."] = 0.001,
     components: v.Components | None = None,
@@ -102,7 +102,7 @@ def bundle(
     writable(convert, ".json")
     distance = positive(distance)
     calibrations = _calibrations(camera_calibration or [])
-    read = read_network(network, calibrations, control_sigma=control_sigma)
+    read = read_network(network, calibrations, control_sigma=control_sigma, sensor_width=sensor_width)
     for line in read.notes:
         typer.echo(f"note: {line}", err=True)
     content = _with_settings(read, free, fix, control, datum, sigma_px)
@@ -118,7 +118,8 @@ def bundle(
         result = required(found, network)
     settings = {"reject": reject, "alpha": alpha, "components": components,
                 "eliminate": eliminate, "free": free, "fix": fix, "datum": datum,
-                "sigma_px": sigma_px, "control_sigma": control_sigma, "memory_gb": memory_gb}  # fmt: skip
+                "sigma_px": sigma_px, "control_sigma": control_sigma, "sensor_width": sensor_width,
+                "memory_gb": memory_gb}  # fmt: skip
     settings = {key: value for key, value in settings.items() if key in _ALWAYS or value not in (None, ())}
     more = [*calibrations.values(), *([] if control is None else [control])]
     hashes = {file.name: sha256_of(file) for file in more}

@@ -15,7 +15,6 @@ from .common import say
 if TYPE_CHECKING:
     from ..calibration import CameraMapping, FieldDifference
 
-__all__ = ["compare", "read_lens"]
 
 SCHEMA = "reseau-difference/1"
 

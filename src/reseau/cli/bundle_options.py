@@ -18,19 +18,6 @@ if TYPE_CHECKING:
     )
     from ..calibration import FieldDifference
 
-__all__ = [
-    "level_of",
-    "positive",
-    "say_difference",
-    "say_left_out",
-    "say_model",
-    "say_motion",
-    "say_parameters",
-    "say_priors",
-    "say_refraction",
-    "say_rig",
-    "say_turntable",
-]
 
 # Parameters of a camera that are printed at most.
 _MOST = 60
@@ -71,13 +58,13 @@ def positive(distances: list[float] | None) -> list[float]:
 
 def say_parameters(camera: CameraEstimate) -> None:
     """Print the parameters of a camera, with the formal sigmas where these are smaller."""
-    from ..core.numbers import at_power, measured, power
+    from ..core.numbers import at_power, power
 
     rows = zip(
         camera.parameters, camera.values.tolist(), camera.sigma.tolist(), camera.sigma_formal.tolist(),
-        camera.units, strict=True,
+        camera.texts, strict=True,
     )  # fmt: skip
-    for k, (name, value, sigma, formal, unit) in enumerate(rows):
+    for k, (name, value, sigma, formal, text) in enumerate(rows):
         if k == _MOST and len(camera.parameters) > _MOST + 1:
             say(f"  … and {len(camera.parameters) - k} more\n")
             break
@@ -86,7 +73,7 @@ def say_parameters(camera: CameraEstimate) -> None:
             shown = power(value, sigma)
             ten = "e" + shown.exponent.replace("\u2212", "-") if shown.exponent else ""
             more = f" (formal: {at_power(formal, shown)}{ten})"
-        say(f"  {name:<6} {measured(value, sigma, unit)}{more}\n")
+        say(f"  {name:<6} {text}{more}\n")
 
 
 def say_priors(found: PriorInfluence | None) -> None:
@@ -185,9 +172,15 @@ def say_motion(found: MotionEstimates) -> None:
 
 
 def say_left_out(result: Result) -> None:
-    """Print the image points that data snooping rejected, with their test values."""
+    """Print the rejected image points: gross errors by image, others with their test values."""
+    gross = dict[str, list[str]]()
     for image, point, value, critical in result.rejected_points():
-        say(f"left out: point {point} in image {image}, test value {value:.1f} above {critical:.1f}\n")
+        if value == value:
+            say(f"left out: point {point} in image {image}, test value {value:.1f} above {critical:.1f}\n")
+        else:
+            gross.setdefault(image, []).append(point)
+    for image, points in gross.items():
+        say(f"gross errors left out in image {image}: points {', '.join(points)}\n")
 
 
 def say_model(result: Result) -> None:

@@ -42,13 +42,12 @@ from .common import (
 
 if TYPE_CHECKING:
     from ..bundle import BoardChoice, ModelChoice
-    from ..calibration import CameraMapping, FieldDifference, ProjectionField
+    from ..calibration import CameraMapping, FieldDifference
+    from ..calibration.camera import ProjectionField
     from ..execution import Executor
     from ..procedures.calibrated import Calibrated
     from ..procedures.calibration_options import CalibrationOptions, CameraOptions
     from ..procedures.exposures import Taken
-
-__all__ = ["calibrate"]
 
 
 @dataclass(frozen=True)
@@ -351,7 +350,7 @@ def _executor(images: list[Path], computing: Computing) -> Executor:
     """What measures the photographs; its processes import in the background."""
     from ..core.processes import start_early
     from ..execution import Processes
-    from ..io import is_points
+    from ..io.reading import is_points
 
     modules = ["reseau.procedures.target_measurement"]
     executor = computing.executor(modules, sum(not is_points(path) for path in images))

@@ -18,9 +18,9 @@ from .common import Place, say
 from .declared import Commands
 
 if TYPE_CHECKING:
-    from ..service import Configurations, Decision
+    from ..service import Configurations
+    from ..service.decisions import Decision
 
-__all__ = ["app", "say_decision", "time_of"]
 
 app = Commands(help="Calibrations in force: decide, review, return, history, drift.")
 
@@ -364,7 +364,8 @@ def function(
     It is declined, with exit status 1, where the calibrations do not support it.
     """
     from ..core.failure import Failure
-    from ..service import CovariateTable, FunctionOptions
+    from ..service import CovariateTable
+    from ..service.covariates import FunctionOptions
 
     writable(out, ".json")
     if covariates is None and not recorded:
@@ -394,7 +395,7 @@ def at(
     out: Annotated[v.Out, "Here the calibration (.json)."],
 ) -> None:
     """Write the calibration at given values of the covariates, with what their uncertainties add."""
-    from ..service import CalibrationFunction
+    from ..service.covariates import CalibrationFunction
 
     writable(out, ".json")
     values, sigmas = {}, {}

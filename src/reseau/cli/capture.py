@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import json
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
+from ..core.files import writable
 from ..core.options import Group, Option
-from .acquisition import Where, conduct
+from .acquisition import Where, ask_operator, conduct
 from .blurred import BESIDE_RAYS
+from .common import say
 from .declared import Commands
+from .sensor import event, lines
 
 if TYPE_CHECKING:
+    from ..archive import Session
     from ..capture import Bench
-    from ..sessions import BlurredParameters, TestfieldParameters
-
-__all__ = ["app"]
+    from ..sessions import TestfieldParameters
+    from ..sessions.parameters import BlurredParameters, SensorParameters
 
 app = Commands(
     help="Acquire frames on a bench. Each frame is archived before the next exposure.",
@@ -107,7 +115,8 @@ def coded_field(
     levels = _numbers(on_stage.heights, "--heights")
 
     def parameters(bench: Bench) -> TestfieldParameters:
-        from ..capture import Goal, at_heights, paper_steps, read_steps
+        from ..capture import Goal, paper_steps
+        from ..capture.steps import at_heights, read_steps
         from ..instruments import Turntable
         from ..sessions import TestfieldParameters
 
@@ -141,8 +150,8 @@ def blurred(
     """Record targets on a frame from all poses, measure them by rays, and adjust the network."""
 
     def parameters(bench: Bench) -> BlurredParameters:
-        from ..capture import read_steps
-        from ..sessions import BlurredParameters
+        from ..capture.steps import read_steps
+        from ..sessions.parameters import BlurredParameters
 
         if poses is None:
             raise UsageError("is missing", where="--poses", do="give a CSV with the images of the network")
@@ -213,3 +222,96 @@ def _position(text: str, option: str) -> dict[str, float]:
         raise UsageError(
             f"cannot interpret {text!r}", where=option, do="write axis=value, as tilt=0,roll=0"
         ) from None
+
+
+@app.command()
+def sensor(
+    where: Where,
+    out: Annotated[v.Out | None, "Here the calibration, in addition to the archive."] = None,
+    camera: v.Camera | None = None,
+    levels: Annotated[int, Option("Number of exposure times in light.", least=5)] = 14,
+    frames: Annotated[int, Option("Number of frames for each exposure time.", least=2)] = 8,
+    longest_ms: v.LongestMs = 1000.0,
+    mtf: Annotated[bool, Option("Also measure the MTF, with a slanted edge.")] = False,
+    region: v.Region | None = None,
+    retakes: v.Retakes = 2,
+    yes: Annotated[bool, Option("Do not prompt.")] = False,
+) -> None:
+    """Calibrate a camera's sensor: dark signal, response, linearity, noise, gain, full well, defects, MTF."""
+    writable(out)
+
+    def parameters(bench: Bench) -> SensorParameters:
+        from ..sessions.parameters import SensorParameters
+
+        return SensorParameters.on_bench(
+            bench, camera=camera, levels=levels, frames=frames, longest_us=longest_ms * 1000, edge=mtf,
+            region=region, retakes=retakes,
+        )  # fmt: skip
+
+    def afterwards(session: Session) -> None:
+        _print_result(session, out, where.as_json)
+
+    who = _print_request if yes else ask_operator
+    conduct(where, "sensor", parameters, operator=who, afterwards=afterwards, also_resumed=("out", "yes"))
+
+
+def _print_request(request: str) -> None:
+    """Print a request to the operator without waiting."""
+    typer.echo(request, err=True)
+
+
+def _print_result(session: Session, out: Path | None, as_json: bool) -> None:
+    """Print the calibration, and write it if `out` is given.
+
+    Raises
+    ------
+    EstimationError
+        If an edge was taken but could not be measured; all other results are stored.
+    """
+    from ..core.errors import EstimationError
+    from ..io import write_whole
+    from ..sessions import calibration_of, parameters_of
+
+    found = calibration_of(session)
+    if out is not None:
+        write_whole(out, found.to_json())
+    if as_json:
+        say(json.dumps(event(found)) + "\n")
+    else:
+        say(lines(found) + (f"{out}\n" if out is not None else ""))
+    if getattr(parameters_of(session), "edge_us", None) is not None and "psf" not in found.parameters:
+        raise EstimationError(found.validity.get("edge", "no usable frame"), where="edge")
+
+
+@app.command()
+def own(
+    where: Where,
+    generator: Annotated[
+        Path | None, typer.Option("--generator", "-g", help="Python file with a generator `plan(run, …)`.")
+    ] = None,
+    set_: Annotated[v.Set | None, "Here arguments of the plan, as tilt=30."] = None,
+    retakes: v.Retakes = 0,
+    camera: v.Camera | None = None,
+    table: v.Table | None = None,
+) -> None:
+    """Carry out your own plan: a Python generator, stored with the session."""
+    values = dict(_value(text) for text in set_ or ())
+    if generator is not None:
+        from ..io import read_text
+        from ..sessions.kinds import own_plan
+
+        own_plan(read_text(generator), generator, values)
+    how = {"set": values, "retakes": retakes, "park": {}, "camera": camera}
+    how |= {} if table is None else {"table": table}
+    conduct(where, "own", lambda bench: how, {"generator.py": generator})
+
+
+def _value(text: str) -> tuple[str, Any]:
+    """Parse an argument: its name, and its value in TOML (number, list …) or as text."""
+    name, equals, value = text.partition("=")
+    if not equals or not name.isidentifier():
+        raise UsageError(f"cannot interpret {text!r}", where="--set", do="write name=value, as tilt=30")
+    try:
+        return name, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name, value

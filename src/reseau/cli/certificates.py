@@ -22,10 +22,9 @@ from .declared import Commands
 if TYPE_CHECKING:
     from ..adjust import Simulated, UncertaintyBudget
     from ..calibration import Calibration
-    from ..service import Decision
     from ..service.certificates import CertificateData
+    from ..service.decisions import Decision
 
-__all__ = ["app", "uncertainty"]
 
 app = Commands(help="Certificates of calibrations: create, verify, vocabulary.")
 
@@ -117,7 +116,10 @@ def create(
     A calibration that was rejected, or still needs a review, gets none.
     """
     from ..io import write_whole
-    from ..service.certificates import CertificateData, certify, dcc_of, html_of, pdf_of, sign
+    from ..service.certificates import CertificateData, certify, html_of
+    from ..service.certificates.dcc import dcc_of
+    from ..service.certificates.page import pdf_of
+    from ..service.certificates.signature import sign
 
     kinds = [writable(each, ".pdf", ".xml", ".html").suffix.lower() for each in out]
     if len(set(kinds)) < len(kinds):
@@ -241,13 +243,10 @@ def uncertainty(
     """
     from ..adjust import simulate
     from ..core.provenance import canonical_json
-    from ..io import read_measurement, write_whole
-    from ..service.certificates import (
-        CertificateData,
-        measurement_budget,
-        simulate_measurement,
-        uncertainty_of,
-    )
+    from ..io import write_whole
+    from ..io.reading import read_measurement
+    from ..service.certificates import CertificateData, measurement_budget
+    from ..service.certificates.budget import simulate_measurement, uncertainty_of
 
     writable(out, ".json")
     given: CertificateData | None = None if data is None else CertificateData.read(data)

@@ -19,7 +19,7 @@ from ..core.notice import before_compiling
 
 if TYPE_CHECKING:
     from ..archive import Archive
-    from ..calibration import SensorCorrection
+    from ..calibration.sensor import SensorCorrection
     from ..core.data import Frame, ImagePoints
     from ..core.failure import Failure
     from ..execution import Executor
@@ -92,7 +92,8 @@ class Reading:
     @cached_property
     def correction(self) -> SensorCorrection | None:
         """The correction of the sensor, which is read once for all frames of a command."""
-        from ..calibration import Calibration, SensorCorrection
+        from ..calibration import Calibration
+        from ..calibration.sensor import SensorCorrection
 
         return (
             None if self.sensor is None else SensorCorrection.from_calibration(Calibration.read(self.sensor))
@@ -131,7 +132,7 @@ def orientation(mirrored: bool | None, max_rotation_deg: float | None) -> dict[s
 
 def read_photo(path: Path) -> Frame | ImagePoints:
     """Read an image, or image coordinates."""
-    from ..io import is_points, read_measurement
+    from ..io.reading import is_points, read_measurement
 
     return read_measurement(path).image_points() if is_points(path) else Reading().frame(path)
 
@@ -165,7 +166,7 @@ def overlay_files(path: Path, images: Sequence[Path]) -> dict[Path, Path]:
     InputError
         If the folder does not exist or cannot be created.
     """
-    from ..io import is_points
+    from ..io.reading import is_points
 
     where = "--overlay"
     shown = list(dict.fromkeys(image for image in images if not is_points(image)))

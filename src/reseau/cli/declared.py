@@ -22,8 +22,6 @@ from typer.models import ArgumentInfo, OptionInfo
 from ..core.errors import UsageError
 from ..core.options import Declared, Group, declaration
 
-__all__ = ["Commands", "declared"]
-
 _VALUES = {int: "INTEGER", float: "NUMBER", str: "TEXT", Path: "PATH", bool: ""}
 
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from ..designs.drawing import Drawable
     from ..io import BoardDesign, ReseauDesign, TestfieldDesign
 
-__all__ = ["app"]
-
 
 app = Commands(help="Draw a target for printing in true size, and write its coordinates.")
 

@@ -12,8 +12,6 @@ from ..core.errors import UsageError
 from ..core.files import writable
 from .common import say
 
-__all__ = ["export"]
-
 _SAME, _FAR = 1e-5, 0.3
 """Differences (px) that are rounding errors, and above which another format is proposed."""
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from ..io import ReseauMeasurement
     from ..measure.points import Measured
 
-__all__ = ["BY_DESIGN", "NOT_NOMINAL", "Image", "Output", "Task", "app", "measurement_csv"]
-
 
 BY_DESIGN = "Default: determined by the design if it is not symmetric. Not used with nominal positions."
 NOT_NOMINAL = "Not used with nominal positions."
@@ -187,7 +185,7 @@ class Task:
 
     def run(self, reading: Reading, measure: Callable[[Frame], Any]) -> None:
         """Measure the image and deliver the result."""
-        from ..io import is_points, read_measurement
+        from ..io.reading import is_points, read_measurement
 
         if is_points(self.image):
             self._deliver(read_measurement(self.image), None)

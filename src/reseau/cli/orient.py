@@ -1,22 +1,23 @@
-"""`reseau orient`: the inner orientation of scanned film frames."""
+"""`reseau orient`, `reseau measure fiducials`, `reseau measure perforations`: photographs on film."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from ..core import vocabulary as v
 from ..core.errors import InputError
+from ..core.files import writable
 from ..core.options import Option
-from .common import Computing, overlay_files, progress, say, say_files_left_out
+from .common import Computing, overlay_files, progress, required, say, say_files_left_out
+from .measure import Output
 
 if TYPE_CHECKING:
-    from ..io import FrameOrientation, RollSummary
+    from ..io import FiducialOrientation, FrameOrientation
+    from ..io.frame import RollSummary
     from ..sessions.film_files import OrientedFiles
-
-__all__ = ["orient"]
 
 
 def orient(
@@ -120,3 +121,175 @@ def _line(document: FrameOrientation) -> str:
     elif document.transform is not None:
         text += f", {document.transform.kind}: no residuals (8 parameters from 4 corners)"
     return text + (f" ({document.why})" if document.why else "") + "\n"
+
+
+def fiducials(
+    scan: Annotated[Path, typer.Argument(help="Scanned photograph with its borders: TIFF, PNG, JPEG.")],
+    design: Annotated[
+        v.Design,
+        "Here the fiducial marks of the camera, fiducial-design/1, or the name of a camera that "
+        "`reseau design fiducials` lists.",
+    ],
+    output: Output,
+    transform: v.Transform = "affine",
+    dpi: v.Dpi | None = None,
+    rotation: Annotated[
+        Literal["0", "90", "180", "270"] | None,
+        typer.Option(
+            help="Rotation of the camera's x-axis in the scan, degrees counter-clockwise. Default: "
+            "determined by the marks if they are not symmetric."
+        ),
+    ] = None,
+    mirrored: Annotated[
+        v.Mirrored | None, "Default: determined by the marks if they are not symmetric."
+    ] = None,
+) -> None:
+    """Measure the fiducial marks of a scanned aerial photograph, and orient it.
+
+    The JSON document is the calibration of the scan for `reseau apply`, which also resamples the picture to
+    millimetres of the camera.
+    """
+    from ..core.failure import Failure
+    from ..core.provenance import sha256_of
+    from ..designs import aerial_camera
+    from ..io import FiducialDesign, write_whole
+    from ..io.images import open_scan, read_image
+    from ..measure.fiducials import FiducialOptions, measure_fiducials
+
+    out, overlay = output.out, output.overlay
+    suffix = ".json" if out is None else writable(out, ".json", ".csv").suffix.lower()
+    drawn = None if overlay is None else overlay_files(overlay, [scan])[scan]
+    named = design.parent == Path() and not design.suffix and not design.exists()
+    camera = aerial_camera(design.name) if named else FiducialDesign.read(design)
+    options = FiducialOptions(dpi, None if rotation is None else int(rotation), mirrored, transform)
+    opened = open_scan(scan)
+    with progress(f"measuring {scan.name}", 1):
+        found = measure_fiducials(opened, camera, options, sha256_of(scan))
+    if drawn is not None and isinstance(found, Failure):
+        found.overlay(read_image(scan), drawn)
+    elif drawn is not None:
+        assert not isinstance(found, Failure)
+        pixels = opened.window(0, opened.height, 0, opened.width)
+        found.overlay(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels, drawn)
+    result = required(found, scan)
+    document = result.document()
+    if out is not None:
+        write_whole(out, document.to_json() if suffix == ".json" else csv_of(document))
+    if output.as_json:
+        say(document.to_json())
+        return
+    _say_marks(document)
+
+
+def csv_of(document: FiducialOrientation) -> str:
+    """Measured marks as CSV ``id,x,y,sx,sy,rho``."""
+    lines = ["id,x,y,sx,sy,rho"]
+    for mark in document.marks:
+        if mark.at is not None:
+            c = mark.at
+            lines.append(f"{mark.id},{c.x:.4f},{c.y:.4f},{c.sx:.4f},{c.sy:.4f},{c.rho:.4f}")
+    return "\n".join(lines) + "\n"
+
+
+def _say_marks(document: FiducialOrientation) -> None:
+    """Describe the orientation: one line for the scan, one for each mark, and notes."""
+    from ..core.numbers import measured
+
+    assert document.transform is not None
+    assert document.px_per_mm is not None
+    good = sum(mark.ok for mark in document.marks)
+    side = "mirrored, " if document.mirrored else ""
+    say(
+        f"{document.image}: {good} of {len(document.marks)} fiducial marks, {side}rotated by "
+        f"{document.rotation_deg}°, {25.4 * document.px_per_mm:.1f} dpi\n"
+    )
+    sigma, kind = document.transform.sigma_mm, document.transform.kind
+    if sigma is None:
+        say(f"{kind}: no residuals\n")
+    else:
+        say(f"{kind}: residuals {1000 * sigma[0]:.2g} µm in X, {1000 * sigma[1]:.2g} µm in Y\n")
+    for mark in document.marks:
+        if mark.at is None:
+            say(f"  {mark.id}: {mark.why}\n")
+            continue
+        x, y = document.transform.residuals_mm[mark.id]
+        c = mark.at
+        say(
+            f"  {mark.id}: x {measured(c.x, c.sx, 'px')}, y {measured(c.y, c.sy, 'px')}, residuals "
+            f"{1000 * x:.1f}, {1000 * y:.1f} µm\n"
+        )
+    for note in document.notes:
+        say(f"note: {note}\n")
+
+
+Box = tuple[float, float, float, float]
+
+
+def perforations(
+    scan: Annotated[Path, typer.Argument(help="Scan of 35 mm film that runs from top to bottom.")],
+    left: Annotated[
+        Box,
+        Option(
+            "Approximate edges of the first perforation of the left row (px).",
+            value="LEFT,TOP,RIGHT,BOTTOM",
+        ),
+    ],
+    right: Annotated[
+        Box,
+        Option(
+            "Approximate edges of the first perforation of the right row (px).",
+            value="LEFT,TOP,RIGHT,BOTTOM",
+        ),
+    ],
+    perforation_px: Annotated[
+        float, typer.Option(min=1.0, help="Approximate pitch of the perforations (px).")
+    ],
+    number: Annotated[v.Number, "Here of perforations in a row, at least 2."],
+    channel: Annotated[v.Channel | None, "Here that with the darkest rims. Default: the last."] = None,
+    reach: Annotated[float, typer.Option(min=1.0, help="Search distance from the given edges (px).")] = 12.0,
+    overlay: v.Overlay | None = None,
+    as_json: v.AsJson = False,
+) -> None:
+    """Measure the perforations of 35 mm film: scale, rotation and perspective of the scan.
+
+    The scale follows from the pitch of 4.75 mm and the distance of the rows of 28.17 mm (ISO 2906).
+    """
+    import numpy as np
+
+    from ..core.errors import UsageError
+    from ..core.numbers import measured
+    from ..core.provenance import canonical_json
+    from ..io.images import open_scan
+    from ..measure.film import film_plane
+    from ..procedures.film_frame import film_scale
+
+    if number < 2:
+        raise UsageError(f"is {number}, not at least 2", where="--number")
+    drawn = None if overlay is None else overlay_files(overlay, [scan])[scan]
+    opened = open_scan(scan)
+    name = channel or opened.channels[-1]
+    if name not in opened.channels:
+        do = f"use {', '.join(opened.channels)}"
+        raise UsageError(f"the scan has no channel {name!r}", where="--channel", do=do)
+    rows = [np.array([*box, perforation_px]) for box in (left, right)]
+    plane = required(film_plane(opened, rows, number, channel=opened.channels.index(name), reach=reach), scan)
+    if drawn is not None:
+        pixels = opened.window(0, opened.height, 0, opened.width)
+        plane.overlay(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels, drawn)
+    found = film_scale(plane)
+    if as_json:
+        document: dict[str, Any] = {
+            "schema": "reseau-film-plane/1",
+            "edges": plane.edges,
+            "rms_px": plane.rms_px,
+            "quantities": {name: each.model_dump() for name, each in found.items()},
+            "values": plane.values.tolist(),
+            "covariance": plane.covariance.tolist(),
+            "centre_px": plane.centre.tolist(),
+            "unit_px": plane.unit,
+        }
+        say(canonical_json(document))
+        return
+    say(f"{scan.name}: {plane.edges} edges of perforations, rms {plane.rms_px:.2g} px\n")
+    for name, each in found.items():
+        say(f"  {name:<14} {measured(each.value, each.sigma, each.unit)}\n")

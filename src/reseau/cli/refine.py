@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from ..procedures.oscilloscope import PhotoI, PhotoII, StillStandard
     from ..procedures.refining import RefineOptions
 
-__all__ = ["refine"]
-
 
 @dataclass(frozen=True)
 class _Files:
@@ -69,7 +67,7 @@ class _Files:
 
     def options(self) -> RefineOptions:
         """Options of the procedure; the points of the body are read."""
-        from ..io import read_measurement
+        from ..io.reading import read_measurement
         from ..measure import PinOptions, ReseauOptions
         from ..procedures.refining import RefineOptions
 
@@ -120,8 +118,8 @@ class _Files:
 
     def frames(self) -> list[Frame | None]:
         """The photographs in their order; None for coordinates."""
-        from ..io import is_points
         from ..io.images import read_image
+        from ..io.reading import is_points
 
         return [None if is_points(path) else read_image(path) for path in self.photographs]
 
@@ -143,7 +141,8 @@ def refine(
     from ..core.failure import Failure
     from ..core.provenance import canonical_json
     from ..core.threads import one_thread
-    from ..io import ReseauDesign, points_document, write_whole
+    from ..io import ReseauDesign, write_whole
+    from ..io.points import points_document
     from ..procedures.refining import Photographs, refine_photographs
 
     writable(out, ".json")

@@ -19,7 +19,6 @@ from .declared import Commands
 if TYPE_CHECKING:
     from ..service.client import Client
 
-__all__ = ["app"]
 
 app = Commands(
     help="A service, by its API: sessions, calibrations, alarms, benches. The token is in RESEAU_TOKEN.",

@@ -22,7 +22,6 @@ from .declared import Commands
 if TYPE_CHECKING:
     from ..service import Run
 
-__all__ = ["alarms", "app", "recalibrate"]
 
 app = Commands(help="Schedules of recalibrations: add, show, export, run.")
 alarms = Commands(help="Alarms: list, acknowledge, send.")
@@ -124,7 +123,8 @@ def run_(
     if not once:
         for each in (signal.SIGTERM, signal.SIGINT):
             signal.signal(each, lambda *_: over.set())
-    from ..service import Alarms, Recalibrations, Schedules, sender
+    from ..service import Alarms, Recalibrations, Schedules
+    from ..service.alarms import sender
 
     deliver = None if not notify else sender(notify, inside or ())
     if not once:
@@ -271,7 +271,8 @@ def send(
     repeat: v.Repeat = 24.0,
 ) -> None:
     """Send the open alarms, each once, and again while nobody acknowledges it."""
-    from ..service import Alarms, sender
+    from ..service import Alarms
+    from ..service.alarms import sender
 
     with place.open() as found:
         sent = Alarms(found).send(sender(notify, inside or ()), timedelta(hours=repeat))

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from ..service.http.service import Service
     from ..service.state import StateFolder
 
-__all__ = ["app", "audit_app", "serve"]
 
 app = Commands(help="The service: users, tokens, backup, upgrade, unit of systemd.")
 user_app = Commands(help="Users of the service.")

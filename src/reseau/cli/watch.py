@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ..capture import Bench
     from ..core.data import Frame
 
-__all__ = ["watch"]
-
 
 def watch(
     design: v.Design,
@@ -42,7 +40,7 @@ def watch(
     import time
     import webbrowser
 
-    from ..capture import steer
+    from ..capture.lighting import steer
     from ..core.errors import InputError, InstrumentError
     from ..exchange import read_target
     from ..instruments import Camera

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from .compiled import kernel
 
-__all__ = ["assign"]
-
 
 @kernel
 def assign(out: NDArray[Any], values: NDArray[Any]) -> None:

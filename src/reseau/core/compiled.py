@@ -11,6 +11,9 @@ Machine code is kept in one file for each loop, types of its arguments and proce
 2. the package, where it can be written to;
 3. the user's folder of caches, for packages that belong to someone else. What is in the package is read.
 
+A wheel brings machine code for the usual processors of its platform (``DELIVERED``), which is read where the
+processor has what they have; see ``building/wheels.py``.
+
 A file is found by a digest of what was compiled: the instructions and constants of the loop and of all that
 it calls. So code that was changed never runs in its old form, and a copy, another installation or a checkout
 with other times of its files finds what is there. A process waits for what another one compiles.
@@ -28,6 +31,7 @@ import inspect
 import json
 import os
 import pickle
+import platform
 import sys
 import threading
 import time
@@ -46,18 +50,6 @@ from .exclusive import lock_file
 from .files import write_whole
 from .notice import compiles
 
-__all__ = [
-    "Compiled",
-    "Instruction",
-    "Kernel",
-    "compiled",
-    "folders",
-    "kernel",
-    "listed",
-    "named",
-    "types_of",
-]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -66,6 +58,16 @@ _ALLOCATING = {"array", "copy", "empty", "empty_like", "full", "ones", "zeros", 
 _PATIENCE = 60.0
 """Seconds for which a process waits for what another one compiles, before it compiles itself."""
 _SUFFIX = ".nbc"
+DELIVERED = "machine_code"
+"""Folder in the package with what a wheel brings."""
+_V3 = ("x86-64-v3", frozenset(("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")))
+_USUAL = {
+    "x86_64": _V3,
+    "amd64": _V3,
+    "aarch64": ("generic", frozenset(("neon",))),
+    "arm64": ("apple-m1", frozenset(("neon",))),
+}
+"""The usual processor of a platform, as LLVM names it, with what one must have that runs its machine code."""
 _building = threading.RLock()
 
 
@@ -135,8 +137,8 @@ class Compiled(Kernel[P, R]):
     def kept(self, types: tuple[Any, ...]) -> bool:
         """Whether a folder keeps it, compiled for types of arguments."""
         made = self.dispatcher
-        name = made._cache.file(types, made.targetctx.codegen())
-        return any((folder / name).exists() for folder in folders())
+        names = made._cache.files(types, made.targetctx.codegen())
+        return any((folder / name).exists() for name in names for folder in folders())
 
     def compile(self, types: tuple[Any, ...]) -> bool:
         """Compile it for types of arguments; return whether it had not been before."""
@@ -371,7 +373,18 @@ def folders() -> list[Path]:
     package = Path(__file__).resolve().parents[1]
     beside = package / "__pycache__" / "compiled"
     exists = next(each for each in (beside, beside.parent, package) if each.is_dir())
-    return [beside] if os.access(exists, os.W_OK) else [beside, _own() / "reseau" / "compiled"]
+    found = [package / DELIVERED] if (package / DELIVERED).is_dir() else []
+    return [*found, beside, *([] if os.access(exists, os.W_OK) else [_own() / "reseau" / "compiled"])]
+
+
+@cache
+def usual_processor() -> tuple[str, str] | None:
+    """Return the usual processor of this platform, and its features, where this one runs its machine code."""
+    from llvmlite.binding import get_host_cpu_features
+
+    name, needed = _USUAL.get(platform.machine().lower(), ("", frozenset()))
+    has = {feature for feature, present in get_host_cpu_features().items() if present}
+    return (name, "") if name and needed <= has else None
 
 
 def _own() -> Path:
@@ -405,18 +418,18 @@ class _Kept:
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return what was compiled for a signature, or None when it is to be compiled."""
-        name = self.file(signature, context.codegen())
+        names = self.files(signature, context.codegen())
         context.refresh()
         self._release()
         begun = time.monotonic()
         while True:
-            for folder in self._folders:
-                found = _read(folder / name)
+            for path in (folder / name for name in names for folder in self._folders):
+                found = _read(path)
                 if found is not None:
                     self._release()
                     return import_module("numba.core.compiler").CompileResult._rebuild(context, *found)
             patient = time.monotonic() - begun < _PATIENCE
-            if self._lock is not None or not (self._locked(name) or patient):
+            if self._lock is not None or not (self._locked(names[0]) or patient):
                 compiles()
                 return None
             if self._lock is None:
@@ -434,15 +447,18 @@ class _Kept:
             }
             content = json.dumps(header).encode() + b"\n" + dumps(done._reduce())
             with suppress(InputError):  # of a full disk or a closed folder: it is compiled again
-                write_whole(self._folders[-1] / self.file(signature, done.codegen), content)
+                write_whole(self._folders[-1] / self.files(signature, done.codegen)[0], content)
                 self._remove_earlier()
         self._release()
 
-    def file(self, signature: Any, codegen: Any) -> str:
-        """Return the name of the file for a signature, on this processor."""
+    def files(self, signature: Any, codegen: Any) -> list[str]:
+        """Return the names of the files for a signature: of this processor, and of the usual one."""
         types = [_spelled(_described(each)) for each in _arguments(signature)]
-        key = hashlib.sha256(repr((types, codegen.magic_tuple())).encode()).hexdigest()
-        return f"{self._stem}-{self._digest[:16]}-{key[:16]}{_SUFFIX}"
+        own = codegen.magic_tuple()
+        usual = usual_processor()
+        runs = [own] if usual is None else [own, (own[0], *usual)]
+        keys = [hashlib.sha256(repr((types, each)).encode()).hexdigest()[:16] for each in runs]
+        return [f"{self._stem}-{self._digest[:16]}-{key}{_SUFFIX}" for key in dict.fromkeys(keys)]
 
     @property
     def _stem(self) -> str:
@@ -451,7 +467,7 @@ class _Kept:
 
     def _remove_earlier(self) -> None:
         """Remove what was compiled of the function before it was changed; not where others may use it."""
-        if len(self._folders) == 1 and "NUMBA_CACHE_DIR" not in os.environ:
+        if self._folders[-1].parent.name == "__pycache__":
             for path in self._folders[-1].glob(f"{self._stem}-*{_SUFFIX}"):
                 if not path.name.startswith(f"{self._stem}-{self._digest[:16]}-"):
                     path.unlink(missing_ok=True)

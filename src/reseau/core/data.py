@@ -19,7 +19,7 @@ from .tone import ToneCurve
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Array", "Frame", "ImagePoints", "Mask", "Rows", "rows_of_groups"]
+__all__ = ["Array", "Mask", "Rows", "rows_of_groups"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -9,8 +9,6 @@ from typing import Any, Self
 
 from .errors import UsageError
 
-__all__ = ["Display", "Table", "data_frame", "html_table"]
-
 Facts = Sequence[tuple[str, str]]
 Columns = Mapping[str, Sequence[Any]]
 

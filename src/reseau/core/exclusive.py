@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import IO
 
-__all__ = ["lock_file"]
-
 _BEYOND = 1 << 30
 """Position of the byte that is locked where a lock keeps others from reading: beyond the content."""
 

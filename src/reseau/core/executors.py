@@ -21,8 +21,6 @@ from .failure import Code, Failure
 from .processes import process_context
 from .threads import always_one_thread, one_thread
 
-__all__ = ["Executor", "Here", "Processes", "crashed", "prepare_process"]
-
 J = TypeVar("J")
 R = TypeVar("R")
 _AHEAD = 2

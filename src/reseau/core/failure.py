@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from .data import Frame
 
-__all__ = ["Code", "Estimated", "Failure", "Remark"]
-
 
 class Code(StrEnum):
     """Why an estimate failed or a result carries a warning; callers branch on it, never on a text.
@@ -223,6 +221,11 @@ class Code(StrEnum):
         "rank-defect",
         "the observations do not determine a combination of the unknowns",
         "hold one of the parameters that are named, or add observations",
+    )
+    REVERBERATION = (
+        "reverberation",
+        "a second echo of a reflector, behind the first and weaker",
+        "nothing is needed; it is no point",
     )
     SATURATED = "saturated", "the image is overexposed", "take less light, or a shorter exposure"
     SEVERAL_TARGETS = (

@@ -18,32 +18,6 @@ from numpy.typing import NDArray
 
 from .arrays import Array
 
-__all__ = [
-    "ACCENT",
-    "BLUE",
-    "FAINT",
-    "INK",
-    "PALE",
-    "Panel",
-    "contour_levels",
-    "draw_contours",
-    "draw_ellipses",
-    "draw_picture",
-    "draw_vectors",
-    "drawing",
-    "frame_of",
-    "image_axes",
-    "length",
-    "new_axes",
-    "nice",
-    "over_picture",
-    "plane_axes",
-    "set_style",
-    "to_bytes",
-    "to_svg",
-    "typical_pitch",
-]
-
 Pair = tuple[Array, Array]
 
 INK, FAINT, PALE, ACCENT, BLUE = "#22272b", "#9aa3a8", "#e9edef", "#b3402a", "#2f5d7c"

@@ -10,8 +10,6 @@ from typing import TypeVar
 
 from .errors import InputError, UsageError
 
-__all__ = ["empty_folder", "made_folder", "split_frame", "writable", "write_whole"]
-
 P = TypeVar("P", bound=Path | None)
 
 

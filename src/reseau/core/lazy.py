@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
-__all__ = ["above", "lazily", "without_collecting"]
-
 
 def above(place: str) -> Any:
     """Return what a method of a result needs of a module above its own, imported at the call.

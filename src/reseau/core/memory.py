@@ -9,8 +9,6 @@ import os
 import sys
 from pathlib import Path
 
-__all__ = ["available_memory", "keep_loaded", "share_freed_memory"]
-
 _ARENA_MAX = -8
 """`M_ARENA_MAX` of the C library of Linux."""
 

@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Power", "aligned", "at_power", "grouped", "measured", "plain", "power"]
-
 _MINUS = "\u2212"
 
 

@@ -7,8 +7,6 @@ from contextlib import contextmanager
 
 from .errors import UsageError
 
-__all__ = ["missing", "optional"]
-
 _DISTRIBUTIONS = {
     "apprise": "reseau[service]",
     "argon2": "reseau[service]",

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from pydantic.json_schema import JsonSchemaValue
     from pydantic_core import CoreSchema
 
-__all__ = ["Declared", "Group", "Option", "declaration", "options_of"]
-
 
 class Group(StrEnum):
     """Groups of options in the help of a command."""

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from .overlay import Layer
 
-__all__ = ["Overlaid"]
-
 
 class Overlaid:
     """Base of such results."""

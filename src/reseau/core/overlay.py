@@ -26,8 +26,6 @@ from .arrays import Array
 from .figures import INK, drawing, nice
 from .files import write_whole
 
-__all__ = ["FOUND", "MISSING", "OTHER", "Layer", "declined_layers", "draw_overlay"]
-
 FOUND, OTHER, MISSING, _SIGMA = "#3ddc84", "#5cc8ff", "#ff6a3d", "#fff07a"
 """Colours of measured places, of places that look alike, of missing ones, and of ellipses."""
 _DECLINED = (

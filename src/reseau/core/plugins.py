@@ -7,8 +7,6 @@ from typing import Any
 
 from .errors import UsageError
 
-__all__ = ["CAMERAS", "DISCOVERY", "INSTRUMENTS", "SESSIONS", "SIMULATORS", "plugin", "plugins"]
-
 INSTRUMENTS, DISCOVERY, SIMULATORS = "reseau.instruments", "reseau.discovery", "reseau.simulators"
 """Groups of entry points: drivers; functions that list addresses; simulated benches."""
 CAMERAS, SESSIONS = "reseau.cameras", "reseau.sessions"

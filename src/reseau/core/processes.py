@@ -7,8 +7,6 @@ import os
 from collections.abc import Sequence
 from multiprocessing.context import BaseContext
 
-__all__ = ["cores", "process_context", "start_early"]
-
 
 def cores() -> int:
     """Number of cores available to this process.

@@ -12,8 +12,6 @@ from .errors import InputError
 from .files import split_frame
 from .version import __version__
 
-__all__ = ["Provenance", "canonical_json", "sha256_of"]
-
 
 def sha256_of(source: bytes | Path) -> str:
     """SHA-256 of bytes, or of a file read in pieces; of ``loop.dcm#3``, a frame of a file, that of the file.

@@ -9,8 +9,6 @@ from typing import Any
 
 import threadpoolctl  # type: ignore[import-untyped]
 
-__all__ = ["always_one_thread", "one_thread"]
-
 _KEPT = 32 * 2**20
 """Largest block, in bytes, by which the C library of Linux adapts to a program."""
 

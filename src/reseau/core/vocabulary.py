@@ -11,8 +11,6 @@ from typing import Annotated, Literal
 
 from .options import Declared, Group, Option, declaration
 
-__all__ = ["names"]
-
 # What is read.
 Design = Annotated[Path, Option("Design of the target.", Group.BASIC, "-d")]
 TestObject = Annotated[Path, Option("Design of the test object: its rods.")]
@@ -142,6 +140,14 @@ ControlSigma = Annotated[
         "Standard deviation of control points, in the unit of the network; of MicMac's the factor on them.",
         Group.ADJUSTMENT,
         least=1e-9,
+    ),
+]
+SensorWidth = Annotated[
+    float,
+    Option(
+        "Width of the sensor (mm) of cameras of other programs whose lengths are in pixels.",
+        Group.CAMERA,
+        least=1e-3,
     ),
 ]
 Alpha = Annotated[float, Option("Significance level of a single test.", Group.ADJUSTMENT)]

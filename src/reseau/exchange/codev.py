@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -11,9 +11,21 @@ from typing import Literal
 import numpy as np
 
 from ..core.errors import FormatError
-from ..optics.lenses import AIR, Aperture, Layout, Medium, Prescription, Surface, model_glass
+from ..optics.lenses import AIR, Aperture, Cauchy, Layout, Medium, Prescription, Surface, model_glass
 from .lines import read_bytes
-from .prescribed import MOST_MB, Opening, catalogue_glass, far, finite, kind_behind, with_stop, within
+from .prescribed import (
+    MOST_MB,
+    Opening,
+    UnknownGlass,
+    catalogue_glass,
+    far,
+    finite,
+    glasses_beside,
+    kind_behind,
+    schott,
+    with_stop,
+    within,
+)
 
 __all__ = ["read_codev"]
 
@@ -21,6 +33,11 @@ _UNITS = {"M": ("mm", 1.0), "C": ("cm", 10.0), "I": ("inches", 25.4)}
 _LETTERS = "ABCDEFGHIJ"
 """Coefficients of r⁴ to r²²."""
 _CODE = re.compile(r"(\d{3,})[.:](\d{3,})")
+_INDEX_AND_ABBE = re.compile(r"([1-3]\.\d+):(\d+(?:\.\d*)?)")
+_TERMS = 4
+"""Terms of Cauchy's formula through the indices of a private glass."""
+_INFINITE = {"INF": "1e13", "INFINITY": "1e13"}
+"""Words for the distance by which CODE V stands for infinity."""
 _OPENINGS: dict[str, Literal["diameter", "f-number", "object aperture"]] = {
     "EPD": "diameter",
     "FNO": "f-number",
@@ -87,7 +104,7 @@ def read_codev(path: Path | str) -> Prescription:
     """
     path = Path(path)
     text = read_bytes(path, MOST_MB).decode("latin-1")
-    return within(path, lambda: _lens(list(_commands(text)), path.stem))
+    return within(path, lambda: _lens(list(_commands(text)), path.stem, glasses_beside(path)))
 
 
 def _commands(text: str) -> Iterator[tuple[str, list[str]]]:
@@ -106,7 +123,7 @@ def _quoted(found: re.Match[str]) -> str:
 
 def _numbers(name: str, words: list[str], count: int = 1) -> list[float]:
     try:
-        found = [finite(word) for word in words]
+        found = [finite(_INFINITE.get(word.upper(), word)) for word in words]
     except ValueError:
         found = []
     if len(found) < count:
@@ -114,8 +131,9 @@ def _numbers(name: str, words: list[str], count: int = 1) -> list[float]:
     return found
 
 
-def _lens(commands: list[tuple[str, list[str]]], stem: str) -> Prescription:
+def _lens(commands: list[tuple[str, list[str]]], stem: str, own: Mapping[str, Medium]) -> Prescription:
     listed, stated, private = _listed(commands)
+    private = {**own, **private}
     if len(listed) < 3:
         raise FormatError("is not a lens of CODE V: it has no surfaces between SO and SI")
     notes: list[str] = []
@@ -170,11 +188,11 @@ def _lens(commands: list[tuple[str, list[str]]], stem: str) -> Prescription:
 
 def _listed(
     commands: list[tuple[str, list[str]]],
-) -> tuple[list[_Listed], dict[str, list[str]], set[str]]:
-    """Surfaces, commands for the whole lens with their words, and names of private glasses."""
+) -> tuple[list[_Listed], dict[str, list[str]], dict[str, Medium]]:
+    """Surfaces, commands for the whole lens with their words, and private glasses."""
     listed: list[_Listed] = []
     stated: dict[str, list[str]] = {}
-    private: set[str] = set()
+    private, lines = dict[str, Medium](), list[float]()
     whole = {"DIM", "RDM", "WL", "REF", "WTW", "TEM", *_OPENINGS, *_VIGNETTING}
     catalogue = ended = False
     for command, words in commands:
@@ -183,8 +201,11 @@ def _listed(
             catalogue = True
         elif catalogue:
             catalogue = key != "END"
-            if command[0] in "'\"":
-                private.add(command.strip("'\""))
+            if key == "PWL":
+                lines = _numbers(command, words)
+            elif command[0] in "'\"":
+                name = command.strip("'\"")
+                private[name] = _private(name, lines, words)
         elif command in ("SO", "S", "SI"):
             shape, thickness = _numbers(command, words[:2], 2)
             listed.append(
@@ -200,6 +221,23 @@ def _listed(
         elif not within(listed[-1].name, lambda: _of_surface(listed[-1], command, words)):  # noqa: B023
             raise FormatError(f"has {command}, which is not supported", where=listed[-1].name)
     return listed, stated, private
+
+
+def _private(name: str, lines_nm: list[float], words: list[str]) -> Medium:
+    """A glass of the file: Laurent's formula, or Cauchy's through its indices at some wavelengths."""
+    if words and words[0].isalpha():
+        if words[0].upper() != "LAU":
+            return UnknownGlass(name, words[0], ("LAU", "indices"))
+        return schott(_numbers(name, words[1:], 6), name, None)
+    indices = _numbers(name, words)
+    if not lines_nm or len(indices) != len(lines_nm):
+        raise FormatError(
+            f"the private glass {name} has {len(indices)} indices for {len(lines_nm)} wavelengths (PWL)"
+        )
+    terms = min(len(lines_nm), _TERMS)
+    columns = np.power.outer(1e6 / np.array(lines_nm) ** 2, np.arange(terms))
+    found = np.linalg.lstsq(columns, np.array(indices), rcond=None)[0]
+    return Cauchy(tuple(found.tolist()), name, (min(lines_nm), max(lines_nm)) if terms > 1 else None)
 
 
 def _of_surface(at: _Listed, command: str, words: list[str]) -> bool:
@@ -236,17 +274,18 @@ def _opening(stated: dict[str, list[str]], scale: float, distance: float, notes:
     return Opening(_OPENINGS[key], scale * value if key == "EPD" else value, distance)
 
 
-def _medium(at: _Listed, private: set[str], notes: list[str]) -> Medium:
+def _medium(at: _Listed, private: Mapping[str, Medium], notes: list[str]) -> Medium:
     name = at.glass
     if name.upper() in ("", "AIR"):
         return AIR
-    if name in private:
-        raise FormatError(f"the glass {name} of a private catalogue is not supported", where=at.name)
-    code = _CODE.fullmatch(name)
-    if code is None:
-        return catalogue_glass(name, at.name, notes)
-    # 517.642: the decimals of the index, and the Abbe number with two digits in front of its point.
-    index, abbe = 1 + float(f"0.{code[1]}"), float(f"{code[2][:2]}.{code[2][2:]}")
+    code, plain = _CODE.fullmatch(name), _INDEX_AND_ABBE.fullmatch(name)
+    if plain is not None:
+        index, abbe = float(plain[1]), float(plain[2])
+    elif code is not None:
+        # 517.642: the decimals of the index, and the Abbe number with two digits in front of its point.
+        index, abbe = 1 + float(f"0.{code[1]}"), float(f"{code[2][:2]}.{code[2][2:]}")
+    else:
+        return catalogue_glass(name, at.name, notes, private)
     notes.append(
         f"the glass {name} of {at.name} is known by its index {index:g} and Abbe number {abbe:g} only"
     )
@@ -259,7 +298,7 @@ def _surface(
     before: Medium,
     radii: bool,
     scale: float,
-    private: set[str],
+    private: Mapping[str, Medium],
     notes: list[str],
     *,
     last: bool,

@@ -68,6 +68,6 @@ def read_lens(path: Path | str) -> Lens:
         return Lens(document.prescription(), document.sensor)
     if re.search(r"^\s*SURF\s+\d+\s*$", text, re.MULTILINE):
         return Lens(read_zemax(path))
-    if re.search(r"^(.*;)?\s*so\s+[-+.\d]\S*\s+[-+.\d]", text, re.MULTILINE | re.IGNORECASE):
+    if re.search(r"^(.*;)?\s*so\s+[-+.\d]\S*\s+([-+.\d]|inf)", text, re.MULTILINE | re.IGNORECASE):
         return Lens(read_codev(path))
     raise FormatError("is not a lens", where=path, do="expected lens/1 in TOML, Zemax .zmx, or CODE V .seq")

@@ -33,12 +33,12 @@ from ..optics.poses import matrix_to_vector
 from .lines import network_of, numbers, read_bytes, read_head
 from .markup import Node, read_markup
 
-__all__ = ["is_micmac", "read_micmac"]
+__all__ = ["interior_text", "is_micmac", "read_interior", "read_micmac"]
 
 _PATTERN = "Orientation-*.xml"
 _SIDES = {"eConvApero_DistM2C": "object", "eConvApero_DistC2M": "image"}
-
-
+# Coefficients of Fraser's model, and their signs with y up.
+_SIGNS = {"P1": 1.0, "P2": -1.0, "b1": 1.0, "b2": -1.0}
 # Binary files of homologous points, little-endian.
 _HEAD = np.dtype([("images", "<i4"), ("count", "<i4")])
 _MOST_MB = 500
@@ -152,6 +152,57 @@ def read_micmac(path: Path | str, control_sigma: float | None = None) -> Network
     return replace(network, sigma=sigma, role=role)
 
 
+def read_interior(path: Path) -> Camera:
+    """Read an interior orientation, ``AutoCal*.xml``.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is not as described, or the model of the distortion is another one.
+    """
+    return _camera(read_markup(path).need("CalibrationInternConique"), path.stem)
+
+
+def interior_text(values: Mapping[str, float], size: tuple[int, int], pitch_mm: float, side: str) -> str:
+    """Return the text of an interior orientation.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Parameters of Brown's camera.
+    size : (int, int)
+        Width and height, px.
+    pitch_mm : float
+        Pixel size.
+    side : str
+        Side of the distortion.
+
+    Examples
+    --------
+    >>> text = interior_text({"c": 8.0, "K1": 1e-4}, (640, 480), 0.01, "object")
+    >>> "<PP>319.5 239.5</PP>" in text, "<F>800.0</F>" in text, "<CoeffDist>1e-08</CoeffDist>" in text
+    (True, True, True)
+    """
+    lens = camera_model("brown")
+    zero = Camera("", *size, (1.0, 1.0), "brown", np.zeros(len(lens.names)))
+    given = replace(zero, values=np.array([values.get(name, 0.0) for name in lens.names]))
+    v = replace(given.in_millimetres(1 / pitch_mm), pitch_mm=(1.0, 1.0)).parameters
+    place = f"{v['x0'] + (size[0] - 1) / 2!r} {(size[1] - 1) / 2 - v['y0']!r}"
+    radial = "".join(f"          <CoeffDist>{v[name]!r}</CoeffDist>\n" for name in ("K1", "K2", "K3"))
+    signed = {name: 0.0 + sign * v[name.upper()] for name, sign in _SIGNS.items()}
+    others = "".join(f"        <{name}>{value!r}</{name}>\n" for name, value in signed.items())
+    convention = next(name for name, known in _SIDES.items() if known == side)
+    return (
+        f'<?xml version="1.0" ?>\n<ExportAPERO>\n  <CalibrationInternConique>\n'
+        f"    <KnownConv>{convention}</KnownConv>\n    <PP>{place}</PP>\n    <F>{v['c']!r}</F>\n"
+        f"    <SzIm>{size[0]} {size[1]}</SzIm>\n    <CalibDistortion>\n      <ModPhgrStd>\n"
+        f"        <RadialePart>\n          <CDist>{place}</CDist>\n{radial}        </RadialePart>\n{others}"
+        f"      </ModPhgrStd>\n    </CalibDistortion>\n  </CalibrationInternConique>\n</ExportAPERO>\n"
+    )
+
+
 def _interior_file(folder: Path, named: str, by: Path) -> Path:
     """Return the file of an interior orientation: beside the orientation, or from the project."""
     places = (folder / Path(named).name, folder.parent / named)
@@ -192,8 +243,7 @@ def _distortion(element: Node) -> dict[str, float]:
         )  # fmt: skip
     values = {f"K{k}": one.value(".") for k, one in enumerate(radial.all("CoeffDist"), start=1) if k <= 5}
     if standard is not None:
-        signs = {"P1": 1.0, "P2": -1.0, "b1": 1.0, "b2": -1.0}
-        for name, sign in signs.items():
+        for name, sign in _SIGNS.items():
             values[name.upper()] = sign * standard.value(name, 0.0)
     return values
 

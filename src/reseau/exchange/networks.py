@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping, Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,15 +29,62 @@ from .metashape import is_metashape, read_metashape
 from .micmac import is_micmac, read_micmac
 from .openptv import is_openptv, read_openptv
 from .photomodeler import read_photomodeler
+from .sfm import is_sfm, read_sfm
 
 __all__ = ["calibration_files", "read_foreign", "read_network", "write_network"]
 
-# Formats that the first bytes tell, and their readers.
-_BINARY_OR_XML: tuple[tuple[Callable[[bytes], bool], Callable[[Path], Network]], ...] = (
-    (is_metashape, read_metashape),
-    (is_dbat, read_dbat),
-    (is_libmv, read_libmv),
-)
+
+@dataclass(frozen=True)
+class _Peek:
+    """A file or folder whose format is not known."""
+
+    path: Path
+
+    @cached_property
+    def head(self) -> bytes:
+        """First bytes of a file."""
+        return b"" if self.path.is_dir() else read_head(self.path)
+
+    @cached_property
+    def counts(self) -> list[int]:
+        """Numbers of words in the first lines."""
+        return [len(line.split()) for line in self.head.decode("latin-1").splitlines()[:5]]
+
+    def has(self, *names: str) -> bool:
+        """Whether the folder has one of some files."""
+        return any((self.path / name).exists() for name in names)
+
+
+class _Format(NamedTuple):
+    """A format of networks: the program, how it is recognised and read."""
+
+    program: str
+    recognises: Callable[[_Peek], bool]
+    read: Callable[[Path, float | None], Network]
+
+
+def _plain(read: Callable[[Path], Network]) -> Callable[[Path, float | None], Network]:
+    """A reader, followed by one standard deviation of all known coordinates of points."""
+    return lambda path, sigma: _with_control_sigma(read(path), sigma)
+
+
+_THREE_COUNTS = re.compile(rb"\s*\d+[ \t]+\d+[ \t]+\d+[ \t]*[\r\n]")
+# In the order in which they are tried; the last two are numbers in lines only.
+_FORMATS = (
+    _Format("MicMac", lambda at: is_micmac(at.path), read_micmac),
+    _Format("OpenPTV", lambda at: is_openptv(at.path), _plain(read_openptv)),
+    _Format("COLMAP", lambda at: at.has("cameras.txt", "cameras.bin"), _plain(read_colmap)),
+    _Format("OpenMVG and AliceVision", lambda at: is_sfm(at.head), _plain(read_sfm)),
+    _Format("Metashape", lambda at: is_metashape(at.head), _plain(read_metashape)),
+    _Format("DBAT", lambda at: is_dbat(at.head), _plain(read_dbat)),
+    _Format("libmv", lambda at: is_libmv(at.head), _plain(read_libmv)),
+    _Format("Bundler", lambda at: is_bundler(at.head.decode("latin-1")), _plain(read_bundler)),
+    _Format("BAL", lambda at: bool(_THREE_COUNTS.match(at.head)), _plain(read_bal)),
+    _Format(
+        "PhotoModeler", lambda at: at.counts[1:4:2] in ([2, 10], [4, 10]) and len(at.counts) > 4,
+        _plain(read_photomodeler),
+    ),
+)  # fmt: skip
 
 
 def read_network(
@@ -42,6 +92,7 @@ def read_network(
     calibrations: Mapping[str, Path | str] | None = None,
     *,
     control_sigma: float | None = None,
+    sensor_width: float | None = None,
 ) -> Network:
     """Read a network of this project or of another program, recognised by its content.
 
@@ -56,6 +107,8 @@ def read_network(
     control_sigma : float, optional
         Standard deviation of control points, in the unit of the network; for MicMac the factor on their
         uncertainties, as in Campari.
+    sensor_width : float, optional
+        Width (mm) of the sensor of cameras whose lengths are in pixels: they are then in mm.
 
     Raises
     ------
@@ -74,11 +127,8 @@ def read_network(
     reseau.core.errors.InputError: missing.json: cannot be read (No such file or directory)
     """
     path, given = Path(path), dict(calibrations or {})
-    if path.is_dir() or path.suffix.lower() != ".json":
-        if path.is_dir() and is_micmac(path):
-            network = read_micmac(path, control_sigma)
-        else:
-            network = _with_control_sigma(read_foreign(path), control_sigma)
+    if path.is_dir() or path.suffix.lower() != ".json" or is_sfm(read_head(path)):
+        network = _with_sensor_width(read_foreign(path, control_sigma), sensor_width)
         # With a pitch of one, the principal distance is in pixels.
         known = {camera.id: camera for camera in network.cameras}
         with_size = {name: camera for name, camera in known.items() if camera.pitch_mm != (1.0, 1.0)}
@@ -99,7 +149,8 @@ def read_network(
         if isinstance(entry, CalibratedCameraEntry | FilmCameraEntry) and entry.id not in given
     }
     cameras |= _chosen(given, {entry.id for entry in document.cameras}, with_size)
-    return _with_control_sigma(Network.from_document(document, cameras), control_sigma)
+    network = _with_control_sigma(Network.from_document(document, cameras), control_sigma)
+    return _with_sensor_width(network, sensor_width)
 
 
 def _with_control_sigma(network: Network, sigma: float | None) -> Network:
@@ -107,6 +158,23 @@ def _with_control_sigma(network: Network, sigma: float | None) -> Network:
     if sigma is None:
         return network
     return replace(network, sigma=np.where(np.isnan(network.sigma), np.nan, sigma))
+
+
+def _with_sensor_width(network: Network, width: float | None) -> Network:
+    """The network with cameras in millimetres whose lengths are in pixels."""
+    if width is None:
+        return network
+    cameras = tuple(
+        camera.in_millimetres(width / camera.width) if camera.in_pixels else camera
+        for camera in network.cameras
+    )
+    if cameras == network.cameras:
+        raise UsageError(
+            "is given, but no camera has lengths in pixels that depend on it: pixel sizes are known, or the "
+            "model has focal lengths in pixels",
+            where="sensor width",
+        )
+    return replace(network, cameras=cameras)
 
 
 def _chosen(
@@ -157,15 +225,17 @@ def calibration_files(path: Path | str) -> tuple[Path, ...]:
     return tuple(path.parent / entry["calibration"] for entry in cameras if "calibration" in entry)
 
 
-def read_foreign(path: Path | str) -> Network:
+def read_foreign(path: Path | str, control_sigma: float | None = None) -> Network:
     r"""Read a network of another program; its format is recognised by the content.
 
     Parameters
     ----------
     path : Path or str
         Text export of PhotoModeler, BAL or Bundler file, XML or ``.psz`` of Metashape, project of DBAT,
-        problem of libmv, or folder with COLMAP's text or binary files, a calibration of OpenPTV, or
-        orientations of MicMac.
+        problem of libmv, scene of OpenMVG or AliceVision, or folder with COLMAP's text or binary files, a
+        calibration of OpenPTV, or orientations of MicMac.
+    control_sigma : float, optional
+        See :func:`read_network`.
 
     Raises
     ------
@@ -184,38 +254,23 @@ def read_foreign(path: Path | str) -> Network:
     <Network: 1 camera, 1 image, 1 point, 1 image point, datum free>
     """
     path = Path(path)
-    if path.is_dir():
-        if is_micmac(path):
-            return read_micmac(path)
-        if is_openptv(path):
-            return read_openptv(path)
-        if not any((path / f"cameras.{kind}").exists() for kind in ("txt", "bin")):
-            raise FormatError(
-                "is not a folder of a known program",
-                where=path,
-                do="give a folder of COLMAP (cameras, images, points3D), of OpenPTV (with `parameters`), or "
-                "of MicMac (Ori-NAME)",
-            )
-        return read_colmap(path)
     if not path.exists():
         raise InputError("does not exist", where=path)
-    head = read_head(path)
-    for recognise, read in _BINARY_OR_XML:
-        if recognise(head):
-            return read(path)
-    lines = read_text(path, "latin-1").splitlines()
-    first = lines[0].split() if lines else []
-    if lines and is_bundler(lines[0]):
-        return read_bundler(path)
-    if len(first) == 3 and all(word.isdigit() for word in first):
-        return read_bal(path)
-    if len(lines) > 4 and len(lines[1].split()) in (2, 4) and len(lines[3].split()) == 10:
-        return read_photomodeler(path)
+    at = _Peek(path)
+    for form in _FORMATS:
+        if form.recognises(at):
+            return form.read(path, control_sigma)
+    if path.is_dir():
+        raise FormatError(
+            "is not a folder of a known program",
+            where=path,
+            do="give a folder of COLMAP (cameras, images, points3D), of OpenPTV (with `parameters`), or "
+            "of MicMac (Ori-NAME)",
+        )
     raise FormatError(
         "is not a network of a known program",
         where=path,
-        do="use reseau-network/1 or a network of PhotoModeler, BAL, Bundler, COLMAP, Metashape, DBAT, libmv, "
-        "OpenPTV or MicMac",
+        do=f"use reseau-network/1 or a network of {', '.join(form.program for form in _FORMATS)}",
     )
 
 

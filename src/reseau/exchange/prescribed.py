@@ -2,17 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Literal, TypeVar
 
 import numpy as np
 
 from ..core.errors import FormatError, UsageError
-from ..optics.lenses import Medium, Prescription, Rays, Tracer, glass
+from ..optics.lenses import Medium, Powers, Prescription, Rays, Sellmeier, Tracer, glass
 from ..optics.lenses.paraxial import Paraxial
+from .lines import read_bytes
 
-__all__ = ["MOST_MB", "Opening", "catalogue_glass", "far", "finite", "kind_behind", "with_stop", "within"]
+__all__ = [
+    "MOST_MB",
+    "Opening",
+    "UnknownGlass",
+    "catalogue_glass",
+    "far",
+    "finite",
+    "glasses_beside",
+    "kind_behind",
+    "schott",
+    "with_stop",
+    "within",
+]
 
 MOST_MB = 10
 """Largest size of a file with a prescription."""
@@ -78,8 +93,80 @@ def far(distance: float) -> float:
     return distance if distance < _FAR else np.inf
 
 
-def catalogue_glass(name: str, where: str, notes: list[str]) -> Medium:
-    """Glass of the catalogue; a note is added where it is there under another name, or is a moulded one."""
+def glasses_beside(path: Path) -> dict[str, Medium]:
+    """Glasses of the catalogues ``.agf`` in the folder of a file, by name."""
+    found = dict[str, Medium]()
+    for file in sorted(path.parent.glob("*.[aA][gG][fF]")):
+        content = read_bytes(file, MOST_MB)
+        wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")
+        text = content.decode("utf-16" if wide else "latin-1", "replace")
+        found |= within(file, partial(_agf, text))
+    return found
+
+
+def _agf(text: str) -> dict[str, Medium]:
+    """Glasses of a catalogue: lines NM (name, number of the formula), CD (coefficients), LD (range, µm)."""
+    found, lines = dict[str, Medium](), dict[str, list[str]]()
+    for words in (line.split() for line in f"{text}\nNM".splitlines()):
+        if words[:1] == ["NM"] and "CD" in lines:
+            name, formula = lines["NM"][0], lines["NM"][1] if len(lines["NM"]) > 1 else ""
+            make = _FORMULAS.get(formula.partition(".")[0])
+            try:
+                values = [finite(word) for word in lines["CD"]]
+                low, high = (1e3 * finite(word) for word in lines["LD"][:2])
+            except (ValueError, KeyError):
+                raise FormatError(f"the glass {name} has no coefficients or no range") from None
+            found[name.upper()] = (
+                UnknownGlass(name, formula, tuple(_FORMULAS))
+                if make is None
+                else make(values, name, (low, high))
+            )
+        if words:
+            lines = {"NM": words[1:]} if words[0] == "NM" else lines | {words[0]: words[1:]}
+    return found
+
+
+@dataclass(frozen=True)
+class UnknownGlass:
+    """A glass whose formula is not known; it is refused where it is used."""
+
+    name: str
+    formula: str
+    known: tuple[str, ...]
+
+    def index(self, wavelength_nm: float) -> float:
+        """See :class:`~reseau.optics.lenses.Medium`."""
+        raise UsageError(
+            f"its dispersion has the formula {self.formula}; known are {', '.join(self.known)}",
+            where=f"glass {self.name}",
+        )
+
+
+def _pairs(values: list[float], name: str, limits: tuple[float, float]) -> Medium:
+    pairs = [(b, c) for b, c in zip(values[::2], values[1::2], strict=False) if b]
+    return Sellmeier(tuple(b for b, _ in pairs), tuple(c for _, c in pairs), name, limits)
+
+
+def schott(values: list[float], name: str, limits: tuple[float, float] | None) -> Medium:
+    """Schott's older formula, which CODE V calls that of Laurent."""
+    return Powers(
+        values[0], tuple(zip(values[1:6], (2.0, -2.0, -4.0, -6.0, -8.0), strict=False)), name, limits
+    )
+
+
+# Formulas of AGF by their numbers: Schott, and Sellmeier with three, four and five terms.
+_FORMULAS: dict[str, Callable[[list[float], str, tuple[float, float]], Medium]] = {
+    "1": schott,
+    "2": _pairs,
+    "6": _pairs,
+    "11": _pairs,
+}
+
+
+def catalogue_glass(name: str, where: str, notes: list[str], own: Mapping[str, Medium]) -> Medium:
+    """Glass of own catalogues or of ours; a note where it is there under another name, or a moulded one."""
+    if name.upper() in own:
+        return own[name.upper()]
     base = _MOULDED.get(name.upper())
     found = within(where, lambda: glass(base or name))
     plain = name.upper().replace("-", "").partition("_")[0]

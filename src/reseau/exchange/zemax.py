@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -11,7 +12,17 @@ import numpy as np
 from ..core.errors import FormatError
 from ..optics.lenses import AIR, Aperture, Layout, Medium, Prescription, Surface, model_glass
 from .lines import read_bytes
-from .prescribed import MOST_MB, Opening, catalogue_glass, far, finite, kind_behind, with_stop, within
+from .prescribed import (
+    MOST_MB,
+    Opening,
+    catalogue_glass,
+    far,
+    finite,
+    glasses_beside,
+    kind_behind,
+    with_stop,
+    within,
+)
 
 __all__ = ["read_zemax"]
 
@@ -110,7 +121,8 @@ def read_zemax(path: Path | str) -> Prescription:
     header, listed = _parsed(_decoded(read_bytes(Path(path), MOST_MB)))
     if len(listed) < 3 or ("MODE" in header and header["MODE"][:1] != ["SEQ"]):
         raise FormatError("is not a sequential lens of Zemax", where=path)
-    return within(path, lambda: _lens(header, listed, Path(path).stem))
+    own = glasses_beside(Path(path))
+    return within(path, lambda: _lens(header, listed, Path(path).stem, own))
 
 
 def _decoded(content: bytes) -> str:
@@ -148,7 +160,9 @@ def _parsed(text: str) -> tuple[dict[str, list[str]], list[_Listed]]:
     return header, listed
 
 
-def _lens(header: dict[str, list[str]], listed: list[_Listed], stem: str) -> Prescription:
+def _lens(
+    header: dict[str, list[str]], listed: list[_Listed], stem: str, own: Mapping[str, Medium]
+) -> Prescription:
     notes: list[str] = []
     scale = _scale(header, notes)
     wavelengths, weights, reference = _wavelengths(header)
@@ -159,7 +173,7 @@ def _lens(header: dict[str, list[str]], listed: list[_Listed], stem: str) -> Pre
         notes.append(
             f"is meant for {temperature:g} °C and {pressure:g} atm; indices are those at 20 °C and 1 atm"
         )
-    before = AIR if listed[0].glass is None else _medium(listed[0], notes)
+    before = AIR if listed[0].glass is None else _medium(listed[0], notes, own)
     distance = far(_thickness(listed[0], scale))
     surfaces: list[Surface] = []
     layout, medium, stop = Layout(), before, -1
@@ -175,7 +189,7 @@ def _lens(header: dict[str, list[str]], listed: list[_Listed], stem: str) -> Pre
             layout.turn(shift, tilt, tilt_first=at.parameter(6) != 0)
         else:
             _break(at, layout, "SCBD 1", scale)
-            surface, medium = _surface(at, layout, medium, scale, last, notes)
+            surface, medium = _surface(at, layout, medium, scale, last, notes, own)
             surfaces.append(surface)
             _break(at, layout, "SCBD 2", scale)
         if not last:
@@ -267,16 +281,22 @@ def _opening(header: dict[str, list[str]], listed: list[_Listed], scale: float, 
     return Opening(kind, value, distance, real=_number(header, "RAIM", 1, 0.0) == 2)
 
 
-def _medium(at: _Listed, notes: list[str]) -> Medium:
+def _medium(at: _Listed, notes: list[str], own: Mapping[str, Medium]) -> Medium:
     """Medium of a line GLAS; numbers beside the name of a glass are placeholders."""
     assert at.glass is not None
     if at.glass.upper() == "___BLANK":
         return within(_named(at), lambda: model_glass(at.value("GLAS", at=3), at.value("GLAS", at=4)))
-    return catalogue_glass(at.glass, _named(at), notes)
+    return catalogue_glass(at.glass, _named(at), notes, own)
 
 
 def _surface(
-    at: _Listed, layout: Layout, before: Medium, scale: float, last: bool, notes: list[str]
+    at: _Listed,
+    layout: Layout,
+    before: Medium,
+    scale: float,
+    last: bool,
+    notes: list[str],
+    own: Mapping[str, Medium],
 ) -> tuple[Surface, Medium]:
     """A surface, and the medium behind it."""
     curvature, conic = at.value("CURV") / scale, at.value("CONI")
@@ -296,7 +316,7 @@ def _surface(
     elif last:
         kind, medium = "plain", before
     else:
-        medium = AIR if at.glass is None else _medium(at, notes)
+        medium = AIR if at.glass is None else _medium(at, notes, own)
         kind = kind_behind(before, medium)
     found = Surface(
         curvature,

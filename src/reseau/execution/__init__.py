@@ -6,7 +6,6 @@ that is started again takes up where it ended.
 """
 
 from ..core.executors import Executor, Here, Processes
-from .choice import executor_at
-from .outputs import Outputs
+from .cluster import Outputs, executor_at
 
 __all__ = ["Executor", "Here", "Outputs", "Processes", "executor_at"]

@@ -10,23 +10,26 @@ and all that is under way in it. What is lost with a worker is done again by ano
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import pickle
 import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from functools import lru_cache, partial
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple, Self, TypeVar
 
 from ..archive.objects import Objects, objects_at
-from ..core.errors import EstimationError, UsageError
-from ..core.executors import Processes, crashed
+from ..core.errors import ArchiveError, EstimationError, UsageError
+from ..core.executors import Executor, Here, Processes, crashed
 from ..core.failure import Failure
 from ..core.optional import optional
-
-__all__ = ["Cluster"]
+from ..core.processes import cores
+from ..core.provenance import canonical_json, sha256_of
+from ..core.version import __version__
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -227,3 +230,124 @@ def _done(place: str, work: _Sent, job: _Sent) -> _Sent:
 def _work(place: str, sent: _Sent) -> Callable[[Any], Any]:
     found: Callable[[Any], Any] = _received(_messages(place), sent)
     return found
+
+
+def executor_at(
+    jobs: int | None = None,
+    cluster: str = "",
+    store: str = "",
+    modules: Sequence[str] = (),
+    parts: int | None = None,
+) -> Executor:
+    """Return the executor that a user asks for.
+
+    Parameters
+    ----------
+    jobs : int, optional
+        Number of processes; by default one for each core.
+    cluster : str, optional
+        Address of the scheduler of a Dask cluster, such as ``tcp://192.168.1.5:8786``; replaces `jobs`.
+    store : str, optional
+        Folder or URL that the workers of the cluster share; required with a cluster.
+    modules : sequence of str
+        Modules to import once for all processes.
+    parts : int, optional
+        Number of parts that the work has; there are no more processes.
+
+    Raises
+    ------
+    UsageError
+        If the cluster has no store, its packages are not installed, or it does not answer.
+
+    Examples
+    --------
+    >>> executor_at(1).local
+    True
+    """
+    if cluster:
+        from .cluster import Cluster
+
+        return Cluster(cluster, store)
+    count = jobs or cores()
+    if parts is not None:
+        count = max(1, min(count, parts))
+    return Here() if count == 1 else Processes(count, modules)
+
+
+_SCHEMA = "reseau-output/1"
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Where the outputs of a computation are kept, and what they depend on besides their inputs.
+
+    Parameters
+    ----------
+    place : str
+        Folder or URL of the store.
+    about : mapping
+        Name of the computation and its parameters, JSON values.
+    suffix : str
+        Suffix of the files.
+
+    Examples
+    --------
+    >>> outputs = Outputs("memory://outputs", {"compute": "length"})
+    >>> outputs.read(outputs.made({"text": "3f"}, lambda: b"3"))
+    b'3'
+    >>> outputs.read(outputs.made({"text": "3f"}, lambda: b"not computed again"))
+    b'3'
+    """
+
+    place: str
+    about: Mapping[str, Any]
+    suffix: str = ".json"
+
+    @cached_property
+    def _store(self) -> Objects:
+        # What is lost in a power failure is computed again.
+        return objects_at(self.place, durable=False)
+
+    def made(self, inputs: Mapping[str, str], compute: Callable[[], bytes]) -> str:
+        """Return the SHA-256 of an output; compute and keep it unless it exists and is whole.
+
+        Parameters
+        ----------
+        inputs : mapping of str to str
+            SHA-256 of each input, by its role.
+        compute : callable
+            Returns the output; deterministic.
+
+        Raises
+        ------
+        ArchiveError
+            If the store cannot be used.
+        Exception
+            What `compute` raises.
+        """
+        depends = {"about": dict(self.about), "inputs": dict(inputs), "software": __version__}
+        key = sha256_of(json.dumps(depends, sort_keys=True).encode())
+        sha256 = self._whole(key)
+        if not sha256:
+            sha256 = self._store.put(compute(), self.suffix)
+            record = {"schema": _SCHEMA, "sha256": sha256, **depends}
+            self._store.write_record(key, canonical_json(record).encode())
+        return sha256
+
+    def read(self, sha256: str) -> bytes:
+        """Return an output.
+
+        Raises
+        ------
+        ArchiveError
+            If it is missing or damaged.
+        """
+        return self._store.get(sha256, self.suffix)
+
+    def _whole(self, key: str) -> str:
+        try:
+            sha256 = str(json.loads(self._store.record(key) or b"{}")["sha256"])
+            self.read(sha256)
+        except (ValueError, KeyError, TypeError, ArchiveError):
+            return ""
+        return sha256

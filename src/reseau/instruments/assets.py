@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 
-__all__ = ["ImageStore"]
-
 ENVIRONMENT = "RESEAU_ASSETS"
 _TEMPLATE = "{:06d}.tiff"
 Document = tuple[str, dict[str, Any]]

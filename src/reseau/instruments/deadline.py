@@ -8,8 +8,6 @@ from typing import Self
 
 from ..core.errors import UsageError
 
-__all__ = ["Deadline"]
-
 
 class _Remaining(float):
     """What is left of a time limit (s), which messages name as a whole."""

@@ -19,8 +19,6 @@ from .settings import Limits, Settings
 from .status import Status
 from .values import Identity
 
-__all__ = ["Device"]
-
 S = TypeVar("S", bound=Settings)
 T = TypeVar("T")
 

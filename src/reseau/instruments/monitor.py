@@ -8,8 +8,6 @@ from typing import Any
 
 from ..core.errors import InstrumentError
 
-__all__ = ["Monitor"]
-
 Reading = dict[str, dict[str, Any]]
 Subscriber = Callable[[Reading], None]
 

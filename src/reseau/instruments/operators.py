@@ -22,8 +22,6 @@ from ..core.errors import (
     UsageError,
 )
 
-__all__ = ["RemoteOperator", "TerminalOperator"]
-
 _LONGEST = 65_536
 
 

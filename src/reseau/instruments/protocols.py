@@ -17,19 +17,6 @@ from .settings import Settings
 from .status import Status
 from .values import AxisState, BScan, Environment, Identity, ScreenPicture, Waveform
 
-__all__ = [
-    "Camera",
-    "CameraRig",
-    "EnvironmentSensor",
-    "Exposure",
-    "ExposureSet",
-    "Instrument",
-    "Movable",
-    "Oscilloscope",
-    "Turntable",
-    "UltrasonicScanner",
-]
-
 
 @runtime_checkable
 class Instrument(Protocol):

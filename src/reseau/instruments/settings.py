@@ -9,8 +9,6 @@ from typing import Any, Self
 
 from ..core.errors import SettingError
 
-__all__ = ["Limits", "Settings", "choice", "quantity", "text"]
-
 Limits = Mapping[str, tuple[float, float]]
 """Lowest and highest allowed value of each setting, by name."""
 

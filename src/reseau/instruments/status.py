@@ -7,8 +7,6 @@ from collections.abc import Callable
 
 from ..core.errors import DeadlineError
 
-__all__ = ["Status"]
-
 
 class Status:
     """Operation that runs in a thread of its own.

@@ -15,8 +15,6 @@ from ..core.environment import Condition
 from ..core.errors import ImageError
 from ..core.provenance import sha256_of
 
-__all__ = ["AxisState", "BScan", "Environment", "Identity", "ScreenPicture", "Waveform", "now"]
-
 
 def now() -> datetime:
     """Return the current time in UTC."""

@@ -20,22 +20,18 @@ from .frame import (
     EDGES,
     FrameCorners,
     FrameOrientation,
-    FrameOutcome,
     FrameTransform,
     MeasuredCorner,
     MeasuredEdge,
-    RollSummary,
 )
 from .lens import LensDocument, LensSensor
-from .measurement import MeasuredPoint, PhotographPoints, PointColumns, ReseauMeasurement
-from .points import POINTS, points_document, points_of
-from .reading import is_points, read_design, read_measurement
+from .measurement import PhotographPoints, ReseauMeasurement
+from .reading import read_design
 from .testfield import SHAPES, FieldLines, FieldTargets, TestfieldDesign, parse_design
 
 __all__ = [
     "CORNERS",
     "EDGES",
-    "POINTS",
     "SHAPES",
     "BoardDesign",
     "DesignPoint",
@@ -48,7 +44,6 @@ __all__ = [
     "FieldTargets",
     "FrameCorners",
     "FrameOrientation",
-    "FrameOutcome",
     "FrameTransform",
     "LensDocument",
     "LensSensor",
@@ -57,21 +52,14 @@ __all__ = [
     "MeasuredCorner",
     "MeasuredEdge",
     "MeasuredFiducial",
-    "MeasuredPoint",
     "PhotographPoints",
-    "PointColumns",
     "ReseauDesign",
     "ReseauMeasurement",
     "Rings",
-    "RollSummary",
     "Strict",
     "TestfieldDesign",
-    "is_points",
     "parse_design",
-    "points_document",
-    "points_of",
     "read_design",
-    "read_measurement",
     "read_text",
     "write_whole",
 ]

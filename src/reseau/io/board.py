@@ -11,8 +11,6 @@ from pydantic import Field, model_validator
 from ..core.data import Array
 from .document import Document
 
-__all__ = ["PUZZLE_CODE", "BoardDesign", "BoardKind"]
-
 BoardKind = Literal["chess", "puzzle", "deltille", "charuco", "circles", "aprilgrid", "markers"]
 Length = Annotated[float, Field(gt=1e-6, le=1e6)]
 Count = Annotated[int, Field(ge=1, le=1000)]

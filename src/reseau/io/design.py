@@ -11,8 +11,6 @@ from pydantic import Field, model_validator
 from ..core.data import Array
 from .document import Document, Strict
 
-__all__ = ["DesignPoint", "Mark", "ReseauDesign", "Rings"]
-
 Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
 """Beyond this, squares of coordinates lose the digits of the design."""
 _ONE_PLACE = 1e-6

@@ -22,8 +22,6 @@ from ..core.errors import ImageError, InputError
 from ..core.optional import optional
 from .scans import CHANNELS, Scan
 
-__all__ = ["count_dicom", "exposure_of_dicom", "is_dicom", "open_dicom"]
-
 _SUFFIXES = (".dcm", ".dicom", ".dic", ".ima")
 
 

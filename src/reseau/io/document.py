@@ -12,7 +12,7 @@ from ..core.errors import FormatError, InputError
 from ..core.files import write_whole
 from ..core.provenance import canonical_json
 
-__all__ = ["Document", "Strict", "read_text", "write_whole"]
+__all__ = ["write_whole"]
 
 
 class Strict(BaseModel):

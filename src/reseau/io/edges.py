@@ -8,8 +8,6 @@ from pydantic import Field
 
 from .document import Document, Strict
 
-__all__ = ["EdgesDocument", "MeasuredEdge"]
-
 
 class MeasuredEdge(Strict):
     """One edge, measured or not.

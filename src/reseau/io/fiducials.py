@@ -11,15 +11,6 @@ from ..core.data import Array, ImagePoints
 from .document import Document, Strict
 from .frame import FrameTransform, MeasuredCorner, points_of
 
-__all__ = [
-    "FiducialDesign",
-    "FiducialMark",
-    "FiducialOrientation",
-    "FiducialPoint",
-    "MarkPart",
-    "MeasuredFiducial",
-]
-
 Length = Annotated[float, Field(gt=0, le=1e4)]
 _NEEDS = {
     "cross": ("line_width",),

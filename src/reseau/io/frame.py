@@ -12,20 +12,6 @@ from pydantic import Field, model_validator
 from ..core.data import Array, ImagePoints
 from .document import Document, Strict
 
-__all__ = [
-    "CORNERS",
-    "EDGES",
-    "CornerPositions",
-    "FrameCorners",
-    "FrameOrientation",
-    "FrameOutcome",
-    "FrameTransform",
-    "MeasuredCorner",
-    "MeasuredEdge",
-    "RollSummary",
-    "points_of",
-]
-
 CORNERS = ("ul", "ur", "lr", "ll")
 """Upper left, upper right, lower right, lower left: clockwise, as the frame is seen."""
 EDGES = ("upper", "right", "lower", "left")

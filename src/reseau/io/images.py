@@ -1,9 +1,10 @@
 """Image files: one reader for whole frames and for windows of scans, and a writer.
 
-Accepted files: PNG, JPEG and BMP as OpenCV decodes them, those of :mod:`reseau.io.coded`, and a page of a
-TIFF (``scan.tif#2`` is the second, ``scan.tif`` the first) with grey or RGB samples of 1, 8 or 16 bit, signed
-16 bit, or floating point, uncompressed or in a compression that tifffile decodes; and a frame of a DICOM
-file, see :mod:`reseau.io.dicom`. Other grey values are never rescaled; an alpha channel is ignored, and so is
+Accepted files: PNG, JPEG and BMP as OpenCV decodes them; WebP, GIF, AVIF, JPEG 2000, plain PGM and PPM as
+Pillow does, of an animation the first picture; and a page of a TIFF (``scan.tif#2`` is the second,
+``scan.tif`` the first) with grey or RGB samples of 1, 8 or 16 bit, signed 16 bit, or floating point,
+uncompressed or in a compression that tifffile decodes; and a frame of a DICOM file, see
+:mod:`reseau.io.dicom`. Other grey values are never rescaled; an alpha channel is ignored, and so is
 an orientation tag: pixel coordinates are those of the sensor. A colour profile does not change grey values:
 its curve is given beside them.
 
@@ -14,7 +15,9 @@ are decoded, unless imagecodecs is not installed.
 from __future__ import annotations
 
 import mmap
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -28,22 +31,10 @@ from ..core.files import split_frame
 from ..core.provenance import sha256_of
 from ..core.tone import ToneCurve
 from . import write_whole
-from .coded import coded_kind, decoded_coded
 from .dicom import is_dicom, open_dicom
 from .photographs import decoded_heic, decoded_raw, is_heic, is_raw
 from .profiles import curve_of_file, curve_of_profile
 from .scans import CHANNELS, Scan, Window, full_scale_of, scan_of
-
-__all__ = [
-    "MAX_PIXELS",
-    "Channel",
-    "count_pages",
-    "grey_of",
-    "luma",
-    "open_scan",
-    "read_image",
-    "write_image",
-]
 
 MAX_PIXELS = 500_000_000
 """The largest image that is read whole; its header is checked before a pixel is decoded."""
@@ -585,3 +576,94 @@ def write_image(path: Path | str, pixels: NDArray[Any]) -> None:
     options = [cv2.IMWRITE_PNG_COMPRESSION, 6] if path.suffix.lower() == ".png" else []
     _, coded = cv2.imencode(path.suffix, pixels[:, :, ::-1] if pixels.ndim == 3 else pixels, options)
     write_whole(path, coded.tobytes())
+
+
+_JP2, _J2K = b"\0\0\0\x0cjP  \r\n\x87\n", b"\xff\x4f\xff\x51"
+
+
+def coded_kind(magic: bytes) -> str:
+    """The format of a file by its first bytes, at least 32; empty for any other.
+
+    Examples
+    --------
+    >>> coded_kind(b"RIFF\\0\\0\\0\\0WEBPVP8 ")
+    'WebP'
+    """
+    if magic[:4] == b"RIFF" and magic[8:12] == b"WEBP":
+        return "WebP"
+    if magic[:6] in (b"GIF87a", b"GIF89a"):
+        return "GIF"
+    if magic[4:8] == b"ftyp" and (b"avif" in magic[8:32] or b"avis" in magic[8:32]):
+        return "AVIF"
+    if magic.startswith((_JP2, _J2K)):
+        return "JPEG 2000"
+    if magic[:2] in (b"P5", b"P6") and magic[2:3].isspace():
+        return "PGM"
+    return ""
+
+
+def decoded_coded(path: Path, kind: str, largest: int) -> tuple[NDArray[Any], tuple[str, ...]]:
+    """Pixels of an image, and notes about it.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    kind : str
+        Its format, as :func:`coded_kind` gives it.
+    largest : int
+        Number of pixels that it may have.
+
+    Returns
+    -------
+    pixels : ndarray (h, w) or (h, w, 3)
+        Grey values or colours, of 8 or 16 bit; a PGM of 10 or 12 bit is scaled to 16.
+    notes : tuple of str
+        Says that it has several pictures.
+
+    Raises
+    ------
+    ImageError
+        When it is damaged or too large.
+    """
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings(), _whole_files():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                width, height = image.size
+                if width * height <= largest:
+                    return _pixels(image), _notes(image)
+        raise ImageError(f"has {width}×{height} pixels, more than {largest:,}", where=path, do="crop it")
+    except Image.DecompressionBombError as error:
+        raise ImageError(
+            "has more pixels than a file of its kind may have", where=path, do="crop it"
+        ) from error
+    except (OSError, ValueError, SyntaxError, EOFError, RuntimeError) as error:
+        raise ImageError(f"is a damaged {kind} image", where=path, do="copy it again") from error
+
+
+@contextmanager
+def _whole_files() -> Iterator[None]:
+    """Refuse files that end too early, also where another library (WeasyPrint) has Pillow fill them up."""
+    from PIL import ImageFile
+
+    before, ImageFile.LOAD_TRUNCATED_IMAGES = ImageFile.LOAD_TRUNCATED_IMAGES, False
+    try:
+        yield
+    finally:
+        ImageFile.LOAD_TRUNCATED_IMAGES = before
+
+
+def _pixels(image: Any) -> NDArray[Any]:
+    """Grey values or colours, without transparency."""
+    if image.mode in ("I;16", "I;16B", "I"):
+        return np.asarray(image).astype(np.uint16)
+    grey = image.mode in ("1", "L", "LA")
+    return np.asarray(image.convert("L" if grey else "RGB"))
+
+
+def _notes(image: Any) -> tuple[str, ...]:
+    several = getattr(image, "n_frames", 1) > 1
+    return ("has several pictures, of which the first is used",) if several else ()

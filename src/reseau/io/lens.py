@@ -32,16 +32,6 @@ from ..optics.lenses import (
 from ..optics.lenses.paraxial import Paraxial
 from .document import Document, Strict, write_whole
 
-__all__ = [
-    "LensAperture",
-    "LensBreak",
-    "LensDocument",
-    "LensMedium",
-    "LensSensor",
-    "LensSurface",
-    "medium_of",
-]
-
 Positive = Annotated[float, Field(gt=0)]
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]

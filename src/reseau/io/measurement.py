@@ -18,8 +18,6 @@ from ..core.errors import FormatError, UsageError
 from ..core.failure import Code, Failure, Remark
 from .document import Document, Strict, read_text
 
-__all__ = ["MeasuredPoint", "PhotographPoints", "PointColumns", "ReseauMeasurement"]
-
 
 class MeasuredPoint(Strict):
     """One mark, measured or not; sigmas in pixels.
@@ -145,13 +143,10 @@ class ReseauMeasurement(Document):
     @classmethod
     def from_image_points(cls, points: ImagePoints, *, image: str, sha256: str) -> Self:
         """Create the document from measured points."""
-        s = points.sigma
-        rho = points.cov[:, 0, 1] / (s[:, 0] * s[:, 1])
-        measured = tuple(
-            MeasuredPoint(id=name, x=float(x), y=float(y), sx=float(a), sy=float(b), rho=float(r), ok=True)
-            for name, (x, y), (a, b), r in zip(points.names, points.xy, s, rho, strict=True)
+        count = len(points)
+        return cls.from_columns(
+            image, sha256, points.names, points.xy, points.cov, np.ones(count, dtype=bool), [""] * count
         )
-        return cls(image=image, sha256=sha256, points=measured, found=len(measured), expected=len(measured))
 
     @classmethod
     def read_csv(cls, path: Path | str, *, sha256: str = "") -> Self:

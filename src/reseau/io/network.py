@@ -12,21 +12,6 @@ from ..optics.cameras import additional_models, camera_model, camera_models
 from .document import Document, Strict
 from .refraction import RefractionEntry
 
-__all__ = [
-    "AdditionalParameters",
-    "BaseColumns",
-    "CalibratedCameraEntry",
-    "CameraEntry",
-    "DistanceColumns",
-    "FilmCameraEntry",
-    "ImageColumns",
-    "Network1",
-    "ObservationColumns",
-    "PointColumns",
-    "ShutterEntry",
-    "TurntableEntry",
-]
-
 T = TypeVar("T")
 Triple = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from ..core.errors import ImageError
 from ..core.optional import optional
 
-__all__ = ["PHOTOGRAPHS", "RAW", "Exif", "decoded_heic", "decoded_raw", "is_heic", "is_raw", "read_exif"]
-
 RAW = (
     ".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".3fr", ".iiq",
 )  # fmt: skip

@@ -10,8 +10,6 @@ import numpy as np
 from ..core.data import ImagePoints
 from ..core.errors import FormatError
 
-__all__ = ["POINTS", "points_document", "points_of"]
-
 POINTS = "reseau-points/1"
 
 

@@ -17,8 +17,6 @@ import numpy as np
 
 from ..core.tone import ToneCurve
 
-__all__ = ["curve_of_file", "curve_of_profile"]
-
 _SAMPLES = 4096
 """Entries of a table that stands for a formula."""
 _MOST = 4_000_000

@@ -11,8 +11,6 @@ from .document import read_text
 from .measurement import ReseauMeasurement
 from .testfield import TestfieldDesign, parse_design
 
-__all__ = ["is_points", "read_design", "read_measurement"]
-
 
 def read_design(path: Path | str) -> ReseauDesign | TestfieldDesign | BoardDesign:
     """Read the design of a target, of either schema.

@@ -12,8 +12,6 @@ from ..optics.refraction import Refraction, RefractiveIndex, Window
 from .document import Document, Strict
 from .lens import GlassOrMedium, medium_of
 
-__all__ = ["MediumEntry", "RefractionEntry", "RefractionFile", "WindowEntry"]
-
 Triple = tuple[float, float, float]
 
 

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from ..core.errors import ImageError
 from ..core.tone import ToneCurve
 
-__all__ = ["CHANNELS", "Scan", "full_scale_of", "scan_of"]
-
 CHANNELS = {1: ("grey",), 3: ("red", "green", "blue")}
 """Names of the channels by their number."""
 _STRIPE = 256

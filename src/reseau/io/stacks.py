@@ -17,8 +17,6 @@ from ..core.provenance import sha256_of
 from .dicom import count_dicom, is_dicom
 from .images import Channel, count_pages, grey_of, read_image
 
-__all__ = ["VIDEOS", "frames_of", "open_video"]
-
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 """Suffixes of videos."""
 _LOSSLESS = ("FFV1", "HFYU", "FFVH", "MPNG", "PNG ", "RAW ", "DIB ", "Y800", "GREY", "\0\0\0\0")

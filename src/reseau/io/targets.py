@@ -11,8 +11,6 @@ from ..core.data import Array
 from ..optics.formation import Outline, mark_outline
 from .document import Document, Strict
 
-__all__ = ["SpaceTargets", "TargetColumns"]
-
 Triple = tuple[float, float, float]
 Length = Annotated[float, Field(gt=0, le=1e5)]
 Shape = Literal["disk", "square"]

@@ -16,8 +16,6 @@ from .board import BoardDesign
 from .design import ReseauDesign, at_one_place
 from .document import Document, Strict
 
-__all__ = ["SHAPES", "FieldLines", "FieldTargets", "TestfieldDesign", "parse_design"]
-
 TargetShape = Literal["square", "triangle", "cross", "circle"]
 SHAPES: tuple[TargetShape, ...] = ("square", "triangle", "cross", "circle")
 """Shapes of targets, in the order of their numbers."""

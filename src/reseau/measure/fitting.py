@@ -6,10 +6,11 @@ from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 
 from ..adjust import Adjustment, Elimination, GaussHelmert, Options, Parameters, adjust, eliminate
-from ..core.data import Array, ImagePoints
+from ..core.data import Array, ImagePoints, Mask
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure
 from ..optics import PlaneMapping, RationalPolynomial
@@ -17,6 +18,7 @@ from ..optics.field import SmoothField
 
 __all__ = [
     "fit_mapping",
+    "gross_errors",
     "is_mirrored",
     "mapping_problem",
     "reduce_mapping",
@@ -139,6 +141,72 @@ def reduce_mapping(
         return shortage
     problem = mapping_problem(_with_start_values(model, points, target), points, target, target_sigma)
     return eliminate(problem, alpha, criterion, keep, options=options)
+
+
+_BEYOND_CHANCE = 1e-3
+"""Probability of a misfit, or of a point that deviates, by chance, from which it is explained otherwise."""
+_SUSPECTS = 5
+"""Number of points, those with the largest residuals, of which each is left out for a trial."""
+
+
+def beyond_chance(fit: Adjustment) -> bool:
+    """Whether the residuals of an adjustment are larger than the sigmas of the points explain."""
+    squares = fit.sigma0**2 * fit.redundancy
+    return fit.redundancy > 0 and bool(scipy.stats.chi2.sf(squares, fit.redundancy) < _BEYOND_CHANCE)
+
+
+def gross_errors(
+    model: PlaneMapping, points: ImagePoints, target: Array, target_sigma: ArrayLike = 0.0
+) -> Mask:
+    """Points that contradict all others, of a model that does not fit all of them.
+
+    While the residuals are beyond chance, the point without which they are smallest is a gross error if it
+    deviates from the prediction by the others (F-test with their scatter, over all points).
+
+    Parameters
+    ----------
+    model, points, target, target_sigma
+        As in :func:`mapping_problem`.
+
+    Returns
+    -------
+    ndarray (n,) of bool
+
+    Examples
+    --------
+    >>> square = np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0)), axis=-1).reshape(-1, 2)
+    >>> points = ImagePoints.with_sigma(map(str, range(16)), square, 0.01)
+    >>> target = square + 0.01 * np.random.default_rng(0).standard_normal(square.shape)
+    >>> target[5] += [0.0, 0.4]
+    >>> np.flatnonzero(gross_errors(RationalPolynomial.affine(), points, target))
+    array([5])
+    """
+    spread = np.broadcast_to(np.asarray(target_sigma, dtype=np.float64), target.shape)
+    kept = np.ones(len(points), dtype=bool)
+
+    def fitted(rows: Mask) -> Adjustment | Failure:
+        return fit_mapping(model, points.select(rows), target[rows], spread[rows])
+
+    fit = fitted(kept)
+    while isinstance(fit, Adjustment) and fit.redundancy > 4 and beyond_chance(fit):
+        rows = np.flatnonzero(kept)
+        off = model.with_values(fit.values)(points.xy[rows]) - target[rows]
+        size = (off**2).sum(axis=1) / (np.trace(points.cov[rows], axis1=1, axis2=2) + 1e-300)
+        trials = []
+        for at in rows[np.union1d(np.argsort(-size)[:_SUSPECTS], np.argsort(-np.hypot(*off.T))[:_SUSPECTS])]:
+            others = kept.copy()
+            others[at] = False
+            trial = fitted(others)
+            if isinstance(trial, Adjustment) and trial.redundancy > 2:
+                trials.append((trial.sigma0**2 * trial.redundancy, others, trial))
+        if not trials:
+            break
+        squares, others, trial = min(trials, key=lambda one: one[0])
+        gain = (fit.sigma0**2 * fit.redundancy - squares) / 2 / trial.sigma0**2
+        if scipy.stats.f.sf(gain, 2, trial.redundancy) * len(rows) > _BEYOND_CHANCE:
+            break
+        kept, fit = others, trial
+    return ~kept
 
 
 def _with_start_values(model: PlaneMapping, points: ImagePoints, target: ArrayLike) -> PlaneMapping:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+import scipy
 
 from ..core.data import Array, Frame, ImagePoints, Mask
 from ..core.display import Display
@@ -14,6 +16,8 @@ from ..core.errors import UsageError
 from ..core.failure import Code, Estimated, Remark
 from ..core.overlaid import Overlaid
 from ..io import ReseauMeasurement
+from ..optics.field import SmoothField
+from .fitting import on_one_line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,33 +62,61 @@ class Reason(str):
         return str(self), self.code
 
 
-_FAR_ABOVE = 5.0
-"""Ratio of deviations from predictions to their standard deviations from which there is a warning."""
+_ABOVE = 2.0
+"""Ratio of the scatter about a smooth mapping to that of the sigmas, which hold within a quarter, from which
+there is a note."""
+_FALSE = 0.01
+"""Share of sound frames in which one point deviates beyond chance."""
+_SPARE = 6
+"""Minimum number of points beyond the coefficients of a mapping, per axis."""
 
 
-def deviating(deviation: Array, cov: Array) -> tuple[Remark, ...]:
-    """A note where points deviate from the predictions by the others far more than their sigmas say.
+def deviating(ids: Sequence[str], source: Array, xy: Array, cov: Array) -> tuple[Remark, ...]:
+    """A note where points deviate from every smooth mapping of the others more than their sigmas say.
+
+    Mappings with trends of all degrees compete: the one that predicts points best from the others counts. A
+    stiff one would make few points of a strong distortion look like wrong ones.
 
     Parameters
     ----------
-    deviation : ndarray (n, 2)
-        Measured minus predicted, NaN where unknown.
+    ids : sequence of str (n,)
+        Names.
+    source, xy : ndarray (n, 2)
+        Points in the design and in the image, NaN where not measured.
     cov : ndarray (n, 2, 2)
-        Covariances of the measured points.
+        Covariances in the image.
     """
-    known = np.isfinite(deviation).all(axis=1)
-    if known.sum() < 8:
+    known = np.flatnonzero(np.isfinite(xy).all(axis=1) & np.isfinite(source).all(axis=1))
+    if len(known) < 3 + _SPARE or on_one_line(source[known]):
         return ()
     sigma = np.sqrt(np.trace(cov[known], axis1=1, axis2=2) / 2)
-    rms = float(np.sqrt(np.mean(deviation[known] ** 2)))
-    typical = float(np.sqrt(np.mean(sigma**2)))
-    if not rms > _FAR_ABOVE * typical:
+    spare = {degree: len(known) - (degree + 1) * (degree + 2) // 2 for degree in range(1, 6)}
+    fields = {
+        degree: SmoothField.fit(source[known], xy[known], sigma=sigma / np.median(sigma), degree=degree)
+        for degree, freedom in spare.items()
+        if freedom >= _SPARE
+    }
+    left = {degree: one.leave_one_out() for degree, one in fields.items()}
+    degree = min(left, key=lambda each: float(np.square(left[each][0] / sigma[:, None]).sum()))
+    best, (off, predicted) = fields[degree], left[degree]
+    typical, scatter = float(np.median(sigma)), float(np.sqrt(np.mean(best.noise**2)))
+    if scatter > _ABOVE * typical:
+        text = (
+            f"points deviate from the prediction by the others by {np.sqrt(np.mean(off**2)):.2g} px (rms), "
+            f"more than the {typical:.2g} px of their sigmas explain: the distortion is not smooth, or "
+            "sigmas do not contain all errors"
+        )
+        return (Remark(text, Code.INCONSISTENT),)
+    # The scatter is that of the sigmas, or larger; one point that is wrong enlarges it for all.
+    far = np.abs(off / predicted).max(axis=1) * max(scatter / typical, 1.0)
+    worst = int(far.argmax())
+    # The scatter is known from the points that are left, and the degree was chosen among several.
+    chance = 2 * scipy.special.stdtr(spare[degree], -far[worst])
+    if 2 * len(known) * len(fields) * chance > _FALSE:
         return ()
-    text = (
-        f"each point deviates from the prediction by the others by {rms:.2g} px (rms), far more than the "
-        f"{typical:.2g} px of its sigmas: the distortion is not smooth, or sigmas do not contain all errors"
-    )
-    return (Remark(text, Code.INCONSISTENT),)
+    away = float(np.hypot(*off[worst]))
+    text = f"{ids[known[worst]]} deviates from the prediction by the others by {away:.2g} px"
+    return (Remark(f"{text}, {far[worst]:.0f} sigma", Code.INCONSISTENT),)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -11,7 +11,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from ..calibration import (
-    CalibratedMapping,
     Calibration,
     CameraCorrection,
     CameraMapping,
@@ -19,24 +18,23 @@ from ..calibration import (
     FiducialMapping,
     FilmFrameMapping,
     InstrumentCorrection,
-    SensorCorrection,
     read_calibration,
     required_use,
     undistort_video,
-    undistorted_camera,
-    write_corrected,
     write_tables,
 )
-from ..calibration.raster import planes_of
+from ..calibration.mapping import CalibratedMapping
+from ..calibration.raster import planes_of, undistorted_camera, write_corrected
+from ..calibration.sensor import SensorCorrection
 from ..core.data import ImagePoints
 from ..core.errors import UsageError
 from ..core.provenance import Provenance, canonical_json, sha256_of
 from ..exchange.film import film_files
-from ..io import POINTS, points_document, points_of, read_measurement, read_text
+from ..io import read_text
 from ..io.images import open_scan, read_image, write_image
+from ..io.points import POINTS, points_document, points_of
+from ..io.reading import read_measurement
 from .exposures import photographs_in
-
-__all__ = ["Application", "AppliedFrame", "AppliedPoints", "View", "oriented_roll"]
 
 
 class View(NamedTuple):
@@ -177,7 +175,8 @@ class Application:
 
         Examples
         --------
-        >>> from reseau.calibration import Assessment, Covariance, Quantity, Use
+        >>> from reseau.calibration.assessment import Assessment, Use
+        >>> from reseau.calibration.document import Covariance, Quantity
         >>> camera = Calibration(
         ...     kind="camera", name="lens", sigma0=None, redundancy=0,
         ...     model={"model": "opencv", "width": 640, "height": 480, "pitch_mm": [1.0, 1.0]},

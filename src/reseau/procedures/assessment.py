@@ -16,14 +16,11 @@ import numpy as np
 
 from ..bundle import Explanation, Result, camera_mapping, explain
 from ..bundle.explanations import described
-from ..calibration import Assessment, CameraMapping, Cause, ErrorMap, Use, projection_field
-from ..calibration.assessment import two_digits
+from ..calibration import CameraMapping, Cause, projection_field
+from ..calibration.assessment import Assessment, ErrorMap, Use, two_digits
 from ..core.data import Array, Mask
 from ..core.failure import Code, Remark
 from .next_pose import next_photograph
-
-__all__ = ["assess", "sorted_remarks"]
-
 
 _CELLS, _EMPTY, _LIT = 12, 0.5, 0.3
 """Cells of a zone along each axis are a third of these; a zone with fewer of them covered is not covered;

@@ -41,20 +41,6 @@ from ..optics.poses import matrix_to_vector, rotation_matrix
 from ..optics.targets import target_outline
 from .target_measurement import Measurer, measurer_of
 
-__all__ = [
-    "SPACING_PX",
-    "BlurredFrame",
-    "calibrated_by",
-    "focused",
-    "lens_camera",
-    "measure_blurred_frame",
-    "orient_by_rays",
-    "pose_in_network",
-    "refocused",
-    "targets_of",
-    "thin_lens_of",
-]
-
 Design = ReseauDesign | TestfieldDesign
 
 SPACING_PX = 0.8

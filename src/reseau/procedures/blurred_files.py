@@ -30,8 +30,6 @@ from .blurred import (
 from .blurred_network import BlurredNetwork, final_document
 from .exposures import photographs_in
 
-__all__ = ["BlurredImaging", "measure_blurred_photograph", "network_documents", "photographs_of_network"]
-
 
 @dataclass(frozen=True)
 class BlurredImaging:

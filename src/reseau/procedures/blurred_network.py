@@ -40,14 +40,6 @@ from ..optics.lenses import (
 from ..optics.refraction import RefractedRays, Refraction
 from .blurred import SPACING_PX
 
-__all__ = [
-    "BlurredNetwork",
-    "BlurredRound",
-    "NetworkOptions",
-    "final_document",
-    "measure_blurred_network",
-]
-
 _NODES = 150
 """Largest number of nodes along the size of a target."""
 _DIFFERS = 9.21
@@ -346,8 +338,8 @@ def _misfits(entry: BlurredRound) -> tuple[Remark, ...]:
     names, values = list(unlike), list(unlike.values())
     more = f" and {len(names) - 8} more" if len(names) > 8 else ""
     text = (
-        f"residuals of the targets in {', '.join(names[:8])}{more} are {min(values):.2g} to "
-        f"{max(values):.2g} times the noise of the photographs: lens, focus or aperture are not theirs, and "
+        f"residuals of the targets in {', '.join(names[:8])}{more} are {min(values):.3g} to "
+        f"{max(values):.3g} times the noise beside them: lens, focus or aperture are not theirs, and "
         "object points may be wrong by more than their sigmas, also where sigma0 is good"
     )
     return (Remark(text, Code.INCONSISTENT),)

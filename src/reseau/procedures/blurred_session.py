@@ -22,8 +22,6 @@ from .blurred_files import BlurredImaging, network_documents
 from .blurred_network import BlurredNetwork, NetworkOptions, measure_blurred_network
 from .testfield import P, Place
 
-__all__ = ["BlurredProcedure"]
-
 _FEWEST = 6
 """Targets that must stand out in a usable frame: twice what its orientation needs."""
 

@@ -26,7 +26,9 @@ from ..bundle import (
     explain,
     model_search_entries,
 )
-from ..calibration import Assessment, Calibration, Covariance, FieldDifference
+from ..calibration import Calibration, FieldDifference
+from ..calibration.assessment import Assessment
+from ..calibration.document import Covariance
 from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display, Table, html_table
 from ..core.errors import InputError, UsageError
@@ -34,15 +36,15 @@ from ..core.failure import Estimated, Remark
 from ..core.lazy import above
 from ..core.provenance import Provenance
 from ..exchange.calibrations import Exported, export_calibrations
-from ..io import BoardDesign, is_points, write_whole
+from ..io import BoardDesign, write_whole
 from ..io.images import Channel, read_image
 from ..io.photographs import read_exif
+from ..io.reading import is_points
 from .assessment import assess, sorted_remarks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["ONE_CAMERA", "Calibrated", "ReportOptions"]
 
 ONE_CAMERA = "camera"
 """Name of a camera that is alone."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..calibration import SensorCorrection
+from ..calibration.sensor import SensorCorrection
 from ..core.data import Frame, ImagePoints
 from ..core.failure import Failure
 from ..core.provenance import sha256_of
@@ -20,8 +20,6 @@ from .calibration_options import CalibrationOptions, CameraOptions
 from .exposures import Taken, photograph_reader, photographs_of
 from .target_measurement import Photograph, drawing_overlays, measurer_of
 from .which_target import Design, target_of
-
-__all__ = ["calibrate_photographs"]
 
 
 def calibrate_photographs(

@@ -28,6 +28,7 @@ from ..bundle import (
     choose_board,
     choose_models,
     held_as_designed,
+    misnamed,
     search_model,
 )
 from ..bundle.network import stage_of_turntable
@@ -43,14 +44,9 @@ from ..optics import PixelGrid, camera_model
 from ..optics.refraction import RefractedRays, Refraction
 from .calibrated import ONE_CAMERA, Calibrated
 from .calibration_options import CalibrationOptions, CameraOptions, PlaneDesign
-from .copies import copies_among, said_of_copies
 from .exposures import Taken
-from .misnamed_points import left_out
 from .target_measurement import MeasuredPhotograph, Measurer, Photograph, by_reason, few_of
-from .told_target import measured_as_shown
-from .turned_targets import named_alike, named_by_others, ways_to_turn
-
-__all__ = ["calibrate_camera", "first_camera", "network_of"]
+from .told_target import measured_as_shown, named_alike, named_by_others, ways_to_turn
 
 _LEAST_POINTS = 8
 _LEAST_IMAGES = 3
@@ -562,3 +558,141 @@ def _scale(object_points: Sequence[Any], image_points: Sequence[Any]) -> float:
         mapping = np.linalg.lstsq(design, xy - xy.mean(axis=0), rcond=None)[0]
         scales.append(float(np.linalg.svd(mapping, compute_uv=False)[0]))
     return float(np.median(scales))
+
+
+_LEAST_COMMON = 8
+"""Points in common with which photographs are compared."""
+_KNOWN = np.log(1.5)
+"""Standard deviation of the logarithm of the variances that measurements state, against the scatter of
+photographs of one pose."""
+_LEAST_SHARE = 1e-4
+"""Share of the variances of a copy that was hardly compressed; of one that is as its original it is less."""
+
+
+def copies_among(measured: Mapping[str, ImagePoints]) -> dict[str, str]:
+    """Photographs that are copies of others, by their names: the first of those that are alike.
+
+    Parameters
+    ----------
+    measured : mapping of str to ImagePoints
+        Points of each photograph.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> xy = rng.uniform(0, 600, (20, 2))
+    >>> names = [str(k) for k in range(20)]
+    >>> first, second = (ImagePoints.with_sigma(names, xy + rng.normal(0, 0.01, (20, 2)), 0.01) for _ in "ab")
+    >>> copies_among({"a.jpg": first, "b.jpg": second, "again.jpg": first})
+    {'again.jpg': 'a.jpg'}
+    """
+    row = {
+        name: k for k, name in enumerate(dict.fromkeys(n for each in measured.values() for n in each.names))
+    }
+    images = list(measured)
+    xy = np.full((len(images), len(row), 2), np.nan)
+    variance = np.full((len(images), len(row), 2), np.nan)
+    for k, points in enumerate(measured.values()):
+        at = [row[name] for name in points.names]
+        xy[k, at], variance[k, at] = points.xy, np.diagonal(points.cov, axis1=1, axis2=2)
+    original = dict[int, int]()
+    for k in range(len(images)):
+        if k not in original:
+            later = np.arange(k + 1, len(images))
+            square = (xy[later] - xy[k]) ** 2 / (variance[later] + variance[k])
+            original |= {int(n): k for n in later[_of_one_exposure(square)] if int(n) not in original}
+    return {images[n]: images[k] for n, k in sorted(original.items())}
+
+
+def said_of_copies(copies: Mapping[str, str]) -> tuple[str, ...]:
+    """What is said of copies: one note, or none.
+
+    Examples
+    --------
+    >>> said_of_copies({"b.jpg": "a.jpg", "c.jpg": "a.jpg"})
+    ('copies of one photograph count once: a.jpg = b.jpg = c.jpg',)
+    """
+    groups: dict[str, list[str]] = {}
+    for copy, original in copies.items():
+        groups.setdefault(original, [original]).append(copy)
+    said = ", ".join(" = ".join(names) for names in groups.values())
+    return (f"copies of one photograph count once: {said}",) if said else ()
+
+
+def _of_one_exposure(square: Array) -> Array:
+    """Which photographs (m,) have differences, squared and over their variances (m, n, 2), of a copy."""
+    known = np.isfinite(square)
+    count = known.sum(axis=(1, 2))
+    share = np.where(known, square, 0.0).sum(axis=(1, 2)) / np.maximum(count, 1)
+    size = np.log(np.maximum(share, _LEAST_SHARE))
+    spread = np.sqrt(_KNOWN**2 + 2 / np.maximum(count, 1))
+    exposure = np.exp(-0.5 * (size / spread) ** 2) / (np.sqrt(2 * np.pi) * spread)
+    copy = 1 / -np.log(_LEAST_SHARE)
+    return np.asarray((count >= 2 * _LEAST_COMMON) & (share < 1) & (copy > exposure))
+
+
+_STAND_IN = "opencv"
+"""Model of a camera of which only the size of its images is used."""
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Image points that are left out, and the others.
+
+    Parameters
+    ----------
+    network : Network
+        All image points, with the coordinates of the design.
+    found : Misnamed
+        Those that are left out.
+    """
+
+    network: Network
+    found: Misnamed
+
+    def kept(self, measured: Mapping[str, ImagePoints]) -> dict[str, ImagePoints]:
+        """The measured points without those that are left out."""
+        network = self.network
+        wrong = {
+            (network.images[network.image_of[k]], network.points[network.point_of[k]])
+            for k in self.found.rows
+        }
+        kept = {}
+        for image, points in measured.items():
+            keep = np.array([(image, name) not in wrong for name in points.names])
+            names = tuple(name for name, good in zip(points.names, keep, strict=True) if good)
+            kept[image] = ImagePoints(names, points.xy[keep], points.cov[keep])
+        return kept
+
+    def after(self, result: Result) -> LeftOut | None:
+        """Those that still lie in other places by the cameras of an adjustment without them."""
+        adjusted = result.network
+        plain = all(camera.has_plane_mapping for camera in adjusted.cameras)
+        if adjusted.refraction is not None or not plain:
+            return self
+        by_name = {
+            camera.id: camera_mapping(result, c, formal=True).mapping
+            for c, camera in enumerate(adjusted.cameras)
+        }
+        lenses = [by_name[camera.id] for camera in self.network.cameras]
+        found = misnamed(self.network, lenses, self.found)
+        return None if found is None else replace(self, found=found)
+
+
+def left_out(
+    network: Network, cameras: Sequence[str], sizes: Mapping[str, tuple[int, int]], of: Sequence[int]
+) -> LeftOut | None:
+    """Find image points that lie in the places of others.
+
+    Parameters
+    ----------
+    network : Network
+        Image points and the design; its cameras are not used.
+    cameras, sizes, of : sequence of str, mapping of str to (int, int), sequence of int
+        Names of the cameras, sizes of their images, and the camera of each image.
+    """
+    values = np.zeros(len(camera_model(_STAND_IN).names))
+    plain = tuple(Camera(name, *sizes[name], (1.0, 1.0), _STAND_IN, values) for name in cameras)
+    network = replace(network, cameras=plain, camera_of=np.array(of, dtype=np.intp))
+    found = misnamed(network)
+    return None if found is None else LeftOut(network, found)

@@ -9,8 +9,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from ..calibration import Calibration, CameraMapping, CorrectedImage, Use, write_corrected
-from ..calibration.raster import planes_of
+from ..calibration import Calibration, CameraMapping, CorrectedImage
+from ..calibration.assessment import Use
+from ..calibration.raster import planes_of, write_corrected
 from ..core.errors import UsageError
 from ..core.files import writable
 from ..exchange import export_calibration, export_rig
@@ -18,8 +19,6 @@ from ..exchange.calibrations import formats_holding
 from ..io import write_whole
 from ..io.images import open_scan
 from .calibrated import Calibrated
-
-__all__ = ["calibration_folder", "checked_output", "folder_beside", "write_calibrated"]
 
 _FILES = {"opencv": "opencv.yml", "ros": "ros.yaml", "colmap": "colmap.txt"}
 """Files for other programs, by their formats."""

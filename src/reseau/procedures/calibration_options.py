@@ -16,8 +16,6 @@ from ..optics import CameraModel, camera_model
 from ..optics.cameras import default_camera_model
 from .z_stage import Heights
 
-__all__ = ["CalibrationOptions", "CameraOptions", "PlaneDesign"]
-
 
 class PlaneDesign(Protocol):
     """A plane target: names and coordinates of its points."""

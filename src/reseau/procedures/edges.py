@@ -13,9 +13,8 @@ from ..core.data import Frame
 from ..core.failure import Failure
 from ..core.provenance import Provenance
 from ..io.edges import EdgesDocument, MeasuredEdge
-from ..sensor import ChartEdge, EdgeSpread, measure_edges
-
-__all__ = ["Sharpness", "measure_sharpness"]
+from ..sensor import EdgeSpread, measure_edges
+from ..sensor.chart import ChartEdge
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,27 +13,14 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from ..archive.objects import LocalObjects, objects_at
-from ..calibration import SensorCorrection
+from ..calibration.sensor import SensorCorrection
 from ..core.data import Frame, ImagePoints
 from ..core.errors import InputError, UsageError
 from ..core.failure import Code, Failure
-from ..io import is_points, read_measurement
 from ..io.images import Channel, read_image
 from ..io.photographs import PHOTOGRAPHS, read_exif
+from ..io.reading import is_points, read_measurement
 from .target_measurement import MeasuredPhotograph, Photograph, Unread
-
-__all__ = [
-    "Taken",
-    "exposures_of_files",
-    "files_left_out",
-    "files_of",
-    "of_another_lens",
-    "photograph_reader",
-    "photographs_in",
-    "photographs_named",
-    "photographs_of",
-]
-
 
 _DESCRIBING = (".json", ".yaml", ".yml", ".xml")
 """Suffixes of designs and calibrations, which are kept beside photographs."""

@@ -26,22 +26,10 @@ from ..measure.film import (
     Kind,
     Roll,
     orient_frames,
-    result_of,
-    roll_of,
     transformed,
 )
 
-__all__ = [
-    "FrameOptions",
-    "FrameResult",
-    "Roll",
-    "film_scale",
-    "orient_scan",
-    "orientation_of",
-    "reorient_scan",
-    "result_of",
-    "roll_of",
-]
+__all__ = ["FrameOptions", "FrameResult"]
 
 
 def orient_scan(scan: Scan, options: FrameOptions | None = None) -> list[FrameResult]:

@@ -12,12 +12,12 @@ from ..core.data import Frame
 from ..core.errors import EstimationError
 from ..core.failure import Failure
 from ..core.provenance import Provenance
-from ..io import FrameCorners, FrameOrientation, FrameOutcome, RollSummary
+from ..io import FrameCorners, FrameOrientation
+from ..io.frame import FrameOutcome, RollSummary
 from ..io.scans import Scan
 from ..measure.film import Kind
-from .film_frame import FrameOptions, FrameResult, Roll, orient_scan, orientation_of, reorient_scan, roll_of
-
-__all__ = ["FilmRollProcedure", "OrientedFrame"]
+from ..measure.film.roll import Roll, roll_of
+from .film_frame import FrameOptions, FrameResult, orient_scan, orientation_of, reorient_scan
 
 
 class _Named(Protocol):

@@ -20,13 +20,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ..bundle import Network, Result, Stage, camera_mapping
-from ..calibration import CameraMapping, NextPhotograph
+from ..calibration import CameraMapping
+from ..calibration.assessment import NextPhotograph
 from ..calibration.camera import by_rotation, places, projection_slopes, worst
 from ..core.data import Array, Mask, Rows
 from ..optics import Pose
 from ..optics.poses import matrix_to_vector, rotation_matrix
-
-__all__ = ["PREDICTED", "next_photograph", "with_image"]
 
 _MARGIN_PX = 6.0
 """Points closer to the edge of the image are not expected to be measured."""

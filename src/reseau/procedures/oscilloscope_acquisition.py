@@ -14,8 +14,6 @@ from ..core.provenance import Provenance
 from ..io import ReseauDesign
 from .oscilloscope import PhotoI, PhotoII, PhotoIII, photo_i, photo_ii, photo_iii
 
-__all__ = ["OscilloscopeProcedure"]
-
 
 class _Named(Protocol):
     """A step; see :class:`reseau.capture.Step`."""

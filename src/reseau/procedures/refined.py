@@ -16,13 +16,12 @@ from ..core.errors import UsageError
 from ..core.failure import Estimated
 from ..core.lazy import above
 from ..core.provenance import canonical_json
-from ..io import ReseauDesign, points_document
+from ..io import ReseauDesign
+from ..io.points import points_document
 from .oscilloscope import PhotoI, PhotoII, PhotoIII, StillStandard, note_entries
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-__all__ = ["Refined"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -18,8 +18,6 @@ from ..measure import PinOptions, ReseauOptions
 from .oscilloscope import photo_i, photo_ii, photo_iii, still_standard_in
 from .refined import Refined
 
-__all__ = ["Photographs", "RefineOptions", "refine_photographs"]
-
 
 @dataclass(frozen=True)
 class Photographs:

@@ -12,9 +12,9 @@ from ..core.data import Frame
 from ..core.environment import Surroundings
 from ..core.errors import EstimationError, UsageError
 from ..core.provenance import Provenance
-from ..sensor import Level, LevelSums, SensorResult, SensorSeries, calibrate_sensor, with_edge
-
-__all__ = ["Exposed", "Exposure", "SensorProcedure"]
+from ..sensor import Level, SensorSeries, calibrate_sensor
+from ..sensor.sensor import SensorResult, with_edge
+from ..sensor.series import LevelSums
 
 _SATURATED = 0.01
 """Largest share of pixels of an edge at full scale."""

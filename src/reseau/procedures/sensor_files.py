@@ -20,8 +20,6 @@ from ..io.photographs import PHOTOGRAPHS, read_exif
 from ..io.stacks import VIDEOS, frames_of
 from .sensor import Exposure, SensorProcedure
 
-__all__ = ["FileExposure", "add_files", "exposures_in", "read_exposures"]
-
 _KINDS = {
     "dark": "dark",
     "light": "light",

@@ -25,19 +25,6 @@ from ..measure import (
 )
 from ..measure.points import Measured
 
-__all__ = [
-    "MeasuredPhotograph",
-    "Measurer",
-    "Photograph",
-    "Unread",
-    "by_reason",
-    "drawing_overlays",
-    "few_of",
-    "measured_in_order",
-    "measurer_of",
-    "measurer_with",
-]
-
 _COUNTS = re.compile(r"(?<![\w.×-])\d+(?![\w.×-])")
 """Numbers in a reason, but those in names of files and in sizes of images."""
 Measurer = Callable[[Frame], Measured | Failure]

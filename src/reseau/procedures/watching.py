@@ -24,8 +24,6 @@ from .exposures import photographs_in
 from .target_measurement import Measurer
 from .testfield import TestfieldProcedure
 
-__all__ = ["Seen", "WatchedFolder", "Watching"]
-
 _ACROSS, _DOWN = 12, 9
 _LEAST_IMAGES, _LEAST_POINTS = 3, 12
 _STILL_PX = 1.5

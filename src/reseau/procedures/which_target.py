@@ -17,11 +17,10 @@ from ..core.failure import Code, Failure
 from ..designs import board
 from ..designs.known import known_designs
 from ..exchange import read_target
-from ..io import BoardDesign, ReseauDesign, TestfieldDesign, is_points
+from ..io import BoardDesign, ReseauDesign, TestfieldDesign
+from ..io.reading import is_points
 from ..measure import PuzzlePart, boards_shown, puzzle_part
 from .target_measurement import measurer_of
-
-__all__ = ["Design", "corrected", "described", "designs_beside", "target_of", "which_target"]
 
 Design = ReseauDesign | TestfieldDesign | BoardDesign
 _DESIGNS = (".json", ".yaml", ".yml", ".xml")

@@ -17,8 +17,6 @@ from ..bundle import Network, Stage
 from ..core.data import Array, Rows
 from ..core.errors import UsageError
 
-__all__ = ["Heights"]
-
 _LEAST_POINTS = 8
 
 

@@ -19,7 +19,14 @@ from ..calibration.mapping import carried
 from ..core.data import Array, ImagePoints, Mask
 from ..core.failure import Code, Failure
 from ..io import ReseauDesign
-from ..measure.fitting import fit_mapping, is_mirrored, on_one_line, reduce_mapping, residual_field
+from ..measure.fitting import (
+    fit_mapping,
+    gross_errors,
+    is_mirrored,
+    on_one_line,
+    reduce_mapping,
+    residual_field,
+)
 from ..optics import RationalPolynomial, Similarity
 from ..optics.field import SmoothField
 
@@ -92,6 +99,8 @@ class FittedCamera(CameraCorrection):
     ----------
     fit : CorrectionFit, optional
         How the model was fitted.
+    gross : tuple of str
+        Marks that contradict the others, and were left out.
 
     Examples
     --------
@@ -105,6 +114,7 @@ class FittedCamera(CameraCorrection):
     """
 
     fit: CorrectionFit | None = None
+    gross: tuple[str, ...] = ()
 
 
 def correct_camera(
@@ -186,6 +196,14 @@ def correct_camera(
         return systems
     photo_system, object_system, base = systems
     photo, target = carried(photo_system, marks), object_system(plane)
+    wrong = gross_errors(model, photo, target, sigma[:, None])
+    if wrong.any():  # O or S may be one of them
+        gross = tuple(name for name, bad in zip(known, wrong, strict=True) if bad)
+        sound = points.select(~np.isin(points.names, gross))
+        found = correct_camera(
+            sound, design, model=model, alpha=alpha, criterion=criterion, check=check, trials=trials
+        )
+        return found if isinstance(found, Failure) else replace(found, gross=gross + found.gross)
     used = np.array([name not in held for name in known])
     elimination = reduce_mapping(
         model,

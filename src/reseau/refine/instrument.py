@@ -20,7 +20,7 @@ from ..calibration.mapping import carried
 from ..core.data import Array, ImagePoints
 from ..core.failure import Code, Failure
 from ..io import ReseauDesign
-from ..measure.fitting import is_mirrored, reduce_mapping, residual_field
+from ..measure.fitting import beyond_chance, gross_errors, is_mirrored, reduce_mapping, residual_field
 from ..optics import RationalPolynomial, Similarity, wong_display
 from ..optics.field import SmoothField
 from .camera import defining_marks
@@ -99,6 +99,11 @@ class FittedInstrument(InstrumentCorrection):
     ----------
     fit : InstrumentFit, optional
         How the model was fitted.
+    gross : tuple of str
+        Rods that contradict the others, and were left out.
+    enlarged : float
+        Factor by which standard deviations of group B are larger than those of the rods make them, where
+        residuals are beyond chance and no gross errors.
 
     Examples
     --------
@@ -114,6 +119,8 @@ class FittedInstrument(InstrumentCorrection):
     """
 
     fit: InstrumentFit | None = None
+    gross: tuple[str, ...] = ()
+    enlarged: float = 1.0
 
 
 def correct_instrument(
@@ -182,6 +189,7 @@ def correct_instrument(
     known = [name for name in points.names if name in coordinates]
     if shared is None:
         shared = np.zeros((len(points), 2, 0))
+    all_shared = shared
     shared = shared[[name in coordinates for name in points.names]]
     if len(known) < 4:
         return Failure(
@@ -196,6 +204,15 @@ def correct_instrument(
     plane = object_plane(refined, table[:, :2], design)
     if isinstance(plane, Failure):
         return plane
+    wrong = gross_errors(model, refined, plane.to_common(table[:, :2]), table[:, 2:] * plane.scale)
+    if wrong.any():  # M or N may be one of them
+        gross = tuple(name for name, bad in zip(known, wrong, strict=True) if bad)
+        sound = ~np.isin(points.names, gross)
+        found = correct_instrument(
+            points.select(sound), design, camera, model=model, alpha=alpha, criterion=criterion, check=check,
+            trials=trials, registration=registration, shared=all_shared[sound],
+        )  # fmt: skip
+        return found if isinstance(found, Failure) else replace(found, gross=gross + found.gross)
     target = plane.to_common(table[:, :2])
     used = ~np.isin(known, list(check))
     # (vii) equations (7a, b)
@@ -219,7 +236,8 @@ def correct_instrument(
     monomials = reduced(model.split())
     fit = elimination.full
     full = model.with_values(fit.values)
-    covariance = _joint_covariance(camera, rods.select(used), full, fit, registration, shared[used])
+    enlarged = max(fit.sigma0, 1.0) if beyond_chance(fit) else 1.0
+    covariance = _joint_covariance(camera, rods.select(used), full, fit, registration, shared[used], enlarged)
     left = residual_field(full, fitted, target[used], full(fitted.xy) - target[used], sigma, trials)
     correction = FittedInstrument(
         camera,
@@ -229,6 +247,7 @@ def correct_instrument(
         design.unit,
         rods.select(used),
         LocalModel.where_needed(left),
+        enlarged=enlarged,
     )
     displays = rivals(RationalPolynomial.ultrasonic(), wong_display(), fitted, target[used], sigma)
     record = InstrumentFit(
@@ -251,8 +270,9 @@ def _joint_covariance(
     fit: Adjustment,
     registration: Registration | None,
     shared: Array,
+    enlarged: float,
 ) -> Array:
-    """Covariance of the coefficients of both groups.
+    """Covariance of the coefficients of both groups; the own errors of group B are enlarged by a factor.
 
     An error δ of the coefficients of group A changes the estimates of group B by −Q Aᵀ W G δ, with A and W
     the design matrix and the weights of its adjustment, Q its cofactor matrix and G the derivatives of its
@@ -266,7 +286,7 @@ def _joint_covariance(
     by_image = by_photo @ by_pixel
     cofactors = by_refined @ np.asarray(fit.problem.covariance) @ np.swapaxes(by_refined, 1, 2)
     weights = np.linalg.inv(cofactors)
-    q_b = fit.cofactor
+    q_b = enlarged**2 * fit.cofactor
 
     def responses(conditions: Array) -> Array:
         found: Array = -fit.cofactor @ (by_b.swapaxes(1, 2) @ weights @ by_refined @ conditions)

@@ -6,14 +6,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration import CameraCorrection, InstrumentCorrection
+from ..calibration import CameraCorrection
 from ..core.data import ImagePoints
 from ..core.failure import Code, Remark
 from ..io import ReseauDesign
+from .instrument import FittedInstrument
 from .registration import Registration
 from .standard import StandardTest
 
-__all__ = ["ANOTHER_SHAPE_PX", "of_the_camera", "of_the_change", "of_the_object"]
+__all__ = ["ANOTHER_SHAPE_PX", "of_gross_errors", "of_the_camera", "of_the_change", "of_the_object"]
 
 _UPRIGHT = np.deg2rad(20.0)
 """Rotation of the test object against the reseau, or of the reseau in the image, that is accepted."""
@@ -58,6 +59,12 @@ def of_the_camera(camera: CameraCorrection, registration: Registration | None) -
     return tuple(notes)
 
 
+def of_gross_errors(what: str, names: tuple[str, ...]) -> tuple[Remark, ...]:
+    """A remark on points that were left out."""
+    text = f"{what} that contradict the others and were left out: {', '.join(names)}"
+    return (Remark(text, Code.GROSS_ERRORS),) if names else ()
+
+
 def of_the_change(test: StandardTest, registration: Registration | None, unit: str) -> tuple[Remark, ...]:
     """Remarks on changes since a calibration, and their likely causes."""
     if test.holds:
@@ -88,13 +95,17 @@ def of_the_change(test: StandardTest, registration: Registration | None, unit: s
 
 
 def of_the_object(
-    instrument: InstrumentCorrection,
+    instrument: FittedInstrument,
     pins: ImagePoints,
     design: ReseauDesign,
     declined: Mapping[str, str] | None = None,
 ) -> tuple[Remark, ...]:
     """Remarks on the test object; `declined` gives the reasons of rods that were seen and not measured."""
-    notes, plane = [], instrument.plane
+    plane = instrument.plane
+    notes = [*of_gross_errors("rods", instrument.gross)]
+    if instrument.enlarged > 1:
+        text = f"residuals of the rods are {instrument.enlarged:.1f} times their standard deviations"
+        notes.append(Remark(f"{text}, beyond chance; those of group B were enlarged", Code.SIGMAS_DOUBTFUL))
     if abs(plane.rotation) > np.pi - _UPRIGHT:
         notes.append(Remark("the test object is upside down, or M and N are swapped", Code.TARGET_ROTATED))
     elif abs(plane.rotation) > np.deg2rad(2.0):

@@ -16,7 +16,6 @@ from ..optics.lenses import PlaneTarget, PupilElements, RayMap, RaySurrogate, ra
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["blurred_figure"]
 
 _RINGS = 8
 
@@ -64,7 +63,7 @@ def blurred_figure(
     columns, rows = (np.rint(at) + np.arange(-half, half + 1.0) for at in xy)
     inside_x, inside_y = (columns >= 0) & (columns < frame.width), (rows >= 0) & (rows < frame.height)
     columns, rows = columns[inside_x], rows[inside_y]
-    share = image.gridded.image(xy, float(found.psf_px[k]), columns, rows, PixelResponse(fill))
+    share = image.formed(xy, float(found.psf_px[k]), columns, rows, PixelResponse(fill))
     photograph = frame.pixels[np.ix_(rows.astype(np.intp), columns.astype(np.intp))].astype(float)
     design = np.stack([share.ravel(), np.ones(share.size)], axis=1)
     formed = (design @ np.linalg.lstsq(design, photograph.ravel(), rcond=None)[0]).reshape(share.shape)

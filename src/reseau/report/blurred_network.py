@@ -14,8 +14,6 @@ from ..core.provenance import Provenance
 from ..procedures.blurred_network import BlurredNetwork, BlurredRound
 from .template import rendered
 
-__all__ = ["blurred_network_report"]
-
 _IMAGES = 40
 
 
@@ -64,7 +62,9 @@ def _summary(found: BlurredNetwork) -> list[tuple[str, str, str]]:
 def _row(number: int, entry: BlurredRound) -> list[str]:
     blur = [found.blur_px[found.ok] for found in entry.measured.values()]
     widest = max((float(values.max()) for values in blur if len(values)), default=0.0)
-    misfit = max((found.misfit for found in entry.measured.values() if found.ok.any()), default=0.0)
+    misfit = max(
+        (found.misfit for found in entry.measured.values() if np.isfinite(found.misfit)), default=0.0
+    )
     return [
         "ordinary coordinates" if number == 0 else f"round {number}",
         f"{entry.result.sigma0:.4g}",

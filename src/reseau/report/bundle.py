@@ -7,24 +7,31 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup
+from matplotlib.figure import Figure
 
-from ..bundle import Result, camera_mapping, projection_field_at
+from ..bundle import (
+    CommonPattern,
+    Result,
+    by_place,
+    by_point,
+    camera_mapping,
+    common_pattern,
+    projection_field_at,
+)
 from ..bundle.network.shutter import MOTION
-from ..calibration import Assessment, CameraMapping, FieldDifference, projection_field
-from ..core.data import Frame, Rows
-from ..core.figures import nice
+from ..calibration import CameraMapping, FieldDifference, projection_field
+from ..calibration.assessment import Assessment
+from ..core.data import Array, Frame, Rows
+from ..core.errors import UsageError
+from ..core.figures import ACCENT, FAINT, INK, drawing, nice, to_svg
 from ..core.numbers import aligned, at_power, measured, plain, power
 from ..core.provenance import Provenance
 from ..procedures.assessment import sorted_remarks
 from .bundle_figures import distortion_figure, network_figure, next_figure, residual_figure
-from .bundle_tables import components_table, dropped_table, images_table, left_out_table, worst_points
 from .fields import difference_figure, errors_figure, uncertainty_figure
 from .overlay import Marks, frame_overlay
-from .patterns import patterns_of
 from .tables import unit_text
 from .template import rendered
-
-__all__ = ["bundle_report"]
 
 _IMAGES, _CAMERAS, _PLACES = 200, 20, 45
 _PHOTOGRAPHS, _ACROSS = 8, 800
@@ -415,3 +422,191 @@ def _difference(name: str, found: FieldDifference) -> dict[str, Any]:
         "p": f"{found.p:.2g}",
         "tilt": " / ".join(f"{angle:.2g}" for angle in 1e3 * found.rotation),
     }
+
+
+_WORST = 20
+"""Number of image points listed."""
+
+
+def images_table(result: Result) -> list[tuple[str, ...]]:
+    """Return a row for each image: points, residuals, factors on sigmas, reliability, orientation."""
+    network = result.network
+    v = np.where(result.rejected[:, None], np.nan, result.residuals)
+    r, least, effect = (
+        result.redundancy_numbers, result.minimal_detectable_errors(), result.external_reliability()
+    )  # fmt: skip
+    angle, sigma = np.degrees(result.angles), np.degrees(result.angle_sigma)
+    q = np.sqrt(np.maximum(np.diagonal(result.pose_covariance, axis1=1, axis2=2), 0.0))[:, 3:]
+    rows: list[tuple[str, ...]] = []
+    for i, name in enumerate(network.images):
+        at = network.rays_of_images[i]
+        at = at[np.isfinite(v[at]).all(axis=1)]
+        if not result.fit.usable.images[i]:
+            rows.append((name, str(len(at)), "left out", *[""] * 7))
+            continue
+        rows.append(
+            (
+                name,
+                str(len(at)),
+                _pair(np.sqrt((v[at] ** 2).mean(axis=0)), ".3f"),
+                _pair(result.variance_factors[i], ".2f"),
+                _pair(r[at].mean(axis=0), ".2f"),
+                f"{_median(least[at]):.2g}",
+                f"{_largest(effect[at]):.2g}",
+                " / ".join(f"{s:.2g}" for s in q[i]),
+                " / ".join(f"{a:.4f}" for a in angle[i]),
+                " / ".join(f"{s:.2g}" for s in sigma[i]),
+            )
+        )
+    return rows
+
+
+def worst_points(result: Result) -> list[tuple[str, ...]]:
+    """Return the image points with the largest test values, with their reliability."""
+    network, w = result.network, np.nan_to_num(result.test_values)
+    order = np.argsort(-w.max(axis=1), kind="stable")[:_WORST]
+    v, r = result.residuals, result.redundancy_numbers
+    least, effect = result.minimal_detectable_errors(), result.external_reliability()
+    return [
+        (
+            network.images[network.image_of[k]],
+            network.points[network.point_of[k]],
+            _pair(v[k], ".3f"),
+            _pair(r[k], ".2f"),
+            _pair(w[k], ".1f"),
+            _pair(least[k], ".2g"),
+            _pair(effect[k], ".2g"),
+        )
+        for k in order
+        if w[k].max() > 0
+    ]
+
+
+def left_out_table(result: Result) -> list[tuple[str, str, str, str]]:
+    """Return the rejected image points: image, point, test value, bound; gross errors without these."""
+    return [
+        (image, point, f"{value:.1f}", f"{critical:.1f}")
+        if value == value
+        else (image, point, "gross error", "")
+        for image, point, value, critical in result.rejected_points()
+    ]
+
+
+def components_table(result: Result) -> list[tuple[str, str, str, str]]:
+    """Return variance components: name, factor, its standard deviation, redundancy."""
+    found = result.components
+    if found is None:
+        return []
+    columns = zip(found.names, found.factors, found.sigma, found.redundancy, strict=True)
+    return [(name, f"{factor:.3f}", f"{sigma:.2g}", f"{r:.1f}") for name, factor, sigma, r in columns]
+
+
+def dropped_table(result: Result) -> dict[str, Any] | None:
+    """Return dropped parameters and the errors of prediction before and after; None without elimination."""
+    if result.eliminated is None:
+        return None
+    before, after = result.validation or (np.nan, np.nan)
+    return {
+        "steps": [
+            (step.camera, step.test.name, f"{step.test.statistic:.2f}", f"{step.test.critical:.2f}",
+             f"{step.test.p:.2g}", f"{step.sigma0:.5g}")
+            for step in result.eliminated
+        ],
+        "before": f"{before:.4g}",
+        "after": f"{after:.4g}",
+    }  # fmt: skip
+
+
+def _pair(values: Array, form: str) -> str:
+    return " / ".join(f"{value:{form}}" if np.isfinite(value) else "–" for value in values)
+
+
+def _median(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def _largest(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.max()) if len(known) else float("nan")
+
+
+_PANELS, _FIGURES_ACROSS = 8, 4
+"""Number of groups of images drawn, and number of panels side by side."""
+_SURE = 0.01
+"""Level at which the shift of a single class is marked as significant."""
+
+
+def patterns_of(result: Result) -> list[dict[str, Any]]:
+    """Return the common residuals of a network: by place in each camera's image, and by groups of images.
+
+    Without a test, `why_not` gives the reason.
+    """
+    network = result.network
+    patterns = [
+        (f"at the same place in all images of {camera.label}", by_place(result, c), False)
+        for c, camera in enumerate(network.cameras)
+    ]
+    if any(group is not None for group in network.groups):
+        patterns.append(
+            ("of the same point in the images of a group", by_point(result, network.groups), True)
+        )
+    found = list[dict[str, Any]]()
+    for title, key, grouped in patterns:
+        try:
+            pattern = common_pattern(result, key)
+        except UsageError as error:
+            found.append({"title": title, "why_not": error.what})
+            continue
+        found.append(
+            {
+                "title": title,
+                "classes": len(pattern.count),
+                "statistic": f"{pattern.statistic:.2f}",
+                "degrees": " and ".join(str(degree) for degree in pattern.degrees),
+                "p": f"{pattern.p:.2g}",
+                "rms": f"{pattern.rms:.2g}",
+                "sigma0": f"{pattern.sigma0:.4g}",
+                "figure": Markup(_figure(result, pattern, grouped)),
+            }
+        )
+    return found
+
+
+def _figure(result: Result, pattern: CommonPattern, grouped: bool) -> str:
+    """Draw shifts as arrows at their mean places, one panel for each group; significant ones in colour."""
+    network = result.network
+    labels = np.full(len(pattern.count), "", dtype=object)
+    if grouped:
+        seen = pattern.key >= 0
+        labels[pattern.key[seen]] = np.array(network.groups, dtype=object)[network.image_of[seen]]
+    names = list(dict.fromkeys(labels))[:_PANELS]
+    across = min(len(names), _FIGURES_ACROSS)
+    down = -(-len(names) // across)
+    camera = network.cameras[0]
+    shape = camera.height / camera.width
+    size = np.hypot(*pattern.shift.T)
+    typical = float(np.quantile(size, 0.9)) or 1.0
+    enlarged = nice((0.1 if grouped else 0.04) * camera.width / typical)
+    sure = pattern.p_at < _SURE
+    width = 8.6 if across > 1 else 6.0
+    with drawing():
+        figure = Figure(figsize=(width, 0.5 + width * down * shape / across), layout="constrained")
+        grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
+        for axes in grid.flat[len(names) :]:
+            axes.remove()
+        for axes, name in zip(grid.flat, names, strict=False):
+            for chosen, colour in (((labels == name) & ~sure, INK), ((labels == name) & sure, ACCENT)):
+                axes.quiver(
+                    *pattern.xy[chosen].T, *(enlarged * pattern.shift[chosen]).T, color=colour, angles="xy",
+                    scale_units="xy", scale=1, width=0.004,
+                )  # fmt: skip
+            axes.set_xlim(0, camera.width)
+            axes.set_ylim(camera.height, 0)
+            axes.set_aspect("equal")
+            axes.label_outer()
+            axes.set_title(str(name), color=FAINT if not grouped else INK)
+        figure.supxlabel("x / px")
+        figure.supylabel("y / px")
+        figure.suptitle(f"shifts × {enlarged:g}; longest {size.max():.2g} px", fontsize=10.5)
+        return to_svg(figure)

@@ -8,12 +8,11 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from ..bundle import Result
-from ..calibration import Assessment, CameraMapping, ErrorMap
+from ..calibration import CameraMapping
+from ..calibration.assessment import Assessment, ErrorMap
 from ..core.data import Array, Rows
 from ..core.figures import ACCENT, BLUE, FAINT, INK, PALE, drawing, image_axes, nice, to_svg
 from ..optics.cameras import distortion_names
-
-__all__ = ["distortion_figure", "network_figure", "next_figure", "residual_figure"]
 
 _MANY_POINTS, _ELLIPSES, _CELLS, _WEAK = 4000, 250, 12, 5.0
 _BAND = 3.0

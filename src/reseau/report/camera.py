@@ -11,8 +11,6 @@ from ..bundle import Result, camera_mapping
 from .bundle_figures import distortion_figure, network_figure
 from .tables import Row, symbol
 
-__all__ = ["camera_section"]
-
 
 def camera_section(result: Result, images: int, true: Mapping[str, float]) -> Row:
     """Return the content of the section's template.

@@ -16,8 +16,6 @@ from .factors import best_similarity, factor_by_factor, identified
 from .tables import rms_pair
 from .truth import BodyComparison, CameraComparison, Comparison, Known, KnownPoints, RodComparison, Stage
 
-__all__ = ["compare_camera", "compare_with_truth", "similarity_residuals"]
-
 
 def similarity_residuals(
     points: ImagePoints, target: Array, others: ImagePoints, others_target: Array

@@ -12,8 +12,6 @@ from matplotlib.figure import Figure
 from ..core.data import Array, Rows
 from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, to_svg
 
-__all__ = ["control_figure"]
-
 _HIGH, _WIDE, _LIMIT = 1.35, 8.6, 3.0
 
 

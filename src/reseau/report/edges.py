@@ -16,10 +16,9 @@ from ..core.failure import Failure
 from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, image_axes, to_svg
 from ..core.overlay import Layer, declined_layers, draw_overlay
 from ..procedures.edges import Sharpness
-from ..sensor import ChartEdge, EdgeSpread, FreeCurve
+from ..sensor import EdgeSpread, FreeCurve
+from ..sensor.chart import ChartEdge
 from .template import rendered
-
-__all__ = ["edges_overlay", "edges_report"]
 
 _SIZE, _FIELD = (8.6, 3.8), (8.6, 5.2)
 """Inches."""

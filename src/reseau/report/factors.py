@@ -18,17 +18,6 @@ from ..refine import correct_instrument
 from .tables import rms_pair
 from .truth import Factor, Known, KnownPoints
 
-__all__ = [
-    "FACTORS",
-    "Corrector",
-    "best_similarity",
-    "correctors",
-    "factor_by_factor",
-    "identified",
-    "rods_of",
-    "with_rods_as_made",
-]
-
 FACTORS = ("scales and best similarity", "group A", "group B", "groups A and B", "(7a, b) without group A")
 """Corrections; the last is for comparison: one polynomial fitted directly to the photo-coordinates."""
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..calibration import ErrorMap, FieldDifference, ProjectionField
+from ..calibration import FieldDifference
+from ..calibration.assessment import ErrorMap
+from ..calibration.camera import ProjectionField
 from ..core.data import Array
 from ..core.figures import FAINT, draw_contours, drawing, image_axes, to_svg
-
-__all__ = ["difference_figure", "errors_figure", "uncertainty_figure"]
 
 _SIZE = (6.2, 4.6)
 """Inches."""

@@ -24,8 +24,6 @@ from ..core.figures import (
 )
 from ..optics import PlaneMapping
 
-__all__ = ["distortion_figure", "draw_distortion", "residual_figure"]
-
 _WIDTH, _PANEL = 8.6, 3.75
 """Of a figure and of the plane of one of its two panels, in inches."""
 

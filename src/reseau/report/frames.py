@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from ..core.data import Array
 from ..core.errors import InputError
-from ..io import FrameOrientation, RollSummary
+from ..io import FrameOrientation
+from ..io.frame import RollSummary
 from ..io.images import write_image
 from ..io.scans import Scan
 from ..measure.film import FrameResult
 from .template import rendered
-
-__all__ = ["contact_sheet", "frame_tile", "roll_page", "scan_overlay", "write_marked"]
 
 _STRIPE, _UNWRITTEN = 512, 50_000_000
 """Rows copied at a time, and bytes that are held before they are written."""

@@ -11,8 +11,6 @@ from matplotlib.figure import Figure
 from ..core.data import Array, ImagePoints
 from ..core.figures import ACCENT, BLUE, FAINT, INK, Panel, drawing, length, nice, plane_axes, to_svg
 
-__all__ = ["PROBABILITY", "body_map", "draw_body"]
-
 PROBABILITY = 0.95
 """Probability that a point lies within its ellipse."""
 _SIZE = (4.1, 4.1)

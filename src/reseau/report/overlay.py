@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from ..core.data import Array, Frame, Mask
 from ..core.figures import ACCENT
 
-__all__ = ["Arcs", "Marks", "frame_overlay", "preview"]
-
 _WIDTH = 1200
 _FOUND, _CHECK = "#1f8a70", "#e0a100"
 _ON_DARK = ("#35c79f", "#f0603f")

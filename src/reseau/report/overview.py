@@ -21,8 +21,6 @@ from .photo_iii import errors_of
 from .tables import rms
 from .truth import Comparison
 
-__all__ = ["overview_png"]
-
 
 def overview_png(
     first: PhotoI,

@@ -21,8 +21,6 @@ from .tables import Row
 from .template import rendered
 from .truth import Comparison, Factor, Pair
 
-__all__ = ["applied_report", "oscilloscope_report"]
-
 
 def oscilloscope_report(
     first: PhotoI,

@@ -30,8 +30,6 @@ from .tables import (
 )
 from .truth import CameraComparison
 
-__all__ = ["photo_i_section"]
-
 
 def photo_i_section(
     found: PhotoI, design: ReseauDesign, frame: Frame | None, truth: CameraComparison | None

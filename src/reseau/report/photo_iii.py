@@ -16,8 +16,6 @@ from .overlay import Arcs, Marks, frame_overlay
 from .tables import Item, Row
 from .truth import BodyComparison
 
-__all__ = ["errors_of", "photo_iii_section"]
-
 _SHOWN_FROM = 0.2
 """Brightness, relative to the brightest echo, above which a rejected spot is crossed out in the picture."""
 

@@ -11,7 +11,6 @@ from ..io import Document, Strict
 if TYPE_CHECKING:
     from ..bundle import Result
 
-__all__ = ["Scene", "SceneCamera", "scene_of"]
 
 Triple = tuple[float, float, float]
 _MANY_POINTS = 2000

@@ -12,10 +12,9 @@ from ..core.data import Array
 from ..core.failure import Failure
 from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing, to_svg
 from ..core.provenance import Provenance
-from ..sensor import EdgeSpread, FreeCurve, Linearity, SensorResult
+from ..sensor import EdgeSpread, FreeCurve, Linearity
+from ..sensor.sensor import SensorResult
 from .template import rendered
-
-__all__ = ["mtf_figure", "sensor_report", "transfer_figure"]
 
 _SIZE = (8.6, 3.6)
 _MEANING = {

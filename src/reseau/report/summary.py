@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from .truth import BodyComparison, CameraComparison, Comparison, Factor, Pair, RodComparison
 
-__all__ = ["comparison_table"]
-
 _LABEL = 33
 
 

@@ -15,24 +15,6 @@ from ..core.data import Array, Mask
 from ..core.numbers import aligned, grouped, power
 from ..optics.field import SmoothField
 
-__all__ = [
-    "Estimates",
-    "Item",
-    "Measured",
-    "Row",
-    "axis_rows",
-    "coefficient_rows",
-    "declined_rows",
-    "model_tests",
-    "probability",
-    "rms",
-    "rms_pair",
-    "step_rows",
-    "symbol",
-    "unit_markup",
-    "unit_text",
-]
-
 Item = tuple[str, str, str]
 """A number in the summary of a page: number, unit, meaning."""
 Row = dict[str, Any]

@@ -9,8 +9,6 @@ from itertools import count
 import jinja2
 from markupsafe import Markup
 
-__all__ = ["TEMPLATES", "environment", "rendered"]
-
 TEMPLATES = (
     "applied.html.j2",
     "blurred_network.html.j2",

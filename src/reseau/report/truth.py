@@ -9,18 +9,6 @@ from typing import Any, Protocol
 from ..core.data import Array
 from ..optics import PlaneMapping
 
-__all__ = [
-    "BodyComparison",
-    "CameraComparison",
-    "Comparison",
-    "Factor",
-    "Known",
-    "KnownPoints",
-    "Pair",
-    "RodComparison",
-    "Stage",
-]
-
 Pair = tuple[float, float]
 """Root mean squares of x and of y."""
 

@@ -19,8 +19,6 @@ from ..core.data import Array, Frame, Mask
 from ..core.failure import Code, Failure
 from .edge import LEAST_SLANT, MOST_SLANT, EdgeSpread, measure_edge
 
-__all__ = ["ChartEdge", "EdgeRegion", "find_edges", "measure_edges"]
-
 Region = tuple[int, int, int, int]
 
 _REACH_PX, _LEAST_REACH_PX = 40, 10

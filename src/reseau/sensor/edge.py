@@ -20,8 +20,6 @@ from ..core.threads import one_thread
 from .free_curve import FREQUENCIES, FreeCurve, fit_free
 from .gaussian_edge import EdgePixels, approximate_edge, fit_gaussian
 
-__all__ = ["EdgeSpread", "measure_edge"]
-
 _REACH_PX, _REACH_PSF = 8.0, 4.0
 """Distance from the edge up to which pixels are used for the Gaussian: the larger of pixels and widths."""
 _FREE_REACH_PX, _FREE_REACH_PSF = 32.0, 12.0

@@ -30,8 +30,6 @@ from ..core.failure import Code, Failure
 from ..core.threads import one_thread
 from .gaussian_edge import ENOUGH, EdgePixels, edge_slope, edge_spread
 
-__all__ = ["FREQUENCIES", "FreeCurve", "fit_free"]
-
 FREQUENCIES: Array = np.arange(33) / 32
 """Frequencies in cycles per pixel at which the curve is reported."""
 NYQUIST = 0.5

@@ -18,8 +18,6 @@ from ..adjust import Adjustment, GaussMarkov, Options, Parameters, adjust
 from ..core.data import Array, Mask
 from ..core.failure import Failure
 
-__all__ = ["ENOUGH", "EdgePixels", "approximate_edge", "edge_slope", "edge_spread", "fit_gaussian"]
-
 _NEAR_PX = 8.0
 """Distance from the approximate edge within which its gradient is evaluated."""
 _ROUNDS = 3

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from ..core.errors import UsageError
 
-__all__ = ["Image32", "Level", "LevelSums", "SensorSeries", "saturation"]
-
 Image32 = NDArray[np.float32]
 _LINEAR = 0.7
 """Largest signal of the levels used, as a share of saturation (EMVA 1288)."""

@@ -17,8 +17,6 @@ from ..core.data import Array, Mask
 from ..core.failure import Code, Failure
 from .series import SensorSeries, saturation
 
-__all__ = ["Curve", "Linearity", "PhotonTransfer", "curve_of", "fit_linearity", "fit_transfer"]
-
 ROUNDING = 1 / 12
 _COARSE = 1.5
 """Least variance, relative to that of rounding, at which rounding is independent of the signal."""

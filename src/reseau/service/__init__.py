@@ -12,73 +12,44 @@ from typing import TYPE_CHECKING
 from ..core.lazy import lazily
 
 if TYPE_CHECKING:
-    from .alarms import Alarm, Alarms, sender
-    from .charts import ChartOptions, KnownSeries, Monitored, monitor
-    from .covariates import CalibrationFunction, CovariateTable, FunctionOptions, explain, fit_function
-    from .inforce import Applied, Configurations, Decision, Drift
-    from .recalibration import Recalibrated, Recalibration, Recalibrations
-    from .recurrence import Recurrence
-    from .rules import AcceptanceRules, Judgement, Limits, judge
+    from .alarms import Alarms
+    from .charts import ChartOptions, monitor
+    from .covariates import CovariateTable, fit_function
+    from .inforce import Configurations
+    from .recalibration import Recalibrations
+    from .rules import AcceptanceRules, Limits, judge
     from .schedule import Run, Schedule, Schedules
 
 __all__ = [
     "AcceptanceRules",
-    "Alarm",
     "Alarms",
-    "Applied",
-    "CalibrationFunction",
     "ChartOptions",
     "Configurations",
     "CovariateTable",
-    "Decision",
-    "Drift",
-    "FunctionOptions",
-    "Judgement",
-    "KnownSeries",
     "Limits",
-    "Monitored",
-    "Recalibrated",
-    "Recalibration",
     "Recalibrations",
-    "Recurrence",
     "Run",
     "Schedule",
     "Schedules",
-    "explain",
     "fit_function",
     "judge",
     "monitor",
-    "sender",
 ]
 
 _PLACES = {
     "AcceptanceRules": ".rules",
-    "Alarm": ".alarms",
     "Alarms": ".alarms",
-    "Applied": ".inforce",
-    "CalibrationFunction": ".covariates",
     "ChartOptions": ".charts",
     "Configurations": ".inforce",
     "CovariateTable": ".covariates",
-    "Decision": ".inforce",
-    "Drift": ".inforce",
-    "FunctionOptions": ".covariates",
-    "Judgement": ".rules",
-    "KnownSeries": ".charts",
     "Limits": ".rules",
-    "Monitored": ".charts",
-    "Recalibrated": ".recalibration",
-    "Recalibration": ".recalibration",
     "Recalibrations": ".recalibration",
-    "Recurrence": ".recurrence",
     "Run": ".schedule",
     "Schedule": ".schedule",
     "Schedules": ".schedule",
-    "explain": ".covariates",
     "fit_function": ".covariates",
     "judge": ".rules",
     "monitor": ".charts",
-    "sender": ".alarms",
 }
 """Modules that define the names."""
 

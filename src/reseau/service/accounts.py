@@ -29,18 +29,6 @@ from ..core.errors import ArchiveError, UsageError
 from ..core.optional import optional
 from .attempts import RefusedLogin, attempts_table, count_attempt, forget_attempt
 
-__all__ = [
-    "LOCAL",
-    "SCOPES",
-    "Accounts",
-    "Principal",
-    "RefusedLogin",
-    "Scope",
-    "Token",
-    "User",
-    "one_time_code",
-]
-
 Scope = Literal["read", "operate", "administer"]
 SCOPES: tuple[Scope, ...] = ("read", "operate", "administer")
 """Scopes in ascending order; each includes those before it."""

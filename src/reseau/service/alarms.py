@@ -21,8 +21,6 @@ from .delivering import networks_of
 from .inforce import Configurations, a_time
 from .schedule import Schedules
 
-__all__ = ["Alarm", "Alarms", "sender"]
-
 _JOURNAL, _LONGEST_S = "alarms", 120.0
 
 

@@ -13,8 +13,6 @@ import sqlalchemy as sa
 
 from ..core.errors import ReseauError
 
-__all__ = ["RefusedLogin", "attempts_table", "count_attempt", "forget_attempt"]
-
 _LIMITS: dict[str, tuple[int, timedelta]] = {
     "address": (30, timedelta(minutes=10)),
     "pair": (10, timedelta(minutes=15)),

@@ -25,7 +25,6 @@ from .state import StateFolder, private_file
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-__all__ = ["Audit", "AuditEntry", "Head", "verify_log"]
 
 _JOURNAL, _KEY, _PUBLIC, _HEAD = "audit", "audit-key.pem", "audit-public.pem", "audit-head.json"
 _FIRST = "0" * 64

@@ -23,8 +23,6 @@ from .state import StateFolder
 from .wire import Certificates, Wire, checked_peer, error_of
 from .worker import address_file
 
-__all__ = ["BenchLink"]
-
 _START_S, _PAUSE_S, _LONGEST_PAUSE_S, _END_S = 60.0, 0.1, 10.0, 5.0
 _BUSY = ("running", "pausing", "paused", "asking", "ending")
 _MOST_WAITING = 4

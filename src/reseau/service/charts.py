@@ -26,8 +26,6 @@ from ..core.data import Array, Mask, Rows
 from ..core.errors import UsageError
 from .runlength import Cusum, Ewma, Shewhart
 
-__all__ = ["ChartOptions", "KnownSeries", "Limits", "Monitored", "design", "monitor"]
-
 Kind = Literal["cusum", "ewma", "shewhart"]
 
 _SPENT = 0.92

@@ -23,8 +23,6 @@ from ..core.errors import (
 )
 from ..core.optional import optional
 
-__all__ = ["Client", "ServerEvent"]
-
 _ERRORS: dict[str, type[ReseauError]] = {
     "archive": ArchiveError, "estimation": EstimationError, "input": InputError,
     "instrument": InstrumentError,

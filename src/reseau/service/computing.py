@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from .. import sessions
-from ..archive import Archive, ArchivedFrame, Session, Verdict
+from ..archive import Archive, Session, Verdict
+from ..archive.records import ArchivedFrame
 from ..capture.steps import Step, as_taken
 from ..core.errors import ImageError, ReseauError
 from ..core.threads import one_thread
 from .decoding import PHOTOGRAPH, Decoder
-
-__all__ = ["finish", "rerun"]
 
 
 def finish(session: Session) -> str:

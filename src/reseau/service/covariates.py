@@ -19,25 +19,13 @@ import numpy as np
 import scipy
 from pydantic import Field
 
-from ..calibration import Calibration, Covariance, Quantity
+from ..calibration import Calibration
+from ..calibration.document import Covariance, Quantity
 from ..core.data import Array
 from ..core.errors import FormatError, UsageError
 from ..core.failure import Code, Failure
 from ..io import Document, Strict, read_text
 from .charts import ChartOptions, Monitored, monitor
-
-__all__ = [
-    "CalibrationFunction",
-    "Covariate",
-    "CovariateTable",
-    "Explanation",
-    "FunctionOptions",
-    "conditions_of",
-    "explain",
-    "fit_function",
-    "series_of",
-]
-
 
 _OF_IMAGE = ("extent", "unit", "size")
 """What the validity of a single calibration says about the image, and not about its adjustment."""

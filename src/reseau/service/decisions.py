@@ -12,8 +12,6 @@ from .charts import Monitored
 from .covariates import Explanation
 from .rules import Judgement, Outcome
 
-__all__ = ["Applied", "Decision", "Drift"]
-
 
 @dataclass(frozen=True)
 class Decision:

@@ -30,8 +30,6 @@ from ..core.errors import ImageError, UsageError
 from ..core.tone import ToneCurve
 from ..io.scans import Scan, scan_of
 
-__all__ = ["PHOTOGRAPH", "Decoder", "DecodingLimits", "is_upload"]
-
 PHOTOGRAPH = "photograph"
 """Kind of the files that were uploaded, as they came."""
 

@@ -14,8 +14,6 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-__all__ = ["Network", "is_reachable", "networks_of"]
-
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 _PROXIES = ("http_proxy", "https_proxy", "all_proxy", "ftp_proxy")
 

@@ -11,8 +11,6 @@ from ..calibration import Calibration, CameraMapping, calibration_difference
 from ..core.data import Array
 from ..core.errors import UsageError
 
-__all__ = ["Change", "Difference", "change", "difference"]
-
 _PLACES, _FEW = 17, 7
 _RANK = 1e-6
 

@@ -17,14 +17,11 @@ from typing import Literal, cast
 
 import numpy as np
 
-from ..archive import Archive, Entry, Journal
-from ..calibration import (
-    Calibration,
-    CameraMapping,
-    calibration_difference,
-    in_model_of,
-    parse_calibration,
-)
+from ..archive import Archive
+from ..archive.journal import Entry, Journal
+from ..calibration import Calibration, CameraMapping, calibration_difference
+from ..calibration.conversion import in_model_of
+from ..calibration.reader import parse_calibration
 from ..core.data import Array
 from ..core.errors import UsageError
 from ..core.failure import Failure
@@ -40,8 +37,6 @@ from .covariates import (
 )
 from .decisions import Applied, Decision, Drift
 from .rules import AcceptanceRules, Judgement, Outcome, judge
-
-__all__ = ["Applied", "Configurations", "Decision", "Drift", "a_time", "key_of"]
 
 _PREFIX = "calibrations/"
 _KEY_LENGTH = 12
@@ -237,7 +232,7 @@ class Configurations:
 
     def _origin(self, session: str, key: str) -> dict[str, str]:
         """The session from which a calibration is, and the SHA-256 of the result that is its proof."""
-        from ..sessions import CALIBRATION
+        from ..sessions.conducting import CALIBRATION
 
         of = self._archive.session(session)
         for each in of.results():

@@ -17,13 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import edge_sigma, exposure_of, grey_counts
+from ..capture.checks import edge_sigma, exposure_of, grey_counts
 from ..core.data import Frame
 from ..core.errors import UsageError
 from ..procedures.watching import Seen
 from ..report.overlay import preview
-
-__all__ = ["LivePage"]
 
 _ADDRESS, _WIDTH, _BINS, _RED = "127.0.0.1", 960, 64, (40, 40, 235)
 _PAGES = {"/": ("live.html", "text/html"), "/live.js": ("live.js", "text/javascript"),

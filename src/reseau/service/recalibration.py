@@ -15,14 +15,14 @@ from pydantic import Field
 from .. import sessions
 from ..archive import Archive, Session
 from ..calibration import Calibration
-from ..capture import Bench, BenchFile, Watch
+from ..capture import Bench, BenchFile
+from ..capture.judging import Watch
 from ..core.errors import InstrumentError, UsageError
 from ..io import Document
-from .inforce import Configurations, Decision
+from .decisions import Decision
+from .inforce import Configurations
 from .rules import AcceptanceRules
 from .schedule import Run, Schedule
-
-__all__ = ["Recalibrated", "Recalibration", "Recalibrations"]
 
 _PREFIX = "recalibrations/"
 

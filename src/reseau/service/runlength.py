@@ -20,8 +20,6 @@ import scipy
 from ..core.data import Array
 from ..core.errors import UsageError
 
-__all__ = ["Chart", "Cusum", "Ewma", "Prerun", "Shewhart", "Transition"]
-
 _NODES = 80
 _CELLS = 400
 _HEADROOM = 1e-10

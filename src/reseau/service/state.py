@@ -8,8 +8,6 @@ from pathlib import Path
 
 from ..core.errors import InputError, UsageError
 
-__all__ = ["StateFolder", "private_file"]
-
 _LOCAL, _TOKEN = "local-token", 32
 
 

@@ -15,8 +15,6 @@ from ..archive import Archive, Session
 from ..core.errors import InputError, ReseauError
 from ..core.optional import optional
 
-__all__ = ["TiledPublisher", "publish", "runs_of"]
-
 _KINDS = ("start", "descriptor", "event", "stop")
 _LOOK_S, _SESSIONS = 5.0, 50
 

@@ -9,11 +9,10 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..archive import Archive, verify
+from ..archive import Archive
+from ..archive.verification import verify
 from ..core.errors import ArchiveError, InputError, UsageError
 from ..core.files import empty_folder
-
-__all__ = ["Counted", "backup", "restore", "state_beside", "upgrade_archive"]
 
 _ARCHIVE, _STATE, _INDEX, _OBJECTS, _WORKERS = "archive", "state", "index.sqlite", "objects", "workers"
 _KEPT = ("accounts.sqlite", "audit-key.pem", "audit-public.pem", "audit-head.json", "local-token")

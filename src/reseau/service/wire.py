@@ -31,8 +31,6 @@ from ..core.errors import (
 from ..core.optional import optional
 from .state import StateFolder, private_file
 
-__all__ = ["Certificates", "Wire", "error_of", "to_error"]
-
 T = TypeVar("T")
 _LENGTHS = struct.Struct(">II")
 _MOST_HEADER, _MOST_BODY = 8 << 20, 256 << 20

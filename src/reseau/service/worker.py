@@ -27,15 +27,15 @@ from typing import Any
 
 from .. import sessions
 from ..archive import Archive
-from ..capture import Bench, BenchFile, BenchLock, Control, by_hand, edge_sigma, exposure_fault, grey_counts
+from ..capture import Bench, BenchFile, BenchLock, by_hand
+from ..capture.checks import edge_sigma, exposure_fault, grey_counts
+from ..capture.engine import Control
 from ..core.errors import BenchError, InstrumentError, ReseauError, StateError, UsageError
 from ..core.memory import keep_loaded, share_freed_memory
 from ..instruments import Camera, Turntable
 from ..io import read_text
 from .state import StateFolder, private_file
 from .wire import Certificates, Wire, checked_peer, to_error
-
-__all__ = ["Worker", "address_file", "run"]
 
 _LIVE_S, _RETRY_S, _WIDTH = 5.0, 3.0, 960
 _STEADY_S = 0.1
@@ -672,7 +672,7 @@ def _known(error: Exception, where: str) -> ReseauError:
 
 
 def _limits() -> Any:
-    from ..capture import Limits
+    from ..capture.checks import Limits
 
     return Limits()
 

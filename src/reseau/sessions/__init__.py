@@ -12,7 +12,6 @@ True
 """
 
 from .conducting import (
-    CALIBRATION,
     begin,
     calibration_of,
     capture,
@@ -24,36 +23,22 @@ from .conducting import (
     rerun_all,
     resume,
 )
-from .kinds import CORNERS, KINDS, OF_FILES, SCENE, Reported, SessionKind, kind_of, own_plan
+from .kinds import CORNERS, KINDS, OF_FILES, SCENE, SessionKind, kind_of
 from .parameters import (
-    BlurredParameters,
-    FilmParameters,
     FramesParameters,
-    OscilloscopeParameters,
-    OwnParameters,
     PhotographsParameters,
-    ScanParameters,
-    SensorParameters,
     SessionParameters,
     TestfieldParameters,
     present_keys,
 )
 
 __all__ = [
-    "CALIBRATION",
     "CORNERS",
     "KINDS",
     "OF_FILES",
     "SCENE",
-    "BlurredParameters",
-    "FilmParameters",
     "FramesParameters",
-    "OscilloscopeParameters",
-    "OwnParameters",
     "PhotographsParameters",
-    "Reported",
-    "ScanParameters",
-    "SensorParameters",
     "SessionKind",
     "SessionParameters",
     "TestfieldParameters",
@@ -63,7 +48,6 @@ __all__ = [
     "check",
     "kind_of",
     "lock",
-    "own_plan",
     "parameters_of",
     "present_keys",
     "procedure_of",

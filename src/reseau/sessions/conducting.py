@@ -8,38 +8,15 @@ from typing import Any
 
 from ..archive import Archive, Session
 from ..calibration.document import Calibration
-from ..capture import (
-    Acquisition,
-    Bench,
-    BenchLock,
-    Control,
-    Decision,
-    Procedure,
-    RemoteOperator,
-    Rerun,
-    Watch,
-    carry_out,
-    plans,
-)
-from ..capture import rerun as rerun_with
+from ..capture import Acquisition, Bench, BenchLock, RemoteOperator, carry_out, plans
+from ..capture.engine import Control, Decision, Rerun
+from ..capture.engine import rerun as rerun_with
+from ..capture.judging import Procedure, Watch
 from ..core.errors import ReseauError, UsageError
 from ..core.failure import Code, Failure
 from ..execution import Executor
 from .kinds import GENERATOR, Reported, SessionKind, kind_of, own_plan
 from .parameters import OwnParameters, SessionParameters, present_keys
-
-__all__ = [
-    "begin",
-    "calibration_of",
-    "capture",
-    "check",
-    "lock",
-    "parameters_of",
-    "procedure_of",
-    "rerun",
-    "rerun_all",
-    "resume",
-]
 
 CALIBRATION = "calibration.json"
 

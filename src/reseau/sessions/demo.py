@@ -24,15 +24,15 @@ from ..capture import (
     Bench,
     BenchFile,
     InstrumentEntry,
-    Plan,
-    Watch,
     carry_out,
     paper_steps,
     plans,
     plugin,
     spread,
 )
+from ..capture.acquisition import Plan
 from ..capture.bench import IN_PROCESS, built
+from ..capture.judging import Watch
 from ..core.data import Frame
 from ..core.errors import EstimationError, InputError
 from ..core.plugins import INSTRUMENTS
@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
     from ..report.truth import Comparison, KnownPoints
 
-__all__ = ["STEPS", "Demo", "OscilloscopeSession", "TestfieldSession", "World", "run_demo"]
 
 STEPS = 18
 """Calls of the callback `step`: fifteen frames, comparison, report, and end."""

@@ -14,28 +14,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..archive import objects_at
+from ..archive.objects import objects_at
 from ..core import vocabulary as v
 from ..core.errors import EstimationError, InputError, ReseauError, UsageError
 from ..core.failure import Failure
 from ..core.files import made_folder
 from ..core.provenance import Provenance, canonical_json, sha256_of
 from ..execution import Executor
-from ..io import FrameCorners, FrameOrientation, FrameOutcome, RollSummary, write_whole
+from ..io import FrameCorners, FrameOrientation, write_whole
+from ..io.frame import FrameOutcome, RollSummary
 from ..io.images import open_scan, write_image
-from ..procedures.film_frame import (
-    FrameOptions,
-    FrameResult,
-    Roll,
-    orient_scan,
-    orientation_of,
-    reorient_scan,
-    result_of,
-    roll_of,
-)
+from ..measure.film.roll import Roll, result_of, roll_of
+from ..procedures.film_frame import FrameOptions, FrameResult, orient_scan, orientation_of, reorient_scan
 from ..report.frames import contact_sheet, frame_tile, roll_page, scan_overlay, write_marked
-
-__all__ = ["OrientedFiles", "ScanJob", "ScanOutcome", "orient_files", "scan_jobs"]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from ..archive import Session, Verdict
-from ..capture import Acquisition, BenchFile, Limits, Plan, Procedure, Step, plans, spread
+from ..capture import Acquisition, BenchFile, Step, plans, spread
+from ..capture.acquisition import Plan
+from ..capture.checks import Limits
+from ..capture.judging import Procedure
 from ..core.data import Frame
 from ..core.errors import FormatError, UsageError
 from ..core.failure import Failure
@@ -36,7 +39,6 @@ if TYPE_CHECKING:
     from ..procedures.sensor import SensorProcedure
     from ..procedures.testfield import TestfieldProcedure
 
-__all__ = ["CORNERS", "KINDS", "OF_FILES", "SCENE", "Reported", "SessionKind", "kind_of", "own_plan"]
 
 CORNERS = "corners.json"
 """Optional input of a session of the plan `film`: calibrated corners of the camera."""

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 from pydantic import Field, PositiveInt, model_validator
 
-from ..capture import HEIGHT, ROLES, Bench, Goal, SensorSeriesPlan, Step
+from ..capture import Bench, Goal, SensorSeriesPlan, Step
+from ..capture.bench import ROLES
 from ..capture.by_hand import check_reach
+from ..capture.steps import HEIGHT
 from ..core import vocabulary as v
 from ..core.errors import FormatError, StateError, UsageError
 from ..instruments import Camera, CameraRig, EnvironmentSensor, Turntable

@@ -18,7 +18,8 @@ from typing import Any
 import httpx
 import pytest
 
-from reseau.archive import Archive, verify
+from reseau.archive import Archive
+from reseau.archive.verification import verify
 from reseau_sims.serving.bench import SimulatedBench
 
 from ...capture.fieldrig import DESIGN

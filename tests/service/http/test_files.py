@@ -17,7 +17,8 @@ import numpy as np
 import psutil
 import pytest
 
-from reseau.archive import Archive, verify
+from reseau.archive import Archive
+from reseau.archive.verification import verify
 from reseau.core.errors import ImageError
 from reseau.core.tone import ToneCurve
 from reseau.service.decoding import Decoder, DecodingLimits

@@ -14,7 +14,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from reseau.core.errors import UsageError
-from reseau.service.accounts import Accounts, RefusedLogin, one_time_code
+from reseau.service.accounts import Accounts, one_time_code
+from reseau.service.attempts import RefusedLogin
 
 from .served import ORIGIN, PASSWORD, Served, served
 from .test_security import NOW, Clock

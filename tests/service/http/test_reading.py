@@ -22,7 +22,7 @@ import pytest
 import sqlalchemy as sa
 
 from reseau.archive import Archive
-from reseau.calibration import parse_calibration
+from reseau.calibration.reader import parse_calibration
 from reseau.service import Configurations
 from reseau.service.http.events import Events
 

@@ -15,6 +15,7 @@ from ..network import Camera, Network
 from ..network.network import finite
 from ..solver.spatial import directions
 from .checks import listed
+from .evidence import ODDS
 
 __all__ = ["causes", "given_poses_that_do_not_fit", "outside_image", "seen_frontally"]
 
@@ -74,7 +75,9 @@ def causes(network: Network) -> list[Remark]:
         # Directions follow from these values.
         return found
     uv = directions(network)
-    return [*_copies(network), *_stations(network, uv), *_lines(network, uv)]
+    return [
+        *_copies(network), *_stations(network, uv), *_lines(network, uv), *_control_on_a_line(network)
+    ]  # fmt: skip
 
 
 def _camera(camera: Camera) -> list[Remark]:
@@ -348,6 +351,40 @@ def _lines(network: Network, uv: Array) -> list[Remark]:
     plural = "s" * (len(bad) > 1)
     return [Remark(f"all points of image{plural} {listed(bad)} lie on one line: they do not determine its "
                    "position", Code.COLLINEAR)]  # fmt: skip
+
+
+def _control_on_a_line(network: Network) -> list[Remark]:
+    """Control points that a line explains as well: nothing holds the rotation about it."""
+    known = np.flatnonzero((network.held | network.observed).all(axis=1) & (network.rays > 1))
+    others = finite(network.x0).any() or network.stage is not None or network.rig is not None
+    if network.datum != "control" or others or len(known) < 3:
+        return []
+    places = network.xyz[known]
+    off = places - places.mean(axis=0)
+    axes = np.linalg.svd(off, full_matrices=False)[2]
+    # What the images resolve at the points: their extent in object space by that in the images.
+    scales = []
+    for rows in _by_image(network, np.isin(network.point_of, known)):
+        if len(rows) > 2:
+            own = network.xyz[network.point_of[rows]]
+            extent = float(np.linalg.norm(network.xy[rows] - network.xy[rows].mean(axis=0)))
+            scales.append(np.linalg.norm(own - own.mean(axis=0)) / max(extent, 1e-300))
+    if not scales:
+        return []
+    resolved = float(np.median(scales)) * float(np.sqrt(np.median(network.cov[:, 0, 0])))
+    sigma = np.sqrt(np.nan_to_num(network.sigma[known]).max(axis=1) ** 2 + resolved**2)
+    # Two coordinates across the line of each point, less its four parameters.
+    square = float((((off @ axes[1:].T) / sigma[:, None]) ** 2).sum())
+    if 0.5 * square - (2 * len(known) - 4) > ODDS:
+        return []
+    return [
+        Remark(
+            f"the {len(known)} control points lie on one line, to what their standard deviations and the "
+            "images resolve: nothing holds the rotation of the network about it; add a control point beside "
+            "the line, or use the datum `free`",
+            Code.COLLINEAR,
+        )
+    ]
 
 
 def seen_frontally(network: Network, rotation: Array, xyz: Array, used: Mask) -> list[Remark]:

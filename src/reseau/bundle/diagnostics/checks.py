@@ -13,12 +13,11 @@ from ...core.errors import UsageError
 from ...core.failure import Code, Remark
 from ..network import Network
 from ..solver import BundleFit
-from .evidence import ODDS
 from .patterns import CommonPattern, by_place, common_pattern
 from .regularisation import regularised
 from .result import Result
 
-__all__ = ["LISTED", "checks", "in_images", "listed", "perspective", "unmodelled_pattern"]
+__all__ = ["LISTED", "checks", "in_images", "listed", "unmodelled_pattern"]
 
 LISTED = 8
 SHOWN = 3
@@ -488,24 +487,6 @@ def _parallel(network: Network, fit: BundleFit) -> list[Remark]:
     return found
 
 
-def perspective(result: Result, camera: int) -> tuple[float, bool]:
-    """Return the reciprocal focal length of a camera in its sigmas, and whether it predicts better than zero.
-
-    Examples
-    --------
-    >>> from reseau.bundle import adjust_network, example_network
-    >>> perspective(adjust_network(example_network()), 0)[1]
-    True
-    """
-    model = result.network.cameras[camera].registered
-    names, _, values = result.camera_columns(camera)
-    sigma = np.sqrt(np.diag(result.formal_camera_covariance(camera)))
-    scales = () if model is None or model.parallel else model.of_role("scale")
-    ratios = [abs(v) / s for name, v, s in zip(names, values, sigma, strict=True) if name in scales and s > 0]
-    size = float(min(ratios, default=np.inf))
-    return size, bool(0.5 * size**2 - 1 > ODDS)
-
-
 def _without_perspective(result: Result) -> list[Remark]:
     """Cameras of which parallel rays predict the image points as well."""
     return [
@@ -516,7 +497,7 @@ def _without_perspective(result: Result) -> list[Remark]:
             Code.NOT_IDENTIFIED,
         )
         for c, camera in enumerate(result.network.cameras)
-        for size, seen in [perspective(result, c)]
+        for size, seen in [result.perspective(c)]
         if not seen
     ]
 

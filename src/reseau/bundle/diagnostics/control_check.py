@@ -108,15 +108,12 @@ class ControlShape:
         """
         if self.agree.all():
             return ""
-        names, found, given, limit = self.names, self.found, self.given, self.limit
+        names = self.names
         exchanged = [f"{names[a]} and {names[b]}" for a, b in self._exchanged]
         if exchanged:
             return f"the coordinates of control points {', or '.join(exchanged)} look exchanged"
-        if self.agree.sum() <= max(_LEAST - 1, _HALF * len(names)):
-            # In a flat figure some points agree with a mirrored one by chance.
-            mirrored = _largest_agreement(found * [1.0, 1.0, -1.0], given, limit)
-            if mirrored.sum() > max(_LEAST - 1, self.agree.sum()):
-                return "the control points are mirrored: their coordinate system is left-handed"
+        if self._mirrored:
+            return "the control points are mirrored: their coordinate system is left-handed"
         if self.agree.sum() < _LEAST:
             return (
                 f"the control points {', '.join(names)} do not agree with the shape determined by the images"
@@ -133,6 +130,12 @@ class ControlShape:
             f"control point{'s' * (len(wrong) > 1)} {', '.join(wrong)} "
             f"contradict{'s' * (len(wrong) == 1)} the others"
         )
+
+    @cached_property
+    def _mirrored(self) -> bool:
+        """Whether more points agree with the mirrored figure; in a flat one some do with both."""
+        mirrored = _largest_agreement(self.found * [1.0, 1.0, -1.0], self.given, self.limit)
+        return bool(mirrored.sum() > max(_LEAST - 1, self.agree.sum()))
 
     @cached_property
     def _in_another_unit(self) -> float:
@@ -190,7 +193,8 @@ class ControlShape:
     @property
     def as_a_whole(self) -> bool:
         """Whether the doubt is not about single points."""
-        return bool(self.agree.sum() < _LEAST) or bool(self._exchanged) or self._in_another_unit > 0
+        single = self.agree.sum() >= _LEAST and not self._exchanged and not self._in_another_unit
+        return not (single and (self.agree.all() or not self._mirrored))
 
 
 def control_shape(

@@ -75,17 +75,25 @@ class CameraEstimate(Display):
     @property
     def correlation(self) -> Array:
         """Correlation matrix (u, u)."""
-        size = np.where(self.sigma > 0, self.sigma, 1.0)
-        correlation: Array = self.covariance / np.outer(size, size)
+        known = self.formal is None or bool(np.isfinite(self.covariance).all())
+        covariance = self.covariance if known or self.formal is None else self.formal
+        size = np.sqrt(np.diag(covariance))
+        size = np.where(size > 0, size, 1.0)
+        correlation: Array = covariance / np.outer(size, size)
         np.fill_diagonal(correlation, 1.0)
         return correlation
 
     def __getitem__(self, name: str) -> float:
         return float(self.values[self.parameters.index(name)])
 
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """Estimates with standard deviations and units, as they are printed."""
+        rows = zip(self.values.tolist(), self.sigma.tolist(), self.units, strict=True)
+        return tuple("not determined" if np.isnan(s) else measured(value, s, unit) for value, s, unit in rows)
+
     def _facts(self) -> list[tuple[str, str]]:
-        rows = zip(self.parameters, self.values.tolist(), self.sigma.tolist(), self.units, strict=True)
-        return [(self.id, ""), *((name, measured(value, s, unit)) for name, value, s, unit in rows)]
+        return [(self.id, ""), *zip(self.parameters, self.texts, strict=True)]
 
     def _columns(self) -> dict[str, list[object]]:
         return {

@@ -34,6 +34,7 @@ from .estimates import (
     RigEstimate,
     StageEstimate,
 )
+from .evidence import ODDS
 from .shared import SharedErrors, Uncertainty, shared_errors
 
 if TYPE_CHECKING:
@@ -225,14 +226,45 @@ class Result(Estimated, Display):
     # -- estimates in columns
 
     def camera(self, c: int) -> CameraEstimate:
-        """Return the estimated parameters of the c-th camera of the network."""
+        """Return the estimated parameters of the c-th camera of the network.
+
+        What the image points do not determine has no standard deviation.
+        """
         names, columns, values = self.camera_columns(c)
         entry = self.network.cameras[c]
         units = tuple(entry.unit_of(name) for name in names)
         found = self.uncertainty(columns)
-        return CameraEstimate(
-            entry.id, names, values, found.covariance, units, formal=found.formal, dof=found.dof
+        covariance = found.covariance
+        if not self.perspective(c)[1]:
+            scale = np.isin(names, entry.registered.of_role("scale") if entry.registered else ())
+            covariance = np.where(scale[:, None] | scale, np.nan, covariance)
+        return CameraEstimate(entry.id, names, values, covariance, units, formal=found.formal, dof=found.dof)
+
+    def perspective(self, c: int) -> tuple[float, bool]:
+        """Return the reciprocal focal length in its sigmas, and whether it predicts better than zero.
+
+        Examples
+        --------
+        >>> from reseau.bundle import adjust_network, example_network
+        >>> adjust_network(example_network()).perspective(0)[1]
+        True
+        """
+        model = self.network.cameras[c].registered
+        if model is None or model.parallel or not self.fit.cofactors.reduced.known:
+            return np.inf, True
+        names, _, values = self.camera_columns(c)
+        sigma = np.sqrt(np.diag(self.formal_camera_covariance(c)))
+        of = zip(names, values.tolist(), sigma.tolist(), strict=True)
+        size = min(
+            [abs(v) / s for name, v, s in of if name in model.of_role("scale") and s > 0], default=np.inf
         )
+        return size, bool(0.5 * size**2 - 1 > ODDS)
+
+    @cached_property
+    def _without_distance(self) -> Mask:
+        """Images whose distances are not determined, as the focal length of their camera is not (m,)."""
+        cameras = [not self.perspective(c)[1] for c in range(len(self.network.cameras))]
+        return np.array(cameras, dtype=bool)[self.network.camera_of]
 
     @cached_property
     def shared(self) -> SharedErrors | None:
@@ -258,24 +290,28 @@ class Result(Estimated, Display):
         """Exterior orientations."""
         network = self.network
         order = [3, 4, 5, 0, 1, 2]
+        covariance = self.pose_covariance[:, order][:, :, order]
         return ImageEstimates(
             network.images,
             tuple(network.cameras[c].id for c in network.camera_of),
             self.fit.values.x0,
             self.rotation,
-            self.pose_covariance[:, order][:, :, order],
+            np.where(self._without_distance[:, None, None], np.nan, covariance),
             network.unit,
         )
 
     @cached_property
     def points(self) -> PointEstimates:
-        """Object points."""
+        """Object points; what only images without a distance show has no standard deviation."""
         network = self.network
+        sound = ~self._without_distance[network.image_of]
+        held: Mask = np.all(network.held | network.observed, axis=1)
+        held[network.point_of[sound]] = True
         return PointEstimates(
             network.points,
             network.role,
             self.fit.values.xyz,
-            self.point_covariance,
+            np.where(held[:, None, None], self.point_covariance, np.nan),
             network.rays,
             network.unit,
         )
@@ -665,9 +701,10 @@ class Result(Estimated, Display):
         return _factors(*self.scatter)
 
     def rejected_points(self) -> list[tuple[str, str, float, float]]:
-        """Return image, point, test value and critical value of the image points that data snooping rejected.
+        """Return image, point, test value and critical value of the rejected image points.
 
-        Points of images that were left out as a whole are not among them.
+        Test values are NaN for gross errors that were left out before data snooping. Points of images that
+        were left out as a whole are not among them.
         """
         network = self.network
         rows = np.flatnonzero(self.rejected & self.fit.usable.images[network.image_of])

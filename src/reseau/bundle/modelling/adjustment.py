@@ -594,7 +594,10 @@ def _explained(failure: Failure, problem: BundleProblem, found: list[Remark]) ->
     if not found and failure.code is not Code.TOO_FEW_POINTS and len(problem.observations) <= MANY:
         rows = suspects(problem)
         if len(rows):
-            found = [*grouped(network, rows), _gross(network, rows)]
+            share = 100 * len(rows) / max(len(network.xy), 1)
+            said = f"{len(rows)} of {len(network.xy)} image points ({share:.0f} %) contradict the others"
+            first = Remark(f"{said}: reject them (`--reject`)", Code.GROSS_ERRORS)
+            found = [first, *grouped(network, rows), _gross(network, rows)]
         elif failure.code in (Code.NOT_CONVERGED, Code.NOT_FINITE):
             found = _worst_images(network, _misfits_px(problem))
     if not found:

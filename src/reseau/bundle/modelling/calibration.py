@@ -62,7 +62,8 @@ def calibration_of(
     if not names:
         raise UsageError("no parameter was estimated", where=f"camera {camera}")
     found = result.camera(c)
-    covariance, sigma = found.covariance, found.sigma
+    covariance = result.uncertainty(result.camera_columns(c)[1]).covariance
+    sigma = np.sqrt(np.diag(covariance))
     parameters = {
         key: Quantity(value=value, sigma=0.0, unit=entry.unit_of(key))
         for key, value in entry.parameters.items()

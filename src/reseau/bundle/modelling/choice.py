@@ -23,7 +23,7 @@ from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Code, Estimated, Failure
 from ...optics.cameras import camera_model
-from ..diagnostics.checks import perspective, unmodelled_pattern
+from ..diagnostics.checks import unmodelled_pattern
 from ..diagnostics.evidence import ODDS
 from ..network import Camera, Network
 from ..solver import BundleFit
@@ -450,7 +450,7 @@ class _Search:
                 self.declined[each] = (
                     "not needed: the usual models leave no pattern that images have in common"
                 )
-        size, seen = perspective(result_of(fit), self.camera)
+        size, seen = result_of(fit).perspective(self.camera)
         for each in parallel:
             if seen:
                 self.declined[each] = (

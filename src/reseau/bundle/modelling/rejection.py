@@ -11,14 +11,17 @@ from dataclasses import replace
 import numpy as np
 
 from ...adjust import critical_tau, data_snooping, robust
+from ...adjust.mixture import Mixture
 from ...adjust.outliers import TUNING, Rejection, SnoopingStep
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure, Remark
+from ...optics.poses import matrix_to_vector
 from ..diagnostics import control_shape
 from ..diagnostics.checks import listed
 from ..network import Network
-from ..solver import BundleFit, BundleProblem
-from .startup import adjusted_in_steps
+from ..network.network import finite
+from ..solver import BundleFit, BundleProblem, approximate
+from .startup import adjusted_in_steps, lost_images
 
 __all__ = ["MANY", "bent_plane", "many_rejected", "suspects", "without_gross_errors"]
 
@@ -31,10 +34,11 @@ _GROSS_ERROR, _ROBUST_TOLERANCE = 0.2, 0.05
 _ROUGHLY = 1e-2
 # Part of the points of an image above which it is left out as a whole.
 _MOSTLY = 0.5
-# Image points with misfits above this multiple of the median are left out at first; number of rounds.
-_TRIM_LIMIT, _TRIM_ROUNDS = 5.0, 5
-# Multiple of the median above which misfits are beyond all measure.
-_ABSURD = 1e4
+# Rounds in which good image points and gross errors are told apart, iterations in each, and relative change
+# of the standard deviation of good ones that ends them.
+_ROUNDS, _STEPS, _SETTLED = 15, 4, 0.02
+# Probability of a good image point below which it is suspected where nothing is rejected.
+_CERTAIN = 1e-3
 # Times the number of test values that are expected above the critical value, from which on the shape of the
 # control is compared with the images before single points are rejected.
 _MORE = 2.0
@@ -50,12 +54,12 @@ def without_gross_errors(
     Images most of whose points are rejected are left out as a whole: the few that remain may fit by chance.
     Where the approximate values do not suffice, the adjustment of all observations gives better ones.
     """
-    first = _careful(_trimmed(problem), alpha, max_fraction)
+    first = _careful(_trimmed(problem, alpha), alpha, max_fraction)
     if isinstance(first, Failure) or first[2]:
         plain = adjusted_in_steps(problem)
         if not isinstance(plain, Failure):
             begun = problem.continued(plain)
-            second = _careful(_trimmed(begun), alpha, max_fraction)
+            second = _careful(_trimmed(begun, alpha), alpha, max_fraction)
             if isinstance(second, Failure):
                 # What remains after trimming can be too weak for an adjustment.
                 second = _careful(begun, alpha, max_fraction)
@@ -66,11 +70,34 @@ def without_gross_errors(
     if isinstance(first, Failure):
         return first
     fit, steps, left = first
+    steps = (*_of_gross_errors(problem, fit, steps, alpha), *steps)
+    # Images that no pose explains are not even begun with.
+    left = [*left, *(int(i) for i in lost_images(problem.network, fit.values.x0, fit.values.xyz))]
     if not left:
         return fit, steps, []
     names = listed(problem.network.images[i] for i in left)
     text = f"most points of image{'s' * (len(left) > 1)} {names} contradict the others: left out as a whole"
     return fit, steps, [Remark(text, Code.GROSS_ERRORS)]
+
+
+def _of_gross_errors(
+    problem: BundleProblem, fit: BundleFit, steps: tuple[SnoopingStep, ...], alpha: float
+) -> list[SnoopingStep]:
+    """Test values of image points that were left out before data snooping, by their misfits in the end."""
+    n = 2 * len(problem.network.xy)
+    given = np.ones(n) if problem.weights is None else problem.weights[:n]
+    gross = np.asarray(fit.rejected[:n]) & (given > 0) & np.isfinite(fit.residuals[:n])
+    gross[[step.index[0] for step in steps if step.index[0] < n]] = False
+    rows = np.flatnonzero(gross.reshape(-1, 2).all(axis=1))
+    if not len(rows) or fit.redundancy < 2:
+        return []
+    v = fit.residuals[:n].reshape(-1, 2)[rows]
+    v = np.abs(np.einsum("nij,nj->ni", np.linalg.inv(np.linalg.cholesky(problem.network.cov[rows])), v))
+    worst, critical = v.argmax(axis=1), critical_tau(alpha, fit.redundancy)
+    return [
+        SnoopingStep((int(2 * row + k),), float(size[k] / fit.sigma0), critical, restored=False)
+        for row, size, k in zip(rows, v, worst, strict=True)
+    ]
 
 
 def _used(fit: BundleFit) -> int:
@@ -185,46 +212,77 @@ def _bad_images(problem: BundleProblem, found: Rejection[BundleFit]) -> list[int
     return [int(i) for i in np.flatnonzero((count > 0) & (gone > _MOSTLY * count))]
 
 
-def _trimmed(problem: BundleProblem) -> BundleProblem:
-    """Return the problem with approximate values from the image points that agree with most others.
+def _trimmed(problem: BundleProblem, alpha: float) -> BundleProblem:
+    """Return the problem with estimates from good image points, and without certain gross errors.
 
-    Least squares may not converge with many gross errors (a fifth of the observations). The approximate
-    values come from the largest consistent sets: image points far from them are left out until the estimates
-    improve. Those that are still beyond all measure have weight zero in the problem returned: an adjustment
-    with them would not converge.
+    Least squares may not converge with many gross errors. Good image points and gross errors are two
+    explanations of each misfit (:class:`~reseau.adjust.mixture.Mixture`); their probabilities are weights of
+    the next estimates. Points are intersected anew, as wrong rays hide in what they have pulled. What is good
+    with a probability below `alpha` has weight zero in the problem returned; the rest is left to tests.
     """
-    n = len(problem.network.xy)
-    out = np.ones(n, dtype=bool)
-    for _ in range(_TRIM_ROUNDS):
-        v = problem.misfits_at_start()
-        size = np.sqrt((v**2).sum(axis=1))
-        if not np.isfinite(size).any():
+    network, n = problem.network, len(problem.network.xy)
+    given = np.ones(len(problem.observations)) if problem.weights is None else problem.weights
+    plain = network.rig is None and network.stage is None and not network.shutters.any()
+    extent = max(float(np.hypot(camera.width, camera.height)) for camera in network.cameras)
+    sigma = np.sqrt(np.trace(network.cov, axis1=1, axis2=2) / 2)
+    reach, mixture = extent / float(np.median(sigma)), None
+    for k in range(_ROUNDS):
+        if plain and mixture is not None:
+            problem = _begun_anew(problem, mixture)
+        size = np.sqrt((problem.misfits_at_start() ** 2).sum(axis=1))
+        known = np.isfinite(size) & (given[: 2 * n : 2] > 0)
+        if not known.any():
             break
-        limit = _TRIM_LIMIT * float(np.nanmedian(size))
-        far = ~(size <= limit)
-        if (far == out).all():
+        if mixture is None:
+            middle = float(np.median(size[known])) / np.sqrt(np.log(4))
+            mixture = Mixture(min(max(middle, 1e-9 * reach), reach), 0.2, reach)
+        free = max(1 - (3 * finite(problem.start.xyz).sum()) / (2 * known.sum()), 0.25)
+        before, mixture = mixture, mixture.fitted(size[known], free)
+        good = np.where(known, mixture.good(size), 0.0)
+        weights = given.copy()
+        weights[: 2 * n] *= np.repeat(good, 2)
+        if k and abs(mixture.sigma / before.sigma - 1) < _SETTLED:
             break
-        out = far
-        weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
-        weights[: 2 * n][np.repeat(out, 2)] = 0.0
-        fit = problem.with_weights(weights).adjusted()
-        if isinstance(fit, Failure):
+        values = problem.with_weights(weights).approached(_STEPS)
+        if values is None:
             break
-        problem = problem.continued(fit)
-    size = np.sqrt((problem.misfits_at_start() ** 2).sum(axis=1))
-    known = np.isfinite(size)
-    absurd = known & (size > _ABSURD * max(1.0, float(np.median(size[known])))) if known.any() else ~known
-    if not absurd.any():
+        problem = replace(problem, start=values)
+    if mixture is None:
         return problem
-    weights = np.ones(len(problem.observations)) if problem.weights is None else problem.weights.copy()
-    weights[: 2 * n][np.repeat(absurd, 2)] = 0.0
-    return problem.with_weights(weights)
+    size = np.sqrt((problem.misfits_at_start() ** 2).sum(axis=1))
+    weights = given.copy()
+    weights[: 2 * n][np.repeat(np.isfinite(size) & (mixture.good(size) < alpha), 2)] = 0.0
+    return problem.with_weights(weights) if (weights < given).any() else problem
+
+
+def _begun_anew(problem: BundleProblem, mixture: Mixture) -> BundleProblem:
+    """The problem with points intersected anew, and images resected most of whose points contradict them."""
+    network, start = problem.network, problem.start
+    cameras = tuple(
+        replace(camera, values=start.cameras[c, : len(camera.values)])
+        for c, camera in enumerate(network.cameras)
+    )
+    size = np.sqrt((problem.misfits_at_start() ** 2).sum(axis=1))
+    of, known = network.image_of, np.isfinite(size)
+    good = np.bincount(of[known], mixture.good(size[known]), len(network.images))
+    kept = finite(start.x0) & (good > _MOSTLY * np.bincount(of[known], minlength=len(network.images)))
+    if not kept.any():
+        return problem
+    rotation = np.full(start.x0.shape, np.nan)
+    rotation[kept] = matrix_to_vector(start.rotation[kept])
+    x0 = np.where(kept[:, None], start.x0, np.nan)
+    found = approximate(replace(network, cameras=cameras, x0=x0, rotation=rotation, motion=start.motion))
+    given = finite(network.xyz)[:, None] & finite(start.xyz)[:, None]
+    xyz = np.where(given | ~finite(found.xyz)[:, None], start.xyz, found.xyz)
+    return replace(
+        problem, start=replace(start, rotation=found.rotation, x0=found.x0, motion=found.motion, xyz=xyz)
+    )
 
 
 def suspects(problem: BundleProblem) -> Rows:
     """Image points with very small weights in a robust adjustment, the smallest first."""
     nothing: Rows = np.zeros(0, dtype=np.intp)
-    trimmed = replace(_trimmed(problem), tolerance=max(problem.tolerance, _ROUGHLY))
+    trimmed = replace(_trimmed(problem, _CERTAIN), tolerance=max(problem.tolerance, _ROUGHLY))
     off = robust(trimmed, "huber", max_iterations=30, tolerance=0.3)
     if isinstance(off, Failure):
         return nothing

@@ -183,6 +183,23 @@ class Camera:
         unit = unit_of(name, self.model)
         return unit.replace("mm", "px") if self.in_pixels else unit
 
+    def in_millimetres(self, pitch: float) -> Camera:
+        """Return a camera whose lengths are in pixels with this pixel size (mm).
+
+        Examples
+        --------
+        >>> camera = Camera("a", 640, 480, (1.0, 1.0), "brown", np.array([800.0, 2, 0, 1e-8, *6 * [0.0]]))
+        >>> camera.in_millimetres(0.005).values[[0, 1, 3]]
+        array([4.e+00, 1.e-02, 4.e-04])
+        """
+        power = []
+        for name in self.names:
+            length, _, exponent = self.unit_of(name).partition("^")
+            power.append(int(exponent or 1) if length == "px" else 0)
+        factor = pitch ** np.array(power, dtype=np.float64)
+        sigma = {name: s * float(factor[self.names.index(name)]) for name, s in self.sigma.items()}
+        return replace(self, pitch_mm=(pitch, pitch), values=self.values * factor, sigma=sigma)
+
     @property
     def parameters(self) -> dict[str, float]:
         """Values by name."""

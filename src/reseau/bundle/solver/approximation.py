@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from ...adjust.mixture import Mixture
 from ...core.data import Array, Mask, Rows
 from ...core.display import Display
 from ...core.failure import Code, Remark
@@ -15,9 +16,18 @@ from ...optics.refraction import RefractedRays, Refraction
 from ..network import Network
 from ..network.network import finite
 from .datum import similarity_onto
+from .intersection import Rays
 from .parallel import resect_parallel
 from .pushbroom import resect_line
-from .spatial import behind_ports, directions, intersect, relative_orientation, resect, resect_through
+from .spatial import (
+    behind_ports,
+    directions,
+    field_of,
+    intersect,
+    relative_orientation,
+    resect,
+    resect_through,
+)
 from .values import Values
 
 __all__ = ["Approximate", "approximate"]
@@ -35,8 +45,6 @@ _BENT = 0.3
 _SETTLING = 6
 # Scales at which a free block is compared with the dimensions of its windows.
 _SCALES = np.geomspace(1e-4, 1e4, 161)
-# A ray with a misfit this many times the median is a gross error.
-_FAR = 20.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -97,7 +105,15 @@ def approximate(network: Network) -> Approximate:
     >>> np.abs(approximate(example_network()).x0[0].round(2))
     array([2.2, 0. , 4. ])
     """
-    return _Block(network).grown()
+    block = _Block(network)
+    found, begun = block.grown(), finite(network.x0).any()
+    if not begun and block.known.sum() > 2 and block.gross().any():
+        # Few control points in an image may agree with a wrong pose: the block that explains more is right.
+        other = _Block(network)
+        again = other.grown(by_control=False)
+        if other.evidence() > block.evidence():
+            return again
+    return found
 
 
 def _with_windows_on_cameras(network: Network) -> Network:
@@ -138,6 +154,9 @@ class _Block:
         shutter = np.array([c.shutter_columns for c in network.cameras])[network.camera_of[network.image_of]]
         self.time = (network.xy[:, 1] - shutter[:, 1]) * shutter[:, 0]
         self.angle = np.where(self.known, np.pi / 2, 0.0)
+        self.good = np.ones(len(network.image_of), dtype=bool)
+        self.mixture: Mixture | None = None
+        self.reach = field_of(self.seen)
         self._straighten()
 
     @property
@@ -145,10 +164,10 @@ class _Block:
         """Images that have a pose (m,)."""
         return finite(self.x0)
 
-    def grown(self) -> Approximate:
-        """Return all poses and points that can be computed."""
+    def grown(self, *, by_control: bool = True) -> Approximate:
+        """Return all poses and points that can be computed; without control, from a pair of images."""
         known, notes = self.known.copy(), list[Remark]()
-        if not self.posed.any():
+        if by_control and not self.posed.any():
             self._resect_all()
         if self.posed.sum() < 2 and not self.posed.all():
             control = self.xyz.copy()
@@ -162,63 +181,82 @@ class _Block:
         self._grow()
         if self.network.refraction is not None and not self.known.any() and not self.network.posed.any():
             self._scale_to_windows(self.network.refraction)
+        return self.result(tuple(notes))
+
+    def result(self, notes: tuple[Remark, ...] = ()) -> Approximate:
+        """Return all poses and points; given points as they are given."""
         given = finite(self.network.xyz)
         xyz = np.where(given[:, None], self.network.xyz, self.xyz)
-        return Approximate(self.rotation, self.x0, xyz, self.motion, tuple(notes))
+        # Points whose rays contradict each other are where these are nearest.
+        lost = ~finite(xyz)
+        rows = np.flatnonzero(
+            self.posed[self.network.image_of] & lost[self.network.point_of] & finite(self.uv)
+        )
+        near, _ = self._rays(rows).nearest(len(xyz))
+        return Approximate(self.rotation, self.x0, np.where(lost[:, None], near, xyz), self.motion, notes)
+
+    def _judged(self) -> tuple[Rows, Array, Mixture]:
+        """Rays with a pose and a point, their misfits, and how these are distributed."""
+        network = self.network
+        known = self.posed[network.image_of] & finite(self.xyz)[network.point_of] & finite(self.uv)
+        rows = np.flatnonzero(known)
+        off = self._rays(rows).misfits(self.xyz[network.point_of[rows]])
+        mixture = Mixture(_LOOSE, 0.2, self.reach) if self.mixture is None else self.mixture
+        return rows, off, mixture.fitted(off)
+
+    def gross(self) -> Mask:
+        """Image points with a pose and a point that are gross errors; all without."""
+        rows, off, mixture = self._judged()
+        found = np.ones(len(self.uv), dtype=bool)
+        found[rows] = mixture.gross(off)
+        return found
+
+    def evidence(self) -> float:
+        """Return what poses and points explain, less the price of their parameters."""
+        rows, off, mixture = self._judged()
+        images = len(np.unique(self.network.image_of[rows]))
+        points = len(np.unique(self.network.point_of[rows]))
+        return float(mixture.evidence(off).sum()) - (6 * images + 3 * points) * mixture.price
 
     def _grow(self) -> None:
         """Intersect points and resect images in turn until nothing is added."""
         while True:
-            self._intersect_all()
             if self.network.refraction is not None:
-                # The straight lines to points that have just been intersected.
+                # The straight lines to points that have just been intersected; only then rays agree.
                 for _ in range(_SETTLING):
+                    self.intersect(plain=True)
                     self._straighten()
-                    self._intersect_all()
+            self.intersect()
             if self.posed.all() or not self._resect_all():
                 return
 
-    def _intersect_all(self) -> None:
-        """Intersect the points of two or more oriented images, except points with known coordinates."""
-        network = self.network
-        rows = self.posed[network.image_of] & ~self.known[network.point_of] & finite(self.uv)
-        image, point = network.image_of[rows], network.point_of[rows]
-        uv, time = self.uv[rows], self.time[rows]
-        for _ in range(3):
-            rotation, x0 = self._poses(image, time)
-            xyz, angle = intersect(point, uv, rotation, x0, len(self.xyz), network.parallel[image])
-            off = self._misfit(image, point, uv, time, xyz)
-            worst = np.zeros(len(xyz))
-            np.maximum.at(worst, point, np.nan_to_num(off, posinf=1e9))
-            count = np.bincount(point, minlength=len(xyz))
-            limit = max(_LOOSE, _FAR * float(np.median(off))) if len(off) else _LOOSE
-            bad = (off >= worst[point]) & (off > limit) & (count[point] > 2)
-            if not bad.any():
-                break
-            image, point, uv, time = image[~bad], point[~bad], uv[~bad], time[~bad]
-        free = ~self.known
+    def intersect(self, *, plain: bool = False) -> None:
+        """Intersect the good rays, or all, of the points in two or more images, except of known points."""
+        network, free = self.network, ~self.known
+        rows = np.flatnonzero(self.posed[network.image_of] & free[network.point_of] & finite(self.uv))
+        rays = self._rays(rows)
+        if plain:
+            xyz, angle = rays.nearest(len(self.xyz))
+        else:
+            xyz, angle, self.good[rows], self.mixture = rays.intersected(
+                len(self.xyz), self.good[rows], self.mixture, self.reach
+            )
         self.xyz[free] = xyz[free]
         self.angle = np.where(self.known, np.pi / 2, angle)
+
+    def _rays(self, rows: Rows) -> Rays:
+        """Rays of some image points, with the poses of their images."""
+        image = self.network.image_of[rows]
+        return Rays(
+            self.network.point_of[rows], self.uv[rows], *self._poses(image, self.time[rows]),
+            self.network.parallel[image],
+        )  # fmt: skip
 
     def _poses(self, image: Rows, time: Array) -> tuple[Array, Array]:
         """Rotations (n, 3, 3) and projection centres (n, 3) at the times of rays."""
         rotation, x0, motion = self.rotation[image], self.x0[image], time[:, None] * self.motion[image]
         x0 = x0 + np.einsum("nji,nj->ni", rotation, motion[:, :3])
         return (rotation_matrix(motion[:, 3:]) @ rotation if motion[:, 3:].any() else rotation), x0
-
-    def _misfit(self, image: Rows, point: Rows, uv: Array, time: Array, xyz: Array) -> Array:
-        """Angles (sine) between computed and measured directions; infinite behind the camera."""
-        rotation, x0 = self._poses(image, time)
-        x = np.einsum("nij,nj->ni", rotation, xyz[point] - x0)
-        # Parallel rays: the distance from the ray, in that from the camera, which stands for its size.
-        beside = self.network.parallel[image]
-        x[beside, :2] -= uv[beside]
-        uv = np.where(beside[:, None], 0.0, uv)
-        ray = np.column_stack([uv, np.ones(len(uv))])
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            across = np.linalg.norm(np.cross(x, ray), axis=1)
-            off: Array = across / np.linalg.norm(x, axis=1) / np.linalg.norm(ray, axis=1)
-        return np.where(x[:, 2] > 0, off, np.inf)
 
     def _resect_all(self) -> bool:
         """Orient every image with at least four known points; return whether any was oriented."""
@@ -269,7 +307,7 @@ class _Block:
             # The bend of the rays depends on the pose.
             only = replace(refraction, path_of=refraction.path_of[[i]])
             found = resect_through(only, found, xyz, self.seen[rows], _LOOSE)
-        if found is None or found.agree.sum() < max(4, 0.5 * len(rows)):
+        if found is None or (bent and found.agree.sum() < max(4, 0.5 * len(rows))):
             return False
         self.rotation[i], self.x0[i] = found.rotation, found.x0
         return True

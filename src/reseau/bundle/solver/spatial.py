@@ -6,11 +6,13 @@ points are those of OpenCV, applied to directions corrected for distortion.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple, Self
 
 import cv2
 import numpy as np
 
+from ...adjust.mixture import Mixture
 from ...core.data import Array, Mask, Rows
 from ...optics.poses import rotation_matrix
 from ...optics.refraction import RefractedRays, Refraction
@@ -21,6 +23,7 @@ __all__ = [
     "Resection",
     "behind_ports",
     "directions",
+    "field_of",
     "intersect",
     "relative_orientation",
     "resect",
@@ -36,6 +39,11 @@ _STEPS, _SHORT, _ROUGH = 20, 1e-9, 1e-3
 
 # Rays closer than this (sine) to the plane across the middle of all rays are not used in a resection.
 _GRAZING = 0.1
+# Standard deviations that are tried in a resection, points by which poses are judged, poses from three points
+# at first and at most, those that are refined, and rounds of this.
+_SIGMAS, _SCORED, _TRIALS, _KEPT, _ROUNDS = 10, 200, (30, 1500), 3, 6
+# Logarithm of the odds from which a pose is taken.
+_ODDS = np.log(10.0)
 # Steps of a resection through windows, and its cost of a point that has no ray.
 _POSE_STEPS, _MISSED = 60, 10.0
 
@@ -162,8 +170,17 @@ def intersect(
     return xyz, angle
 
 
+def field_of(uv: Array) -> float:
+    """Extent (rad) of the field of view of some directions (n, 2): twice their root mean square angle."""
+    uv = uv[np.isfinite(uv).all(axis=1)]
+    if not len(uv):
+        return 1.0
+    angle = np.arctan(np.linalg.norm(uv - np.median(uv, axis=0), axis=1))
+    return max(2.0 * float(np.sqrt((angle**2).mean())), 1e-6)
+
+
 def resect(xyz: Array, uv: Array, tolerance: float) -> Resection | None:
-    """Compute the pose of an image from the largest consistent set of at least four points.
+    """Compute the pose of an image that explains its points better than gross errors do.
 
     Parameters
     ----------
@@ -172,12 +189,12 @@ def resect(xyz: Array, uv: Array, tolerance: float) -> Resection | None:
     uv : ndarray (k, 2)
         Ideal directions.
     tolerance : float
-        Largest misfit of the direction of a consistent point (rad).
+        Largest standard deviation (rad) of the directions of good points.
 
     Returns
     -------
     Resection or None
-        None where fewer than four points are consistent.
+        None where no pose pays for its six parameters; see :class:`~reseau.adjust.mixture.Mixture`.
     """
     # In a plane across the middle of the rays misfits are angles, even in the corners of a wide lens.
     turn = _towards(uv)
@@ -188,10 +205,11 @@ def resect(xyz: Array, uv: Array, tolerance: float) -> Resection | None:
     uv, given, xyz = ray[front, :2] / ray[front, 2:], len(xyz), xyz[front]
     centre = xyz.mean(axis=0)
     size = float(np.abs(xyz - centre).max()) or 1.0
-    local = np.ascontiguousarray((xyz - centre) / size)
-    image = np.ascontiguousarray(uv)
+    search = _Poses(
+        np.ascontiguousarray((xyz - centre) / size), np.ascontiguousarray(uv), field_of(uv), tolerance
+    )
     try:
-        best = _best_pose(local, image, tolerance)
+        best = search.best()
     except cv2.error:
         return None
     if best is None:
@@ -273,41 +291,88 @@ def resect_through(
     return Resection(rotation, x0, agree)
 
 
-def _best_pose(xyz: Array, uv: Array, tolerance: float) -> tuple[Array, Array, Mask] | None:
-    eye, none = np.eye(3), np.zeros(0)
-    agree = np.ones(len(xyz), dtype=bool)
-    if len(xyz) > 4:
-        found, _, _, inliers = cv2.solvePnPRansac(
-            xyz, uv, eye, none, reprojectionError=tolerance, iterationsCount=500, confidence=0.9999,
-            flags=cv2.SOLVEPNP_SQPNP,
-        )  # fmt: skip
-        if found and inliers is not None and len(inliers) >= 4:
-            agree = np.zeros(len(xyz), dtype=bool)
-            agree[inliers.ravel()] = True
-    count, vectors, shifts, _ = cv2.solvePnPGeneric(
-        np.ascontiguousarray(xyz[agree]), np.ascontiguousarray(uv[agree]), eye, none, flags=cv2.SOLVEPNP_SQPNP
-    )
-    best = None
-    for k in range(count):
-        refined, shift = cv2.solvePnPRefineLM(
-            np.ascontiguousarray(xyz[agree]),
-            np.ascontiguousarray(uv[agree]),
-            eye,
-            none,
-            vectors[k],
-            shifts[k],
-        )
-        rotation = rotation_matrix(refined.ravel())
-        x = xyz @ rotation.T + shift.ravel()
+class _Poses(NamedTuple):
+    """Poses of an image from three of its points, judged by all: points (k, 3), directions, their extent."""
+
+    xyz: Array
+    uv: Array
+    reach: float
+    largest: float
+
+    def misfits(self, poses: Array) -> Array:
+        """Sizes (h, k) of the misfits of poses (h, 6); infinite behind the camera."""
+        x = self.xyz @ np.swapaxes(rotation_matrix(poses[:, :3]), 1, 2) + poses[:, None, 3:]
         with np.errstate(divide="ignore", invalid="ignore"):
-            off = np.linalg.norm(x[:, :2] / x[:, 2:] - uv, axis=1)
-        fits = (off < tolerance) & (x[:, 2] > 0)
-        score = (int(fits.sum()), -float(np.median(off)))
-        if best is None or score > best[0]:
-            best = (score, rotation, shift.ravel(), fits)
-    if best is None or best[0][0] < 4:
-        return None
-    return best[1], np.asarray(best[2], dtype=np.float64), best[3]
+            off = np.linalg.norm(x[..., :2] / x[..., 2:] - self.uv, axis=-1)
+        return np.where(x[..., 2] > 0, off, np.inf)
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations that are tried."""
+        return np.geomspace(min(1e-5, self.largest), self.largest, _SIGMAS)
+
+    def best(self) -> tuple[Array, Array, Mask] | None:
+        """The pose that explains most, refined by its good points; None where none pays for itself."""
+        k, rng = len(self.xyz), np.random.default_rng(0)
+        some = self if k <= _SCORED else self._part(rng.permutation(k)[:_SCORED])
+        begin = Mixture(self.largest, 0.5, self.reach)
+        poses = self._of_all()
+        done, wanted = 0, float(_TRIALS[0])
+        while done < wanted:
+            three = np.argsort(rng.random((_TRIALS[0], k)), axis=1)[:, :3] if k > 3 else np.arange(3)[None]
+            poses = np.concatenate([poses, *(self._of_three(rows) for rows in three)])
+            done += len(three)
+            poses = poses[np.isfinite(poses).all(axis=1)]
+            if not len(poses):
+                continue
+            gain, sigma = begin.at_best(some.misfits(poses), self.sigmas, 6)
+            order = np.argsort(-gain, kind="stable")[:_KEPT]
+            mixture, poses = replace(begin, sigma=float(sigma[order[0]])), poses[order]
+            good = float(mixture.good(some.misfits(poses[:1])[0]).mean())
+            # So many that three good points are among them.
+            wanted = min(_TRIALS[1], np.log(1e-3) / np.log(max(1.0 - good**3, 1e-12) - 1e-13))
+        found = [each for pose in poses if (each := self._refined(pose, begin)) is not None]
+        best = max(found, key=lambda each: each[0], default=None)
+        return best[1:] if best is not None and best[0] > _ODDS else None
+
+    def _part(self, rows: Rows) -> Self:
+        return self._replace(xyz=self.xyz[rows], uv=self.uv[rows])
+
+    def _of_all(self) -> Array:
+        """Poses (h, 6) from all points."""
+        _, *found, _ = cv2.solvePnPGeneric(
+            self.xyz, self.uv, np.eye(3), np.zeros(0), flags=cv2.SOLVEPNP_SQPNP
+        )
+        return self._poses(found)
+
+    def _of_three(self, rows: Rows) -> Array:
+        """Poses (h, 6) from three points."""
+        _, *found = cv2.solveP3P(self.xyz[rows], self.uv[rows], np.eye(3), np.zeros(0), cv2.SOLVEPNP_AP3P)
+        return self._poses(found)
+
+    @staticmethod
+    def _poses(found: list[Any]) -> Array:
+        """Poses (h, 6) as OpenCV returns them: vectors of all rotations, then all shifts."""
+        return np.array(found, dtype=np.float64).reshape(2, -1, 3).transpose(1, 0, 2).reshape(-1, 6)
+
+    def _refined(self, pose: Array, begin: Mixture) -> tuple[float, Array, Array, Mask] | None:
+        """A pose refined by its good points, and what it explains beyond the price of its parameters."""
+        best = None
+        for _ in range(_ROUNDS):
+            off = self.misfits(pose[None])[0]
+            _, sigma = begin.at_best(off, self.sigmas, 6)
+            mixture = replace(begin, sigma=float(sigma)).fitted(off)
+            good = ~mixture.gross(off)
+            gain = float(mixture.evidence(off).sum()) - 6 * mixture.price
+            if good.sum() < 4 or mixture.sigma > self.largest or (best is not None and gain <= best[0]):
+                break
+            best = gain, rotation_matrix(pose[:3]), pose[3:], good
+            found = cv2.solvePnPRefineLM(
+                np.ascontiguousarray(self.xyz[good]), np.ascontiguousarray(self.uv[good]), np.eye(3),
+                np.zeros(0), pose[:3].reshape(3, 1).copy(), pose[3:].reshape(3, 1).copy(),
+            )  # fmt: skip
+            pose = np.array(found, dtype=np.float64).ravel()
+        return best
 
 
 def relative_orientation(first: Array, second: Array, tolerance: float) -> Pair | None:
@@ -324,7 +389,7 @@ def relative_orientation(first: Array, second: Array, tolerance: float) -> Pair 
         return None
     a, b = np.ascontiguousarray(first), np.ascontiguousarray(second)
     try:
-        essential, inliers = cv2.findEssentialMat(a, b, np.eye(3), cv2.RANSAC, 0.9999, tolerance, 1000)
+        essential, inliers = cv2.findEssentialMat(a, b, np.eye(3), cv2.RANSAC, 0.9999, tolerance, 5000)
         if essential is None or essential.shape != (3, 3):
             return None
         count, rotation, shift, agree = cv2.recoverPose(essential, a, b, np.eye(3), mask=inliers.copy())

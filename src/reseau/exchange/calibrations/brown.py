@@ -1,12 +1,13 @@
-"""Cameras with Brown's distortion in the image: PhotoModeler's text export, and the cameras of DBAT (XML).
+"""Cameras with Brown's distortion: PhotoModeler's text export, cameras of DBAT and MicMac (XML).
 
-Both correct measured coordinates: c, principal point from the upper left corner of the format, K1, K2, K3,
-P1, P2, in mm. A camera of PhotoModeler is written as the head of its text export, which DBAT reads; into
-PhotoModeler itself the numbers are typed (Camera Viewer).
+The first two correct measured coordinates: c, principal point from the upper left corner of the format, K1,
+K2, K3, P1, P2, in mm; MicMac's are in pixels. A camera of PhotoModeler is written as the head of its text
+export, which DBAT reads; into PhotoModeler itself the numbers are typed (Camera Viewer).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 
@@ -14,22 +15,48 @@ from ...bundle import Camera
 from ...core.errors import FormatError
 from ..dbat import camera_of as dbat_camera
 from ..markup import read_markup
+from ..micmac import interior_text, read_interior
 from ..photomodeler import camera_of_numbers
 from .plain import PlainCamera
 
 __all__ = [
     "BROWN",
+    "in_pixels",
     "is_dbat",
+    "is_micmac",
     "is_photomodeler",
     "read_dbat",
+    "read_micmac",
     "read_photomodeler",
     "write_dbat",
+    "write_micmac",
     "write_photomodeler",
 ]
 
 BROWN = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
 """Parameters that both have."""
 _HEAD, _CAMERA_LINE = 4, 10
+_SCALES = ("fx", "fy", "cx", "cy")
+
+
+def in_pixels(
+    values: Mapping[str, float], size: tuple[int, int], pitch_mm: tuple[float, float]
+) -> dict[str, float]:
+    """Parameters of OpenCV's model of a camera with Brown's distortion of ideal points.
+
+    Examples
+    --------
+    >>> found = in_pixels({"c": 8.0, "K1": 1e-3}, (640, 480), (0.01, 0.01))
+    >>> round(found["fx"], 6), round(found["k1"], 6), found["cx"]
+    (800.0, 0.064, 319.5)
+    """
+    c, x0, y0, k1, k2, k3, p1, p2 = (values.get(name, 0.0) for name in BROWN)
+    found = {
+        "fx": c / pitch_mm[0], "fy": c / pitch_mm[1],
+        "cx": x0 / pitch_mm[0] + (size[0] - 1) / 2, "cy": (size[1] - 1) / 2 - y0 / pitch_mm[1],
+        "k1": k1 * c**2, "k2": k2 * c**4, "p1": -p2 * c, "p2": p1 * c, "k3": k3 * c**6,
+    }  # fmt: skip
+    return {name: value for name, value in found.items() if value or name in _SCALES}
 
 
 def write_photomodeler(camera: PlainCamera) -> str:
@@ -108,6 +135,28 @@ def read_dbat(text: str, path: Path) -> PlainCamera:
         raise FormatError(f"has {len(found)} cameras, not one", where=path)
     name = found[0].find("name")
     return _plain(dbat_camera(found[0], path.stem if name is None or not name.text else name.text, ()))
+
+
+def write_micmac(camera: PlainCamera) -> str:
+    """Return the text of an interior orientation, ``AutoCal_….xml``."""
+    side = str(camera.options.get("side", "image"))
+    return interior_text(camera.values, (camera.width, camera.height), camera.pitch_mm[0], side)
+
+
+def is_micmac(text: str) -> bool:
+    """Whether this is such a file."""
+    return "<CalibrationInternConique>" in text
+
+
+def read_micmac(text: str, path: Path) -> PlainCamera:
+    """Read an interior orientation; lengths are in pixels.
+
+    Raises
+    ------
+    FormatError
+        When it is incomplete, or the model of the distortion is another one.
+    """
+    return _plain(read_interior(path))
 
 
 def _format(camera: PlainCamera) -> tuple[float, float]:

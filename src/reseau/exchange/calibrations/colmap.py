@@ -11,29 +11,34 @@ __all__ = ["read", "recognises", "write"]
 
 _CENTRE = ("fx", "fy", "cx", "cy")
 _FISHEYE = ("k1", "k2", "k3", "k4")
-# Models with their parameters; those with one focal length, and simpler ones, are read only.
+# Models with their parameters, those with one focal length first.
 _MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": _CENTRE,
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "PINHOLE": _CENTRE,
     "OPENCV": (*_CENTRE, *RADIAL_TANGENTIAL),
     "FULL_OPENCV": (*_CENTRE, *RATIONAL),
-    "OPENCV_FISHEYE": (*_CENTRE, *_FISHEYE),
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV_FISHEYE": (*_CENTRE, *_FISHEYE),
 }
 
 
 def write(camera: PlainCamera) -> str:
-    """Return the text of a ``cameras.txt`` with one camera."""
-    if camera.model == "fisheye":
-        model = "OPENCV_FISHEYE"
-    else:
-        rational = any(camera.values.get(name, 0.0) for name in RATIONAL[4:])
-        model = "FULL_OPENCV" if rational else "OPENCV"
-    names = _MODELS[model]
-    values = [v + 0.5 * (name in ("cx", "cy")) for name, v in zip(names, camera.of(*names), strict=True)]
+    """Return the text of a ``cameras.txt`` with one camera, in the first model that holds it."""
+    given = {name: value for name, value in camera.values.items() if value}
+    if given.get("fx") == given.get("fy"):
+        given["f"] = given.get("fx", 0.0)
+    fisheye = camera.model == "fisheye"
+    model, names = next(
+        (model, names)
+        for model, names in _MODELS.items()
+        if model.endswith("FISHEYE") == fisheye
+        and set(given) - {"f", "fx", "fy"} <= set(names)
+        and (names[0] == "fx" or "f" in given)
+    )
+    values = [given.get(name, 0.0) + 0.5 * (name in ("cx", "cy")) for name in names]
     head = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
     return f"{head}1 {model} {camera.width} {camera.height} {' '.join(map(repr, values))}\n"
 

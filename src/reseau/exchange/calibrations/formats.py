@@ -39,7 +39,8 @@ _EIGHT, _TWELVE = (*_CENTRE, *RATIONAL), (*_CENTRE, *THIN_PRISM)
 _FISHEYE = (*_CENTRE, "k1", "k2", "k3", "k4")
 # The most specific formats are tried first.
 _ORDER = (
-    "ros", "kalibr", "mrcal", "dbat", "metashape", "opencv", "matlab", "openptv", "photomodeler", "colmap",
+    "ros", "kalibr", "mrcal", "dbat", "micmac", "metashape", "opencv", "matlab", "openptv", "photomodeler",
+    "colmap",
 )  # fmt: skip
 # Pixel size where none is known: models in mm have only ratios to it.
 _NOMINAL_MM = 0.005
@@ -77,6 +78,10 @@ class CalibrationFormat:
         Puts a comment of one line into a text; None where the format has no comments.
     splined : bool
         Whether it also holds cameras with a spline surface, which describe every lens.
+    sides : tuple of str
+        Sides of Brown's distortion that it holds, the usual one first.
+    square : bool
+        Whether pixels are square.
 
     Examples
     --------
@@ -92,6 +97,8 @@ class CalibrationFormat:
     read: Callable[[str, Path], PlainCamera]
     beside: Mapping[str, Callable[[PlainCamera], str]] = field(default_factory=dict)
     splined: bool = False
+    sides: tuple[str, ...] = ("image",)
+    square: bool = False
     comment: Callable[[str, str], str] | None = None
 
 
@@ -100,8 +107,8 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
 
     Examples
     --------
-    >>> list(calibration_formats())
-    ['opencv', 'ros', 'kalibr', 'colmap', 'mrcal', 'metashape', 'photomodeler', 'dbat', 'matlab', 'openptv']
+    >>> "micmac" in calibration_formats()
+    True
     """
     wide, fisheye = (("opencv", _FIVE), ("opencv", _EIGHT)), ("fisheye", _FISHEYE)
     formats = (
@@ -140,6 +147,11 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
         CalibrationFormat(
             "dbat", (".xml",), (("brown", brown.BROWN),), brown.write_dbat, brown.is_dbat, brown.read_dbat,
             comment=_after_head,
+        ),
+        CalibrationFormat(
+            "micmac", (".xml",), (("brown", (*brown.BROWN, "B1", "B2")),),
+            brown.write_micmac, brown.is_micmac, brown.read_micmac, comment=_after_head,
+            sides=("image", "object"), square=True,
         ),
         CalibrationFormat(
             "matlab", (".m",), (("opencv", _FIVE),), matlab.write, matlab.recognises, matlab.read,
@@ -399,9 +411,21 @@ def _as_it_is(
         {o.name: stored[o.name] for o in registered.options if o.name in stored}
     )
     plain = not stored.get("additional")
+    if form.square and given[0] != given[1]:
+        return None
+    if plain and model == "brown" and options.get("side") == "object" and "object" not in form.sides:
+        # The same model in pixels.
+        if not set(own) <= {*brown.BROWN}:
+            return None
+        model, own, given, options = (
+            "opencv",
+            brown.in_pixels(own, (width, height), (given[0], given[1])),
+            (1.0, 1.0),
+            {},
+        )
     for wanted, names in form.models:
         same = wanted.partition("_full")[0] == model.partition("_full")[0] and set(own) <= set(names)
-        if plain and same and options == _options(wanted):
+        if plain and same and any(options == _options(wanted, side) for side in form.sides):
             return PlainCamera(name, width, height, wanted, own, (given[0], given[1]), options)
     if form.splined and isinstance(lens.mapping, SplinedStereographic):
         return PlainCamera(name, width, height, model, own)
@@ -471,6 +495,7 @@ def exported_lens(
         if not names and best is not None and best.greatest_px < _POOR:
             break
         pitch = _pitch(lens, pitch_mm) if camera_model(wanted).needs_pitch else (1.0, 1.0)
+        pitch = (pitch[0], pitch[0]) if form.square else pitch
         try:
             done = convert(
                 lens.mapping, PixelGrid(width, height, pitch), wanted, _options(wanted), free=names
@@ -491,9 +516,9 @@ def exported_lens(
     return best
 
 
-def _options(model: str) -> dict[str, str | float]:
+def _options(model: str, side: str = "image") -> dict[str, str | float]:
     """Options of a model in the files of other programs: Brown's distortion is that of measured points."""
-    given = {"side": "image"} if model == "brown" else {}
+    given = {"side": side} if model == "brown" else {}
     return camera_model(model).checked_options(given)
 
 

@@ -18,9 +18,10 @@ from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ...optics.formation import Outline, PixelResponse
 from ...optics.lenses import PlaneTarget, PupilElements, RayImage, RayMap, RaySurrogate, ray_image, ray_images
-from ..matching import Matches, MatchOptions, grey_variance, match, with_alike_errors
+from ..matching import Matches, MatchOptions, match, with_alike_errors
 from ..points import Measured, Reason
 from ..screening import Screened, screen
+from .likeness import Likeness, Residuals
 from .shapes import RayShapes
 
 __all__ = [
@@ -54,10 +55,6 @@ _ALIKE = 0.8
 """Least correlation of a target with its formed image."""
 _DISTURBED = 2.5
 """Largest ratio of the residuals of a target to those of the others."""
-_MISFIT = 1.5
-"""Ratio of the residuals of all targets to the noise from which there is a warning."""
-_FEWEST = 8
-"""Targets from which the noise as a function of the grey value is estimated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +151,8 @@ class BlurredResult(Measured):
     rings : int
         Rings of elements of the stop that were used; 0 for those of a surrogate.
     misfit : float
-        Residuals of the targets (median of their root mean squares) ÷ noise of the frame: about 1 where
-        they are like their images; NaN if none was matched.
+        Residuals of the targets, in means over 3×3 pixels, ÷ those beside them, both in units of the noise of
+        their grey values: about 1 where they are like their images; NaN if none was measured.
 
     Examples
     --------
@@ -308,14 +305,14 @@ class Run:
             start[k] = self._found(int(k), cast(RayImage, images[k]))
         rows = seen[np.isfinite(start[seen]).all(axis=1)]
         halves = np.array([self._half(cast(RayImage, images[k])) for k in rows], dtype=np.intp)
-        results: list[tuple[Rows, Matches]] = []
+        results: list[tuple[Rows, Array, Matches]] = []
         for half in np.unique(halves):
             those = rows[halves == half]
             shape = self._shape(
                 those, [cast(RayImage, images[k]) for k in those], elements, self.options.varied
             )
-            results.append((those, self._matched(shape, start[those], int(half))))
-        misfit = self._judge(results)
+            results.append((those, start[those], self._matched(shape, start[those], int(half))))
+        likeness = self._judge(results)
         for k in seen:
             image = cast(RayImage, images[k])
             self.columns["blur_px"][k], self.columns["offset"][k] = image.blur, image.centroid
@@ -331,8 +328,8 @@ class Run:
             predicted=self.predicted,
             deviation=np.where(self.ok[:, None], self.columns["xy"] - self.predicted, np.nan),
             rings=rings,
-            misfit=misfit,
-            notes=self._notes(misfit),
+            misfit=likeness.misfit,
+            notes=self._notes(likeness),
             **cast(Any, self.columns),
         )
 
@@ -351,8 +348,9 @@ class Run:
             lines = lines[(lines >= 0) & (lines < self.frame.height)]
             inside = np.ix_(lines.astype(np.intp), columns.astype(np.intp))
             grey, valid = self.screened.grey[inside].ravel(), self.screened.valid[inside].ravel()
-            gridded = shape.at(k, np.zeros(count))
-            parts = gridded.derivatives(xy, width, columns, lines, PixelResponse(o.fill))
+            where = xy, width, columns, lines, PixelResponse(o.fill)
+            outlines = shape.at(k, np.zeros(count))
+            parts = shape.images[k].formed(*where, derivatives=True, bright=shape.bright, parts=outlines)
             parts = parts.reshape(len(parts), -1)
             u, v = (at.ravel() for at in np.meshgrid((columns - xy[0]) / half, (lines - xy[1]) / half))
             light = np.stack([np.ones_like(u), u, v, parts[0]], axis=1)[valid]
@@ -413,7 +411,8 @@ class Run:
         """Image (r, c) of a target at a place, in a window around the nearest pixel."""
         across: Array = np.rint(xy) + np.arange(-half, half + 1.0)[:, None]
         response = PixelResponse(self.options.fill)
-        return image.gridded.image(xy, self.options.psf_px, across[:, 0], across[:, 1], response)
+        bright = self.options.polarity == "bright"
+        return image.formed(xy, self.options.psf_px, across[:, 0], across[:, 1], response, bright=bright)
 
     def _found(self, k: int, image: RayImage) -> Array:
         """Approximate position of a target by correlation within the range of search; NaN if not found."""
@@ -442,8 +441,9 @@ class Run:
     def _shape(
         self, rows: Rows, images: list[RayImage], elements: PupilElements, varied: Varied | None
     ) -> RayShapes:
+        bright = self.options.polarity == "bright"
         if varied is None:
-            return RayShapes(tuple(images))
+            return RayShapes(tuple(images), bright=bright)
         steps = _STEP * np.diag(varied.sigma)
         beside = [(varied.camera(step), varied.camera(-step), 2 * float(step.sum())) for step in steps]
         motions = []
@@ -456,7 +456,7 @@ class Run:
                 lit = np.asarray(a.dxy.any(axis=1) & b.dxy.any(axis=1))[:, None] / by
                 changes.append((lit * (a.xy - b.xy), lit * (a.dxy - b.dxy)))
             motions.append(Outline(*(np.stack(part) for part in zip(*changes, strict=True))))
-        return RayShapes(tuple(images), tuple(motions))
+        return RayShapes(tuple(images), tuple(motions), bright=bright)
 
     def _matched(self, shape: RayShapes, start: Array, half: int) -> Matches:
         o = self.options
@@ -485,17 +485,15 @@ class Run:
 
         first = run(options)
         sure = first.converged & (first.correlation > _ALIKE)
-        if sure.sum() < _FEWEST:
-            return first
-        variance = grey_variance(self.screened.grey, start[sure], first.residuals[sure])
+        variance = Residuals.of(self.screened.grey, start[sure], first.residuals[sure]).variance()
         return first if variance is None else run(replace(options, variance=variance))
 
-    def _judge(self, results: list[tuple[Rows, Matches]]) -> float:
-        """Fill in the columns; decline what is not an image of its target; return the misfit of all."""
+    def _judge(self, results: list[tuple[Rows, Array, Matches]]) -> Likeness:
+        """Fill in the columns; decline what is not an image of its target; return how like the others are."""
         if not results:
-            return float("nan")
-        usual = float(np.median(np.concatenate([found.noise for _, found in results])))
-        for rows, found in results:
+            return Likeness(float("nan"), False)
+        usual, left = float(np.median(np.concatenate([found.noise for *_, found in results]))), []
+        for rows, start, found in results:
             found = with_alike_errors(found)
             sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1))
             distance = np.hypot(*(found.xy - self.predicted[rows]).T)
@@ -527,14 +525,16 @@ class Run:
             for name in ("contrast", "t", "noise", "psf_px"):
                 self.columns[name][rows] = getattr(found, name)
             self.columns["varied"][rows], self.columns["varied_sigma"][rows] = found.form, found.form_sigma
-        return usual / self.screened.noise
+            if good.any():
+                left.append(Residuals.of(self.screened.grey, start[good], found.residuals[good]))
+        return Residuals.likeness(left) if left else Likeness(float("nan"), False)
 
-    def _notes(self, misfit: float) -> tuple[Remark, ...]:
+    def _notes(self, likeness: Likeness) -> tuple[Remark, ...]:
         """Say if the images of all targets differ from those formed."""
-        if not (self.ok.any() and misfit > _MISFIT):
+        if not likeness.unlike:
             return ()
         text = (
-            f"residuals are {misfit:.2g} times the noise of the frame: lens, focus or "
+            f"residuals of targets are {likeness.misfit:.3g} times the noise beside them: lens, focus or "
             "aperture are not those of the photograph, and places may be wrong by more than their sigmas"
         )
         return (Remark(text, Code.INCONSISTENT),)

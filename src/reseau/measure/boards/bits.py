@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.data import Array
 from ...optics import Chain
-from ..testfield.lattice_mapping import images_of
+from ..plane.levels import levels_around
 
 __all__ = ["Bits", "Integers", "read_bits"]
 
@@ -74,33 +72,21 @@ def read_bits(grey: NDArray[np.float32], mapping: Chain, nodes: Integers, on_edg
     if not on_edges:
         middle = 2 * whole((1, 0), (0, 1), (1, 1)) + 1
         around = _AROUND * np.array([[0, 1], [1, 0], [0, -1], [-1, 0]])
-        own = _levels(grey, mapping, middle[:, None] / 2 + around)
-        beside = _levels(grey, mapping, middle[:, None] / 2 + around * (1 / _AROUND - 1))
+        own = levels_around(grey, mapping, middle / 2, around)
+        beside = levels_around(grey, mapping, middle / 2, around * (1 / _AROUND - 1))
         # Squares that share a side have the other colour.
         other = np.median(beside, axis=1) - np.median(own, axis=1)
-        level = _levels(grey, mapping, middle[:, None] / 2)[:, 0] - np.median(own, axis=1)
+        level = levels_around(grey, mapping, middle / 2, np.zeros((1, 2)))[:, 0] - np.median(own, axis=1)
         dotted = level / np.where(other == 0, 1e-9, other) > _DOTTED
         return Bits(middle, np.where(dotted, 1, -1).astype(np.int8))
     found, sign = [], []
     for step in np.eye(2, dtype=np.intp):
         middle = np.asarray(2 * whole((int(step[0]), int(step[1]))) + step, dtype=np.intp)
         across = step[::-1]
-        places = np.stack([middle / 2, middle / 2 + 0.4 * across, middle / 2 - 0.4 * across], axis=1)
-        levels = _levels(grey, mapping, places)
+        levels = levels_around(grey, mapping, middle / 2, np.array([[0.0], [0.4], [-0.4]]) * across)
         contrast = np.abs(levels[:, 1] - levels[:, 2])
         brighter = levels[:, 0] - levels[:, 1:].mean(axis=1)
         sure = np.abs(brighter) > _SURE * contrast
         found.append(middle[sure])
         sign.append(np.sign(brighter[sure]).astype(np.int8))
     return Bits(np.concatenate(found), np.concatenate(sign))
-
-
-def _levels(grey: NDArray[np.float32], mapping: Chain, places: Array) -> Array:
-    """Grey values at places (n, k, 2) of a lattice."""
-    at = images_of(mapping, np.asarray(places, dtype=np.float64).reshape(-1, 2)).astype(np.float32)
-    at = np.nan_to_num(np.clip(at, -1e4, 1e6)).reshape(-1, places.shape[1], 2)
-    values = cv2.remap(
-        grey, np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1]), cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )  # fmt: skip
-    return np.asarray(values, dtype=np.float64).reshape(len(places), -1)

@@ -8,9 +8,7 @@ exchanged.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import cv2
@@ -20,23 +18,17 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
 from ...optics import Chain
-from ..reseau.lens_mapping import lens_through
-from ..reseau.plane_mapping import plane_through
-from ..testfield.lattice_mapping import images_of, second_order, started
+from ..plane.growth import grown_through
+from ..plane.levels import levels_around
 
 __all__ = [
-    "LENS_FROM",
-    "SADDLE_PX",
     "Saddles",
     "along",
     "bright_between",
     "crossed",
     "ended",
     "find_saddles",
-    "first_mapping",
     "grown",
-    "grown_through",
-    "levels_at",
     "sector_levels",
     "seeds",
 ]
@@ -64,18 +56,12 @@ _WELL = 5
 """Neighbours of a seed from which others are preferred for their strength alone, of 6."""
 _GATE = 0.22
 """Largest distance of a corner from its node, in steps of the lattice."""
-_CHOICE = 16
-"""Number of points near a node among which its corner is looked for: sharpened edges have many saddles."""
-_FROM = 1.1
-"""Distance from a known node within which the next are searched, in steps."""
 _DIAGONAL = 0.3
 """Where the sectors around a node are looked at, in steps along both axes."""
 _CROSSED = 0.3
 """Least difference between the darker of two bright sectors and the brighter of two dark ones."""
 _AROUND, _ACROSS, _ALONG = np.arange(-1, 2), np.array([-1.0, 0.0, 1.0]) / 2, np.array([1.0, 2.0, 1.0]) / 4
 """Pixels around a saddle, and Sobel's derivative by their columns and mean over their rows."""
-LENS_FROM, SADDLE_PX = 8, 0.5
-"""Least number of nodes from which the distortion of a lens is used; their standard deviation."""
 _LARGE_PX = 2_500_000
 """Size of a frame from which it is searched at half its size."""
 
@@ -269,114 +255,10 @@ def grown(
     return grown_through(saddles.xy, mapping, extent, shape, accepted, strongest=True)
 
 
-def grown_through(
-    xy: Array,
-    mapping: Chain,
-    extent: int,
-    shape: tuple[int, int],
-    accepted: Callable[[Chain, Array, Rows, Array], Mask],
-    *,
-    strongest: bool = False,
-) -> tuple[Array, Rows, Chain]:
-    """Grow a lattice through points (m, 2) of a frame.
-
-    Parameters
-    ----------
-    xy, mapping, extent, shape
-        The points, the strongest first; see :func:`grown`; height and width of the frame.
-    accepted : callable
-        Which of some nodes (n, 2) belong to these points (n,), given the mapping and its slopes there
-        (n, 2, 2).
-    strongest : bool
-        Whether the strongest of the points that are accepted is the corner of a node, by default the nearest.
-
-    Returns
-    -------
-    nodes, rows, mapping
-        As :func:`grown`.
-    """
-    grid = np.array(list(product(range(-extent, extent + 1), repeat=2)), dtype=np.float64)
-    tree = scipy.spatial.KDTree(xy)
-    nodes, rows, free = np.zeros((1, 2)), np.zeros(1, dtype=np.intp), mapping
-    through_lens = led = False
-    for _ in range(3 * extent):
-        beside = grid[scipy.spatial.KDTree(nodes).query(grid)[0] < _FROM + 0.5 * (len(nodes) < 4)]
-        predicted, slopes, _ = second_order(mapping, beside)
-        pixels = np.maximum(np.linalg.norm(slopes, axis=1).min(axis=1), 1e-6)
-        if led:
-            predicted = predicted + _led(nodes, xy[rows] - images_of(mapping, nodes), beside)
-        gap, at, which = _within(tree, predicted, _GATE * pixels)
-        good = accepted(mapping, beside[at], which, slopes[at]) if len(at) else np.zeros(0, dtype=bool)
-        gap, row = _first(len(beside), gap[good], at[good], which[good], strongest=strongest)
-        taken = np.isfinite(gap)
-        order = np.argsort(gap / pixels, kind="stable")
-        _, once = np.unique(row[order], return_index=True)
-        keep = np.sort(order[once])
-        keep = keep[taken[keep]]
-        same = np.array_equal(row[keep], rows) and np.array_equal(beside[keep], nodes)
-        nodes, rows = beside[keep], row[keep]
-        if len(rows) < 4 or np.ptp(nodes, axis=0).min() < 1 or (same and led):
-            break
-        if same and through_lens:
-            # Behind a fisheye what nodes have in excess of the mapping is continued to those beside them.
-            led = True
-            continue
-        if same and len(rows) < LENS_FROM:
-            break
-        # A polynomial through few nodes does not predict the next ones through a wide lens.
-        through_lens |= same
-        free = free if same else plane_through(nodes, xy[rows], shape)
-        lens = None
-        if through_lens:
-            lens = lens_through(nodes, xy[rows], np.full(len(rows), SADDLE_PX), shape, free)
-        mapping = free if lens is None else lens.mapping
-    return nodes, rows, mapping
-
-
-def _within(tree: scipy.spatial.KDTree, places: Array, gate: Array) -> tuple[Array, Rows, Rows]:
-    """Points within the distance `gate` of some places: their distances, and rows of places and of points."""
-    gap, row = tree.query(places, k=np.arange(1, min(_CHOICE, tree.n) + 1))
-    at, k = np.nonzero(gap < gate[:, None])
-    return gap[at, k], at, row[at, k]
-
-
-def _first(count: int, gap: Array, at: Rows, which: Rows, *, strongest: bool) -> tuple[Array, Rows]:
-    """The strongest or nearest point at each of `count` places: distance (infinite without one) and row."""
-    distance, row = np.full(count, np.inf), np.zeros(count, dtype=np.intp)
-    order = np.lexsort((which if strongest else gap, at))
-    first = order[np.unique(at[order], return_index=True)[1]]
-    distance[at[first]], row[at[first]] = gap[first], which[first]
-    return distance, row
-
-
-def _led(nodes: Array, excess: Array, beside: Array) -> Array:
-    """What nodes have in excess (n, 2) of a mapping, continued to those beside them (m, 2)."""
-    low = nodes.min(axis=0) - 3
-    field = np.full((*(np.ptp(nodes, axis=0) + 7).astype(np.intp), 2), np.nan)
-    field[tuple((nodes - low).astype(np.intp).T)] = excess
-    at, found = (beside - low).astype(np.intp), []
-    for step in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        near, far = (field[tuple((at + k * np.array(step)).T)] for k in (1, 2))
-        found.append(np.where(np.isfinite(far), 2 * near - far, near))
-    known = np.isfinite(found)
-    return np.asarray(np.where(known, found, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1))
-
-
 def sector_levels(grey: NDArray[np.float32], mapping: Chain, nodes: Array, share: float = _DIAGONAL) -> Array:
     """Grey values (n, 4) in the sectors around nodes of a lattice: after, before, and beside both steps."""
     around = share * np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]])
-    return levels_at(grey, images_of(mapping, (nodes[:, None] + around).reshape(-1, 2)).reshape(-1, 4, 2))
-
-
-def levels_at(grey: NDArray[np.float32], xy: Array) -> Array:
-    """Grey values (n, k) at image points (n, k, 2), linear between pixels."""
-    # Beside the border of the frame a sector is seen up to there.
-    at = np.clip(
-        np.nan_to_num(xy.astype(np.float32)), 0, np.array([grey.shape[1] - 1, grey.shape[0] - 1], np.float32)
-    )
-    # Fewer than 32768 pixels along an axis of the map are allowed.
-    x, y = (np.ascontiguousarray(at[..., k]) for k in range(2))
-    return np.asarray(cv2.remap(grey, x, y, cv2.INTER_LINEAR), dtype=np.float64)
+    return levels_around(grey, mapping, nodes, around)
 
 
 def crossed(levels: Array, bright: Mask) -> Mask:
@@ -416,8 +298,3 @@ def along(edges: Array, slopes: Array) -> Mask:
     one = np.maximum(_between(edges[:, 0], lines[:, 0]), _between(edges[:, 1], lines[:, 1]))
     two = np.maximum(_between(edges[:, 0], lines[:, 1]), _between(edges[:, 1], lines[:, 0]))
     return np.asarray(np.minimum(one, two) < 1.5 * _TURNED)
-
-
-def first_mapping(slope: Array, at: Array, shape: tuple[int, int]) -> Chain:
-    """The linear mapping of a lattice with steps (2, 2) in columns from an image point."""
-    return started(np.vstack([np.column_stack([slope, at]), [0.0, 0.0, 1.0]]), 1, shape)

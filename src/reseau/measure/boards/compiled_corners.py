@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ...core.compiled import compiled
 
-__all__ = ["add_images", "pixels_around"]
+__all__ = ["pixels_around"]
 
 Floats = NDArray[Any]
 
@@ -50,15 +50,3 @@ def pixels_around(
                     near |= abs(two) < reach and 0 < one < along
                 found[k, i, j] = near
     return found
-
-
-@compiled
-def add_images(total: Floats, images: Floats, factor: Floats, first: Floats) -> None:
-    """Add images (k, r, c), times factors (k,), to `total` (h, w), from pixels x, y `first` (k, 2) on."""
-    high, wide = total.shape
-    for k in range(len(images)):
-        left, top = first[k]
-        for i in range(max(0, -top), min(images.shape[1], high - top)):
-            row, image = total[top + i], images[k, i]
-            for j in range(max(0, -left), min(images.shape[2], wide - left)):
-                row[left + j] += factor[k] * image[j]

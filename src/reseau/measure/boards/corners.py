@@ -18,18 +18,19 @@ from ...core.failure import Code
 from ...optics import Chain
 from ...optics.corners import Corners, corner_images
 from ...optics.formation import PixelResponse, polygons
-from ..compiled_filter import filtered
+from ..compiled_filter import add_images, filtered
+from ..marks.judging import Objection
 from ..matching import GrownOutline, Matches, Shape, Window
-from ..points import Reason
-from ..reseau.lens_mapping import UNFIT, mapping_through
+from ..plane.lattice_mapping import images_of, second_order
+from ..plane.lens_mapping import UNFIT, mapping_through
+from ..plane.levels import levels_around
 from ..reseau.mark_windows import BESIDE, ENOUGH, Located
 from ..reseau.marks import ReseauOptions
 from ..reseau.plane_marks import PlaneMarks, intact
 from ..response import sharpened_from_px
 from ..screening import Screened
-from ..testfield.lattice_mapping import images_of, second_order
-from .candidates import ended, levels_at
-from .compiled_corners import add_images, pixels_around
+from .candidates import ended
+from .compiled_corners import pixels_around
 from .shadows import pixels_alike, shaded
 
 __all__ = ["BORDER_PX", "CornerMarks", "CornerShape", "DeltilleMarks", "Sectors"]
@@ -349,7 +350,7 @@ class CornerMarks(PlaneMarks):
 
     def _in_shadows(self, rows: Rows, found: Matches) -> Matches:
         """See :class:`PlaneMarks`: shadows make objections to some corners, and displace others."""
-        objected = np.any([mask for mask, _ in self._objections(rows, found)], axis=0)
+        objected = np.any([mask for mask, *_ in self._objections(rows, found)], axis=0)
         plain = intact(found) & ~objected
         if not (objected & (found.rejected > 0)).any() or plain.sum() < ENOUGH or not self.balanced:
             return found
@@ -402,7 +403,7 @@ class CornerMarks(PlaneMarks):
         self.look = replace(self.look, psf_px=float(np.median(first.psf_px)))
         return first
 
-    def _objections(self, rows: Rows, found: Matches) -> list[tuple[Mask, Reason]]:
+    def _objections(self, rows: Rows, found: Matches) -> list[Objection]:
         """See :class:`PlaneMarks`: where edges nearly coincide, small errors of their directions shift it."""
         _, along, _ = self._steps(rows)
         tangent = along / np.linalg.norm(along, axis=1, keepdims=True)
@@ -410,28 +411,25 @@ class CornerMarks(PlaneMarks):
         other = np.roll(tangent, 1, axis=2)
         sine = tangent[:, 0] * other[:, 1] - tangent[:, 1] * other[:, 0]
         flat = np.abs(sine).max(axis=1) < _FLAT
-        seen = Reason("seen at too flat an angle", Code.UNCERTAIN)
         # Of a corner on the border two sectors are not seen, and nothing shows an error of its edges.
         h, w = self.screened.grey.shape
         gap = np.minimum(found.xy, np.array([w - 1, h - 1]) - found.xy).min(axis=1)
         # What the kernel takes from beyond the frame is unknown.
         beyond = 0 if self.look.kernel is None else sharpened_from_px(self.look.kernel)
         near = gap < max(BORDER_PX + _BORDER * self.look.blur_px, beyond)
-        border = near, Reason("on the border of the frame", Code.OUTSIDE)
         # Without its pixels an edge is where faint tails of its blur have it.
         part = found.converged & (np.isfinite(found.residuals).sum(axis=(1, 2)) < self.own_px[rows])
         unseen = part.copy()
         unseen[part] = self._edges_seen(rows[part], found.select(part)).min(axis=1) < _LEAST_EDGE
-        hidden = Reason("an edge is hidden or saturated", Code.HIDDEN)
-        beyond_pattern = Reason(
-            "the pattern ends there: paper is where a dark square should be", Code.OTHER_DESIGN
-        )
-        outer = (self._single(rows), beyond_pattern)
-        crossed = (
-            self.crossed[rows],
-            Reason("edges of shadows, or of something else, cross it", Code.DISTURBED),
-        )
-        return [border, outer, crossed, (unseen, hidden), *super()._objections(rows, found), (flat, seen)]
+        ends = "the pattern ends there: paper is where a dark square should be"
+        return [
+            (near, "on the border of the frame", Code.OUTSIDE),
+            (self._single(rows), ends, Code.OTHER_DESIGN),
+            (self.crossed[rows], "edges of shadows, or of something else, cross it", Code.DISTURBED),
+            (unseen, "an edge is hidden or saturated", Code.HIDDEN),
+            *super()._objections(rows, found),
+            (flat, "seen at too flat an angle", Code.UNCERTAIN),
+        ]
 
     def _single(self, rows: Rows) -> Mask:
         """Which corners, not found before, are those of a single square where two should meet."""
@@ -442,9 +440,9 @@ class CornerMarks(PlaneMarks):
         # Markers lie in bright squares, at some distance from their corners.
         shares = np.array([_BRIGHT_AT, _BRIGHT_AT, _DARK_AT, _DARK_AT])[:, None, None] * self.sectors.reach
         around = shares * np.stack([one - two, two - one, one + two, -one - two])
-        at = self.at[rows[single]] + around @ self.frame.T
-        levels = levels_at(self.screened.grey, images_of(self.mapping, at.reshape(-1, 2)).reshape(at.shape))
-        single[single] = ended(levels.T, np.ones(levels.shape[1], dtype=bool))
+        around = np.moveaxis(around, 0, 1) @ self.frame.T
+        levels = levels_around(self.screened.grey, self.mapping, self.at[rows[single]], around)
+        single[single] = ended(levels, np.ones(len(levels), dtype=bool))
         return single
 
     def _edge_seen(self, rows: Rows, found: Matches) -> Array:

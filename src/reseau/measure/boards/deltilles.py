@@ -26,8 +26,9 @@ from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
 from ...io.board import BoardDesign
 from ...optics import Chain
-from ..testfield.lattice_mapping import images_of
-from .candidates import first_mapping, grown_through, levels_at
+from ..plane.growth import first_mapping, grown_through
+from ..plane.lattice_mapping import images_of
+from ..plane.levels import levels_around
 from .placement import Placed, cost_of, failed, numbered
 
 __all__ = ["find_deltille", "lattice_of_deltille"]
@@ -354,9 +355,7 @@ def _levels(grey: NDArray[np.float32], mapping: Chain, nodes: Array, part: float
     They are those of the middles, or of places on the way to these, at a part of it.
     """
     third = np.array([[1, 1], [-2, 1], [1, -2], [-1, -1], [2, -1], [-1, 2]]) / 3
-    return levels_at(
-        grey, images_of(mapping, (nodes[:, None] + part * third).reshape(-1, 2)).reshape(-1, 6, 2)
-    )
+    return levels_around(grey, mapping, nodes, part * third)
 
 
 def _crossed(levels: Array) -> Mask:

@@ -16,6 +16,7 @@ from ...core.threads import one_thread
 from ...designs.boards import marker_cells
 from ...designs.dots import halves_of_dots
 from ...io.board import BoardDesign
+from ..plane.lattice_mapping import second_order, stretches
 from ..points import Measured, Reason
 from ..reseau.disks import find_disks
 from ..reseau.mark_windows import Located
@@ -23,7 +24,6 @@ from ..reseau.marks import ReseauOptions
 from ..reseau.plane_marks import PlaneMarks
 from ..reseau.sheet import DiskMarks
 from ..screening import Screened, inner_pixels, screen
-from ..testfield.lattice_mapping import second_order, stretches
 from .candidates import Saddles, find_saddles
 from .corners import BORDER_PX, CornerMarks, DeltilleMarks, Sectors
 from .deltilles import find_deltille

@@ -7,9 +7,11 @@ has not. Where several places are equally good, one is taken and the user is tol
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,22 +23,20 @@ from ...core.failure import Code, Failure, Remark
 from ...designs.dots import dot_signs
 from ...io.board import BoardDesign
 from ...optics import Chain
+from ..plane.growth import LENS_FROM, SADDLE_PX, first_mapping
+from ..plane.lattice_mapping import images_of, slope_of
+from ..plane.lens_mapping import lens_through
+from ..plane.plane_mapping import STRENGTHS, plane_through, projectivity_behind
 from ..reseau.disks import Disks
-from ..reseau.lens_mapping import lens_through
 from ..reseau.mark_windows import Located
-from ..reseau.plane_mapping import STRENGTHS, plane_through, projectivity_behind
 from ..reseau.sheet_placement import MOST_DISKS, disk_seeds, grown_disks
-from ..testfield.lattice_mapping import images_of, slope_of
 from .bits import Bits, Integers, read_bits
 from .candidates import (
-    LENS_FROM,
-    SADDLE_PX,
     Saddles,
     along,
     bright_between,
     crossed,
     ended,
-    first_mapping,
     grown,
     sector_levels,
     seeds,
@@ -244,104 +244,55 @@ def numbered(
 
     `ends` says at which nodes nothing is seen that the design has there.
     """
-    # Diagonals of a staggered grid are halved: its nodes have columns and rows that are both even or odd.
-    matrix = _lattice_of(design)
-    numbers = design.nodes @ matrix.T // (2 if design.staggered else 1)
-    least = numbers.min(axis=0)
-    numbers = numbers - least
-    size = numbers.max(axis=0) + 1
-    index = np.full(tuple(size + 1), -1, dtype=np.intp)
-    index[tuple(numbers.T)] = np.arange(len(numbers))
-    known = {tuple(node): k for k, node in enumerate(nodes.tolist())}
-    mirrored = _mirrored(mapping)
-    found: list[tuple[float, Integers, Integers]] = []
+    lattice = _Lattice(design, nodes, mapping, shape)
     signs = None if bits is None else dot_signs(design)
-    once, turns = (THIRD, 3) if design.kind == "deltille" else (QUARTER, 4)
-    for quarter in range(turns):
-        # Rows of a design go downwards as those of a frame do.
-        turn = np.linalg.matrix_power(once, quarter)
-        turn = turn @ np.diag([-1, 1]) if mirrored else turn
-        inverse = np.rint(np.linalg.inv(turn)).astype(np.intp)
-        at = nodes @ turn.T
-        low, high = at.min(axis=0), at.max(axis=0)
-        ranges = []
-        for a, b, n in zip(low, high, size, strict=True):
-            spare = max(0, int(n - 1 - (b - a)))
-            over = max(0, int((b - a) - (n - 1)))
-            ranges.append(range(int(-a) - over, int(-a) + spare + 1))
-        for shift in product(*ranges):
-            place = at + np.array(shift)
-            inside = ((place >= 0) & (place < size)).all(axis=1)
-            of = np.where(inside, index[tuple(np.where(inside[:, None], place, 0).T)], -1)
-            there = of >= 0
-            if dark is not None:
-                # An odd quarter turn exchanges the sectors of a corner.
-                seen = dark[1][there] ^ (quarter % 2 == 1) ^ mirrored
-                agree = dark[0][of[there]] == seen
-                if agree.mean() < 0.5 if len(agree) else True:
-                    continue
-            back = (numbers - np.array(shift)) @ inverse.T
-            missing = np.array([tuple(node) not in known for node in back.tolist()])
-            lost = 0.0
-            if missing.any():
-                gone = back[missing].astype(np.float64)
-                where = images_of(mapping, gone)
-                sight = ((where > 2) & (where < np.array(shape[::-1]) - 3)).all(axis=1)
-                each = (np.full(len(gone), _MISSED) if cost is None else cost(gone))[sight]
-                hidden = each == _MISSED
-                lost = float(each[~hidden].sum()) + min(float(each[hidden].sum()), _HIDDEN)
-            score = there.sum() - lost - _FOREIGN * (~there).sum()
-            if bits is not None and signs is not None:
-                score -= _FOREIGN * bits.compared(signs, turn, np.array(shift))[0]
-            found.append((float(score), turn, np.array(shift)))
+    found: list[tuple[float, Integers, Integers]] = []
+    for turn, shift, odd in lattice.ways():
+        of = lattice.rows(turn, shift)
+        there = of >= 0
+        if dark is not None:
+            # An odd quarter turn exchanges the sectors of a corner.
+            agree = dark[0][of[there]] == dark[1][there] ^ odd
+            if not len(agree) or agree.mean() < 0.5:
+                continue
+        score = there.sum() - lattice.lost(turn, shift, cost) - _FOREIGN * (~there).sum()
+        if bits is not None and signs is not None:
+            score -= _FOREIGN * bits.compared(signs, turn, shift)[0]
+        found.append((float(score), turn, shift))
     if not found:
         return Failure("the lattice found does not agree with the board at any place", Code.OTHER_DESIGN)
     found.sort(key=lambda one: -one[0])
     score, turn, moved = found[0]
     if bits is not None and signs is not None:
-        wrong, total = bits.compared(signs, turn, moved)
-        puzzle = design.kind == "puzzle"
-        if wrong > (MISREAD * total if puzzle else _MISREAD_DOTS):
-            return Failure(
-                f"{wrong} of {total} dots are not as on the board where it fits best", Code.OTHER_DESIGN
-            )
-        if puzzle and len(found) * scipy.special.bdtr(wrong, total, 0.5) > _CHANCE:
-            return Failure(f"{total} dots are too few to tell which part it is", Code.NOT_IDENTIFIED)
-    inverse = np.rint(np.linalg.inv(turn)).astype(np.intp)
-
-    def seen_at(line: NDArray[np.intp]) -> Array:
-        """Places in the lattice found of columns and rows of the design."""
-        at = line @ matrix.T // (2 if design.staggered else 1) - least
-        return np.asarray((at - moved) @ inverse.T, dtype=np.float64)
-
-    def goes_on(beyond: Array) -> Mask:
-        found = np.array([tuple(node) in known for node in beyond.astype(np.intp).tolist()])
-        # The last ones of a print are seen, but not always found.
-        return found | (cost(beyond) == 0) if cost is not None and found.any() else found
-
-    more = any(_mostly(seen_at(line), mapping, shape, goes_on) for line in _lines_around(design))
-    if score < _FITS * min(len(nodes), len(numbers)) or (more and design.kind != "puzzle"):
+        misread = _misread(design, *bits.compared(signs, turn, moved), len(found))
+        if misread is not None:
+            return misread
+    of = lattice.rows(turn, moved)
+    there = of >= 0
+    seen_at = partial(lattice.seen_at, turn, moved)
+    more = any(
+        _mostly(seen_at(line), mapping, shape, partial(lattice.goes_on, cost))
+        for line in _lines_around(design)
+    )
+    if score < _FITS * min(len(nodes), len(of)) or (more and design.kind != "puzzle"):
         return Failure(
             f"{len(nodes)} points in a lattice were found; the board has others, or more beside them",
             Code.OTHER_DESIGN,
         )
-    alike = [one for one in found[1:] if score - one[0] < _ALIKE]
-    place = nodes @ turn.T + moved
-    inside = ((place >= 0) & (place < size)).all(axis=1)
-    of = np.where(inside, index[tuple(np.where(inside[:, None], place, 0).T)], -1)
-    there = of >= 0
     lines = [seen_at(design.nodes[line]) for line in _lines_beside(design, of[there])]
     if ends is not None and any(_mostly(line, mapping, shape, ends) for line in lines):
         return Failure(
             f"{there.sum()} points in a lattice were found, and nothing beside them where the board has more",
             Code.OTHER_DESIGN,
         )
-    seen, start = np.zeros(len(numbers), dtype=bool), np.zeros((len(numbers), 2))
+    count = len(design.nodes)
+    seen, start = np.zeros(count, dtype=bool), np.zeros((count, 2))
     seen[of[there]], start[of[there]] = True, xy[there]
-    frame, origin = _to_lattice(design, turn, moved + least)
+    frame, origin = _to_lattice(design, turn, moved + lattice.least)
     located = Located(design.ids, design.xy, design.polarity, mapping, frame, origin, seen, start)
+    alike = [one for one in found[1:] if score - one[0] < _ALIKE]
     texts = []
-    if turned := [one for one in alike if _same(numbers, (turn, moved), one[1:])]:
+    if turned := [one for one in alike if _same(lattice.numbers, (turn, moved), one[1:])]:
         texts.append(
             f"the board looks the same turned in {len(turned) + 1} ways: names are those of one of them"
         )
@@ -358,6 +309,91 @@ def _same(numbers: Integers, place: tuple[Integers, Integers], other: tuple[Inte
     back = np.rint(np.linalg.inv(place[0])).astype(np.intp)
     there = (numbers - place[1]) @ back.T @ other[0].T + other[1]
     return set(map(tuple, there.tolist())) == set(map(tuple, numbers.tolist()))
+
+
+def _misread(design: BoardDesign, wrong: int, total: int, places: int) -> Failure | None:
+    """Why the dots that were read are not those of the board at the best of so many places."""
+    puzzle = design.kind == "puzzle"
+    if wrong > (MISREAD * total if puzzle else _MISREAD_DOTS):
+        return Failure(
+            f"{wrong} of {total} dots are not as on the board where it fits best", Code.OTHER_DESIGN
+        )
+    if puzzle and places * scipy.special.bdtr(wrong, total, 0.5) > _CHANCE:
+        return Failure(f"{total} dots are too few to tell which part it is", Code.NOT_IDENTIFIED)
+    return None
+
+
+class _Lattice:
+    """Nodes (n, 2) of a lattice that was found, and the places of a design on it."""
+
+    def __init__(self, design: BoardDesign, nodes: Integers, mapping: Chain, shape: tuple[int, int]) -> None:
+        self.design, self.nodes, self.mapping, self.shape = design, nodes, mapping, shape
+        self.mirrored = _mirrored(mapping)
+        # Diagonals of a staggered grid are halved: its nodes have columns and rows that are both even or odd.
+        numbers = self._numbers(design.nodes)
+        self.least = numbers.min(axis=0)
+        self.numbers = numbers - self.least
+        self.size = self.numbers.max(axis=0) + 1
+        self.index = np.full(tuple(self.size), -1, dtype=np.intp)
+        self.index[tuple(self.numbers.T)] = np.arange(len(numbers))
+        self.low = nodes.min(axis=0)
+        self.seen = np.zeros(tuple(np.ptp(nodes, axis=0) + 1), dtype=bool)
+        self.seen[tuple((nodes - self.low).T)] = True
+
+    def _numbers(self, nodes: Integers) -> Integers:
+        """Columns and rows of the design as steps between nearest neighbours."""
+        return np.asarray(nodes @ _lattice_of(self.design).T // (2 if self.design.staggered else 1))
+
+    def ways(self) -> Iterator[tuple[Integers, Integers, bool]]:
+        """Turns (2, 2) and shifts (2,) from nodes to the design; whether they exchange dark sectors."""
+        once, turns = (THIRD, 3) if self.design.kind == "deltille" else (QUARTER, 4)
+        for quarter in range(turns):
+            # Rows of a design go downwards as those of a frame do.
+            turn = np.linalg.matrix_power(once, quarter)
+            turn = turn @ np.diag([-1, 1]) if self.mirrored else turn
+            low, extent = (self.nodes @ turn.T).min(axis=0), np.ptp(self.nodes @ turn.T, axis=0) + 1
+            spare = self.size - extent
+            first, last = -low + np.minimum(spare, 0), -low + np.maximum(spare, 0)
+            for shift in product(
+                *(range(a, b + 1) for a, b in zip(first.tolist(), last.tolist(), strict=True))
+            ):
+                yield turn, np.array(shift), (quarter % 2 == 1) ^ self.mirrored
+
+    def rows(self, turn: Integers, shift: Integers) -> Rows:
+        """Rows (n,) of the design at the nodes, -1 where it has no point."""
+        return _entries(self.index, self.nodes @ turn.T + shift, -1)
+
+    def seen_at(self, turn: Integers, shift: Integers, line: Integers) -> Array:
+        """Places in the lattice of columns and rows (m, 2) of the design."""
+        back = np.linalg.inv(turn)
+        return np.asarray(np.rint((self._numbers(line) - self.least - shift) @ back.T))
+
+    def lost(self, turn: Integers, shift: Integers, cost: Callable[[Array], Array] | None) -> float:
+        """What points of the design that are in sight, and were not found, count against a place."""
+        at = self.seen_at(turn, shift, self.design.nodes)
+        gone = at[~_entries(self.seen, at - self.low, False)]
+        if not len(gone):
+            return 0.0
+        where = images_of(self.mapping, gone)
+        sight = ((where > 2) & (where < np.array(self.shape[::-1]) - 3)).all(axis=1)
+        each = (np.full(len(gone), _MISSED) if cost is None else cost(gone))[sight]
+        hidden = each == _MISSED
+        return float(each[~hidden].sum()) + min(float(each[hidden].sum()), _HIDDEN)
+
+    def goes_on(self, cost: Callable[[Array], Array] | None, beyond: Array) -> Mask:
+        """At which nodes beyond the design something is seen."""
+        found: Mask = _entries(self.seen, beyond - self.low, False)
+        # The last ones of a print are seen, but not always found.
+        if cost is None or not found.any():
+            return found
+        return np.asarray(found | (cost(beyond) == 0), dtype=bool)
+
+
+def _entries(table: NDArray[Any], at: Array | Integers, outside: Any) -> NDArray[Any]:
+    """Entries (n,) of a table at places (n, 2), and what is `outside` of it."""
+    at = at.astype(np.intp)
+    inside: Mask = np.all((at >= 0) & (at < table.shape), axis=1)
+    return np.asarray(np.where(inside, table[tuple(np.where(inside[:, None], at, 0).T)], outside))
 
 
 def _lines_beside(design: BoardDesign, found: Rows) -> list[Rows]:
@@ -495,6 +531,42 @@ def _plane_of_markers(
     return found, good
 
 
+def _agreeing(
+    design: BoardDesign, corners: Array, numbers: NDArray[np.intp], shape: tuple[int, int]
+) -> tuple[Rows, Array, Array, Mask] | Failure:
+    """Markers of the board that were read: their rows (m,), corners (4 m, 2) in pitches and in the image.
+
+    Also which corners agree with the places of the others.
+    """
+    own, places = design.markers
+    row_of = {int(number): k for k, number in enumerate(own)}
+    keep = np.array([int(number) in row_of for number in numbers], dtype=bool)
+    if not keep.any():
+        return Failure("no marker of the board was read", Code.NOT_FOUND)
+    corners, rows = corners[keep], np.array([row_of[int(number)] for number in numbers[keep]])
+    plane, image = places[rows].reshape(-1, 2) / design.pitch, corners.reshape(-1, 2)
+    matrix, good = _plane_of_markers(plane, image, shape)
+    if matrix is None or good.sum() < 4:
+        return Failure("the markers read do not agree with the board", Code.INCONSISTENT)
+    whole = good.reshape(-1, 4).all(axis=1)
+    astray = int((~whole).sum())
+    if 0 < len(rows) <= min(2 * astray, _FEW_READ):
+        # Nothing tells which of them are misread.
+        return Failure(f"the {len(rows)} markers read do not agree with each other", Code.INCONSISTENT)
+    if len(rows) > _FEW_READ and astray > 1:
+        other = design.model_copy(update={"legacy": not design.legacy}).markers[1][rows].reshape(-1, 2)
+        alike = _plane_of_markers(other / design.pitch, image, shape)[1].reshape(-1, 4).all(axis=1)
+        if astray > _ASTRAY * len(rows) or (~alike).sum() < astray:
+            return Failure(
+                f"{astray} of {len(rows)} markers lie at other places than on the board: it has "
+                "another layout (old or new) or number of columns",
+                Code.OTHER_DESIGN,
+            )
+    if np.linalg.det(matrix[:2, :2] - np.outer(matrix[:2, 2], matrix[2, :2]) / matrix[2, 2]) > 0:
+        return Failure("the board is seen mirrored", Code.MIRRORED)
+    return rows, plane, image, np.repeat(whole, 4) if whole.any() else good
+
+
 def lay_marked(
     grey: NDArray[np.float32],
     saddles: Saddles,
@@ -521,39 +593,16 @@ def lay_marked(
         are no saddles, the corners of the markers read are found.
     """
     shape = (grey.shape[0], grey.shape[1])
-    corners, numbers = markers
-    own, places = design.markers
-    row_of = {int(number): k for k, number in enumerate(own)}
-    keep = np.array([int(number) in row_of for number in numbers], dtype=bool)
-    if not keep.any():
-        return Failure("no marker of the board was read", Code.NOT_FOUND)
-    corners, rows = corners[keep], np.array([row_of[int(number)] for number in numbers[keep]])
-    plane, image = places[rows].reshape(-1, 2) / design.pitch, corners.reshape(-1, 2)
-    matrix, good = _plane_of_markers(plane, image, shape)
-    if matrix is None or good.sum() < 4:
-        return Failure("the markers read do not agree with the board", Code.INCONSISTENT)
-    whole = good.reshape(-1, 4).all(axis=1)
-    astray = int((~whole).sum())
-    if 0 < len(rows) <= min(2 * astray, _FEW_READ):
-        # Nothing tells which of them are misread.
-        return Failure(f"the {len(rows)} markers read do not agree with each other", Code.INCONSISTENT)
-    if len(rows) > _FEW_READ and astray > 1:
-        other = design.model_copy(update={"legacy": not design.legacy}).markers[1][rows].reshape(-1, 2)
-        alike = _plane_of_markers(other / design.pitch, image, shape)[1].reshape(-1, 4).all(axis=1)
-        if astray > _ASTRAY * len(rows) or (~alike).sum() < astray:
-            return Failure(
-                f"{astray} of {len(rows)} markers lie at other places than on the board: it has "
-                "another layout (old or new) or number of columns",
-                Code.OTHER_DESIGN,
-            )
-    use = np.repeat(whole, 4) if whole.any() else good
-    if np.linalg.det(matrix[:2, :2] - np.outer(matrix[:2, 2], matrix[2, :2]) / matrix[2, 2]) > 0:
-        return Failure("the board is seen mirrored", Code.MIRRORED)
+    agreeing = _agreeing(design, *markers, shape)
+    if isinstance(agreeing, Failure):
+        return agreeing
+    rows, plane, image, use = agreeing
     mapping = plane_through(plane[use], image[use], shape, _READ_PX)
     nodes = design.xy / design.pitch
     frame, origin = np.eye(2) / design.pitch, np.zeros(2)
     if design.kind == "markers":
         known, start = np.zeros(len(nodes), dtype=bool), images_of(mapping, nodes)
+        whole = use.reshape(-1, 4).all(axis=1)
         of = (4 * rows[whole][:, None] + np.arange(4)).ravel()
         known[of], start[of] = True, image[np.repeat(whole, 4)]
         return Placed(Located(design.ids, design.xy, "dark", mapping, frame, origin, known, start))

@@ -18,12 +18,13 @@ from ...core.threads import one_thread
 from ...designs.boards import board
 from ...io.board import BoardDesign, BoardKind
 from ...optics import Chain
+from ..plane.growth import first_mapping
+from ..plane.lattice_mapping import slope_of
 from ..reseau.disks import Disks, find_disks
 from ..reseau.sheet_placement import disk_seeds, grown_disks
 from ..screening import screen
-from ..testfield.lattice_mapping import slope_of
 from .bits import Integers
-from .candidates import Saddles, find_saddles, first_mapping, grown, seeds
+from .candidates import Saddles, find_saddles, grown, seeds
 from .deltilles import lattice_of_deltille
 from .markers import ReadMarkers, markers_of_any_dictionary
 from .placement import THIRD

@@ -17,6 +17,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
+from ..plane.levels import levels_at
 from .candidates import Saddles
 
 __all__ = ["SEARCHES", "read_tags", "tag_outlines", "with_seen_edges"]
@@ -56,8 +57,8 @@ def _seen_edges(grey: NDArray[np.float32], saddles: Saddles, radius: float) -> A
     does not cross four times, the given directions remain.
     """
     angle, found = 2 * np.pi * np.arange(_PLACES + 1) / _PLACES, saddles.edges.copy()
-    x, y = saddles.xy.T[:, :, None]
-    level = _level(grey, x + radius * np.cos(angle), y + radius * np.sin(angle)) - _level(grey, x, y)
+    circle = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    level = levels_at(grey, saddles.xy[:, None] + circle) - levels_at(grey, saddles.xy[:, None])
     crossed = (level[:, 1:] > 0) != (level[:, :-1] > 0)
     rows = np.flatnonzero(crossed.sum(axis=1) == 4)
     place = np.nonzero(crossed[rows])[1].reshape(-1, 4)
@@ -71,24 +72,14 @@ def _seen_edges(grey: NDArray[np.float32], saddles: Saddles, radius: float) -> A
     return found
 
 
-def _level(grey: NDArray[np.float32], x: Array, y: Array) -> Array:
-    """Grey values between pixels; those of the border beyond it."""
-    x, y = np.clip(x, 0.0, grey.shape[1] - 1.001), np.clip(y, 0.0, grey.shape[0] - 1.001)
-    i, j = y.astype(np.intp), x.astype(np.intp)
-    u, v = x - j, y - i
-    above = (1 - u) * grey[i, j] + u * grey[i, j + 1]
-    level: Array = (1 - v) * above + v * ((1 - u) * grey[i + 1, j] + u * grey[i + 1, j + 1])
-    return level
-
-
 def _are_edges(grey: NDArray[np.float32], start: Array, end: Array) -> Mask:
     """Whether lines (m) are dark on the right, seen in the image, and bright on the left, all along."""
-    (x, y), (dx, dy) = start.T[:, :, None], (end - start).T[:, :, None]
-    off, share = np.maximum(_BESIDE, 1.5 / np.hypot(dx, dy)), np.linspace(0.12, 0.88, _ALONG)
-    x, y = x + share * dx, y + share * dy
+    step, share = (end - start)[:, None], np.linspace(0.12, 0.88, _ALONG)[:, None]
+    off = np.maximum(_BESIDE, 1.5 / np.linalg.norm(step, axis=2, keepdims=True))
+    at = start[:, None] + share * step
     # A quarter turn of x into y: to the right in the image.
-    right, left = ((x + side * off * dy, y - side * off * dx) for side in (1, -1))
-    contrast = _level(grey, *right) - _level(grey, *left)
+    beside = off * step[..., ::-1] * [1, -1]
+    contrast = levels_at(grey, at + beside) - levels_at(grey, at - beside)
     least = contrast.min(axis=1)
     return np.asarray((least > 0) & (least > _EDGE * np.median(contrast, axis=1)))
 
@@ -166,20 +157,6 @@ def tag_outlines(grey: NDArray[np.float32], saddles: Saddles, weak: float, radiu
     return np.asarray(strong[ring[closed] % count])
 
 
-def _sampled(grey: NDArray[np.float32], xy: Array) -> Array:
-    """Grey values at image points (..., 2), linear between pixels."""
-    at = np.nan_to_num(np.clip(xy, -1e4, 1e6)).reshape(-1, 2).astype(np.float32)
-    # Fewer than 32768 pixels along an axis of the map are allowed.
-    wide = min(len(at), 1024)
-    lines = np.zeros((-(-len(at) // wide) * wide, 2), np.float32)
-    lines[: len(at)] = at
-    values = cv2.remap(
-        grey, lines[:, 0].reshape(-1, wide), lines[:, 1].reshape(-1, wide), cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )  # fmt: skip
-    return np.asarray(values.ravel()[: len(at)].reshape(xy.shape[:-1]), dtype=np.float64)
-
-
 def read_tags(
     grey: NDArray[np.float32], corners: Array, words: Mask, border_bits: int, most_wrong: int
 ) -> tuple[Rows, Array]:
@@ -220,7 +197,7 @@ def read_tags(
         matrix = cv2.getPerspectiveTransform(unit.astype(np.float32), quad.astype(np.float32))
         image = np.column_stack([places, np.ones(len(places))]) @ matrix.T
         images[k] = image[:, :2] / image[:, 2:]
-    levels = _sampled(grey, images)
+    levels = levels_at(grey, images)
     cells, paper = levels[:, : side * side].reshape(-1, side, side), np.median(levels[:, -4:], axis=1)
     border = np.ones((side, side), dtype=bool)
     border[border_bits:-border_bits, border_bits:-border_bits] = False

@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask
 
-__all__ = ["LEAST", "grey_variance", "medians", "relative_weights"]
+__all__ = ["LEAST", "adjusted_grey", "grey_variance", "linear_variance", "medians", "relative_weights"]
 
-_SIGNIFICANT = 5.0
-"""The slope of the variance must exceed this many of its standard deviations to be used."""
 _ENOUGH = 8000
 """Number of pixels that show how the variance grows."""
 LEAST = 0.05
@@ -50,29 +48,51 @@ def grey_variance(pixels: NDArray[Any], start: Array, residuals: Array) -> tuple
     >>> bool(abs(b - 0.1) < 0.03)
     True
     """
+    adjusted = adjusted_grey(pixels, start, residuals)
+    used = np.flatnonzero(np.isfinite(residuals))
+    used = used[:: max(1, len(used) // _ENOUGH)]
+    left = residuals.ravel()[used]
+    square, grey = left**2, adjusted.ravel()[used]
+    return linear_variance(grey, square)
+
+
+def adjusted_grey(pixels: NDArray[Any], start: Array, residuals: Array) -> Array:
+    """Adjusted grey values (k, rows, columns); parameters as of :func:`grey_variance`."""
     column, row = (
         np.rint(start[:, axis]).astype(np.intp)[:, None] + np.arange(size) - size // 2
         for axis, size in enumerate(residuals.shape[:0:-1])
     )
     h, w = pixels.shape
     observed = pixels[np.clip(row, 0, h - 1)[:, :, None], np.clip(column, 0, w - 1)[:, None, :]]
-    used = np.flatnonzero(np.isfinite(residuals))
-    used = used[:: max(1, len(used) // _ENOUGH)]
-    left = residuals.ravel()[used]
-    square, grey = left**2, observed.ravel()[used] + left
-    if square.size < 500 or not square.any():
+    return np.asarray(observed + residuals)
+
+
+def linear_variance(grey: Array, square: Array) -> tuple[float, float] | None:
+    """Coefficients of a variance a + b·grey that explains squares (n,) of errors better than a constant one.
+
+    Both explanations are compared by their likelihood, less what one more parameter is worth (Schwarz 1978).
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> grey = rng.uniform(20.0, 200.0, 2000)
+    >>> linear_variance(grey, rng.normal(0.0, 3.0, 2000) ** 2)
+    >>> a, b = linear_variance(grey, rng.normal(0.0, np.sqrt(4 + grey / 10)) ** 2)
+    >>> round(b, 1)
+    0.1
+    """
+    if not square.any():
         return None
     design = np.stack([np.ones_like(grey), grey])
-    mean = square.mean()
+    mean = float(square.mean())
     variance = np.full(len(grey), mean)
     for _ in range(4):
         # The square of a normal deviate has variance 2σ⁴.
         weighted = design / (2 * variance**2)
-        normal = weighted @ design.T
-        a, b = np.linalg.lstsq(normal, weighted @ square, rcond=None)[0]
+        a, b = np.linalg.lstsq(weighted @ design.T, weighted @ square, rcond=None)[0]
         variance = np.maximum(a + b * grey, LEAST * mean)
-    sigma = np.sqrt(np.linalg.pinv(normal)[1, 1])
-    return (float(a), float(b)) if b > _SIGNIFICANT * sigma else None
+    gain = float((np.log(mean) + 1 - np.log(variance) - square / variance).sum())
+    return (float(a), float(b)) if b > 0 and gain > np.log(len(grey)) else None
 
 
 def relative_weights(grey: Array, variance: tuple[float, float], used: Mask | None = None) -> Array:

@@ -12,9 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
+import scipy
 
 from ...core import vocabulary as v
 from ...core.data import Array, Frame, ImagePoints, Mask, Rows
@@ -24,9 +26,10 @@ from ..matching import MatchOptions
 from ..points import Reason
 from ..screening import Screened, screen
 from .arcs import ArcMatches
-from .echoes import Echoes, find_echoes, ground_of
+from .echoes import Echoes, Grey, find_echoes, ground_of
 from .forms import match_arcs
 from .graphics import bridged, find_cuts, is_sharp, looks_drawn, same_in_all, series
+from .reverberations import find_reverberations
 from .screenlight import blur_of_wires, falloff
 from .shapes import ends_of, reach_of
 
@@ -45,6 +48,13 @@ _IN_ROWS = (
     Reason("a character in a row of characters", Code.DRAWN),
     Reason("one of a scale's equally spaced marks", Code.DRAWN),
 )
+_TOO_UNCERTAIN = Reason("too uncertain", Code.UNCERTAIN)
+_HALF_SEEN = (Code.HIDDEN, Code.UNCERTAIN, Code.OVERLAPPING, Code.OUTSIDE)
+"""Why an echo may not be measured and have a reverberation all the same."""
+_ECHO_PX = 6.0, 1.8
+"""Usual size of an echo (one sigma) along and across, pixels, over which its brightness is averaged."""
+_MOST_BY_CHANCE = 0.5
+"""Largest number of spots as bright as an echo that chance makes in its frame."""
 _STATIC = 0.7
 """Share of a spot that must be the same in all frames for it to be a static graphic."""
 
@@ -61,7 +71,7 @@ class PinOptions:
         Largest length of a pin's arc; by default 6 % of the frame's diagonal, at least 40 px. Longer spots
         are edges of the sector, the face of the transducer or interfaces.
     most_tilt_deg : float
-        Largest tilt of an arc against the rows of the frame.
+        Largest tilt of an arc against the rows of the frame, or the common direction of its echoes.
     least_strength : float
         Minimum brightness over the background, as a share of that of the brightest echo.
     least_correlation : float
@@ -178,6 +188,23 @@ class PinDetections(Overlaid):
         """Codes (m,) of the reasons; None where a spot is a pin."""
         return tuple(why.code if isinstance(why, Reason) else None for why in self.why)
 
+    @property
+    def direction(self) -> float:
+        """Common direction (rad) of the echoes in the image, from -π/2 to π/2."""
+        double = np.exp(2j * self.tilt[self.ok]) * np.minimum(
+            self.length[self.ok] / self.thickness[self.ok] - 1, 5
+        )
+        return float(np.angle(double.sum()) / 2)
+
+    def turned_back(self, width: int) -> PinDetections:
+        """The same spots in the frame, of this width, that was turned by 90° against the clock for them."""
+        back = np.array([[0.0, -1.0], [1.0, 0.0]])
+        columns: dict[str, Any] = {"tilt": self.tilt + np.pi / 2, "cov": back @ self.cov @ back.T}
+        columns |= {name: getattr(self, name) @ back.T + [width - 1.0, 0.0] for name in ("xy", "centroid")}
+        if self.shared is not None:
+            columns["shared"] = back @ self.shared
+        return replace(self, **columns)
+
     def _heading(self) -> str:
         return f"{self.image}: {int(self.ok.sum())} echoes found"
 
@@ -240,6 +267,21 @@ def find_pins(
     screened = screen(frame, run=None)
     if isinstance(screened, Failure):
         return screened
+    judge = _judge(frame, screened, o, tuple(others), hidden)
+    if abs(judge.direction) <= np.pi / 4:
+        return judge.verdict()
+    # The echoes stand upright in the frame: turned by 90°, they lie along its rows.
+    lying = replace(frame, pixels=np.rot90(frame.pixels))
+    turned = tuple(replace(other, pixels=np.rot90(other.pixels)) for other in others)
+    screened = replace(screened, grey=np.rot90(screened.grey), valid=np.rot90(screened.valid))
+    behind = None if hidden is None else np.rot90(hidden)
+    return _judge(lying, screened, o, turned, behind).verdict().turned_back(frame.width)
+
+
+def _judge(
+    frame: Frame, screened: Screened, o: PinOptions, others: tuple[Frame, ...], hidden: Mask | None
+) -> _Judge:
+    """The spots of a frame, to be judged."""
     longest = o.max_length_px or max(_LONG_PX, 0.06 * float(np.hypot(*frame.pixels.shape)))
     ground = ground_of(screened.grey, max(15, round(_GROUND_LENGTHS * longest)))
     blur = None
@@ -254,7 +296,34 @@ def find_pins(
         covered |= hidden
     echoes = find_echoes(bridged(light, covered), o.smoothing_px, least)
     open_ = replace(screened, valid=screened.valid & ~covered)
-    return _Judge(frame, open_, echoes, longest, o, tuple(others), blur).verdict()
+    judge = _Judge(frame, open_, echoes, longest, least, o, others, blur)
+    judge.by_chance = _by_chance(bridged(light, covered), echoes, _lit(screened.valid & ~covered, hidden))
+    return judge
+
+
+def _lit(valid: Mask, hidden: Mask | None) -> Mask:
+    """Pixels between the echoes: those that are seen, within the extent of a reseau."""
+    if hidden is None or not hidden.any():
+        return valid
+    row, column = (np.flatnonzero(hidden.any(axis=axis)) for axis in (1, 0))
+    seen = np.zeros_like(valid)
+    seen[row[0] : row[-1], column[0] : column[-1]] = True
+    return np.asarray(seen & valid & ~hidden)
+
+
+def _by_chance(light: Grey, echoes: Echoes, lit: Mask) -> Array:
+    """How many spots (m,) as bright as each one, over the size of an echo, what is between echoes makes.
+
+    Speckle is as bright as echoes, and smaller. Averaged over an echo, its brightness above the median falls
+    off exponentially at most.
+    """
+    along, across = _ECHO_PX
+    even = cv2.GaussianBlur(light, (0, 0), along, sigmaY=across)
+    middle, upper = np.quantile(even[lit], [0.5, 0.75]).tolist() if lit.any() else (0.0, 1.0)
+    scale = max(upper - middle, 1e-6) / np.log(2)
+    places = lit.sum() / (4 * np.pi * along * across)
+    brightest = scipy.ndimage.maximum(even, echoes.owner, np.arange(len(echoes)))
+    return np.asarray(0.5 * places * np.exp(-np.maximum(np.asarray(brightest) - middle, 0) / scale))
 
 
 class _Judge:
@@ -266,15 +335,27 @@ class _Judge:
         screened: Screened,
         echoes: Echoes,
         longest: float,
+        least: float,
         options: PinOptions,
         others: tuple[Frame, ...],
         blur: tuple[float, float] | None,
     ) -> None:
         self.blur = blur
         self.frame, self.screened, self.echoes, self.options = frame, screened, echoes, options
-        self.longest = longest
+        self.longest, self.least = longest, least
+        self.direction = self._direction()
+        self.by_chance = np.zeros(len(echoes))
         self.still = same_in_all(frame, others)
         self.why = np.full(len(echoes), "", dtype=object)
+
+    def _direction(self) -> float:
+        """Common direction (rad) of long spots, by their brightness over that of their steps."""
+        e = self.echoes
+        drawn = looks_drawn(e)
+        long = (e.length > _UPRIGHT_FROM * e.thickness) & (e.length <= self.longest)
+        long &= ~(drawn | np.any(series(e, drawn), axis=0))
+        soft = e.height[long] / np.maximum(e.edge[long, 0], 1e-6)
+        return float(np.angle((soft**2 * np.exp(2j * e.tilt[long])).sum()) / 2)
 
     def verdict(self) -> PinDetections:
         """Reject spots that need no match, match the others, decide."""
@@ -288,6 +369,10 @@ class _Judge:
             (sharp, Reason("sharp all around: drawn by the instrument", Code.DRAWN)),
             (e.joined > o.most_touching, Reason("touches another spot", Code.OVERLAPPING)),
             (self._static(), Reason("the same in all frames", Code.DRAWN)),
+            (
+                self.by_chance > _MOST_BY_CHANCE,
+                Reason("no brighter than speckle or grain", Code.LOW_CONTRAST),
+            ),
         ]
         drawn = sharp | looks_drawn(e)
         coarse += zip(series(e, drawn), _IN_ROWS, strict=True)
@@ -308,6 +393,7 @@ class _Judge:
         every = np.arange(len(e))
         for mask, reason in zip(series(e, drawn | self._looks_drawn(at, found)), _IN_ROWS, strict=True):
             self._object(every, mask, reason, also_sharp=sharp)
+        self._repeated(at, found)
         brightest = float(e.height[self.why == ""].max(initial=0.0))
         self._object(
             every,
@@ -322,6 +408,29 @@ class _Judge:
         if also_sharp is not None:
             free |= also_sharp[at]
         self.why[at[mask & free]] = reason
+
+    def _repeated(self, at: Rows, found: ArcMatches) -> None:
+        """Reject second echoes of the same reflectors."""
+        e, xy = self.echoes, self.echoes.xy.copy()
+        measured = found.converged & np.isin(self.why[at], ["", _TOO_UNCERTAIN])
+        xy[at[measured]] = found.xy[measured]
+        codes = np.array([getattr(why, "code", None) for why in self.why], dtype=object)
+        echo = np.array([code is None or code in _HALF_SEEN for code in codes], dtype=bool)
+        seen = np.flatnonzero(echo | (codes == Code.LOW_CONTRAST))
+        repeated = find_reverberations(
+            xy[seen],
+            e.height[seen],
+            e.length[seen],
+            echo[seen],
+            ~self.screened.valid,
+            self.least,
+            self.longest,
+            self.direction,
+        )
+        second, doubtful = repeated.of != -1, repeated.doubtful
+        text = f"{abs(repeated.spacing):.1f} px behind another one"
+        self._object(seen, second & doubtful, Reason(f"a point, or a reverberation {text}", Code.AMBIGUOUS))
+        self._object(seen, second, Reason(f"a reverberation {text}", Code.REVERBERATION))
 
     def _static(self) -> Mask:
         e = self.echoes
@@ -341,7 +450,9 @@ class _Judge:
         """Objections to spots from their own images, the most serious first."""
         o, e = self.options, self.echoes
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
-        upright = np.abs(e.tilt[at]) > np.deg2rad(o.most_tilt_deg)
+        # Against the rows, or the common direction, which few echoes tell roughly.
+        steep = np.abs((e.tilt[at] - [[0.0], [self.direction]] + np.pi / 2) % np.pi - np.pi / 2).min(axis=0)
+        upright = steep > np.deg2rad(o.most_tilt_deg)
         upright &= e.length[at] > _UPRIGHT_FROM * e.thickness[at]
         moved = np.hypot(*(found.xy - e.xy[at]).T) > np.maximum(3.0, 0.5 * e.length[at])
         border = np.array([self.frame.width, self.frame.height]) - 1
@@ -364,7 +475,7 @@ class _Judge:
             (moved, Reason("the match moved away from the spot", Code.DEVIATES)),
             (upright, Reason("too steep for the arc of a pin", Code.UNLIKE)),
             (4 * found.arcs.along > 1.6 * self.longest, Reason("longer than a pin", Code.UNLIKE)),
-            (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
+            (~(sigma <= o.most_sigma_px), _TOO_UNCERTAIN),
         ]
 
     def _likeness(self, found: ArcMatches) -> Array:

@@ -12,11 +12,11 @@ from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign, ReseauMeasurement
-from ...optics.field import SmoothField, trend_degree
 from ..points import Measured, Reason, deviating
+from .assignment import assign
 from .detection import PinDetections, PinOptions, find_pins
 from .segments import cut_segments
-from .wires import Layout, LayoutOptions, Wires, lay_wires, nearest_pairs
+from .wires import Layout, LayoutOptions, Wires, lay_wires
 
 if TYPE_CHECKING:
     from ...core.overlay import Layer
@@ -31,8 +31,6 @@ _BESIDE_PX = 3.0
 """Minimum distance from the centre line of an echo within which another rod counts as covered by it."""
 _FLAT = 1e-3
 """Least extent of a design across, relative to that along."""
-_ROUNDS = 3
-"""Rounds of fitting the field and assigning echoes with it; usually two suffice."""
 _COLUMNS = (
     "contrast",
     "t",
@@ -208,7 +206,7 @@ def measure_pins(
     if isinstance(seen, Failure):
         return seen
     echoes = np.flatnonzero(seen.ok)
-    layout = _placed_pattern(design, known, seen.xy[echoes], o)
+    layout = _placed_pattern(design, known, seen, o)
     if isinstance(layout, Failure):
         return Failure(
             f"the rods of design {design.name!r} were not found: {layout.reason}",
@@ -222,7 +220,9 @@ def measure_pins(
     return _with_slanted(work.result(design.ids, known), design, echoes, layout.gate_px)
 
 
-def _placed_pattern(design: ReseauDesign, known: Rows, seen: Array, o: PinOptions) -> Layout | Failure:
+def _placed_pattern(
+    design: ReseauDesign, known: Rows, found: PinDetections, o: PinOptions
+) -> Layout | Failure:
     """The rods fitted to the echoes, from nominal positions if the design has them.
 
     Echoes on the segments of slanted wires support a position; only the rods are in the result.
@@ -232,13 +232,16 @@ def _placed_pattern(design: ReseauDesign, known: Rows, seen: Array, o: PinOption
     ends = design.segments[rows]
     wires = Wires(tuple(design.ids[i] for i in rows), ends[:, 0], ends[:, 1])
     nominal = design.nominal_px[known]
-    options = LayoutOptions(
-        o.gate, float(np.deg2rad(o.max_rotation_deg)), None if o.mirrored is None else True
-    )
+    seen, mirrored = found.xy[found.ok], None if o.mirrored is None else True
+    options = LayoutOptions(o.gate, float(np.deg2rad(o.max_rotation_deg)), mirrored, found.direction)
     start = nominal if np.isfinite(nominal).all() else None
     if start is not None:
         start = np.concatenate([start, np.full((len(slanted), 2), np.nan)])
     layout = lay_wires(wires, seen, options, start)
+    if isinstance(layout, Failure) and start is not None:
+        # The photograph may be turned or mirrored against the one in which the nominal positions were read.
+        anywhere = lay_wires(wires, seen, options)
+        layout = layout if isinstance(anywhere, Failure) else anywhere
     return layout if isinstance(layout, Failure) else replace(layout, row=layout.row[: len(known)])
 
 
@@ -285,74 +288,44 @@ class _Rods:
     ) -> None:
         self.tolerance_px = tolerance * np.sqrt(np.abs(np.linalg.det(layout.matrix)))
         self.frame, self.source, self.seen, self.echoes = frame, source, seen, echoes
-        self.row, self.gate_px = layout.row, layout.gate_px
+        self.gate_px, self.ids = layout.gate_px, ids
         self.notes = (_AMBIGUOUS,) if layout.ambiguous else ()
-        self.predicted = layout(source)
+        assigned = assign(
+            source,
+            seen.xy[echoes],
+            seen.cov[echoes],
+            layout.row,
+            layout(source),
+            layout.gate_px,
+            self.tolerance_px,
+        )
+        self.row, self.predicted, self.deviation = assigned.row, assigned.predicted, assigned.deviation
         self.why = np.full(len(source), "", dtype=object)
-        self.deviation = np.full(source.shape, np.nan)
-        self.ids = ids
-        self._settle()
+        for rod, distance in assigned.excluded.items():
+            text = f"what is seen lies {distance:.1f} px from the position predicted by the other rods"
+            self.why[rod] = Reason(text, Code.DEVIATES)
         self._separate()
 
-    def _settle(self) -> None:
-        """Fit a field through rods and echoes, assign echoes with it, and reject deviating ones."""
-        for _ in range(_ROUNDS):
-            field = self._field()
-            if field is None:
-                break
-            self.predicted = field(self.source)
-            mine, theirs = nearest_pairs(self.predicted, self.seen.xy[self.echoes], self.gate_px)
-            row = np.full(len(self.source), -1)
-            row[mine] = theirs
-            if (row == self.row).all():
-                break
-            self.row = row
-        while (field := self._field()) is not None:
-            has = np.flatnonzero(self.row >= 0)
-            self.predicted = field(self.source)
-            self.deviation[:] = np.nan
-            self.deviation[has], _ = field.leave_one_out()
-            off = np.hypot(*self.deviation[has].T)
-            worst = int(off.argmax())
-            if off[worst] <= self.gate_px:
-                break
-            self.why[has[worst]] = Reason(
-                f"{off[worst]:.1f} px from the position predicted by its neighbours", Code.DEVIATES
-            )
-            self.row[has[worst]] = -1
-        self.deviation[self.row < 0] = np.nan
-
     def _separate(self) -> None:
-        """Reject an echo that also covers the predicted place of a rod without an echo."""
-        has, without = np.flatnonzero(self.row >= 0), np.flatnonzero(self.row < 0)
-        if not len(has) or not len(without):
-            return
-        seen, at = self.seen, self.echoes[self.row[has]]
-        offset = self.predicted[without][:, None] - seen.xy[at]
+        """Reject echoes that cover the predicted places of several rods."""
+        seen, at = self.seen, self.echoes
+        offset = self.predicted[:, None] - seen.xy[at]
         c, s = np.cos(seen.tilt[at]), np.sin(seen.tilt[at])
         along = np.abs(c * offset[..., 0] + s * offset[..., 1])
         across = np.abs(c * offset[..., 1] - s * offset[..., 0])
-        shared = (along < 0.5 * seen.length[at]) & (across < np.maximum(seen.thickness[at], _BESIDE_PX))
-        for i, k in zip(*np.nonzero(shared), strict=True):
-            one, other = has[k], without[i]
-            self.why[one] = Reason(f"its echo touches that of {self.ids[other]}", Code.OVERLAPPING)
-            self.why[other] = Reason(f"its echo touches that of {self.ids[one]}", Code.OVERLAPPING)
-            self.row[one] = -1
-            self.deviation[one] = np.nan
-
-    def _field(self) -> SmoothField | None:
-        """Field from the design to the image; None if too few rods were found to test one."""
-        has = np.flatnonzero(self.row >= 0)
-        if len(has) < 5:
-            return None
-        degree = max(1, min(3, trend_degree(len(has))))
-        return SmoothField.fit(
-            self.source[has], self.seen.xy[self.echoes[self.row[has]]], degree=degree, local=len(has) >= 20
-        )
+        covers = (along < 0.5 * seen.length[at]) & (across < np.maximum(seen.thickness[at], _BESIDE_PX))
+        for echo in np.flatnonzero(covers.sum(axis=0) > 1):
+            rods = [i for i in np.flatnonzero(covers[:, echo]) if self.row[i] in (-1, echo)]
+            for one, other in zip(rods, rods[1:] + rods[:1], strict=True):
+                if one == other:
+                    continue
+                self.why[one] = Reason(f"its echo touches that of {self.ids[other]}", Code.OVERLAPPING)
+                self.row[one] = -1
+                self.deviation[one] = np.nan
 
     def result(self, ids: tuple[str, ...], known: Rows) -> PinResult:
         """Spread results over all rods of the design, including those without coordinates."""
-        n, found = len(ids), self.row >= 0
+        n, found = len(ids), np.flatnonzero(self.row >= 0)
         at = self.echoes[self.row[found]]
         why = Reason("the design has no coordinates of it", Code.NO_COORDINATES).repeated(n)
         why[known] = [self._reason(i) for i in range(len(known))]
@@ -363,7 +336,7 @@ class _Rods:
             return full
 
         ok = np.zeros(n, dtype=bool)
-        ok[known] = found
+        ok[known[found]] = True
         predicted = np.full((n, 2), np.nan)
         predicted[known] = self.predicted
         expected = self.seen.cov[at] + self.tolerance_px[found, None, None] ** 2 * np.eye(2)
@@ -379,7 +352,8 @@ class _Rods:
             deviation=spread(self.deviation[found]),
             **{name: spread(getattr(self.seen, name)[at]) for name in _COLUMNS},
             detections=self.seen,
-            notes=self.notes + deviating(self.deviation[found], expected),
+            notes=self.notes
+            + deviating([self.ids[i] for i in found], self.source[found], self.seen.xy[at], expected),
         )
 
     def _reason(self, rod: int) -> str:

@@ -86,9 +86,11 @@ class LayoutOptions:
     gate : float
         Largest distance of a wire from its predicted position, relative to the spacing of the pattern.
     max_rotation : float
-        Largest rotation (rad) against the image, upright or upside down.
+        Largest rotation (rad) of the pattern against `direction`, upright or upside down.
     mirrored : bool, optional
         Whether the image has the opposite handedness; None to determine it.
+    direction : float
+        Angle (rad) in the image of what is along x in the pattern.
 
     Examples
     --------
@@ -99,6 +101,7 @@ class LayoutOptions:
     gate: float = 0.15
     max_rotation: float = np.deg2rad(12.0)
     mirrored: bool | None = None
+    direction: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +194,7 @@ def lay_wires(
             return Failure("fewer than four echoes lie near the nominal positions", Code.TOO_FEW_POINTS)
         return _supported(wires, seen, near, 1.0)
     tried: list[tuple[float, bool, Layout]] = []
+    upright = np.exp(1j * o.direction)
     for factor, shift, mirror in _hypotheses(points, seen, wires.spacing, o):
         linear = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
         layout = _refined(wires, seen, linear @ np.diag([1.0, -1.0 if mirror else 1.0]), shift, o)
@@ -199,7 +203,7 @@ def lay_wires(
         found = int((layout.row >= 0).sum())
         score = found - 0.5 * layout.rms_px / layout.gate_px
         # If the pattern is ambiguous, the upright one with y up is preferred.
-        tried.append((score, not mirror or factor.real < 0, layout))
+        tried.append((score, not mirror or (factor / upright).real < 0, layout))
     if not tried:
         return Failure(
             f"no position of the {len(wires.ids)} wires fits the {len(seen)} echoes", Code.NOT_FOUND
@@ -271,7 +275,7 @@ def _hypotheses(
     for mirror in (True, False) if o.mirrored is None else (o.mirrored,):
         p = points[:, 0] + (-1j if mirror else 1j) * points[:, 1]
         factor = (z[j] - z[i])[:, None] / (p[second] - p[first])
-        turn = np.abs(np.angle(factor**2)) / 2  # against upright or upside down
+        turn = np.abs(np.angle((factor * np.exp(-1j * o.direction)) ** 2)) / 2  # upright or upside down
         pair, base = np.nonzero(turn <= o.max_rotation)
         a = factor[pair, base]
         b = z[i[pair]] - a * p[first[base]]

@@ -16,12 +16,12 @@ from ...core.failure import Code, Remark
 from ...core.tone import ToneCurve
 from ..matching import Matches, grey_variance
 from ..matching.noise import relative_weights
+from ..plane.lens_mapping import mapping_through
+from ..plane.plane_mapping import plane_through
 from ..response import Samples, estimate_kernel, sharpened_from_px
 from ..screening import inner_pixels
 from ..tone import find_curve
-from .lens_mapping import mapping_through
 from .mark_windows import DISTURBED, ENOUGH, Appearance, MarkWindows
-from .plane_mapping import plane_through
 
 __all__ = ["learn", "weigh"]
 

@@ -112,7 +112,7 @@ class Located:
 
     Examples
     --------
-    >>> from reseau.measure.testfield.lattice_mapping import started
+    >>> from reseau.measure.plane.lattice_mapping import started
     >>> plain, two = started(np.eye(3), 1, (480, 640)), np.array([[0.0, 0.0], [1.0, 0.0]])
     >>> all_found = np.ones(2, dtype=bool)
     >>> Located(("a", "b"), two, "dark", plain, np.eye(2), np.zeros(2), all_found, 100 * two).at[1]

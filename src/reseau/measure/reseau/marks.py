@@ -16,7 +16,9 @@ from ...core.failure import Code
 from ...io import ReseauDesign
 from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse, coverage, mark_outline
+from ..marks.judging import Objection, judged_by_neighbours, reasons_of, robust_spread, spread
 from ..matching import SIZE, Matches, MatchOptions, grey_variance, match, with_alike_errors
+from ..plane.levels import levels_at
 from ..points import Reason
 from .assignment import spacing
 from .placement import Placement
@@ -41,6 +43,8 @@ _ALL_LIGHT = 1.6
 """Share of the light that a dark mark may seem to take: a camera's zero may be above that of the light."""
 _OTHER_KIND = 0.3
 """Relative difference from which two contrasts are not the same kind of mark in uneven light."""
+_SIGMAS = 3.0
+"""Standard deviations of a prediction by neighbours below which it declines no mark."""
 _DISTINCT = 1.6
 """Multiple of the tolerated deviation from the neighbours' prediction for a distinct mark."""
 _CERTAIN = 0.8
@@ -257,7 +261,8 @@ class MarkMeasurement:
         plain &= found.noise <= _UNEASY * ordinary
         if not len(suspect) or plain.sum() < max(_FEWEST_PLAIN, 3 * len(suspect)):
             return found  # a scene lies behind all of them
-        scatter = 1.4826 * float(np.nanmedian(np.abs(judged.deviation[at[plain]])))
+        off = judged.deviation[at[plain]]
+        scatter = robust_spread(off[np.isfinite(off)], 0.0)
         sigma = float(np.median(np.sqrt(np.trace(found.cov[plain], axis1=1, axis2=2) / 2)))
         if not scatter < _PREDICTABLE * sigma:
             return found  # the neighbours do not tell where a mark is
@@ -447,14 +452,19 @@ class MarkMeasurement:
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
         along = np.swapaxes(np.concatenate([along, -along], axis=2), 1, 2)
         steps = along[:, :, None] * distance[:, None]
-        seen = _values(self.screened.grey, first.xy[:, None, None] + steps)
+        seen = levels_at(self.screened.grey, first.xy[:, None, None] + steps)
         # Blurred wires are brighter where they cross than elsewhere.
         reach = float(np.ceil(distance[-1])) + 1
         pixels = np.arange(-reach, reach + 1)
         psf_px = float(np.median(first.psf_px))
         outline = self._outline(at, replace(options, psf_px=psf_px)).oriented()
         wires = coverage(outline, pixels, pixels, psf_px, options.response)
-        formed = np.stack([_values(image, reach + each) for image, each in zip(wires, steps, strict=True)])
+        formed = np.stack(
+            [
+                levels_at(image.astype(np.float32), reach + each)
+                for image, each in zip(wires, steps, strict=True)
+            ]
+        )
         share = first.contrast[:, None, None] * formed
         profile = np.median(seen - first.level[:, None, None], axis=(0, 1)) / np.median(share, axis=(0, 1))
         profile = profile / np.median(profile[distance <= 0.7 * half])
@@ -513,19 +523,19 @@ class MarkMeasurement:
         return found.replaced(uneasy[better], curved.select(better))
 
     def _judged(self, at: Rows, found: Matches) -> Verdict:
-        n = len(self.source)
-        why = np.full(n, "", dtype=object)
-        outside = np.ones(n, dtype=bool)
-        outside[at] = False
-        why[outside] = Reason("outside the frame", Code.OUTSIDE)
-        for mask, reason in self._objections(at, found, self.predicted[at]):
-            why[at[mask & (why[at] == "")]] = reason
-        why[at[(why[at] == "") & self._beside_wires(at, found, why)]] = Reason(
-            "most other crossings with its wire are not seen, and it is faint", Code.UNLIKE
-        )
-        xy, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
-        xy[at], cov[at] = found.xy, found.cov
-        deviation = self._judge_by_neighbours(at, found, xy, cov, why)
+        n, why = len(self.source), Reason("outside the frame", Code.OUTSIDE).repeated(len(self.source))
+        own = reasons_of(self._objections(at, found, self.predicted[at]), len(at))
+        lone = "most other crossings with its wire are not seen, and it is faint"
+        own[(own == "") & self._beside_wires(at, found, own)] = Reason(lone, Code.UNLIKE)
+        why[at] = own
+        xy, cov = spread(found.xy, at, n), spread(found.cov, at, n)
+        variance, distinct = spread(found.variance, at, n) + _UNMODELLED_PX**2, np.zeros(n, dtype=bool)
+        # A distinct mark is where it is, though the distortion between its neighbours is less smooth.
+        distinct[at] = (found.t > 15) & (found.correlation > _CERTAIN)
+        limit = np.where(distinct, _DISTINCT, 1.0) * self.options.neighbour_px
+        known = self.source, xy, variance
+        why, field, deviation = judged_by_neighbours(*known, why, limit, _SIGMAS, self.field)
+        self.field = field or self.field
         return Verdict(xy, cov, why, deviation, self.field(self.source))
 
     def _beside_wires(self, at: Rows, found: Matches, why: Array) -> Mask:
@@ -533,7 +543,7 @@ class MarkMeasurement:
 
         Where the light of a screen ends, wires that end there look like crossings with its edge.
         """
-        suspect, good = np.zeros(len(at), dtype=bool), why[at] == ""
+        suspect, good = np.zeros(len(at), dtype=bool), why == ""
         if self.design.mark.shape != "line-grid" or not good.any():
             return suspect
         faint = found.t < _FAINT * float(np.median(found.t[good]))
@@ -557,10 +567,10 @@ class MarkMeasurement:
         if not len(at):
             return 0, 0
         found = self._match_all(at, beside)
-        refused = np.any([mask for mask, _ in self._objections(at, found, beside)], axis=0)
+        refused = np.any([mask for mask, *_ in self._objections(at, found, beside)], axis=0)
         return int((~refused).sum()), len(at)
 
-    def _objections(self, at: Rows, found: Matches, predicted: Array) -> list[tuple[Mask, Reason]]:
+    def _objections(self, at: Rows, found: Matches, predicted: Array) -> list[Objection]:
         """Objections to marks from their own images, the most serious first."""
         o = self.options
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
@@ -578,24 +588,20 @@ class MarkMeasurement:
         # A dark mark takes no more than all the light; in the dark any noise looks like a larger share.
         impossible = found.contrast > _ALL_LIGHT + 3 * contrast_sigma
         impossible &= self.design.polarity == "dark"
+        faint = ~(found.t >= o.least_t) | impossible
+        blurred = self._image_width(found.psf_px) > _BLURRED * self._image_width(ordinary)
         return [
-            (found.seen <= _SEEN, Reason("on lost lines or beyond the edge of the frame", Code.HIDDEN)),
-            (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
-            (
-                ~(found.t >= o.least_t) | impossible,
-                Reason("no mark is distinct from its surroundings", Code.LOW_CONTRAST),
-            ),
-            (height < least, Reason(TOO_WEAK, Code.LOW_CONTRAST)),
-            (
-                self._image_width(found.psf_px) > _BLURRED * self._image_width(ordinary),
-                Reason("less sharp than the other marks", Code.BLURRED),
-            ),
-            (unlike, Reason("contrast differs from the other marks", Code.UNLIKE)),
-            (strong & ~self._alike(found), Reason("the image is not that of a mark", Code.UNLIKE)),
-            (found.rejected > 0.4, Reason("disturbed by bit errors or the scene", Code.DISTURBED)),
-            (self.covered[at], Reason("disturbed by an object over or beside it", Code.DISTURBED)),
-            (moved, Reason("no mark at the position predicted by its neighbours", Code.DEVIATES)),
-            (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
+            (found.seen <= _SEEN, "on lost lines or beyond the edge of the frame", Code.HIDDEN),
+            (~found.converged, "the match did not converge", Code.NOT_CONVERGED),
+            (faint, "no mark is distinct from its surroundings", Code.LOW_CONTRAST),
+            (height < least, TOO_WEAK, Code.LOW_CONTRAST),
+            (blurred, "less sharp than the other marks", Code.BLURRED),
+            (unlike, "contrast differs from the other marks", Code.UNLIKE),
+            (strong & ~self._alike(found), "the image is not that of a mark", Code.UNLIKE),
+            (found.rejected > 0.4, "disturbed by bit errors or the scene", Code.DISTURBED),
+            (self.covered[at], "disturbed by an object over or beside it", Code.DISTURBED),
+            (moved, "no mark at the position predicted by its neighbours", Code.DEVIATES),
+            (~(sigma <= o.most_sigma_px), "too uncertain", Code.UNCERTAIN),
         ]
 
     def _alike(self, found: Matches) -> Mask:
@@ -616,46 +622,11 @@ class MarkMeasurement:
         width: Array = np.sqrt(np.square(np.asarray(psf_px)) + (1 + mark_px**2) / 12)
         return width
 
-    def _judge_by_neighbours(self, at: Rows, found: Matches, xy: Array, cov: Array, why: Array) -> Array:
-        """Reject marks that deviate from the prediction of their neighbours, the worst first."""
-        deviation = np.full(xy.shape, np.nan)
-        limit = self.options.neighbour_px
-        distinct = np.zeros(len(xy), dtype=bool)
-        distinct[at] = (found.t > 15) & (found.correlation > _CERTAIN)
-        while (good := np.flatnonzero(why == "")).size >= 10:
-            relative = self._relative(cov[good])
-            # The length scale found first is used in all rounds; without one, the likeliest is chosen.
-            length = self.field.length if np.isfinite(self.field.length) else None
-            self.field = SmoothField.fit(self.source[good], xy[good], sigma=relative, length=length)
-            deviation[:] = np.nan
-            deviation[good], sigma = self.field.leave_one_out()
-            # A prediction that is uncertain by more than a pixel cannot reject a mark.
-            # A distinct mark is where it is, though the distortion between its neighbours is less smooth.
-            tolerated = np.where(distinct[good], _DISTINCT, 1.0)[:, None] * limit
-            excess = (np.abs(deviation[good]) / np.maximum(tolerated, 3 * sigma)).max(axis=1)
-            worst = int(excess.argmax())
-            if excess[worst] <= 1:
-                break
-            off = np.hypot(*deviation[good[worst]])
-            why[good[worst]] = Reason(
-                f"{off:.1f} px from the position predicted by its neighbours", Code.DEVIATES
-            )
-        deviation[why != ""] = np.nan
-        return deviation
-
     def _relative(self, cov: Array) -> Array:
         """Relative standard deviations of points for a field."""
         variance = np.trace(cov, axis1=1, axis2=2) / 2 + _UNMODELLED_PX**2
         relative: Array = np.sqrt(variance / np.median(variance))
         return relative
-
-
-def _values(image: ArrayLike, xy: Array) -> Array:
-    """Values (...) of an image between its pixels, at positions (..., 2)."""
-    x, y = np.moveaxis(xy.astype(np.float32), -1, 0).reshape(2, len(xy), -1)
-    grey = np.asarray(image, dtype=np.float32)
-    values = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(values, dtype=np.float64).reshape(xy.shape[:-1])
 
 
 def _of_each(options: MatchOptions, rows: Rows) -> dict[str, Any]:
@@ -672,8 +643,7 @@ def _sure(found: Matches) -> Mask:
 
 def _robust(values: Array, least: float) -> tuple[float, float]:
     """Median and a robust measure of spread, at least `least`."""
-    median = float(np.median(values))
-    return median, max(least, 1.4826 * float(np.median(np.abs(values - median))))
+    return float(np.median(values)), max(least, robust_spread(values))
 
 
 def _size(cov: Array) -> Array:

@@ -24,6 +24,7 @@ from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign
 from ...optics.field import SmoothField
 from ..fitting import on_one_line
+from ..marks.judging import columns_of, spread
 from ..matching import Matches
 from ..points import Measured, Reason, deviating
 from ..screening import lost_in_blocks
@@ -128,7 +129,11 @@ class ReseauResult(Measured):
         for family, chains in enumerate(wires.marks):
             for chain in chains:
                 ends = xy[chain[[0, -1]]]
-                inner = ends[0] + np.linspace(0, 1, 120)[:, None] * (ends[1] - ends[0])
+                # Through its marks: a wire may be bowed.
+                places = np.linspace(0, len(chain) - 1, 120)
+                inner = scipy.interpolate.make_interp_spline(
+                    np.arange(len(chain)), xy[chain], k=min(3, len(chain) - 1)
+                )(places)
                 # Wires extend to their frame; there the field is continued along its tangent.
                 beyond = (
                     np.hypot(*(ends[1] - ends[0])) / (len(chain) - 1) * wires.directions[chain[0], :, family]
@@ -242,7 +247,8 @@ def measure_reseau(
             where=frame.name,
             places=judged.xy[judged.why == ""],
         )
-    notes += deviating(judged.deviation, judged.cov)
+    good = np.where((judged.why == "")[:, None], judged.xy, np.nan)
+    notes += deviating([design.ids[i] for i in known], source[known], good, judged.cov)
     result = _columns(frame, design, known, at, found, judged, measurement.field, notes)
     if use_nominal and options.nominal_within_px is None and _astray(frame, result, nominal):
         return _without_nominal(frame, design, result, options)
@@ -415,35 +421,16 @@ def _columns(
     notes: tuple[Remark, ...],
 ) -> ReseauResult:
     """Spread results over all marks of the design, including those without coordinates."""
-    good = judged.why == ""
-    judged.xy[~good], judged.cov[~good] = np.nan, np.nan
-    n = len(design.points)
-
-    def spread(values: Array, rows: Rows) -> Array:
-        full = np.full((n, *values.shape[1:]), np.nan)
-        full[rows] = values
-        return full
-
-    ok, reasons = (
-        np.zeros(n, dtype=bool),
-        Reason("the design has no coordinates of it", Code.NO_COORDINATES).repeated(n),
-    )
-    ok[known], reasons[known] = good, judged.why
-    inside = known[at]
+    n, at = len(design.points), known[at]
+    reasons = Reason("the design has no coordinates of it", Code.NO_COORDINATES).repeated(n)
+    reasons[known] = judged.why
     return ReseauResult(
         image=frame.name,
         sha256=frame.sha256,
         ids=design.ids,
-        xy=spread(judged.xy, known),
-        cov=spread(judged.cov, known),
-        ok=ok,
-        why=tuple(reasons),
-        predicted=spread(judged.predicted, known),
-        psf_px=spread(found.psf_px, inside),
-        contrast=spread(found.contrast, inside),
-        t=spread(found.t, inside),
-        noise=spread(found.noise, inside),
-        deviation=spread(judged.deviation, known),
+        predicted=spread(judged.predicted, known, n),
+        deviation=spread(judged.deviation, known, n),
         field=field,
         notes=notes,
+        **columns_of(found, at, reasons[at], reasons),
     )

@@ -19,16 +19,17 @@ from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Remark
 from ...optics import Chain
 from ...optics.field import SmoothField
+from ..marks.judging import Objection, columns_of, judged_by_neighbours, reasons_of, robust_spread
 from ..matching import (
     Matches,
     with_alike_errors,
 )
+from ..plane.lattice_mapping import images_of, slope_of
+from ..plane.lens_mapping import UNFIT, free_through, mapping_through
 from ..points import Reason
 from ..screening import Screened
-from ..testfield.lattice_mapping import images_of, slope_of
 from ..testfield.targets import replaced
 from .learning import learn, weigh
-from .lens_mapping import UNFIT, free_through, mapping_through
 from .mark_windows import BESIDE, DISTURBED, ENOUGH, SEEN, Located, MarkWindows
 from .marks import ReseauOptions
 
@@ -49,6 +50,8 @@ _BULGED = 0.3
 _SAFELY = 0.2
 """Part of the largest deviation from a prediction by neighbours up to which marks, which then lie on a
 polynomial through the others, need not be compared with it."""
+_SIGMAS = 4.0
+"""Standard deviations of a prediction by neighbours below which it declines no mark."""
 _UNMODELLED_PX = 0.05
 """Scatter of positions beyond their own sigmas: the sheet is not plane."""
 _FORMED_PX = 0.002
@@ -63,8 +66,6 @@ _ROUNDS, _SAME, _NEAR = 6, 0.5, 2.0
 """Most rounds of matching with the mapping through the last matches; change of positions with the mapping,
 in sigmas, from which both follow each other, and total change from which marks are matched again: what a
 match gives is the middle of an image to first order only."""
-_LENGTH_OF = 80
-"""Number of marks from which the correlation length of what a polynomial leaves is that of half as many."""
 _BOUND = 2.0
 """Standard deviations up to which the variance of positions may be larger than their scatter shows."""
 _PER_SMOOTH = 2.5
@@ -112,7 +113,7 @@ class PlaneMarks(MarkWindows):
     def _edge_seen(self, rows: Rows, found: Matches) -> Array:
         """Share (k,) of the pixels on the blurred edge of each mark that were used."""
 
-    def _misshapen(self, found: Matches) -> list[tuple[Mask, Reason]]:
+    def _misshapen(self, found: Matches) -> list[Objection]:
         """Objections to the form of marks."""
         return []
 
@@ -155,12 +156,12 @@ class PlaneMarks(MarkWindows):
         smooth: a mark that was matched without an objection, and of which then too little is left, keeps
         its first match.
         """
-        good, start = np.all([~mask for mask, _ in self._objections(rows, found)], axis=0), self.start.copy()
+        good, start = np.all([~mask for mask, *_ in self._objections(rows, found)], axis=0), self.start.copy()
         self._uncover(rows, found, doubtful, field)
         again = self._match_all(rows[doubtful])
         if self.precise_start:
             hidden = {Code.HIDDEN, Code.NOT_CONVERGED, Code.UNCERTAIN}
-            lost = [mask for mask, why in self._objections(rows[doubtful], again) if why.code in hidden]
+            lost = [mask for mask, _, code in self._objections(rows[doubtful], again) if code in hidden]
             lit = good[doubtful] & np.any(lost, axis=0)
             those = rows[doubtful][lit]
             self.lit[those], self.start[those] = True, start[those]
@@ -240,7 +241,7 @@ class PlaneMarks(MarkWindows):
         # Where paper is saturated, neighbours do not predict the light.
         if self.precise_start:
             doubtful = self._uneasy(found)
-            for mask, _ in self._objections(rows, found):
+            for mask, *_ in self._objections(rows, found):
                 doubtful |= mask
             doubtful |= (np.abs(found.xy - self.mapping(self.at[rows])) > self.options.neighbour_px).any(
                 axis=1
@@ -400,7 +401,7 @@ class PlaneMarks(MarkWindows):
         """
         noise = found.noise[known]
         ordinary = float(np.median(noise)) if len(noise) else np.inf
-        spread = 1.4826 * float(np.median(np.abs(noise / ordinary - 1))) if len(noise) else 0.0
+        spread = robust_spread(noise) / ordinary if len(noise) else 0.0
         return np.asarray(found.noise > max(least, 1 + _SPREADS * spread) * ordinary)
 
     def _uncover(self, rows: Rows, found: Matches, uneasy: Mask, field: SmoothField) -> None:
@@ -460,44 +461,29 @@ class PlaneMarks(MarkWindows):
         beside = np.median(width[known][near], axis=1)
         return np.asarray(width > _BLURRED * np.maximum(beside, np.median(width[known])))
 
-    def _objections(self, rows: Rows, found: Matches) -> list[tuple[Mask, Reason]]:
+    def _objections(self, rows: Rows, found: Matches) -> list[Objection]:
         """Objections to marks from their own images, the most serious first."""
         o = self.options
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
         strong = found.converged & (found.t > 8)
+        disturbed = (found.rejected > 0.25) | self._disturbed(found, strong, DISTURBED)
+        # Without paper, the reflection in a disk is all that is left to compare.
+        unlike = (found.correlation < 0.8) & ~self.dazzled[rows]
+        faint = ~(found.t >= o.least_t) | (found.contrast <= 0)
         return [
-            (
-                found.seen < self.least_seen,
-                Reason("hidden, saturated or beyond the edge of the frame", Code.HIDDEN),
-            ),
-            (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
-            (
-                ~(found.t >= o.least_t) | (found.contrast <= 0),
-                Reason(f"no {self.word} is distinct from its surroundings", Code.LOW_CONTRAST),
-            ),
-            (
-                self._blurred(rows, found, strong),
-                Reason(f"less sharp than the other {self.word}s", Code.BLURRED),
-            ),
+            (found.seen < self.least_seen, "hidden, saturated or beyond the edge of the frame", Code.HIDDEN),
+            (~found.converged, "the match did not converge", Code.NOT_CONVERGED),
+            (faint, f"no {self.word} is distinct from its surroundings", Code.LOW_CONTRAST),
+            (self._blurred(rows, found, strong), f"less sharp than the other {self.word}s", Code.BLURRED),
             *self._misshapen(found),
-            # Without paper, the reflection in a disk is all that is left to compare.
-            (
-                (found.correlation < 0.8) & ~self.dazzled[rows],
-                Reason(f"the image is not that of a {self.word}", Code.UNLIKE),
-            ),
-            (
-                (found.rejected > 0.25) | self._disturbed(found, strong, DISTURBED),
-                Reason("partly hidden or disturbed", Code.DISTURBED),
-            ),
-            (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
+            (unlike, f"the image is not that of a {self.word}", Code.UNLIKE),
+            (disturbed, "partly hidden or disturbed", Code.DISTURBED),
+            (~(sigma <= o.most_sigma_px), "too uncertain", Code.UNCERTAIN),
         ]
 
     def _why(self, rows: Rows, found: Matches) -> Array:
         """Reason why each mark (k,) is rejected by its own image; empty where it is not."""
-        why = np.full(len(rows), "", dtype=object)
-        for mask, reason in self._objections(rows, found):
-            why[mask & (why == "")] = reason
-        return why
+        return reasons_of(self._objections(rows, found), len(rows))
 
     def _off_polynomial(self, rows: Rows, xy: Array) -> Array | None:
         """Deviations (k, 2) of marks from a polynomial through the others; None for too few of them."""
@@ -515,29 +501,10 @@ class PlaneMarks(MarkWindows):
 
         `why` (k,) are the reasons of their own images.
         """
-        why = why.copy()
-        source, field, known = self._straight(rows), None, before
-        variance = np.trace(found.cov, axis1=1, axis2=2) / 2 + _UNMODELLED_PX**2
-        radius = self.radius(rows)
-        while (good := np.flatnonzero(why == "")).size >= 10:
-            relative = np.sqrt(variance[good] / np.median(variance[good]))
-            if known is None and good.size >= _LENGTH_OF:
-                # The length that some of them show is that of all.
-                some = good[:: good.size // (_LENGTH_OF // 2)]
-                known = SmoothField.fit(source[some], found.xy[some])
-            length = known.length if known is not None and np.isfinite(known.length) else None
-            field = known = SmoothField.fit(source[good], found.xy[good], sigma=relative, length=length)
-            deviation, sigma = field.leave_one_out()
-            limit = np.maximum(np.maximum(self.options.neighbour_px, _BULGED * radius[good, None]), 4 * sigma)
-            excess = (np.abs(deviation) / limit).max(axis=1)
-            worst = int(excess.argmax())
-            if excess[worst] <= 1:
-                break
-            distance = np.hypot(*deviation[worst])
-            why[good[worst]] = Reason(
-                f"{distance:.1f} px from the position predicted by its neighbours", Code.DEVIATES
-            )
-        return why, field
+        variance = found.variance + _UNMODELLED_PX**2
+        limit = np.maximum(self.options.neighbour_px, _BULGED * self.radius(rows))
+        known = self._straight(rows), found.xy, variance
+        return judged_by_neighbours(*known, why, limit, _SIGMAS, before)[:2]
 
     def _spread(
         self,
@@ -550,11 +517,6 @@ class PlaneMarks(MarkWindows):
     ) -> dict[str, Any]:
         """Columns over all marks; `off` are deviations of good ones from the others, else of the field."""
         n, good = len(self.at), why == ""
-        ok, reasons = (
-            np.zeros(n, dtype=bool),
-            Reason("outside the frame", Code.OUTSIDE).repeated(n),
-        )
-        ok[rows], reasons[rows] = good, why
         predicted, deviation = self.mapping(self.at), np.full((n, 2), np.nan)
         if off is not None:
             predicted[rows[good]], deviation[rows[good]] = found.xy[good] - off, off
@@ -562,29 +524,18 @@ class PlaneMarks(MarkWindows):
             predicted[rows] = field(self._straight(rows))
             deviation[rows[good]] = field.leave_one_out()[0]
 
-        def spread(values: Array, keep: Mask | slice = slice(None)) -> Array:
-            full = np.full((n, *values.shape[1:]), np.nan)
-            full[rows[keep]] = values[keep]
-            return full
-
         design: dict[str, Any] = {}
         if with_field and field is not None and good.sum() >= 10:
             design["field"] = SmoothField.fit(self.xy[rows[good]], found.xy[good])
         elif with_field:
             design["field"] = SmoothField.fit(self.xy, self.mapping(self.at), local=False)
-        return (
-            design
-            | {
-                "image": self.image.name,
-                "sha256": self.image.sha256,
-                "ids": self.ids,
-                "xy": spread(found.xy, good),
-                "cov": spread(found.cov, good),
-                "ok": ok,
-                "why": tuple(reasons),
-                "predicted": predicted,
-                "deviation": deviation,
-                "notes": self.notes,
-            }
-            | {name: spread(getattr(found, name)) for name in ("psf_px", "contrast", "t", "noise")}
-        )
+        outside = Reason("outside the frame", Code.OUTSIDE).repeated(n)
+        columns = columns_of(found, rows, why, outside) | design
+        return columns | {
+            "image": self.image.name,
+            "sha256": self.image.sha256,
+            "ids": self.ids,
+            "predicted": predicted,
+            "deviation": deviation,
+            "notes": self.notes,
+        }

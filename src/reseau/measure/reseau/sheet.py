@@ -12,20 +12,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.data import Array, Frame, Mask, Rows
+from ...core.data import Array, Frame, Rows
 from ...core.failure import Code, Failure
 from ...core.threads import one_thread
 from ...io import ReseauDesign, Rings
 from ...optics import Chain
 from ...optics.formation import Outline, PixelResponse, side_rule
+from ..marks.judging import Objection
 from ..matching import GrownOutline, Matches, Shape, Window
-from ..points import Reason
+from ..plane.lattice_mapping import images_of, second_order, slope_of
+from ..plane.plane_mapping import plane_through
 from ..screening import Screened, screen
-from ..testfield.lattice_mapping import images_of, second_order, slope_of
 from .disks import Disks, find_disks
 from .mark_windows import Located
 from .marks import ReseauOptions
-from .plane_mapping import plane_through
 from .plane_marks import PlaneMarks
 from .sheet_placement import MOST_DISKS, SheetPlacement, lay_sheet
 
@@ -175,14 +175,12 @@ class DiskMarks(PlaneMarks):
         twice = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
         return np.asarray(((a + b) * twice[..., None]).sum(axis=-2) / (3 * twice.sum(axis=-1)[..., None]))
 
-    def _misshapen(self, found: Matches) -> list[tuple[Mask, Reason]]:
+    def _misshapen(self, found: Matches) -> list[Objection]:
         """See :class:`PlaneMarks`."""
+        bent = np.hypot(found.form[:, 1], found.form[:, 2]) > _BENT
         return [
-            (np.abs(found.form[:, 0]) > _GROWN, Reason("size differs from the other disks", Code.UNLIKE)),
-            (
-                np.hypot(found.form[:, 1], found.form[:, 2]) > _BENT,
-                Reason("the outline is not that of a disk", Code.UNLIKE),
-            ),
+            (np.abs(found.form[:, 0]) > _GROWN, "size differs from the other disks", Code.UNLIKE),
+            (bent, "the outline is not that of a disk", Code.UNLIKE),
         ]
 
 

@@ -20,10 +20,11 @@ from ...core.errors import UsageError
 from ...core.failure import Code, Failure
 from ...io import ReseauDesign
 from ...optics import Chain
-from ..testfield.lattice_mapping import second_order, started, stretches
+from ..plane.growth import first_mapping, grown_through
+from ..plane.lattice_mapping import second_order
+from ..plane.levels import levels_around
 from .assignment import spacing
 from .disks import Disks
-from .plane_mapping import plane_through
 
 __all__ = [
     "MOST_DISKS",
@@ -39,6 +40,8 @@ _SEEDS = 6
 """Number of seeds that are tried."""
 _GATE = 0.25
 """Largest distance of a disk from its node, in steps of the lattice."""
+_ALIKE = 0.7
+"""Largest difference of the areas of disks, as logarithms, from those of the meshes around them."""
 _FROM = 1.6
 """Distance from a disk of the lattice within which the next are searched, in steps."""
 _ANGLES = 72
@@ -166,29 +169,15 @@ def grown_disks(
     seed: int, slope: Array, disks: Disks, shape: tuple[int, int], extent: float
 ) -> tuple[Array, Rows, Chain]:
     """Nodes (m, 2) of the lattice grown from a seed, the disks on them, and the mapping to the image."""
-    count = int(extent)
-    grid = np.array(list(product(range(-count, count + 1), repeat=2)), dtype=np.float64)
-    tree, size = scipy.spatial.KDTree(disks.xy), np.log(np.linalg.det(disks.form))
-    mapping = started(np.vstack([np.column_stack([slope, disks.xy[seed]]), [0.0, 0.0, 1.0]]), 1, shape)
-    nodes, rows = np.zeros((1, 2)), np.array([seed])
-    for _ in range(3 * count):
-        beside = grid[scipy.spatial.KDTree(nodes).query(grid)[0] < _FROM]
-        predicted, slopes, _ = second_order(mapping, beside)
-        pixels = stretches(slopes)[1]
-        gap, row = tree.query(predicted)
+    size, first = np.log(np.linalg.det(disks.form)), np.linalg.det(slope)
+
+    def accepted(mapping: Chain, beside: Array, row: Rows, slopes: Array) -> Mask:
         # The area of an ellipse is proportional to that of the mesh around it.
-        alike = np.abs(size[row] - size[seed] - np.log(np.abs(np.linalg.det(slopes) / np.linalg.det(slope))))
-        taken = (gap < _GATE * pixels) & (alike < 0.7)
-        order = np.argsort(gap / pixels + 1e6 * ~taken, kind="stable")
-        _, once = np.unique(row[order], return_index=True)
-        keep = np.sort(order[once])
-        keep = keep[taken[keep]]
-        same = len(keep) == len(rows) and np.array_equal(row[keep], rows)
-        nodes, rows = beside[keep], row[keep]
-        if same or len(rows) < 5 or np.ptp(nodes, axis=0).min() < 1:
-            break
-        mapping = plane_through(nodes, disks.xy[rows], shape)
-    return nodes, rows, mapping
+        mesh = np.log(np.abs(np.linalg.det(slopes) / first))
+        return np.asarray(np.abs(size[row] - size[seed] - mesh) < _ALIKE)
+
+    start = first_mapping(slope, disks.xy[seed], shape)
+    return grown_through(disks.xy, start, int(extent), shape, accepted, reach=_FROM)
 
 
 def _read(
@@ -278,9 +267,7 @@ def _darkness(
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     def along(diameter: float) -> Array:
-        xy = mapping((nodes[:, None] + diameter / 2 / step * circle).reshape(-1, 2))
-        values: Array = scipy.ndimage.map_coordinates(grey, xy[:, ::-1].T, order=1, mode="nearest")
-        return values.reshape(len(nodes), _ANGLES)
+        return levels_around(grey, mapping, nodes, diameter / 2 / step * circle)
 
     low = np.median(along(0.4 * size), axis=1, keepdims=True)
     high = np.median(along((size + rings.inner) / 2), axis=1, keepdims=True)

@@ -20,16 +20,18 @@ from ...core.threads import one_thread
 from ...core.tone import ToneCurve
 from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
+from ..marks.judging import Objection, columns_of, reasons_of
 from ..matching import Matches, Window
+from ..plane.lattice_mapping import images_of, slope_of, stretches
+from ..plane.plane_mapping import plane_through
+from ..plane.polynomial import common_part, median, refit
 from ..points import Measured, Reason
 from ..response import Samples
-from ..screening import screen
+from ..screening import quiet_noise, screen
 from ..tone import FoundCurve, find_curve
-from .lattice import median
-from .lattice_fit import LatticeFit, common_part, refit
-from .lattice_mapping import images_of, slope_of, stretches
+from .lattice import LatticeFit
 from .motion import MovedShape, anisotropy, path_of, spread_of
-from .recognition import Reading, SearchedFrame
+from .recognition import Reading, SearchedFrame, shows_second
 from .target_images import form_targets
 from .targets import Light, Scene, match_targets, pixels_of_targets, replaced
 
@@ -139,7 +141,7 @@ class TestfieldResult(Measured):
     --------
     >>> from reseau.optics import Chain, Similarity
     >>> lattice = LatticeFit(
-    ...     Chain(Similarity(), Similarity(), ("camera.", "display.")), np.arange(2), np.arange(2), 0.02, 400
+    ...     Chain(Similarity(), Similarity(), ("camera.", "display.")), np.arange(2), np.arange(2)
     ... )
     >>> none = np.zeros((0, 16))
     >>> reading = Reading(np.zeros((0, 2), int), none, none, (), np.zeros((0, 16, 2)), none, none, 0.8)
@@ -147,8 +149,8 @@ class TestfieldResult(Measured):
     >>> xy = np.array([[40.1, 40.2], [np.nan, np.nan]])
     >>> columns = [xy, np.tile(1e-4 * np.eye(2), (2, 1, 1)), ok, ("", "outside"), xy, 0 * xy, *[one] * 4]
     >>> found = TestfieldResult("a.tif", "", ("1.01", "1.02"), *columns, lattice, reading, squares=0)
-    >>> found.found, found.points.names, found.lattice.rms_px
-    (1, ('1.01',), 0.02)
+    >>> found.found, found.points.names
+    (1, ('1.01',))
     """
 
     __test__ = False  # prevents collection by pytest
@@ -215,44 +217,31 @@ def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) 
     if isinstance(screened, Failure):
         return screened
     grey = screened.grey if design.polarity == "dark" else -screened.grey
-    original = SearchedFrame(screened.grey, grey, design, options.psf_px, PixelResponse(options.fill))
-    seen, read = original, original.read()
-    if isinstance(read, Failure) and read.code != Code.MIRRORED:
-        # Lines that are too thin can be between the targets only. Lines of one pixel width may be recovered
-        # from a blurred frame by sharpening, lines and targets of a few pixels in a small part of it by
-        # interpolation.
-        for other in (lambda: original, original.sharpened, original.enlarged):
-            trial = other()
-            if trial is None:
-                continue
-            again = trial.read_by_targets() if trial is original else trial.read()
-            if not isinstance(again, Failure) or again.code == Code.MIRRORED:
-                seen, read = trial, again
-                break
+    noise, response = quiet_noise(grey), PixelResponse(options.fill)
+    read = SearchedFrame(screened.grey, grey, noise, design, options.psf_px, response).read()
     if isinstance(read, Failure):
         return replace(read, where=frame.name)
-    if seen.shows_second(read):
+    if shows_second(read):
         return Failure(
             f"shows two testfields {design.name!r}; crop the image to one of them",
             Code.SEVERAL_TARGETS,
             where=frame.name,
         )
-    read = seen.original(read)
-    lattice, reading, placed = read.lattice, read.reading, read.placed
+    (lattice, reading), placed = read.original(), read.placed
     valid = screened.valid & (frame.pixels < frame.full_scale)
     size = (float(frame.width), float(frame.height))
     light = Light.through(reading.xy.reshape(-1, 2), reading.level.ravel(), reading.contrast.ravel(), size)
     scene = Scene(
         screened.grey,
         valid,
-        original.noise,
+        noise,
         design,
         lattice.mapping,
         placed.frame,
         placed.origin,
         light,
-        seen.blurred(reading.psf_px),
-        PixelResponse(options.fill),
+        reading.psf_px,
+        response,
         options.row_jitter_px,
     )
     work = _Measurement(scene, lattice, options)
@@ -265,7 +254,7 @@ def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) 
         image=frame.name,
         sha256=frame.sha256,
         ids=design.ids,
-        lattice=lattice,
+        lattice=replace(lattice, mapping=work.scene.mapping),
         reading=reading,
         squares=placed.squares,
         **work.columns(),
@@ -358,27 +347,10 @@ class _Measurement:
             if good.mean() < 1 - _FEW and (why == "").sum() < 1.05 * good.sum():
                 break
         found, why, predicted = self._reshaped(wanted, found, why, predicted)
-        n = len(self.at)
-        ok, reasons = (
-            np.zeros(n, dtype=bool),
-            Reason("beyond the edge of the frame", Code.OUTSIDE).repeated(n),
-        )
-        ok[wanted], reasons[wanted] = why == "", why
-
-        def spread(values: Array, keep: Mask | slice = slice(None)) -> Array:
-            full = np.full((n, *values.shape[1:]), np.nan)
-            full[wanted[keep]] = values[keep]
-            return full
-
-        good = why == ""
-        return {
-            "xy": spread(found.xy, good),
-            "cov": spread(found.cov + FORMED_PX**2 * np.eye(2), good),
-            "ok": ok,
-            "why": tuple(reasons),
-            "predicted": predicted,
-            "deviation": spread(found.xy - predicted[wanted], good),
-        } | {name: spread(getattr(found, name)) for name in ("psf_px", "contrast", "t", "noise")}
+        beyond = Reason("beyond the edge of the frame", Code.OUTSIDE).repeated(len(self.at))
+        found = replace(found, cov=found.cov + FORMED_PX**2 * np.eye(2))
+        columns = columns_of(found, wanted, why, beyond)
+        return columns | {"predicted": predicted, "deviation": columns["xy"] - predicted}
 
     def _alike(self, found: Matches, good: Mask, wanted: Rows) -> bool:
         """Whether light and sharpness of the targets are those with which their neighbours were formed."""
@@ -519,7 +491,10 @@ class _Measurement:
     def _learn_from(self, first: Matches, sure: Mask, rows: Rows) -> None:
         """Learn mapping, light and sharpness from matched targets."""
         scene = self.scene
-        mapping = refit(scene.mapping, self.at[rows[sure]], first.xy[sure], _UNMODELLED_PX)
+        (h, w), at, xy = scene.grey.shape, self.at[rows[sure]], first.xy[sure]
+        # A projectivity that was found at a coarse scale may be a rough one.
+        tried = refit(scene.mapping, at, xy, _UNMODELLED_PX), plane_through(at, xy, (h, w))
+        mapping = min(tried, key=lambda each: float(np.median(np.abs(images_of(each, at) - xy))))
         # In small blurred targets contrast, sharpness and size can hardly be distinguished.
         large = sure & scene.design.large[rows]
         plain = large if large.sum() >= _LEAST_FIRST else sure
@@ -605,9 +580,7 @@ class _Measurement:
 
     def _judged(self, scene: Scene, wanted: Rows, found: Matches) -> tuple[Array, Array]:
         """Reason why each target is rejected, and the positions predicted by the mapping through all."""
-        why = np.full(len(wanted), "", dtype=object)
-        for mask, reason in self._objections(found):
-            why[mask & (why == "")] = reason
+        why = reasons_of(self._objections(found), len(wanted))
         mapping, good = scene.mapping, why == ""
         if good.sum() >= _LEAST_FIRST:
             mapping = refit(mapping, self.at[wanted[good]], found.xy[good], _UNMODELLED_PX)
@@ -623,18 +596,14 @@ class _Measurement:
             )
         return why, predicted
 
-    def _objections(self, found: Matches) -> list[tuple[Mask, Reason]]:
+    def _objections(self, found: Matches) -> list[Objection]:
         """Objections to targets from their own images, the most serious first."""
         o = self.options
         sigma = np.sqrt(np.maximum(np.diagonal(found.cov, axis1=1, axis2=2).max(axis=1), 0))
         sure = found.converged & (found.t > o.least_t)
+        indistinct = "no target is distinct from its surroundings"
         if not sure.any():
-            return [
-                (
-                    np.ones(len(found), dtype=bool),
-                    Reason("no target is distinct from its surroundings", Code.LOW_CONTRAST),
-                )
-            ]
+            return [(np.ones(len(found), dtype=bool), indistinct, Code.LOW_CONTRAST)]
         amplitude = found.contrast * found.level
         width, contrast, noise, usual = (
             median(values[sure]) for values in (found.psf_px, found.contrast, found.noise, amplitude)
@@ -644,26 +613,16 @@ class _Measurement:
         # Something beside a target raises its residuals, but changes neither sharpness nor contrast nor size.
         alike = (np.abs(np.log(found.psf_px / width)) < _ALIKE) & (np.abs(found.form[:, 0]) < _ALIKE)
         alike &= np.abs(found.contrast / contrast - 1) < _ALIKE
+        unlike = found.noise > np.where(alike, _UNLIKE_BESIDE, _UNLIKE) * noise
+        blurred = np.abs(np.log(found.psf_px / width)) > np.log(_BLURRED)
         return [
-            (found.seen < _SEEN, Reason("hidden, saturated or beyond the edge of the frame", Code.HIDDEN)),
-            (~found.converged, Reason("the match did not converge", Code.NOT_CONVERGED)),
-            (
-                ~(found.t >= o.least_t),
-                Reason("no target is distinct from its surroundings", Code.LOW_CONTRAST),
-            ),
-            (found.rejected > 0.1, Reason("partly hidden", Code.HIDDEN)),
-            (
-                found.noise > np.where(alike, _UNLIKE_BESIDE, _UNLIKE) * noise,
-                Reason("the image is not that of the target", Code.UNLIKE),
-            ),
-            (
-                np.abs(np.log(found.psf_px / width)) > np.log(_BLURRED),
-                Reason("sharpness differs from the other targets", Code.BLURRED),
-            ),
-            (
-                pale > _PALE,
-                Reason("contrast differs from the other targets", Code.UNLIKE),
-            ),
-            (np.abs(found.form[:, 0]) > _GROWN, Reason("size differs from the design", Code.UNLIKE)),
-            (~(sigma <= o.most_sigma_px), Reason("too uncertain", Code.UNCERTAIN)),
+            (found.seen < _SEEN, "hidden, saturated or beyond the edge of the frame", Code.HIDDEN),
+            (~found.converged, "the match did not converge", Code.NOT_CONVERGED),
+            (~(found.t >= o.least_t), indistinct, Code.LOW_CONTRAST),
+            (found.rejected > 0.1, "partly hidden", Code.HIDDEN),
+            (unlike, "the image is not that of the target", Code.UNLIKE),
+            (blurred, "sharpness differs from the other targets", Code.BLURRED),
+            (pale > _PALE, "contrast differs from the other targets", Code.UNLIKE),
+            (np.abs(found.form[:, 0]) > _GROWN, "size differs from the design", Code.UNLIKE),
+            (~(sigma <= o.most_sigma_px), "too uncertain", Code.UNCERTAIN),
         ]

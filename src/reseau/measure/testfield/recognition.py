@@ -13,9 +13,8 @@ in the original.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -29,15 +28,22 @@ from ...designs.topology import HIDDEN, Decoded, TopologicalCode
 from ...io import TestfieldDesign
 from ...optics.formation import Outline, PixelResponse
 from ..matching import SIZE, GrownOutline, Window
-from ..screening import quiet_noise
-from .lattice import Ridges, find_lattices, median, ridge_points
-from .lattice_fit import LatticeFit, lattices
-from .lattice_mapping import images_of, reduced, slope_of, straightened, stretches
-from .line_profiles import blur_of
+from ..plane.lattice_mapping import images_of, reduced, slope_of, straightened, stretches
+from ..plane.levels import levels_at
+from ..plane.polynomial import median
+from .lattice import LatticeFit, extremes, lattices
 from .target_images import flat_outline, stacked
-from .target_lattice import lattices_of_targets
 
-__all__ = ["Kinds", "Placement", "Read", "Reading", "SearchedFrame", "locate", "read_clusters"]
+__all__ = [
+    "Kinds",
+    "Placement",
+    "Read",
+    "Reading",
+    "SearchedFrame",
+    "locate",
+    "read_clusters",
+    "shows_second",
+]
 
 _ALIKE = 0.06
 """Relative difference of local frames below which they share one set of formed images."""
@@ -141,6 +147,8 @@ class Reading:
         Grey value around each target, and its contrast; NaN where there is none.
     psf_px : float
         Best width of the point-spread function.
+    small : int
+        Number of further squares in sight, which are too small to be read.
     """
 
     cell: Rows
@@ -151,6 +159,7 @@ class Reading:
     level: Array
     contrast: Array
     psf_px: float
+    small: int = 0
 
 
 def read_clusters(
@@ -180,7 +189,7 @@ def read_clusters(
     code = TopologicalCode.of(design)
     decoded = code.decoded(joint)
     level, contrast = (np.where(joint == HIDDEN, np.nan, values) for values in (found.level, found.contrast))
-    return Reading(work.cell, alone, joint, decoded, work.xy, level, contrast, better)
+    return Reading(work.cell, alone, joint, decoded, work.xy, level, contrast, better, work.small)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,6 +227,7 @@ class _Clusters:
         longest, shortest = (self.step * scale for scale in stretches(np.nan_to_num(frames)))
         legible: Mask = seen.any(axis=1) & (shortest > _LEAST_STEP_PX) & (longest < max(h, w) / 2)
         legible &= legible.sum() <= _MOST_SQUARES * len(design.centres)
+        self.small = int((seen.any(axis=1) & (shortest <= _LEAST_STEP_PX)).sum())
         self.cell, self.xy, self.visible = self.cell[legible], xy[legible], seen[legible]
         if not legible.any():
             return
@@ -230,15 +240,7 @@ class _Clusters:
         self.columns, self.rows = (np.arange(-r, r + 1.0) for r in reach // self.each)
         columns, rows = self.each * self.columns, self.each * self.rows
         offset = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        sampled = (self.xy[:, :, None] + offset).astype(np.float32)
-        # OpenCV samples less than 32768 rows and columns at a time.
-        lines = sampled.reshape(-1, len(columns), 2)
-        self.seen = np.concatenate(
-            [
-                cv2.remap(grey, some[..., 0], some[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-                for some in np.array_split(lines, 1 + len(lines) // 30_000)
-            ]
-        ).reshape(*self.xy.shape[:2], -1)
+        self.seen = levels_at(grey, self.xy[:, :, None] + offset, cv2.INTER_CUBIC).astype(np.float32)
         self.variance = self.seen.var(axis=2)
         # Pixels that are nearer to a neighbour than to the target are ignored.
         on_board = np.einsum("gij,nj->gni", np.linalg.inv(self.frames), offset)
@@ -454,31 +456,39 @@ _QUARTERS = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [
 """Rotation matrices for 0 to 3 quarter turns from x to y."""
 
 
-_BLURRED_PX, _SHARP_PX = 1.8, 0.7
-"""Width of the point-spread function removed from a blurred frame, and of the one that replaces it."""
-_LEAST_POWER = 2e-3
-"""Minimum power of the noise relative to that of the image in sharpening."""
-_MOST_LATTICES, _MOST_SHARPENED = 14, 3
-"""Most lattices that are tried in a frame, and in a frame that was sharpened: if it shows a testfield, its
-lines are now the strongest."""
-_BLOCK_PX, _DENSE = 8, 0.1
-"""Side of the blocks in which ridge points are counted, and the share of pixels from which they are dense."""
-_LEAST_FIELD_PX, _SMALL_FIELD_PX, _ENLARGED_PX = 100, 420, 960
-"""Sizes of a part of the frame that is enlarged to be read, and its size then."""
+_SCALES = (1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0)
+"""Scales at which a frame is searched; targets have a few pixels at one of them."""
+_SMALLEST_PX, _LARGEST_PX = 24, 4_000_000
+"""Least side of a frame that is searched, and number of its pixels above which it is not enlarged."""
+_SHARPEST_PX = 0.4
+"""Width of the point-spread function of a reduced frame."""
 _LEAST_PSF = 0.5
-"""Least width of the point-spread function, relative to the expected one, taken from an enlarged part."""
+"""Least width of the point-spread function, relative to the expected one, taken from an enlarged frame."""
 _ELSEWHERE = 0.2
-"""Share of ridge points beyond a testfield from which a second testfield is searched."""
+"""Share of spots beyond a testfield from which a second testfield is searched."""
 
 
 @dataclass(frozen=True, eq=False)
 class Read:
-    """Recognized testfield: lattice of lines, clusters, and position on the board."""
+    """Recognized testfield: the frame in which it was read, its spots, lattice, clusters, and position."""
 
-    ridges: Ridges
+    frame: SearchedFrame
+    spots: Array
     lattice: LatticeFit
     reading: Reading
     placed: Placement
+
+    def original(self) -> tuple[LatticeFit, Reading]:
+        """Lattice and clusters in pixels of the frame as it was taken."""
+        scale, lattice, reading = self.frame.scale, self.lattice, self.reading
+        if scale == 1:
+            return lattice, reading
+        shift = np.full(2, (scale - 1) / 2)
+        blurred = reading.psf_px**2 - (max(scale, 1.0) ** 2 - 1) / 12
+        psf_px = max(np.sqrt(max(blurred, 0.0)), _LEAST_PSF * self.frame.psf_px) / scale
+        mapping = reduced(lattice.mapping, scale, shift)
+        xy = (reading.xy - shift) / scale
+        return replace(lattice, mapping=mapping), replace(reading, xy=xy, psf_px=float(psf_px))
 
 
 @dataclass(frozen=True, eq=False)
@@ -487,168 +497,111 @@ class SearchedFrame:
 
     Parameters
     ----------
-    grey, dark : ndarray (h, w), float32
-        Grey values, and the same with dark lines on a bright background.
+    grey, dark : ndarray (h, w)
+        Grey values, and the same with dark targets on a bright background.
+    noise : float
+        Standard deviation of the noise.
     design : TestfieldDesign
         The testfield.
     psf_px : float
-        Approximate width of the point-spread function.
+        Expected width of the point-spread function.
     response : PixelResponse
-        Response of a pixel.
-    taken_px2 : float
-        Variance of the point-spread function that was removed by sharpening.
-    factor : int
-        Number of pixels along one of the original frame, of which this is a part enlarged.
-    corner : (int, int)
-        Column and row of the original frame at which that part begins.
+        Light-sensitive area of the pixels.
+    scale : float
+        Size of the frame relative to the original one.
     """
 
     grey: NDArray[np.float32]
     dark: NDArray[np.float32]
+    noise: float
     design: TestfieldDesign
     psf_px: float
     response: PixelResponse
-    taken_px2: float = 0.0
-    factor: int = 1
-    corner: tuple[int, int] = (0, 0)
+    scale: float = 1.0
 
-    @cached_property
-    def noise(self) -> float:
-        """Standard deviation of the noise."""
-        return quiet_noise(self.dark)
-
-    def enlarged(self) -> SearchedFrame | None:
-        """The part of the frame with the most lines and edges, enlarged; None if it is large already."""
-        points = ridge_points(self.dark, self.noise).xy
-        h, w = self.dark.shape
-        blocks = np.zeros((h // _BLOCK_PX + 1, w // _BLOCK_PX + 1), np.float32)
-        column, row = ((points + 0.5) / _BLOCK_PX).astype(np.intp).clip(0).T
-        np.add.at(blocks, (row.clip(max=blocks.shape[0] - 1), column.clip(max=blocks.shape[1] - 1)), 1)
-        dense = cv2.blur(blocks, (3, 3)) > _DENSE * _BLOCK_PX**2
-        _, _, parts, _ = cv2.connectedComponentsWithStats(dense.astype(np.uint8), connectivity=4)
-        if len(parts) < 2:
-            return None
-        left, top, wide, high, _ = (_BLOCK_PX * parts[1:][np.argmax(parts[1:, cv2.CC_STAT_AREA])]).tolist()
-        if not _LEAST_FIELD_PX < max(wide, high) < _SMALL_FIELD_PX:
-            return None
-        margin = 2 * _BLOCK_PX
-        left, right = max(left - margin, 0), min(left + wide + margin, w)
-        top, bottom = max(top - margin, 0), min(top + high + margin, h)
-        factor = int(np.clip(round(_ENLARGED_PX / max(wide, high)), 2, 4))
-        grey, dark = (
-            np.asarray(
-                cv2.resize(
-                    image[top:bottom, left:right], None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC
-                ),
-                dtype=np.float32,
-            )
-            for image in (self.grey, self.dark)
-        )
-        psf_px = float(np.sqrt((factor * self.psf_px) ** 2 + (factor**2 - 1) / 12))
-        return replace(self, grey=grey, dark=dark, psf_px=psf_px, factor=factor, corner=(left, top))
-
-    def original(self, read: Read) -> Read:
-        """What was read in this frame, in pixels of the original one."""
-        if self.factor == 1:
-            return read
-        shift = (self.factor - 1) / 2 - self.factor * np.array(self.corner)
-
-        def xy(points: Array) -> Array:
-            return np.asarray((points - shift) / self.factor)
-
-        psf_px = np.sqrt(max(read.reading.psf_px**2 - (self.factor**2 - 1) / 12, 0.0)) / self.factor
-        reading = replace(
-            read.reading,
-            xy=xy(read.reading.xy),
-            psf_px=max(float(psf_px), _LEAST_PSF * self.psf_px / self.factor),
-        )
-        lattice = replace(
-            read.lattice,
-            mapping=reduced(read.lattice.mapping, self.factor, shift),
-            rms_px=read.lattice.rms_px / self.factor,
-        )
+    def _scaled(self, scale: float) -> SearchedFrame:
+        """The frame reduced or enlarged."""
+        if scale == 1:
+            return self
+        each = max(1, round(1 / scale))
+        high, wide = (n // each * each for n in self.grey.shape)
+        size = round(wide * scale), round(high * scale)
+        how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+        grey = np.asarray(cv2.resize(self.grey[:high, :wide], size, interpolation=how), dtype=np.float32)
+        psf_px = float(np.hypot(scale * self.psf_px, np.sqrt((max(scale, 1.0) ** 2 - 1) / 12)))
         return replace(
-            read, ridges=replace(read.ridges, xy=xy(read.ridges.xy)), lattice=lattice, reading=reading
+            self,
+            grey=grey,
+            dark=grey if self.dark is self.grey else -grey,
+            noise=min(scale, 1.0) * self.noise,
+            psf_px=max(psf_px, _SHARPEST_PX),
+            response=PixelResponse(1.0) if scale < 1 else self.response,
+            scale=scale,
         )
 
-    def sharpened(self) -> SearchedFrame:
-        """The frame sharpened by removing most of an assumed blur."""
-        power = max(_LEAST_POWER, (self.noise / max(float(self.grey.std()), 1e-9)) ** 2)
-        grey, dark = (_sharpened(image, power) for image in (self.grey, self.dark))
-        return replace(self, grey=grey, dark=dark, psf_px=1.0, taken_px2=_BLURRED_PX**2 - _SHARP_PX**2)
+    def read(self) -> Read | Failure:
+        """The testfield with the squares of the design, at the coarsest scale at which all are legible.
 
-    def blurred(self, psf_px: float) -> float:
-        """Width of the point-spread function in the original frame, from the width in this one."""
-        return float(np.sqrt(psf_px**2 + self.taken_px2))
-
-    def read(self, ridges: Ridges | None = None) -> Read | Failure:
-        """First of the lattices through the lines whose squares are those of the design.
-
-        Parameters
-        ----------
-        ridges : Ridges, optional
-            Ridge points in which lines are searched; all of the frame by default.
+        Of those at which only some are, at the one that shows most of them.
         """
-        ridges = ridges or ridge_points(self.dark, self.noise)
-        found = find_lattices(ridges)
-        if isinstance(found, Failure):
-            return found
-        width = self.design.lines.width / self.design.pitch
-        most = _MOST_SHARPENED if self.taken_px2 else _MOST_LATTICES
-        blur = blur_of(self.psf_px, self.response)
-        return self._first(ridges, lattices(self.dark, ridges, found, width, blur, most))
+        failure: Failure | None = None
+        best: Read | None = None
+        for scale in _SCALES:
+            size = scale**2 * self.grey.size
+            if min(self.grey.shape) * scale < _SMALLEST_PX or (scale > 1 and size > _LARGEST_PX):
+                continue
+            seen = self._scaled(scale)
+            found = seen._among(extremes(seen.dark, seen.noise))
+            if isinstance(found, Read):
+                if best is None or found.placed.squares > best.placed.squares:
+                    best = found
+                if not found.reading.small:
+                    return best
+                continue
+            if best is None and found.code == Code.MIRRORED:
+                return found
+            # That the targets of another design were seen says more than that there are none.
+            if failure is None or found.code != Code.NOT_FOUND:
+                failure = found
+        if best is not None:
+            return best
+        return Failure("is too small to show a testfield", Code.NOT_FOUND) if failure is None else failure
 
-    def read_by_targets(self) -> Read | Failure:
-        """The same with lattices between the targets, where lines are too thin to be found."""
-        ridges = ridge_points(self.dark, self.noise)
-        return self._first(ridges, lattices_of_targets(self.dark, self.noise, self.design))
-
-    def _first(self, ridges: Ridges, tried: Iterable[LatticeFit]) -> Read | Failure:
-        """The first lattice whose squares are those of the design."""
-        design, failure = self.design, None
-        for lattice in tried:
-            reading = read_clusters(self.grey, lattice, design, self.psf_px, self.response)
-            placed = reading if isinstance(reading, Failure) else locate(reading, design)
+    def _among(self, spots: Array) -> Read | Failure:
+        """The first lattice of spots whose squares are those of the design."""
+        failure: Failure | None = None
+        for lattice in lattices(spots, self.design, self.grey.shape):
+            reading = read_clusters(self.grey, lattice, self.design, self.psf_px, self.response)
+            placed = reading if isinstance(reading, Failure) else locate(reading, self.design)
             if isinstance(placed, Placement) and isinstance(reading, Reading):
-                return Read(ridges, lattice, reading, placed)
+                return Read(self, spots, lattice, reading, placed)
             if isinstance(placed, Failure) and placed.code == Code.MIRRORED:
                 return placed
             if failure is None and isinstance(placed, Failure):
                 failure = placed
         if failure is None:
-            failure = Failure("the straight lines found do not form one lattice", Code.NOT_FOUND)
+            failure = Failure("no spots form the lattice of a testfield", Code.NOT_FOUND)
         return failure
 
-    def shows_second(self, read: Read) -> bool:
-        """Whether a second testfield is visible beyond the one that was read."""
-        identified = read.placed.identified(read.reading, self.design)
-        # Keep a margin of half a square; the projectivity is accurate enough to locate the border.
-        low, high = identified.min(axis=0) - 0.5, identified.max(axis=0) + 1.5
-        at = straightened(read.lattice.mapping, read.ridges.xy)
-        beyond = ((at < low) | (at > high)).any(axis=1)
-        if beyond.mean() < _ELSEWHERE:
-            return False
-        rest = replace(read.ridges, xy=read.ridges.xy[beyond], normal=read.ridges.normal[beyond])
-        other = self.read(rest)
-        if isinstance(other, Failure):
-            return False
-        # The rest may show other squares of the same testfield.
-        at = (self.design.centres @ other.placed.frame.T) + other.placed.origin
-        mine = (self.design.centres @ read.placed.frame.T) + read.placed.origin
-        ends = (at >= other.reading.cell.min(axis=0)) & (at <= other.reading.cell.max(axis=0) + 1)
-        seen = ends.all(axis=1)
-        apart = np.hypot(*(other.lattice.mapping(at[seen]) - read.lattice.mapping(mine[seen])).T)
-        step = np.hypot(*(other.lattice.mapping(at[seen] + [0.25, 0.0]) - other.lattice.mapping(at[seen])).T)
-        return bool(np.median(apart / step) > 1)
 
-
-def _sharpened(grey: NDArray[np.float32], power: float) -> NDArray[np.float32]:
-    """An image with one Gaussian blur replaced by another; `power` is the relative power of the noise."""
-    (h, w), margin = grey.shape, min(int(4 * _BLURRED_PX + 4), min(grey.shape) - 1)
-    wide = np.pad(grey, margin, mode="reflect")
-    down, across = np.fft.fftfreq(wide.shape[0])[:, None], np.fft.rfftfreq(wide.shape[1])
-    before, after = (
-        np.exp(-2 * (np.pi * sigma) ** 2 * (down**2 + across**2)) for sigma in (_BLURRED_PX, _SHARP_PX)
-    )
-    found = np.fft.irfft2(np.fft.rfft2(wide) * after * before / (before**2 + power), s=wide.shape)
-    return found[margin : margin + h, margin : margin + w].astype(np.float32)
+def shows_second(read: Read) -> bool:
+    """Whether a second testfield is visible beyond the one that was read."""
+    design = read.frame.design
+    identified = read.placed.identified(read.reading, design)
+    # Keep a margin of half a square; the projectivity is accurate enough to locate the border.
+    low, high = identified.min(axis=0) - 0.5, identified.max(axis=0) + 1.5
+    at = straightened(read.lattice.mapping, read.spots)
+    beyond = ((at < low) | (at > high)).any(axis=1)
+    if beyond.mean() < _ELSEWHERE:
+        return False
+    other = read.frame._among(read.spots[beyond])
+    if isinstance(other, Failure):
+        return False
+    # The rest may show other squares of the same testfield.
+    at = (design.centres @ other.placed.frame.T) + other.placed.origin
+    mine = (design.centres @ read.placed.frame.T) + read.placed.origin
+    ends = (at >= other.reading.cell.min(axis=0)) & (at <= other.reading.cell.max(axis=0) + 1)
+    seen = ends.all(axis=1)
+    apart = np.hypot(*(other.lattice.mapping(at[seen]) - read.lattice.mapping(mine[seen])).T)
+    step = np.hypot(*(other.lattice.mapping(at[seen] + [0.25, 0.0]) - other.lattice.mapping(at[seen])).T)
+    return bool(np.median(apart / step) > 1)

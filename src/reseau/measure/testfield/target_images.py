@@ -13,7 +13,7 @@ from ...optics import Chain
 from ...optics.formation import Outline
 from ...optics.targets import target_outline
 from ..matching import SIZE, GrownOutline
-from .lattice_mapping import second_order, stretches
+from ..plane.lattice_mapping import second_order, stretches
 from .light import curved
 
 __all__ = ["flat_outline", "form_targets", "stacked"]

@@ -21,12 +21,11 @@ from ...core.data import Array, Mask, Rows
 from ...io import TestfieldDesign
 from ...optics import Chain
 from ...optics.formation import PixelResponse
+from ..compiled_filter import add_images
 from ..matching import FormedShape, Matches, MatchOptions, Shape, ShapeSubset, Window, match
-from .compiled import add_windows
-from .lattice import median
-from .lattice_mapping import images_of, slope_of
+from ..plane.lattice_mapping import images_of, slope_of
+from ..plane.polynomial import median
 from .light import attenuate, bends, illumination, without_own
-from .line_profiles import blur_of
 from .motion import MovedShape, steps_of
 from .target_images import form_targets
 
@@ -245,7 +244,6 @@ class _Canvas:
     ) -> None:
         self.scene, self.images, self.xy = scene, images, xy
         self.total = scene.line_light.copy()
-        self.near = np.zeros(self.total.shape, dtype=bool)
         self.parts: list[_Part] = []
         for size in (False, True):
             of = large == size
@@ -317,7 +315,7 @@ class _Canvas:
         else:
             share = self.images.image(xy, width, form, part, window)
         own = self.scene.light.at(xy)[1].astype(np.float32)[:, None, None] * share
-        add_windows(self.total, self.near, centre.astype(np.intp) - half, own, wanted)
+        add_images(self.total, own, np.ones(len(own)), centre.astype(np.intp) - half)
         return _Part(part, half, own, formed)
 
     def match(
@@ -336,7 +334,11 @@ class _Canvas:
             return scene.noise
         sign = 1.0 if scene.design.polarity == "dark" else -1.0
         limit = 2 * _FLAT * scene.noise / scene.row_jitter_px
-        bend = bends(scene.grey, self.total, self.near & scene.valid, sign, limit)
+        near = np.zeros(self.total.shape, dtype=bool)
+        for part in self.parts:
+            column, row = self._pixels(part)
+            near[row[:, :, None], column[:, None, :]] = True
+        bend = bends(scene.grey, self.total, near & scene.valid, sign, limit)
         if len(bend) < _LEAST_FLAT:
             return scene.noise
         # The median of normal deviates is 0.6745 of their σ; the variance of such a difference is 3/2 σ².
@@ -389,12 +391,14 @@ class _Canvas:
 
 def _line_light(scene: Scene) -> NDArray[np.float32]:
     """Grey values that the lines attenuate or add, (h, w)."""
-    from .compiled_lattice import shade_lines
+    from ..plane.compiled_lattice import shade_lines
 
     h, w = scene.grey.shape
     lines, free = scene.design.lines, np.ones((h, w), np.float32)
     x0, y0, x1, y1 = lines.extent
-    blur, count = blur_of(scene.psf_px, scene.response), max(h, w) // 4
+    count = max(h, w) // 4
+    # The square of a pixel has the same variance in all directions.
+    blur = float(np.hypot(scene.psf_px, scene.response.fill / np.sqrt(12)))
     steps, longest = steps_of(scene.path), float(np.hypot(*scene.path)) / 2
     for axis, places in ((0, lines.vertical_x), (1, lines.horizontal_y)):
         # Points of the board on every line, and beside it.

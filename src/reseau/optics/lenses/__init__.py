@@ -1,6 +1,6 @@
 """Lenses: prescriptions, media, rays through them, and the images that rays form."""
 
-from .images import PlaneTarget, RayImage, counted_image, image_scale, ray_image, ray_images
+from .images import PlaneTarget, RayImage, image_scale, ray_image, ray_images
 from .media import (
     AIR,
     Air,
@@ -57,7 +57,6 @@ __all__ = [
     "Water",
     "aim",
     "behind_windows",
-    "counted_image",
     "glass",
     "glass_names",
     "image_scale",

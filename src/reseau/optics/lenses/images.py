@@ -14,7 +14,7 @@ projection centre.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -22,16 +22,19 @@ import numpy as np
 from ...core.data import Array
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure
-from ..formation import Outline
+from ..formation import Outline, PixelResponse
 from ..gridded import GriddedOutline
 from ..newton import determinant
 from .pupils import PupilElements
 from .ray_maps import CalibratedLens, LensCamera, RayMap
 
-__all__ = ["PlaneTarget", "RayImage", "counted_image", "image_scale", "ray_image", "ray_images"]
+__all__ = ["PlaneTarget", "RayImage", "image_scale", "ray_image", "ray_images"]
 
 _TOGETHER = 40_000
 """Largest number of rays of one wavelength in one call, for the sake of memory."""
+
+_UNSEEN = 1e-4
+"""Shift of an image, pixels, below which the shares of elements count as even: two outlines less to form."""
 
 _GRID = np.array([[u, v] for u in (-1.0, 0.0, 1.0) for v in (-1.0, 0.0, 1.0)])
 
@@ -107,6 +110,13 @@ class RayImage:
     blur : float
         Root mean square distance of rays of one point from their mean, pixels.
 
+    falloff : ndarray (2,)
+        Change of the logarithm of the light of an even ground, by pixel along x and y. A dark target takes
+        its share of the light of the ground; a bright one in front of nothing is as much darker.
+    uneven : ndarray (2, j, 2) or (0, 0, 2)
+        Changes of the tangents by pixel along x and y: the share of an element changes with the place of the
+        sensor, most where apertures cut the stop.
+
     Examples
     --------
     >>> image = RayImage(Outline.circle(3.0, 0.5), np.array([10.0, 20.0]), 0.0)
@@ -117,11 +127,54 @@ class RayImage:
     outline: Outline
     point: Array
     blur: float
+    falloff: Array = field(default_factory=lambda: np.zeros(2))
+    uneven: Array = field(default_factory=lambda: np.zeros((0, 0, 2)))
 
     @cached_property
-    def gridded(self) -> GriddedOutline:
-        """The outline, gridded for the formation of images."""
-        return GriddedOutline.of(self.outline)
+    def gridded(self) -> tuple[GriddedOutline, ...]:
+        """The outline, and its changes by pixel along x and y, gridded for the formation of images."""
+        parts = self.outline.dxy, *self.uneven
+        return tuple(GriddedOutline.of(Outline(self.outline.xy, dxy)) for dxy in parts)
+
+    def formed(
+        self,
+        place: Array,
+        sigma: float,
+        columns: Array,
+        rows: Array,
+        response: PixelResponse,
+        *,
+        bright: bool = False,
+        derivatives: bool = False,
+        parts: tuple[GriddedOutline, ...] | None = None,
+    ) -> Array:
+        """Share (r, c) of the light of each pixel, or with derivatives (4 + m, r, c).
+
+        Parameters
+        ----------
+        place : ndarray (2,)
+            Pixel of the corresponding point.
+        sigma : float
+            Width of the point-spread function, pixels.
+        columns, rows : ndarray (c,), (r,)
+            Adjacent pixels.
+        response : PixelResponse
+        bright : bool
+            Whether the light is that of a bright target, which falls off as that of an even ground.
+        derivatives : bool
+            By place, width, and parameters of the form; see :class:`GriddedOutline`.
+        parts : tuple of GriddedOutline, optional
+            In place of :attr:`gridded`, with other parameters of the optics.
+        """
+        where = place, sigma, columns, rows, response
+        even, *uneven = (
+            part.derivatives(*where) if derivatives else part.image(*where) for part in parts or self.gridded
+        )
+        x, y = columns - self.point[0], rows[:, None] - self.point[1]
+        for away, part in zip((x, y), uneven, strict=False):
+            even = even + away * part
+        by_x, by_y = self.falloff if bright else (0.0, 0.0)
+        return np.asarray(np.exp(by_x * x + by_y * y) * even)
 
     @property
     def centroid(self) -> Array:
@@ -224,75 +277,49 @@ def _image_of(
     by_u, by_v = (np.einsum("gt,wetx->wegx", slopes, maps) for slopes in _slopes(_GRID))
     area = np.abs(by_u[..., 0] * by_v[..., 1] - by_u[..., 1] * by_v[..., 0])
     usable &= (area > 0).all(axis=2)
-    density = (emitted / np.where(usable[..., None], area, 1.0)).mean(axis=2)
-    coefficients, share = maps.reshape(-1, 6, 2), np.where(usable, density, 0.0).ravel()
-    if not (share.sum() > 0 and np.isfinite(point).all()):
+    density = np.where(usable[..., None], emitted / np.where(usable[..., None], area, 1.0), 0.0)
+    coefficients, light = maps.reshape(-1, 6, 2), density.reshape(-1, len(_GRID))
+    if not (light.any() and np.isfinite(point).all()):
         lens = camera.camera if isinstance(camera, CalibratedLens) else camera
         why = lens.why_dark(target.centre) if isinstance(lens, LensCamera) else "it is not in the field"
         return Failure(f"no light of the target reaches the sensor: {why}", Code.OUTSIDE)
+    # What a place of the sensor receives through each element, and its changes with the place: the share of
+    # an element is that at the point of the image, not that where the element has the target.
+    plane = np.einsum("tg,eg->et", _FIT[:3], light)
+    by_uv = np.stack([coefficients[:, 1], coefficients[:, 2]], axis=1)
+    # What blocks light within the stop, as a spider, does not change with the place as a plane does.
+    dark = (light == 0).any(axis=1) | (determinant(by_uv) == 0)
+    by_xy = np.linalg.solve(np.where(dark[:, None, None], np.eye(2), by_uv), plane[:, 1:, None])[..., 0]
+    by_xy[dark] = 0.0
+    at_point = np.maximum(light.mean(axis=1) - ((coefficients[:, 0] - point) * by_xy).sum(axis=1), 0.0)
+    share = at_point / at_point.sum()
+    slope = by_xy / at_point.sum()
+    falloff = slope.sum(axis=0)
     # Elements without light remain, as points: images with other parameters have the same nodes.
     coefficients[share == 0] = 0.0
     coefficients[share == 0, 0] = point
-    return _assembled(coefficients, share / share.sum(), target, point)
+    uneven = slope - share[:, None] * falloff
+    return _assembled(coefficients, share, target, point, falloff, uneven)
 
 
-def _assembled(coefficients: Array, share: Array, target: PlaneTarget, point: Array) -> RayImage:
-    """Outline of an image from the mappings (m, 6, 2) of the elements and their light (m,)."""
+def _assembled(
+    coefficients: Array, share: Array, target: PlaneTarget, point: Array, falloff: Array, uneven: Array
+) -> RayImage:
+    """Outline of an image from mappings (m, 6, 2) of elements, their light (m,) and its changes (m, 2)."""
     uv = target.outline.xy / target.extent
     xy = _powers(uv) @ coefficients
     by_u, by_v = (slopes @ coefficients for slopes in _slopes(uv))
     du, dv = target.outline.dxy.T[:, None, :, None] / target.extent
-    dxy = (by_u * du + by_v * dv) * share[:, None, None]
-    outline = Outline((xy - point).reshape(-1, 2), dxy.reshape(-1, 2)).oriented()
-    spot = coefficients[:, 0]
-    away = spot - share @ spot
-    return RayImage(outline, point, float(np.sqrt(share @ (away**2).sum(axis=1))))
-
-
-def counted_image(
-    camera: RayMap, target: PlaneTarget, elements: PupilElements, side: int, columns: Array, rows: Array
-) -> Array:
-    """Image of a target by counting rays in the pixels, as Meid 1992, section 3.1.4, describes it.
-
-    For comparison with :func:`ray_image`; it needs millions of rays.
-
-    Parameters
-    ----------
-    camera, target, elements
-        As for :func:`ray_image`.
-    side : int
-        Number of elements of the target along the side of the square around it.
-    columns, rows : ndarray (c,), (r,)
-        Adjacent pixels.
-
-    Returns
-    -------
-    ndarray (r, c)
-        Light in the pixels; their sum is 1 if all light of the target falls into them.
-
-    Examples
-    --------
-    >>> from reseau.optics.lenses import SensorPlane, ThinLens
-    >>> camera = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (0.0, 0.0)))
-    >>> disk = PlaneTarget(np.array([0.0, 0, 1000]), np.eye(3)[:, :2], Outline.circle(2.0, 0.2))
-    >>> pixels = np.arange(-20.0, 21.0)
-    >>> image = counted_image(camera, disk, PupilElements.equal_areas(3), 20, pixels, pixels)
-    >>> round(float(image.sum()), 6)
-    1.0
-    """
-    from matplotlib.path import Path
-
-    middle = (np.arange(side) + 0.5) * 2 / side - 1
-    uv = target.extent * np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 2)
-    uv = uv[Path(target.outline.xy).contains_points(uv)]
-    image, total = np.zeros((len(rows), len(columns))), 0.0
-    ends = [np.append(pixels - 0.5, pixels[-1] + 0.5) for pixels in (rows, columns)]
-    for at, weight in zip(elements.xy, elements.weights, strict=True):
-        xy, light = camera.spots(target.points(uv), PupilElements(at[None], weight[None]))
-        xy, light = xy.reshape(-1, 2), np.abs(np.nan_to_num(light) @ target.normal).ravel()
-        image += np.histogram2d(xy[:, 1], xy[:, 0], bins=ends, weights=light)[0]
-        total += float(light.sum())
-    return image / total
+    tangents = by_u * du + by_v * dv
+    nodes = Outline((xy - point).reshape(-1, 2), (tangents * share[:, None, None]).reshape(-1, 2))
+    outline = nodes.oriented()
+    side = 1.0 if np.array_equal(outline.dxy, nodes.dxy) else -1.0
+    changes = side * uneven.T[:, :, None, None] * tangents
+    away = coefficients[:, 0] - share @ coefficients[:, 0]
+    if np.hypot(*((uneven * away).sum(axis=1) @ away)) < _UNSEEN:
+        changes = changes[:0]
+    blur = float(np.sqrt(share @ (away**2).sum(axis=1)))
+    return RayImage(outline, point, blur, falloff, changes.reshape(len(changes), len(outline.xy), 2))
 
 
 def image_scale(camera: RayMap, centre: Array, axes: Array) -> Array:

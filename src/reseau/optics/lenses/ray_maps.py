@@ -21,6 +21,7 @@ from .paraxial import Paraxial
 from .prescription import Prescription
 from .pupils import Aiming, PupilElements
 from .trace import Tracer
+from .vignetting import Vignetting
 
 __all__ = ["ByRays", "CalibratedLens", "LensCamera", "RayMap", "SensorPlane"]
 
@@ -79,6 +80,10 @@ class ByRays(ABC):
     def rays(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
         """Pixels (n, 2) and light (n, 3) of rays from points (n, 3) through points (n, 2) of the stop."""
 
+    def open_part(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
+        """Points (n, e, 2) of the open part of the stop for points (e, 2) of it all, and areas (n, e)."""
+        return np.broadcast_to(pupil, (len(points), *pupil.shape)), np.ones((len(points), len(pupil)))
+
     def corresponding(self, points: Array) -> Array:
         """See :class:`RayMap`."""
         return self.rays(points, np.zeros((len(points), 2)), self.wavelength_nm)[0]
@@ -90,10 +95,12 @@ class ByRays(ABC):
         xy, light = [], []
         for k, (wavelength, weight) in enumerate(self.wavelengths):
             # Other points of the stop for each wavelength: the spots of all together are denser.
-            through = np.tile(elements.turned(k * _GOLDEN).xy, (shape[0], 1))
-            arrived, carried = self.rays(starts, through, wavelength)
+            turned = elements.turned(k * _GOLDEN).xy
+            through, area = self.open_part(points, turned, wavelength)
+            arrived, carried = self.rays(starts, through.reshape(-1, 2), wavelength)
             xy.append(arrived.reshape(*shape, 2))
-            light.append(carried.reshape(*shape, 3) * (elements.weights * weight)[:, None])
+            shares = elements.weights * weight * area
+            light.append(carried.reshape(*shape, 3) * shares[..., None])
         return np.stack(xy), np.stack(light)
 
 
@@ -196,23 +203,36 @@ class LensCamera(ByRays):
         return np.asarray(front.vertex + position * front.axes[:, 2])
 
     @cached_property
-    def _ready(self) -> dict[float, tuple[Aiming, Tracer, Tracer | None]]:
-        """By wavelength: what aims rays, traces them, and traces them with apertures, where it has any."""
+    def _ready(self) -> dict[float, tuple[Aiming, Tracer, Tracer | None, Vignetting | None]]:
+        """By wavelength: what aims rays, traces them, and, where it has apertures, stops them."""
         return {}
 
-    def _at(self, wavelength_nm: float) -> tuple[Aiming, Tracer, Tracer | None]:
+    def _at(self, wavelength_nm: float) -> tuple[Aiming, Tracer, Tracer | None, Vignetting | None]:
         if wavelength_nm not in self._ready:
+            aiming = Aiming(self.lens, wavelength_nm)
             limited = any(surface.apertures for surface in self.lens.surfaces)
             self._ready[wavelength_nm] = (
-                Aiming(self.lens, wavelength_nm),
+                aiming,
                 Tracer(self.lens, wavelength_nm, apertures=False),
                 Tracer(self.lens, wavelength_nm) if limited else None,
+                Vignetting(self.lens, aiming, wavelength_nm) if limited else None,
             )
         return self._ready[wavelength_nm]
 
+    def open_part(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
+        """See :class:`Vignetting`."""
+        part = self._at(wavelength_nm)[3]
+        if part is None:
+            return super().open_part(points, pupil, wavelength_nm)
+        radius = np.hypot(*pupil.T)
+        along = np.where(radius[:, None] > 0, pupil, [1.0, 0.0]) / np.where(radius > 0, radius, 1.0)[:, None]
+        inner, outer = part.edges(points @ self.rotation.T + self.projection_centre, along)
+        area = outer**2 - inner**2
+        return np.sqrt(inner**2 + area * radius**2)[..., None] * along, area
+
     def why_dark(self, point: Array) -> str:
         """Why no light of a point (3,) reaches the sensor, by its principal ray."""
-        aiming, tracer, limits = self._at(self.wavelength_nm)
+        aiming, tracer, limits, _ = self._at(self.wavelength_nm)
         local = point[None] @ self.rotation.T + self.projection_centre
         reason = aiming.why(local[0])
         if reason is not None:
@@ -223,7 +243,7 @@ class LensCamera(ByRays):
 
     def rays(self, points: Array, pupil: Array, wavelength_nm: float) -> tuple[Array, Array]:
         """Rays by ray tracing."""
-        aiming, tracer, limits = self._at(wavelength_nm)
+        aiming, tracer, limits, _ = self._at(wavelength_nm)
         aimed = aiming(points @ self.rotation.T + self.projection_centre, pupil)
         free, weight = tracer.trace(aimed.rays), aimed.solid_angle
         if limits is not None:

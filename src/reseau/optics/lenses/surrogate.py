@@ -9,7 +9,7 @@ import numpy as np
 from ...core.data import Array
 from ...core.errors import UsageError
 from .pupils import PupilElements
-from .ray_maps import RayMap
+from .ray_maps import ByRays, RayMap
 
 __all__ = ["RaySurrogate"]
 
@@ -115,7 +115,11 @@ class RaySurrogate:
         scaled = low + (unit + 1) / 2 * (high - low)
         points = np.stack([scaled[:, 0], scaled[:, 1], np.ones(len(unit))], axis=1) / scaled[:, 2:]
         xy, light = camera.spots(points, elements)
-        if not light.any(axis=-1).all():
+        cut = isinstance(camera, ByRays) and any(
+            (camera.open_part(points, elements.xy, wavelength)[1] < 1).any()
+            for wavelength, _ in camera.wavelengths
+        )
+        if cut or not light.any(axis=-1).all():
             raise UsageError(
                 "light is stopped by an aperture in the range of the surrogate; trace rays instead"
             )

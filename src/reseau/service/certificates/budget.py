@@ -28,14 +28,6 @@ from ...core.data import Array, ImagePoints
 from ...core.errors import UsageError
 from .data import CertificateData
 
-__all__ = [
-    "SOURCES",
-    "CalibrationUncertainty",
-    "measurement_budget",
-    "simulate_measurement",
-    "uncertainty_of",
-]
-
 SOURCES = ("grey values", "target coordinates", "temperature", "model", "reproducibility")
 # Images that show what their points have in common; those that earlier versions needed for their scatter.
 _LEAST_IMAGES, _LEAST_SCATTERED = 3, 6

@@ -9,14 +9,14 @@ from datetime import date, datetime
 import numpy as np
 
 from ...adjust import UncertaintyBudget
-from ...calibration import Calibration, CameraMapping, Use
+from ...calibration import Calibration, CameraMapping
+from ...calibration.assessment import Use
 from ...core.data import ImagePoints
 from ...core.errors import UsageError
-from ..inforce import Decision, key_of
+from ..decisions import Decision
+from ..inforce import key_of
 from .budget import CalibrationUncertainty, measurement_budget, uncertainty_of
 from .data import CertificateData, Contact, Item
-
-__all__ = ["Certificate", "certify"]
 
 _PLACES = ("centre", "upper_left", "upper_right", "lower_right", "lower_left")
 

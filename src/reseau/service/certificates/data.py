@@ -9,8 +9,6 @@ from pydantic import Field
 
 from ...io import Document, Strict
 
-__all__ = ["CertificateData", "Contact", "Item", "Reference", "Standard", "Stated", "Temperature"]
-
 Text = Annotated[str, Field(pattern=r"^\S(.*\S)?$")]
 Country = Annotated[str, Field(pattern=r"^[A-Z]{2}$")]
 Kind = Literal["grey values", "target coordinates", "temperature", "model", "reproducibility", "other"]

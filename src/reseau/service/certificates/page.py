@@ -20,8 +20,6 @@ from ...core.optional import optional
 from ...core.version import __version__
 from .certificate import Certificate
 
-__all__ = ["attached", "html_of", "pages_digest", "pdf_of"]
-
 NAME = "dcc.xml"
 # Correlations of more parameters do not fit the width of a page; they are in the XML.
 _WIDEST = 12
@@ -138,7 +136,7 @@ def pdf_of(certificate: Certificate, xml: Callable[[str], bytes]) -> tuple[bytes
 
     Examples
     --------
-    >>> from reseau.service.certificates import dcc_of
+    >>> from reseau.service.certificates.dcc import dcc_of
     >>> from reseau.service.certificates.certificate import example_certificate
     >>> made = example_certificate()
     >>> pdf_of(made, lambda pages: dcc_of(made, pages))[0][:5]  # doctest: +SKIP

@@ -17,8 +17,6 @@ from typing import Any
 from ...core.errors import FormatError, InputError, UsageError
 from ...core.optional import optional
 
-__all__ = ["DS", "read_pem", "sign", "signatures"]
-
 DS = "http://www.w3.org/2000/09/xmldsig#"
 _CANONICAL = {
     "http://www.w3.org/TR/2001/REC-xml-c14n-20010315",

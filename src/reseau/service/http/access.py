@@ -14,21 +14,6 @@ from ..accounts import LOCAL, Principal, Scope
 from .options import is_loopback
 from .service import Service
 
-__all__ = [
-    "Administering",
-    "Forbidden",
-    "Here",
-    "NotFound",
-    "Operating",
-    "Reading",
-    "Unknown",
-    "by_cookie",
-    "csrf_of",
-    "operating",
-    "principal_of",
-    "service_of",
-]
-
 _UNSAFE = {"POST", "PUT", "PATCH", "DELETE"}
 
 

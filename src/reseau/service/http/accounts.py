@@ -6,13 +6,12 @@ from datetime import timedelta
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Request, Response
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
-from ..accounts import Principal, RefusedLogin, Scope
+from ..accounts import Principal, Scope
+from ..attempts import RefusedLogin
 from .access import Administering, Forbidden, Here, NotFound, Operating, Reading, by_cookie, csrf_of
-from .answers import Answer, Done, refusals
-
-__all__ = ["router", "set_cookie"]
+from .answers import Answer, Done, Instant, refusals
 
 router = APIRouter(tags=["accounts"], responses=refusals(400, 401, 403, 422, 503))
 
@@ -20,7 +19,9 @@ _KNOWN_S = 365 * 86400
 Named = Annotated[str, Path(max_length=80, description="Its name.")]
 
 
-class Me(Answer):
+class Me(
+    Answer, json_schema_extra={"example": {"name": "Ada", "scope": "operate", "via": "token", "csrf": None}}
+):
     """Who makes the request."""
 
     name: str
@@ -28,22 +29,13 @@ class Me(Answer):
     via: str
     csrf: str | None = Field(description="With a login: the value for X-CSRF-Token.")
 
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={"example": {"name": "Ada", "scope": "operate", "via": "token", "csrf": None}},
-    )
 
-
-class Login(Answer):
+class Login(Answer, json_schema_extra={"example": {"name": "Ada", "password": "correct horse battery"}}):
     """Name and password; the code only for users who need one."""
 
     name: str = Field(max_length=80)
     password: str = Field(max_length=1000)
     code: str = Field(default="", max_length=10)
-
-    model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"example": {"name": "Ada", "password": "correct horse battery"}}
-    )
 
 
 class Confirmed(Answer):
@@ -65,19 +57,15 @@ class Code(Answer):
     code: str = Field(min_length=1, max_length=10)
 
 
-class NewUser(Confirmed):
+class NewUser(
+    Confirmed,
+    json_schema_extra={"example": {"name": "Ada", "password": "correct horse battery", "scope": "operate"}},
+):
     """A user."""
 
     name: str = Field(min_length=1, max_length=80)
     password: str = Field(min_length=12, max_length=1000)
     scope: Scope = "read"
-
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={
-            "example": {"name": "Ada", "password": "correct horse battery", "scope": "operate"}
-        },
-    )
 
 
 class UserAnswer(Answer):
@@ -86,19 +74,15 @@ class UserAnswer(Answer):
     name: str
     scope: Scope
     one_time: bool
-    created: str
+    created: Instant
 
 
-class NewToken(Confirmed):
+class NewToken(Confirmed, json_schema_extra={"example": {"name": "plotter", "scope": "read", "days": 90}}):
     """A token of mine, which may do at most what I may."""
 
     name: str = Field(min_length=1, max_length=80)
     scope: Scope = "read"
     days: int = Field(default=90, ge=1, le=731)
-
-    model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"example": {"name": "plotter", "scope": "read", "days": 90}}
-    )
 
 
 class TokenAnswer(Answer):
@@ -107,9 +91,9 @@ class TokenAnswer(Answer):
     name: str
     scope: Scope
     user: str
-    created: str
-    expires: str
-    revoked: str | None
+    created: Instant
+    expires: Instant
+    revoked: Instant | None
 
 
 class Secret(Answer):
@@ -236,10 +220,7 @@ def confirm_code(given: Code, who: Reading, service: Here) -> Done:
 @router.get("/users")
 def users(who: Administering, service: Here) -> list[UserAnswer]:
     """All users."""
-    return [
-        UserAnswer(name=u.name, scope=u.scope, one_time=u.one_time, created=u.created.isoformat())
-        for u in service.accounts.users()
-    ]
+    return [UserAnswer.model_validate(each) for each in service.accounts.users()]
 
 
 @router.post("/users", status_code=201, responses=refusals(429))
@@ -264,13 +245,10 @@ def remove_user(request: Request, name: Named, given: Confirmed, who: Administer
 def tokens(who: Reading, service: Here) -> list[TokenAnswer]:
     """My tokens, also those that have ended; without their secrets. Administrators see all."""
     return [
-        TokenAnswer(
-            name=t.name, scope=t.scope, user=t.user, created=t.created.isoformat(),
-            expires=t.expires.isoformat(), revoked=None if t.revoked is None else t.revoked.isoformat(),
-        )
-        for t in service.accounts.tokens()
-        if t.user == who.name or who.may("administer")
-    ]  # fmt: skip
+        TokenAnswer.model_validate(each)
+        for each in service.accounts.tokens()
+        if each.user == who.name or who.may("administer")
+    ]
 
 
 @router.post("/tokens", status_code=201, responses=refusals(429))

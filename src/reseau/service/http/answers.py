@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from datetime import datetime
+from typing import Annotated, Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, RedirectResponse, Response
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, BeforeValidator
 from starlette.exceptions import HTTPException
 
 from ...core.errors import (
@@ -19,25 +20,27 @@ from ...core.errors import (
     ReseauError,
     UsageError,
 )
-from ..accounts import RefusedLogin
+from ..attempts import RefusedLogin
 from .access import Forbidden, NotFound, Unknown
 from .guard import log
 
-__all__ = ["TOO_MANY", "Answer", "Done", "ErrorAnswer", "add_error_handlers", "refusals"]
+
+def _as_text(time: Any) -> Any:
+    return time.isoformat() if isinstance(time, datetime) else time
 
 
-class Answer(BaseModel):
+Instant = Annotated[str, BeforeValidator(_as_text)]
+"""A time, ISO 8601."""
+
+
+class Answer(BaseModel, extra="forbid", from_attributes=True):
     """Base of answers."""
 
-    model_config = ConfigDict(extra="forbid")
 
-
-class Done(Answer):
+class Done(Answer, json_schema_extra={"example": {"done": "revoked"}}):
     """Something was done."""
 
     done: str
-
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"done": "revoked"}})
 
 
 class ErrorDetail(Answer):
@@ -50,22 +53,23 @@ class ErrorDetail(Answer):
     do: str | None
 
 
-class ErrorAnswer(Answer):
+class ErrorAnswer(
+    Answer,
+    json_schema_extra={
+        "example": {
+            "error": {
+                "code": "not_found",
+                "text": "monday: is not a session of this archive",
+                "what": "is not a session of this archive",
+                "where": "monday",
+                "do": None,
+            }
+        }
+    },
+):
     """An error; the text is one line for people, the code is for programs."""
 
     error: ErrorDetail
-
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={
-            "example": {
-                "error": {
-                    "code": "not_found", "text": "monday: is not a session of this archive",
-                    "what": "is not a session of this archive", "where": "monday", "do": None,
-                }
-            }
-        },
-    )  # fmt: skip
 
 
 _STATUS: tuple[tuple[type[ReseauError], int, str], ...] = (

@@ -22,8 +22,6 @@ from .options import ServeOptions
 from .patience import PatientProtocol
 from .service import Service
 
-__all__ = ["create_app", "serve"]
-
 API = "/api/1"
 _CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"
 """Of TLS 1.2: with forward secrecy and authenticated; those of TLS 1.3 all are."""

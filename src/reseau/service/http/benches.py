@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from ..accounts import Principal
 from .access import Here, NotFound, Operating, Reading, operating
@@ -18,7 +18,6 @@ from .sessions import new_name
 if TYPE_CHECKING:
     from ..benches import BenchLink
 
-__all__ = ["BenchAnswer", "bench_answer", "router"]
 
 router = APIRouter(tags=["benches"], responses=refusals(400, 401, 403, 404, 409, 422, 503))
 
@@ -83,16 +82,12 @@ class SettingAnswer(Answer):
     options: list[str] | None
 
 
-class Move(Answer):
+class Move(Answer, json_schema_extra={"example": {"axis": "tilt", "position": 1.0, "relative": True}}):
     """Where an axis is moved to, or by how much."""
 
     axis: str = Field(max_length=80)
     position: float = Field(ge=-1e6, le=1e6, allow_inf_nan=False)
     relative: bool = False
-
-    model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"example": {"axis": "tilt", "position": 1.0, "relative": True}}
-    )
 
 
 class Home(Answer):
@@ -101,16 +96,13 @@ class Home(Answer):
     axis: str = Field(max_length=80)
 
 
-class Changes(Answer):
+class Changes(
+    Answer, json_schema_extra={"example": {"instrument": "camera", "changes": {"exposure_us": 5000.0}}}
+):
     """Settings of an instrument to change."""
 
     instrument: str = Field(max_length=80)
     changes: dict[str, float | int | str] = Field(min_length=1, max_length=50)
-
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={"example": {"instrument": "camera", "changes": {"exposure_us": 5000.0}}},
-    )
 
 
 class Tested(Answer):
@@ -122,18 +114,15 @@ class Tested(Answer):
     error: str | None
 
 
-class NewSession(Answer):
+class NewSession(
+    Answer, json_schema_extra={"example": {"name": "monday", "plan": "frames", "parameters": {"count": 5}}}
+):
     """A session: its name, plan, parameters and input files."""
 
     name: str = Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00-\x1f.][^/\\\x00-\x1f]*$")
     plan: str = Field(max_length=40)
     parameters: dict[str, Any] = Field(default_factory=dict)
     inputs: dict[str, str] = Field(default_factory=dict, description="Contents of files, by name.")
-
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={"example": {"name": "monday", "plan": "frames", "parameters": {"count": 5}}},
-    )
 
 
 class Resumed(Answer):

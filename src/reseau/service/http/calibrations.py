@@ -10,32 +10,21 @@ from datetime import UTC, date, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Request, Response
-from pydantic import AwareDatetime, ConfigDict, Field
+from pydantic import AwareDatetime, Field
 
-from ...calibration import Assessment
+from ...calibration.assessment import Assessment
 from ...core.errors import ReseauError, UsageError
 from .access import Administering, Here, NotFound, Operating, Reading
-from .answers import Answer, Done, refusals
+from .answers import Answer, Done, Instant, refusals
 from .service import Service
 from .sessions import the_session
 from .stored import FILE_ANSWERS, file_answer, picture_answer
 
 if TYPE_CHECKING:
     from ...calibration import Calibration
-    from ..inforce import Configurations, Decision
+    from ..decisions import Decision
+    from ..inforce import Configurations
 
-__all__ = [
-    "SVG",
-    "ConfigurationRow",
-    "calibration_detail",
-    "configuration_detail",
-    "decision_row",
-    "known_configurations",
-    "listed",
-    "router",
-    "the_configuration",
-    "the_decision",
-]
 
 router = APIRouter(tags=["calibrations"], responses=refusals(400, 401, 403, 404, 409, 422, 503))
 
@@ -51,7 +40,7 @@ class InForce(Answer):
 
     key: str
     name: str
-    since: str
+    since: Instant
     why: str
 
 
@@ -76,7 +65,7 @@ class FindingRow(Answer):
 class EarlierRow(Answer):
     """A judgement by an earlier version of the rules."""
 
-    at: str
+    at: Instant
     by: str
     outcome: str
     rules: int
@@ -91,8 +80,8 @@ class DecisionRow(Answer):
     key: str
     name: str
     outcome: str
-    since: str
-    at: str
+    since: Instant
+    at: Instant
     by: str
     comment: str
     compared_with: str | None
@@ -107,7 +96,7 @@ class DecisionRow(Answer):
 class EventRow(Answer):
     """A service event."""
 
-    at: str
+    at: Instant
     what: str
 
 
@@ -155,19 +144,28 @@ class CalibrationDetail(Answer):
     figures: list[str]
 
 
-class NewConfiguration(Answer):
+class NewConfiguration(
+    Answer, json_schema_extra={"example": {"name": "left", "parts": {"camera": "DMK 33", "lens": "8 mm"}}}
+):
     """A configuration by its parts."""
 
     name: str = Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00-\x1f]+$")
     parts: dict[str, str] = Field(min_length=1, max_length=50)
 
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={"example": {"name": "left", "parts": {"camera": "DMK 33", "lens": "8 mm"}}},
-    )
 
-
-class NewDecision(Answer):
+class NewDecision(
+    Answer,
+    json_schema_extra={
+        "example": {
+            "session": "monday",
+            "rules": {
+                "schema": "reseau-acceptance/1",
+                "version": 1,
+                "image": {"warning": 0.1, "action": 0.3},
+            },
+        }
+    },
+):
     """A calibration of a session, or a document, to be judged by rules (`reseau-acceptance/1`)."""
 
     session: str | None = Field(default=None, max_length=200)
@@ -176,18 +174,6 @@ class NewDecision(Answer):
     since: AwareDatetime | None = None
     name: str = Field(default="", max_length=100, description="Name of the calibration.")
     comment: str = Field(default="", max_length=2000)
-
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={
-            "example": {
-                "session": "monday",
-                "rules": {
-                    "schema": "reseau-acceptance/1", "version": 1, "image": {"warning": 0.1, "action": 0.3},
-                },
-            }
-        },
-    )  # fmt: skip
 
 
 class Review(Answer):
@@ -203,12 +189,10 @@ class Comment(Answer):
     comment: str = Field(min_length=1, max_length=2000)
 
 
-class NewName(Answer):
+class NewName(Answer, json_schema_extra={"example": {"name": "after the new lens"}}):
     """The name of a calibration."""
 
     name: str = Field(min_length=1, max_length=100, pattern=r"^[^/\\\x00-\x1f]+$")
-
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"name": "after the new lens"}})
 
 
 class Return(Answer):
@@ -218,13 +202,11 @@ class Return(Answer):
     comment: str = Field(default="", max_length=2000)
 
 
-class ServiceEvent(Answer):
+class ServiceEvent(Answer, json_schema_extra={"example": {"what": "lens changed"}}):
     """What happened to the instrument."""
 
     what: str = Field(min_length=1, max_length=500)
     at: AwareDatetime | None = None
-
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"what": "lens changed"}})
 
 
 class CertificateOrder(Answer):
@@ -284,19 +266,18 @@ def the_decision(known: Configurations, name: str, key: str) -> Decision:
 
 def decision_row(decision: Decision) -> DecisionRow:
     """Return a decision as it is answered."""
-    return DecisionRow(
-        key=decision.key, name=decision.name or decision.session or f"{decision.since:%-d %B %Y %H:%M} UTC",
-        outcome=decision.outcome, since=decision.since.isoformat(),
-        at=decision.at.isoformat(), by=decision.by, comment=decision.comment,
-        compared_with=decision.compared_with,
-        findings=[FindingRow(rule=f.rule, level=f.level, text=f.text) for f in decision.judgement.findings],
-        reviewed_by=decision.reviewed_by, review=decision.review, comments=list(decision.comments),
-        session=decision.session,
-        earlier=[
-            EarlierRow(at=at.isoformat(), by=by, outcome=each.outcome, rules=int(str(each.rules["version"])))
-            for by, at, each in decision.earlier
-        ],
-    )  # fmt: skip
+    shown = {key: value for key, value in vars(decision).items() if key != "judgement"}
+    return DecisionRow.model_validate(
+        shown
+        | {
+            "name": decision.name or decision.session or f"{decision.since:%-d %B %Y %H:%M} UTC",
+            "findings": decision.judgement.findings,
+            "earlier": [
+                {"at": at, "by": by, "outcome": each.outcome, "rules": int(str(each.rules["version"]))}
+                for by, at, each in decision.earlier
+            ],
+        }
+    )
 
 
 def _in_force(service: Service, known: Configurations, name: str, now: datetime) -> InForce | None:
@@ -568,7 +549,10 @@ def certificate(name: Name, key: Key, given: CertificateOrder, who: Administerin
     from ...core.optional import optional
 
     with optional():
-        from ..certificates import CertificateData, certify, dcc_of, html_of, pdf_of, sign
+        from ..certificates import CertificateData, certify, html_of
+        from ..certificates.dcc import dcc_of
+        from ..certificates.page import pdf_of
+        from ..certificates.signature import sign
 
     known, keys = the_configuration(service, name), service.options
     decision = the_decision(known, name, key)

@@ -19,7 +19,6 @@ from .stored import picture_answer
 if TYPE_CHECKING:
     from ...calibration import Calibration
 
-__all__ = ["Chosen", "Comparison", "calibrated", "choices", "chosen", "comparison", "router"]
 
 router = APIRouter(tags=["calibrations"], responses=refusals(400, 401, 403, 404, 409, 422, 503))
 

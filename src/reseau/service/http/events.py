@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ...archive import Archive
 
-__all__ = ["BLUESKY", "Event", "Events"]
 
 _KEPT, _WAITING, _BEAT_S = 5000, 1000, 10.0
 _MOST_CLIENTS, _PART = 500, 100

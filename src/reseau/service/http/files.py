@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, File, Form, Path, UploadFile
-from pydantic import ConfigDict
 
 from ...core import vocabulary as v
 from ...core.errors import InputError, UsageError
@@ -14,9 +13,8 @@ from ...io.photographs import PHOTOGRAPHS
 from ..decoding import PHOTOGRAPH
 from .access import Here, NotFound, Operating, Reading
 from .answers import Answer, refusals
+from .service import Job
 from .sessions import SessionName, new_name, the_session
-
-__all__ = ["JobAnswer", "router"]
 
 router = APIRouter(tags=["files"], responses=refusals(400, 401, 403, 404, 413, 422, 503))
 
@@ -26,26 +24,11 @@ MOST_FILES, MOST_BYTES = 200, 200 << 20
 _MOST_DESIGN = 4 << 20
 
 
-class Uploaded(Answer):
+class Uploaded(Answer, json_schema_extra={"example": {"session": "left, March", "job": 1}}):
     """The session that the photographs became, and the computation that has begun."""
 
     session: str
     job: int
-
-    model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"example": {"session": "left, March", "job": 1}}
-    )
-
-
-class JobAnswer(Answer):
-    """A computation."""
-
-    number: int
-    what: Literal["finish", "rerun"]
-    session: str
-    state: Literal["waiting", "running", "done", "failed"]
-    found: Any
-    why: str
 
 
 def _label(name: str | None, number: int) -> str:
@@ -157,21 +140,21 @@ def _text(file: UploadFile) -> str:
 
 
 @router.post("/sessions/{session}/rerun", status_code=202)
-def rerun(session: SessionName, who: Operating, service: Here) -> JobAnswer:
+def rerun(session: SessionName, who: Operating, service: Here) -> Job:
     """Compute the results of a session again from its frames, and compare them byte by byte."""
     kept = the_session(service, session)
     if not kept.results():
         raise UsageError(f"has no results (status: {kept.status})", where=session)
-    return JobAnswer(**vars(service.jobs.add("rerun", session)))
+    return service.jobs.add("rerun", session)
 
 
 @router.get("/jobs/{number}")
 def job(
     number: Annotated[int, Path(ge=1, le=1 << 31, description="Number of the computation.")], who: Reading,
     service: Here,
-) -> JobAnswer:  # fmt: skip
+) -> Job:  # fmt: skip
     """A computation: its state, and what it found. The session has the results."""
     found = service.jobs.get(number)
     if found is None:
         raise NotFound("is no computation of this service since its start", where=number)
-    return JobAnswer(**vars(found))
+    return found

@@ -22,8 +22,6 @@ from starlette.exceptions import HTTPException
 
 from .options import ServeOptions
 
-__all__ = ["ARRIVED", "Guard", "Meters", "log"]
-
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]

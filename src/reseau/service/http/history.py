@@ -5,20 +5,19 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query, Request, Response
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from ...core.errors import UsageError
 from .access import Administering, Here, NotFound, Operating, Reading
-from .answers import Answer, Done, refusals
+from .answers import Answer, Done, Instant, refusals
 from .calibrations import SVG, the_configuration
 from .service import Service
 from .stored import picture_answer
 
 if TYPE_CHECKING:
     from ..covariates import CovariateTable
-    from ..inforce import Drift
+    from ..decisions import Drift
 
-__all__ = ["AlarmRow", "all_alarms", "drift_of", "router", "scheduled"]
 
 router = APIRouter(tags=["history"], responses=refusals(400, 401, 403, 404, 409, 422, 503))
 
@@ -67,7 +66,15 @@ class DriftAnswer(Answer):
     conversion_px: float
 
 
-class Covariates(Answer):
+class Covariates(
+    Answer,
+    json_schema_extra={
+        "examples": [
+            {"table": {"4f2a11d09c3e": {"temperature [°C]": 20.4}}},
+            {"recorded": ["air.temperature"]},
+        ]
+    },
+):
     """Covariates of each calibration: a table of them, or what sensors measured with the calibrations."""
 
     table: dict[str, dict[str, float]] = Field(
@@ -78,21 +85,11 @@ class Covariates(Answer):
         default_factory=list, max_length=20, description="In place of a table: names of recorded conditions."
     )
 
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={
-            "examples": [
-                {"table": {"4f2a11d09c3e": {"temperature [°C]": 20.4}}},
-                {"recorded": ["air.temperature"]},
-            ]
-        },
-    )
-
 
 class RunRow(Answer):
     """A run of a schedule."""
 
-    time: str
+    time: Instant
     state: str
     why: str
     attempts: int
@@ -111,7 +108,18 @@ class ScheduleRow(Answer):
     runs: list[RunRow]
 
 
-class NewSchedule(Answer):
+class NewSchedule(
+    Answer,
+    json_schema_extra={
+        "example": {
+            "name": "weekly",
+            "recalibration": "left",
+            "rule": "FREQ=WEEKLY;COUNT=52",
+            "start": "2026-03-02T08:00",
+            "zone": "Europe/Berlin",
+        }
+    },
+):
     """When a recalibration is due: a rule of RFC 5545 in a time zone."""
 
     name: str = Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00-\x1f]+$")
@@ -122,23 +130,13 @@ class NewSchedule(Answer):
     zone: str = Field(max_length=60)
     window_minutes: int = Field(default=240, ge=1, le=100_000)
 
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={
-            "example": {
-                "name": "weekly", "recalibration": "left", "rule": "FREQ=WEEKLY;COUNT=52",
-                "start": "2026-03-02T08:00", "zone": "Europe/Berlin",
-            }
-        },
-    )  # fmt: skip
-
 
 class AlarmRow(Answer):
     """An alarm; `key` names the event."""
 
     key: str
     text: str
-    sent: list[str]
+    sent: list[Instant]
     acknowledged: str
 
 
@@ -209,17 +207,9 @@ def scheduled(service: Service) -> list[ScheduleRow]:
         found = []
         for name in known.names():
             each = known.get(name)
-            runs = known.runs(name, ahead=3)
-            found.append(
-                ScheduleRow(
-                    name=name, recalibration=each.recalibration, configuration=each.configuration,
-                    rule=each.rule, start=each.start, zone=each.zone, window_minutes=each.window_minutes,
-                    runs=[
-                        RunRow(time=r.time.isoformat(), state=r.state, why=r.why, attempts=r.attempts)
-                        for r in runs[-20:]
-                    ],
-                )
-            )  # fmt: skip
+            runs = [RunRow.model_validate(run) for run in known.runs(name, ahead=3)[-20:]]
+            shown = each.model_dump(exclude={"except_for"})
+            found.append(ScheduleRow(**shown, runs=runs))
         return found
 
     return service.current("schedules", compute)
@@ -230,12 +220,7 @@ def all_alarms(service: Service) -> list[AlarmRow]:
     from ..alarms import Alarms
 
     def compute() -> list[AlarmRow]:
-        return [
-            AlarmRow(
-                key=a.key, text=a.text, sent=[at.isoformat() for at in a.sent], acknowledged=a.acknowledged
-            )
-            for a in Alarms(service.archive).all()
-        ]
+        return [AlarmRow.model_validate(each) for each in Alarms(service.archive).all()]
 
     found = service.current("alarms", compute)
     service.meters.alarms.set(sum(not each.acknowledged for each in found))

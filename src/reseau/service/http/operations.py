@@ -8,15 +8,12 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
-from pydantic import ConfigDict
 
 from ...core.version import __version__
-from ..audit import Head
+from ..audit import AuditEntry, Head
 from .access import Administering, Here, Reading, principal_of
 from .answers import TOO_MANY, Answer, refusals
 from .service import Service
-
-__all__ = ["audited", "open_router", "router"]
 
 router = APIRouter(tags=["service"], responses=refusals(400, 401, 403, 422, 503))
 open_router = APIRouter(tags=["service"], responses=refusals(403))
@@ -31,19 +28,9 @@ class About(Answer):
     uptime_s: float
 
 
-class AuditRow(Answer):
-    """An entry of the audit log."""
-
-    number: int
-    at: str
-    by: str
-    via: str
-    action: str
-    about: str
-    facts: dict[str, object]
-
-
-class AuditState(Answer):
+class AuditState(
+    Answer, json_schema_extra={"example": {"whole": True, "wrong": [], "number": 17, "head": "17 9f2c…"}}
+):
     """Whether the audit log is whole, and its head."""
 
     whole: bool
@@ -51,19 +38,12 @@ class AuditState(Answer):
     number: int
     head: str
 
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={"example": {"whole": True, "wrong": [], "number": 17, "head": "17 9f2c…"}},
-    )
 
-
-class Health(Answer):
+class Health(Answer, json_schema_extra={"example": {"status": "ready", "why": ""}}):
     """Whether it lives, and why it is not ready."""
 
     status: str
     why: str = ""
-
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"status": "ready", "why": ""}})
 
 
 @open_router.get("/health/live")
@@ -127,9 +107,9 @@ def audit(
     service: Here,
     count: Annotated[int, Query(ge=1, le=1000)] = 100,
     before: Annotated[int | None, Query(ge=1, le=1 << 62)] = None,
-) -> list[AuditRow]:
+) -> list[AuditEntry]:
     """The last entries of the audit log, newest first."""
-    return [AuditRow(**vars(each)) for each in service.audit.entries(count, before)]
+    return list(service.audit.entries(count, before))
 
 
 @router.get("/audit/state")

@@ -10,8 +10,6 @@ from urllib.parse import urlsplit
 
 from ...core.errors import UsageError
 
-__all__ = ["ServeOptions", "is_loopback"]
-
 
 @dataclass(frozen=True)
 class ServeOptions:

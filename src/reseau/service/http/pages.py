@@ -20,8 +20,6 @@ from . import accounts, benches, calibrations, comparisons, history, operations,
 from .access import Administering, Here, NotFound, Reading, Unknown, csrf_of, principal_of, service_of
 from .service import Service
 
-__all__ = ["rendered_error", "router"]
-
 router = APIRouter(include_in_schema=False)
 
 _STATIC = {
@@ -240,7 +238,7 @@ def _read_verdict(session: Session, found: sessions.SessionDetail) -> list[str]:
 def _verdict(session: Session, found: sessions.SessionDetail) -> list[str]:
     """What the results of a session are good for, in lines."""
     from ... import sessions as kinds
-    from ...io import RollSummary
+    from ...io.frame import RollSummary
 
     latest = {each.name: each for each in session.results()}
     if found.plan == "film" and "summary.json" in latest:

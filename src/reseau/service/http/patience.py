@@ -7,8 +7,6 @@ from typing import Any, ClassVar
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-__all__ = ["PatientProtocol"]
-
 _HEAD_S, _READ_S = 10.0, 30.0
 """Time in which the head of a request must arrive, and how long a client may not read."""
 _MOST_WAITING = 250

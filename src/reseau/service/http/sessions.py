@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
-from pydantic import ConfigDict
 
-from ...archive import ArchivedFrame, ArchivedResult, Session
+from ...archive import Session
+from ...archive.records import ArchivedFrame, ArchivedResult
 from ...core.errors import ArchiveError, ReseauError, UsageError
+from ...report.scene import Scene
 from ..decoding import PHOTOGRAPH
 from .access import Here, NotFound, Reading, principal_of
-from .answers import TOO_MANY, Answer, refusals
+from .answers import TOO_MANY, Answer, Instant, refusals
 from .events import BLUESKY
 from .service import Service
 from .stored import FILE_ANSWERS, file_answer, marks_of, picture_answer, preview_jpeg, result_named
-
-__all__ = ["SessionRow", "frames", "router", "rows", "session_detail", "the_session"]
 
 router = APIRouter(tags=["sessions"], responses=refusals(400, 401, 403, 404, 422, 503))
 
@@ -32,32 +30,34 @@ class SessionRow(Answer):
 
     name: str
     plan: str
-    begun: str
+    begun: Instant
     frames: int
     results: int
     status: str
 
 
-class SessionPage(Answer):
+class SessionPage(
+    Answer,
+    json_schema_extra={
+        "example": {
+            "sessions": [
+                {
+                    "name": "monday",
+                    "plan": "testfield",
+                    "begun": "2026-03-02T08:00:00+00:00",
+                    "frames": 36,
+                    "results": 2,
+                    "status": "done",
+                }
+            ],
+            "before": None,
+        }
+    },
+):
     """Sessions, latest first; `before` leads to the earlier ones."""
 
     sessions: list[SessionRow]
     before: str | None
-
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={
-            "example": {
-                "sessions": [
-                    {
-                        "name": "monday", "plan": "testfield", "begun": "2026-03-02T08:00:00+00:00",
-                        "frames": 36, "results": 2, "status": "done",
-                    }
-                ],
-                "before": None,
-            }
-        },
-    )  # fmt: skip
 
 
 class FrameRow(Answer):
@@ -92,7 +92,7 @@ class SessionDetail(Answer):
 
     name: str
     plan: str
-    begun: str
+    begun: Instant
     status: str
     why: str
     software: str
@@ -104,24 +104,6 @@ class SessionDetail(Answer):
     to_come: list[str]
     rejected: list[FrameRow]
     results: list[ResultRow]
-
-
-class CameraInSpace(Answer):
-    """An image: where its camera was, its axes right, down, forward, and tangents of half its view."""
-
-    name: str
-    position: tuple[float, float, float]
-    axes: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
-    field: tuple[float, float]
-
-
-class SceneAnswer(Answer):
-    """Cameras and points in space."""
-
-    unit: str
-    cameras: list[CameraInSpace]
-    points: list[str]
-    xyz: list[tuple[float, float, float]]
 
 
 class BlueskyDocument(Answer):
@@ -205,12 +187,9 @@ def _measurable(frame: ArchivedFrame) -> ArchivedFrame:
 def rows(service: Service, count: int, before: str | None = None, like: str = "") -> list[SessionRow]:
     """Return lines of the list, latest first."""
     return [
-        SessionRow(
-            name=s.name, plan=s.plan, begun=s.begun.isoformat(), frames=s.frames, results=s.results,
-            status=s.status,
-        )
-        for s in reversed(service.archive.sessions(last=count, before=before, like=like))
-    ]  # fmt: skip
+        SessionRow.model_validate(each)
+        for each in reversed(service.archive.sessions(last=count, before=before, like=like))
+    ]
 
 
 def _row(frame: ArchivedFrame) -> FrameRow:
@@ -252,12 +231,7 @@ def session_detail(service: Service, session: Session) -> SessionDetail:
         inputs={name: each.sha256 for name, each in session.inputs().items()}, expected=expected, good=good,
         taken=taken, to_come=to_come,
         rejected=[_row(each) for each in session.frames(kind="frame", ok=False, last=_MOST_REJECTED)],
-        results=[
-            ResultRow(
-                id=r.id, name=r.name, size=r.size, sha256=r.sha256, software=r.software, inputs=r.inputs
-            )
-            for r in session.results()
-        ],
+        results=[ResultRow.model_validate(each) for each in session.results()],
     )  # fmt: skip
 
 
@@ -369,14 +343,13 @@ def result_file(
 
 
 @router.get("/sessions/{session}/scene")
-def scene(session: SessionName, who: Reading, service: Here) -> SceneAnswer:
+def scene(session: SessionName, who: Reading, service: Here) -> Scene:
     """Cameras and target in space, as the calibration of the session found them."""
     kept = the_session(service, session)
     found = scene_result(kept)
     if found is None:
         raise NotFound("has no cameras in space", where=session)
-    content = json.loads(kept.content(found))
-    return SceneAnswer(**{key: value for key, value in content.items() if key != "schema"})
+    return Scene.parse(kept.content(found).decode("utf-8"), where=f"{session}: {found.name}")
 
 
 def scene_result(session: Session) -> ArchivedResult | None:

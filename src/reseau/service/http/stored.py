@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 
-from ...archive import ArchivedFrame, ArchivedResult, Session
+from ...archive import Session
+from ...archive.records import ArchivedFrame, ArchivedResult
 
 if TYPE_CHECKING:
     from ...core.data import Frame
     from ...report.overlay import Marks
 
-__all__ = ["FILE_ANSWERS", "file_answer", "marks_of", "picture_answer", "preview_jpeg"]
 
 _TYPES = {
     ".csv": "text/csv; charset=utf-8", ".html": "text/html; charset=utf-8", ".ics": "text/calendar",

@@ -1,0 +1,1 @@
+"""What the measurement of all marks has in common: their judgement, and the columns of results."""
