@@ -630,6 +630,31 @@ def test_half_a_chessboard_in_sight_is_measured() -> None:
     assert not [note for note in found.notes if note.code is Code.AMBIGUOUS]
 
 
+@pytest.mark.parametrize(
+    ("design", "other"),
+    [
+        (CHESS, board("chess", 10, 7, 20.0)),
+        (CHESS, CHESS),
+        (SHIFTED, CIRCLES),
+        (SHIFTED, SHIFTED),
+        (CHARUCO, CHARUCO),
+        (APRIL_ONE, APRIL_ONE),
+        (MARKERS, MARKERS),
+    ],
+    ids=lambda design: f"{design.kind} {design.columns}",
+)
+def test_a_board_is_told_apart_from_another_one_beside_it(design: BoardDesign, other: BoardDesign) -> None:
+    (right, truth), (left, second) = picture(design, turn=100.0), picture(other, turn=75.0)
+    frame = replace(right, pixels=np.hstack([left.pixels, right.pixels]))
+    found = measured(frame, design)
+    twice = Code.SEVERAL_TARGETS in [note.code for note in found.notes]
+    assert twice is (design == other)
+    if not twice or np.median(found.xy[found.ok, 0]) > left.width:
+        second = truth + np.array([left.width, 0])
+    assert found.ok.mean() > 0.9
+    assert np.abs(found.xy - second)[found.ok].max() < 0.06
+
+
 def test_a_corner_on_the_border_of_the_frame_is_declined() -> None:
     frame, truth = picture(CHESS, 20.0, 10.0)
     cut = int(np.round(truth[30, 0])) - 1

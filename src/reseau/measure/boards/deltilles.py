@@ -29,7 +29,7 @@ from ...optics import Chain
 from ..plane.growth import first_mapping, grown_through
 from ..plane.lattice_mapping import images_of
 from ..plane.levels import levels_around
-from .placement import Placed, cost_of, failed, numbered
+from .placement import NO_ROWS, Placed, cost_of, failed, laid_once, numbered
 
 __all__ = ["find_deltille", "lattice_of_deltille"]
 
@@ -92,6 +92,10 @@ class SixSectors:
 
     def __len__(self) -> int:
         return len(self.xy)
+
+    def select(self, keep: Mask | Rows) -> SixSectors:
+        """Selected places."""
+        return SixSectors(self.xy[keep], self.phase[keep], self.strength[keep])
 
 
 def _bells() -> list[Array]:
@@ -174,7 +178,7 @@ def find_oblique(grey: NDArray[np.float32], noise: float, angle: float) -> SixSe
     found = find_six_sectors(np.asarray(shorter, dtype=np.float32), noise)
     xy = (found.xy + low) @ np.linalg.inv(matrix).T
     inside = ((xy >= 0) & (xy <= [w - 1, h - 1])).all(axis=1)
-    return SixSectors(xy[inside], found.phase[inside], found.strength[inside])
+    return SixSectors(xy, found.phase, found.strength).select(inside)
 
 
 def find_deltille(
@@ -237,7 +241,7 @@ def lay_deltille(grey: NDArray[np.float32], corners: SixSectors, design: BoardDe
     """
     found = failed(0, _LATTICE)
     for few in _by_strength(corners):
-        laid = _laid(grey, few, design)
+        laid = laid_once(few, partial(_laid, grey, design), design)
         if not isinstance(laid, Failure):
             return laid
         # Another board than that which was designed says more than none.
@@ -262,8 +266,7 @@ def lattice_of_deltille(grey: NDArray[np.float32], noise: float, extent: int) ->
 def _by_strength(corners: SixSectors) -> Iterator[SixSectors]:
     """The strong ones, and more: edges and texture have weaker corners, some of them beside the true ones."""
     for share in _STRONG if len(corners) else ():
-        strong = corners.strength >= share * corners.strength[:_SHOWN].mean()
-        yield SixSectors(corners.xy[strong], corners.phase[strong], corners.strength[strong])
+        yield corners.select(corners.strength >= share * corners.strength[:_SHOWN].mean())
 
 
 def _grown(
@@ -290,12 +293,14 @@ def _grown(
     return best
 
 
-def _laid(grey: NDArray[np.float32], corners: SixSectors, design: BoardDesign) -> Placed | Failure:
+def _laid(
+    grey: NDArray[np.float32], design: BoardDesign, corners: SixSectors
+) -> tuple[Placed | Failure, Rows]:
     """A deltille among corners of one strength, see :func:`lay_deltille`."""
     shape = (grey.shape[0], grey.shape[1])
     best = _grown(grey, corners, design.columns + design.rows, _ENOUGH * len(design.nodes))
     if best is None or len(best[0]) < _FEWEST:
-        return failed(0 if best is None else len(best[0]), _LATTICE)
+        return failed(0 if best is None else len(best[0]), _LATTICE), NO_ROWS
     nodes, rows, mapping = best
     levels = np.median(_levels(grey, mapping, nodes), axis=0)
     cost = cost_of(float(levels[3:].mean()), float(levels[:3].mean()))
@@ -313,7 +318,7 @@ def _laid(grey: NDArray[np.float32], corners: SixSectors, design: BoardDesign) -
         return np.asarray((around[:, :3].min(axis=1) > between) & (around[:, 3:].max(axis=1) > between))
 
     known = nodes.astype(np.intp), corners.xy[rows], mapping, shape
-    return numbered(design, *known, None, missed, ends=ended)
+    return numbered(design, *known, None, missed, ends=ended), rows
 
 
 def _seeds(corners: SixSectors) -> list[tuple[int, Array]]:

@@ -8,10 +8,10 @@ has not. Where several places are equally good, one is taken and the user is tol
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import Any
+from typing import Any, Protocol, Self, TypeVar
 
 import cv2
 import numpy as np
@@ -44,11 +44,14 @@ from .candidates import (
 from .puzzles import MISREAD, QUARTER, PuzzlePart, part_of_code
 
 __all__ = [
+    "NO_ROWS",
+    "SECOND",
     "THIRD",
     "Placed",
     "cost_of",
     "failed",
     "find_puzzle",
+    "laid_once",
     "lay_chessboard",
     "lay_circles",
     "lay_marked",
@@ -94,6 +97,8 @@ _EVEN = 0.5
 """Largest difference of two dark sectors, as a share of their contrast to the paper."""
 _PUZZLE = 40
 """Largest number of corners of a PuzzleBoard of unknown size, along an axis from any of them."""
+SECOND = Remark("the frame shows the board more than once: one of them is measured", Code.SEVERAL_TARGETS)
+NO_ROWS: Rows = np.zeros(0, dtype=np.intp)
 _AROUND = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, 0.5], [-0.5, -0.5]])
 """Middles of the squares that meet in a node."""
 THIRD = np.array([[-1, -1], [1, 0]])
@@ -108,6 +113,55 @@ class Placed:
     notes: tuple[Remark, ...] = ()
     certain: bool = True
     """Whether the frame shows which points they are, except for turns by which the board equals itself."""
+
+
+class _Points(Protocol):
+    """Places of a frame that look like points of boards, in columns."""
+
+    @property
+    def xy(self) -> Array:
+        """Positions (m, 2)."""
+
+    def select(self, keep: Mask | Rows) -> Self:
+        """Selected places."""
+
+
+P = TypeVar("P", bound=_Points)
+
+
+def laid_once(
+    points: P, lay: Callable[[P], tuple[Placed | Failure, Rows]], design: BoardDesign
+) -> Placed | Failure:
+    """The board on the first lattice of points that its design explains.
+
+    Parameters
+    ----------
+    points : Saddles, Disks or SixSectors
+        Places that look like points of the board.
+    lay : callable
+        Where the board is if it is the largest lattice of some of them, and the rows of that lattice.
+    design : BoardDesign
+        The board.
+    """
+    best: Placed | Failure | None = None
+    while True:
+        found, rows = lay(points)
+        if best is None:
+            best = found
+        elif len(rows) < _ENOUGH * len(design.ids):
+            # The rest of the scene is no board.
+            return best
+        elif isinstance(best, Placed):
+            return replace(best, notes=(*best.notes, SECOND)) if isinstance(found, Placed) else best
+        elif isinstance(found, Placed):
+            best = found
+        if not len(rows):
+            return best
+        # Another one may be beside it, or in front of it.
+        tree = scipy.spatial.KDTree(points.xy[rows])
+        apart = tree.query(points.xy[rows], k=2)[0][:, 1]
+        gap, nearest = tree.query(points.xy)
+        points = points.select(gap > apart[nearest] / 2)
 
 
 def failed(found: int, what: str) -> Failure:
@@ -127,13 +181,20 @@ def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDes
     design : BoardDesign
         A chessboard.
     """
+    return laid_once(saddles, partial(_laid_on_corners, grey, design), design)
+
+
+def _laid_on_corners(
+    grey: NDArray[np.float32], design: BoardDesign, saddles: Saddles
+) -> tuple[Placed | Failure, Rows]:
+    """See :func:`laid_once`."""
     numbers, shape = design.nodes, (grey.shape[0], grey.shape[1])
     extent = int(numbers.max()) + 2
     best: tuple[Array, Rows, Chain] | None = None
     enough, mesh = _ENOUGH * len(numbers), 0.0
     for row, step in seeds(saddles)[:_SEEDS]:
         size = abs(float(np.linalg.det(step)))
-        # Another board may be in the scene, or a picture of one: the largest in the frame counts.
+        # Another board may be in the scene, or a picture of one: the largest in the frame comes first.
         if best is not None and len(best[0]) >= enough and size < _LARGER * mesh:
             continue
         found = grown(grey, saddles, first_mapping(step, saddles.xy[row], shape), extent)
@@ -141,7 +202,7 @@ def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDes
             best, mesh = found, size
     least = min(_FEWEST, len(numbers))
     if best is None or len(best[0]) < least:
-        return failed(0 if best is None else len(best[0]), "corners in a lattice")
+        return failed(0 if best is None else len(best[0]), "corners in a lattice"), NO_ROWS
     nodes, rows, mapping = best
     # The sector of a corner between the steps to the right and downwards is black where the sum is even, as
     # the square there is the one of the upper left corner, moved diagonally.
@@ -167,8 +228,8 @@ def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDes
     if isinstance(placed, Failure) and design.kind == "puzzle" and bits is not None:
         part = part_of_code(known[0], bits, _mirrored(mapping))
         if not isinstance(part, Failure):
-            return Failure(f"the frame shows {part}, others than the board has", Code.OTHER_DESIGN)
-    return placed
+            placed = Failure(f"the frame shows {part}, others than the board has", Code.OTHER_DESIGN)
+    return placed, rows
 
 
 def find_puzzle(grey: NDArray[np.float32], saddles: Saddles) -> PuzzlePart | Failure:
@@ -449,11 +510,18 @@ def lay_circles(grey: NDArray[np.float32], disks: Disks, design: BoardDesign) ->
     design : BoardDesign
         A grid of circles.
     """
+    disks = disks.strongest(MOST_DISKS * len(design.ids))
+    return laid_once(disks, partial(_laid_on_circles, grey, design), design)
+
+
+def _laid_on_circles(
+    grey: NDArray[np.float32], design: BoardDesign, disks: Disks
+) -> tuple[Placed | Failure, Rows]:
+    """See :func:`laid_once`."""
     assert design.size is not None
     shape = (grey.shape[0], grey.shape[1])
     numbers = design.nodes @ _lattice_of(design).T // (2 if design.asymmetric else 1)
     step = design.pitch * (np.sqrt(2) if design.asymmetric else 1.0)
-    disks = disks.strongest(MOST_DISKS * len(numbers))
     extent = int(np.ptp(numbers, axis=0).max()) + 2
     best: tuple[Array, Rows, Chain] | None = None
     again = False
@@ -469,7 +537,7 @@ def lay_circles(grey: NDArray[np.float32], disks: Disks, design: BoardDesign) ->
             break
     if best is None or len(best[0]) < min(_FEWEST, len(numbers)):
         width = f"circles with a diameter of {100 * design.size / design.pitch:.0f} % of the pitch"
-        return failed(0 if best is None else len(best[0]), f"{width} in a lattice")
+        return failed(0 if best is None else len(best[0]), f"{width} in a lattice"), NO_ROWS
     nodes, rows, mapping = best
 
     def seen(nodes: Array) -> tuple[Array, Array, Array]:
@@ -493,7 +561,7 @@ def lay_circles(grey: NDArray[np.float32], disks: Disks, design: BoardDesign) ->
         return gone(beyond, beside=True)
 
     known = nodes.astype(np.intp), disks.xy[rows], mapping, shape
-    return numbered(design, *known, None, cost, ends=ended)
+    return numbered(design, *known, None, cost, ends=ended), rows
 
 
 def _lattice_of(design: BoardDesign) -> Integers:
@@ -533,10 +601,10 @@ def _plane_of_markers(
 
 def _agreeing(
     design: BoardDesign, corners: Array, numbers: NDArray[np.intp], shape: tuple[int, int]
-) -> tuple[Rows, Array, Array, Mask] | Failure:
+) -> tuple[Rows, Array, Array, Mask, Chain, tuple[Remark, ...]] | Failure:
     """Markers of the board that were read: their rows (m,), corners (4 m, 2) in pitches and in the image.
 
-    Also which corners agree with the places of the others.
+    Also which corners agree with the places of the others, the mapping through these, and notes.
     """
     own, places = design.markers
     row_of = {int(number): k for k, number in enumerate(own)}
@@ -553,10 +621,15 @@ def _agreeing(
     if 0 < len(rows) <= min(2 * astray, _FEW_READ):
         # Nothing tells which of them are misread.
         return Failure(f"the {len(rows)} markers read do not agree with each other", Code.INCONSISTENT)
+    use = np.repeat(whole, 4) if whole.any() else good
+    mapping = plane_through(plane[use], image[use], shape, _READ_PX)
+    # Markers beside the board do not contradict it.
+    near = whole | _on_board(mapping, places.mean(axis=1) / design.pitch, corners.mean(axis=1))
     if len(rows) > _FEW_READ and astray > 1:
         other = design.model_copy(update={"legacy": not design.legacy}).markers[1][rows].reshape(-1, 2)
         alike = _plane_of_markers(other / design.pitch, image, shape)[1].reshape(-1, 4).all(axis=1)
-        if astray > _ASTRAY * len(rows) or (~alike).sum() < astray:
+        contrary = int((near & ~whole).sum())
+        if contrary > _ASTRAY * near.sum() or (~alike).sum() < astray:
             return Failure(
                 f"{astray} of {len(rows)} markers lie at other places than on the board: it has "
                 "another layout (old or new) or number of columns",
@@ -564,7 +637,18 @@ def _agreeing(
             )
     if np.linalg.det(matrix[:2, :2] - np.outer(matrix[:2, 2], matrix[2, :2]) / matrix[2, 2]) > 0:
         return Failure("the board is seen mirrored", Code.MIRRORED)
-    return rows, plane, image, np.repeat(whole, 4) if whole.any() else good
+    beside = corners[~near], numbers[keep][~near]
+    twice = len(beside[0]) > _FEW_READ and not isinstance(_agreeing(design, *beside, shape), Failure)
+    each = np.repeat(near, 4)
+    return rows[near], plane[each], image[each], use[each], mapping, (SECOND,) * twice
+
+
+def _on_board(mapping: Chain, markers: Array, seen: Array) -> Mask:
+    """Whether places (m, 2) of a frame are those of markers (n, 2) of the board, or between them."""
+    tree = scipy.spatial.KDTree(images_of(mapping, markers))
+    gap, nearest = tree.query(seen)
+    apart = tree.query(tree.data[nearest], k=2)[0][:, 1]
+    return np.asarray(gap < apart / np.sqrt(2))
 
 
 def lay_marked(
@@ -596,8 +680,7 @@ def lay_marked(
     agreeing = _agreeing(design, *markers, shape)
     if isinstance(agreeing, Failure):
         return agreeing
-    rows, plane, image, use = agreeing
-    mapping = plane_through(plane[use], image[use], shape, _READ_PX)
+    rows, plane, image, use, mapping, notes = agreeing
     nodes = design.xy / design.pitch
     frame, origin = np.eye(2) / design.pitch, np.zeros(2)
     if design.kind == "markers":
@@ -605,7 +688,7 @@ def lay_marked(
         whole = use.reshape(-1, 4).all(axis=1)
         of = (4 * rows[whole][:, None] + np.arange(4)).ravel()
         known[of], start[of] = True, image[np.repeat(whole, 4)]
-        return Placed(Located(design.ids, design.xy, "dark", mapping, frame, origin, known, start))
+        return Placed(Located(design.ids, design.xy, "dark", mapping, frame, origin, known, start), notes)
     known = np.zeros(len(nodes), dtype=bool)
     start = images_of(mapping, nodes)
     dark, apart = _dark_sectors(design), 1.0
@@ -644,7 +727,7 @@ def lay_marked(
     if known.sum() < 4:
         return failed(int(known.sum()), "corners beside the markers read")
     mapping = again_through(nodes[known], start[known]) if known.sum() >= _FEWEST else mapping
-    return Placed(Located(design.ids, design.xy, "dark", mapping, frame, origin, known, start))
+    return Placed(Located(design.ids, design.xy, "dark", mapping, frame, origin, known, start), notes)
 
 
 def _filled(grey: NDArray[np.float32], mapping: Chain, nodes: Array, dark: Mask) -> Mask:

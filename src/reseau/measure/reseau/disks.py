@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ...core.data import Array, Mask
+from ...core.data import Array, Mask, Rows
 from .components import part_sums
 
 __all__ = ["Disks", "find_disks"]
@@ -54,7 +54,11 @@ class Disks:
 
     def strongest(self, count: int) -> Disks:
         """At most `count` of the strongest ellipses."""
-        return Disks(self.xy[:count], self.form[:count], self.t[:count])
+        return self.select(np.arange(min(count, len(self))))
+
+    def select(self, keep: Mask | Rows) -> Disks:
+        """Selected ellipses."""
+        return Disks(self.xy[keep], self.form[keep], self.t[keep])
 
 
 def find_disks(grey: NDArray[np.float32], valid: Mask, noise: float) -> Disks:

@@ -41,6 +41,8 @@ _BASES = np.array(
 """Bases of a lattice: seen at a flat angle, a diagonal is as short as an axis."""
 _LEGIBLE_PX = 4.0
 """Distance of targets, along the axis where it is larger, below which they are sought at a finer scale."""
+_MUCH = 0.1
+"""Share of the spots on a lattice from which others are searched among the rest."""
 _LEAST = 12
 """Minimum number of targets on a lattice."""
 _OFF_STEP = 0.1
@@ -90,18 +92,25 @@ def lattices(xy: Array, design: TestfieldDesign, shape: tuple[int, ...]) -> Iter
     >>> bool(np.abs(centre - xy.mean(axis=0)).max() < 0.1)
     True
     """
-    if len(xy) < _LEAST:
-        return
     first = np.array(design.targets.square) == 1
     places = np.unique((design.xy[first, 0] - design.centres[0, 0]).round(3)) / design.pitch + 0.5
-    largest: Rows = np.zeros(0, dtype=np.intp)
-    for seed, steps in _seeds(xy):
-        if seed in largest or np.linalg.norm(steps, axis=0).max() < _LEGIBLE_PX:
-            continue
-        nodes, rows = _grown(xy, seed, steps, shape)
-        if len(nodes) >= max(_LEAST, 1.2 * len(largest)):
-            largest = rows
-            yield from _between_lines(nodes, xy[rows], places, shape)
+    while len(xy) >= _LEAST:
+        # Of targets that are legible, and of others.
+        largest = [np.zeros(0, dtype=np.intp)] * 2
+        for seed, steps in _seeds(xy):
+            if any(seed in rows for rows in largest):
+                continue
+            nodes, rows = _grown(xy, seed, steps, shape)
+            fine = int(np.linalg.norm(steps, axis=0).max() < _LEGIBLE_PX)
+            if len(nodes) >= max(_LEAST, 1.2 * len(largest[fine])):
+                largest[fine] = rows
+                if not fine:
+                    yield from _between_lines(nodes, xy[rows], places, shape)
+        taken = np.union1d(*largest)
+        if len(taken) < _MUCH * len(xy):
+            return
+        # Another testfield, of which the targets may be larger, may be beside it.
+        xy = np.delete(xy, taken, axis=0)
 
 
 def extremes(dark: NDArray[np.float32], noise: float) -> Array:

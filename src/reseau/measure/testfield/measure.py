@@ -81,6 +81,9 @@ sharpness, contrast and size differ from the usual by less than this share."""
 FORMED_PX = 0.002
 """Standard deviation of a coordinate from what no image shows: edges of prints, unequal pixels, formation of
 images. Other programs for the formation of images agree with ours to this."""
+_SECOND = Remark(
+    "the frame shows the testfield more than once: one of them is measured", Code.SEVERAL_TARGETS
+)
 _BLURRED, _PALE, _GROWN = 1.5, 0.25, 0.15
 """Tolerances of sharpness (factor), contrast and size (shares) of a target relative to the others."""
 
@@ -221,12 +224,7 @@ def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) 
     read = SearchedFrame(screened.grey, grey, noise, design, options.psf_px, response).read()
     if isinstance(read, Failure):
         return replace(read, where=frame.name)
-    if shows_second(read):
-        return Failure(
-            f"shows two testfields {design.name!r}; crop the image to one of them",
-            Code.SEVERAL_TARGETS,
-            where=frame.name,
-        )
+    second = _SECOND if shows_second(read) else None
     (lattice, reading), placed = read.original(), read.placed
     valid = screened.valid & (frame.pixels < frame.full_scale)
     size = (float(frame.width), float(frame.height))
@@ -258,7 +256,7 @@ def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) 
         reading=reading,
         squares=placed.squares,
         **work.columns(),
-        notes=() if note is None else (note,),
+        notes=tuple(each for each in (second, note) if each is not None),
     )
 
 
@@ -571,6 +569,10 @@ class _Measurement:
         some = np.flatnonzero(uneasy)[seen >= _SEEN]
         covered[uneasy] = (seen < _SEEN) & ~(found.correlation[uneasy] > _LIKE)
         found.seen[covered] = seen[covered[uneasy]]
+        if not len(some):
+            return found, covered
+        if not len(some):
+            return found, covered
         among = self._among(np.isin(np.arange(len(found)), some))
         again = match_targets(self.scene.through(valid), self.rows, among, searching=False)
         better = again.converged & (again.seen >= _SEEN) & ~(again.noise > _CLEARED * found.noise[some])
