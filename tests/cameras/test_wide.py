@@ -17,6 +17,7 @@ from reseau.io.network import Network1
 from reseau.optics.cameras import (
     Division,
     DoubleSphere,
+    EnhancedUnified,
     Equisolid,
     Fisheye,
     Omni,
@@ -125,6 +126,10 @@ def published(kind: str, x: Array, shape: tuple[float, ...]) -> Array:
         d1 = np.linalg.norm(x, axis=1)
         d2 = np.sqrt((x[:, :2] ** 2).sum(axis=1) + (xi * d1 + x[:, 2]) ** 2)
         return x[:, :2] / (alpha * d2 + (1 - alpha) * (xi * d1 + x[:, 2]))[:, None]
+    if kind == "eucm":
+        alpha, beta = shape
+        d = np.sqrt(beta * (x[:, :2] ** 2).sum(axis=1) + x[:, 2] ** 2)
+        return x[:, :2] / (alpha * d + (1 - alpha) * x[:, 2])[:, None]
     # Division: the ideal radius as a function of that in the image, solved by bisection.
     low, high = np.zeros(len(x)), np.minimum(np.tan(angle) * 1.001, (1 - 1e-12) / np.sqrt(-shape[0]))
     for _ in range(200):
@@ -144,6 +149,8 @@ def published(kind: str, x: Array, shape: tuple[float, ...]) -> Array:
         (Omni, "omni", (1.6,)),
         (DoubleSphere, "double_sphere", (-0.18, 0.59)),
         (DoubleSphere, "double_sphere", (0.6, 0.3)),
+        (EnhancedUnified, "eucm", (0.59, 1.13)),
+        (EnhancedUnified, "eucm", (0.25, 0.6)),
         (Division, "division", (-0.3,)),
     ],
 )
@@ -169,6 +176,8 @@ def test_projections_are_those_of_their_publications(
     [
         (Omni([*FRAME, -0.8]), np.degrees(np.arccos(0.8))),
         (DoubleSphere([*FRAME, -0.7, 0.4]), 80.0),
+        (EnhancedUnified([*FRAME, -0.8, 1.2]), np.degrees(np.arctan(np.sqrt((2.25**2 - 1) / 1.2)))),
+        (EnhancedUnified([*FRAME, 1.5, 2.0]), np.degrees(np.arctan(2.0))),
         (Division([*FRAME, 0.3]), np.degrees(np.arctan(np.sqrt(1 / 1.2)))),
     ],
 )

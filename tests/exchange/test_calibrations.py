@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -39,13 +40,15 @@ CAMERAS = {
         "openptv",
         {"c": 8.1, "x0": 0.05, "y0": -0.08, "K1": -3e-3, "P2": 4e-5, "B1": 2e-4, "she": 1e-4},
     ),
+    "ellipsoid": ("eucm", CENTRE | {"alpha": 0.6, "beta": 1.1}),
     "spheres": ("double_sphere", CENTRE | {"xi": -0.2, "alpha": 0.56}),
 }
 # Which cameras each format holds without conversion.
 HELD = {
     "opencv": ("radial", "five", "rational", "prism", "tilted", "fisheye"),
     "ros": ("radial", "five", "rational", "fisheye"),
-    "kalibr": ("radial", "fisheye", "omni", "spheres"),
+    "kalibr": ("radial", "fisheye", "omni", "spheres", "ellipsoid"),
+    "basalt": ("radial", "five", "rational", "fisheye", "spheres", "ellipsoid"),
     "colmap": ("radial", "rational", "fisheye"),
     "mrcal": ("radial", "five", "rational", "prism"),
     "metashape": ("radial", "five", "fisheye"),
@@ -121,6 +124,52 @@ def test_a_model_that_a_format_lacks_is_converted_with_its_differences(
     inside = (np.abs(projected(given) - np.array(SIZE) / 2) < np.array(SIZE) / 2).all(axis=1)
     difference = np.linalg.norm(projected(again) - projected(given), axis=1)
     assert difference[inside].max() < 1.1 * done.greatest_px
+
+
+def basalt(kind: str, **intrinsics: float) -> str:
+    cameras = [
+        {"camera_type": kind, "intrinsics": {"fx": 194.3, "fy": 194.2, "cx": 251.8, "cy": 191.7} | intrinsics}
+    ]
+    content = {"T_imu_cam": [], "intrinsics": cameras * 2, "resolution": [[512, 384]] * 2, "vignette": []}
+    return json.dumps({"value0": content})
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "plane"),
+    [
+        ("pinhole", {}, (0.5, 0.4)),
+        # x/z (1 + k1 r² + …)/(1 + k4 r² + …), with r² = 0.41.
+        ("pinhole-radtan8", {"k1": 0.3, "k4": 0.5, "rpmax": 2.7, "k2": 0.0, "k3": 0.0, "k5": 0.0, "k6": 0.0,
+                             "p1": 0.0, "p2": 0.0}, (0.5 * 1.123 / 1.205, 0.4 * 1.123 / 1.205)),
+        # x/(α√(β(x² + y²) + z²) + (1 − α)z), with β = 1 and 0.9.
+        ("ucm", {"alpha": 0.7}, (0.5 / (0.7 * 1.41**0.5 + 0.3), 0.4 / (0.7 * 1.41**0.5 + 0.3))),
+        ("eucm", {"alpha": 0.7, "beta": 0.9},
+         (0.5 / (0.7 * 1.369**0.5 + 0.3), 0.4 / (0.7 * 1.369**0.5 + 0.3))),
+    ],
+)  # fmt: skip
+def test_cameras_of_basalt_project_as_their_formulas(
+    kind: str, values: dict[str, float], plane: tuple[float, float], tmp_path: Path
+) -> None:
+    path = tmp_path / "calibration.json"
+    path.write_text(basalt(kind, **values))
+    mapping = import_calibration(path).mapping()
+    expected = np.array(plane) * [194.3, 194.2] + [251.8, 191.7]
+    np.testing.assert_allclose(mapping.to_pixels([[0.5, 0.4]])[0], expected, rtol=0, atol=1e-9)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (basalt("fov", w=0.9), "camera type 'fov'; known are pinhole"),
+        (basalt("ds", xi=-0.2), "not all of fx, fy, cx, cy, xi, alpha"),
+        (basalt("pinhole").replace("512", "[]"), "no complete intrinsics and resolution"),
+    ],
+)
+def test_a_calibration_of_basalt_that_is_incomplete_is_refused(text: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "calibration.json"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=said):
+        import_calibration(path)
 
 
 @pytest.mark.parametrize("number", ["-" * 100_000, "[" * 100_000, "1e999"])

@@ -29,8 +29,8 @@ def export(
         str | None,
         typer.Option(
             metavar="FORMAT",
-            help="Format of the calibration: opencv, ros, kalibr, colmap, mrcal, metashape, photomodeler, "
-            "dbat, matlab, openptv, reseau.",
+            help="Format of the calibration: opencv, ros, kalibr, basalt, colmap, mrcal, metashape, "
+            "photomodeler, dbat, matlab, openptv, reseau.",
         ),
     ] = None,
     out: v.Out | None = None,

@@ -17,7 +17,7 @@ from ...io import read_text, write_whole
 from ...optics import PixelGrid
 from ...optics.cameras import SplinedStereographic, SplineGrid, camera_model, convert, unit_of
 from ...optics.poses import rotation_matrix
-from . import brown, colmap, matlab, metashape, mrcal, opencv, openptv, yamls
+from . import basalt, brown, colmap, matlab, metashape, mrcal, opencv, openptv, yamls
 from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, Mounted, PlainCamera
 
 __all__ = [
@@ -39,8 +39,8 @@ _EIGHT, _TWELVE = (*_CENTRE, *RATIONAL), (*_CENTRE, *THIN_PRISM)
 _FISHEYE = (*_CENTRE, "k1", "k2", "k3", "k4")
 # The most specific formats are tried first.
 _ORDER = (
-    "ros", "kalibr", "mrcal", "dbat", "micmac", "metashape", "opencv", "matlab", "openptv", "photomodeler",
-    "colmap",
+    "ros", "kalibr", "basalt", "mrcal", "dbat", "micmac", "metashape", "opencv", "matlab", "openptv",
+    "photomodeler", "colmap",
 )  # fmt: skip
 # Pixel size where none is known: models in mm have only ratios to it.
 _NOMINAL_MM = 0.005
@@ -111,6 +111,7 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
     True
     """
     wide, fisheye = (("opencv", _FIVE), ("opencv", _EIGHT)), ("fisheye", _FISHEYE)
+    spheres = ("double_sphere", (*_CENTRE, "xi", "alpha")), ("eucm", (*_CENTRE, "alpha", "beta"))
     formats = (
         CalibrationFormat(
             "opencv", (".yml", ".yaml", ".xml", ".json"),
@@ -124,8 +125,12 @@ def calibration_formats() -> dict[str, CalibrationFormat]:
         CalibrationFormat(
             "kalibr", (".yaml",),
             (("opencv", _RADTAN), fisheye, ("omni", (*_RADTAN, "xi")),
-             ("double_sphere", (*_CENTRE, "xi", "alpha"))),
+             *spheres),
             yamls.write_kalibr, yamls.is_kalibr, yamls.read_kalibr, comment=_hash,
+        ),
+        CalibrationFormat(
+            "basalt", (".json",), (("opencv", _EIGHT), fisheye, *spheres),
+            basalt.write, basalt.recognises, basalt.read,
         ),
         CalibrationFormat(
             "colmap", (".txt",), (("opencv", _RADTAN), ("opencv", _EIGHT), fisheye),

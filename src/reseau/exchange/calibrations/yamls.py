@@ -2,7 +2,8 @@
 
 ROS: sensor_msgs/CameraInfo as ``camera_calibration`` writes it, with the models ``plumb_bob``,
 ``rational_polynomial`` and ``equidistant``. Kalibr: pinhole cameras with ``radtan`` or ``equidistant``
-distortion, ``omni`` with ``radtan``, ``ds`` without. Pixels are counted from the centre of the first one.
+distortion, ``omni`` with ``radtan``, ``ds`` and ``eucm`` without. Pixels are counted from the centre of the
+first one.
 """
 
 from __future__ import annotations
@@ -20,6 +21,12 @@ from .plain import RADIAL_TANGENTIAL, Mounted, PlainCamera, opencv_camera
 
 __all__ = ["is_kalibr", "is_ros", "read_kalibr", "read_ros", "write_kalibr", "write_kalibr_rig", "write_ros"]
 
+_SHAPES = {
+    "omni": ("omni", ("xi",)),
+    "double_sphere": ("ds", ("xi", "alpha")),
+    "eucm": ("eucm", ("alpha", "beta")),
+}
+"""Registered models, those of Kalibr, and the parameters that come first."""
 _ROS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,), "fisheye": (4,)}
 
 
@@ -110,12 +117,10 @@ def _chain(entries: list[dict[str, Any]]) -> str:
 
 def _entry(camera: PlainCamera) -> dict[str, Any]:
     centre = camera.of("fx", "fy", "cx", "cy")
-    kind, own = {"omni": ("omni", ["xi"]), "double_sphere": ("ds", ["xi", "alpha"])}.get(
-        camera.model, ("pinhole", [])
-    )
-    distortion = {"opencv": "radtan", "fisheye": "equidistant", "omni": "radtan", "double_sphere": "none"}
+    kind, own = _SHAPES.get(camera.model, ("pinhole", ()))
+    distortion = {"opencv": "radtan", "fisheye": "equidistant", "omni": "radtan"}
     names = {"radtan": RADIAL_TANGENTIAL, "equidistant": ("k1", "k2", "k3", "k4"), "none": ()}
-    model = distortion[camera.model]
+    model = distortion.get(camera.model, "none")
     return {
         "camera_model": kind,
         "intrinsics": [*camera.of(*own), *centre],
@@ -145,11 +150,11 @@ def read_kalibr(text: str, path: Path) -> PlainCamera:
         values = [float(v) for v in entry["intrinsics"]]
         found = [float(v) for v in entry.get("distortion_coeffs", ())]
         width, height = (int(v) for v in entry["resolution"])
-        own = {"pinhole": (), "omni": ("xi",), "ds": ("xi", "alpha")}[kind]
+        registered, own = {"pinhole": ("opencv", ()), **{k: (n, o) for n, (k, o) in _SHAPES.items()}}[kind]
         *shape, fx, fy, cx, cy = values
     except (KeyError, TypeError, ValueError, AttributeError):
         raise FormatError(
-            "has no complete camera cam0 of the model pinhole, omni or ds", where=path
+            "has no complete camera cam0 of the model pinhole, omni, ds or eucm", where=path
         ) from None
     names = {"radtan": RADIAL_TANGENTIAL, "equidistant": ("k1", "k2", "k3", "k4"), "none": ()}.get(model)
     if (
@@ -167,7 +172,6 @@ def read_kalibr(text: str, path: Path) -> PlainCamera:
     plain = opencv_camera(name, (width, height), (fx, fy), (cx, cy), found, path)
     if kind == "pinhole":
         return plain
-    registered = {"omni": "omni", "ds": "double_sphere"}[kind]
     return PlainCamera(
         name, width, height, registered, {**plain.values, **dict(zip(own, shape, strict=True))}
     )

@@ -15,6 +15,7 @@ from .opencv import OpenCV, opencv_coefficients  # isort: skip
 from .projections import (  # isort: skip
     Division,
     DoubleSphere,
+    EnhancedUnified,
     Equisolid,
     Fisheye,
     Omni,
@@ -56,6 +57,7 @@ __all__ = [
     "Division",
     "DoubleSphere",
     "EbnerCorrection",
+    "EnhancedUnified",
     "Equisolid",
     "Fisheye",
     "FourierCorrection",

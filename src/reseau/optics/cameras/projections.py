@@ -1,8 +1,8 @@
 """Wide-angle cameras: a projection that is symmetric about the axis, then distortion of its plane.
 
 One family: ``fisheye`` (the equidistant projection, OpenCV's fisheye), ``equisolid``, ``orthographic``,
-``stereographic``, ``omni`` (the unified sphere of Mei, OpenCV's omnidir), ``double_sphere`` and ``division``;
-mappings, kernel and registrations.
+``stereographic``, ``omni`` (the unified sphere of Mei, OpenCV's omnidir), ``double_sphere``, ``eucm`` (the
+enhanced unified model) and ``division``; mappings, kernel and registrations.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from collections.abc import Mapping as Named
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,6 +27,7 @@ from .registry import CameraModel, Parameter, register_camera
 __all__ = [
     "Division",
     "DoubleSphere",
+    "EnhancedUnified",
     "Equisolid",
     "Fisheye",
     "Omni",
@@ -36,7 +37,7 @@ __all__ = [
 ]
 
 # Kinds of projection; the first constant of the kernel. The second is the number of parameters of the shape.
-EQUIDISTANT, EQUISOLID, ORTHOGRAPHIC, STEREOGRAPHIC, SPHERE, TWO_SPHERES, DIVISION = range(7)
+EQUIDISTANT, EQUISOLID, ORTHOGRAPHIC, STEREOGRAPHIC, SPHERE, TWO_SPHERES, ELLIPSOID, DIVISION = range(8)
 KIND, SHAPES = 0, 1
 FX, FY, CX, CY, SHAPE = range(5)
 # Parameters of the plane, after those of the shape.
@@ -44,6 +45,8 @@ K1, K2, K3, K4, P1, P2, SX1, SY1 = range(8)
 PLANE: Final = ("k1", "k2", "k3", "k4", "p1", "p2", "sx1", "sy1")
 # Below this s the quotient θ/r is a series, which loses no digits.
 _SMALL = 1e-4
+# Of a lens that is not wide, α and β act alike; usual values of β are 1 within this.
+_PRIORS = {"beta": 0.3}
 # Tangent of the largest angle at which the inverse starts.
 _WIDEST = 50.0
 
@@ -349,6 +352,46 @@ class DoubleSphere(Projected):
 
 
 @dataclass(frozen=True, eq=False)
+class EnhancedUnified(Projected):
+    """The enhanced unified model with distortion: with d = √(1 + βr²), m = (u, v)/(αd + 1 − α).
+
+    Khomutenko, B., Garcia, G. & Martinet, P. (2016), An enhanced unified camera model, IEEE Robotics and
+    Automation Letters 1(1), eq. (8), Kalibr's and Basalt's ``eucm``. With β = 1 it is the unified sphere with
+    ξ = α/(1 − α); the focal length on the axis is fx.
+
+    Examples
+    --------
+    >>> EnhancedUnified([800.0, 800.0, 319.5, 239.5, 0.5, 1.0])([[np.tan(0.5), 0.0]]).round(3)
+    array([[728.047, 239.5  ]])
+    """
+
+    kind: ClassVar[int] = ELLIPSOID
+    names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", "alpha", "beta", *PLANE)
+    shape_start: ClassVar[tuple[float, ...]] = (0.55, 1.0)
+
+    def _limit(self) -> float:
+        alpha, beta = self._shape
+        if not beta > 0:
+            return 0.0
+        # Beyond d the denominator is below zero, or the image shrinks.
+        d = 1 - 1 / alpha if alpha < 0 else alpha / (alpha - 1) if alpha > 1 else np.inf
+        return float((d * d - 1) / beta)
+
+    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
+        alpha, beta = self._shape
+        d = np.sqrt(1 + beta * s)
+        g = 1 / (1 + alpha * (d - 1))
+        by_d = -alpha * g * g / (2 * d)
+        return g, beta * by_d, np.stack([(1 - d) * g * g, s * by_d], axis=1)
+
+    def _tangent(self, size: Array) -> Array:
+        alpha, beta = self._shape
+        t = beta * size * size
+        below = (1 - alpha * alpha * t) / (alpha * np.sqrt(1 - (2 * alpha - 1) * t) + 1 - alpha)
+        return _positive(size, below)
+
+
+@dataclass(frozen=True, eq=False)
 class Division(Projected):
     """The division model with distortion: m = 2(u, v)/(1 + √(1 − 4λr²)), so that ``r = |m|/(1 + λ|m|²)``.
 
@@ -426,6 +469,13 @@ def _projected(
         by_h = a / (2.0 * h)
         by_s = -(b * (1.0 + 2.0 * w * by_h) / (2.0 * far) + (1.0 - b) * by_h) * g * g
         by_a, by_b = -h * (b * w / far + 1.0 - b) * g * g, (w - far) * g * g
+    elif kind == ELLIPSOID:
+        a, b = p[c, SHAPE], p[c, SHAPE + 1]
+        far = np.sqrt(1.0 + b * s) if b > 0.0 else np.nan
+        below = 1.0 + a * (far - 1.0)
+        g = 1.0 / below if below > 0.0 else np.nan
+        by_b = -a * g * g / (2.0 * far)
+        by_s, by_a, by_b = b * by_b, (1.0 - far) * g * g, s * by_b
     else:
         a = p[c, SHAPE]
         inside = 1.0 - 4.0 * a * s
@@ -470,7 +520,8 @@ def _projected(
 def _register(name: str, camera: type[Projected], usual: tuple[str, ...], *, bends: bool = False) -> None:
     """Register one of the family; `bends` where the shape is zero without distortion."""
     count = len(camera.shape_start)
-    scale = 1.0 if bends or not count else 1.0 + camera.shape_start[0]
+    # Focal lengths over those on the axis.
+    scale = 1.0 / float(camera()._projection(np.zeros(1))[0][0])
 
     def build(values: Array, grid: PixelGrid, options: Named[str, Any]) -> Projected:
         return camera(values)
@@ -484,7 +535,8 @@ def _register(name: str, camera: type[Projected], usual: tuple[str, ...], *, ben
     parameters = [Parameter(each, "px", "scale", True, True) for each in ("fx", "fy")]
     parameters += [Parameter(each, "px", "centre", True, True) for each in ("cx", "cy")]
     for each in camera.names[SHAPE : SHAPE + count]:
-        parameters.append(Parameter(each, "", "distortion" if bends else "shape", True, required=not bends))
+        role: Literal["distortion", "shape"] = "distortion" if bends else "shape"
+        parameters.append(Parameter(each, "", role, True, not bends, _PRIORS.get(each, 0.0)))
     parameters += [Parameter(each, usual=each in usual) for each in PLANE]
     register_camera(
         CameraModel(name, tuple(parameters), build, start, kernel=_projected, constants=constants)
@@ -497,4 +549,5 @@ _register("orthographic", Orthographic, ("k1", "k2"))
 _register("stereographic", Stereographic, ("k1", "k2"))
 _register("omni", Omni, ("p1", "p2"))
 _register("double_sphere", DoubleSphere, ())
+_register("eucm", EnhancedUnified, ())
 _register("division", Division, ("p1", "p2"), bends=True)

@@ -315,7 +315,8 @@ class AdditionalModel:
 # Names under which other programs and publications know the models.
 _OTHER_NAMES = {
     "equidistant": "fisheye", "kannala_brandt": "fisheye", "kb4": "fisheye", "mei": "omni", "ucm": "omni",
-    "unified": "omni", "ds": "double_sphere", "radtan": "opencv", "affine": "telecentric",
+    "unified": "omni", "ds": "double_sphere", "enhanced_unified": "eucm", "radtan": "opencv",
+    "affine": "telecentric",
 }  # fmt: skip
 _CAMERAS: dict[str, CameraModel] = {}
 _FAMILIES: dict[str, Callable[[str], CameraModel | None]] = {}
