@@ -27,8 +27,9 @@ from ..screening import Screened, inner_pixels, screen
 from .candidates import Saddles, find_saddles
 from .corners import BORDER_PX, CornerMarks, DeltilleMarks, Sectors
 from .deltilles import find_deltille
+from .marked import lay_marked
 from .markers import find_markers, find_tags
-from .placement import Placed, find_puzzle, lay_chessboard, lay_circles, lay_marked
+from .placement import Placed, find_puzzle, lay_chessboard, lay_circles
 from .puzzles import PuzzlePart
 from .tags import with_seen_edges
 
