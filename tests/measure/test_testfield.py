@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +25,10 @@ from reseau_sims import FieldBench, Stain, Station
 from reseau_sims.testfield import DISTANCE_MM, JITTER_PX
 
 from .fields import bounds
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from worlds.boards import Field
+from worlds.sheets import views
 
 DESIGN = coded_testfield()
 OPTIONS = TestfieldOptions(row_jitter_px=JITTER_PX, fill=0.8)
@@ -275,6 +282,17 @@ def test_a_testfield_is_found_beside_a_larger_one_whose_code_begins_alike() -> N
     found, alone = answer(np.hstack(frames), design), answer(frames[1], design)
     assert found.ok.all()
     np.testing.assert_allclose(found.xy - [frames[0].shape[1], 0], alone.xy, rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("condition", ["gamma", "sharpened", "jpeg60"])
+def test_cameras_that_process_their_pictures_leave_sigmas_of_the_size_of_errors(condition: str) -> None:
+    """Residuals are then larger than noise, but displace targets less."""
+    design = coded_testfield()
+    (view,) = views(condition, 1, Field(json.loads(design.to_json())))
+    found = measure_testfield(Frame(view.picture(), 255.0), design)
+    assert found.ok.all()
+    sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
+    assert np.sqrt((((found.xy - view.truth) / sigma) ** 2).mean()) == pytest.approx(1.0, abs=0.15)
 
 
 def test_a_mirrored_frame_is_measured_with_the_design_from_behind() -> None:

@@ -137,7 +137,7 @@ class PlaneMarks(MarkWindows):
             found = replaced(found, ~doubtful, self._match_all(rows[doubtful]))
         found = self._without_growth(rows, found)
         alike = with_alike_errors(found, np.rint(self.start[rows]) if self.even else None)
-        found = self._tempered(rows, found, alike) if self.precise_start else alike
+        found = self._tempered(rows, found, alike)
         if self.precise_start:
             found = self._with_doubtful_light(rows, found)
         found = self._in_shadows(rows, found)

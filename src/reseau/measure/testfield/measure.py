@@ -22,7 +22,7 @@ from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
 from ..marks.judging import Objection, columns_of, reasons_of
 from ..matching import Matches, Window
-from ..plane.lattice_mapping import images_of, slope_of, stretches
+from ..plane.lattice_mapping import images_of, numbers_of, slope_of, stretches
 from ..plane.plane_mapping import plane_through
 from ..plane.polynomial import common_part, median, refit
 from ..points import Measured, Reason
@@ -84,6 +84,8 @@ images. Other programs for the formation of images agree with ours to this."""
 _SECOND = Remark(
     "the frame shows the testfield more than once: one of them is measured", Code.SEVERAL_TARGETS
 )
+_CHANCE = 2.0
+"""Standard deviations by which the scatter of targets may be too small by chance."""
 _BLURRED, _PALE, _GROWN = 1.5, 0.25, 0.15
 """Tolerances of sharpness (factor), contrast and size (shares) of a target relative to the others."""
 
@@ -346,9 +348,28 @@ class _Measurement:
                 break
         found, why, predicted = self._reshaped(wanted, found, why, predicted)
         beyond = Reason("beyond the edge of the frame", Code.OUTSIDE).repeated(len(self.at))
+        found = self._by_scatter(found, wanted, why, predicted)
         found = replace(found, cov=found.cov + FORMED_PX**2 * np.eye(2))
         columns = columns_of(found, wanted, why, beyond)
         return columns | {"predicted": predicted, "deviation": columns["xy"] - predicted}
+
+    def _by_scatter(self, found: Matches, wanted: Rows, why: Array, predicted: Array) -> Matches:
+        """Covariances no larger than what the scatter of small and large targets about a mapping shows.
+
+        Residuals contain more than noise: levels, a curve and a filter of the camera that are not quite those
+        of the model leave some in every window, and errors of neighbouring pixels cancel each other after
+        sharpening. Targets are displaced less than such residuals tell.
+        """
+        off, cov = found.xy - predicted[wanted], found.cov.copy()
+        parameters, large = len(numbers_of(self.scene.mapping)[1].ravel()), self.scene.design.large[wanted]
+        for size in (False, True):
+            good = np.flatnonzero((why == "") & (large == size))
+            if (redundancy := 2 * len(good) - parameters) > 0:
+                squares = (off[good, None] @ np.linalg.solve(cov[good], off[good, :, None])).sum()
+                # As large as it may be by chance.
+                most = squares / redundancy * (1 + _CHANCE * np.sqrt(2 / redundancy))
+                cov[large == size] *= min(1.0, most)
+        return replace(found, cov=cov)
 
     def _alike(self, found: Matches, good: Mask, wanted: Rows) -> bool:
         """Whether light and sharpness of the targets are those with which their neighbours were formed."""
