@@ -48,9 +48,9 @@ def camera_mapping(
         covariance = result.fit.cofactors.reduced.block(columns, columns) * result.fit.variance
         degrees = float("inf")
     else:
-        uncertain = result.uncertainty(columns)
-        covariance, degrees = uncertain.covariance, uncertain.degrees
-    found = camera.parameters | dict(zip(names, values.tolist(), strict=True))
+        degrees = result.uncertainty(columns).degrees
+        names, covariance = result.with_considered(c, names, columns)
+    found = camera.parameters | dict(zip(names, values.tolist(), strict=False))
     size = (camera.width, camera.height)
     return CameraMapping.of_estimates(camera.plane_mapping(), size, found, names, covariance, dof=degrees)
 

@@ -62,16 +62,14 @@ def calibration_of(
     if not names:
         raise UsageError("no parameter was estimated", where=f"camera {camera}")
     found = result.camera(c)
-    covariance = result.uncertainty(result.camera_columns(c)[1]).covariance
-    sigma = np.sqrt(np.diag(covariance))
+    columns = result.camera_columns(c)[1]
+    every, covariance = result.with_considered(c, names, columns)
+    sigma = dict(zip(every, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     parameters = {
-        key: Quantity(value=value, sigma=0.0, unit=entry.unit_of(key))
-        for key, value in entry.parameters.items()
-    } | {
-        key: Quantity(value=float(value), sigma=float(s), unit=entry.unit_of(key))
-        for key, value, s in zip(names, values, sigma, strict=True)
+        key: Quantity(value=value, sigma=sigma.get(key, 0.0), unit=entry.unit_of(key))
+        for key, value in (entry.parameters | dict(zip(names, values.tolist(), strict=True))).items()
     }
-    degrees = result.uncertainty(result.camera_columns(c)[1]).degrees
+    degrees = result.uncertainty(columns).degrees
     dof = {"degrees_of_freedom": degrees} if np.isfinite(degrees) else {}
     used = result.fit.usable.observations & ~result.rejected
     xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
@@ -82,7 +80,7 @@ def calibration_of(
         name=name,
         model=_model(entry),
         parameters=parameters,
-        covariance=Covariance(names=names, matrix=tuple(tuple(row) for row in covariance.tolist())),
+        covariance=Covariance(names=every, matrix=tuple(tuple(row) for row in covariance.tolist())),
         sigma0=result.sigma0 if result.redundancy > 0 else None,
         redundancy=result.redundancy,
         place=_place(result, camera),
