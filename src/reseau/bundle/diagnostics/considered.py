@@ -9,9 +9,9 @@ The displacements of the coefficients over the whole image, without what the ori
 orthonormal in their order: a = T β, in pixels, root mean square. The radial terms decay,
 a_j ~ N(0, (s q^j)²), the others (decentring, tilt, prism) have a size of their own. s, q and that size are as
 probable as they predict the estimates and the image points (the evidence; Bishop 2006, *Pattern Recognition
-and Machine Learning*, sect. 3.5). With the estimates x̂ of covariance C, which held coefficients θ change by K θ, and with
-their scores g and information M, the coefficients have the mean t and the covariance V, and the estimates
-without them err by
+and Machine Learning*, sect. 3.5). With the estimates x̂ of covariance C, which held coefficients θ change by
+K θ, and with their scores g and information M, the coefficients have the mean t and the covariance V, and the
+estimates without them err by
 
     [−K; I] (V + t tᵀ) [−K; I]ᵀ
 
