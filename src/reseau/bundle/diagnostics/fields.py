@@ -132,7 +132,7 @@ def projection_field_at(
             where=result.network.cameras[c].label,
             do="use the field without a distance",
         )
-    camera = camera_mapping(result, c, additional)
+    camera = camera_mapping(result, c, additional, formal=True)
     _, columns, _ = own_columns(result, c, additional)
     covariance = _with_mean_pose(result, c, columns)
     xy, shape = places(camera, across, down)

@@ -74,7 +74,11 @@ def calibration_of(
     used = result.fit.usable.observations & ~result.rejected
     xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
     targets = covariance_by_targets(result, c)
+    if targets is not None:
+        targets = np.pad(targets, (0, len(every) - len(names)))
     by_targets = {} if targets is None else {"covariance_of_targets": targets.tolist()}
+    # Coefficients that were held have no formal sigma.
+    formal = dict.fromkeys(every, 0.0) | dict(zip(names, found.sigma_formal.tolist(), strict=True))
     return Calibration(
         kind="camera",
         name=name,
@@ -86,7 +90,7 @@ def calibration_of(
         place=_place(result, camera),
         tests=tuple(vars(test) for test in result.camera_tests(c)),
         validity={"extent": [*xy.min(axis=0).tolist(), *xy.max(axis=0).tolist()], "unit": "px",
-                  "sigma_formal": dict(zip(names, found.sigma_formal.tolist(), strict=True)), **dof,
+                  "sigma_formal": formal, **dof,
                   "images": int(np.count_nonzero(result.fit.usable.images & (result.network.camera_of == c))),
                   **by_targets, "rms_px": result.rms_px(c),
                   "warnings": [remark.text for remark in result.warnings],
