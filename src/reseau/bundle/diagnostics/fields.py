@@ -49,7 +49,7 @@ def camera_mapping(
         degrees = float("inf")
     else:
         degrees = result.uncertainty(columns).degrees
-        names, covariance = result.with_considered(c, names, columns)
+        names, covariance, _ = result.with_considered(c, names, columns)
     found = camera.parameters | dict(zip(names, values.tolist(), strict=False))
     size = (camera.width, camera.height)
     return CameraMapping.of_estimates(camera.plane_mapping(), size, found, names, covariance, dof=degrees)

@@ -286,14 +286,17 @@ class Result(Estimated, Display):
         more = [each.errors(columns)[: len(columns), : len(columns)] for each in self._considered.values()]
         return found if not more else found.with_errors(np.sum(more, axis=0))
 
-    def with_considered(self, c: int, names: tuple[str, ...], columns: Rows) -> tuple[tuple[str, ...], Array]:
-        """Names and covariance of parameters of a camera, with coefficients that were held at zero."""
+    def with_considered(
+        self, c: int, names: tuple[str, ...], columns: Rows
+    ) -> tuple[tuple[str, ...], Array, Array | None]:
+        """Names and covariance of parameters of a camera, with coefficients that were held; their part of it."""
         k, covariance, own = len(columns), self.uncertainty(columns).covariance, self._considered.get(c)
         if own is None:
-            return names, covariance
-        total = own.errors(columns)
+            return names, covariance, None
+        part = own.errors(columns)
+        total = part.copy()
         total[:k, :k] = covariance
-        return (*names, *own.names), total
+        return (*names, *own.names), total, part
 
     @cached_property
     def _considered(self) -> dict[int, Considered]:

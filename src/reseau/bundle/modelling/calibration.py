@@ -63,7 +63,7 @@ def calibration_of(
         raise UsageError("no parameter was estimated", where=f"camera {camera}")
     found = result.camera(c)
     columns = result.camera_columns(c)[1]
-    every, covariance = result.with_considered(c, names, columns)
+    every, covariance, held = result.with_considered(c, names, columns)
     sigma = dict(zip(every, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     parameters = {
         key: Quantity(value=value, sigma=sigma.get(key, 0.0), unit=entry.unit_of(key))
@@ -74,9 +74,11 @@ def calibration_of(
     used = result.fit.usable.observations & ~result.rejected
     xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
     targets = covariance_by_targets(result, c)
-    if targets is not None:
-        targets = np.pad(targets, (0, len(every) - len(names)))
-    by_targets = {} if targets is None else {"covariance_of_targets": targets.tolist()}
+    targets = None if targets is None else np.pad(targets, (0, len(every) - len(names)))
+    parts = {
+        f"covariance_of_{name}": part.tolist()
+        for name, part in (("targets", targets), ("held", held)) if part is not None
+    }  # fmt: skip
     # Coefficients that were held have no formal sigma.
     formal = dict.fromkeys(every, 0.0) | dict(zip(names, found.sigma_formal.tolist(), strict=True))
     return Calibration(
@@ -92,7 +94,7 @@ def calibration_of(
         validity={"extent": [*xy.min(axis=0).tolist(), *xy.max(axis=0).tolist()], "unit": "px",
                   "sigma_formal": formal, **dof,
                   "images": int(np.count_nonzero(result.fit.usable.images & (result.network.camera_of == c))),
-                  **by_targets, "rms_px": result.rms_px(c),
+                  **parts, "rms_px": result.rms_px(c),
                   "warnings": [remark.text for remark in result.warnings],
                   "warning_codes": [remark.code.value for remark in result.warnings]},
         provenance=dict(provenance or {}),
