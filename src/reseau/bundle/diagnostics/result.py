@@ -289,7 +289,7 @@ class Result(Estimated, Display):
     def with_considered(
         self, c: int, names: tuple[str, ...], columns: Rows
     ) -> tuple[tuple[str, ...], Array, Array | None]:
-        """Names and covariance of parameters of a camera, with coefficients that were held; their part of it."""
+        """Names and covariance of a camera's parameters with coefficients that were held, and the part of these."""
         k, covariance, own = len(columns), self.uncertainty(columns).covariance, self._considered.get(c)
         if own is None:
             return names, covariance, None
