@@ -289,7 +289,7 @@ class Result(Estimated, Display):
     def with_considered(
         self, c: int, names: tuple[str, ...], columns: Rows
     ) -> tuple[tuple[str, ...], Array, Array | None]:
-        """Names and covariance of a camera's parameters with coefficients that were held, and the part of these."""
+        """Names and covariance of a camera's parameters with coefficients that were held, and their part."""
         k, covariance, own = len(columns), self.uncertainty(columns).covariance, self._considered.get(c)
         if own is None:
             return names, covariance, None
