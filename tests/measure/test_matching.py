@@ -10,8 +10,9 @@ from scipy.ndimage import uniform_filter
 
 from reseau.adjust import adjust_batch
 from reseau.measure import MatchOptions, match
-from reseau.measure.matching import compiled, matcher
+from reseau.measure.matching import matcher
 from reseau.measure.matching.correlation import with_alike_errors
+from reseau.measure.matching.iteration import Iteration
 from reseau.measure.matching.matcher import SIZE
 from reseau.measure.matching.matches import Matches
 from reseau.measure.matching.patches import Patches
@@ -238,7 +239,7 @@ def test_the_result_of_a_mark_does_not_depend_on_the_others():
         {"row_jitter_px": 0.1, "polarity": "bright", "response": PixelResponse(0.8)},
     ],
 )
-def test_compiled_matches_from_known_light_are_those_of_the_general_adjustment(options, monkeypatch):
+def test_matches_from_known_light_are_those_of_the_general_adjustment(options, monkeypatch):
     xy, bright = places(), options.get("polarity") == "bright"
     pixels = formed("square", xy, bright=bright, fill=options.get("response", PixelResponse()).fill) + noise(
         8
@@ -250,7 +251,7 @@ def test_compiled_matches_from_known_light_are_those_of_the_general_adjustment(o
     settings = MatchOptions(**{"half_px": 9, "psf_px": 0.75, "settled": 0.1} | options)
     known = {"noise": NOISE, "form_sigma": np.array([0.1]), "searching": 0.0}
     light = np.full(len(xy), 102.0 if bright else 0.68), level
-    compiled = match(*given, settings, light=light, **known)
+    single = match(*given, settings, light=light, **known)
     iterated = matcher._iterated
 
     def by_general(patch, rows, start, mean, formed, weights, free, iteration, noise=None):
@@ -266,20 +267,20 @@ def test_compiled_matches_from_known_light_are_those_of_the_general_adjustment(o
 
     monkeypatch.setattr(matcher, "_iterated", by_general)
     general = match(*given, settings, light=light, **known)
-    assert compiled.converged.sum() > len(xy) - 5
+    assert single.converged.sum() > len(xy) - 5
     for name in ("converged", "seen", "rejected"):
-        np.testing.assert_allclose(getattr(compiled, name), getattr(general, name), rtol=0, atol=1e-6)
-    compiled, general = compiled.select(general.converged), general.select(general.converged)
+        np.testing.assert_allclose(getattr(single, name), getattr(general, name), rtol=0, atol=1e-6)
+    single, general = single.select(general.converged), general.select(general.converged)
     sigma = np.sqrt(np.diagonal(general.cov, axis1=1, axis2=2))
     # Iterations end at corrections of a tenth of a sigma, which is 0.01 px.
-    np.testing.assert_allclose((compiled.xy - general.xy) / sigma, 0, rtol=0, atol=settings.settled)
-    scaled = (compiled.cov - general.cov) / (sigma[:, :, None] * sigma[:, None])
+    np.testing.assert_allclose((single.xy - general.xy) / sigma, 0, rtol=0, atol=settings.settled)
+    scaled = (single.cov - general.cov) / (sigma[:, :, None] * sigma[:, None])
     np.testing.assert_allclose(scaled, 0, rtol=0, atol=0.05)
-    off = np.linalg.norm((compiled.residuals - general.residuals).reshape(len(sigma), -1), axis=1)
+    off = np.linalg.norm((single.residuals - general.residuals).reshape(len(sigma), -1), axis=1)
     np.testing.assert_allclose(off / NOISE, 0, rtol=0, atol=3 * settings.settled)
-    np.testing.assert_allclose(compiled.form_sigma, general.form_sigma, rtol=0.05, atol=0)
+    np.testing.assert_allclose(single.form_sigma, general.form_sigma, rtol=0.05, atol=0)
     for name in ("psf_px", "contrast", "level", "noise", "correlation", "t"):
-        np.testing.assert_allclose(getattr(compiled, name), getattr(general, name), rtol=5e-3, atol=5e-3)
+        np.testing.assert_allclose(getattr(single, name), getattr(general, name), rtol=5e-3, atol=5e-3)
 
 
 @pytest.mark.parametrize("trials", [4, 6, 8])
@@ -288,15 +289,13 @@ def test_marks_that_have_no_trials_left_are_never_corrected_with_derivatives_of_
     xy = places()
     pixels = formed("square", xy) + noise(8)
     off = np.where(np.arange(len(xy))[:, None] % 3 == 0, 2.5, 0.3)
-    corrected = compiled.advanced
-    batches = []
+    linearise, batches = Iteration.linearise, []
 
-    def advanced(rows, place, first, *rest):
-        assert place.max() < len(first[1]) == len(first[2])
-        batches.append((len(rows), len(first[1])))
-        corrected(rows, place, first, *rest)
+    def linearised(work, rows, share, slopes):
+        batches.append(len(rows))
+        linearise(work, rows, share, slopes)
 
-    monkeypatch.setattr(matcher, "advanced", advanced)
+    monkeypatch.setattr(Iteration, "linearise", linearised)
     monkeypatch.setattr(matcher, "_FIRST", trials)
     level = np.zeros((len(xy), 3))
     level[:, 0] = LEVEL
@@ -307,20 +306,21 @@ def test_marks_that_have_no_trials_left_are_never_corrected_with_derivatives_of_
         pixels, pixels > -np.inf, shape, xy + off, settings, light=(np.full(len(xy), 0.68), level), **known
     )
     assert len(batches) > 1
+    assert batches[-1] < batches[0]
     good = found.converged
     assert good.any()
     assert np.abs(found.xy - xy)[good].max() < 0.2
 
 
 @pytest.mark.parametrize("polarity", ["dark", "bright"])
-def test_compiled_searches_are_those_of_the_general_adjustment(polarity, monkeypatch):
+def test_searches_in_single_precision_are_those_of_the_general_adjustment(polarity, monkeypatch):
     xy, bright = places(), polarity == "bright"
     pixels = formed("square", xy, bright=bright) + noise(8)
     pixels[20:24, 20:60] += 40.0
     given = pixels, pixels > -np.inf, GrownOutline(outlines("square", len(xy)).single(), SIZE), xy + 0.7
     settings = MatchOptions(half_px=9, psf_px=1.5, settled=0.05, polarity=polarity, influence=True)
     known = {"noise": NOISE, "form_sigma": np.array([0.1])}
-    compiled = match(*given, settings, **known)
+    single = match(*given, settings, **known)
     start = Patches.start
 
     def general_start(patch, noise):
@@ -330,18 +330,18 @@ def test_compiled_searches_are_those_of_the_general_adjustment(polarity, monkeyp
 
     monkeypatch.setattr(Patches, "start", general_start)
     general = match(*given, settings, **known)
-    assert compiled.converged.sum() > len(xy) - 3
-    np.testing.assert_array_equal(compiled.converged, general.converged)
+    assert single.converged.sum() > len(xy) - 3
+    np.testing.assert_array_equal(single.converged, general.converged)
     sigma = np.sqrt(np.diagonal(general.cov, axis1=1, axis2=2))
     # Iterations end at corrections of a twentieth of a sigma.
-    np.testing.assert_allclose((compiled.xy - general.xy) / sigma, 0, rtol=0, atol=0.1)
+    np.testing.assert_allclose((single.xy - general.xy) / sigma, 0, rtol=0, atol=0.1)
     # Of a pixel at the limit of rejection either may be right; its residual is a part of the covariance.
-    alike = (np.isfinite(compiled.residuals) == np.isfinite(general.residuals)).all(axis=(1, 2))
+    alike = (np.isfinite(single.residuals) == np.isfinite(general.residuals)).all(axis=(1, 2))
     assert alike.sum() >= len(xy) - 1
-    compiled, general = compiled.select(alike), general.select(alike)
-    np.testing.assert_allclose(compiled.cov, general.cov, rtol=0.05, atol=1e-9)
+    single, general = single.select(alike), general.select(alike)
+    np.testing.assert_allclose(single.cov, general.cov, rtol=0.05, atol=1e-9)
     most = np.abs(general.influence).max()
-    np.testing.assert_allclose(compiled.influence, general.influence, rtol=0, atol=0.05 * most)
+    np.testing.assert_allclose(single.influence, general.influence, rtol=0, atol=0.05 * most)
 
 
 def test_a_match_of_precise_positions_finds_the_light_and_keeps_large_residuals():

@@ -68,6 +68,8 @@ _USUAL = {
     "arm64": ("apple-m1", frozenset(("neon",))),
 }
 """The usual processor of a platform, as LLVM names it, with what one must have that runs its machine code."""
+_COMPILER = "optimised"
+"""Module of the compiler, which imports Numba."""
 _building = threading.RLock()
 
 
@@ -270,6 +272,8 @@ def _dispatcher(function: Kernel[..., Any], slots: Slots, called: bool) -> Any:
         options["no_cpython_wrapper"] = True
         if not _allocates(function, slots):
             options["_nrt"] = False
+    else:
+        options["pipeline_class"] = import_module(f".{_COMPILER}", __package__).Optimised
     return numba.njit(**options)(own)
 
 
@@ -325,7 +329,8 @@ def _digest(function: Kernel[..., Any], slots: Slots) -> str:
     import llvmlite
     import numba
 
-    digest = hashlib.sha256(Path(__file__).read_bytes())
+    compilers = Path(__file__), Path(__file__).with_name(_COMPILER + ".py")
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in compilers))
     digest.update(repr((sys.version_info[:2], numba.__version__, llvmlite.__version__)).encode())
     for each in _reached(function, slots):
         calls = {name: other.name for name, other in _calls(each, slots).items()}

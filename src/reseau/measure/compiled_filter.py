@@ -1,4 +1,4 @@
-"""Filtering of many windows with one even kernel, and their addition to a frame, compiled."""
+"""Filtering of many windows with one even kernel, compiled."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..core.compiled import compiled
 
-__all__ = ["add_images", "filtered"]
+__all__ = ["filtered"]
 
 Floats = NDArray[Any]
 
@@ -65,15 +65,3 @@ def _add(image: Floats, first: int, offsets: Floats, weights: Floats, total: Flo
     upper, lower = image[b : b + n], image[d : d + n]
     for i in range(n):
         total[i] += one * (left[i] + right[i]) + two * (upper[i] + lower[i])
-
-
-@compiled
-def add_images(total: Floats, images: Floats, factor: Floats, first: Floats) -> None:
-    """Add images (k, r, c), times factors (k,), to `total` (h, w), from pixels x, y `first` (k, 2) on."""
-    high, wide = total.shape
-    for k in range(len(images)):
-        left, top = first[k]
-        for i in range(max(0, -top), min(images.shape[1], high - top)):
-            row, image = total[top + i], images[k, i]
-            for j in range(max(0, -left), min(images.shape[2], wide - left)):
-                row[left + j] += factor[k] * image[j]

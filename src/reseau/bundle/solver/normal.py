@@ -68,49 +68,35 @@ class Sums(NamedTuple):
     diagonal: Array
 
 
-@compiled
-def locals_of(first: Rows, start: Rows, width: Rows, place: Rows, out: Rows, count: Rows) -> int:
-    """Write the distinct segments of each point to `out` (n·6, 3) and `place`; return their number."""
-    total = 0
-    for j in range(len(first) - 1):
-        base = total
-        for k in range(first[j], first[j + 1]):
-            for a in range(SEGMENTS):
-                if width[k, a] == 0:
-                    continue
-                q = base
-                while q < total and out[q, 0] != start[k, a]:
-                    q += 1
-                if q == total:
-                    out[q, 0], out[q, 1] = start[k, a], width[k, a]
-                    total += 1
-        for a in range(base + 1, total):
-            s, w, b = out[a, 0], out[a, 1], a
-            while b > base and out[b - 1, 0] > s:
-                out[b, 0], out[b, 1] = out[b - 1, 0], out[b - 1, 1]
-                b -= 1
-            out[b, 0], out[b, 1] = s, w
-        offset = 0
-        for q in range(base, total):
-            out[q, 2] = offset
-            offset += out[q, 1]
-        for k in range(first[j], first[j + 1]):
-            for a in range(SEGMENTS):
-                for q in range(base, total):
-                    if width[k, a] > 0 and out[q, 0] == start[k, a]:
-                        place[k, a] = out[q, 2]
-        # Segments that follow each other without a gap are one: long loops are faster.
-        joined = base
-        for q in range(base + 1, total):
-            if out[joined, 0] + out[joined, 1] == out[q, 0]:
-                out[joined, 1] += out[q, 1]
-            else:
-                joined += 1
-                for i in range(3):
-                    out[joined, i] = out[q, i]
-        total = joined + 1 if total > base else base
-        count[j] = total - base
-    return total
+def locals_of(first: Rows, start: Rows, width: Rows) -> tuple[Rows, Rows, Rows]:
+    """Distinct segments of each point.
+
+    Returns
+    -------
+    place : ndarray (n, 6)
+        First position of each segment of a ray among the unknowns that its point depends on.
+    count : ndarray (p,)
+        Number of segments of each point.
+    table : ndarray (m, 3)
+        First reduced unknown, number of unknowns and offset of each; segments that follow each other without
+        a gap are one, as long loops are faster.
+    """
+    place = np.zeros_like(start)
+    ray, a = np.nonzero(width)
+    point = np.repeat(np.arange(len(first) - 1), np.diff(first))[ray]
+    # The rays are in the order of their points, and the segments of a point in that of their unknowns.
+    key = point * (start.max(initial=0) + 1) + start[ray, a]
+    _, index, which = np.unique(key, return_index=True, return_inverse=True)
+    owner, at, size = point[index], start[ray, a][index], width[ray, a][index]
+    before = np.cumsum(size) - size
+    offset = before - before[np.searchsorted(owner, owner)]
+    place[ray, a] = offset[which]
+    begins = np.ones(len(at), dtype=bool)
+    begins[1:] = (owner[1:] != owner[:-1]) | (at[:-1] + size[:-1] != at[1:])
+    joined = np.flatnonzero(begins)
+    sizes = np.diff(np.append(before[joined], size.sum()))
+    count = np.bincount(owner[joined], minlength=len(first) - 1)
+    return place, count, np.column_stack([at[joined], sizes, offset[joined]])
 
 
 @compiled

@@ -295,11 +295,8 @@ class Unknowns:
         joined = alone[camera] & (start[:, 1] == start[:, 0] + 6) & (width[:, 1] > 0)
         width[:, 0] += np.where(joined, width[:, 1], 0)
         width[joined, 1], start[joined, 1] = 0, -1
-        place = np.zeros_like(start)
-        table = np.zeros((n * SEGMENTS, 3), dtype=np.intp)
-        number = np.zeros(len(self.first) - 1, dtype=np.intp)
-        total = locals_of(self.first, start, width, place, table, number)
-        at, size, offset = (np.ascontiguousarray(table[:total, i]) for i in range(3))
+        place, number, table = locals_of(self.first, start, width)
+        at, size, offset = (np.ascontiguousarray(each) for each in table.T)
         local = np.concatenate([[0], np.cumsum(number)])
         # Points with held coordinates have no unknowns: to eliminate them would couple all their images.
         eliminated = ((self.kept < 0) & ~self.network.held.all(axis=1)).astype(np.intp)

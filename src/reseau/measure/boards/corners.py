@@ -18,9 +18,9 @@ from ...core.failure import Code
 from ...optics import Chain
 from ...optics.corners import Corners, corner_images
 from ...optics.formation import PixelResponse, polygons
-from ..compiled_filter import add_images, filtered
+from ..compiled_filter import filtered
 from ..marks.judging import Objection
-from ..matching import GrownOutline, Matches, Shape, Window
+from ..matching import GrownOutline, Matches, Shape, Window, add_windows
 from ..plane.lattice_mapping import images_of, second_order
 from ..plane.lens_mapping import UNFIT, mapping_through
 from ..plane.levels import levels_around
@@ -30,7 +30,6 @@ from ..reseau.plane_marks import PlaneMarks, intact
 from ..response import sharpened_from_px
 from ..screening import Screened
 from .candidates import ended
-from .compiled_corners import pixels_around
 from .shadows import pixels_alike, shaded
 
 __all__ = ["BORDER_PX", "CornerMarks", "CornerShape", "DeltilleMarks", "Sectors"]
@@ -250,9 +249,7 @@ class CornerMarks(PlaneMarks):
         """See :class:`PlaneMarks`: the half squares around a corner, and what lies along its edges."""
         back = np.linalg.inv(self._steps(rows)[0])
         across = np.einsum("kei,kij->kej", self.sectors.normal[rows], back)
-        return np.asarray(
-            pixels_around(self.start[rows], across, half, self.sectors.reach, self.sectors.along)
-        )
+        return _pixels_around(self.start[rows], across, half, self.sectors.reach, self.sectors.along)
 
     @property
     def balanced(self) -> bool:
@@ -306,7 +303,7 @@ class CornerMarks(PlaneMarks):
             if look.kernel is not None:
                 wider = np.pad(taken, ((0, 0), (reach, reach), (reach, reach)))
                 taken = filtered(wider, look.kernel.astype(np.float32))
-            add_images(share, taken, self.sectors.ink[part], low[part].astype(np.intp))
+            add_windows(share, self.sectors.ink[part, None, None] * taken, low[part].astype(np.intp))
         self.figures = share, at, width, look.kernel
         return share
 
@@ -477,3 +474,29 @@ class DeltilleMarks(CornerMarks):
     form_sigma = np.full(3, _TURN)
     learnt_form_sigma = np.full(3, _TURNED)
     even = False
+
+
+def _pixels_around(start: Array, across: Array, half: tuple[int, int], reach: float, along: float) -> Mask:
+    """Pixels (k, r, c) of windows that belong to corners: those near all edges, and along each of two.
+
+    Parameters
+    ----------
+    start : ndarray (k, 2)
+        Corners; windows are centred on the nearest pixels.
+    across : ndarray (k, e, 2)
+        Distances on the plane of the board from each edge, positive on its dark side, per pixel along x, y.
+    half : (int, int)
+        Half the width and height of the windows.
+    reach, along : float
+        Distance from the edges, and that along them on the dark side; `along` counts for two edges only,
+        where it is larger.
+    """
+    off = np.rint(start) - start
+    x, y = (off[:, i, None] + np.arange(-half[i], half[i] + 1.0) for i in range(2))
+    away = across[:, :, :1, None] * x[:, None, None] + across[:, :, 1:, None] * y[:, None, :, None]
+    beside = np.abs(away) < reach
+    near: Mask = beside.all(axis=1)
+    if along > reach:
+        ahead = (away > 0) & (away < along)
+        near |= (beside[:, 0] & ahead[:, 1]) | (beside[:, 1] & ahead[:, 0])
+    return near

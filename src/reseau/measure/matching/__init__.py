@@ -4,7 +4,7 @@ from .correlation import with_alike_errors
 from .matcher import SIZE, match
 from .matches import Matches
 from .noise import grey_variance
-from .patches import MatchOptions
+from .patches import MatchOptions, add_windows
 from .shapes import FormedShape, GrownOutline, Shape, ShapeSubset, Window
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "Shape",
     "ShapeSubset",
     "Window",
+    "add_windows",
     "grey_variance",
     "match",
     "with_alike_errors",

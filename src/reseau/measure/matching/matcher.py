@@ -17,10 +17,10 @@ from ...adjust import BatchAdjustment, BatchOptions, BatchReason, adjust_batch
 from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
 from ...optics.formation import Outline
-from .compiled import ACTIVE, DONE, FAILED, STALE, advanced, influenced, linearised
+from .iteration import ACTIVE, DONE, STALE, Iteration
 from .matches import Matches, matches_of, with_rows
 from .noise import medians
-from .patches import CONTRAST, SHARPEST, WIDTH, MatchOptions, Patches, X, Y
+from .patches import CONTRAST, WIDTH, MatchOptions, Patches, X, Y
 from .shapes import GrownOutline, Shape, ShapeSubset
 
 __all__ = ["SIZE", "match"]
@@ -294,49 +294,6 @@ def _trimmed(
     return found, kept
 
 
-class _Iteration:
-    """State of the iteration of some marks, as compiled code takes it."""
-
-    def __init__(self, patch: Patches, start: Array, options: BatchOptions, noise: float | None) -> None:
-        k, u, n = *start.shape, patch.grey.shape[1]
-        jitter = 0.0 if noise is None else patch.options.row_jitter_px / noise
-        self.window = patch.terms
-        self.light = patch.options.polarity == "dark", 1.0 if noise is None else noise**2, jitter**2
-        self.x, self.residuals, self.cofactor = start.copy(), np.empty((k, n)), np.full((k, u, u), np.nan)
-        self.iteration, (self.state, self.rounds) = np.zeros((k, 6)), np.zeros((2, k), np.int64)
-        self.iteration[:, 1], self.iteration[:, 5] = options.damping, 2.0
-        # Errors that rows have in common are not among those of pixels.
-        wanted = k if patch.options.influence and jitter == 0 else 0
-        self.influence: tuple[Any, Any] = (
-            np.zeros((wanted, 2, n), np.float32),
-            np.zeros((wanted, n), np.float32),
-        )
-
-    @property
-    def left(self) -> Mask:
-        """Marks that have not converged."""
-        return np.asarray(self.state != DONE)
-
-    def finished(self, patch: Patches, rows: Rows, weights: Array, free: Array) -> BatchAdjustment:
-        """Results of the marks `rows`; their influences are left with `patch`."""
-        if len(self.influence[1]):
-            patch.keep(rows, *self.influence)
-        redundancy = (weights > 0).sum(axis=1) + np.isfinite(free).sum() - self.x.shape[1]
-        reasons = np.where(self.left, BatchReason.MAX_ITERATIONS, BatchReason.CONVERGED)
-        cost = np.where(np.isfinite(self.iteration[:, 0]), self.iteration[:, 0], np.nan)
-        return BatchAdjustment(
-            estimates=self.x,
-            cofactor=self.cofactor,
-            residuals=self.residuals,
-            sigma0=np.sqrt(cost / np.maximum(redundancy, 1)),
-            redundancy=redundancy,
-            converged=~self.left,
-            iterations=self.rounds,
-            reasons=np.where(self.state == FAILED, BatchReason.SINGULAR, reasons).astype(np.int64),
-            factors=np.broadcast_to(1.0, self.residuals.shape),
-        )
-
-
 def _iterated(
     patch: Patches,
     rows: Rows,
@@ -361,65 +318,37 @@ def _iterated(
     noise : float, optional
         Standard deviation of grey values, if shifts of rows are among the errors.
     """
-    work, (m, u), n = _Iteration(patch, start, options, noise), start.shape, patch.grey.shape[1]
-    every = len(rows) == len(patch.xy)
-    observed, psf = (v if every else v[rows] for v in (patch.grey, SHARPEST * patch.psf))
-    prior, x, trial = 1 / free**2, work.x, start.copy()
-    common = np.zeros((2, m if work.light[2] > 0 else 0, n), np.float32)
-    space = (
-        *(work.residuals, np.zeros((m, u, u)), np.zeros((m, u))),
-        *(work.cofactor, common[0], common[1]),
-    )
-    steps: Any = x, space, trial, work.iteration, work.state
-    state, some, left, begun = work.state, np.arange(m), options.max_iterations, start.copy()
-    formed_at, last, place = start, _LAST, np.arange(m)
-    if every:
+    work, n = Iteration(patch, rows, start, mean, weights, free, options, noise), patch.grey.shape[1]
+    state, some, left, last = work.state, np.arange(len(rows)), options.max_iterations, _LAST
+    if len(rows) == len(patch.xy):
         patch.shares = np.empty(patch.shape, np.float32)
-    while len(some):
-        share, slopes = formed
-        # In the layout of the batch with one outline each: another one is compiled, and loaded, by itself.
-        share = np.ascontiguousarray(share).reshape(len(some), n)
-        slopes = np.ascontiguousarray(slopes).reshape(len(some), -1, n)
-        with one_thread():
-            linearised(
-                *(some, share, slopes, observed, weights, work.window, work.light, psf, mean, prior),
-                *(options.share, *steps, work.influence),
-            )
-        begun[some], place[some] = formed_at, np.arange(len(some))
-        patch.shares[rows[some]] = share.reshape(-1, *patch.shape[1:])
-        first, further = (formed_at, share, slopes), np.flatnonzero(state == ACTIVE)
-        while left > 0 and len(some := np.flatnonzero(state == ACTIVE)):
-            left -= 1
-            tried = np.ascontiguousarray(patch.image(trial[some], rows[some]))
-            before = work.iteration[some, 0]
-            work.rounds[some] += 1
-            with one_thread():
-                advanced(
-                    *(some, place[some], first, tried.reshape(len(some), n), observed, weights, work.window),
-                    *(work.light[0], psf, mean, prior, options.share, *steps),
-                )
-            taken = work.iteration[some, 0] < before
-            patch.shares[rows[some[taken]]] = tried[taken]
-        # With derivatives of another image the gradient of the noise vanishes at another place.
-        changed = (state == DONE) & (patch.change(begun, x, rows) > options.share)
-        if len(work.influence[1]) and len(further):
-            done = further[(state[further] == DONE) & ~(changed[further] & (left > 0))]
-            with one_thread():
-                influenced(
-                    *(done, place[done], first, weights, work.window, work.light[0], psf, work.cofactor),
-                    work.influence,
-                )
-        if changed.any() and left < last:
-            left, last = last, 0
-        # What is still active has no trials left, and a Jacobian of a batch that is no more.
-        some = np.flatnonzero(changed | (state == STALE) | (state == ACTIVE))
-        if left <= 0 or not len(some):
-            break
-        # Trials are counted, as in the general adjustment; only what has converged may go on without any.
-        left -= int(changed.any())
-        formed_at = x[some]
-        formed = patch.slopes(formed_at, rows[some])
-    return work.finished(patch, rows, weights, free)
+    with one_thread():
+        while len(some):
+            share = np.ascontiguousarray(formed[0]).reshape(len(some), n)
+            work.linearise(some, share, formed[1].reshape(len(some), -1, n))
+            patch.shares[rows[some]] = share.reshape(-1, *patch.shape[1:])
+            while left > 0 and len(some := np.flatnonzero(state == ACTIVE)):
+                left -= 1
+                tried = np.asarray(patch.image(work.trial[some], rows[some]))
+                work.rounds[some] += 1
+                taken = work.advance(some, tried.reshape(len(some), n))
+                patch.shares[rows[some[taken]]] = tried[taken]
+            # With derivatives of another image the gradient of the noise vanishes at another place.
+            changed = (state == DONE) & (patch.change(work.begun, work.x, rows) > options.share)
+            if changed.any() and left < last:
+                left, last = last, 0
+            # What is still active has no trials left.
+            some = np.flatnonzero(changed | (state == STALE) | (state == ACTIVE))
+            if left <= 0 or not len(some):
+                break
+            # Trials are counted, as in the general adjustment; only what has converged may go on without any.
+            left -= int(changed.any())
+            formed = patch.slopes(work.x[some], rows[some])
+        # Errors that rows have in common are not among those of pixels.
+        if patch.options.influence and not work.jitter2:
+            done = np.flatnonzero(state == DONE)
+            patch.keep(rows[done], *work.influences(done))
+        return work.finished()
 
 
 def _robust_sigma(residuals: Array, used: Array) -> Array:

@@ -116,6 +116,15 @@ def windows(values: NDArray[Any], centre: Rows, half: tuple[int, int]) -> NDArra
     return np.asarray(values[rows[:, :, None], columns[:, None]])
 
 
+def add_windows(total: NDArray[Any], images: NDArray[Any], first: Rows) -> None:
+    """Add images (k, r, c) to a frame (h, w), each from column and row `first` (k, 2) on."""
+    (h, w), (_, high, wide) = total.shape, images.shape
+    for image, (left, top) in zip(images, first.tolist(), strict=True):
+        right, down, up, back = min(w - left, wide), min(h - top, high), max(0, -top), max(0, -left)
+        if up < down and back < right:
+            total[top + up : top + down, left + back : left + right] += image[up:down, back:right]
+
+
 class Patches:
     """Windows of a frame, and the images formed in them."""
 

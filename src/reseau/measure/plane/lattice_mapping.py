@@ -1,8 +1,9 @@
 """The mapping of a lattice to an image, a projectivity followed by a polynomial; derivatives and inverse.
 
-Both are :class:`reseau.optics.RationalPolynomial`; here they are evaluated by compiled code, for the many
-small sets of points of a search. No polynomial in the image by a projectivity describes a frame behind a
-fisheye: at 70° from the axis that is far outside of it, at 90° nowhere. A fisheye can lie between both.
+Both are :class:`reseau.optics.RationalPolynomial`; here they are evaluated without their tables of terms,
+for the many small sets of points of a search. No polynomial in the image by a projectivity describes a frame
+behind a fisheye: at 70° from the axis that is far outside of it, at 90° nowhere. A fisheye can lie between
+both.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 
 from ...core.data import Array
 from ...optics import Chain, Equidistant, PlaneMapping, RationalPolynomial
-from .compiled_lattice import images
+from .lattice_images import images
 
 __all__ = [
     "degree_of",
@@ -99,21 +100,14 @@ def degree_of(mapping: Chain) -> int:
     return isqrt(len(mapping.second.values)) - 1
 
 
-_NONE: tuple[Array, Array] = np.empty((0, 2, 2)), np.empty((0, 2, 2, 2))
-
-
 def images_of(mapping: Chain, at: Array) -> Array:
     """Images (n, 2) of lattice coordinates (n, 2)."""
-    value = np.empty((len(at), 2))
-    images(numbers_of(mapping), np.ascontiguousarray(at, dtype=np.float64), value, *_NONE)
-    return value
+    return images(numbers_of(mapping), at)[0]
 
 
 def slope_of(mapping: Chain, at: Array) -> Array:
     """Derivatives (n, 2, 2) of a mapping at lattice coordinates (n, 2)."""
-    value, slope = np.empty((len(at), 2)), np.empty((len(at), 2, 2))
-    images(numbers_of(mapping), np.ascontiguousarray(at, dtype=np.float64), value, slope, _NONE[1])
-    return slope
+    return images(numbers_of(mapping), at, 1)[1]
 
 
 def stretches(slope: Array) -> tuple[Array, Array]:
@@ -126,10 +120,7 @@ def stretches(slope: Array) -> tuple[Array, Array]:
 
 def second_order(mapping: Chain, at: Array) -> tuple[Array, Array, Array]:
     """A mapping at points (n, 2) with its first (n, 2, 2) and second derivatives (n, 2, 2, 2)."""
-    n = len(at)
-    found = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 2, 2, 2))
-    images(numbers_of(mapping), np.ascontiguousarray(at, dtype=np.float64), *found)
-    return found
+    return images(numbers_of(mapping), at, 2)
 
 
 def straightened(mapping: Chain, xy: Array) -> Array:

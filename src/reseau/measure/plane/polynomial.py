@@ -13,7 +13,7 @@ from ...core.data import Array, Rows
 from ...core.threads import one_thread
 from ...optics import Chain
 from ...optics.field import trend_degree
-from .compiled_lattice import monomials
+from .lattice_images import monomials
 from .lattice_mapping import degree_of, numbers_of, of_degree, with_coefficients
 
 __all__ = ["common_part", "median", "monomials_of", "refit"]
@@ -71,8 +71,7 @@ def common_part(at: Array, residuals: Array) -> Array | None:
 
 def monomials_of(mapping: Chain, at: Array) -> tuple[Array, Array]:
     """Monomials (n, m) of the polynomial at lattice coordinates (n, 2), and images by the projectivity."""
-    found: tuple[Array, Array] = monomials(numbers_of(mapping), np.ascontiguousarray(at), degree_of(mapping))
-    return found
+    return monomials(numbers_of(mapping), at, degree_of(mapping))
 
 
 def _solved(mapping: Chain, design: Array, observed: Array, sigma_px: float) -> tuple[Chain, Array]:

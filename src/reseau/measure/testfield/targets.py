@@ -21,8 +21,8 @@ from ...core.data import Array, Mask, Rows
 from ...io import TestfieldDesign
 from ...optics import Chain
 from ...optics.formation import PixelResponse
-from ..compiled_filter import add_images
-from ..matching import FormedShape, Matches, MatchOptions, Shape, ShapeSubset, Window, match
+from ..matching import FormedShape, Matches, MatchOptions, Shape, ShapeSubset, Window, add_windows, match
+from ..plane.lattice_images import shade_lines
 from ..plane.lattice_mapping import images_of, slope_of
 from ..plane.polynomial import median
 from .light import attenuate, bends, illumination, without_own
@@ -315,7 +315,7 @@ class _Canvas:
         else:
             share = self.images.image(xy, width, form, part, window)
         own = self.scene.light.at(xy)[1].astype(np.float32)[:, None, None] * share
-        add_images(self.total, own, np.ones(len(own)), centre.astype(np.intp) - half)
+        add_windows(self.total, own, centre.astype(np.intp) - half)
         return _Part(part, half, own, formed)
 
     def match(
@@ -391,8 +391,6 @@ class _Canvas:
 
 def _line_light(scene: Scene) -> NDArray[np.float32]:
     """Grey values that the lines attenuate or add, (h, w)."""
-    from ..plane.compiled_lattice import shade_lines
-
     h, w = scene.grey.shape
     lines, free = scene.design.lines, np.ones((h, w), np.float32)
     x0, y0, x1, y1 = lines.extent
