@@ -78,7 +78,7 @@ def reorient_scan(
     Returns
     -------
     list of FrameResult
-        The repeated results if more frames are oriented, otherwise `before`.
+        The repeated results if they are more complete or more accurate, otherwise `before`.
 
     Examples
     --------
@@ -95,11 +95,17 @@ def reorient_scan(
     again = orient_frames(scan, roll.options(options))
     order = {"oriented": 2, "three-edges": 1, "declined": 0}
 
-    def best(results: Sequence[FrameResult]) -> int:
-        return max(order[result.status] for result in results)
+    def rank(results: Sequence[FrameResult]) -> tuple[int, float]:
+        """Best status, and then the smallest of the largest sigmas of its frames."""
+        best = max(order[result.status] for result in results)
+        sigmas = [
+            float(np.trace(r.lines.covariance))
+            for r in results
+            if r.lines is not None and order[r.status] == best
+        ]
+        return best, -min(sigmas, default=np.inf)
 
-    better = best(again) > best(before) or (best(again) == best(before) == 1)
-    if not better:
+    if rank(again) <= rank(before):
         return list(before)
     note = f"by the shape of {roll.frames} frames of its roll"
     return [

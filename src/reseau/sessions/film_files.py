@@ -308,10 +308,10 @@ def _common(done: dict[str, ScanOutcome]) -> Roll | None:
 
 
 def _again(work: list[ScanJob], done: dict[str, ScanOutcome], roll: Roll) -> None:
-    """Orient frames that were not fully oriented again, with the shape of the roll."""
+    """Orient frames that are not fully oriented, or in doubt, again, with the shape of the roll."""
     for job in work:
         item = done[job.name]
-        if item.results and any(result.status != "oriented" for result in item.results):
+        if item.results and any(result.status != "oriented" or result.why for result in item.results):
             done[job.name] = _run(replace(job, roll=roll), item)
 
 

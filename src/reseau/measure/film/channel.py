@@ -11,18 +11,17 @@ import scipy
 
 from ...core.data import Array, Mask
 from .adjacent_lines import (
-    FEW_DISPLACED,
+    LINED,
     AdjacentEdge,
-    SharpSteps,
+    Softness,
     common_forms,
     displaced_by_lines,
     edge_beside_line,
-    is_one_step,
-    sharp_steps,
+    soft_steps,
 )
 from .border import Band, Border, Film
 from .edges import EdgeProfiles, measure_profiles, merged
-from .lines import EdgeData, robust_line, shared_error, waviness
+from .lines import EdgeData, Rival, robust_line, shared_error, waviness
 from .steps import STRAIGHT, StepForm, Tone
 
 __all__ = ["WIDER_SEARCH", "Channel", "channels_by_contrast", "measure_channel"]
@@ -39,11 +38,7 @@ _FOREIGN = 0.08
 from which it is no film."""
 _UNEVEN = 0.45
 """Share of its own tone by which film may differ between edges, because the scanner's light is uneven."""
-_CLEAR = 0.6
-"""Usual share of profiles that show a step on an undisturbed edge."""
-_ENDS, _HIDDEN = 2.0, 1.0
-"""Standard deviations, in widths of the step, of an end of an edge that is completely displaced by a line,
-and of one that may be, although most steps do not show it."""
+_BESIDE = "a line of the picture beside it"
 _TURNED, _ROUNDED, _MARGIN = 1.2, 0.25, 0.015
 """Sigmas by which neighbouring profiles lie inwards at a rounded corner, share of half an edge that the
 corner may take, and additional margin."""
@@ -178,8 +173,8 @@ def measure_channel(
             found = found if more is None else merged(found, more)
         profiles[k] = found
     edges = [
-        _edge(band(k, False, far[k]), found, sharp, channel, polarity)
-        for k, (found, sharp) in enumerate(zip(profiles, sharp_steps(profiles), strict=True))
+        _edge(band(k, False, far[k]), found, soft, channel, polarity)
+        for k, (found, soft) in enumerate(zip(profiles, soft_steps(profiles), strict=True))
     ]
     data, rejected, why = (list(column) for column in zip(*edges, strict=True))
     borders = [None if found is None else found.border for found in profiles]
@@ -200,21 +195,21 @@ def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
 
 
 def _edge(
-    band: Band | None, found: EdgeProfiles | None, sharp: SharpSteps, channel: int, polarity: int
+    band: Band | None, found: EdgeProfiles | None, soft: Softness, channel: int, polarity: int
 ) -> tuple[EdgeData | None, int, str]:
     """Profiles of an edge that agree with its line, or the reason why it is not found."""
     if band is None:
         return None, 0, "is not in the scan, or nothing separates it from the picture"
     if found is None:
         return None, 0, "no contrast between film and picture"
-    drawn, part = displaced_by_lines(found, sharp)
-    place, offset, sigma = (part_[found.good] for part_ in (found.place, found.offset, found.sigma))
-    line = _line(place, offset, np.hypot(sigma, drawn[found.good]), sigma)
-    sigma = np.hypot(sigma, drawn[found.good])
+    drawn, beside, moves = (part[found.good] for part in displaced_by_lines(found, soft))
+    place, offset, own = (part[found.good] for part in (found.place, found.offset, found.sigma))
+    sigma = np.hypot(own, drawn)
+    line = _line(place, offset, sigma, own)
     rejected = int((~found.good).sum())
     if line is None:
         return None, rejected, f"no line fits {len(place)} of {len(found.place)} profiles that show a step"
-    (start, stop, bow), agree, doubt = line
+    (_, _, bow), agree, doubt = line
     if agree.sum() < max(12, 0.1 * len(found.place)) or agree.mean() < _LEAST_AGREE:
         return None, rejected, f"only {int(agree.sum())} of {len(found.place)} profiles agree with a line"
     border = found.border
@@ -223,40 +218,65 @@ def _edge(
     # An error of the film's tone moves a step by √(2π) of its width, times the error relative to the
     # contrast.
     common = float(np.sqrt(2 * np.pi) * found.width * _TONE * border.noise / border.contrast)
-    hidden, untouched = False, place[drawn[found.good] == 0]
-    spans, few = _spans(untouched), FEW_DISPLACED
-    if spans:
+    if _spans(place[beside < 0.5]):
         # The edge is seen by itself beside the structures that displace some of its steps.
-        agree &= drawn[found.good] == 0
-        few /= 2
-    elif found.good.mean() <= _CLEAR:
-        few /= 5
-    if part > few:
-        grey = band.grey[:, :, channel].astype(np.float64) * polarity
-        # A line displaces an edge by at most its width; a larger bow is real.
-        own = bow if abs(bow) > 2 * found.width else 0.0
-        fitted = (start * (1 - band.place) + stop * (1 + band.place)) / 2 - own * (1 - band.place**2)
-        sections = grey, band, fitted, border.level, border.noise, sharp.width
-        if spans:
-            # Of a line that nothing separates from the edge, noise lets few steps show the width.
-            doubt = max(doubt, _HIDDEN * sharp.width * is_one_step(*sections))
-        else:
-            two, hidden = edge_beside_line(*sections)
-            if two is not None:
-                return _along_chord(band, two, own + two.bow, common), rejected, ""
+        agree &= beside < 0.5
+    rival, two = _rival(band, found, soft, band.grey[:, :, channel].astype(np.float64) * polarity, line[0])
+    if two is not None:
+        left = float(np.hypot(np.sqrt(rival.probability) * rival.moved_px, doubt))
+        chord = _along_chord(band, two, two.bow + _wide_bow(bow, found), common)
+        return replace(chord, ends=left, rival=rival), rejected, ""
+    doubt = float(np.hypot(doubt, np.sqrt(rival.probability) * rival.moved_px))
+    if (beside > 0.5).any() and rival.probability < beside.max():
+        # The sigmas of these profiles contain it.
+        moved = float(moves[beside > 0.5].max())
+        where = f"a line of the picture beside {np.mean(beside > 0.5):.0%} of it"
+        rival = Rival(where, float(beside.max()), -moved)
     residuals = _inward(line[0], place, offset)
     total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
     agree &= _straight(place, residuals / total)
     # A structure of the picture lies inwards of the edge; parts of an edge that is bent lie on both sides.
     bent = agree.mean() < _BENT and not _only_inwards(residuals, line[1])
-    shown = np.ones(len(place), dtype=bool) if bent else agree
-    wave = waviness(place[shown], residuals[shown], total[shown])
+    whole = np.ones(len(place), dtype=bool) if bent else agree
+    wave = waviness(place[whole], residuals[whole], total[whole])
     scale = shared_error(place[agree], residuals[agree], total[agree])
     # Steps that are too sharp belong to a scratch and are equally uninformative.
-    hidden |= sharp.beyond(found)
-    ends = float(np.hypot(max(doubt, _ENDS * sharp.width * part if hidden else 0.0), wave))
-    data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends, wave)
+    ends = float(np.sqrt(doubt**2 + wave**2 + soft.sharpened * soft.width**2))
+    data = EdgeData(
+        _points(band, place[agree], offset[agree]), total[agree] * scale, common, ends, wave, rival
+    )
     return data, rejected + int((~agree).sum()), ""
+
+
+def _rival(
+    band: Band, found: EdgeProfiles, soft: Softness, grey: Array, line: Array
+) -> tuple[Rival, AdjacentEdge | None]:
+    """The second best explanation of an edge, and the edge itself if a line beside it is the best one.
+
+    Edge and line are adjusted together where the widths of the steps make a line more probable than anywhere.
+    """
+    rival = Rival(_BESIDE, soft.lined, -soft.displaced)
+    if soft.lined <= LINED:
+        return rival, None
+    (start, stop, bow), border = line, found.border
+    fitted = (start * (1 - band.place) + stop * (1 + band.place)) / 2
+    fitted = fitted - _wide_bow(bow, found) * (1 - band.place**2)
+    shown = float(np.exp(np.median(found.blur[0][found.good])))
+    two, gain = edge_beside_line(grey, band, fitted, border.level, border.noise, soft.width, shown)
+    odds = soft.lined / (1 - soft.lined) * np.exp(np.clip(gain, -20, 20))
+    lined = float(odds / (1 + odds))
+    if two is None:
+        return replace(rival, probability=lined), None
+    away = two.ends - np.array([start, stop])
+    moved = float(away[np.abs(away).argmax()])
+    if lined > 0.5:
+        return Rival("softness of its own, without a line beside it,", 1 - lined, -moved), two
+    return Rival(_BESIDE, lined, moved), None
+
+
+def _wide_bow(bow: float, found: EdgeProfiles) -> float:
+    """The bow of an edge that is more than a line displaces it, and therefore real."""
+    return bow if abs(bow) > 2 * found.width else 0.0
 
 
 def _spans(place: Array) -> bool:

@@ -46,6 +46,20 @@ _MODEL_PX = 0.012
 """Standard deviation of the error of either end of an edge by the model of the step, which profiles share."""
 
 
+@dataclass(frozen=True)
+class Rival:
+    """Another explanation of an edge: what it is, its probability, and what it moves inwards, pixels."""
+
+    what: str
+    probability: float
+    moved_px: float
+
+    def __str__(self) -> str:
+        way = "inwards" if self.moved_px > 0 else "outwards"
+        moved = f"would move it {abs(self.moved_px):.2g} px {way}"
+        return f"{self.what} (probability {self.probability:.2f}) {moved}"
+
+
 @dataclass(frozen=True, eq=False)
 class EdgeData:
     """Profiles of one edge as observations, in columns.
@@ -62,6 +76,8 @@ class EdgeData:
         Standard deviation of an independent error of either end of the edge, pixels.
     wave : float
         The part of it by which the edge is neither straight nor evenly bowed.
+    rival : Rival, optional
+        The second best explanation of what is seen.
     """
 
     xy: Array
@@ -69,6 +85,7 @@ class EdgeData:
     common: float = 0.0
     ends: float = 0.0
     wave: float = 0.0
+    rival: Rival | None = None
 
 
 @dataclass(frozen=True)

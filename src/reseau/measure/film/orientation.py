@@ -15,13 +15,15 @@ from ...core.data import Array, Frame
 from ...core.display import Display
 from ...core.failure import Code, Failure
 from ...core.overlaid import Overlaid
-from ...io import CORNERS, EDGES, FrameOrientation, MeasuredCorner, MeasuredEdge
+from ...io import CORNERS, EDGES, FormatCandidate, FrameOrientation, MeasuredCorner, MeasuredEdge, RivalEdge
 from ...io.scans import Scan
 from .border import Band, read_band
 from .channel import WIDER_SEARCH, Channel, channels_by_contrast, measure_channel
-from .lines import FrameShape, Lines, adjust_lines, derived, shape_of
-from .search import FrameGuess, search_frames
+from .formats import ALL_FORMATS, FORMATS, format_probabilities, scale_by_perforations
+from .lines import EdgeData, FrameShape, Lines, adjust_lines, derived, shape_of
+from .search import FrameGuess, search_frames, size_of
 from .steps import Tone
+from .strips import in_reading_order, overview_of, rest_of_strip
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,9 +31,6 @@ if TYPE_CHECKING:
     from ...core.overlay import Layer
 
 __all__ = ["FORMATS", "FrameOptions", "FrameResult", "orient_frames"]
-
-FORMATS: tuple[tuple[float, float], ...] = ((36.0, 24.0), (56.0, 56.0), (56.0, 41.5), (69.0, 56.0))
-"""Formats tried by default: 35 mm, 6×6, 6×4.5, 6×7."""
 
 _OVERVIEWS = ((500, 60), (1000, 300))
 """Longer side of the overviews in pixels, and number of combinations of lines tested in each."""
@@ -41,9 +40,6 @@ _REACH = 4.0
 """Largest error of an approximate edge, in pixels of the overview."""
 _FILM_MM, _GAP_MM = 0.25, 0.2
 """Width of film examined beyond an edge, and width that separates the frame from other structures."""
-_MOST_SIGMA_PX, _MOST_SIGMA_MM, _MOST_SIGMA_WIDTHS = 0.33, 0.01, 0.18
-"""Largest standard deviation of a corner's coordinate of an oriented frame: the largest of the three applies,
-the last in widths of a blurred step, so that a scan finer than its film need not be better than the film."""
 _FITS, _AGREES, _CONTRADICTS = (0.3, 1.1), 0.015, 0.08
 """Size of a frame relative to the scan at which the resolution stated in the file can be that of the scan;
 and relative differences of the scale from it: from the first the frame is not of its format, from the second
@@ -59,8 +55,9 @@ _REACHED, _SEEN, _SAMPLES = 0.12, 0.4, 20
 that must be seen; and the number of these parts."""
 _STATUS = {"oriented": 2, "three-edges": 1, "declined": 0}
 """Rank of each status."""
-_REMEDY, _FLAT = "scan it with more contrast", "hold the film flat and parallel to the sensor"
-"""What helps if edges are uncertain, and if they are not straight."""
+_STATED = 0.05, 0.5
+"""Least probability of another explanation of an edge that is stated with the frame, and least share that
+what it moves has in the largest standard deviation of a corner."""
 _SLANT = float(np.deg2rad(0.7))
 """Standard deviation of the rotation angle of a tilted copying camera, radians."""
 _MOST_W = 4.0
@@ -129,6 +126,12 @@ class FrameResult(Display, Overlaid):
         Pixels per millimetre of the scan where they contradict the format: the opening of a slide mount.
     roll_frames : int, optional
         Number of frames of the roll whose shape was used.
+    place : ndarray (4, 2), optional
+        Approximate corners in the scan, also of a declined frame.
+    frame : int, optional
+        Number of the frame in a scan of several, in reading order.
+    formats : tuple of ((float, float), float)
+        Formats that the frame can be, with their probabilities, if none was given.
 
     Examples
     --------
@@ -148,6 +151,9 @@ class FrameResult(Display, Overlaid):
     code: Code | None = None
     resolution: float | None = None
     roll_frames: int | None = None
+    place: Array | None = None
+    frame: int | None = None
+    formats: tuple[tuple[tuple[float, float], float], ...] = ()
 
     def __bool__(self) -> bool:
         return self.status != "declined"
@@ -185,7 +191,8 @@ class FrameResult(Display, Overlaid):
         return axes
 
     def _heading(self) -> str:
-        return f"{self.image}: {self.status}" + (f" ({self.why})" if self.why else "")
+        number = "" if self.frame is None else f", frame {self.frame}"
+        return f"{self.image}{number}: {self.status}" + (f" ({self.why})" if self.why else "")
 
     def layers(self) -> list[Layer]:
         """What is drawn over the scan: corners, measured edges, and the edges that were not found."""
@@ -244,6 +251,8 @@ class FrameResult(Display, Overlaid):
             "channel": self.channel,
             "edges": self.edges,
             "roll_frames": self.roll_frames,
+            "frame": self.frame,
+            "formats": tuple(FormatCandidate(format_mm=each, probability=p) for each, p in self.formats),
         }
         if self.lines is None or not self:
             none = dict.fromkeys(
@@ -306,21 +315,32 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
         if isinstance(guesses, Failure):
             declined = declined or ([_declined(scan, guesses)] if missing else [])
             continue
-        results = [_oriented(scan, guess, reduction, options) for guess in guesses]
-        good = [result for result in results if result]
-        if good:
-            return sorted(good, key=_reading)
+        scale = _perforated(scan, guesses[0], reduction) if options.near is None else None
+        if scale is not None and not _of_scale(guesses[0], reduction, scale, options):
+            again, finer = _found(scan, options, missing, cut=bool(declined), scale=scale)
+            guesses, reduction = (guesses, reduction) if isinstance(again, Failure) else (again, finer)
+        results = [_oriented(scan, guess, reduction, options, scale) for guess in guesses]
+        if any(results):
+            return in_reading_order(results + rest_of_strip(scan, results, options, _oriented))
         # The reason why four edges are no frame is more useful than why three of them are none.
         declined = declined or results[:1]
     return declined
 
 
-def _reading(result: FrameResult) -> tuple[float, float]:
-    if result.lines is None:
-        return 0.0, 0.0
-    x, y = result.lines.corners.mean(axis=0)
-    size = float(np.ptp(result.lines.corners[:, 1]))
-    return float(np.rint(y / size)), float(x)
+def _perforated(scan: Scan, guess: FrameGuess, reduction: float) -> float | None:
+    """Pixels of the scan per millimetre by perforations along or across a frame; None without them."""
+    along = guess.corners[1] - guess.corners[0]
+    overview, r = scan.overview(overview_of(scan, _OVERVIEWS[-1][0]))
+    scale = scale_by_perforations(overview, float(np.arctan2(along[1], along[0])))
+    return None if scale is None else scale * r
+
+
+def _of_scale(guess: FrameGuess, reduction: float, scale: float, options: FrameOptions) -> bool:
+    """Whether a frame has the size of one of the formats at a scale."""
+    among = ALL_FORMATS if options.formats == FORMATS else options.formats
+    own = np.log(size_of(guess.corners) * reduction / scale)
+    lying = [np.log(each) for w, h in among for each in ((w, h), (h, w))]
+    return any(np.abs(own - each).max() < _CONTRADICTS for each in lying)
 
 
 def _declined(scan: Scan, failure: Failure) -> FrameResult:
@@ -332,20 +352,23 @@ def _declined(scan: Scan, failure: Failure) -> FrameResult:
 
 
 def _found(
-    scan: Scan, options: FrameOptions, missing: bool, cut: bool
+    scan: Scan, options: FrameOptions, missing: bool, cut: bool, scale: float | None = None
 ) -> tuple[list[FrameGuess] | Failure, float]:
     """Frames in an overview; a finer overview is used if the first gives no reliable frame.
 
-    After four edges that are no frame, one may be `missing` only because the scan is `cut` there.
+    After four edges that are no frame, one may be `missing` only because the scan is `cut` there. The `scale`
+    is that of perforations, px/mm, at which all formats are searched.
     """
     best: list[FrameGuess] = []
     reduction, dark = 1.0, True
     sizes = options.formats if options.shape is None else [(options.shape.width, options.shape.height)]
     # Four lines of the picture may be a frame of another scale: that of the scan first, if it is stated.
     known = next((k for size in sizes if (k := _resolution(scan, options, size)) is not None), None)
+    if scale is not None:
+        known, sizes = scale, ALL_FORMATS if options.formats == FORMATS else sizes
     scales = [known] if options.dpi is not None else [None] if missing or known is None else [known, None]
     for longest, tried in _OVERVIEWS:
-        overview, r = scan.overview(longest)
+        overview, r = scan.overview(overview_of(scan, longest))
         if longest > _OVERVIEWS[0][0] and r == reduction:
             break
         dark = float(np.ptp(np.quantile(overview, [0.01, 0.99]))) < 0.01 * scan.full_scale
@@ -387,9 +410,21 @@ def _rank(found: list[FrameGuess]) -> float:
     return found[0].score + (2.0 if all(found[0].supported) else 0.0)
 
 
-def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOptions) -> FrameResult:
-    """Measure the edges of one frame in all channels, adjust, and keep the best channel."""
+def _oriented(
+    scan: Scan, guess: FrameGuess, reduction: float, options: FrameOptions, exact: float | None = None
+) -> FrameResult:
+    """Measure the edges of one frame in all channels, adjust, and keep the best channel.
+
+    Its format is the most probable one at the `exact` scale of perforations, or that of the file.
+    """
     corners = (guess.corners + 0.5) * reduction - 0.5
+    formats: list[tuple[tuple[float, float], float]] = []
+    if options.shape is None and options.formats == FORMATS:
+        known = exact if options.dpi is None else options.dpi / 25.4
+        stated = None if scan.dpi is None else scan.dpi / 25.4
+        formats = format_probabilities(size_of(corners), ALL_FORMATS, known, stated)
+        formats = [each for each in formats if each[1] > _STATED[0]]
+        guess = replace(guess, format_mm=formats[0][0])
     side = np.hypot(*(np.roll(corners, -1, axis=0) - corners).T)
     scale = float((side[0] + side[2]) / (2 * guess.format_mm[0]))
     reach = max(_REACH * reduction, 6.0)
@@ -416,10 +451,10 @@ def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOpt
         # Channels are ordered by contrast: a later one must show more edges, or more accurate ones.
         if best is None or _seen(result) > _seen(best):
             best = result
-        if best.status == "oriented":  # other channels show the same edges with less contrast
-            break
+        if best.status == "oriented" and not best.why:
+            break  # other channels show the same edges with less contrast
     assert best is not None
-    return best
+    return replace(best, place=corners, formats=tuple(formats))
 
 
 def _seen(result: FrameResult) -> tuple[int, float]:
@@ -547,7 +582,6 @@ def _judged(
             "may be a line of the picture: give the approximate corners, or the correct --format-mm",
             code=Code.INCONSISTENT,
         )
-    sigma = np.sqrt(np.diag(lines.covariance))
     if missing:
         reason = measured.why[EDGES.index(missing[0])]
         if doubt := _unproven(scan, lines, measured, EDGES.index(missing[0]), shape, options):
@@ -555,15 +589,6 @@ def _judged(
             return replace(base, lines=None, why=why, code=Code.EDGE_MISSING)
         why = f"{missing[0]} edge: {reason}; its position follows from the format"
         return replace(base, status="three-edges", why=why, code=Code.EDGE_MISSING)
-    scale = max(base.px_per_mm or (0.0, 0.0))
-    limit = max(_MOST_SIGMA_PX, _MOST_SIGMA_MM * scale, _MOST_SIGMA_WIDTHS * measured.width)
-    if (most := float(sigma.max())) > limit:
-        wavy = [EDGES[k] for k, data in enumerate(measured.data) if data is not None and data.wave > most / 2]
-        remedy = f"the {wavy[0]} edge is no straight or evenly bowed line; {_FLAT}" if wavy else _REMEDY
-        mm = f"{1000 * most / scale:.2g} µm of {w:g}x{h:g} mm, " if scale else ""
-        size = f"{most:.2f} px ({mm}at most {limit:.2f} px)"
-        why = f"a corner would have a standard deviation of {size}; {remedy}"
-        return replace(base, lines=None, why=why, code=Code.UNCERTAIN)
     known = _resolution(scan, options, guess.format_mm)
     own = float(np.mean(base.px_per_mm or (1.0, 1.0)))
     if known is not None and abs(own / known - 1) > _AGREES:
@@ -578,7 +603,25 @@ def _judged(
         )
         why += " of the scan, not of the format"
         return replace(base, status="oriented", why=why, code=Code.UNEQUAL_SCALES, resolution=known)
-    return replace(base, status="oriented")
+    return replace(
+        base, status="oriented", why="; ".join([base.why] * bool(base.why) + _doubts(measured, lines))
+    )
+
+
+def _doubts(measured: Channel, lines: Lines) -> list[str]:
+    """What else the edges may be, with probabilities, and edges that are not straight."""
+    least, said = _STATED[1] * float(np.sqrt(np.diag(lines.covariance)).max()), []
+    for name, data in zip(EDGES, measured.data, strict=True):
+        if data is not None and data.wave > least:
+            said.append(
+                f"the {name} edge is no straight or evenly bowed line, its ends are known to {data.wave:.2g} "
+                "px; hold the film flat and parallel to the sensor"
+            )
+        rival = None if data is None else data.rival
+        stated = rival is not None and rival.probability > _STATED[0]
+        if stated and np.sqrt(rival.probability) * abs(rival.moved_px) > least:
+            said.append(f"{name} edge: {rival}")
+    return said
 
 
 def _slanted(corners: Array, measured: Channel, shape: FrameShape) -> tuple[Lines, float] | None:
@@ -613,5 +656,13 @@ def _reports(measured: Channel, lines: Lines | None) -> dict[str, MeasuredEdge]:
             rms_px=float(lines.rms[k]) if lines is not None and found else None,
             curvature_px=bow if found else None,
             why=measured.why[k],
+            rival=_rival(measured.data[k]),
         )
     return reports
+
+
+def _rival(data: EdgeData | None) -> RivalEdge | None:
+    if data is None or data.rival is None:
+        return None
+    rival = data.rival
+    return RivalEdge(what=rival.what, probability=rival.probability, moved_px=rival.moved_px)

@@ -1,0 +1,123 @@
+"""Formats of film: those that a frame can be by its proportions and size, and the scale by perforations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from ...core.data import Array
+from .adjacent_lines import student
+from .perforations import PITCH_MM, ROWS_MM
+
+__all__ = ["ALL_FORMATS", "FORMATS", "format_probabilities", "scale_by_perforations"]
+
+FORMATS: tuple[tuple[float, float], ...] = ((36.0, 24.0), (56.0, 56.0), (56.0, 41.5), (69.0, 56.0))
+"""Formats searched by default: 35 mm, 6×6, 6×4.5, 6×7; frames of all others have proportions like these."""
+ALL_FORMATS: tuple[tuple[float, float], ...] = (
+    *FORMATS,
+    (24.0, 18.0),
+    (24.0, 24.0),
+    (84.0, 56.0),
+    (118.0, 88.0),
+    (120.0, 95.0),
+    (4.8, 3.5),
+    (5.79, 4.01),
+    (10.26, 7.49),
+    (22.0, 16.0),
+)
+"""Also half frame, 24×24, 6×9, 9×12, 4×5 inch, and the cine formats 8, Super 8, 16 and 35 mm."""
+_ASPECT, _SIZE = 0.012, 0.02
+"""Relative standard deviations of the proportions of a frame in an overview, and of its size."""
+_TRUE, _RANGE = 0.8, 3.4
+"""Probability that the resolution that a file states is that of the scan, and logarithmic range of others."""
+_LEAST_PITCH, _PERIODS = 6.0, 4
+"""Least pitch of perforations in an overview, pixels, and their least number in a row."""
+_HEIGHT = 0.45
+"""Share of the pitch in which rows across perforations show them entirely."""
+_REGULAR = 0.65
+"""Least share of the variance along both rows that has the period of the perforations, of which the
+fundamental has 0.78; a picture hardly has two such rows with this ratio of distance and period."""
+_VISIBLE = 0.05
+"""Least contrast of perforations, as a share of that of the scan."""
+
+
+def format_probabilities(
+    size: Array, among: Sequence[tuple[float, float]], exact: float | None, stated: float | None
+) -> list[tuple[tuple[float, float], float]]:
+    """Formats, as they lie in the scan, with their probabilities, the most probable first.
+
+    Parameters
+    ----------
+    size : ndarray (2,)
+        Width and height of the frame, pixels.
+    among : sequence of (width, height)
+        Possible formats in mm, in either orientation.
+    exact, stated : float, optional
+        Pixels per millimetre that are known, and those that the file states.
+
+    Examples
+    --------
+    A frame of 720 px × 480 px may be 36 mm × 24 mm or 84 mm × 56 mm; at 508 dpi it is the former:
+
+    >>> size = np.array([720.0, 480.0])
+    >>> [(format, round(p, 2)) for format, p in format_probabilities(size, ALL_FORMATS, None, None)[:2]]
+    [((36.0, 24.0), 0.5), ((84.0, 56.0), 0.5)]
+    >>> format_probabilities(size, ALL_FORMATS, 508 / 25.4, None)[0][0]
+    (36.0, 24.0)
+    """
+    lying = list(dict.fromkeys(each for w, h in among for each in ((w, h), (h, w))))
+    sides = np.array(lying)
+    weight = student(np.log(size[0] / size[1] * sides[:, 1] / sides[:, 0]), _ASPECT)
+    scale = np.log(np.sqrt(np.prod(size) / sides.prod(axis=1)))
+    if exact is not None:
+        weight = weight * student(scale - np.log(exact), _SIZE)
+    elif stated is not None:
+        weight = weight * (_TRUE * student(scale - np.log(stated), _SIZE) + (1 - _TRUE) / _RANGE)
+    weight = np.round(weight / weight.sum(), 9)  # of equal ones the first is the usual one
+    return [(lying[k], float(weight[k])) for k in np.argsort(-weight, kind="stable")]
+
+
+def scale_by_perforations(overview: NDArray[np.float32], angle: float) -> float | None:
+    """Pixels of an overview per millimetre by the two rows of perforations of 35 mm film; None without them.
+
+    Two rows with the period of 4.75 mm, 28.17 mm apart, in either direction of the film.
+
+    Parameters
+    ----------
+    overview : ndarray (h, w, c)
+        The reduced scan.
+    angle : float
+        Direction of the film or across it, against the rows of the overview, radians.
+    """
+    grey = overview.mean(axis=2)
+    height, width = grey.shape
+    turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), float(np.rad2deg(angle)), 1.0)
+    level = cv2.warpAffine(grey, turn, (width, height), borderMode=cv2.BORDER_REPLICATE)
+    found = [_rows_of_perforations(plane) for plane in (level, np.ascontiguousarray(level.T))]
+    share, pitch = max(found)
+    return pitch / PITCH_MM if share > _REGULAR else None
+
+
+def _rows_of_perforations(grey: NDArray[np.float32]) -> tuple[float, float]:
+    """Share of the variance along the most regular two rows that perforations explain, and their pitch."""
+    height, width = grey.shape
+    rest = grey - scipy.ndimage.uniform_filter1d(grey, max(3, width // _PERIODS), axis=1)
+    power = np.abs(np.fft.rfft(rest * np.hanning(width), n=4 * width, axis=1)) ** 2
+    total = power.sum(axis=1)
+    seen = np.sqrt(total) > _VISIBLE * np.sqrt(total.max())
+    best = (0.0, 1.0)
+    # A line of a windowed spectrum is sixteen samples wide where it is sampled four times as finely.
+    lines = scipy.ndimage.uniform_filter1d(power, 17, axis=1) * 17 * (seen / np.maximum(total, 1e-9))[:, None]
+    for k in range(4 * _PERIODS, int(4 * width / _LEAST_PITCH)):
+        pitch = 4 * width / k
+        away = round(pitch * ROWS_MM / PITCH_MM)
+        if away >= height:
+            continue
+        row = scipy.ndimage.uniform_filter1d(lines[:, k], max(1, round(_HEIGHT * pitch)))
+        share = float(np.minimum(row[:-away], row[away:]).max()) if away else 0.0
+        best = max(best, (share, pitch))
+    return best
