@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["KINDS", "FilmScan", "World", "frame"]
+__all__ = ["KINDS", "FilmScan", "World", "frame", "strip"]
 
 Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
@@ -403,6 +403,25 @@ def frame(world: World, seed: int) -> FilmScan:
         world.format,
         {"tilt_deg": float(np.rad2deg(turn)), "px_per_mm": k, "mount": mount},
     )
+
+
+def strip(world: World, seed: int) -> tuple[NDArray[np.uint8], list[Array], float]:
+    """Draw a strip of two to six frames side by side: its pixels, the corners of each, and pixels per mm."""
+    rng = np.random.default_rng([78, seed])
+    scale = float(rng.uniform(*world.scale))
+    level = replace(world, scale=(scale, scale), tilt=(0.0, 0.3))
+    drawn = [frame(level, 100 * seed + k) for k in range(int(rng.integers(2, 7)))]
+    height = min(len(each.pixels) for each in drawn)
+    parts, corners, left = [], [], 0
+    for each in drawn:
+        # Between frames half a millimetre to two of film stay on either side.
+        x, away = each.corners[:, 0], rng.uniform(0.5, 2.0, 2) * scale
+        first, last = max(int(x.min() - away[0]), 0), min(int(x.max() + away[1]), each.pixels.shape[1])
+        down = (len(each.pixels) - height) // 2
+        parts.append(each.pixels[down : down + height, first:last])
+        corners.append(each.corners + np.array([left - first, -down]))
+        left += last - first
+    return np.concatenate(parts, axis=1), corners, scale
 
 
 def _filtered(light: Array | Plane, transfer: Array) -> Array:

@@ -224,6 +224,9 @@ class FrameOrientation(Document):
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file; what is missing of the last fields is left out."""
         content = super().to_dict()
+        for edge in content["edges"].values():
+            if edge["rival"] is None:
+                del edge["rival"]
         missing = [key for key in ("transform", "roll_frames", "frame", "formats") if not content[key]]
         return {key: value for key, value in content.items() if key not in missing}
 

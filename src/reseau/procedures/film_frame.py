@@ -78,7 +78,7 @@ def reorient_scan(
     Returns
     -------
     list of FrameResult
-        The repeated results if they are more complete or more accurate, otherwise `before`.
+        The repeated results if they are as complete, otherwise `before`.
 
     Examples
     --------
@@ -95,17 +95,11 @@ def reorient_scan(
     again = orient_frames(scan, roll.options(options))
     order = {"oriented": 2, "three-edges": 1, "declined": 0}
 
-    def rank(results: Sequence[FrameResult]) -> tuple[int, float]:
-        """Best status, and then the smallest of the largest sigmas of its frames."""
-        best = max(order[result.status] for result in results)
-        sigmas = [
-            float(np.trace(r.lines.covariance))
-            for r in results
-            if r.lines is not None and order[r.status] == best
-        ]
-        return best, -min(sigmas, default=np.inf)
+    def best(results: Sequence[FrameResult]) -> int:
+        return max(order[result.status] for result in results)
 
-    if rank(again) <= rank(before):
+    # What the roll has in common is additional knowledge of a frame that is as complete without it.
+    if best(again) < max(best(before), 1):
         return list(before)
     note = f"by the shape of {roll.frames} frames of its roll"
     return [

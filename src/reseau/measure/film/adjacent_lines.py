@@ -53,7 +53,7 @@ pixels hardly show the width, small errors of their model have a large part in i
 _SOFTNESS, _DIRECTIONS = 0.03, 0.04
 """Scatter of logarithmic widths from edge to edge, by focus and penumbra, and half the difference of the two
 directions of a scan, by lens and carriage; both with the heavy tails of Student's distribution."""
-LINED, _PARTLY, _SHARPENED = 0.01, 0.01, 0.01
+LINED, _PARTLY, _SHARPENED = 0.02, 0.03, 0.01
 """Prior probabilities: that a line runs beside all of an edge within a few widths of its step, that one runs
 beside a given place of it, and that what was measured is sharper than an edge can be (a scratch)."""
 _RANGE = 1.5
@@ -200,7 +200,8 @@ def _quantiles(values: Array, weight: Array, shares: Sequence[float]) -> list[fl
     """Weighted quantiles: a sharp step in the middle of a pixel hardly shows its width."""
     order = np.argsort(values, kind="stable")
     below = np.cumsum(weight[order]) / weight.sum()
-    return [float(values[order][min(np.searchsorted(below, share), len(order) - 1)]) for share in shares]
+    at = np.minimum(np.searchsorted(below, shares), len(order) - 1)
+    return [float(each) for each in values[order][at]]
 
 
 def displaced_by_lines(found: EdgeProfiles, soft: Softness) -> tuple[Array, Array, Array]:
@@ -213,7 +214,7 @@ def displaced_by_lines(found: EdgeProfiles, soft: Softness) -> tuple[Array, Arra
     -------
     (ndarray (n,), ndarray (n,), ndarray (n,))
         Standard deviations of the displacements of profiles, pixels, probabilities of a line beside them, and
-        rms displacements by it.
+        mean displacements by it, inwards.
     """
     n, good = len(found.place), np.flatnonzero(found.good)
     groups = [g for g in np.array_split(good, max(1, n // NEIGHBOURS)) if len(g)]
@@ -221,7 +222,9 @@ def displaced_by_lines(found: EdgeProfiles, soft: Softness) -> tuple[Array, Arra
         return np.zeros(n), np.zeros(n), np.zeros(n)
     weight = 1 / (found.blur[1] + _EVEN**2)
     excess = np.array([np.average(found.blur[0][g], weights=weight[g]) for g in groups]) - soft.log_width
-    scale = np.sqrt([1 / weight[g].mean() + soft.texture**2 + soft.scatter**2 for g in groups])
+    # The texture was seen with the noise in it.
+    noise = np.array([max(1 / weight[g].mean(), soft.texture**2) for g in groups])
+    scale = np.sqrt(noise + soft.scatter**2)
     each = _WEIGHT * student(excess[:, None] - _INCREASE, scale[:, None])
     seen = np.stack([student(excess, scale), each.sum(axis=1)], axis=1)
     prior = np.array([1 - max(_PARTLY, soft.lined), max(_PARTLY, soft.lined)])
@@ -235,14 +238,15 @@ def displaced_by_lines(found: EdgeProfiles, soft: Softness) -> tuple[Array, Arra
         after[k] = change @ (seen[k + 1] * after[k + 1])
         after[k] /= after[k].sum()
     lined = (before * after)[:, 1] / (before * after).sum(axis=1)
-    rms = soft.width * np.sqrt((each * _MOVED**2).sum(axis=1) / each.sum(axis=1))
+    mean, square = (each @ _MOVED**k / each.sum(axis=1) * soft.width**k for k in (1, 2))
     # A line displaces all profiles beside it alike: together they are as uncertain as one. Where a line is as
     # improbable as anywhere, each has its own doubt.
     run = NEIGHBOURS * float(lined.sum() / lined.max())
-    sigma = rms * np.sqrt(lined * (1 + run * lined / (lined + 3 * _PARTLY)))
+    variance = lined * square - (lined * mean) ** 2
+    sigma = np.sqrt(variance * (1 + run * lined / (lined + 3 * _PARTLY)))
     middle = np.array([found.place[g].mean() for g in groups])
-    sigma, lined, rms = (np.interp(found.place, middle, each) for each in (sigma, lined, rms))
-    return sigma, lined, rms
+    sigma, lined, mean = (np.interp(found.place, middle, each) for each in (sigma, lined, mean))
+    return sigma, lined, mean
 
 
 _SECTIONS = 20

@@ -204,7 +204,7 @@ def _edge(
         return None, 0, "no contrast between film and picture"
     drawn, beside, moves = (part[found.good] for part in displaced_by_lines(found, soft))
     place, offset, own = (part[found.good] for part in (found.place, found.offset, found.sigma))
-    sigma = np.hypot(own, drawn)
+    sigma, offset = np.hypot(own, drawn), offset - beside * moves
     line = _line(place, offset, sigma, own)
     rejected = int((~found.good).sum())
     if line is None:

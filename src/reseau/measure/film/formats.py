@@ -64,7 +64,7 @@ def format_probabilities(
     A frame of 720 px × 480 px may be 36 mm × 24 mm or 84 mm × 56 mm; at 508 dpi it is the former:
 
     >>> size = np.array([720.0, 480.0])
-    >>> [(format, round(p, 2)) for format, p in format_probabilities(size, ALL_FORMATS, None, None)[:2]]
+    >>> [(format, round(p, 1)) for format, p in format_probabilities(size, ALL_FORMATS, None, None)[:2]]
     [((36.0, 24.0), 0.5), ((84.0, 56.0), 0.5)]
     >>> format_probabilities(size, ALL_FORMATS, 508 / 25.4, None)[0][0]
     (36.0, 24.0)
@@ -97,7 +97,8 @@ def scale_by_perforations(overview: NDArray[np.float32], angle: float) -> float 
     height, width = grey.shape
     turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), float(np.rad2deg(angle)), 1.0)
     level = cv2.warpAffine(grey, turn, (width, height), borderMode=cv2.BORDER_REPLICATE)
-    found = [_rows_of_perforations(plane) for plane in (level, np.ascontiguousarray(level.T))]
+    planes = (np.asarray(plane, dtype=np.float32) for plane in (level, level.T))
+    found = [_rows_of_perforations(plane) for plane in planes]
     share, pitch = max(found)
     return pitch / PITCH_MM if share > _REGULAR else None
 

@@ -618,8 +618,9 @@ def _doubts(measured: Channel, lines: Lines) -> list[str]:
                 "px; hold the film flat and parallel to the sensor"
             )
         rival = None if data is None else data.rival
-        stated = rival is not None and rival.probability > _STATED[0]
-        if stated and np.sqrt(rival.probability) * abs(rival.moved_px) > least:
+        if rival is None or rival.probability < _STATED[0]:
+            continue
+        if np.sqrt(rival.probability) * abs(rival.moved_px) > least:
             said.append(f"{name} edge: {rival}")
     return said
 
