@@ -144,6 +144,10 @@ KINDS: dict[str, World] = {
     "compressed": replace(_PLAIN, code="srgb", blocks=(6.0, 20.0), grain=(0.03, 0.06)),
     "sharpened": replace(_PLAIN, code="srgb", sharpen=(0.5, 1.5), blur=(0.6, 1.2)),
     "on a table": replace(_PLAIN, beside=("table", "strip")),
+    "out of focus": replace(_PLAIN, blur=(1.5, 4.0), tails=(0.0, 0.01), scene=("forms", "posts")),
+    "half frame": replace(_PLAIN, format=(18.0, 24.0), beside=("strip",)),
+    "6x7": replace(_PLAIN, format=(69.0, 56.0), scale=(12.0, 15.0), film="negative", range=(1.0, 1.8)),
+    "16 mm": replace(_PLAIN, format=(10.26, 7.49), scale=(60.0, 90.0), radius=(0.2, 0.6)),
     "6x6": replace(_PLAIN, format=(56.0, 56.0), scale=(14.0, 18.0), radius=(0.2, 0.8), tilt=(0.0, 4.0)),
     "cut": replace(_PLAIN, beside=("crop",)),
 }

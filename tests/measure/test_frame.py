@@ -14,7 +14,7 @@ from reseau.core.tone import ToneCurve
 from reseau.io.scans import scan_of
 from reseau.measure.film import FrameOptions, FrameResult, Roll, orient_frames, roll_of
 from reseau.measure.film.adjacent_lines import softness_of
-from reseau.measure.film.lines import robust_line, waviness
+from reseau.measure.film.lines import EdgeData, FrameShape, departing_line, explained_shape, robust_line
 from reseau.procedures.film_frame import reorient_scan
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 
@@ -385,9 +385,38 @@ def test_grey_values_are_measured_with_the_curve_that_the_file_states(negative: 
 def test_ends_of_a_wavy_edge_are_as_uncertain_as_it_departs_from_a_line() -> None:
     place, sigma = np.linspace(-1, 1, 300), np.full(300, 0.05)
     noise = np.random.default_rng(0).normal(0, 0.05, 300)
-    assert waviness(place, noise, sigma) == 0.0
-    # A line through one wave of 0.5 px misses its ends by 0.48 px.
-    assert 0.4 < waviness(place, noise + 0.5 * np.sin(np.pi * place), sigma) < 0.8
+    none = np.zeros(300), np.zeros((300, 0))
+    _, covariance, departs = departing_line(place, noise, sigma, *none)
+    assert departs < 0.03
+    assert np.sqrt(np.diag(covariance))[:2].max() < 0.03
+    # A line through one wave of 0.5 px, weighted evenly, misses its ends by 0.48 px.
+    values, covariance, departs = departing_line(place, noise + 0.5 * np.sin(np.pi * place), sigma, *none)
+    assert 0.1 < departs < 0.5
+    assert (np.abs(values[:2]) < 2 * np.sqrt(np.diag(covariance))[:2]).all()
+    assert np.abs(values[:2]).max() < 0.2
+
+
+@pytest.mark.parametrize(("moved", "tilted"), [((0, 15), False), ((0, 0), False), ((-8, 8), True)])
+def test_an_edge_off_the_format_is_another_line_unless_the_camera_was_tilted(
+    moved: tuple[float, float], tilted: bool
+) -> None:
+    corners = np.array([[20.0, 20.0], [920.0, 20.0], [920.0, 620.0], [20.0, 620.0]])
+    ends = np.zeros((4, 2))
+    ends[3] = moved
+    if tilted:
+        ends[1] = moved[::-1]  # a trapezium
+    none = np.zeros((0, 2)), np.zeros(0)
+    edges = [EdgeData(np.append(each, 0.0), 0.01 * np.eye(3), *none) for each in ends]
+    (first, *_), seen = explained_shape(corners, edges, FrameShape(36.0, 24.0), None)
+    if tilted:
+        assert seen > 0.9
+    elif moved[1]:
+        assert first.edge == 3
+        assert first.probability > 0.5
+        assert 0 < first.inwards < 15
+    else:
+        assert first.probability < 0.01
+        assert seen < 0.05
 
 
 def test_a_line_is_found_through_profiles_of_which_half_may_be_displaced() -> None:
@@ -409,7 +438,7 @@ def test_frames_of_a_strip_are_delivered_in_order() -> None:
 
 def test_the_softness_of_edges_is_explained_together() -> None:
     alike, wide, sharp, two = (
-        softness_of([(float(np.log(width)), 0.02) for width in widths])
+        softness_of([(float(np.log(width)), 0.02) for width in widths], 700.0)
         for widths in (
             (0.75, 0.76, 0.75, 0.77),
             (0.75, 0.75, 1.2, 0.76),

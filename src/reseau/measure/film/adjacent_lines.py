@@ -32,7 +32,6 @@ from .edges import NEIGHBOURS, EdgeProfiles
 from .steps import StepForm
 
 __all__ = [
-    "LINED",
     "AdjacentEdge",
     "Softness",
     "common_forms",
@@ -53,35 +52,47 @@ pixels hardly show the width, small errors of their model have a large part in i
 _SOFTNESS, _DIRECTIONS = 0.03, 0.04
 """Scatter of logarithmic widths from edge to edge, by focus and penumbra, and half the difference of the two
 directions of a scan, by lens and carriage; both with the heavy tails of Student's distribution."""
-LINED, _PARTLY, _SHARPENED = 0.02, 0.03, 0.01
-"""Prior probabilities: that a line runs beside all of an edge within a few widths of its step, that one runs
-beside a given place of it, and that what was measured is sharper than an edge can be (a scratch)."""
+_LINES, _CONTOURS, _HIDDEN = 2.0, 20.0, 3.0
+"""Number of lines of a picture that run in the direction of an edge from end to end, number of contours that
+a line across the picture meets, and widths of the step within which they are hidden in it."""
+_LEVEL = float(np.deg2rad(1.0))
+"""Scatter of the directions of these lines about that of the edge: cameras are held so well, radians."""
+_SHARPENED = 0.01
+"""Prior probability that what was measured is sharper than an edge can be (a scratch)."""
 _RANGE = 1.5
 """Range of logarithmic widths of lines that are sharper than edges."""
 _PERSISTENT = 0.9
-"""Share of the neighbourhoods of profiles beside which a line goes on to the next."""
+"""Share of the neighbourhoods of profiles beside which a second step goes on to the next."""
+_LEAST_SQUARE = 0.6
+"""Least variance of a step with a second one, relative to that of the step alone."""
 _LEAST = 20
 """Least number of profiles that show the softness of an edge."""
 
 
-def _second_steps() -> tuple[Array, Array, Array]:
+def _second_steps(*, alone: bool) -> tuple[Array, Array, Array]:
     """Second steps as they may be: increase of the logarithmic width, displacement (widths), and weight.
 
     A second step with a share r of the contrast, at the distance s behind the first, appears as one step that
-    is displaced by r·s and has the variance w² + r(1 − r)·s². Shares are evenly distributed, distances in
-    their logarithm; a first step of less than a tenth of the contrast is no edge of a frame.
+    is displaced by r·s and has the variance w² + r(1 − r)·s²; a negative share, of a picture that is brighter
+    at its edge than behind it, sharpens the step. Where the picture is as dark as film at its edge, the
+    second step is seen `alone`, sharper if it is that of a narrow line. Shares are evenly distributed,
+    distances in their logarithm.
     """
-    share, distance = (
-        each.ravel() for each in np.meshgrid(np.linspace(0.05, 0.9, 18), np.geomspace(0.15, 6.0, 30))
-    )
-    return (
-        0.5 * np.log1p(share * (1 - share) * distance**2),
-        share * distance,
-        np.full(len(share), 1 / len(share)),
-    )
+    shares = np.concatenate([np.linspace(-0.9, -0.05, 18), np.linspace(0.05, 0.9, 18)])
+    share, distance = (each.ravel() for each in np.meshgrid(shares, _DISTANCES))
+    square = 1 + share * (1 - share) * distance**2
+    # What sharpens a step further is visible beside it.
+    hidden = square > _LEAST_SQUARE
+    increase, moved = 0.5 * np.log(square[hidden]), (share * distance)[hidden]
+    if alone:
+        narrow, distance = (each.ravel() for each in np.meshgrid([0.0, -0.1, -0.2, -0.3], _DISTANCES))
+        increase, moved = np.append(increase, narrow), np.append(moved, distance)
+    return increase, moved, np.full(len(moved), 1 / len(moved))
 
 
-_INCREASE, _MOVED, _WEIGHT = _second_steps()
+_DISTANCES = np.geomspace(0.15, 6.0, 30)
+_ALL, _PARTS = _second_steps(alone=False), _second_steps(alone=True)
+"""Those beside all of an edge, which a step of its own must show, and those beside parts of it."""
 
 
 class Softness(NamedTuple):
@@ -98,6 +109,9 @@ class Softness(NamedTuple):
         it, pixels.
     sharpened : float
         Probability that the steps are sharper than those of an edge.
+    before, beside : float
+        Probabilities, without the widths, of a line beside all of the edge, and of a contour beside a place
+        of it.
     """
 
     log_width: float
@@ -106,6 +120,8 @@ class Softness(NamedTuple):
     lined: float = 0.0
     displaced: float = 0.0
     sharpened: float = 0.0
+    before: float = 0.0
+    beside: float = 0.0
 
     @property
     def width(self) -> float:
@@ -118,7 +134,7 @@ def student(value: Array, scale: Array | float) -> Array:
     return np.asarray(0.375 * (1 + (value / scale) ** 2 / 4) ** -2.5 / scale)
 
 
-def softness_of(widths: Sequence[tuple[float, float] | None]) -> list[Softness]:
+def softness_of(widths: Sequence[tuple[float, float] | None], side: float) -> list[Softness]:
     """Explain the widths of the steps of four edges together.
 
     Each edge is as soft as the scan in its direction, with a scatter of its own; or a line beside it widens
@@ -128,6 +144,8 @@ def softness_of(widths: Sequence[tuple[float, float] | None]) -> list[Softness]:
     ----------
     widths : sequence of (float, float) or None
         Logarithm of the width of each edge and its standard deviation; None if it was not measured.
+    side : float
+        Side of the frame, pixels: the wider a step, the more of the picture is hidden in it.
     """
     seen = [k for k, each in enumerate(widths) if each is not None]
     if not seen:
@@ -138,9 +156,13 @@ def softness_of(widths: Sequence[tuple[float, float] | None]) -> list[Softness]:
     apart = np.linspace(-0.4, 0.4, 33) if len(seen) > 2 else np.zeros(1)
     sign = np.where(np.array(seen) % 2 == 0, -1.0, 1.0)
     away = own - common[:, None, None] - sign * apart[:, None]  # (common, apart, edge)
-    alike = (1 - LINED - _SHARPENED) * student(away, scale)
-    each = _WEIGHT * student(away[..., None] - _INCREASE, scale[:, None])
-    lined = LINED * each.sum(axis=-1)
+    hidden = 2 * _HIDDEN * np.exp(own) / side
+    before = _LINES * hidden * np.minimum(hidden / _LEVEL, 1.0)
+    before, beside = before / (1 + before), 1 - np.exp(-_CONTOURS * hidden / 2)
+    alike = (1 - before) * (1 - _SHARPENED) * student(away, scale)
+    increase, displaced, share = _ALL
+    each = share * student(away[..., None] - increase, scale[:, None])
+    lined = before * each.sum(axis=-1)
     sharp = (
         _SHARPENED / _RANGE * ((away < 0) & (away > -_RANGE)) * (1 - 2 * scale**2 / (away**2 + 2 * scale**2))
     )
@@ -148,21 +170,23 @@ def softness_of(widths: Sequence[tuple[float, float] | None]) -> list[Softness]:
     total = np.log(every).sum(axis=2) + np.log(student(apart, _DIRECTIONS))
     weight = np.exp(total - total.max())
     weight /= weight.sum()
-    moved = (each * _MOVED**2).sum(axis=-1) / each.sum(axis=-1) * np.exp(2 * common)[:, None, None]
+    moved = (each * displaced**2).sum(axis=-1) / each.sum(axis=-1) * np.exp(2 * common)[:, None, None]
     found = [Softness(0.0)] * len(widths)
     for i, k in enumerate(seen):
         p, q = (float((weight * part[..., i] / every[..., i]).sum()) for part in (lined, sharp))
         scan = float((weight * (common[:, None] + sign[i] * apart)).sum())
         square = float((weight * lined[..., i] / every[..., i] * moved[..., i]).sum()) / max(p, 1e-12)
         log = scan if p + q > 0.5 else float(own[i])
-        found[k] = Softness(log, float(sigma[i]), 0.0, p, float(np.sqrt(square)), q)
+        found[k] = Softness(
+            log, float(sigma[i]), 0.0, p, float(np.sqrt(square)), q, float(before[i]), float(beside[i])
+        )
     return found
 
 
-def common_forms(profiles: Sequence[EdgeProfiles | None]) -> list[StepForm | None]:
+def common_forms(profiles: Sequence[EdgeProfiles | None], side: float) -> list[StepForm | None]:
     """Form of the blurred step for each edge: width as the edges together explain it, common lobes."""
     kept = [p if p is not None and p.good.sum() > _LEAST else None for p in profiles]
-    soft = softness_of([None if p is None else (float(np.log(p.width)), 2 * _EVEN) for p in kept])
+    soft = softness_of([None if p is None else (float(np.log(p.width)), 2 * _EVEN) for p in kept], side)
     forms = [p.form for p in kept if p is not None]
     if not forms:
         return [None] * len(profiles)
@@ -177,7 +201,7 @@ def common_forms(profiles: Sequence[EdgeProfiles | None]) -> list[StepForm | Non
     ]
 
 
-def soft_steps(profiles: Sequence[EdgeProfiles | None]) -> list[Softness]:
+def soft_steps(profiles: Sequence[EdgeProfiles | None], side: float) -> list[Softness]:
     """Softness of the steps of each edge, from its profiles."""
     widths: list[tuple[float, float] | None] = []
     textures = []
@@ -193,7 +217,7 @@ def soft_steps(profiles: Sequence[EdgeProfiles | None]) -> list[Softness]:
         change = np.abs(np.diff(own[::NEIGHBOURS]))
         textures.append(1.4826 * float(np.median(change)) / np.sqrt(2) if len(change) > 3 else 0.0)
     texture = sorted(textures)[min(1, len(textures) - 1)] if textures else 0.0
-    return [each._replace(texture=texture) for each in softness_of(widths)]
+    return [each._replace(texture=texture) for each in softness_of(widths, side)]
 
 
 def _quantiles(values: Array, weight: Array, shares: Sequence[float]) -> list[float]:
@@ -205,16 +229,13 @@ def _quantiles(values: Array, weight: Array, shares: Sequence[float]) -> list[fl
 
 
 def displaced_by_lines(found: EdgeProfiles, soft: Softness) -> tuple[Array, Array, Array]:
-    """Displacements of steps by lines beside parts of the edge, and their probabilities.
-
-    A line that widens the steps at one place is beside the next one, too: a hidden Markov chain along the
-    edge (Rabiner 1989) of which each state is seen by the width of the steps.
+    """Displacements of steps by what is beside parts of the edge: a second step widens or sharpens them.
 
     Returns
     -------
     (ndarray (n,), ndarray (n,), ndarray (n,))
-        Standard deviations of the displacements of profiles, pixels, probabilities of a line beside them, and
-        mean displacements by it, inwards.
+        Standard deviations of the displacements of profiles, pixels, probabilities of a second step, and mean
+        displacements by it, inwards.
     """
     n, good = len(found.place), np.flatnonzero(found.good)
     groups = [g for g in np.array_split(good, max(1, n // NEIGHBOURS)) if len(g)]
@@ -225,28 +246,35 @@ def displaced_by_lines(found: EdgeProfiles, soft: Softness) -> tuple[Array, Arra
     # The texture was seen with the noise in it.
     noise = np.array([max(1 / weight[g].mean(), soft.texture**2) for g in groups])
     scale = np.sqrt(noise + soft.scatter**2)
-    each = _WEIGHT * student(excess[:, None] - _INCREASE, scale[:, None])
-    seen = np.stack([student(excess, scale), each.sum(axis=1)], axis=1)
-    prior = np.array([1 - max(_PARTLY, soft.lined), max(_PARTLY, soft.lined)])
-    change = _PERSISTENT * np.eye(2) + (1 - _PERSISTENT) * prior
+    increase, displaced, share = _PARTS
+    each = share * student(excess[:, None] - increase, scale[:, None])
+    lined = _chain(np.stack([student(excess, scale), each.sum(axis=1)], axis=1), max(soft.beside, soft.lined))
+    mean, square = (lined * (each @ displaced**k) / each.sum(axis=1) * soft.width**k for k in (1, 2))
+    middle = np.array([found.place[g].mean() for g in groups])
+    sigma, lined, mean = (
+        np.interp(found.place, middle, part)
+        for part in (np.sqrt(np.maximum(square - mean**2, 0.0)), lined, mean)
+    )
+    return sigma, lined, mean
+
+
+def _chain(seen: Array, prior: float) -> Array:
+    """Probability (n,) of a second step beside each part of an edge (Rabiner 1989).
+
+    What is beside one part is beside the next one, too: a hidden Markov chain. `seen` are the likelihoods of
+    the widths (n, 2) without a second step and with one.
+    """
+    share = np.array([1 - prior, prior])
+    change = _PERSISTENT * np.eye(2) + (1 - _PERSISTENT) * share
     before, after = np.empty_like(seen), np.ones_like(seen)
-    state = prior
+    state = share
     for k, likelihood in enumerate(seen):
         before[k] = state * likelihood / (state * likelihood).sum()
         state = before[k] @ change
     for k in range(len(seen) - 2, -1, -1):
         after[k] = change @ (seen[k + 1] * after[k + 1])
         after[k] /= after[k].sum()
-    lined = (before * after)[:, 1] / (before * after).sum(axis=1)
-    mean, square = (each @ _MOVED**k / each.sum(axis=1) * soft.width**k for k in (1, 2))
-    # A line displaces all profiles beside it alike: together they are as uncertain as one. Where a line is as
-    # improbable as anywhere, each has its own doubt.
-    run = NEIGHBOURS * float(lined.sum() / lined.max())
-    variance = lined * square - (lined * mean) ** 2
-    sigma = np.sqrt(variance * (1 + run * lined / (lined + 3 * _PARTLY)))
-    middle = np.array([found.place[g].mean() for g in groups])
-    sigma, lined, mean = (np.interp(found.place, middle, each) for each in (sigma, lined, mean))
-    return sigma, lined, mean
+    return np.asarray((before * after)[:, 1] / (before * after).sum(axis=1))
 
 
 _SECTIONS = 20
@@ -255,7 +283,7 @@ _REACH, _BIN = 7.0, 0.6
 """Range of pixels on both sides, and size of the bins, in widths of the blurred step."""
 _MODEL = 0.012
 """Accuracy of the model relative to the contrast of a section."""
-_OUT, _BEHIND, _SLOPES = -0.5, 2.5, (0.0, -2.0, 2.0)
+_OUT, _BEHIND, _SLOPES = (-0.5, -2.0), 2.5, (0.0, -2.0, 2.0)
 """Approximate values in widths: distance of the edge from the fitted line, of the line behind it from the
 edge, and change of the latter from the centre to an end."""
 _INDEPENDENT_BINS = 5
@@ -281,7 +309,7 @@ class AdjacentEdge(NamedTuple):
 
 
 def edge_beside_line(
-    grey: Array, band: Band, line: Array, level: Array, noise: float, width: float, own: float
+    grey: Array, band: Band, line: Array, level: Array, noise: float, width: float, own: float, bow: float
 ) -> tuple[AdjacentEdge | None, float]:
     """Adjust an edge together with a line beside it, and compare with one step of any softness.
 
@@ -297,6 +325,8 @@ def edge_beside_line(
         Tone of the film beside each profile.
     noise, width, own : float
         Noise of a pixel; width of the blurred step, one sigma, pixels, and the width that the edge shows.
+    bow : float
+        Bow of the line fitted before: it may be real, or that of the displacement by the line.
 
     Returns
     -------
@@ -304,7 +334,7 @@ def edge_beside_line(
         The edge, if two lines can describe it; and the logarithm of the likelihood of the line, over that of
         one step with the width that the edge shows.
     """
-    two = _two_lines(grey, band, line, level, noise, width)
+    two = _two_lines(grey, band, line, level, noise, width, bow)
     if two is None:
         return None, 0.0
     x, place = two.x, two.place
@@ -313,7 +343,7 @@ def edge_beside_line(
     # The line lies behind the edge, and not so far that both are seen.
     if (behind > -0.3 * width).mean() < 0.9 or moved > _FARTHEST * width:
         return None, 0.0
-    one = _two_lines(grey, band, line, level, noise, own, still=True)
+    one = _two_lines(grey, band, line, level, noise, own, bow, still=True)
     without = two.without if one is None else min(one.without, one.chi, two.without)
     gain = _INDEPENDENT_BINS / 2 * float(np.log(max(without, 1e-9) / max(two.chi, 1e-9)))
     return two.adjacent_edge(band, line), gain
@@ -326,7 +356,7 @@ def ends_with_line(
 
     Its covariance assumes that the model is correct.
     """
-    two = _two_lines(grey, band, line, level, noise, width)
+    two = _two_lines(grey, band, line, level, noise, width, 0.0)
     return None if two is None else two.adjacent_edge(band, line)
 
 
@@ -352,7 +382,15 @@ class _TwoLines(NamedTuple):
 
 
 def _two_lines(
-    grey: Array, band: Band, line: Array, level: Array, noise: float, width: float, *, still: bool = False
+    grey: Array,
+    band: Band,
+    line: Array,
+    level: Array,
+    noise: float,
+    width: float,
+    bow: float,
+    *,
+    still: bool = False,
 ) -> _TwoLines | None:
     """The adjustment with and without a line behind the edge; `still` if the edge is at the fitted one."""
     sections = _sections(grey - level[:, None], band, line, noise, width)
@@ -360,15 +398,14 @@ def _two_lines(
         return None
     place, at, value, weight, top = sections
     model = _Model(place, at, width)
-    starts = np.array([model.start(slope, top) for slope in _SLOPES])
-    shared = np.array([4.0, 4.0, _BOW, 4.0, 4.0, 4.0, 4.0]) * width
+    starts = np.array([model.start(out, slope, top) for out in _OUT for slope in _SLOPES])
+    shared = np.array([4.0, 4.0, np.hypot(_BOW, bow / width), 4.0, 4.0, 4.0, 4.0]) * width
     spread = np.concatenate([shared, _of_steps(0.03 * top, 2 * top, 2 * top, 2 * top)])
-    step = model.start(0.0, top)
+    step = model.start(0.0, 0.0, top)
     step[0], step[_SHARED:] = 0.0, _of_steps(0 * top, top, 0 * top, 0 * top)
     held = np.concatenate([shared[:3], [1e-6] * 4, _of_steps(0.03 * top, 2 * top, 1e-3 * top, 2 * top)])
     if still:
-        starts[:, :3] = 0.0
-        starts[:, 3] -= _OUT * width
+        starts = np.array([model.start(0.0, slope, top) for slope in _SLOPES])
         spread[:3] = held[:3] = 1e-3 * width
     for _ in range(2):
         one = model.fitted(value, weight, step[None], held)
@@ -428,9 +465,9 @@ class _Model:
     def __init__(self, place: Array, at: Array, width: float) -> None:
         self.place, self.at, self.width = place, at, width
 
-    def start(self, slope: float, top: Array) -> Array:
-        """Approximate parameters, with the line departing from the edge by `slope` widths."""
-        shared = np.array([_OUT, 0.0, 0.0, _OUT + _BEHIND, slope, 0.0, 3.0]) * self.width
+    def start(self, out: float, slope: float, top: Array) -> Array:
+        """Approximate parameters, with the edge `out` widths inwards and the line departing by `slope`."""
+        shared = np.array([out, 0.0, 0.0, out + _BEHIND, slope, 0.0, 3.0]) * self.width
         return np.concatenate([shared, _of_steps(0 * top, 0.2 * top, 0.8 * top, -0.3 * top)])
 
     def fitted(self, value: Array, weight: Array, starts: Array, spread: Array) -> _Fitted:

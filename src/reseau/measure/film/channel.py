@@ -11,7 +11,6 @@ import scipy
 
 from ...core.data import Array, Mask
 from .adjacent_lines import (
-    LINED,
     AdjacentEdge,
     Softness,
     common_forms,
@@ -21,7 +20,7 @@ from .adjacent_lines import (
 )
 from .border import Band, Border, Film
 from .edges import EdgeProfiles, measure_profiles, merged
-from .lines import EdgeData, Rival, robust_line, shared_error, waviness
+from .lines import Contender, EdgeData, Rival, departing_line, robust_line
 from .steps import STRAIGHT, StepForm, Tone
 
 __all__ = ["WIDER_SEARCH", "Channel", "channels_by_contrast", "measure_channel"]
@@ -56,8 +55,8 @@ within which a profile agrees; and standard deviation of an end continued from t
 structure's distance."""
 _PARTS, _MOST_PARTS = 20, 0.4
 """Parts of an edge, and share of them in which undisturbed profiles determine it."""
-_CHORD = 30
-"""Number of points that represent an edge known by its two ends."""
+_MODEL_PX = 0.012
+"""Standard deviation of the error of either end of an edge by the model of the step, which profiles share."""
 _OTHER_WIDTH, _OTHER_LOBES = 0.12, 0.01
 """Differences in the logarithm of the width, and in the lobes, from which an edge is measured again with the
 form of step common to the edges."""
@@ -82,32 +81,29 @@ class Channel:
     rejected: list[int]
     why: list[str]
 
-    def doubted(self, other: Channel, corners: Array) -> Channel:
+    def doubted(self, other: Channel) -> Channel:
         """The channel with the doubts of one of more contrast: lines that may be hidden beside edges.
 
         Where both put an edge at the same place, both show the same, and less contrast does not show it
         better. A channel without the line shows the edge further outwards.
         """
+        data = [
+            own
+            if own is None or doubtful is None or (doubtful.line - own.line)[:2].max() >= doubtful.doubt
+            else own.doubted(doubtful.doubt)
+            for own, doubtful in zip(self.data, other.data, strict=True)
+        ]
+        return replace(self, data=data)
+
+    def contended(self, others: Sequence[Contender]) -> Channel:
+        """The channel with edges that may be other lines."""
         data = list(self.data)
-        for k, (own, doubtful) in enumerate(zip(self.data, other.data, strict=True)):
-            if own is None or doubtful is None or own.ends >= doubtful.ends:
-                continue
-            start, along = corners[k], corners[(k + 1) % 4] - corners[k]
-            normal = np.array([-along[1], along[0]]) / np.hypot(*along)
-            ends = [
-                np.polynomial.polynomial.polyval(
-                    [0.0, 1.0],
-                    np.polynomial.polynomial.polyfit(
-                        (edge.xy - start) @ along / (along @ along),
-                        (edge.xy - start) @ normal,
-                        1,
-                        w=1 / edge.sigma,
-                    ),
-                )
-                for edge in (own, doubtful)
-            ]
-            if (ends[1] - ends[0]).max() < doubtful.ends:
-                data[k] = replace(own, ends=doubtful.ends)
+        for each in others:
+            own = data[each.edge]
+            if own is not None:
+                moved = float(np.sqrt(each.probability) * np.hypot(each.inwards, each.sigma))
+                rival = Rival("an edge of the frame elsewhere", each.probability, -each.inwards)
+                data[each.edge] = replace(own.doubted(float(np.hypot(moved, own.doubt))), rival=rival)
         return replace(self, data=data)
 
 
@@ -139,6 +135,10 @@ def measure_channel(
 ) -> Channel:
     """Profiles of the four edges in one channel that agree with a line through each edge."""
 
+    pixels = [band(k, False, False) for k in range(4)]
+    side = float(
+        np.mean([np.hypot(*(each.stop - each.start)) for each in pixels if each is not None] or [1.0])
+    )
     far: list[bool] = [False] * 4
     films: list[Film | None] = [None] * 4
 
@@ -162,7 +162,7 @@ def measure_channel(
         if film is not None:
             films[k] = film
             profiles[k] = measured(k, False)
-    for k, (found, form) in enumerate(zip(profiles, common_forms(profiles), strict=True)):
+    for k, (found, form) in enumerate(zip(profiles, common_forms(profiles, side), strict=True)):
         if found is None or form is None:
             continue
         other = abs(np.log(found.width / form.width)) > _OTHER_WIDTH
@@ -174,7 +174,7 @@ def measure_channel(
         profiles[k] = found
     edges = [
         _edge(band(k, False, far[k]), found, soft, channel, polarity)
-        for k, (found, soft) in enumerate(zip(profiles, soft_steps(profiles), strict=True))
+        for k, (found, soft) in enumerate(zip(profiles, soft_steps(profiles, side), strict=True))
     ]
     data, rejected, why = (list(column) for column in zip(*edges, strict=True))
     borders = [None if found is None else found.border for found in profiles]
@@ -204,12 +204,12 @@ def _edge(
         return None, 0, "no contrast between film and picture"
     drawn, beside, moves = (part[found.good] for part in displaced_by_lines(found, soft))
     place, offset, own = (part[found.good] for part in (found.place, found.offset, found.sigma))
-    sigma, offset = np.hypot(own, drawn), offset - beside * moves
+    sigma, offset = np.hypot(own, drawn), offset - moves
     line = _line(place, offset, sigma, own)
     rejected = int((~found.good).sum())
     if line is None:
         return None, rejected, f"no line fits {len(place)} of {len(found.place)} profiles that show a step"
-    (_, _, bow), agree, doubt = line
+    near, agree, doubt = line
     if agree.sum() < max(12, 0.1 * len(found.place)) or agree.mean() < _LEAST_AGREE:
         return None, rejected, f"only {int(agree.sum())} of {len(found.place)} profiles agree with a line"
     border = found.border
@@ -221,31 +221,33 @@ def _edge(
     if _spans(place[beside < 0.5]):
         # The edge is seen by itself beside the structures that displace some of its steps.
         agree &= beside < 0.5
-    rival, two = _rival(band, found, soft, band.grey[:, :, channel].astype(np.float64) * polarity, line[0])
-    if two is not None:
-        left = float(np.hypot(np.sqrt(rival.probability) * rival.moved_px, doubt))
-        chord = _along_chord(band, two, two.bow + _wide_bow(bow, found), common)
-        return replace(chord, ends=left, rival=rival), rejected, ""
+    rival, two = _rival(band, found, soft, band.grey[:, :, channel].astype(np.float64) * polarity, near)
     doubt = float(np.hypot(doubt, np.sqrt(rival.probability) * rival.moved_px))
+    if two is not None:
+        at = np.append(two.ends, two.bow + near[2])
+        covariance = np.diag([0.0, 0.0, soft.width**2 + near[2] ** 2])
+        covariance[:2, :2] = two.covariance + common**2 + doubt**2 * np.eye(2)
+        xy = band.at(place, -_inward(at, place, 0 * place))
+        return EdgeData(at, covariance, xy, np.zeros(0), 0.0, doubt, rival), rejected, ""
     if (beside > 0.5).any() and rival.probability < beside.max():
         # The sigmas of these profiles contain it.
-        moved = float(moves[beside > 0.5].max())
+        moved = float(np.abs(moves[beside > 0.5]).max())
         where = f"a line of the picture beside {np.mean(beside > 0.5):.0%} of it"
         rival = Rival(where, float(beside.max()), -moved)
-    residuals = _inward(line[0], place, offset)
-    total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
-    agree &= _straight(place, residuals / total)
+    residuals = _inward(near, place, offset)
+    agree &= _straight(place, residuals / np.hypot(sigma, _NEIGHBOURHOOD_PX))
     # A structure of the picture lies inwards of the edge; parts of an edge that is bent lie on both sides.
-    bent = agree.mean() < _BENT and not _only_inwards(residuals, line[1])
-    whole = np.ones(len(place), dtype=bool) if bent else agree
-    wave = waviness(place[whole], residuals[whole], total[whole])
-    scale = shared_error(place[agree], residuals[agree], total[agree])
-    # Steps that are too sharp belong to a scratch and are equally uninformative.
-    ends = float(np.sqrt(doubt**2 + wave**2 + soft.sharpened * soft.width**2))
-    data = EdgeData(
-        _points(band, place[agree], offset[agree]), total[agree] * scale, common, ends, wave, rival
+    used = agree | (agree.mean() < _BENT and not _only_inwards(residuals, line[1]))
+    harmonics = band.harmonics(place, offset - residuals)
+    values, covariance, departs = departing_line(
+        *(each[used] for each in (place, offset, own, drawn, harmonics))
     )
-    return data, rejected + int((~agree).sum()), ""
+    # Steps that are too sharp belong to a scratch and are equally uninformative.
+    doubt = float(np.sqrt(doubt**2 + soft.sharpened * soft.width**2))
+    covariance[:2, :2] += common**2 + (_MODEL_PX**2 + doubt**2) * np.eye(2)
+    rest = _inward(values, place[used], offset[used])
+    data = EdgeData(values, covariance, band.at(place[used], offset[used]), rest, departs, doubt, rival)
+    return data, rejected + int((~used).sum()), ""
 
 
 def _rival(
@@ -256,13 +258,13 @@ def _rival(
     Edge and line are adjusted together where the widths of the steps make a line more probable than anywhere.
     """
     rival = Rival(_BESIDE, soft.lined, -soft.displaced)
-    if soft.lined <= LINED:
+    if soft.lined <= soft.before:
         return rival, None
     (start, stop, bow), border = line, found.border
     fitted = (start * (1 - band.place) + stop * (1 + band.place)) / 2
-    fitted = fitted - _wide_bow(bow, found) * (1 - band.place**2)
+    fitted = fitted - bow * (1 - band.place**2)
     shown = float(np.exp(np.median(found.blur[0][found.good])))
-    two, gain = edge_beside_line(grey, band, fitted, border.level, border.noise, soft.width, shown)
+    two, gain = edge_beside_line(grey, band, fitted, border.level, border.noise, soft.width, shown, bow)
     odds = soft.lined / (1 - soft.lined) * np.exp(np.clip(gain, -20, 20))
     lined = float(odds / (1 + odds))
     if two is None:
@@ -272,11 +274,6 @@ def _rival(
     if lined > 0.5:
         return Rival("softness of its own, without a line beside it,", 1 - lined, -moved), two
     return Rival(_BESIDE, lined, moved), None
-
-
-def _wide_bow(bow: float, found: EdgeProfiles) -> float:
-    """The bow of an edge that is more than a line displaces it, and therefore real."""
-    return bow if abs(bow) > 2 * found.width else 0.0
 
 
 def _spans(place: Array) -> bool:
@@ -327,7 +324,8 @@ def _line(place: Array, offset: Array, sigma: Array, own: Array) -> tuple[Array,
 def _misfit(line: tuple[Array, Mask], place: Array, offset: Array, total: Array) -> float:
     """Factor on the standard deviations of the profiles that agree with a line."""
     values, agree = line
-    return shared_error(place[agree], _inward(values, place, offset)[agree], total[agree])
+    rest = (_inward(values, place, offset) / total)[agree]
+    return float(np.sqrt(max(np.mean(rest**2), 1.0)))
 
 
 def _inward(line: Array, place: Array, offset: Array) -> Array:
@@ -351,19 +349,3 @@ def _straight(place: Array, inward: Array) -> Mask:
         if len(straight) and straight[0] > 0 and abs(begin) > 1 - _ROUNDED:
             keep &= np.abs(place - place[order[0]]) > abs(begin - place[order[0]]) + _MARGIN
     return keep
-
-
-def _points(band: Band, place: Array, offset: Array) -> Array:
-    along = (band.stop - band.start) * ((place + 1) / 2)[:, None]
-    return np.asarray(band.start + along + offset[:, None] * band.normal)
-
-
-def _along_chord(band: Band, found: AdjacentEdge, bow: float, common: float) -> EdgeData:
-    """An edge known by its two ends, as points of a line with the same precision."""
-    middle = float(found.covariance.sum() / 4)
-    slope = float((found.covariance[0, 0] + found.covariance[1, 1] - 2 * found.covariance[0, 1]) / 4)
-    place = np.linspace(-1, 1, _CHORD)
-    # A line through n points of sigma s has the variance s²/n at its centre, and s²/Σt² of its slope.
-    place *= np.sqrt(middle / max(slope, 1e-12) / np.mean(place**2))
-    offset = (found.ends[0] * (1 - place) + found.ends[1] * (1 + place)) / 2 - bow * (1 - place**2)
-    return EdgeData(_points(band, place, offset), np.full(_CHORD, np.sqrt(_CHORD * middle)), common)

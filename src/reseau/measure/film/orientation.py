@@ -20,7 +20,7 @@ from ...io.scans import Scan
 from .border import Band, read_band
 from .channel import WIDER_SEARCH, Channel, channels_by_contrast, measure_channel
 from .formats import ALL_FORMATS, FORMATS, format_probabilities, scale_by_perforations
-from .lines import EdgeData, FrameShape, Lines, adjust_lines, derived, shape_of
+from .lines import EdgeData, FrameShape, Lines, adjust_lines, derived, explained_shape, shape_of
 from .search import FrameGuess, search_frames, size_of
 from .steps import Tone
 from .strips import in_reading_order, overview_of, rest_of_strip
@@ -60,8 +60,8 @@ _STATED = 0.05, 0.5
 what it moves has in the largest standard deviation of a corner."""
 _SLANT = float(np.deg2rad(0.7))
 """Standard deviation of the rotation angle of a tilted copying camera, radians."""
-_MOST_W = 4.0
-"""Test value from which the shape of a frame contradicts its format."""
+_MORE_PROBABLE = 0.5
+"""Probability from which an explanation is the answer."""
 
 
 @dataclass(frozen=True)
@@ -445,7 +445,7 @@ def _oriented(
         name = scan.channels[c]
         measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale, tone)
         for other in earlier:
-            measured = measured.doubted(other, corners)
+            measured = measured.doubted(other)
         earlier.append(measured)
         result = _judged(scan, guess, measured, corners, shape, options)
         # Channels are ordered by contrast: a later one must show more edges, or more accurate ones.
@@ -458,10 +458,9 @@ def _oriented(
 
 
 def _seen(result: FrameResult) -> tuple[int, float]:
-    """Rank of a result: status, then accuracy."""
-    return _STATUS[result.status], -np.inf if result.lines is None else -float(
-        np.trace(result.lines.covariance)
-    )
+    """Rank of a result: status, then accuracy of its worst corner."""
+    lines = result.lines
+    return _STATUS[result.status], -np.inf if lines is None else -float(np.diag(lines.covariance).max())
 
 
 def _resolution(scan: Scan, options: FrameOptions, size: tuple[float, float]) -> float | None:
@@ -568,18 +567,24 @@ def _judged(
     if isinstance(lines, Failure):
         return replace(base, why=lines.reason, edges=_reports(measured, None), code=lines.code)
     (w, h), slant, code = guess.format_mm, "", None
-    worst = np.abs(np.nan_to_num(lines.shape_w)).max()
-    if worst > _MOST_W and not missing and (seen := _slanted(corners, measured, shape)):
-        lines, converging = seen
-        worst, code = 0.0, Code.TILTED
-        slant = f"seen at an angle: opposite edges converge by {np.rad2deg(converging):.1f}°"
+    known = _resolution(scan, options, guess.format_mm)
+    contenders, tilted = ([], 0.0) if missing else explained_shape(corners, measured.data, shape, known)
+    another = sum(each.probability for each in contenders)
+    if tilted > _MORE_PROBABLE and (seen := _slanted(corners, measured, shape)):
+        lines, code = seen[0], Code.TILTED
+        slant = f"seen at an angle: opposite edges converge by {np.rad2deg(seen[1]):.1f}°"
+    elif another > _STATED[0]:
+        measured = measured.contended(contenders)
+        again = adjust_lines(corners, measured.data, shape, measured.rejected)
+        lines = lines if isinstance(again, Failure) else again
     base = replace(base, lines=lines, edges=_reports(measured, lines), why=slant, code=code)
-    if worst > _MOST_W:
+    if another > _MORE_PROBABLE:
+        lie = " or the ".join(str(each) for each in contenders if each.probability > _STATED[0])
         return replace(
             base,
             lines=None,
-            why=f"the four edges do not form a frame of {w:g}x{h:g} mm (test value {worst:.1f}); one of them "
-            "may be a line of the picture: give the approximate corners, or the correct --format-mm",
+            why=f"the four edges do not form a frame of {w:g}x{h:g} mm; another line is the {lie}; give the "
+            "approximate corners, or the correct --format-mm",
             code=Code.INCONSISTENT,
         )
     if missing:
@@ -589,7 +594,6 @@ def _judged(
             return replace(base, lines=None, why=why, code=Code.EDGE_MISSING)
         why = f"{missing[0]} edge: {reason}; its position follows from the format"
         return replace(base, status="three-edges", why=why, code=Code.EDGE_MISSING)
-    known = _resolution(scan, options, guess.format_mm)
     own = float(np.mean(base.px_per_mm or (1.0, 1.0)))
     if known is not None and abs(own / known - 1) > _AGREES:
         w, h = (side * own / known for side in guess.format_mm)
@@ -612,10 +616,10 @@ def _doubts(measured: Channel, lines: Lines) -> list[str]:
     """What else the edges may be, with probabilities, and edges that are not straight."""
     least, said = _STATED[1] * float(np.sqrt(np.diag(lines.covariance)).max()), []
     for name, data in zip(EDGES, measured.data, strict=True):
-        if data is not None and data.wave > least:
+        if data is not None and data.departs > max(least, measured.width):
             said.append(
-                f"the {name} edge is no straight or evenly bowed line, its ends are known to {data.wave:.2g} "
-                "px; hold the film flat and parallel to the sensor"
+                f"the {name} edge departs from an evenly bowed line by {data.departs:.2g} px; hold the film "
+                "flat and parallel to the sensor"
             )
         rival = None if data is None else data.rival
         if rival is None or rival.probability < _STATED[0]:
@@ -626,20 +630,13 @@ def _doubts(measured: Channel, lines: Lines) -> list[str]:
 
 
 def _slanted(corners: Array, measured: Channel, shape: FrameShape) -> tuple[Lines, float] | None:
-    """Four edges as seen by a tilted copying camera, and the convergence of opposite edges, radians.
-
-    Perspective makes opposite edges converge; a single wrong edge would also make opposite angles both larger
-    or both smaller.
-    """
+    """Four edges as seen by a tilted copying camera, and the convergence of opposite edges, radians."""
     free = replace(shape, angle_sigma=_SLANT, aspect_sigma=3 * shape.aspect_sigma)
     lines = adjust_lines(corners, measured.data, free, measured.rejected)
     if isinstance(lines, Failure):
         return None
-    ur, lr, ll, aspect = shape_of(lines.corners, shape) - np.array(shape.deviation)
-    converging = max(abs(ur + lr), abs(lr + ll))
-    alike = abs(ur + ll) / 2 < _MOST_W * shape.angle_sigma / np.sqrt(2)
-    alike &= abs(aspect) < _MOST_W * shape.aspect_sigma and converging < _MOST_W * _SLANT
-    return (lines, float(converging)) if alike else None
+    ur, lr, ll, _ = shape_of(lines.corners, shape) - np.array(shape.deviation)
+    return lines, float(max(abs(ur + lr), abs(lr + ll)))
 
 
 def _reports(measured: Channel, lines: Lines | None) -> dict[str, MeasuredEdge]:
@@ -654,7 +651,7 @@ def _reports(measured: Channel, lines: Lines | None) -> dict[str, MeasuredEdge]:
             found=found,
             points=int(lines.used[k]) if lines is not None and found else 0,
             rejected=int(lines.rejected[k]) if lines is not None else measured.rejected[k],
-            rms_px=float(lines.rms[k]) if lines is not None and found else None,
+            rms_px=float(lines.rms[k]) if lines is not None and np.isfinite(lines.rms[k]) else None,
             curvature_px=bow if found else None,
             why=measured.why[k],
             rival=_rival(measured.data[k]),
