@@ -34,13 +34,15 @@ _ASPECT, _SIZE = 0.012, 0.02
 """Relative standard deviations of the proportions of a frame in an overview, and of its size."""
 _TRUE, _RANGE = 0.8, 3.4
 """Probability that the resolution that a file states is that of the scan, and logarithmic range of others."""
-_LEAST_PITCH, _PERIODS = 6.0, 4
+_LEAST_PITCH, _PERIODS, _SLOWER = 6.0, 6, 0.6
 """Least pitch of perforations in an overview, pixels, and their least number in a row."""
 _HEIGHT = 0.45
 """Share of the pitch in which rows across perforations show them entirely."""
-_REGULAR = 0.65
-"""Least share of the variance along both rows that has the period of the perforations, of which the
-fundamental has 0.78; a picture hardly has two such rows with this ratio of distance and period."""
+_REGULAR = 0.52
+"""Least share of the variance along both rows that has the period of perforations in phase: 0.57 to 0.89 in
+scans that show them, at most 0.47 in pictures."""
+_WITHIN = 3
+"""Pixels of an overview inside the lines of a frame that are not taken for its interior."""
 _VISIBLE = 0.05
 """Least contrast of perforations, as a share of that of the scan."""
 
@@ -81,44 +83,57 @@ def format_probabilities(
     return [(lying[k], float(weight[k])) for k in np.argsort(-weight, kind="stable")]
 
 
-def scale_by_perforations(overview: NDArray[np.float32], angle: float) -> float | None:
+def scale_by_perforations(overview: NDArray[np.float32], corners: Array) -> tuple[float, bool] | None:
     """Pixels of an overview per millimetre by the two rows of perforations of 35 mm film; None without them.
 
-    Two rows with the period of 4.75 mm, 28.17 mm apart, in either direction of the film.
+    Two rows with the period of 4.75 mm, 28.17 mm apart, in either direction of the film. Also whether they
+    lie within a frame that was found: then its lines are those of the scanner's window, or of a holder.
 
     Parameters
     ----------
     overview : ndarray (h, w, c)
         The reduced scan.
-    angle : float
-        Direction of the film or across it, against the rows of the overview, radians.
+    corners : ndarray (4, 2)
+        Corners of a frame in it, along or across the film.
     """
     grey = overview.mean(axis=2)
     height, width = grey.shape
-    turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), float(np.rad2deg(angle)), 1.0)
+    along = corners[1] - corners[0]
+    centre = (width - 1) / 2, (height - 1) / 2
+    turn = cv2.getRotationMatrix2D(centre, float(np.rad2deg(np.arctan2(along[1], along[0]))), 1.0)
     level = cv2.warpAffine(grey, turn, (width, height), borderMode=cv2.BORDER_REPLICATE)
-    planes = (np.asarray(plane, dtype=np.float32) for plane in (level, level.T))
-    found = [_rows_of_perforations(plane) for plane in planes]
-    share, pitch = max(found)
-    return pitch / PITCH_MM if share > _REGULAR else None
+    placed = corners @ turn[:, :2].T + turn[:, 2]
+    x, y = np.sort(placed, axis=0).T
+    left, right = int(x[1]) + _WITHIN, int(x[2]) - _WITHIN
+    inner = level[max(int(y[1]) + _WITHIN, 0) : int(y[2]) - _WITHIN, max(left, 0) : right]
+    for part, within in ((inner, True), (level, False)):
+        share, pitch = max(_rows_of_perforations(np.asarray(p, dtype=np.float32)) for p in (part, part.T))
+        if share > _REGULAR:
+            return pitch / PITCH_MM, within
+    return None
 
 
 def _rows_of_perforations(grey: NDArray[np.float32]) -> tuple[float, float]:
-    """Share of the variance along the most regular two rows that perforations explain, and their pitch."""
+    """Share of the variance along the most regular two rows that perforations explain, and their pitch.
+
+    Perforations lie opposite to each other: only what both rows have in common, in phase, speaks for them.
+    """
     height, width = grey.shape
     rest = grey - scipy.ndimage.uniform_filter1d(grey, max(3, width // _PERIODS), axis=1)
-    power = np.abs(np.fft.rfft(rest * np.hanning(width), n=4 * width, axis=1)) ** 2
-    total = power.sum(axis=1)
-    seen = np.sqrt(total) > _VISIBLE * np.sqrt(total.max())
+    wave = np.fft.rfft(rest * np.hanning(width), n=4 * width, axis=1)
+    above = np.cumsum(np.abs(wave[:, ::-1]) ** 2, axis=1)[:, ::-1]
+    seen = np.sqrt(above[:, 0]) > _VISIBLE * np.sqrt(above[:, 0].max())
     best = (0.0, 1.0)
-    # A line of a windowed spectrum is sixteen samples wide where it is sampled four times as finely.
-    lines = scipy.ndimage.uniform_filter1d(power, 17, axis=1) * 17 * (seen / np.maximum(total, 1e-9))[:, None]
     for k in range(4 * _PERIODS, int(4 * width / _LEAST_PITCH)):
         pitch = 4 * width / k
-        away = round(pitch * ROWS_MM / PITCH_MM)
-        if away >= height:
+        away, high = round(pitch * ROWS_MM / PITCH_MM), max(1, round(_HEIGHT * pitch))
+        if not 0 < away < height - high:
             continue
-        row = scipy.ndimage.uniform_filter1d(lines[:, k], max(1, round(_HEIGHT * pitch)))
-        share = float(np.minimum(row[:-away], row[away:]).max()) if away else 0.0
-        best = max(best, (share, pitch))
+        # A line of a windowed spectrum is sixteen samples wide where it is sampled four times as finely.
+        line = (
+            wave[:, k - 8 : k + 9] * (seen / np.sqrt(np.maximum(above[:, round(_SLOWER * k)], 1e-9)))[:, None]
+        )
+        both = (line[:-away] * line[away:].conj()).real.sum(axis=1)
+        share = scipy.ndimage.uniform_filter1d(both, high)
+        best = max(best, (float(share.max()), pitch))
     return best

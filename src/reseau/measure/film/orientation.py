@@ -315,8 +315,8 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
         if isinstance(guesses, Failure):
             declined = declined or ([_declined(scan, guesses)] if missing else [])
             continue
-        scale = _perforated(scan, guesses[0], reduction) if options.near is None else None
-        if scale is not None and not _of_scale(guesses[0], reduction, scale, options):
+        scale, within = _perforated(scan, guesses[0], reduction, options)
+        if scale is not None and (within or not _of_scale(guesses[0], reduction, scale, options)):
             again, finer = _found(scan, options, missing, cut=bool(declined), scale=scale)
             guesses, reduction = (guesses, reduction) if isinstance(again, Failure) else (again, finer)
         results = [_oriented(scan, guess, reduction, options, scale) for guess in guesses]
@@ -327,12 +327,19 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
     return declined
 
 
-def _perforated(scan: Scan, guess: FrameGuess, reduction: float) -> float | None:
-    """Pixels of the scan per millimetre by perforations along or across a frame; None without them."""
-    along = guess.corners[1] - guess.corners[0]
+def _perforated(
+    scan: Scan, guess: FrameGuess, reduction: float, options: FrameOptions
+) -> tuple[float | None, bool]:
+    """Pixels of the scan per millimetre by perforations along or across a frame, and whether it has them.
+
+    They are looked for unless the frame has the size of its format at the resolution of the scan.
+    """
+    known = _resolution(scan, options, guess.format_mm)
+    if options.near is not None or (known is not None and _of_scale(guess, reduction, known, options)):
+        return None, False
     overview, r = scan.overview(overview_of(scan, _OVERVIEWS[-1][0]))
-    scale = scale_by_perforations(overview, float(np.arctan2(along[1], along[0])))
-    return None if scale is None else scale * r
+    found = scale_by_perforations(overview, (guess.corners + 0.5) * reduction / r - 0.5)
+    return (None, False) if found is None else (found[0] * r, found[1])
 
 
 def _of_scale(guess: FrameGuess, reduction: float, scale: float, options: FrameOptions) -> bool:
@@ -366,7 +373,13 @@ def _found(
     known = next((k for size in sizes if (k := _resolution(scan, options, size)) is not None), None)
     if scale is not None:
         known, sizes = scale, ALL_FORMATS if options.formats == FORMATS else sizes
-    scales = [known] if options.dpi is not None else [None] if missing or known is None else [known, None]
+    scales = (
+        [known]
+        if scale is not None or options.dpi is not None
+        else [None]
+        if missing or known is None
+        else [known, None]
+    )
     for longest, tried in _OVERVIEWS:
         overview, r = scan.overview(overview_of(scan, longest))
         if longest > _OVERVIEWS[0][0] and r == reduction:
