@@ -1,6 +1,7 @@
 """Corners of film frames in scans drawn by the way of the light, compared with their truth.
 
-Run from the checkout: ``python benchmarks/film_world.py [--frames 4] [--jobs 2] [--only KIND …] [--each]``.
+Run from the checkout: ``python benchmarks/film_world.py [--frames 4] [--strips 0] [--jobs 2] [--only KIND …]
+[--each]``.
 The scans are those of ``benchmarks/worlds/film.py``, which shares nothing with the project; their resolution
 and format are given, and the curve of their grey values as a file states it, except for those of `UNSTATED`.
 For each kind: frames drawn, oriented, answered with three edges, wrong by more than 1 px and 5 sigma; of
@@ -19,7 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from film_independent import far_off
 from parts import add_options, executor_of, main_of, outcomes
-from worlds.film import KINDS, World, frame
+from worlds.film import KINDS, World, frame, strip
 
 from reseau.core.data import Array
 from reseau.core.tone import ToneCurve
@@ -47,6 +48,27 @@ class Row(NamedTuple):
     def wrong(self) -> bool:
         """Whether a corner is off by more than 1 px and 5 sigma."""
         return far_off(self.error, self.sigma)
+
+
+STRIPS = ("slide", "negative", "soft", "dust, scratches")
+"""Kinds of frames of which strips are drawn."""
+
+
+def one_strip(job: tuple[str, int]) -> tuple[str, int, int, int]:
+    """Draw a strip and orient its frames: numbers of those drawn, right in their order, and wrong."""
+    kind, seed = job
+    pixels, corners, scale = strip(KINDS[kind], seed)
+    scan = replace(scan_of(pixels, dpi=25.4 * scale), curve=_curve(kind, KINDS[kind]))
+    results = orient_scan(scan)
+    right = wrong = 0
+    for found in results:
+        if found.lines is None or not found:
+            continue
+        sigma = np.sqrt(np.diag(found.lines.covariance)).reshape(4, 2)
+        off = [far_off(found.lines.corners - truth, sigma) for truth in corners]
+        wrong += all(off)
+        right += not off[min((found.frame or 1) - 1, len(off) - 1)]
+    return kind, len(corners), right, wrong
 
 
 def _curve(kind: str, world: World) -> ToneCurve | None:
@@ -94,6 +116,7 @@ def _print(name: str, rows: list[Row]) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--frames", type=int, default=4, help="frames of each kind")
+    parser.add_argument("--strips", type=int, default=0, help="strips of each of some kinds")
     add_options(parser)
     parser.add_argument("--only", nargs="*", default=[], help="parts of names of kinds")
     parser.add_argument("--each", action="store_true", help="print every frame that is not oriented, and why")
@@ -111,6 +134,12 @@ def main() -> int:
                     off = f"{np.abs(row.error).max():.2f} px, " if np.isfinite(row.error).all() else ""
                     print(f"    {row.seed}: {mark}{row.status}: {off}{row.why[:150]}")
             every += rows
+        for kind in STRIPS if given.strips else ():
+            done = list(outcomes(executor, one_strip, ((kind, seed) for seed in range(given.strips))))
+            drawn, right, wrong = (sum(each[k] for each in done) for k in (1, 2, 3))
+            print(
+                f"strips of {kind:16} {len(done):4} {drawn:4} frames, {right} right in order, {wrong} wrong"
+            )
     ours = [row for row in every if row.kind not in (*UNSTATED, *BY_THE_FILM)]
     _print("all but unstated, by film", ours)
     _print("all", every)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["KINDS", "FilmScan", "World", "frame"]
+__all__ = ["KINDS", "FilmScan", "World", "frame", "strip"]
 
 Array = NDArray[np.float64]
 Plane = NDArray[np.float32]
@@ -144,6 +144,10 @@ KINDS: dict[str, World] = {
     "compressed": replace(_PLAIN, code="srgb", blocks=(6.0, 20.0), grain=(0.03, 0.06)),
     "sharpened": replace(_PLAIN, code="srgb", sharpen=(0.5, 1.5), blur=(0.6, 1.2)),
     "on a table": replace(_PLAIN, beside=("table", "strip")),
+    "out of focus": replace(_PLAIN, blur=(1.5, 4.0), tails=(0.0, 0.01), scene=("forms", "posts")),
+    "half frame": replace(_PLAIN, format=(18.0, 24.0), beside=("strip",)),
+    "6x7": replace(_PLAIN, format=(69.0, 56.0), scale=(12.0, 15.0), film="negative", range=(1.0, 1.8)),
+    "16 mm": replace(_PLAIN, format=(10.26, 7.49), scale=(60.0, 90.0), radius=(0.2, 0.6)),
     "6x6": replace(_PLAIN, format=(56.0, 56.0), scale=(14.0, 18.0), radius=(0.2, 0.8), tilt=(0.0, 4.0)),
     "cut": replace(_PLAIN, beside=("crop",)),
 }
@@ -403,6 +407,25 @@ def frame(world: World, seed: int) -> FilmScan:
         world.format,
         {"tilt_deg": float(np.rad2deg(turn)), "px_per_mm": k, "mount": mount},
     )
+
+
+def strip(world: World, seed: int) -> tuple[NDArray[np.uint8], list[Array], float]:
+    """Draw a strip of two to six frames side by side: its pixels, the corners of each, and pixels per mm."""
+    rng = np.random.default_rng([78, seed])
+    scale = float(rng.uniform(*world.scale))
+    level = replace(world, scale=(scale, scale), tilt=(0.0, 0.3))
+    drawn = [frame(level, 100 * seed + k) for k in range(int(rng.integers(2, 7)))]
+    height = min(len(each.pixels) for each in drawn)
+    parts, corners, left = [], [], 0
+    for each in drawn:
+        # Between frames half a millimetre to two of film stay on either side.
+        x, away = each.corners[:, 0], rng.uniform(0.5, 2.0, 2) * scale
+        first, last = max(int(x.min() - away[0]), 0), min(int(x.max() + away[1]), each.pixels.shape[1])
+        down = (len(each.pixels) - height) // 2
+        parts.append(each.pixels[down : down + height, first:last])
+        corners.append(each.corners + np.array([left - first, -down]))
+        left += last - first
+    return np.concatenate(parts, axis=1), corners, scale
 
 
 def _filtered(light: Array | Plane, transfer: Array) -> Array:

@@ -36,7 +36,8 @@ def test_a_roll_gives_documents_marked_copies_corners_and_an_overview(
     roll: Path, tmp_path: Path, reseau: Run
 ) -> None:
     images = sorted(roll.glob("*.tif"))
-    status, out, err = reseau("orient", *images, "--format-mm", "36x24", "--out", tmp_path, "--jobs", 1)
+    how = ("--format-mm", "36x24", "--out", tmp_path, "--jobs", 1, "--cut")
+    status, out, err = reseau("orient", *images, *how)
     assert (status, err) == (0, "")
     assert out.count(".tif: oriented") == 4
     assert "5 frames: 4 oriented, 1 with three edges" in out
@@ -46,6 +47,9 @@ def test_a_roll_gives_documents_marked_copies_corners_and_an_overview(
     found = FrameOrientation.read(tmp_path / "0.json")
     np.testing.assert_allclose(found.image_points().xy, frame.truth.corners, rtol=0, atol=0.3)
     assert (tmp_path / "0.csv").read_text().startswith("id,x,y,sx,sy,rho\nul,")
+    height, width = tifffile.imread(tmp_path / "0-frame.tif").shape
+    assert abs(width - 36 / 25.4 * 300) < 3
+    assert abs(height - 24 / 25.4 * 300) < 3
     marked, plain = tifffile.imread(tmp_path / "0-marked.tif"), tifffile.imread(roll / "0.tif")
     x, y = np.rint(found.image_points().xy[0]).astype(int)
     assert marked[y, x] == 255
@@ -56,7 +60,7 @@ def test_a_roll_gives_documents_marked_copies_corners_and_an_overview(
     assert (tmp_path / "summary.html").read_text("utf-8").count("<img") == 5
     # A second run, of the folder, finds the results of the first one, and its roll is still the same.
     (tmp_path / "corners.json").rename(tmp_path / "before.json")
-    assert reseau("orient", roll, "--format-mm", "36x24", "--out", tmp_path, "--jobs", 1)[1] == out
+    assert reseau("orient", roll, *how)[1] == out
     assert (tmp_path / "corners.json").read_text() == (tmp_path / "before.json").read_text()
     corners = FrameCorners.read(tmp_path / "corners.json")
     np.testing.assert_allclose(corners.xy(), frame.gate, rtol=0, atol=0.15)

@@ -37,6 +37,9 @@ def orient(
     marked: Annotated[
         bool, typer.Option(help="Write copies of the scans with marked corners.", rich_help_panel="Files")
     ] = True,
+    cut: Annotated[
+        bool, typer.Option(help="Write one picture for each frame, upright.", rich_help_panel="Files")
+    ] = False,
     roll: Annotated[bool, typer.Option(help="Use the common shape of the frames of a roll.")] = True,
     overlay: Annotated[v.Overlay | None, "Here a folder, for each scan; FILE.png for a single one."] = None,
     as_json: v.AsJson = False,
@@ -53,7 +56,7 @@ def orient(
     drawn = {} if overlay is None else overlay_files(overlay, images)
     jobs = scan_jobs(
         images, out, drawn, format_mm=format_mm, corners=corners, transform=transform, dpi=dpi, near=near,
-        marked=marked and out is not None,
+        marked=marked and out is not None, cut=cut,
     )  # fmt: skip
     with (
         computing.executor(["reseau.sessions.film_files"], len(jobs)) as executor,
@@ -107,11 +110,12 @@ def _line(document: FrameOrientation) -> str:
     """Describe a frame in one line."""
     from ..core.numbers import measured
 
+    name = document.image if document.frame is None else f"{document.image}, frame {document.frame}"
     if document.corners is None or document.principal_point is None:
-        return f"{document.image}: declined: {document.why}\n"
+        return f"{name}: declined: {document.why}\n"
     largest = max(max(c.sx, c.sy) for c in document.corners.values())
     pp = document.principal_point
-    text = f"{document.image}: {document.status}, principal point x {measured(pp.x, pp.sx, 'px')}, "
+    text = f"{name}: {document.status}, principal point x {measured(pp.x, pp.sx, 'px')}, "
     text += f"y {measured(pp.y, pp.sy, 'px')}, "
     text += f"angle {measured(document.angle_deg or 0.0, document.angle_sigma_deg, 'deg')}"
     text += f", corners ± {largest:.2g} px at most"
@@ -120,6 +124,12 @@ def _line(document: FrameOrientation) -> str:
         text += f", {document.transform.kind}: residuals {sx:.2g} mm in X, {sy:.2g} mm in Y"
     elif document.transform is not None:
         text += f", {document.transform.kind}: no residuals (8 parameters from 4 corners)"
+    if len(document.formats) > 1:
+        sizes = (
+            f"{each.format_mm[0]:g}x{each.format_mm[1]:g} ({each.probability:.2f})"
+            for each in document.formats
+        )
+        text += f", format {' or '.join(sizes)}"
     return text + (f" ({document.why})" if document.why else "") + "\n"
 
 

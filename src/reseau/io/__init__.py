@@ -18,11 +18,13 @@ from .fiducials import (
 from .frame import (
     CORNERS,
     EDGES,
+    FormatCandidate,
     FrameCorners,
     FrameOrientation,
     FrameTransform,
     MeasuredCorner,
     MeasuredEdge,
+    RivalEdge,
 )
 from .lens import LensDocument, LensSensor
 from .measurement import PhotographPoints, ReseauMeasurement
@@ -42,6 +44,7 @@ __all__ = [
     "FiducialPoint",
     "FieldLines",
     "FieldTargets",
+    "FormatCandidate",
     "FrameCorners",
     "FrameOrientation",
     "FrameTransform",
@@ -56,6 +59,7 @@ __all__ = [
     "ReseauDesign",
     "ReseauMeasurement",
     "Rings",
+    "RivalEdge",
     "Strict",
     "TestfieldDesign",
     "parse_design",

@@ -107,8 +107,35 @@ def points_of(measured: Mapping[str, MeasuredCorner]) -> ImagePoints:
     return ImagePoints(tuple(measured), xy, np.array(cov, dtype=np.float64).reshape(-1, 2, 2))
 
 
+class FormatCandidate(Strict):
+    """A format that a frame can be, width and height as it lies in the scan, with its probability.
+
+    Examples
+    --------
+    >>> FormatCandidate(format_mm=(36.0, 24.0), probability=0.5).probability
+    0.5
+    """
+
+    format_mm: Pair
+    probability: float
+
+
+class RivalEdge(Strict):
+    """Second best explanation of what is seen at an edge: its probability, and what it moves inwards (px).
+
+    Examples
+    --------
+    >>> RivalEdge(what="a line of the picture beside it", probability=0.07, moved_px=-0.6).probability
+    0.07
+    """
+
+    what: str
+    probability: float
+    moved_px: float
+
+
 class MeasuredEdge(Strict):
-    """Quality of an edge: profiles used and rejected, their scatter, and the bow of the edge.
+    """Quality of an edge: profiles used and rejected, their scatter, its bow, and what else it may be.
 
     Examples
     --------
@@ -122,6 +149,7 @@ class MeasuredEdge(Strict):
     rms_px: float | None
     curvature_px: float | None
     why: str = ""
+    rival: RivalEdge | None = None
 
 
 class FrameTransform(Strict):
@@ -148,7 +176,8 @@ class FrameOrientation(Document):
 
     The numbers of a declined frame are null. `angle_deg` is the direction of the photo x-axis, which
     runs along the lower edge, against the rows of the scan, positive counter-clockwise as seen.
-    `roll_frames` is the number of frames of a roll whose shape was used.
+    `roll_frames` is the number of frames of a roll whose shape was used; `frame` the number of the frame in a
+    scan of several, in reading order; `formats` are those that it can be, if none was given.
 
     Examples
     --------
@@ -174,6 +203,8 @@ class FrameOrientation(Document):
     edges: dict[Literal["upper", "right", "lower", "left"], MeasuredEdge]
     transform: FrameTransform | None = None
     roll_frames: int | None = None
+    frame: int | None = None
+    formats: tuple[FormatCandidate, ...] = ()
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -191,9 +222,12 @@ class FrameOrientation(Document):
         return points_of({name: corners[name] for name in CORNERS if name in corners})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of the file; a missing `transform`, and `roll_frames`, are left out."""
+        """Return the content of the file; what is missing of the last fields is left out."""
         content = super().to_dict()
-        missing = [key for key in ("transform", "roll_frames") if content[key] is None]
+        for edge in content["edges"].values():
+            if edge["rival"] is None:
+                del edge["rival"]
+        missing = [key for key in ("transform", "roll_frames", "frame", "formats") if not content[key]]
         return {key: value for key, value in content.items() if key not in missing}
 
 

@@ -78,7 +78,7 @@ def reorient_scan(
     Returns
     -------
     list of FrameResult
-        The repeated results if more frames are oriented, otherwise `before`.
+        The repeated results if they are as complete, otherwise `before`.
 
     Examples
     --------
@@ -98,8 +98,8 @@ def reorient_scan(
     def best(results: Sequence[FrameResult]) -> int:
         return max(order[result.status] for result in results)
 
-    better = best(again) > best(before) or (best(again) == best(before) == 1)
-    if not better:
+    # What the roll has in common is additional knowledge of a frame that is as complete without it.
+    if best(again) < max(best(before), 1):
         return list(before)
     note = f"by the shape of {roll.frames} frames of its roll"
     return [

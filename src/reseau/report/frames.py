@@ -100,6 +100,31 @@ def _mark(image: NDArray[Any], xy: Array, white: float) -> None:
         image[row, column] = white
 
 
+def write_cut(path: Path, scan: Scan, corners: Array) -> None:
+    """Write one frame of a scan upright, between its corners, with the pixels of the scan.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    scan : Scan
+        The scan.
+    corners : ndarray (4, 2)
+        Corners ul, ur, lr, ll, pixels; they become the centres of the picture's outermost pixels.
+    """
+    low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, None)
+    high = np.minimum(np.ceil(corners.max(axis=0)).astype(int) + 3, [scan.width, scan.height])
+    part = np.ascontiguousarray(scan.window(low[1], high[1], low[0], high[0]))
+    width, height = (
+        round(float(np.hypot(*(corners[1] - corners[0])))),
+        round(float(np.hypot(*(corners[3] - corners[0])))),
+    )
+    goal = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float32)
+    moved = cv2.getPerspectiveTransform((corners - low).astype(np.float32), goal)
+    cut = cv2.warpPerspective(part, moved, (width + 1, height + 1), flags=cv2.INTER_CUBIC)
+    write_image(path, cut)
+
+
 def frame_tile(scan: Scan, found: FrameOrientation) -> NDArray[np.uint8]:
     """Return a picture (h, w, 3) of one frame with its edges, and enlarged pictures of its corners."""
     overview, r = scan.overview(_SIDE)

@@ -26,7 +26,7 @@ from ..io.frame import FrameOutcome, RollSummary
 from ..io.images import open_scan, write_image
 from ..measure.film.roll import Roll, result_of, roll_of
 from ..procedures.film_frame import FrameOptions, FrameResult, orient_scan, orientation_of, reorient_scan
-from ..report.frames import contact_sheet, frame_tile, roll_page, scan_overlay, write_marked
+from ..report.frames import contact_sheet, frame_tile, roll_page, scan_overlay, write_cut, write_marked
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ class ScanJob:
     transform: v.Transform = "affine"
     out: v.Out | None = None
     marked: bool = True
+    cut: bool = False
     overlay: v.Overlay | None = None
     roll: Roll | None = None
 
@@ -196,6 +197,8 @@ def _write(job: ScanJob, scan: Any, documents: list[FrameOrientation]) -> None:
         document.write(job.out / f"{stem}.json")
         write_whole(job.out / f"{stem}.csv", _csv(document))
         write_image(job.out / "provenance" / f"{stem}.png", frame_tile(scan, document))
+        if job.cut and document.corners is not None:
+            write_cut(job.out / f"{stem}-frame.tif", scan, document.image_points().xy)
     if job.marked:
         corners = [d.image_points().xy for d in documents if d.corners is not None]
         if corners:
@@ -209,7 +212,7 @@ def _provenance(job: ScanJob) -> dict[str, Any]:
     if job.corners is not None:
         inputs["corners"] = sha256_of(job.corners)
     options = {"format_mm": job.format_mm, "dpi": job.dpi, "near": job.near, "transform": job.transform}
-    return Provenance(inputs, options | {"marked": job.marked}).to_dict()
+    return Provenance(inputs, options | {"marked": job.marked, "cut": job.cut}).to_dict()
 
 
 def _csv(document: FrameOrientation) -> str:
@@ -308,10 +311,10 @@ def _common(done: dict[str, ScanOutcome]) -> Roll | None:
 
 
 def _again(work: list[ScanJob], done: dict[str, ScanOutcome], roll: Roll) -> None:
-    """Orient frames that were not fully oriented again, with the shape of the roll."""
+    """Orient frames that are not fully oriented, or in doubt, again, with the shape of the roll."""
     for job in work:
         item = done[job.name]
-        if item.results and any(result.status != "oriented" for result in item.results):
+        if item.results and any(result.status != "oriented" or result.why for result in item.results):
             done[job.name] = _run(replace(job, roll=roll), item)
 
 

@@ -32,201 +32,249 @@ from .edges import NEIGHBOURS, EdgeProfiles
 from .steps import StepForm
 
 __all__ = [
-    "FEW_DISPLACED",
     "AdjacentEdge",
-    "SharpSteps",
+    "Softness",
     "common_forms",
     "displaced_by_lines",
     "edge_beside_line",
     "ends_with_line",
-    "is_one_step",
-    "sharp_steps",
+    "soft_steps",
+    "softness_of",
+    "student",
 ]
 
-_QUANTILES, _EVEN = (0.1, 0.3), 0.015
-"""Quantiles of the widths of profiles: the larger is the width of a sharp step; their difference is the
-scatter of its logarithm, with a minimum."""
-_UNEVEN, _SCRATCHED = 0.2, 0.5
-"""Differences of logarithmic widths: of three edges if the scan is sharper on one side, and of the sharpest
-from the next if it is no edge."""
-_PIXEL = float(np.sqrt(1 / 12))
-"""Width that a pixel adds to that of a step, which is hardly determined if it is much smaller."""
-_SMOOTH, _ANISOTROPIC, _END = 0.24, 0.5, 0.5
-"""Largest rms deviation of logarithmic widths at the ends of edges from sharpness that changes smoothly over
-the scan, largest such difference of the two directions, and share of half an edge that makes an end."""
-_ALIKE, _OTHERWISE, _STEADY = 0.4, 0.25, 0.08
-"""A scan is sharper in one direction where opposite edges are alike: largest difference of these as a share
-of that of the directions, and of the directions (logarithms of widths), and largest scatter of an edge."""
-_TOO_SHARP = 0.3
-"""Difference of logarithmic width from which steps are too sharp for an edge."""
-_LARGEST_DISPLACEMENT = 1.5
-"""Largest displacement of a step by a line, in widths; a more distant line is visible by itself."""
-_RATIO, FEW_DISPLACED = 4.0, 0.22
-"""Ratio of the second step to the first where a line displaces an edge, and share of profiles that show this
-by chance."""
-_NEIGHBOURHOODS, _INDEPENDENT = 5, 2.5
-"""Neighbourhoods of profiles that a line widens consistently; their effective number in picture content."""
+_QUANTILE, _EVEN = 0.3, 0.015
+"""Quantile of the widths of profiles that is the width of an edge's steps, because content of the picture
+widens some of them; and least standard deviation of its logarithm."""
+_MODELLED = 0.3
+"""Error of an edge's width by the model of the step, in standard deviations of that of a profile: where
+pixels hardly show the width, small errors of their model have a large part in it."""
+_SOFTNESS, _DIRECTIONS = 0.03, 0.04
+"""Scatter of logarithmic widths from edge to edge, by focus and penumbra, and half the difference of the two
+directions of a scan, by lens and carriage; both with the heavy tails of Student's distribution."""
+_LINES, _CONTOURS, _HIDDEN = 2.0, 20.0, 3.0
+"""Number of lines of a picture that run in the direction of an edge from end to end, number of contours that
+a line across the picture meets, and widths of the step within which they are hidden in it."""
+_LEVEL = float(np.deg2rad(1.0))
+"""Scatter of the directions of these lines about that of the edge: cameras are held so well, radians."""
+_SHARPENED = 0.01
+"""Prior probability that what was measured is sharper than an edge can be (a scratch)."""
+_RANGE = 1.5
+"""Range of logarithmic widths of lines that are sharper than edges."""
+_PERSISTENT = 0.9
+"""Share of the neighbourhoods of profiles beside which a second step goes on to the next."""
+_LEAST_SQUARE = 0.6
+"""Least variance of a step with a second one, relative to that of the step alone."""
+_LEAST = 20
+"""Least number of profiles that show the softness of an edge."""
 
 
-class SharpSteps(NamedTuple):
-    """Widths of sharp steps of an edge.
+def _second_steps(*, alone: bool) -> tuple[Array, Array, Array]:
+    """Second steps as they may be: increase of the logarithmic width, displacement (widths), and weight.
+
+    A second step with a share r of the contrast, at the distance s behind the first, appears as one step that
+    is displaced by r·s and has the variance w² + r(1 − r)·s²; a negative share, of a picture that is brighter
+    at its edge than behind it, sharpens the step. Where the picture is as dark as film at its edge, the
+    second step is seen `alone`, sharper if it is that of a narrow line. Shares are evenly distributed,
+    distances in their logarithm.
+    """
+    shares = np.concatenate([np.linspace(-0.9, -0.05, 18), np.linspace(0.05, 0.9, 18)])
+    share, distance = (each.ravel() for each in np.meshgrid(shares, _DISTANCES))
+    square = 1 + share * (1 - share) * distance**2
+    # What sharpens a step further is visible beside it.
+    hidden = square > _LEAST_SQUARE
+    increase, moved = 0.5 * np.log(square[hidden]), (share * distance)[hidden]
+    if alone:
+        narrow, distance = (each.ravel() for each in np.meshgrid([0.0, -0.1, -0.2, -0.3], _DISTANCES))
+        increase, moved = np.append(increase, narrow), np.append(moved, distance)
+    return increase, moved, np.full(len(moved), 1 / len(moved))
+
+
+_DISTANCES = np.geomspace(0.15, 6.0, 30)
+_ALL, _PARTS = _second_steps(alone=False), _second_steps(alone=True)
+"""Those beside all of an edge, which a step of its own must show, and those beside parts of it."""
+
+
+class Softness(NamedTuple):
+    """Softness of an edge's steps, and whether it is its own.
 
     Parameters
     ----------
     log_width : float
-        Logarithm of the width.
+        Logarithm of the width of a single step.
     scatter, texture : float
-        Scatter of the logarithm along the edge (minimum), and its random part from picture content.
+        Standard deviation of it, and of the width of a profile by content of the picture.
+    lined, displaced : float
+        Probability that a line beside all of the edge widens its steps, and rms displacement of the edge by
+        it, pixels.
+    sharpened : float
+        Probability that the steps are sharper than those of an edge.
+    before, beside : float
+        Probabilities, without the widths, of a line beside all of the edge, and of a contour beside a place
+        of it.
     """
 
     log_width: float
-    scatter: float
-    texture: float
+    scatter: float = _EVEN
+    texture: float = 0.0
+    lined: float = 0.0
+    displaced: float = 0.0
+    sharpened: float = 0.0
+    before: float = 0.0
+    beside: float = 0.0
 
     @property
     def width(self) -> float:
-        """Width, one sigma, pixels."""
+        """Width of a single step, one sigma, pixels."""
         return float(np.exp(self.log_width))
 
-    def beyond(self, found: EdgeProfiles) -> bool:
-        """Whether most steps are sharper than those of an edge can be, as at a scratch."""
-        return bool(np.median(found.blur[0][found.good]) < self.log_width - _TOO_SHARP)
+
+def student(value: Array, scale: Array | float) -> Array:
+    """Density of Student's distribution with four degrees of freedom."""
+    return np.asarray(0.375 * (1 + (value / scale) ** 2 / 4) ** -2.5 / scale)
 
 
-def common_forms(profiles: Sequence[EdgeProfiles | None]) -> list[StepForm | None]:
-    """Form of the blurred step for each edge: common to all, unless their sharpness differs."""
-    if _anisotropic(profiles):
-        across, down = (
-            _common_forms([p if k % 2 == d else None for k, p in enumerate(profiles)]) for d in (0, 1)
-        )
-        return [(across, down)[k % 2][k] for k in range(len(profiles))]
-    return _common_forms(profiles)
+def softness_of(widths: Sequence[tuple[float, float] | None], side: float) -> list[Softness]:
+    """Explain the widths of the steps of four edges together.
 
+    Each edge is as soft as the scan in its direction, with a scatter of its own; or a line beside it widens
+    its steps; or they are those of a scratch. The softness of the scan is what all edges explain best.
 
-def _common_forms(profiles: Sequence[EdgeProfiles | None]) -> list[StepForm | None]:
-    measured = sorted(
-        (p.form for p in profiles if p is not None and p.good.sum() > 20), key=lambda f: f.width
-    )
-    if not measured:
-        return [None] * len(profiles)
-    if _uneven([form.width for form in measured], profiles):
-        return [None if p is None else p.form for p in profiles]
-    width = measured[(len(measured) - 1) // 2].width
-    weight = sum(form.weight for form in measured)
-    lobes = sum(form.weight * form.lobes for form in measured) / max(weight, 1e-12)
-    return [None if p is None else StepForm(width, lobes, p.form.half, weight, p.form.tone) for p in profiles]
-
-
-def sharp_steps(profiles: Sequence[EdgeProfiles | None]) -> list[SharpSteps]:
-    """Widths of sharp steps for each edge: common to all, unless their sharpness differs."""
-    own = _of_edges([p.blur[0][p.good] if p is not None else np.zeros(0) for p in profiles])
-    sharp = [_sharp_steps(widths) for widths in own]
-    seen = [each for each, widths in zip(sharp, own, strict=True) if len(widths)]
+    Parameters
+    ----------
+    widths : sequence of (float, float) or None
+        Logarithm of the width of each edge and its standard deviation; None if it was not measured.
+    side : float
+        Side of the frame, pixels: the wider a step, the more of the picture is hidden in it.
+    """
+    seen = [k for k, each in enumerate(widths) if each is not None]
     if not seen:
-        return sharp
-    # A line beside one of the edges scatters the widths of that edge only.
-    second = min(1, len(seen) - 1)
-    texture = sorted(each.texture for each in seen)[second]
-    if _anisotropic(profiles):
-        scatter = sorted(each.scatter for each in seen)[second]
-        log = [_sharp_steps(np.concatenate(own[k::2])).log_width for k in (0, 1)]
-        return [SharpSteps(log[k % 2], scatter, texture) for k in range(len(profiles))]
-    if _uneven(sorted(each.width for each in seen), profiles):
-        return [each._replace(texture=texture) for each in sharp]
-    scatter = sorted(each.scatter for each in seen)[second]
-    return [SharpSteps(_sharp_steps(np.concatenate(own)).log_width, scatter, texture)] * len(profiles)
+        return [Softness(0.0)] * len(widths)
+    own, sigma = np.array([widths[k] for k in seen]).T
+    scale = np.hypot(_SOFTNESS, sigma)
+    common = np.linspace(own.min() - 0.4, own.max() + 0.4, 161)
+    apart = np.linspace(-0.4, 0.4, 33) if len(seen) > 2 else np.zeros(1)
+    sign = np.where(np.array(seen) % 2 == 0, -1.0, 1.0)
+    away = own - common[:, None, None] - sign * apart[:, None]  # (common, apart, edge)
+    hidden = 2 * _HIDDEN * np.exp(own) / side
+    before = _LINES * hidden * np.minimum(hidden / _LEVEL, 1.0)
+    before, beside = before / (1 + before), 1 - np.exp(-_CONTOURS * hidden / 2)
+    alike = (1 - before) * (1 - _SHARPENED) * student(away, scale)
+    increase, displaced, share = _ALL
+    each = share * student(away[..., None] - increase, scale[:, None])
+    lined = before * each.sum(axis=-1)
+    sharp = (
+        _SHARPENED / _RANGE * ((away < 0) & (away > -_RANGE)) * (1 - 2 * scale**2 / (away**2 + 2 * scale**2))
+    )
+    every = alike + lined + sharp
+    total = np.log(every).sum(axis=2) + np.log(student(apart, _DIRECTIONS))
+    weight = np.exp(total - total.max())
+    weight /= weight.sum()
+    moved = (each * displaced**2).sum(axis=-1) / each.sum(axis=-1) * np.exp(2 * common)[:, None, None]
+    found = [Softness(0.0)] * len(widths)
+    for i, k in enumerate(seen):
+        p, q = (float((weight * part[..., i] / every[..., i]).sum()) for part in (lined, sharp))
+        scan = float((weight * (common[:, None] + sign[i] * apart)).sum())
+        square = float((weight * lined[..., i] / every[..., i] * moved[..., i]).sum()) / max(p, 1e-12)
+        log = scan if p + q > 0.5 else float(own[i])
+        found[k] = Softness(
+            log, float(sigma[i]), 0.0, p, float(np.sqrt(square)), q, float(before[i]), float(beside[i])
+        )
+    return found
 
 
-def _of_edges(widths: list[Array]) -> list[Array]:
-    """Logarithmic widths without those of steps that are far sharper than the other edges.
+def common_forms(profiles: Sequence[EdgeProfiles | None], side: float) -> list[StepForm | None]:
+    """Form of the blurred step for each edge: width as the edges together explain it, common lobes."""
+    kept = [p if p is not None and p.good.sum() > _LEAST else None for p in profiles]
+    soft = softness_of([None if p is None else (float(np.log(p.width)), 2 * _EVEN) for p in kept], side)
+    forms = [p.form for p in kept if p is not None]
+    if not forms:
+        return [None] * len(profiles)
+    weight = sum(form.weight for form in forms)
+    lobes = sum(form.weight * form.lobes for form in forms) / max(weight, 1e-12)
+    middle = float(np.median([each.width for each, p in zip(soft, kept, strict=True) if p is not None]))
+    return [
+        None
+        if p is None
+        else StepForm(each.width if k is not None else middle, lobes, p.form.half, weight, p.form.tone)
+        for p, k, each in zip(profiles, kept, soft, strict=True)
+    ]
 
-    Along a part of an edge these are lines of the picture, which would make the edge itself appear sharp.
+
+def soft_steps(profiles: Sequence[EdgeProfiles | None], side: float) -> list[Softness]:
+    """Softness of the steps of each edge, from its profiles."""
+    widths: list[tuple[float, float] | None] = []
+    textures = []
+    for found in profiles:
+        if found is None or found.good.sum() <= _LEAST:
+            widths.append(None)
+            continue
+        own, variance = found.blur[:, found.good]
+        low, high = _quantiles(own, 1 / (variance + _EVEN**2), (0.1, _QUANTILE))
+        shown = _MODELLED * float(np.sqrt(1 / (1 / (variance + _EVEN**2)).mean()))
+        widths.append((high, float(np.sqrt(_EVEN**2 + (high - low) ** 2 / 4 + shown**2))))
+        # Picture content changes widths at random; a line along the edge widens neighbours alike.
+        change = np.abs(np.diff(own[::NEIGHBOURS]))
+        textures.append(1.4826 * float(np.median(change)) / np.sqrt(2) if len(change) > 3 else 0.0)
+    texture = sorted(textures)[min(1, len(textures) - 1)] if textures else 0.0
+    return [each._replace(texture=texture) for each in softness_of(widths, side)]
+
+
+def _quantiles(values: Array, weight: Array, shares: Sequence[float]) -> list[float]:
+    """Weighted quantiles: a sharp step in the middle of a pixel hardly shows its width."""
+    order = np.argsort(values, kind="stable")
+    below = np.cumsum(weight[order]) / weight.sum()
+    at = np.minimum(np.searchsorted(below, shares), len(order) - 1)
+    return [float(each) for each in values[order][at]]
+
+
+def displaced_by_lines(found: EdgeProfiles, soft: Softness) -> tuple[Array, Array, Array]:
+    """Displacements of steps by what is beside parts of the edge: a second step widens or sharpens them.
+
+    Returns
+    -------
+    (ndarray (n,), ndarray (n,), ndarray (n,))
+        Standard deviations of the displacements of profiles, pixels, probabilities of a second step, and mean
+        displacements by it, inwards.
     """
-    sharp = [_sharp_steps(each).log_width if len(each) else np.inf for each in widths]
-    kept = []
-    for k, each in enumerate(widths):
-        slower = each > min((s for j, s in enumerate(sharp) if j != k), default=-np.inf) - _TOO_SHARP
-        kept.append(each[slower] if np.isfinite(sharp[k]) and slower.mean() > 0.5 else each)
-    return kept
+    n, good = len(found.place), np.flatnonzero(found.good)
+    groups = [g for g in np.array_split(good, max(1, n // NEIGHBOURS)) if len(g)]
+    if not groups:
+        return np.zeros(n), np.zeros(n), np.zeros(n)
+    weight = 1 / (found.blur[1] + _EVEN**2)
+    excess = np.array([np.average(found.blur[0][g], weights=weight[g]) for g in groups]) - soft.log_width
+    # The texture was seen with the noise in it.
+    noise = np.array([max(1 / weight[g].mean(), soft.texture**2) for g in groups])
+    scale = np.sqrt(noise + soft.scatter**2)
+    increase, displaced, share = _PARTS
+    each = share * student(excess[:, None] - increase, scale[:, None])
+    lined = _chain(np.stack([student(excess, scale), each.sum(axis=1)], axis=1), max(soft.beside, soft.lined))
+    mean, square = (lined * (each @ displaced**k) / each.sum(axis=1) * soft.width**k for k in (1, 2))
+    middle = np.array([found.place[g].mean() for g in groups])
+    sigma, lined, mean = (
+        np.interp(found.place, middle, part)
+        for part in (np.sqrt(np.maximum(square - mean**2, 0.0)), lined, mean)
+    )
+    return sigma, lined, mean
 
 
-def displaced_by_lines(found: EdgeProfiles, sharp: SharpSteps) -> tuple[Array, float]:
-    """Possible displacement of steps by lines beside the edge, pixels (n,); share of affected profiles.
+def _chain(seen: Array, prior: float) -> Array:
+    """Probability (n,) of a second step beside each part of an edge (Rabiner 1989).
 
-    A second step with a share r of the contrast, at a distance s behind the first, appears as one step that
-    is displaced by r·s and has the variance w² + r(1 − r)·s². A step that is too sharp is itself a line.
+    What is beside one part is beside the next one, too: a hidden Markov chain. `seen` are the likelihoods of
+    the widths (n, 2) without a second step and with one.
     """
-    sure = _unlike(found, sharp, 2.0)
-    part = float(np.mean(sure[found.good] > 0)) if found.good.any() else 0.0
-    if part > FEW_DISPLACED:
-        # There is such a line; use a lower level of significance for the other profiles.
-        sure = _unlike(found, sharp, 1.0)
-    moved = np.minimum(np.sqrt(_RATIO * np.expm1(2 * np.maximum(sure, 0.0))), _LARGEST_DISPLACEMENT)
-    if part > FEW_DISPLACED:
-        moved = moved * np.sqrt(NEIGHBOURS)  # neighbours are displaced alike
-    return np.asarray(sharp.width * moved), part
-
-
-def _unlike(found: EdgeProfiles, sharp: SharpSteps, sigmas: float) -> Array:
-    """Significant differences from the width of a sharp step, logarithm (n,): of profiles or groups."""
-    other, variance = found.blur[0] - sharp.log_width, found.blur[1] + sharp.texture**2
-    size = min(_NEIGHBOURHOODS * NEIGHBOURS, len(other))
-    mean, own = (scipy.ndimage.uniform_filter1d(values, size, mode="nearest") for values in (other, variance))
-    alone = np.abs(other) - sigmas * np.sqrt(variance)
-    together = mean - sigmas * np.sqrt(own / _INDEPENDENT)
-    return np.asarray(np.minimum(np.maximum(alone, together) - sharp.scatter, 1.0))
-
-
-def _sharp_steps(widths: Array) -> SharpSteps:
-    if not len(widths):
-        return SharpSteps(0.0, _EVEN, 0.0)
-    low, high = np.quantile(widths, _QUANTILES)
-    # Picture content changes widths at random; a line along the edge widens neighbours alike.
-    apart = np.abs(np.diff(widths[::NEIGHBOURS]))
-    texture = 1.4826 * float(np.median(apart)) / np.sqrt(2) if len(apart) > 3 else 0.0
-    return SharpSteps(float(high), max(float(high - low), _EVEN), texture)
-
-
-def _uneven(widths: Sequence[float], profiles: Sequence[EdgeProfiles | None]) -> bool:
-    """Whether sorted widths differ by more than a picture structure at one of the edges can cause."""
-    if len(widths) > 3 and np.log(widths[1] / widths[0]) > _SCRATCHED:
-        widths = widths[1:]  # a lens cannot be that sharp at a single edge
-    return bool(len(widths) > 2 and np.log(widths[2] / widths[0]) > _UNEVEN) and _smooth(profiles)
-
-
-def _anisotropic(profiles: Sequence[EdgeProfiles | None]) -> bool:
-    """Whether the scan is sharper in one direction: opposite edges are alike, and unlike the others.
-
-    Lens and carriage spread a step differently. A line beside an edge widens this one only, and unevenly.
-    """
-    if any(p is None or p.good.sum() <= 20 for p in profiles):
-        return False
-    sharp = [_sharp_steps(p.blur[0][p.good]) for p in profiles if p is not None]
-    log = np.array([each.log_width for each in sharp])
-    apart = abs(log[0] + log[2] - log[1] - log[3]) / 2
-    alike = max(abs(log[0] - log[2]), abs(log[1] - log[3])) < _ALIKE * apart
-    return bool(alike and apart < _OTHERWISE and max(each.scatter for each in sharp) < _STEADY)
-
-
-def _smooth(profiles: Sequence[EdgeProfiles | None]) -> bool:
-    """Whether widths at the ends of edges are those of a scan whose sharpness changes smoothly.
-
-    Then two edges are alike where they meet, apart from a difference of the two directions, which scanners
-    have. Lines beside two of the edges widen these all along.
-    """
-    rows, widths = [], []
-    for k, found in enumerate(profiles):
-        for end in (-1.0, 1.0):
-            if found is not None and (near := found.good & (found.place * end > _END)).sum() >= NEIGHBOURS:
-                x, y = ((end, -1.0), (1.0, end), (-end, 1.0), (-1.0, -end))[k]
-                rows.append((1.0, x, y, float(k % 2)))
-                widths.append(np.log(np.hypot(np.exp(np.median(found.blur[0][near])), _PIXEL)))
-    if len(rows) < 6:
-        return True
-    design, observed = np.array(rows), np.array(widths)
-    change = np.linalg.lstsq(design, observed, rcond=None)[0]
-    rms = np.sqrt(((observed - design @ change) ** 2).sum() / (len(rows) - len(change)))
-    return bool(rms < _SMOOTH and abs(change[3]) < _ANISOTROPIC)
+    share = np.array([1 - prior, prior])
+    change = _PERSISTENT * np.eye(2) + (1 - _PERSISTENT) * share
+    before, after = np.empty_like(seen), np.ones_like(seen)
+    state = share
+    for k, likelihood in enumerate(seen):
+        before[k] = state * likelihood / (state * likelihood).sum()
+        state = before[k] @ change
+    for k in range(len(seen) - 2, -1, -1):
+        after[k] = change @ (seen[k + 1] * after[k + 1])
+        after[k] /= after[k].sum()
+    return np.asarray((before * after)[:, 1] / (before * after).sum(axis=1))
 
 
 _SECTIONS = 20
@@ -235,23 +283,19 @@ _REACH, _BIN = 7.0, 0.6
 """Range of pixels on both sides, and size of the bins, in widths of the blurred step."""
 _MODEL = 0.012
 """Accuracy of the model relative to the contrast of a section."""
-_OUT, _BEHIND, _SLOPES = -0.5, 2.5, (0.0, -2.0, 2.0)
+_OUT, _BEHIND, _SLOPES = (-0.5, -2.0), 2.5, (0.0, -2.0, 2.0)
 """Approximate values in widths: distance of the edge from the fitted line, of the line behind it from the
 edge, and change of the latter from the centre to an end."""
-_MOST_MISFIT, _LEAST_GAIN, _CLEAR_GAIN = 1.0, 3.0, 20.0
-"""Largest χ² over redundancy with two lines; minimum ratio of χ² with one line to that with two; and the same
-if nothing else can be there."""
+_INDEPENDENT_BINS = 5
+"""Number of bins of all sections whose errors are independent: those of the model are common to sections."""
 _CROSSED, _FEW_CROSSED = 9.0, 0.15
 """Misfit of a section, relative to the others, that another structure crosses; and largest share of such."""
 _TOGETHER = 1.7
 """Factor on the standard deviation of the edge, because errors of bins are correlated by grain."""
-_LINED = 0.25
-"""Least share of the sections that show the line."""
 _BOW = 0.3
 """Standard deviation of the bow of the edge, in widths."""
-_FARTHEST, _WELL = (2.0, 3.2), 0.6
-"""Largest displacement of the edge's steps by a line, in widths, for a moderate and for a good fit of two
-lines; and the χ² over redundancy that separates these."""
+_FARTHEST = 3.2
+"""Largest displacement of the edge's steps by a line, in widths: of one further away both are visible."""
 _SHARED = 7
 """Number of parameters common to all sections: p0, p1, p2, q0, q1, q2, h."""
 
@@ -265,9 +309,9 @@ class AdjacentEdge(NamedTuple):
 
 
 def edge_beside_line(
-    grey: Array, band: Band, line: Array, level: Array, noise: float, width: float
-) -> tuple[AdjacentEdge | None, bool]:
-    """Adjust an edge together with a line beside it; test against a model without the line.
+    grey: Array, band: Band, line: Array, level: Array, noise: float, width: float, own: float, bow: float
+) -> tuple[AdjacentEdge | None, float]:
+    """Adjust an edge together with a line beside it, and compare with one step of any softness.
 
     Parameters
     ----------
@@ -279,32 +323,30 @@ def edge_beside_line(
         Offset of the line fitted before, at each profile.
     level : ndarray (n,)
         Tone of the film beside each profile.
-    noise, width : float
-        Noise of a pixel; width of the blurred step, one sigma, pixels.
+    noise, width, own : float
+        Noise of a pixel; width of the blurred step, one sigma, pixels, and the width that the edge shows.
+    bow : float
+        Bow of the line fitted before: it may be real, or that of the displacement by the line.
 
     Returns
     -------
-    (Companion or None, bool)
-        The edge, if two lines describe it; and whether a line may run so close to the edge all along that the
-        two cannot be separated: then straight steps describe all sections, which other structures would not.
+    (AdjacentEdge or None, float)
+        The edge, if two lines can describe it; and the logarithm of the likelihood of the line, over that of
+        one step with the width that the edge shows.
     """
-    two = _two_lines(grey, band, line, level, noise, width)
+    two = _two_lines(grey, band, line, level, noise, width, bow)
     if two is None:
-        return None, True
+        return None, 0.0
     x, place = two.x, two.place
-    first, second = x[_SHARED + 1 :: 4] / two.top, x[_SHARED + 2 :: 4] / two.top
     behind = x[3] + x[4] * place + x[5] * place**2 - x[0] - x[1] * place - x[2] * (place**2 - 1)
-    # Where there is no second step and most of the contrast is in the first, the edge is seen by itself.
-    lined, alone = second > 0.1, (second <= 0.1) & (first > 0.5)
-    there = (first > 0.02).mean() > 0.7 and lined.mean() > _LINED and (lined | alone).mean() > 0.5
-    there &= (behind > -0.3 * width).mean() > 0.9
-    farthest = _FARTHEST[int(two.chi < _WELL)] * width
-    there &= np.abs(x[0] + x[1] * place + x[2] * (place**2 - 1)).max() < farthest
-    # A structure behind the edge at constant distance may be glare of the scanner, which is less distinct.
-    there &= np.ptp(behind) > width or (two.chi < _WELL and two.without > _CLEAR_GAIN * two.chi)
-    if two.chi > _MOST_MISFIT or two.without < _LEAST_GAIN * two.chi or not there:
-        return None, min(two.without, two.chi) < _MOST_MISFIT
-    return two.adjacent_edge(band, line), True
+    moved = np.abs(x[0] + x[1] * place + x[2] * (place**2 - 1)).max()
+    # The line lies behind the edge, and not so far that both are seen.
+    if (behind > -0.3 * width).mean() < 0.9 or moved > _FARTHEST * width:
+        return None, 0.0
+    one = _two_lines(grey, band, line, level, noise, own, bow, still=True)
+    without = two.without if one is None else min(one.without, one.chi, two.without)
+    gain = _INDEPENDENT_BINS / 2 * float(np.log(max(without, 1e-9) / max(two.chi, 1e-9)))
+    return two.adjacent_edge(band, line), gain
 
 
 def ends_with_line(
@@ -314,18 +356,8 @@ def ends_with_line(
 
     Its covariance assumes that the model is correct.
     """
-    two = _two_lines(grey, band, line, level, noise, width)
+    two = _two_lines(grey, band, line, level, noise, width, 0.0)
     return None if two is None else two.adjacent_edge(band, line)
-
-
-def is_one_step(grey: Array, band: Band, line: Array, level: Array, noise: float, width: float) -> bool:
-    """Whether one straight step describes all sections of an edge; arguments as in :func:`edge_beside_line`.
-
-    Then widened steps do not show where the edge is visible by itself: a line may run beside all of it. Not
-    so if too few pixels are visible.
-    """
-    two = _two_lines(grey, band, line, level, noise, width)
-    return two is not None and two.without < _MOST_MISFIT
 
 
 class _TwoLines(NamedTuple):
@@ -350,22 +382,34 @@ class _TwoLines(NamedTuple):
 
 
 def _two_lines(
-    grey: Array, band: Band, line: Array, level: Array, noise: float, width: float
+    grey: Array,
+    band: Band,
+    line: Array,
+    level: Array,
+    noise: float,
+    width: float,
+    bow: float,
+    *,
+    still: bool = False,
 ) -> _TwoLines | None:
+    """The adjustment with and without a line behind the edge; `still` if the edge is at the fitted one."""
     sections = _sections(grey - level[:, None], band, line, noise, width)
     if sections is None:
         return None
     place, at, value, weight, top = sections
     model = _Model(place, at, width)
-    starts = np.array([model.start(slope, top) for slope in _SLOPES])
-    shared = np.array([4.0, 4.0, _BOW, 4.0, 4.0, 4.0, 4.0]) * width
+    starts = np.array([model.start(out, slope, top) for out in _OUT for slope in _SLOPES])
+    shared = np.array([4.0, 4.0, np.hypot(_BOW, bow / width), 4.0, 4.0, 4.0, 4.0]) * width
     spread = np.concatenate([shared, _of_steps(0.03 * top, 2 * top, 2 * top, 2 * top)])
-    alone = model.start(0.0, top)
-    alone[0], alone[_SHARED:] = 0.0, _of_steps(0 * top, top, 0 * top, 0 * top)
+    step = model.start(0.0, 0.0, top)
+    step[0], step[_SHARED:] = 0.0, _of_steps(0 * top, top, 0 * top, 0 * top)
     held = np.concatenate([shared[:3], [1e-6] * 4, _of_steps(0.03 * top, 2 * top, 1e-3 * top, 2 * top)])
+    if still:
+        starts = np.array([model.start(0.0, slope, top) for slope in _SLOPES])
+        spread[:3] = held[:3] = 1e-3 * width
     for _ in range(2):
+        one = model.fitted(value, weight, step[None], held)
         both = model.fitted(value, weight, starts, spread)
-        one = model.fitted(value, weight, alone[None], held)
         misfit = np.minimum(both.misfit, one.misfit)
         crossed = misfit > _CROSSED * np.median(misfit)
         if not 0 < crossed.mean() <= _FEW_CROSSED:
@@ -421,9 +465,9 @@ class _Model:
     def __init__(self, place: Array, at: Array, width: float) -> None:
         self.place, self.at, self.width = place, at, width
 
-    def start(self, slope: float, top: Array) -> Array:
-        """Approximate parameters, with the line departing from the edge by `slope` widths."""
-        shared = np.array([_OUT, 0.0, 0.0, _OUT + _BEHIND, slope, 0.0, 3.0]) * self.width
+    def start(self, out: float, slope: float, top: Array) -> Array:
+        """Approximate parameters, with the edge `out` widths inwards and the line departing by `slope`."""
+        shared = np.array([out, 0.0, 0.0, out + _BEHIND, slope, 0.0, 3.0]) * self.width
         return np.concatenate([shared, _of_steps(0 * top, 0.2 * top, 0.8 * top, -0.3 * top)])
 
     def fitted(self, value: Array, weight: Array, starts: Array, spread: Array) -> _Fitted:

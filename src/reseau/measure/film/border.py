@@ -80,6 +80,16 @@ class Band:
         """Half the side of a pixel across the edge."""
         return float(0.5 * np.abs(self.normal).max())
 
+    def at(self, place: Array, offset: Array) -> Array:
+        """Pixels (n, 2) at positions along the edge and offsets inwards."""
+        along = (self.stop - self.start) * ((place + 1) / 2)[:, None]
+        return np.asarray(self.start + along + offset[:, None] * self.normal)
+
+    def harmonics(self, place: Array, offset: Array) -> Array:
+        """Two harmonics (n, 4) of the phase of an edge on the grid of the pixels."""
+        phase = 2 * np.pi * self.at(place, offset)[:, int(np.abs(self.normal).argmax())]
+        return np.stack([np.cos(phase), np.sin(phase), np.cos(2 * phase), np.sin(2 * phase)], axis=1)
+
 
 def read_band(
     scan: Scan, start: Array, stop: Array, outward: float, inward: float, *, wide: bool = False

@@ -11,18 +11,16 @@ import scipy
 
 from ...core.data import Array, Mask
 from .adjacent_lines import (
-    FEW_DISPLACED,
     AdjacentEdge,
-    SharpSteps,
+    Softness,
     common_forms,
     displaced_by_lines,
     edge_beside_line,
-    is_one_step,
-    sharp_steps,
+    soft_steps,
 )
 from .border import Band, Border, Film
 from .edges import EdgeProfiles, measure_profiles, merged
-from .lines import EdgeData, robust_line, shared_error, waviness
+from .lines import Contender, EdgeData, Rival, departing_line, robust_line
 from .steps import STRAIGHT, StepForm, Tone
 
 __all__ = ["WIDER_SEARCH", "Channel", "channels_by_contrast", "measure_channel"]
@@ -39,11 +37,7 @@ _FOREIGN = 0.08
 from which it is no film."""
 _UNEVEN = 0.45
 """Share of its own tone by which film may differ between edges, because the scanner's light is uneven."""
-_CLEAR = 0.6
-"""Usual share of profiles that show a step on an undisturbed edge."""
-_ENDS, _HIDDEN = 2.0, 1.0
-"""Standard deviations, in widths of the step, of an end of an edge that is completely displaced by a line,
-and of one that may be, although most steps do not show it."""
+_BESIDE = "a line of the picture beside it"
 _TURNED, _ROUNDED, _MARGIN = 1.2, 0.25, 0.015
 """Sigmas by which neighbouring profiles lie inwards at a rounded corner, share of half an edge that the
 corner may take, and additional margin."""
@@ -61,8 +55,8 @@ within which a profile agrees; and standard deviation of an end continued from t
 structure's distance."""
 _PARTS, _MOST_PARTS = 20, 0.4
 """Parts of an edge, and share of them in which undisturbed profiles determine it."""
-_CHORD = 30
-"""Number of points that represent an edge known by its two ends."""
+_MODEL_PX = 0.012
+"""Standard deviation of the error of either end of an edge by the model of the step, which profiles share."""
 _OTHER_WIDTH, _OTHER_LOBES = 0.12, 0.01
 """Differences in the logarithm of the width, and in the lobes, from which an edge is measured again with the
 form of step common to the edges."""
@@ -87,32 +81,29 @@ class Channel:
     rejected: list[int]
     why: list[str]
 
-    def doubted(self, other: Channel, corners: Array) -> Channel:
+    def doubted(self, other: Channel) -> Channel:
         """The channel with the doubts of one of more contrast: lines that may be hidden beside edges.
 
         Where both put an edge at the same place, both show the same, and less contrast does not show it
         better. A channel without the line shows the edge further outwards.
         """
+        data = [
+            own
+            if own is None or doubtful is None or (doubtful.line - own.line)[:2].max() >= doubtful.doubt
+            else own.doubted(doubtful.doubt)
+            for own, doubtful in zip(self.data, other.data, strict=True)
+        ]
+        return replace(self, data=data)
+
+    def contended(self, others: Sequence[Contender]) -> Channel:
+        """The channel with edges that may be other lines."""
         data = list(self.data)
-        for k, (own, doubtful) in enumerate(zip(self.data, other.data, strict=True)):
-            if own is None or doubtful is None or own.ends >= doubtful.ends:
-                continue
-            start, along = corners[k], corners[(k + 1) % 4] - corners[k]
-            normal = np.array([-along[1], along[0]]) / np.hypot(*along)
-            ends = [
-                np.polynomial.polynomial.polyval(
-                    [0.0, 1.0],
-                    np.polynomial.polynomial.polyfit(
-                        (edge.xy - start) @ along / (along @ along),
-                        (edge.xy - start) @ normal,
-                        1,
-                        w=1 / edge.sigma,
-                    ),
-                )
-                for edge in (own, doubtful)
-            ]
-            if (ends[1] - ends[0]).max() < doubtful.ends:
-                data[k] = replace(own, ends=doubtful.ends)
+        for each in others:
+            own = data[each.edge]
+            if own is not None:
+                moved = float(np.sqrt(each.probability) * np.hypot(each.inwards, each.sigma))
+                rival = Rival("an edge of the frame elsewhere", each.probability, -each.inwards)
+                data[each.edge] = replace(own.doubted(float(np.hypot(moved, own.doubt))), rival=rival)
         return replace(self, data=data)
 
 
@@ -144,6 +135,10 @@ def measure_channel(
 ) -> Channel:
     """Profiles of the four edges in one channel that agree with a line through each edge."""
 
+    pixels = [band(k, False, False) for k in range(4)]
+    side = float(
+        np.mean([np.hypot(*(each.stop - each.start)) for each in pixels if each is not None] or [1.0])
+    )
     far: list[bool] = [False] * 4
     films: list[Film | None] = [None] * 4
 
@@ -167,7 +162,7 @@ def measure_channel(
         if film is not None:
             films[k] = film
             profiles[k] = measured(k, False)
-    for k, (found, form) in enumerate(zip(profiles, common_forms(profiles), strict=True)):
+    for k, (found, form) in enumerate(zip(profiles, common_forms(profiles, side), strict=True)):
         if found is None or form is None:
             continue
         other = abs(np.log(found.width / form.width)) > _OTHER_WIDTH
@@ -178,8 +173,8 @@ def measure_channel(
             found = found if more is None else merged(found, more)
         profiles[k] = found
     edges = [
-        _edge(band(k, False, far[k]), found, sharp, channel, polarity)
-        for k, (found, sharp) in enumerate(zip(profiles, sharp_steps(profiles), strict=True))
+        _edge(band(k, False, far[k]), found, soft, channel, polarity)
+        for k, (found, soft) in enumerate(zip(profiles, soft_steps(profiles, side), strict=True))
     ]
     data, rejected, why = (list(column) for column in zip(*edges, strict=True))
     borders = [None if found is None else found.border for found in profiles]
@@ -200,21 +195,21 @@ def _foreign(profiles: Sequence[EdgeProfiles | None]) -> list[Film | None]:
 
 
 def _edge(
-    band: Band | None, found: EdgeProfiles | None, sharp: SharpSteps, channel: int, polarity: int
+    band: Band | None, found: EdgeProfiles | None, soft: Softness, channel: int, polarity: int
 ) -> tuple[EdgeData | None, int, str]:
     """Profiles of an edge that agree with its line, or the reason why it is not found."""
     if band is None:
         return None, 0, "is not in the scan, or nothing separates it from the picture"
     if found is None:
         return None, 0, "no contrast between film and picture"
-    drawn, part = displaced_by_lines(found, sharp)
-    place, offset, sigma = (part_[found.good] for part_ in (found.place, found.offset, found.sigma))
-    line = _line(place, offset, np.hypot(sigma, drawn[found.good]), sigma)
-    sigma = np.hypot(sigma, drawn[found.good])
+    drawn, beside, moves = (part[found.good] for part in displaced_by_lines(found, soft))
+    place, offset, own = (part[found.good] for part in (found.place, found.offset, found.sigma))
+    sigma, offset = np.hypot(own, drawn), offset - moves
+    line = _line(place, offset, sigma, own)
     rejected = int((~found.good).sum())
     if line is None:
         return None, rejected, f"no line fits {len(place)} of {len(found.place)} profiles that show a step"
-    (start, stop, bow), agree, doubt = line
+    near, agree, doubt = line
     if agree.sum() < max(12, 0.1 * len(found.place)) or agree.mean() < _LEAST_AGREE:
         return None, rejected, f"only {int(agree.sum())} of {len(found.place)} profiles agree with a line"
     border = found.border
@@ -223,40 +218,62 @@ def _edge(
     # An error of the film's tone moves a step by √(2π) of its width, times the error relative to the
     # contrast.
     common = float(np.sqrt(2 * np.pi) * found.width * _TONE * border.noise / border.contrast)
-    hidden, untouched = False, place[drawn[found.good] == 0]
-    spans, few = _spans(untouched), FEW_DISPLACED
-    if spans:
+    if _spans(place[beside < 0.5]):
         # The edge is seen by itself beside the structures that displace some of its steps.
-        agree &= drawn[found.good] == 0
-        few /= 2
-    elif found.good.mean() <= _CLEAR:
-        few /= 5
-    if part > few:
-        grey = band.grey[:, :, channel].astype(np.float64) * polarity
-        # A line displaces an edge by at most its width; a larger bow is real.
-        own = bow if abs(bow) > 2 * found.width else 0.0
-        fitted = (start * (1 - band.place) + stop * (1 + band.place)) / 2 - own * (1 - band.place**2)
-        sections = grey, band, fitted, border.level, border.noise, sharp.width
-        if spans:
-            # Of a line that nothing separates from the edge, noise lets few steps show the width.
-            doubt = max(doubt, _HIDDEN * sharp.width * is_one_step(*sections))
-        else:
-            two, hidden = edge_beside_line(*sections)
-            if two is not None:
-                return _along_chord(band, two, own + two.bow, common), rejected, ""
-    residuals = _inward(line[0], place, offset)
-    total = np.hypot(sigma, _NEIGHBOURHOOD_PX)
-    agree &= _straight(place, residuals / total)
+        agree &= beside < 0.5
+    rival, two = _rival(band, found, soft, band.grey[:, :, channel].astype(np.float64) * polarity, near)
+    doubt = float(np.hypot(doubt, np.sqrt(rival.probability) * rival.moved_px))
+    if two is not None:
+        at = np.append(two.ends, two.bow + near[2])
+        covariance = np.diag([0.0, 0.0, soft.width**2 + near[2] ** 2])
+        covariance[:2, :2] = two.covariance + common**2 + doubt**2 * np.eye(2)
+        xy = band.at(place, -_inward(at, place, 0 * place))
+        return EdgeData(at, covariance, xy, np.zeros(0), 0.0, doubt, rival), rejected, ""
+    if (beside > 0.5).any() and rival.probability < beside.max():
+        # The sigmas of these profiles contain it.
+        moved = float(np.abs(moves[beside > 0.5]).max())
+        where = f"a line of the picture beside {np.mean(beside > 0.5):.0%} of it"
+        rival = Rival(where, float(beside.max()), -moved)
+    residuals = _inward(near, place, offset)
+    agree &= _straight(place, residuals / np.hypot(sigma, _NEIGHBOURHOOD_PX))
     # A structure of the picture lies inwards of the edge; parts of an edge that is bent lie on both sides.
-    bent = agree.mean() < _BENT and not _only_inwards(residuals, line[1])
-    shown = np.ones(len(place), dtype=bool) if bent else agree
-    wave = waviness(place[shown], residuals[shown], total[shown])
-    scale = shared_error(place[agree], residuals[agree], total[agree])
+    used = agree | (agree.mean() < _BENT and not _only_inwards(residuals, line[1]))
+    harmonics = band.harmonics(place, offset - residuals)
+    values, covariance, departs = departing_line(
+        *(each[used] for each in (place, offset, own, drawn, harmonics))
+    )
     # Steps that are too sharp belong to a scratch and are equally uninformative.
-    hidden |= sharp.beyond(found)
-    ends = float(np.hypot(max(doubt, _ENDS * sharp.width * part if hidden else 0.0), wave))
-    data = EdgeData(_points(band, place[agree], offset[agree]), total[agree] * scale, common, ends, wave)
-    return data, rejected + int((~agree).sum()), ""
+    doubt = float(np.sqrt(doubt**2 + soft.sharpened * soft.width**2))
+    covariance[:2, :2] += common**2 + (_MODEL_PX**2 + doubt**2) * np.eye(2)
+    rest = _inward(values, place[used], offset[used])
+    data = EdgeData(values, covariance, band.at(place[used], offset[used]), rest, departs, doubt, rival)
+    return data, rejected + int((~used).sum()), ""
+
+
+def _rival(
+    band: Band, found: EdgeProfiles, soft: Softness, grey: Array, line: Array
+) -> tuple[Rival, AdjacentEdge | None]:
+    """The second best explanation of an edge, and the edge itself if a line beside it is the best one.
+
+    Edge and line are adjusted together where the widths of the steps make a line more probable than anywhere.
+    """
+    rival = Rival(_BESIDE, soft.lined, -soft.displaced)
+    if soft.lined <= soft.before:
+        return rival, None
+    (start, stop, bow), border = line, found.border
+    fitted = (start * (1 - band.place) + stop * (1 + band.place)) / 2
+    fitted = fitted - bow * (1 - band.place**2)
+    shown = float(np.exp(np.median(found.blur[0][found.good])))
+    two, gain = edge_beside_line(grey, band, fitted, border.level, border.noise, soft.width, shown, bow)
+    odds = soft.lined / (1 - soft.lined) * np.exp(np.clip(gain, -20, 20))
+    lined = float(odds / (1 + odds))
+    if two is None:
+        return replace(rival, probability=lined), None
+    away = two.ends - np.array([start, stop])
+    moved = float(away[np.abs(away).argmax()])
+    if lined > 0.5:
+        return Rival("softness of its own, without a line beside it,", 1 - lined, -moved), two
+    return Rival(_BESIDE, lined, moved), None
 
 
 def _spans(place: Array) -> bool:
@@ -307,7 +324,8 @@ def _line(place: Array, offset: Array, sigma: Array, own: Array) -> tuple[Array,
 def _misfit(line: tuple[Array, Mask], place: Array, offset: Array, total: Array) -> float:
     """Factor on the standard deviations of the profiles that agree with a line."""
     values, agree = line
-    return shared_error(place[agree], _inward(values, place, offset)[agree], total[agree])
+    rest = (_inward(values, place, offset) / total)[agree]
+    return float(np.sqrt(max(np.mean(rest**2), 1.0)))
 
 
 def _inward(line: Array, place: Array, offset: Array) -> Array:
@@ -331,19 +349,3 @@ def _straight(place: Array, inward: Array) -> Mask:
         if len(straight) and straight[0] > 0 and abs(begin) > 1 - _ROUNDED:
             keep &= np.abs(place - place[order[0]]) > abs(begin - place[order[0]]) + _MARGIN
     return keep
-
-
-def _points(band: Band, place: Array, offset: Array) -> Array:
-    along = (band.stop - band.start) * ((place + 1) / 2)[:, None]
-    return np.asarray(band.start + along + offset[:, None] * band.normal)
-
-
-def _along_chord(band: Band, found: AdjacentEdge, bow: float, common: float) -> EdgeData:
-    """An edge known by its two ends, as points of a line with the same precision."""
-    middle = float(found.covariance.sum() / 4)
-    slope = float((found.covariance[0, 0] + found.covariance[1, 1] - 2 * found.covariance[0, 1]) / 4)
-    place = np.linspace(-1, 1, _CHORD)
-    # A line through n points of sigma s has the variance s²/n at its centre, and s²/Σt² of its slope.
-    place *= np.sqrt(middle / max(slope, 1e-12) / np.mean(place**2))
-    offset = (found.ends[0] * (1 - place) + found.ends[1] * (1 + place)) / 2 - bow * (1 - place**2)
-    return EdgeData(_points(band, place, offset), np.full(_CHORD, np.sqrt(_CHORD * middle)), common)

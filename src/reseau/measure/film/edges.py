@@ -44,6 +44,8 @@ _ROUNDS, _LEAST_PIXELS = 2, 100
 _FORMING, _HELD, _WIDTHS = 3, 0.005, (0.4, 6.0)
 """Iterations of the common form of sharp steps; standard deviation of a logarithm of a width that is held;
 and the range of widths."""
+_PHASE = 0.04
+"""Standard deviation of the harmonics by which the logarithm of a width depends on the phase of pixels."""
 _LOBES, _MOST_LOBES = 0.1, (-0.12, 0.2)
 """Prior standard deviation of the lobes of a step, and their range."""
 
@@ -127,7 +129,21 @@ def measure_profiles(
         return None
     steps, form = found
     place, sigma = np.where(steps.good, steps.place, 0.0), np.where(steps.good, steps.sigma, 1.0)
-    return EdgeProfiles(band.place, place, sigma, steps.good, steps.blur, form, border)
+    blur = _without_phase(steps, band.harmonics(band.place, _smoothed(place, steps.good)))
+    return EdgeProfiles(band.place, place, sigma, steps.good, blur, form, border)
+
+
+def _without_phase(steps: _Steps, harmonics: Array) -> Array:
+    """Widths without what depends on the phase of the edge on the grid of the pixels."""
+    value, variance = steps.blur
+    weight = steps.good / (variance + _PHASE**2)
+    rest = value - float(np.median(value[steps.good]))
+    # Neighbours share the profiles of which their widths are means.
+    normal = harmonics.T @ (weight[:, None] * harmonics) / NEIGHBOURS + np.eye(4) / _PHASE**2
+    part = np.linalg.solve(
+        normal, harmonics.T @ (weight * np.clip(rest, -4 * _PHASE, 4 * _PHASE)) / NEIGHBOURS
+    )
+    return np.stack([value - harmonics @ part, variance])
 
 
 def _width(grey: Array, band: Band, border: Border) -> float:
@@ -392,13 +408,12 @@ def _window(
     """Pixels of profiles from film to a distance inside their starts: values, distances, weights (n, s)."""
     low = np.maximum(-_OUTWARD * width - 2.0, border.outermost - start)
     at = band.distance - start[:, None]
-    used = (at > low[:, None]) & (at < high) & np.isfinite(grey)
-    size = int(used.sum(axis=1).max(initial=0))
+    # A pixel leaves the window as gradually as the edge moves on the grid.
+    used = ((at > low[:, None]) & np.isfinite(grey)) * np.clip(high + band.half - at, 0.0, 1.0)
+    size = int(np.count_nonzero(used, axis=1).max(initial=0))
     if size < 8:
         return None
         # Used pixels come first, in their order; the rest have zero weight.
-    order: Rows = np.argsort(~used, axis=1, kind="stable")[:, :size]
-    value, place, weight = (
-        np.take_along_axis(part, order, axis=1) for part in (grey, band.distance, used.astype(np.float64))
-    )
+    order: Rows = np.argsort(used == 0, axis=1, kind="stable")[:, :size]
+    value, place, weight = (np.take_along_axis(part, order, axis=1) for part in (grey, band.distance, used))
     return np.where(weight > 0, value, 0.0), place, weight

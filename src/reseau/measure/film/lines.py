@@ -9,66 +9,88 @@ determined.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...adjust import Adjustment, GaussMarkov, Options, Parameters, adjust, robust
 from ...core.data import Array, Mask
 from ...core.failure import Code, Failure
+from ...io import EDGES
 from .search import crossings_of
 
 __all__ = [
+    "Contender",
     "EdgeData",
     "FrameShape",
     "Lines",
     "adjust_lines",
+    "departing_line",
     "derived",
+    "explained_shape",
     "robust_line",
     "shape_of",
-    "shared_error",
-    "waviness",
 ]
 
 _BOW_PX, _LEAST_BOW_PX = 3.0, 0.2
 """Prior standard deviation of the bow of an edge in pixels, and its minimum once bows are measured."""
-_SECTIONS = 24, 12
-"""Numbers of sections of an edge whose means show the errors common to neighbouring profiles: structures of
-the picture and phases of the pixels are longer than some of them."""
-_REWEIGHTED = 8
-"""Number of adjustments of these polynomials with weights that decrease with the residuals."""
 _LEAST_SCALE = 0.3
 """Scatter of residuals over sigmas below which sigmas as given decide which profiles agree."""
-_WAVES, _LEAST_WAVED, _SIGNIFICANT, _LEAST_WAVE_PX = 5, 40, 25.0, 0.05
-"""Degree of the polynomials that show that an edge is no bowed line, minimum number of profiles, and least
-significance (χ² of three coefficients) and size."""
-_MODEL_PX = 0.012
-"""Standard deviation of the error of either end of an edge by the model of the step, which profiles share."""
+_BINS, _NEAREST_PX = 48, 0.05
+"""Sections in which profiles are averaged; unit of the departures of an edge from its line, pixels."""
+_PHASE_PX = 0.04
+"""Standard deviation of the harmonics by which a step is displaced with its phase on the pixels."""
+_LENGTHS, _TIMES = np.array([0.04, 0.1, 0.25, 0.6]), np.geomspace(0.05, 25.6, 10)
+"""Lengths over which departures are alike, in halves of the edge, and sizes of them, in their units: evenly
+distributed in their logarithms."""
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another explanation of an edge: what it is, its probability, and what it moves inwards, pixels."""
+
+    what: str
+    probability: float
+    moved_px: float
+
+    def __str__(self) -> str:
+        way = "inwards" if self.moved_px > 0 else "outwards"
+        moved = f"would move it {abs(self.moved_px):.2g} px {way}"
+        return f"{self.what} (probability {self.probability:.2f}) {moved}"
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeData:
-    """Profiles of one edge as observations, in columns.
+    """One edge as measured.
 
     Parameters
     ----------
-    xy : ndarray (n, 2)
-        Positions of the steps, pixels.
-    sigma : ndarray (n,)
-        Standard deviations across the edge.
-    common : float
-        Standard deviation of an error common to all profiles, pixels.
-    ends : float
-        Standard deviation of an independent error of either end of the edge, pixels.
-    wave : float
-        The part of it by which the edge is neither straight nor evenly bowed.
+    line, covariance : ndarray (3,), (3, 3)
+        Offsets of its ends inwards from the approximate edge, and its bow, positive outwards, pixels.
+    xy, residuals : ndarray (n, 2), (n,)
+        Positions of the profiles used, and their distances from the line; none if it was adjusted as a whole.
+    departs : float
+        Standard deviation by which the edge departs from a bowed line, and neighbouring profiles alike.
+    doubt : float
+        Standard deviation of its ends by other explanations of the edge, which the covariance contains.
+    rival : Rival, optional
+        The second best explanation of what is seen.
     """
 
+    line: Array
+    covariance: Array
     xy: Array
-    sigma: Array
-    common: float = 0.0
-    ends: float = 0.0
-    wave: float = 0.0
+    residuals: Array
+    departs: float = 0.0
+    doubt: float = 0.0
+    rival: Rival | None = None
+
+    def doubted(self, doubt: float) -> EdgeData:
+        """The edge with the doubt of another channel, if it is larger."""
+        if doubt <= self.doubt:
+            return self
+        more = np.diag([1.0, 1.0, 0.0]) * (doubt**2 - self.doubt**2)
+        return replace(self, covariance=self.covariance + more, doubt=doubt)
 
 
 @dataclass(frozen=True)
@@ -179,37 +201,135 @@ def adjust_lines(
 
     Parameters
     ----------
-        Approximate corners, accurate to a few pixels.
-        Approximate corners, good to some pixels.
+    corners : ndarray (4, 2)
+        Ends of the approximate edges.
     edges : sequence of EdgeData or None
         Upper, right, lower, left; None for a missing edge, which is then determined by the shape.
     shape : FrameShape or None
         Prior knowledge of the shape.
     rejected : sequence of int
-        Profiles of each edge that were rejected before; included in the reported numbers.
+        Number of profiles of each edge that were rejected.
     """
     if sum(edge is None for edge in edges) > (shape is not None):
         return Failure(
             "fewer than three edges of a known format, or than four of an unknown one", Code.NOT_FOUND
         )
-    bow, keep = _BOW_PX, np.zeros(0, dtype=bool)
+    bow = _BOW_PX
     for _ in range(2):
-        problem, bounds = _problem(corners, edges, shape, bow)
-        found = robust(problem, "huber", tuning=2.5, scale="a-priori", tolerance=1e-2, options=_APRIORI)
-        if isinstance(found, Failure):
-            return found
-        corners = _corners(found.adjustment.values, corners)
-        bow = _bow_of(found.adjustment.values[2:12:3], found.adjustment.sigma[2:12:3])
-        # Profiles far from the adjusted lines are rejected permanently.
-        keep = (np.abs(found.adjustment.w) < 4.0) | ~np.isfinite(found.adjustment.w)
-    keep[bounds[-1] :] = True
-    problem, bounds = _problem(corners, edges, shape, bow)
-    fit = adjust(problem.with_weights(keep.astype(np.float64)), _APRIORI)
-    if isinstance(fit, Failure):
-        return fit
-    return _lines(fit, corners, edges, bounds, keep, rejected)
+        fit = adjust(_problem(corners, edges, shape, bow), _APRIORI)
+        if isinstance(fit, Failure):
+            return fit
+        bow = _bow_of(fit.values[2:12:3], fit.sigma[2:12:3])
+    return _lines(fit, corners, edges, rejected)
 
 
+@dataclass(frozen=True)
+class Contender:
+    """An edge that may be another line.
+
+    Parameters
+    ----------
+    edge : int
+        0 to 3: upper, right, lower, left.
+    probability : float
+        Probability that it is another line, and not an edge of the frame.
+    inwards : float
+        Mean distance inwards from where the other edges and the format put it, and its standard deviation.
+    sigma : float
+        Standard deviation of this distance, pixels.
+    """
+
+    edge: int
+    probability: float
+    inwards: float
+    sigma: float
+
+    def __str__(self) -> str:
+        way = "inside" if self.inwards > 0 else "outside"
+        return (
+            f"{EDGES[self.edge]} one (probability {self.probability:.2f}), {abs(self.inwards):.0f} ± "
+            f"{self.sigma:.0f} px {way} of where the others put it"
+        )
+
+
+def explained_shape(
+    corners: Array, edges: Sequence[EdgeData | None], shape: FrameShape, px_per_mm: float | None
+) -> tuple[list[Contender], float]:
+    """Explain the shape of four edges: a frame, one seen at an angle, or one of the edges is another line.
+
+    An edge of the frame lies where the other three and the format put it, within the tolerances of gates, and
+    the frame has the size of its format or, in a mount, a smaller one; another line may lie anywhere near. A
+    tilted copying camera makes opposite edges converge and preserves the sums of opposite angles.
+
+    Parameters
+    ----------
+    corners, edges, shape
+        As in :func:`adjust_lines`.
+    px_per_mm : float, optional
+        Resolution of the scan.
+
+    Returns
+    -------
+    (list of Contender, float)
+        The edges that may be other lines, the most probable first, and the probability of a tilted camera.
+    """
+    free = adjust_lines(corners, edges, None, [0] * 4)
+    if isinstance(free, Failure):
+        return [], 0.0
+
+    def size(of: Array) -> float:
+        """Density of the size of a frame at the known resolution."""
+        if px_per_mm is None:
+            return 1.0
+        side = np.log(np.hypot(*(np.roll(of, -1, axis=0) - of).T).sum() / (shape.width + shape.height) / 2)
+        away = (float(side) - np.log(px_per_mm)) / _SIZE
+        return float((1 - _MOUNTED) * np.exp(-0.5 * away**2) / np.sqrt(2 * np.pi) + _MOUNTED * _SIZE / _RANGE)
+
+    def density(of: Array, covariance: Array) -> float:
+        """Logarithm of that of a normal distribution."""
+        return -0.5 * float(
+            of @ np.linalg.solve(covariance, of) + np.linalg.slogdet(2 * np.pi * covariance)[1]
+        )
+
+    slope = np.array([shape_of(free.corners + e, shape) for e in 0.01 * np.eye(8).reshape(8, 4, 2)])
+    off = shape_of(free.corners, shape)
+    slope = (slope - off).T / 0.01
+    gate = np.diag([shape.angle_sigma**2] * 3 + [shape.aspect_sigma**2]) + slope @ free.covariance @ slope.T
+    converging = _SLANT**2 / 2 * np.array([[1, 0, -1], [0, 1, 0], [-1, 0, 1]])
+    seen = gate + np.pad(converging, (0, 1)) + np.diag([0.0, 0.0, 0.0, 8 * shape.aspect_sigma**2])
+    off = off - np.array(shape.deviation)
+    tilted = _TILTED * float(np.exp(min(density(off, seen) - density(off, gate), 600.0)))
+    a, b, normal = _frame_axes(corners)
+    length = np.hypot(*(b - a).T)
+    odds, found = [], []
+    for k, own in enumerate(edges):
+        lines = adjust_lines(corners, [None if i == k else e for i, e in enumerate(edges)], shape, [0] * 4)
+        if own is None or isinstance(lines, Failure):
+            continue
+        part = np.zeros((2, 8))
+        for i, end in enumerate((k, (k + 1) % 4)):
+            part[i, 2 * end : 2 * end + 2] = normal[k]
+        away = own.line[:2] - part @ (lines.corners - a[k]).ravel()
+        covariance = part @ lines.covariance @ part.T + own.covariance[:2, :2]
+        anywhere = _ANOTHER / (2 * _BESIDE * length[k - 1] * 4 * _TURNED * length[k])
+        anywhere *= size(lines.corners) / size(free.corners)
+        odds.append(anywhere * np.exp(min(-density(away, covariance), 600.0)))
+        found.append(Contender(k, 0.0, float(away.mean()), float(np.sqrt(covariance.sum() / 4))))
+    total = 1 + tilted + sum(odds)
+    found = [replace(each, probability=float(one / total)) for each, one in zip(found, odds, strict=True)]
+    return sorted(found, key=lambda each: -each.probability), tilted / total
+
+
+_ANOTHER = 0.01
+"""Prior probability that a line found as an edge of a frame is another one: one frame of 25 has one."""
+_BESIDE, _TURNED = 0.05, float(np.deg2rad(1.0))
+"""Range of the distances of such lines from the edge, as a share of the frame, and of their directions, for
+which the search takes them for an edge."""
+_TILTED, _SLANT = 0.02, float(np.deg2rad(0.7))
+"""Prior probability of a tilted copying camera, and standard deviation of its rotation angle, radians."""
+_SIZE, _MOUNTED, _RANGE = 0.007, 0.05, 0.12
+"""Relative standard deviation of the size of a frame at the resolution of its scan, probability that it has
+another one, as in a mount, and range of these."""
 _APRIORI = Options(scale="a-priori")
 _NAMES = tuple(f"{edge}.{what}" for edge in ("upper", "right", "lower", "left") for what in ("a", "b", "bow"))
 
@@ -253,27 +373,17 @@ def shape_of(corners: Array, shape: FrameShape) -> Array:
 
 def _problem(
     corners: Array, edges: Sequence[EdgeData | None], shape: FrameShape | None, bow: float
-) -> tuple[GaussMarkov, list[int]]:
-    """Observations of the profiles, followed by those of the shape; and the first index of each edge."""
-    a, b, normal = _frame_axes(corners)
-    rows, observed, sigma, bounds = [], [], [], [0]
-    # Independent errors of an edge's ends are unknowns, so that the shape helps to determine them.
-    drawn = [k for k, edge in enumerate(edges) if edge is not None and edge.ends > 0]
-    names = [*_NAMES, *(f"{k}.{end}" for k in drawn for end in ("start", "stop"))]
+) -> GaussMarkov:
+    """Observations of the edges, three for each, followed by those of the shape."""
+    rows, observed = [], []
     for k, edge in enumerate(edges):
         if edge is not None:
-            along = b[k] - a[k]
-            place = 2 * ((edge.xy - a[k]) @ along) / (along @ along) - 1
-            part = np.zeros((len(place), len(names)))
-            part[:, 3 * k : 3 * k + 3] = np.stack([(1 - place) / 2, (1 + place) / 2, -(1 - place**2)], 1)
-            if k in drawn:
-                own = 12 + 2 * drawn.index(k)
-                part[:, own : own + 2] = part[:, 3 * k : 3 * k + 2]
+            part = np.zeros((3, 12))
+            part[:, 3 * k : 3 * k + 3] = np.linalg.inv(np.linalg.cholesky(edge.covariance))
             rows.append(part)
-            observed.append((edge.xy - a[k]) @ normal[k])
-            sigma.append(edge.sigma)
-        bounds.append(bounds[-1] + (0 if edge is None else len(edge.sigma)))
+            observed.append(part[:, 3 * k : 3 * k + 3] @ edge.line)
     design = np.concatenate(rows)
+    sigma = [np.ones(len(design))]
     if shape is not None:
         observed.append(np.array(shape.deviation))
         sigma.append(np.array([shape.angle_sigma] * 3 + [shape.aspect_sigma]))
@@ -293,25 +403,15 @@ def _problem(
         return np.concatenate([design, np.stack(slope, axis=1)])
 
     prior = {name: bow for name in _NAMES if name.endswith("bow")}
-    for name, k in zip(names[12:], np.repeat(drawn, 2), strict=True):
-        prior[name] = edges[k].ends
-    parameters = Parameters(names, np.zeros(len(names)), prior_sigma=prior)
-    return GaussMarkov(
-        function, np.concatenate(observed), np.concatenate(sigma), parameters, jacobian
-    ), bounds
+    parameters = Parameters(_NAMES, np.zeros(len(_NAMES)), prior_sigma=prior)
+    return GaussMarkov(function, np.concatenate(observed), np.concatenate(sigma), parameters, jacobian)
 
 
 def _lines(
-    fit: Adjustment,
-    corners: Array,
-    edges: Sequence[EdgeData | None],
-    bounds: list[int],
-    keep: Mask,
-    rejected: Sequence[int],
+    fit: Adjustment, corners: Array, edges: Sequence[EdgeData | None], rejected: Sequence[int]
 ) -> Lines:
     """Results derived from the adjusted chords and bows."""
-    values = fit.values[:12]
-    step = 1e-3
+    values, step = fit.values, 1e-3
     slope = np.stack(
         [
             (_corners(values + step * e, corners) - _corners(values - step * e, corners)).ravel() / (2 * step)
@@ -319,95 +419,89 @@ def _lines(
         ],
         axis=1,
     )
-    cofactor = fit.covariance[:12, :12].copy()
-    for k, edge in enumerate(edges):
-        if edge is not None:
-            cofactor[3 * k : 3 * k + 2, 3 * k : 3 * k + 2] += edge.common**2 + _MODEL_PX**2 * np.eye(2)
-    covariance = slope @ cofactor @ slope.T
-    used, out, rms, coverage = (np.zeros(4) for _ in range(4))
+    used, rms, coverage = (np.zeros(4) for _ in range(3))
     a, b, _ = _frame_axes(corners)
     for k, edge in enumerate(edges):
-        own = slice(bounds[k], bounds[k + 1])
-        kept = keep[own]
-        used[k], out[k] = kept.sum(), rejected[k] + (~kept).sum()
-        residuals = fit.residuals[own][kept]
-        rms[k] = np.sqrt(np.mean(residuals**2)) if len(residuals) else np.nan
-        if edge is not None and kept.any():
+        rms[k] = np.nan
+        if edge is not None:
+            used[k] = len(edge.xy)
+            if len(edge.residuals):
+                rms[k] = np.sqrt(np.mean(edge.residuals**2))
             along = b[k] - a[k]
-            place = ((edge.xy[kept] - a[k]) @ along) / (along @ along)
+            place = ((edge.xy - a[k]) @ along) / (along @ along)
             # Share of thirty sections that contain a profile in use.
             coverage[k] = len(np.unique(np.floor(place * 30))) / 28
-    sigma = fit.sigma[:12]
     return Lines(
         _corners(values, corners),
-        covariance,
+        slope @ fit.covariance @ slope.T,
         values[2::3],
-        sigma[2::3],
+        fit.sigma[2::3],
         used.astype(np.intp),
-        out.astype(np.intp),
+        np.array(rejected, dtype=np.intp),
         rms,
         np.minimum(coverage, 1.0),
-        fit.w[bounds[-1] :],
+        fit.w[3 * sum(edge is not None for edge in edges) :],
         fit.sigma0,
         fit.redundancy,
     )
 
 
-def shared_error(place: Array, residuals: Array, sigma: Array) -> float:
-    """Factor on standard deviations so that they agree with the scatter of means over sections of an edge.
+def departing_line(
+    place: Array, offset: Array, sigma: Array, moved: Array, harmonics: Array
+) -> tuple[Array, Array, float]:
+    """Chord and bow of an edge from which profiles depart, and neighbours alike.
+
+    What the picture shows beside an edge displaces its steps over some length along it; film and gate are
+    neither straight nor evenly bowed. The departures are a random process along the edge of which size and
+    length are unknown: the mean over them, weighted by their likelihoods (Patterson and Thompson 1971).
 
     Parameters
     ----------
-    place : ndarray (n,)
-        Positions of the profiles, −1 to 1.
-    residuals, sigma : ndarray (n,)
-        Residuals from the edge's own line, and their expected standard deviations.
+    place, offset, sigma : ndarray (n,)
+        Positions along the edge (−1 to 1), offsets inwards, and standard deviations by noise.
+    moved : ndarray (n,)
+        Sizes of the departures relative to each other.
+    harmonics : ndarray (n, m)
+        Functions of the phase of the edge on the pixels, with which its steps are displaced alike.
 
     Returns
     -------
-    float
-        Factor, at least 1: the larger of that of single profiles and that of means over sections.
+    (ndarray (3,), ndarray (3, 3), float)
+        Start, stop and bow, their covariance, and the standard deviation of the departures.
     """
-    single = float(np.mean((residuals / sigma) ** 2))
-    together = []
-    for count in _SECTIONS:
-        section = np.clip(((place + 1) / 2 * count).astype(np.intp), 0, count - 1)
-        weight = np.bincount(section, 1 / sigma**2, minlength=count)
-        mean = np.bincount(section, residuals / sigma**2, minlength=count)
-        seen = weight > 0
-        together.append(float((mean[seen] ** 2 / weight[seen]).sum()) / max(int(seen.sum()) - 3, 1))
-    return float(np.sqrt(max(single, *together, 1.0)))
-
-
-def waviness(place: Array, residuals: Array, sigma: Array) -> float:
-    """Standard deviation of the ends of an edge that is neither straight nor evenly bowed, pixels.
-
-    A line and a bow through a wave, or through an edge that is bent at one place, miss its ends by about as
-    much as polynomials of higher degree depart there. Zero if they are not significant.
-
-    Parameters
-    ----------
-    place : ndarray (n,)
-        Positions of the profiles, −1 to 1.
-    residuals, sigma : ndarray (n,)
-        Residuals from the edge's own line, and their expected standard deviations.
-    """
-    if len(place) < _LEAST_WAVED:
-        return 0.0
-    design = np.polynomial.legendre.legvander(place, _WAVES) / sigma[:, None]
-    observed, factor = residuals / sigma, np.ones(len(place))
-    for _ in range(_REWEIGHTED):  # Cauchy's weights
-        cofactor = np.linalg.pinv(design.T @ (factor[:, None] * design))
-        found = cofactor @ design.T @ (factor * observed)
-        rest = observed - design @ found
-        unit = 2.5 * max(1.4826 * float(np.median(np.abs(rest))), 1e-3)
-        factor = 1 / (1 + (rest / unit) ** 2)
-    near = np.abs(rest) < 1.4 * unit
-    scale = shared_error(place[near], (rest * sigma)[near], sigma[near])
-    higher = found[3:]
-    together = float(higher @ np.linalg.solve(cofactor[3:, 3:], higher)) / scale**2
-    size = float(np.sqrt((higher**2).sum()))
-    return size if together > _SIGNIFICANT and size > _LEAST_WAVE_PX else 0.0
+    order = np.argsort(place, kind="stable")
+    place, offset, sigma, moved, harmonics = (
+        each[order] for each in (place, offset, sigma, moved, harmonics)
+    )
+    change = np.abs(np.diff(offset)) / np.hypot(sigma[1:], sigma[:-1])
+    weight = (max(1.0, 1.4826 * float(np.median(change))) * sigma) ** -2
+    part = np.clip(((place + 1) / 2 * _BINS).astype(np.intp), 0, _BINS - 1)
+    total = np.bincount(part, weight, minlength=_BINS)
+    seen = total > 0
+    t, y, size, *phase = (
+        np.bincount(part, weight * each, minlength=_BINS)[seen] / total[seen]
+        for each in (place, offset, np.hypot(moved, _NEAREST_PX), *harmonics.T)
+    )
+    design = np.stack([(1 - t) / 2, (1 + t) / 2, -(1 - t**2), *phase, y], axis=1)
+    prior = np.diag([1e-6, 1e-6, 1e-4] + [_PHASE_PX**-2] * len(phase))
+    alike = np.exp(-np.abs(t[:, None] - t) / _LENGTHS[:, None, None]) * np.outer(size, size)
+    covariance = (_TIMES[:, None, None, None] ** 2 * alike).reshape(-1, len(t), len(t))
+    covariance += np.diag(1 / total[seen])
+    root = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(root, np.broadcast_to(design, (len(root), *design.shape)))
+    white, own = white[..., :-1], white[..., -1:]
+    normal = white.transpose(0, 2, 1) @ white + prior
+    cofactor = np.linalg.inv(normal)
+    found = (cofactor @ white.transpose(0, 2, 1) @ own)[..., 0]
+    rest = (own**2).sum(axis=(1, 2)) - np.einsum("ki,kij,kj->k", found, normal, found)
+    log = -np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    log -= (np.linalg.slogdet(normal)[1] + rest) / 2
+    share = np.exp(log - log.max())
+    share /= share.sum()
+    mean = share @ found
+    spread = cofactor + (found - mean)[:, :, None] * (found - mean)[:, None, :]
+    departs = np.sqrt(np.repeat(_TIMES**2, len(_LENGTHS)) @ share * np.mean(size**2))
+    return mean[:3], np.tensordot(share, spread, 1)[:3, :3], float(departs)
 
 
 def derived(corners: Array, covariance: Array) -> tuple[Array, Array, float, float]:

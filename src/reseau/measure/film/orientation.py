@@ -15,13 +15,15 @@ from ...core.data import Array, Frame
 from ...core.display import Display
 from ...core.failure import Code, Failure
 from ...core.overlaid import Overlaid
-from ...io import CORNERS, EDGES, FrameOrientation, MeasuredCorner, MeasuredEdge
+from ...io import CORNERS, EDGES, FormatCandidate, FrameOrientation, MeasuredCorner, MeasuredEdge, RivalEdge
 from ...io.scans import Scan
 from .border import Band, read_band
 from .channel import WIDER_SEARCH, Channel, channels_by_contrast, measure_channel
-from .lines import FrameShape, Lines, adjust_lines, derived, shape_of
-from .search import FrameGuess, search_frames
+from .formats import ALL_FORMATS, FORMATS, format_probabilities, scale_by_perforations
+from .lines import EdgeData, FrameShape, Lines, adjust_lines, derived, explained_shape, shape_of
+from .search import FrameGuess, search_frames, size_of
 from .steps import Tone
+from .strips import in_reading_order, overview_of, rest_of_strip
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,9 +31,6 @@ if TYPE_CHECKING:
     from ...core.overlay import Layer
 
 __all__ = ["FORMATS", "FrameOptions", "FrameResult", "orient_frames"]
-
-FORMATS: tuple[tuple[float, float], ...] = ((36.0, 24.0), (56.0, 56.0), (56.0, 41.5), (69.0, 56.0))
-"""Formats tried by default: 35 mm, 6×6, 6×4.5, 6×7."""
 
 _OVERVIEWS = ((500, 60), (1000, 300))
 """Longer side of the overviews in pixels, and number of combinations of lines tested in each."""
@@ -41,9 +40,6 @@ _REACH = 4.0
 """Largest error of an approximate edge, in pixels of the overview."""
 _FILM_MM, _GAP_MM = 0.25, 0.2
 """Width of film examined beyond an edge, and width that separates the frame from other structures."""
-_MOST_SIGMA_PX, _MOST_SIGMA_MM, _MOST_SIGMA_WIDTHS = 0.33, 0.01, 0.18
-"""Largest standard deviation of a corner's coordinate of an oriented frame: the largest of the three applies,
-the last in widths of a blurred step, so that a scan finer than its film need not be better than the film."""
 _FITS, _AGREES, _CONTRADICTS = (0.3, 1.1), 0.015, 0.08
 """Size of a frame relative to the scan at which the resolution stated in the file can be that of the scan;
 and relative differences of the scale from it: from the first the frame is not of its format, from the second
@@ -59,12 +55,13 @@ _REACHED, _SEEN, _SAMPLES = 0.12, 0.4, 20
 that must be seen; and the number of these parts."""
 _STATUS = {"oriented": 2, "three-edges": 1, "declined": 0}
 """Rank of each status."""
-_REMEDY, _FLAT = "scan it with more contrast", "hold the film flat and parallel to the sensor"
-"""What helps if edges are uncertain, and if they are not straight."""
+_STATED = 0.05, 0.5
+"""Least probability of another explanation of an edge that is stated with the frame, and least share that
+what it moves has in the largest standard deviation of a corner."""
 _SLANT = float(np.deg2rad(0.7))
 """Standard deviation of the rotation angle of a tilted copying camera, radians."""
-_MOST_W = 4.0
-"""Test value from which the shape of a frame contradicts its format."""
+_MORE_PROBABLE = 0.5
+"""Probability from which an explanation is the answer."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +126,12 @@ class FrameResult(Display, Overlaid):
         Pixels per millimetre of the scan where they contradict the format: the opening of a slide mount.
     roll_frames : int, optional
         Number of frames of the roll whose shape was used.
+    place : ndarray (4, 2), optional
+        Approximate corners in the scan, also of a declined frame.
+    frame : int, optional
+        Number of the frame in a scan of several, in reading order.
+    formats : tuple of ((float, float), float)
+        Formats that the frame can be, with their probabilities, if none was given.
 
     Examples
     --------
@@ -148,6 +151,9 @@ class FrameResult(Display, Overlaid):
     code: Code | None = None
     resolution: float | None = None
     roll_frames: int | None = None
+    place: Array | None = None
+    frame: int | None = None
+    formats: tuple[tuple[tuple[float, float], float], ...] = ()
 
     def __bool__(self) -> bool:
         return self.status != "declined"
@@ -185,7 +191,8 @@ class FrameResult(Display, Overlaid):
         return axes
 
     def _heading(self) -> str:
-        return f"{self.image}: {self.status}" + (f" ({self.why})" if self.why else "")
+        number = "" if self.frame is None else f", frame {self.frame}"
+        return f"{self.image}{number}: {self.status}" + (f" ({self.why})" if self.why else "")
 
     def layers(self) -> list[Layer]:
         """What is drawn over the scan: corners, measured edges, and the edges that were not found."""
@@ -244,6 +251,8 @@ class FrameResult(Display, Overlaid):
             "channel": self.channel,
             "edges": self.edges,
             "roll_frames": self.roll_frames,
+            "frame": self.frame,
+            "formats": tuple(FormatCandidate(format_mm=each, probability=p) for each, p in self.formats),
         }
         if self.lines is None or not self:
             none = dict.fromkeys(
@@ -306,21 +315,39 @@ def orient_frames(scan: Scan, options: FrameOptions | None = None) -> list[Frame
         if isinstance(guesses, Failure):
             declined = declined or ([_declined(scan, guesses)] if missing else [])
             continue
-        results = [_oriented(scan, guess, reduction, options) for guess in guesses]
-        good = [result for result in results if result]
-        if good:
-            return sorted(good, key=_reading)
+        scale, within = _perforated(scan, guesses[0], reduction, options)
+        if scale is not None and (within or not _of_scale(guesses[0], reduction, scale, options)):
+            again, finer = _found(scan, options, missing, cut=bool(declined), scale=scale)
+            guesses, reduction = (guesses, reduction) if isinstance(again, Failure) else (again, finer)
+        results = [_oriented(scan, guess, reduction, options, scale) for guess in guesses]
+        if any(results):
+            return in_reading_order(results + rest_of_strip(scan, results, options, _oriented))
         # The reason why four edges are no frame is more useful than why three of them are none.
         declined = declined or results[:1]
     return declined
 
 
-def _reading(result: FrameResult) -> tuple[float, float]:
-    if result.lines is None:
-        return 0.0, 0.0
-    x, y = result.lines.corners.mean(axis=0)
-    size = float(np.ptp(result.lines.corners[:, 1]))
-    return float(np.rint(y / size)), float(x)
+def _perforated(
+    scan: Scan, guess: FrameGuess, reduction: float, options: FrameOptions
+) -> tuple[float | None, bool]:
+    """Pixels of the scan per millimetre by perforations along or across a frame, and whether it has them.
+
+    They are looked for unless the frame has the size of its format at the resolution of the scan.
+    """
+    known = _resolution(scan, options, guess.format_mm)
+    if options.near is not None or (known is not None and _of_scale(guess, reduction, known, options)):
+        return None, False
+    overview, r = scan.overview(overview_of(scan, _OVERVIEWS[-1][0]))
+    found = scale_by_perforations(overview, (guess.corners + 0.5) * reduction / r - 0.5)
+    return (None, False) if found is None else (found[0] * r, found[1])
+
+
+def _of_scale(guess: FrameGuess, reduction: float, scale: float, options: FrameOptions) -> bool:
+    """Whether a frame has the size of one of the formats at a scale."""
+    among = ALL_FORMATS if options.formats == FORMATS else options.formats
+    own = np.log(size_of(guess.corners) * reduction / scale)
+    lying = [np.log(each) for w, h in among for each in ((w, h), (h, w))]
+    return any(np.abs(own - each).max() < _CONTRADICTS for each in lying)
 
 
 def _declined(scan: Scan, failure: Failure) -> FrameResult:
@@ -332,20 +359,29 @@ def _declined(scan: Scan, failure: Failure) -> FrameResult:
 
 
 def _found(
-    scan: Scan, options: FrameOptions, missing: bool, cut: bool
+    scan: Scan, options: FrameOptions, missing: bool, cut: bool, scale: float | None = None
 ) -> tuple[list[FrameGuess] | Failure, float]:
     """Frames in an overview; a finer overview is used if the first gives no reliable frame.
 
-    After four edges that are no frame, one may be `missing` only because the scan is `cut` there.
+    After four edges that are no frame, one may be `missing` only because the scan is `cut` there. The `scale`
+    is that of perforations, px/mm, at which all formats are searched.
     """
     best: list[FrameGuess] = []
     reduction, dark = 1.0, True
     sizes = options.formats if options.shape is None else [(options.shape.width, options.shape.height)]
     # Four lines of the picture may be a frame of another scale: that of the scan first, if it is stated.
     known = next((k for size in sizes if (k := _resolution(scan, options, size)) is not None), None)
-    scales = [known] if options.dpi is not None else [None] if missing or known is None else [known, None]
+    if scale is not None:
+        known, sizes = scale, ALL_FORMATS if options.formats == FORMATS else sizes
+    scales = (
+        [known]
+        if scale is not None or options.dpi is not None
+        else [None]
+        if missing or known is None
+        else [known, None]
+    )
     for longest, tried in _OVERVIEWS:
-        overview, r = scan.overview(longest)
+        overview, r = scan.overview(overview_of(scan, longest))
         if longest > _OVERVIEWS[0][0] and r == reduction:
             break
         dark = float(np.ptp(np.quantile(overview, [0.01, 0.99]))) < 0.01 * scan.full_scale
@@ -387,9 +423,21 @@ def _rank(found: list[FrameGuess]) -> float:
     return found[0].score + (2.0 if all(found[0].supported) else 0.0)
 
 
-def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOptions) -> FrameResult:
-    """Measure the edges of one frame in all channels, adjust, and keep the best channel."""
+def _oriented(
+    scan: Scan, guess: FrameGuess, reduction: float, options: FrameOptions, exact: float | None = None
+) -> FrameResult:
+    """Measure the edges of one frame in all channels, adjust, and keep the best channel.
+
+    Its format is the most probable one at the `exact` scale of perforations, or that of the file.
+    """
     corners = (guess.corners + 0.5) * reduction - 0.5
+    formats: list[tuple[tuple[float, float], float]] = []
+    if options.shape is None and options.formats == FORMATS:
+        known = exact if options.dpi is None else options.dpi / 25.4
+        stated = None if scan.dpi is None else scan.dpi / 25.4
+        formats = format_probabilities(size_of(corners), ALL_FORMATS, known, stated)
+        formats = [each for each in formats if each[1] > _STATED[0]]
+        guess = replace(guess, format_mm=formats[0][0])
     side = np.hypot(*(np.roll(corners, -1, axis=0) - corners).T)
     scale = float((side[0] + side[2]) / (2 * guess.format_mm[0]))
     reach = max(_REACH * reduction, 6.0)
@@ -410,23 +458,22 @@ def _oriented(scan: Scan, guess: FrameGuess, reduction: float, options: FrameOpt
         name = scan.channels[c]
         measured = measure_channel(name, band, c, guess.polarity, reach, _GAP_MM * scale, tone)
         for other in earlier:
-            measured = measured.doubted(other, corners)
+            measured = measured.doubted(other)
         earlier.append(measured)
         result = _judged(scan, guess, measured, corners, shape, options)
         # Channels are ordered by contrast: a later one must show more edges, or more accurate ones.
         if best is None or _seen(result) > _seen(best):
             best = result
-        if best.status == "oriented":  # other channels show the same edges with less contrast
-            break
+        if best.status == "oriented" and not best.why:
+            break  # other channels show the same edges with less contrast
     assert best is not None
-    return best
+    return replace(best, place=corners, formats=tuple(formats))
 
 
 def _seen(result: FrameResult) -> tuple[int, float]:
-    """Rank of a result: status, then accuracy."""
-    return _STATUS[result.status], -np.inf if result.lines is None else -float(
-        np.trace(result.lines.covariance)
-    )
+    """Rank of a result: status, then accuracy of its worst corner."""
+    lines = result.lines
+    return _STATUS[result.status], -np.inf if lines is None else -float(np.diag(lines.covariance).max())
 
 
 def _resolution(scan: Scan, options: FrameOptions, size: tuple[float, float]) -> float | None:
@@ -533,21 +580,26 @@ def _judged(
     if isinstance(lines, Failure):
         return replace(base, why=lines.reason, edges=_reports(measured, None), code=lines.code)
     (w, h), slant, code = guess.format_mm, "", None
-    worst = np.abs(np.nan_to_num(lines.shape_w)).max()
-    if worst > _MOST_W and not missing and (seen := _slanted(corners, measured, shape)):
-        lines, converging = seen
-        worst, code = 0.0, Code.TILTED
-        slant = f"seen at an angle: opposite edges converge by {np.rad2deg(converging):.1f}°"
+    known = _resolution(scan, options, guess.format_mm)
+    contenders, tilted = ([], 0.0) if missing else explained_shape(corners, measured.data, shape, known)
+    another = sum(each.probability for each in contenders)
+    if tilted > _MORE_PROBABLE and (seen := _slanted(corners, measured, shape)):
+        lines, code = seen[0], Code.TILTED
+        slant = f"seen at an angle: opposite edges converge by {np.rad2deg(seen[1]):.1f}°"
+    elif another > _STATED[0]:
+        measured = measured.contended(contenders)
+        again = adjust_lines(corners, measured.data, shape, measured.rejected)
+        lines = lines if isinstance(again, Failure) else again
     base = replace(base, lines=lines, edges=_reports(measured, lines), why=slant, code=code)
-    if worst > _MOST_W:
+    if another > _MORE_PROBABLE:
+        lie = " or the ".join(str(each) for each in contenders if each.probability > _STATED[0])
         return replace(
             base,
             lines=None,
-            why=f"the four edges do not form a frame of {w:g}x{h:g} mm (test value {worst:.1f}); one of them "
-            "may be a line of the picture: give the approximate corners, or the correct --format-mm",
+            why=f"the four edges do not form a frame of {w:g}x{h:g} mm; another line is the {lie}; give the "
+            "approximate corners, or the correct --format-mm",
             code=Code.INCONSISTENT,
         )
-    sigma = np.sqrt(np.diag(lines.covariance))
     if missing:
         reason = measured.why[EDGES.index(missing[0])]
         if doubt := _unproven(scan, lines, measured, EDGES.index(missing[0]), shape, options):
@@ -555,16 +607,6 @@ def _judged(
             return replace(base, lines=None, why=why, code=Code.EDGE_MISSING)
         why = f"{missing[0]} edge: {reason}; its position follows from the format"
         return replace(base, status="three-edges", why=why, code=Code.EDGE_MISSING)
-    scale = max(base.px_per_mm or (0.0, 0.0))
-    limit = max(_MOST_SIGMA_PX, _MOST_SIGMA_MM * scale, _MOST_SIGMA_WIDTHS * measured.width)
-    if (most := float(sigma.max())) > limit:
-        wavy = [EDGES[k] for k, data in enumerate(measured.data) if data is not None and data.wave > most / 2]
-        remedy = f"the {wavy[0]} edge is no straight or evenly bowed line; {_FLAT}" if wavy else _REMEDY
-        mm = f"{1000 * most / scale:.2g} µm of {w:g}x{h:g} mm, " if scale else ""
-        size = f"{most:.2f} px ({mm}at most {limit:.2f} px)"
-        why = f"a corner would have a standard deviation of {size}; {remedy}"
-        return replace(base, lines=None, why=why, code=Code.UNCERTAIN)
-    known = _resolution(scan, options, guess.format_mm)
     own = float(np.mean(base.px_per_mm or (1.0, 1.0)))
     if known is not None and abs(own / known - 1) > _AGREES:
         w, h = (side * own / known for side in guess.format_mm)
@@ -578,24 +620,36 @@ def _judged(
         )
         why += " of the scan, not of the format"
         return replace(base, status="oriented", why=why, code=Code.UNEQUAL_SCALES, resolution=known)
-    return replace(base, status="oriented")
+    return replace(
+        base, status="oriented", why="; ".join([base.why] * bool(base.why) + _doubts(measured, lines))
+    )
+
+
+def _doubts(measured: Channel, lines: Lines) -> list[str]:
+    """What else the edges may be, with probabilities, and edges that are not straight."""
+    least, said = _STATED[1] * float(np.sqrt(np.diag(lines.covariance)).max()), []
+    for name, data in zip(EDGES, measured.data, strict=True):
+        if data is not None and data.departs > max(least, measured.width):
+            said.append(
+                f"the {name} edge departs from an evenly bowed line by {data.departs:.2g} px; hold the film "
+                "flat and parallel to the sensor"
+            )
+        rival = None if data is None else data.rival
+        if rival is None or rival.probability < _STATED[0]:
+            continue
+        if np.sqrt(rival.probability) * abs(rival.moved_px) > least:
+            said.append(f"{name} edge: {rival}")
+    return said
 
 
 def _slanted(corners: Array, measured: Channel, shape: FrameShape) -> tuple[Lines, float] | None:
-    """Four edges as seen by a tilted copying camera, and the convergence of opposite edges, radians.
-
-    Perspective makes opposite edges converge; a single wrong edge would also make opposite angles both larger
-    or both smaller.
-    """
+    """Four edges as seen by a tilted copying camera, and the convergence of opposite edges, radians."""
     free = replace(shape, angle_sigma=_SLANT, aspect_sigma=3 * shape.aspect_sigma)
     lines = adjust_lines(corners, measured.data, free, measured.rejected)
     if isinstance(lines, Failure):
         return None
-    ur, lr, ll, aspect = shape_of(lines.corners, shape) - np.array(shape.deviation)
-    converging = max(abs(ur + lr), abs(lr + ll))
-    alike = abs(ur + ll) / 2 < _MOST_W * shape.angle_sigma / np.sqrt(2)
-    alike &= abs(aspect) < _MOST_W * shape.aspect_sigma and converging < _MOST_W * _SLANT
-    return (lines, float(converging)) if alike else None
+    ur, lr, ll, _ = shape_of(lines.corners, shape) - np.array(shape.deviation)
+    return lines, float(max(abs(ur + lr), abs(lr + ll)))
 
 
 def _reports(measured: Channel, lines: Lines | None) -> dict[str, MeasuredEdge]:
@@ -610,8 +664,16 @@ def _reports(measured: Channel, lines: Lines | None) -> dict[str, MeasuredEdge]:
             found=found,
             points=int(lines.used[k]) if lines is not None and found else 0,
             rejected=int(lines.rejected[k]) if lines is not None else measured.rejected[k],
-            rms_px=float(lines.rms[k]) if lines is not None and found else None,
+            rms_px=float(lines.rms[k]) if lines is not None and np.isfinite(lines.rms[k]) else None,
             curvature_px=bow if found else None,
             why=measured.why[k],
+            rival=_rival(measured.data[k]),
         )
     return reports
+
+
+def _rival(data: EdgeData | None) -> RivalEdge | None:
+    if data is None or data.rival is None:
+        return None
+    rival = data.rival
+    return RivalEdge(what=rival.what, probability=rival.probability, moved_px=rival.moved_px)

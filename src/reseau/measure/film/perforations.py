@@ -27,11 +27,11 @@ from .steps import profile_function
 if TYPE_CHECKING:
     from ...core.overlay import Layer
 
-__all__ = ["PITCH_MM", "FilmPlane", "edge_of", "film_plane"]
+__all__ = ["PITCH_MM", "ROWS_MM", "FilmPlane", "edge_of", "film_plane"]
 
 PITCH_MM = 4.75
 """Distance between perforations."""
-_ROWS_MM = 28.17
+ROWS_MM = 28.17
 """Distance between the centre lines of the two rows of perforations."""
 _SIZE_MM = 1.98, 2.79
 """Approximate height and width of a perforation; both are estimated."""
@@ -168,7 +168,7 @@ def film_plane(
             for k, xy in _sides_of(scan, box, channel, reach):
                 places.append(xy)
                 axes.append(1 - k % 2)
-                targets.append(i * PITCH_MM if k % 2 == 0 else side * _ROWS_MM / 2)
+                targets.append(i * PITCH_MM if k % 2 == 0 else side * ROWS_MM / 2)
                 signs.append((-1, 1, 1, -1)[k])
     if len(places) < _LEAST:
         return Failure(

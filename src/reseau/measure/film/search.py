@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ...core.data import Array
 from .border import best_line, likelihood
 
-__all__ = ["FrameGuess", "crossings_of", "judged", "search_frames", "settled", "size_of"]
+__all__ = ["FrameGuess", "crossings_of", "overlap_of", "search_frames", "size_of"]
 
 Plane = NDArray[np.float32]
 
@@ -61,7 +61,7 @@ class FrameGuess:
     score: float
 
 
-def judged(guess: FrameGuess, grey: Plane) -> FrameGuess | None:
+def _judged(guess: FrameGuess, grey: Plane) -> FrameGuess | None:
     """The guess with its score from both sides of its edges; None if it is no frame."""
     outside, inside = _sides(guess, grey)
     known, seen = np.isfinite(outside) & np.isfinite(inside), np.array(guess.supported)
@@ -99,7 +99,7 @@ def _film(guess: FrameGuess, outside: Array, inside: Array) -> tuple[float, floa
     return level, spread, strong
 
 
-def settled(guess: FrameGuess, grey: Plane) -> FrameGuess:
+def _settled(guess: FrameGuess, grey: Plane) -> FrameGuess:
     """Move each edge to where unexposed film ends; the lines that got votes may lie within the picture."""
     scale = float(np.mean(size_of(guess.corners) / guess.format_mm))
     seen = np.array(guess.supported)
@@ -188,10 +188,11 @@ _BIN = np.deg2rad(0.5)
 """Step of the directions; the step of the distances is one pixel of the overview."""
 _SPREAD = 16
 """A gradient votes for this many directions on either side of its own; texture at an edge rotates it."""
-_PEAKS = 8
-"""Maximum number of lines of each direction that are combined with others."""
-_LEAST_SIDE = 0.15
-"""Minimum side of a frame, relative to the longer side of the overview."""
+_PEAKS, _OF_STRIP = 8, 24
+"""Maximum number of lines of each direction that are combined with others; and of a strip of frames of which
+size and direction are known."""
+_LEAST_SIDE = 0.2
+"""Minimum side of a frame, relative to the shorter side of the overview."""
 
 
 class _Lines(NamedTuple):
@@ -212,6 +213,7 @@ def search_frames(
     tried: int = 60,
     near: Array | None = None,
     missing: bool = False,
+    along: float | None = None,
 ) -> list[FrameGuess]:
     """Find frames in an overview; the best first, without overlap.
 
@@ -235,15 +237,20 @@ def search_frames(
         Approximate corners, accurate to one tenth of the frame's size; no other frames are searched.
     missing : bool
         Whether to search frames of which one edge was not detected.
+    along : float, optional
+        Direction of the upper edges of a strip of frames, radians; many of them are expected.
     """
     grey, gradient = _gradients(overview)
     votes, reach = _votes(*gradient, grey.shape, max_tilt_deg)
     shapes = list(dict.fromkeys([f for w, h in formats for f in ((w, h), (h, w))]))
     scale = (px_per_mm or hint) if missing else px_per_mm
+    turns, peaks = _turns(max_tilt_deg), _PEAKS
+    if along is not None:
+        turns, peaks = range(round(along / _BIN) - 2, round(along / _BIN) + 3), _OF_STRIP
     found = [
         guess
-        for turn in _turns(max_tilt_deg)
-        for guess in _combined(votes, reach, turn, shapes, tolerance, scale, grey.shape, missing)
+        for turn in turns
+        for guess in _combined(votes, reach, turn, shapes, tolerance, scale, grey.shape, missing, peaks)
     ]
     if near is not None:
         most = 0.1 * float(size_of(near).max())
@@ -256,9 +263,9 @@ def search_frames(
     tested = [guess for alike in of_format.values() for guess in _distinct(alike, tried)]
     with warnings.catch_warnings():  # an edge outside the scan has no tones; it is excluded later
         warnings.simplefilter("ignore", RuntimeWarning)
-        scored = [judged(guess, grey) for guess in tested]
+        scored = [_judged(guess, grey) for guess in tested]
         good = sorted((g for g in scored if g is not None), key=lambda g: _far(g, near) - g.score)
-        return [settled(guess, grey) for guess in _apart(good)]
+        return [_settled(guess, grey) for guess in _apart(good)]
 
 
 def _far(guess: FrameGuess, near: Array | None) -> float:
@@ -316,12 +323,12 @@ def _votes(
     return np.asarray(cv2.GaussianBlur(votes, (5, 1), 1.0), dtype=np.float32), reach
 
 
-def _lines(votes: Plane, reach: int, direction: int, sign: float) -> _Lines:
+def _lines(votes: Plane, reach: int, direction: int, sign: float, peaks: int) -> _Lines:
     """Strongest lines of a direction; distances along `sign` times the direction."""
     row = votes[direction % len(votes)]
     peak = row >= cv2.dilate(row[None], np.ones((1, 7), np.uint8))[0]
     at = np.flatnonzero(peak & (row > 0))
-    at = at[np.argsort(-row[at], kind="stable")[:_PEAKS]]
+    at = at[np.argsort(-row[at], kind="stable")[:peaks]]
     return _Lines((sign * (at - reach)).astype(np.float64), row[at].astype(np.float64))
 
 
@@ -334,6 +341,7 @@ def _combined(
     px_per_mm: float | None,
     shape: tuple[int, int],
     missing: bool,
+    peaks: int,
 ) -> Iterator[FrameGuess]:
     """Rectangles of one direction; with `missing`, those with one edge that was not detected."""
     quarter = len(votes) // 4
@@ -342,7 +350,7 @@ def _combined(
         # Normals point from dark to bright; distances are along the axes of the frame.
         signs = (polarity, -polarity, -polarity, polarity)
         upper, right, lower, left = (
-            _lines(votes, reach, base + quarter * k, float(sign))
+            _lines(votes, reach, base + quarter * k, float(sign), peaks)
             for k, sign in zip((1, 2, 3, 0), signs, strict=True)
         )
         for w, h in shapes:
@@ -352,9 +360,11 @@ def _combined(
             aspect = (size_x[:, None] * h) / np.where(size_y != 0, size_y * w, 1.0)
             whole = np.outer(a_seen.all(axis=1), d_seen.all(axis=1))
             good = (np.abs(np.log(np.maximum(aspect, 1e-9))) < tolerance) & whole
-            good &= (size_x[:, None] > _LEAST_SIDE * max(shape)) & (size_y > _LEAST_SIDE * max(shape))
+            good &= (size_x[:, None] > _LEAST_SIDE * min(shape)) & (size_y > _LEAST_SIDE * min(shape))
             if missing:
-                yield from _completed(across, down, a_seen, d_seen, (w, h), turn, polarity, shape, px_per_mm)
+                yield from _completed(
+                    across, down, a_seen, d_seen, (w, h), turn, polarity, shape, px_per_mm, peaks
+                )
                 continue
             if px_per_mm is not None:
                 good &= np.abs(np.log(np.maximum(size_x, 1e-9)[:, None] / (w * px_per_mm))) < 2 * tolerance
@@ -362,7 +372,7 @@ def _combined(
             # Votes of an edge relative to its length; neighbouring frames in line do not increase the score.
             share = np.minimum(across[i, 2:] / size_y[j, None], 1.5).sum(axis=1)
             share += np.minimum(down[j, 2:] / size_x[i, None], 1.5).sum(axis=1)
-            for n in np.argsort(-share, kind="stable")[:40]:
+            for n in np.argsort(-share, kind="stable")[: 5 * peaks]:
                 box = (across[i[n], 0], down[j[n], 0], across[i[n], 1], down[j[n], 1])
                 corners = _rectangle(box, turn * _BIN, shape)
                 yield FrameGuess(corners, polarity, (w, h), (True,) * 4, float(share[n]))
@@ -394,6 +404,7 @@ def _completed(
     polarity: int,
     shape: tuple[int, int],
     px_per_mm: float | None,
+    peaks: int,
 ) -> Iterator[FrameGuess]:
     """Rectangles from three lines and the format."""
     for lying in (True, False):
@@ -403,7 +414,7 @@ def _completed(
         span = pairs[:, 1] - pairs[:, 0]
         ratio = size[0] / size[1] if lying else size[1] / size[0]
         length = np.maximum(span * ratio, 1.0)
-        good = span > _LEAST_SIDE * max(shape)
+        good = span > _LEAST_SIDE * min(shape)
         if px_per_mm is not None:
             good &= np.abs(np.log(np.maximum(span, 1) / (size[1 if lying else 0] * px_per_mm))) < 0.06
         i, j = np.nonzero(good[:, None] & np.ones(len(ones), dtype=bool))
@@ -417,7 +428,7 @@ def _completed(
         # Votes relative to the length of the edges: a long line does not speak for a short edge.
         share = np.minimum(pairs[i, 2:] / length[i, None], 1.0).sum(axis=1)
         share += np.minimum(ones[j, 2:].max(axis=1) / np.maximum(span[i], 1), 1.0)
-        for n in np.argsort(-share, kind="stable")[:6]:
+        for n in np.argsort(-share, kind="stable")[: 6 * peaks // _PEAKS]:
             p, high = pairs[i[n]], low[n] + length[i[n]]
             box = (low[n], p[0], high, p[1]) if lying else (p[0], low[n], p[1], high)
             missed = (1 if first[n] else 3) if lying else (2 if first[n] else 0)
@@ -469,12 +480,12 @@ def _apart(guesses: list[FrameGuess]) -> list[FrameGuess]:
         alike &= bool(np.abs(size_of(guess.corners) / size - 1).max() < 0.04)
         if kept and not alike:
             continue
-        if all(_overlap(guess.corners, other.corners) < 0.05 for other in kept):
+        if all(overlap_of(guess.corners, other.corners) < 0.05 for other in kept):
             kept.append(guess)
     return kept
 
 
-def _overlap(first: Array, second: Array) -> float:
+def overlap_of(first: Array, second: Array) -> float:
     """Common area relative to that of the first."""
     common: Any = cv2.intersectConvexConvex(first.astype(np.float32), second.astype(np.float32))[0]
     return float(common) / float(np.prod(size_of(first)))
