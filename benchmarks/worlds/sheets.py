@@ -171,6 +171,8 @@ class View:
         Quality of the compression; 0 without.
     sharpening : float
         Weight of an unsharp mask of 1 px; 0 without.
+    shade : float
+        Share of the light that the shadows of three bars take; their edges are soft over 1 to 8 px.
     """
 
     sheet: Printed
@@ -188,6 +190,7 @@ class View:
     noise: float = 1.5
     jpeg: int = 0
     sharpening: float = 0.0
+    shade: float = 0.0
 
     _focal = np.array([1050.0, 1052.0])
     _centre = np.array([482.3, 355.1])
@@ -238,6 +241,8 @@ class View:
         u, v = (x - _WIDTH / 2) / _WIDTH, (y - _HEIGHT / 2) / _WIDTH
         grey = self.light * (1 + self.fall * (u * np.cos(to) + v * np.sin(to)))
         grey = grey * (_AROUND + paper * (1 - _AROUND - self.contrast * ink))
+        if self.shade:
+            grey = grey * self._shadows(x, y)
         if self.gloss:
             middle, wide = rng.uniform([300, 220], [660, 500]), rng.uniform(60, 120)
             grey += self.gloss * np.exp(-0.5 * ((x - middle[0]) ** 2 + (y - middle[1]) ** 2) / wide**2)
@@ -245,6 +250,15 @@ class View:
             share = edge(self._hand(x, y), spacing)
             grey = grey * (1 - share) + share * (125 + 15 * np.sin(x / 17) * np.cos(y / 13))
         return grey
+
+    def _shadows(self, x: Array, y: Array) -> Array:
+        """Share of the light that is left behind three bars before a lamp of some size."""
+        rng, lit = np.random.default_rng(self.seed + 3), np.ones(np.shape(x))
+        for _ in range(3):
+            angle, middle, wide, soft = rng.uniform([0, -250, 25, 1], [np.pi, 250, 60, 8])
+            off = np.abs((x - _WIDTH / 2) * np.cos(angle) + (y - _HEIGHT / 2) * np.sin(angle) - middle) - wide
+            lit = np.minimum(lit, 1 - self.shade * np.clip(0.5 - off / soft, 0, 1))
+        return lit
 
     def _hand(self, x: Array, y: Array) -> Array:
         """Signed distance to the edge of the object in front, positive behind it: a union of fingers."""
@@ -334,6 +348,7 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     "gamma": {"gamma": 2.2},
     "jpeg60": {"jpeg": 60},
     "sharpened": {"sharpening": 1.2},
+    "shadows": {"shade": 0.8},
     "cropped": {"nearer": 2.0},
     "small": {"nearer": 0.5},
 }

@@ -511,7 +511,7 @@ def _named(
         if isinstance(image, str | Path):
             named += [(path.name, path) for path in photographs_named([Path(image)])]
             continue
-        photo = _photo(image, channel, colours)
+        photo = image.candidates if isinstance(image, Measured) else _photo(image, channel, colours)
         name = photo.name if isinstance(photo, Frame) and not isinstance(image, np.ndarray) else ""
         named.append((name or f"image {len(named) + 1}", photo))
     if not named:

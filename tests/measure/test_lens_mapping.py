@@ -7,7 +7,7 @@ import pytest
 from reseau.core.data import Array
 from reseau.measure.plane.lattice_mapping import second_order, slope_of
 from reseau.measure.plane.lens_mapping import lens_through, mapping_through
-from reseau.measure.plane.plane_lens import distorted, projected
+from reseau.measure.plane.plane_lens import distorted, moving, projected
 from reseau.measure.plane.plane_mapping import plane_through
 
 SHAPE, FOCAL, NOISE_PX = (1024, 1024), 380.0, 0.3
@@ -33,10 +33,14 @@ def test_derivatives_of_the_images_through_a_lens_are_those_of_differences() -> 
     rng = np.random.default_rng(2)
     source = np.column_stack([rng.uniform(-1, 1, (9, 2)), np.ones(9)])
     first = [1.1, 0.02, 0.03, -0.01, 0.9, 0.05, 0.02, -0.03]
-    x = np.array([*first, 0.1, -0.05, 0.01, 0.02, -0.03, 0.004, 0.002, -0.001])
+    motion, rows = rng.normal(0, 0.05, 8), rng.uniform(-1, 1, 9)
+    x = np.array([*first, 0.1, -0.05, 0.01, 0.02, -0.03, 0.004, 0.002, -0.001, *motion])
 
     def images(x: Array) -> tuple[Array, Array]:
-        return distorted(*projected(source, x[:8]), x[8:])
+        u, by_u, by_motion = moving(*projected(source, x[:8])[:1], rows, x[16:])
+        by_all = np.concatenate([by_u @ projected(source, x[:8])[1], by_motion], axis=2)
+        image, slopes = distorted(u, by_all, x[8:16])
+        return image, np.concatenate([slopes[..., :8], slopes[..., 16:], slopes[..., 8:16]], axis=2)
 
     slopes = images(x)[1]
     for k, step in enumerate(1e-6 * np.eye(len(x))):
@@ -71,3 +75,34 @@ def test_a_board_from_the_axis_of_a_fisheye_to_the_horizon_has_a_mapping() -> No
         np.testing.assert_allclose((found(at + d) - found(at - d)) / (2 * step), slope[:, :, k], atol=1e-4)
         numeric = (slope_of(found, at + d) - slope_of(found, at - d)) / (2 * step)
         np.testing.assert_allclose(numeric, bend[..., k], atol=1e-2)
+
+
+def moving_plane(at: Array, seed: int, share: float) -> Array:
+    """Images of a plane that turns and shifts while rows are read, through OpenCV's lens with k1, k2, k3."""
+    rng = np.random.default_rng(seed)
+    matrix = np.array([[753.0, 0, 474.0], [0, 754.0, 363.0], [0, 0, 1]])
+    turn, place = rng.uniform(-0.6, 0.6, 3), np.array([-3.5, -2.5, 11.0])
+    spin, speed = share * rng.normal(0, 0.002, 3), share * rng.normal(0, 0.05, 3)
+    xyz = np.column_stack([at, np.zeros(len(at))])
+    lens, xy = np.array([0.082, -0.163, 4e-4, -7e-4, 0.061]), np.full((len(at), 2), 360.0)
+    for _ in range(12):
+        for k, t in enumerate((xy[:, 1] - 359.5) / 360):
+            xy[k] = cv2.projectPoints(xyz[k : k + 1], turn + t * spin, place + t * speed, matrix, lens)[0][
+                0, 0
+            ]
+    return xy
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_plane_that_moves_while_rows_are_read_has_the_derivatives_of_its_images(seed: int) -> None:
+    at = np.stack(np.unravel_index(np.arange(54), (9, 6)), axis=1).astype(float)
+    beside = np.concatenate([at + np.array([step, 0.0]) for step in (0.05, -0.05)])
+    xy = moving_plane(at, seed, 1.0)
+    assert np.abs(xy - moving_plane(at, seed, 0.0)).max() > 2
+    noisy = xy + np.random.default_rng(seed).normal(0, 0.003, xy.shape)
+    found = mapping_through(at, noisy, np.full(len(at), 0.003), (720, 960)).mapping
+    assert np.abs(found(at) - xy).max() < 0.04
+    ahead, behind = np.split(moving_plane(beside, seed, 1.0), 2)
+    # What displaces the images of circles: how the scale changes over a tenth of the pitch.
+    seen = np.subtract(*np.split(found(beside), 2))
+    assert np.abs(seen - (ahead - behind)).max() < 0.012

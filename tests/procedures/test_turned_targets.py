@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 from reseau.core.data import ImagePoints
+from reseau.core.failure import Failure
 from reseau.designs import board
 from reseau.io import BoardDesign
 from reseau.procedures.calibrated import Calibrated
 from reseau.procedures.calibration import calibrate_camera
 from reseau.procedures.calibration_options import CameraOptions
+from reseau.procedures.exposures import Taken
+from reseau.procedures.target_measurement import MeasuredPhotograph, Photograph
 from reseau.procedures.told_target import ways_to_turn
 
 SIGMA, TRUE = 0.01, {"fx": 700.0, "fy": 702.0, "cx": 402.0, "cy": 297.0}
@@ -93,3 +96,36 @@ def test_photographs_of_a_part_that_name_its_points_shifted_are_named_alike(desi
 )
 def test_a_target_that_tells_which_way_is_up_is_never_turned(design: BoardDesign) -> None:
     assert len(ways_to_turn(design)) <= 1
+
+
+@pytest.mark.parametrize("tells", [True, False], ids=["told by the other camera", "told by none"])
+def test_names_that_are_not_certain_are_those_that_the_other_camera_of_a_rig_predicts(tells: bool) -> None:
+    design, rng = board("chess", 8, 10, 20.0), np.random.default_rng(5)
+    xyz = np.column_stack([design.xy * [1, -1], np.zeros(len(design.xy))])
+    matrix = np.array([[TRUE["fx"], 0, TRUE["cx"]], [0, TRUE["fy"], TRUE["cy"]], [0, 0, 1]])
+    images, taken = list[Photograph](), dict[str, Taken]()
+    for k in range(7):
+        turn = cv2.Rodrigues(0.5 * np.array([np.cos(1.3 * k), np.sin(1.3 * k), 0.8 * k]))[0]
+        place = np.array([0.0, 0.0, 330.0]) - turn @ xyz.mean(axis=0)
+        for camera, shift in (("left", 0.0), ("right", -30.0)):
+            xy = cv2.projectPoints(xyz, turn, place + np.array([shift, 0, 0]), matrix, np.zeros(4))[0][:, 0]
+            points = ImagePoints.with_sigma(design.ids, xy + rng.normal(0, SIGMA, xy.shape), SIGMA)
+            name = f"{camera}{k}"
+            if k == 6 and camera == "right":
+                # The last two rows are hidden, and the others named as if they were the last ones.
+                seen, count = design.nodes[:, 1] < 7, int((design.nodes[:, 1] < 2).sum())
+                part = points.select(np.asarray(seen))
+                shifted = ImagePoints(design.ids[count:], part.xy, part.cov)
+                images.append(MeasuredPhotograph(name, shifted, certain=False))
+            elif tells or k < 6:
+                images.append((name, points))
+            taken[name] = Taken(camera, str(k))
+    model = CameraOptions("opencv", ("fx", "fy", "cx", "cy", "k1", "k2"))
+    done = calibrate_camera(images, design, lambda frame: Failure("never"), SIZE, model, taken=taken)
+    assert isinstance(done, Calibrated)
+    assert 0.9 < done.sigma0 < 1.1
+    if tells:
+        assert done.measured["right6"].names == tuple(design.ids[: len(done.measured["right6"].names)])
+    else:
+        assert "right6" not in done.measured
+        assert done.declined["right6"].startswith("which part of the target it shows is not certain")

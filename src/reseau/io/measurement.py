@@ -65,11 +65,13 @@ class ReseauMeasurement(Document):
     expected: int
     notes: tuple[str, ...] = ()
     note_codes: tuple[str, ...] = ()
+    candidates: tuple[str, ...] = ()
+    """Points that were measured, but whose names are not certain: all of them may be shifted."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file; optional keys are left out where there is nothing to say."""
         content = super().to_dict()
-        for key in ("notes", "note_codes"):
+        for key in ("notes", "note_codes", "candidates"):
             if not content[key]:
                 del content[key]
         for point in content["points"]:
@@ -77,12 +79,13 @@ class ReseauMeasurement(Document):
                 del point["share"], point["s_share"]
         return content
 
-    def image_points(self) -> ImagePoints:
-        """Return the marks that were measured.
+    def image_points(self, *, uncertain: bool = False) -> ImagePoints:
+        """Return the marks that were measured; also those with `uncertain` names.
 
         A point without sigmas gets sigmas of one pixel.
         """
-        ok = [p for p in self.points if p.ok and p.x is not None and p.y is not None]
+        more = set(self.candidates) if uncertain else set()
+        ok = [p for p in self.points if (p.ok or p.id in more) and p.x is not None and p.y is not None]
         xy = np.array([(p.x, p.y) for p in ok], dtype=np.float64).reshape(-1, 2)
         s = np.array([(p.sx or 1.0, p.sy or 1.0) for p in ok], dtype=np.float64).reshape(-1, 2)
         cov = np.zeros((len(ok), 2, 2))
@@ -101,11 +104,16 @@ class ReseauMeasurement(Document):
         ok: Mask,
         why: Sequence[str],
         notes: Sequence[Remark] = (),
+        candidates: Mask | None = None,
     ) -> Self:
-        """Create the document from columns; marks that are not `ok` have a reason and no coordinates."""
+        """Create the document from columns; marks that are not `ok` have a reason.
+
+        Coordinates are those of marks that are `ok`, and of `candidates`, whose names are not certain.
+        """
         points = []
+        unsure = np.zeros(len(ids), dtype=bool) if candidates is None else candidates
         for i, name in enumerate(ids):
-            if not ok[i]:
+            if not (ok[i] or unsure[i]):
                 points.append(MeasuredPoint(id=name, ok=False, why=why[i]))
                 continue
             sx, sy = np.sqrt(np.diagonal(cov[i]))
@@ -117,7 +125,8 @@ class ReseauMeasurement(Document):
                     sx=float(sx),
                     sy=float(sy),
                     rho=float(cov[i, 0, 1] / (sx * sy)),
-                    ok=True,
+                    ok=bool(ok[i]),
+                    why=why[i],
                 )
             )
         return cls(
@@ -128,6 +137,7 @@ class ReseauMeasurement(Document):
             expected=len(points),
             notes=tuple(note.text for note in notes),
             note_codes=tuple(note.code.value for note in notes),
+            candidates=tuple(name for name, one in zip(ids, unsure, strict=True) if one),
         )
 
     @classmethod
@@ -265,6 +275,7 @@ class PhotographPoints(Document):
     why: str = ""
     code: str = ""
     notes: tuple[str, ...] = ()
+    certain: bool = True
 
     def to_json(self) -> str:
         """Return the content of the file in one line: there is one for each photograph of a large number."""
@@ -272,12 +283,16 @@ class PhotographPoints(Document):
 
     @classmethod
     def of(
-        cls, found: ImagePoints | Failure, size: tuple[int, int] | None = None, notes: Sequence[str] = ()
+        cls,
+        found: ImagePoints | Failure,
+        size: tuple[int, int] | None = None,
+        notes: Sequence[str] = (),
+        certain: bool = True,
     ) -> Self:
         """Create the document from image points, or from the reason why there are none."""
         if isinstance(found, Failure):
             return cls(size=size, points=None, why=found.reason, code=str(found.code), notes=tuple(notes))
-        return cls(size=size, points=PointColumns.of(found), notes=tuple(notes))
+        return cls(size=size, points=PointColumns.of(found), notes=tuple(notes), certain=certain)
 
     def image_points(self, where: str = "") -> ImagePoints | Failure:
         """Return the image points, or the failure of a photograph of this name."""

@@ -134,7 +134,7 @@ class Measured(Estimated, Display, Overlaid):
     cov : ndarray (n, 2, 2)
         Covariances in px², NaN where not measured.
     ok : ndarray of bool (n,)
-        Which points were measured.
+        Which points were measured, with certain names.
     why : tuple of str (n,)
         Reason why a point was not measured; empty where it was.
     predicted : ndarray (n, 2)
@@ -248,8 +248,22 @@ class Measured(Estimated, Display, Overlaid):
     @property
     def points(self) -> ImagePoints:
         """The points that were measured."""
-        names = tuple(name for name, ok in zip(self.ids, self.ok, strict=True) if ok)
-        return ImagePoints(names, self.xy[self.ok], self.cov[self.ok])
+        return self._some(self.ok)
+
+    @property
+    def candidates(self) -> ImagePoints:
+        """The points that were measured, also those whose names are not certain."""
+        return self._some(self.ok | self._unsure)
+
+    @property
+    def _unsure(self) -> Mask:
+        """Points that were measured, but whose names are not certain."""
+        unsure = np.array([code is Code.AMBIGUOUS for code in self.codes], dtype=bool)
+        return np.asarray(unsure & np.isfinite(self.xy).all(axis=1))
+
+    def _some(self, keep: Mask) -> ImagePoints:
+        names = tuple(name for name, kept in zip(self.ids, keep, strict=True) if kept)
+        return ImagePoints(names, self.xy[keep], self.cov[keep])
 
     def rms(self) -> Array:
         """Root mean square deviation from the prediction, per axis (2,); NaN without predictions."""
@@ -260,7 +274,7 @@ class Measured(Estimated, Display, Overlaid):
         """The result as a document."""
         why = tuple(map(str, self.why))
         return ReseauMeasurement.from_columns(
-            self.image, self.sha256, self.ids, self.xy, self.cov, self.ok, why, self.remarks
+            self.image, self.sha256, self.ids, self.xy, self.cov, self.ok, why, self.remarks, self._unsure
         )
 
     @property

@@ -46,7 +46,7 @@ from .calibrated import ONE_CAMERA, Calibrated
 from .calibration_options import CalibrationOptions, CameraOptions, PlaneDesign
 from .exposures import Taken
 from .target_measurement import MeasuredPhotograph, Measurer, Photograph, by_reason, few_of
-from .told_target import measured_as_shown, named_alike, ways_to_turn
+from .told_target import measured_as_shown, named_alike, named_by_others, ways_to_turn
 
 _LEAST_POINTS = 8
 _LEAST_IMAGES = 3
@@ -57,6 +57,11 @@ _FOCAL_OFF = 1.5
 _CONTRADICTED, _BETTER, _RENAMED = 1.5, 0.7, 3
 """Standard deviation of unit weight from which photographs may name the points of a regular target
 differently; share of it to which the same names must lower it; most attempts."""
+_SHIFTED = (
+    "{}: a part of a regular pattern, whose names may be shifted by rows or columns: the pose of such a "
+    "photograph may be shifted, too; the camera is not affected"
+)
+_UNNAMED = "which part of the target it shows is not certain, and no other photograph tells"
 _MORE_TILTED = "add images with the camera tilted by 20 to 40 degrees in different directions"
 # Relative standard deviation of a diagonal of the target.
 _PRINTED = 1e-4
@@ -122,8 +127,23 @@ def calibrate_camera(
     declined |= {name: f"a copy of {original}" for name, original in copies.items()}
     measured = _without(measured, options.leave_out)
     notes = (*seen.notes, *said_of_copies(copies), *(note for each in photographs for note in each.notes))
+    unsure = {
+        each.name: measured[each.name] for each in photographs if not each.certain and each.name in measured
+    }
+    tied = taken is not None or options.turntable is not None
+    if unsure and not tied:
+        notes += (_SHIFTED.format(few_of(tuple(unsure))),)
     job = _Job(declined, sizes, notes, design, model, options, taken, seen.shown)
-    done = job.calibrated(measured)
+    # Poses that depend on each other would contradict each other with names that are shifted.
+    done = job.calibrated({k: each for k, each in measured.items() if not (tied and k in unsure)})
+    if unsure and tied:
+        named = {}
+        if taken and isinstance(design, BoardDesign) and not isinstance(done, Failure):
+            named = named_by_others(unsure, taken, design, done.result)
+        declined |= dict.fromkeys(unsure.keys() - named.keys(), _UNNAMED)
+        if named:
+            every = {k: named.get(k, each) for k, each in measured.items() if k in named or k not in unsure}
+            done = job.calibrated(every)
     if isinstance(design, BoardDesign) and ways_to_turn(design) and options.control is None:
         # A better camera tells better which photographs name the points in another way.
         for _ in range(_RENAMED):

@@ -20,7 +20,7 @@ from ..core.failure import Code, Failure
 from ..io.images import Channel, read_image
 from ..io.photographs import PHOTOGRAPHS, read_exif
 from ..io.reading import is_points, read_measurement
-from .target_measurement import Photograph, Unread
+from .target_measurement import MeasuredPhotograph, Photograph, Unread
 
 _DESCRIBING = (".json", ".yaml", ".yml", ".xml")
 """Suffixes of designs and calibrations, which are kept beside photographs."""
@@ -325,7 +325,9 @@ def photographs_of(
             elif isinstance(image, Path) and name in zoomed:
                 yield name, Failure(zoomed[name], Code.DECLINED, where=name)
             elif isinstance(image, Path) and is_points(image):
-                yield name, read_measurement(image).image_points()
+                read_points = read_measurement(image)
+                points = read_points.image_points(uncertain=True)
+                yield MeasuredPhotograph(name, points, certain=not read_points.candidates)
             elif isinstance(image, Path) and objects is not None:
                 sha256, suffix = objects.put(_content(image), image.suffix), image.suffix
                 source = partial(_of_store, read, store, sha256, suffix)

@@ -55,10 +55,6 @@ class Unread:
     inputs: Mapping[str, str] = field(default_factory=dict)
 
 
-Photograph = Frame | Unread | tuple[str, ImagePoints | Failure]
-"""A frame, one to be read, the points measured in it by its name, or why it cannot be read."""
-
-
 @dataclass(frozen=True)
 class MeasuredPhotograph:
     """What was measured in a photograph.
@@ -73,12 +69,19 @@ class MeasuredPhotograph:
         Width and height in pixels, if a frame was measured.
     notes : tuple of str
         How the file was read.
+    certain : bool
+        Whether the names of the points are; otherwise all of them may be shifted by rows or columns.
     """
 
     name: str
     found: ImagePoints | Failure
     size: tuple[int, int] | None = None
     notes: tuple[str, ...] = ()
+    certain: bool = True
+
+
+Photograph = Frame | Unread | MeasuredPhotograph | tuple[str, ImagePoints | Failure]
+"""A frame, one to be read, what was measured in it, or by its name the points or why it cannot be read."""
 
 
 def measurer_of(
@@ -193,6 +196,8 @@ def measured_in_order(
 
 def _measured(measure: Measurer, outputs: Outputs | None, photograph: Photograph) -> MeasuredPhotograph | str:
     """What was measured in a photograph, or the SHA-256 of the output that says it."""
+    if isinstance(photograph, MeasuredPhotograph):
+        return photograph
     if isinstance(photograph, tuple):
         return MeasuredPhotograph(*photograph)
     if outputs is None or not isinstance(photograph, Unread):
@@ -213,17 +218,21 @@ def _points(measure: Measurer, photograph: Frame | Unread) -> MeasuredPhotograph
         # One photograph must not end the measurement of the others.
         reason = f"could not be measured ({type(error).__name__}); please report it with the image"
         return MeasuredPhotograph(name, Failure(reason, Code.SINGULAR, where=name), size, frame.notes)
-    return MeasuredPhotograph(name, found if isinstance(found, Failure) else found.points, size, frame.notes)
+    if isinstance(found, Failure):
+        return MeasuredPhotograph(name, found, size, frame.notes)
+    points = found.candidates
+    return MeasuredPhotograph(name, points, size, frame.notes, len(points) == found.found)
 
 
 def _document(photograph: MeasuredPhotograph) -> bytes:
-    document = PhotographPoints.of(photograph.found, photograph.size, photograph.notes)
+    document = PhotographPoints.of(photograph.found, photograph.size, photograph.notes, photograph.certain)
     return document.to_json().encode()
 
 
 def _of_document(name: str, data: bytes) -> MeasuredPhotograph:
     document = PhotographPoints.parse(data.decode(), where=name)
-    return MeasuredPhotograph(name, document.image_points(name), document.size, document.notes)
+    found = document.image_points(name)
+    return MeasuredPhotograph(name, found, document.size, document.notes, document.certain)
 
 
 def by_reason(declined: Mapping[str, str]) -> dict[str, list[str]]:

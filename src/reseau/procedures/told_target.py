@@ -12,6 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ..bundle import Result, Rig, camera_mapping
 from ..calibration import CameraMapping
 from ..core.data import Array, Frame, ImagePoints
 from ..core.errors import ImageError
@@ -19,6 +20,7 @@ from ..core.failure import Code, Failure
 from ..designs.boards import unusual_size
 from ..execution import Executor, Outputs
 from ..io import BoardDesign
+from .exposures import Taken
 from .target_measurement import (
     MeasuredPhotograph,
     Measurer,
@@ -84,10 +86,13 @@ def measured_as_shown(
     if not isinstance(design, BoardDesign):
         return TargetMeasured(tuple(done))
     notes = tuple(filter(None, [unusual_size(design)]))
+    # Where a part of the told board may be hidden, a smaller board may be seen whole.
     against = {
-        each.name for each in done if isinstance(each.found, Failure) and each.found.code in _CONTRADICT
+        each.name
+        for each in done
+        if not each.certain or (isinstance(each.found, Failure) and each.found.code in _CONTRADICT)
     }
-    if len(against) <= sum(not isinstance(each.found, Failure) for each in done):
+    if len(against) <= sum(each.certain and not isinstance(each.found, Failure) for each in done):
         return TargetMeasured(tuple(done), None, notes)
     other = corrected(_frames(seen, against), design)
     if isinstance(other, Failure):
@@ -228,6 +233,60 @@ def _deviations(
         return None
     mapped = np.column_stack([seen, np.ones(len(seen))]) @ plane.T
     return rows, mapped[:, :2] / mapped[:, 2:] - design.xy[rows]
+
+
+def named_by_others(
+    unsure: Mapping[str, ImagePoints], taken: Mapping[str, Taken], design: BoardDesign, result: Result
+) -> dict[str, ImagePoints]:
+    """Name points by photographs that other cameras of a rig took at once.
+
+    Parameters
+    ----------
+    unsure : mapping of str to ImagePoints
+        Photographs whose names may be shifted.
+    taken : mapping of str to Taken
+        Camera and exposure of each photograph.
+    design : BoardDesign
+        The target.
+    result : Result
+        Adjustment of other photographs of the rig.
+
+    Returns
+    -------
+    dict of str to ImagePoints
+        Those photographs of which others tell which points they show; they are the ways to name them whose
+        points lie nearest to where others predict them, by less than half their distance.
+    """
+    network, values, row = result.network, result.fit.values, {name: k for k, name in enumerate(design.ids)}
+    cameras = [camera.id for camera in network.cameras]
+    images = [*network.images, *(name for name in unsure if taken[name].camera in cameras)]
+    count, exposures = len(network.images), list(dict.fromkeys(taken[name].exposure for name in images))
+    rig = Rig(
+        np.array([cameras.index(taken[name].camera) for name in images]),
+        np.array([exposures.index(taken[name].exposure) for name in images]),
+    )
+    rotation, x0 = np.full((len(images), 3, 3), np.nan), np.full((len(images), 3), np.nan)
+    rotation[:count], x0[:count] = values.rotation, values.x0
+    _, rotation, x0 = rig.approximate(rotation, x0)
+    at = {name: k for k, name in enumerate(network.points)}
+    xyz = np.array([values.xyz[at[name]] if name in at else np.full(3, np.nan) for name in design.ids])
+    found = dict[str, ImagePoints]()
+    for image in range(count, len(images)):
+        points = unsure[images[image]]
+        there = (xyz - x0[image]) @ rotation[image].T
+        lens = camera_mapping(result, int(rig.camera[image])).mapping
+        known = np.isfinite(there).all(axis=1) & (there[:, 2] > 0)
+        predicted = np.full((len(xyz), 2), np.nan)
+        predicted[known] = lens(there[known, :2] / there[known, 2:])
+        rows = np.array([row[name] for name in points.names])
+        named = [to for to, _ in _named(design, ways_to_turn(design), rows, np.zeros((len(rows), 2)))]
+        off = [float(np.median(np.linalg.norm(predicted[to] - points.xy, axis=1))) for to in named]
+        apart = np.median(scipy.spatial.KDTree(points.xy).query(points.xy, k=2)[0][:, 1])
+        # A photograph that was not taken with the others is as far from all of them.
+        if np.isfinite(off).any() and np.nanmin(off) < apart / 2:
+            names = np.array(design.ids)[named[int(np.nanargmin(off))]]
+            found[images[image]] = ImagePoints(tuple(names.tolist()), points.xy, points.cov)
+    return found
 
 
 def _named(

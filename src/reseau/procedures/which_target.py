@@ -277,7 +277,7 @@ class _Photographs:
                     break
                 if _may_be(design, self.shown(frame)):
                     measured = measurer_of(design)(frame)
-                    count = 0 if isinstance(measured, Failure) else len(measured.points)
+                    count = 0 if isinstance(measured, Failure) else len(measured.candidates)
                     seen[pattern] = count if count >= _LEAST else 0
                     if count >= (_ENOUGH * len(design.ids) if _plain(design) else _LEAST):
                         enough = _turn(design)

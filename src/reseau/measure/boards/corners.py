@@ -24,13 +24,14 @@ from ..matching import GrownOutline, Matches, Shape, Window
 from ..plane.lattice_mapping import images_of, second_order
 from ..plane.lens_mapping import UNFIT, mapping_through
 from ..plane.levels import levels_around
-from ..reseau.mark_windows import ENOUGH, Located
+from ..reseau.mark_windows import BESIDE, ENOUGH, Located
 from ..reseau.marks import ReseauOptions
 from ..reseau.plane_marks import PlaneMarks, intact
 from ..response import sharpened_from_px
 from ..screening import Screened
 from .candidates import ended
 from .compiled_corners import pixels_around
+from .shadows import pixels_alike, shaded
 
 __all__ = ["BORDER_PX", "CornerMarks", "CornerShape", "DeltilleMarks", "Sectors"]
 
@@ -167,6 +168,7 @@ class CornerMarks(PlaneMarks):
         if not self.balanced:
             # What is not known of the camera shifts them: it is learnt from more.
             self.sampled = _SAMPLED_OF_TAGS
+        self.crossed = np.zeros(len(self.xy), dtype=bool)  # by edges that nothing explains
         self.widths = np.full(len(self.xy), np.nan)  # of the point-spread function at corners, if it varies
 
     def _curvature(self, mapping: Chain, rows: Rows) -> Array:
@@ -346,6 +348,48 @@ class CornerMarks(PlaneMarks):
             cov=found.cov + shift @ cofactor @ np.swapaxes(shift, 1, 2),
         )
 
+    def _in_shadows(self, rows: Rows, found: Matches) -> Matches:
+        """See :class:`PlaneMarks`: shadows make objections to some corners, and displace others."""
+        objected = np.any([mask for mask, *_ in self._objections(rows, found)], axis=0)
+        plain = intact(found) & ~objected
+        if not (objected & (found.rejected > 0)).any() or plain.sum() < ENOUGH or not self.balanced:
+            return found
+        noise, ink = float(np.median(found.noise[plain])), float(np.median(found.contrast[plain]))
+        alike = pixels_alike(found.residuals[plain])
+        start = self.start[rows] = np.where(plain[:, None], found.xy, self.mapping(self.at[rows]))
+        images, reach = self._images(rows)
+        high, wide = (n // 2 for n in found.residuals.shape[1:])
+        beside = self.beside()
+        for part, half in self._windows(reach):
+            half = min(half[0], wide), min(half[1], high)
+            x, y = self.pixels(rows[part], half)
+            window, region = self.window(rows[part], half), self._region(rows[part], half)
+            used = (
+                self.screened.valid[y, x] & (x == window.columns[:, None, :]) & (y == window.rows[:, :, None])
+            )
+            used &= True if region is None else region
+            if beside is not None:
+                used &= np.abs(beside[y, x]) < BESIDE
+            grey, psf = (
+                self.screened.grey[y, x].astype(np.float64),
+                (self.look.psf_px, self.look.psf_log_sigma),
+            )
+            own = shaded(
+                grey,
+                used,
+                self._shape(images, part),
+                window,
+                start[part],
+                ink,
+                psf,
+                self._form_sigma(),
+                noise,
+                alike,
+            )
+            found = own.instead_of(found, part)
+            self.crossed[rows[part]] = ~own.converged
+        return found
+
     def _width(self, at: Array) -> Array:
         """Widths (m,) of the point-spread function at places of the lattice; if it varies, those near."""
         known = np.flatnonzero(np.isfinite(self.widths))
@@ -381,6 +425,7 @@ class CornerMarks(PlaneMarks):
         return [
             (near, "on the border of the frame", Code.OUTSIDE),
             (self._single(rows), ends, Code.OTHER_DESIGN),
+            (self.crossed[rows], "edges of shadows, or of something else, cross it", Code.DISTURBED),
             (unseen, "an edge is hidden or saturated", Code.HIDDEN),
             *super()._objections(rows, found),
             (flat, "seen at too flat an angle", Code.UNCERTAIN),

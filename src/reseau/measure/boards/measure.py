@@ -17,7 +17,7 @@ from ...designs.boards import marker_cells
 from ...designs.dots import halves_of_dots
 from ...io.board import BoardDesign
 from ..plane.lattice_mapping import second_order, stretches
-from ..points import Measured
+from ..points import Measured, Reason
 from ..reseau.disks import find_disks
 from ..reseau.mark_windows import Located
 from ..reseau.marks import ReseauOptions
@@ -37,6 +37,7 @@ __all__ = ["BoardOptions", "BoardResult", "measure_board", "puzzle_part"]
 _BRIGHT = 0.75
 """Share of the range of the sensor below which no noise makes a pixel clipped."""
 _MIRRORED = "the board is seen mirrored: the print is, or the program that took the picture mirrors it"
+_UNCERTAIN = Reason("measured, but which point it is is not certain", Code.AMBIGUOUS)
 _MISREAD = 3
 """Most markers that may be misread: a mirrored one of many is like another one of its dictionary."""
 _CIRCLE_EDGE = 3.0
@@ -226,7 +227,11 @@ def _measured(frame: Frame, design: BoardDesign, options: BoardOptions) -> Board
         kind = DeltilleMarks if design.kind == "deltille" else CornerMarks
         marks = kind(frame, screened, placed.located, common, sectors_of(design))
     columns = marks.columns(with_field=False)
-    return BoardResult(**columns | {"notes": placed.notes + columns["notes"]})
+    found = BoardResult(**columns | {"notes": placed.notes + columns["notes"]})
+    if placed.certain:
+        return found
+    why = tuple(_UNCERTAIN if ok else why for ok, why in zip(found.ok, found.why, strict=True))
+    return replace(found, ok=np.zeros_like(found.ok), why=why)
 
 
 def _placed(frame: Frame, screened: Screened, design: BoardDesign) -> Placed | Failure:

@@ -55,9 +55,9 @@ __all__ = [
     "numbered",
 ]
 
-_MISSED, _PLAIN, _FOREIGN = 0.4, 3.0, 3.0
-"""What counts against a place: a node in sight that was not found; one between squares as bright as paper and
-ink, where nothing hides it; one found that the design has not."""
+_MISSED, _HIDDEN, _ENDED, _FOREIGN = 0.4, 1.5, 3.0, 3.0
+"""What counts against a place: a node in sight that was not found; all of them at most, as one thing may hide
+whole rows; one where the pattern is seen to end; one found that the design has not."""
 _ALIKE = 2.0
 """Lead in nodes of a place over another from which it is certain."""
 _FITS = 0.4
@@ -106,6 +106,8 @@ class Placed:
 
     located: Located
     notes: tuple[Remark, ...] = ()
+    certain: bool = True
+    """Whether the frame shows which points they are, except for turns by which the board equals itself."""
 
 
 def failed(found: int, what: str) -> Failure:
@@ -145,9 +147,6 @@ def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDes
     # the square there is the one of the upper left corner, moved diagonally.
     dark = _dark_sectors(design)
     bright = bright_between(saddles.edges[rows], slope_of(mapping, nodes))
-    paper = float(np.median(sector_levels(grey, mapping, nodes).max(axis=1)))
-    ink = float(np.median(sector_levels(grey, mapping, nodes).min(axis=1)))
-    each = cost_of(ink, paper)
     even = nodes.sum(axis=1) % 2 == 0
     odd = (bright == even).mean() > 0.5
 
@@ -156,7 +155,7 @@ def lay_chessboard(grey: NDArray[np.float32], saddles: Saddles, design: BoardDes
 
     def cost(missing: Array) -> Array:
         levels, bright = seen(missing)
-        return each(levels, crossed(levels, bright))
+        return _costs(crossed(levels, bright), ended(levels, bright))
 
     coded = design.kind == "puzzle" or bool(design.dots)
     bits = read_bits(grey, mapping, nodes.astype(np.intp), design.kind == "puzzle") if coded else None
@@ -211,10 +210,14 @@ def cost_of(ink: float, paper: float) -> Callable[[Array, Mask], Array]:
     limits = paper - 0.25 * (paper - ink), ink + 0.25 * (paper - ink)
 
     def cost(levels: Array, there: Mask) -> Array:
-        plain = ((levels > limits[0]) | (levels < limits[1])).all(axis=1)
-        return np.where(there, 0.0, np.where(plain, _PLAIN, _MISSED))
+        return _costs(there, np.asarray(((levels > limits[0]) | (levels < limits[1])).all(axis=1)))
 
     return cost
+
+
+def _costs(there: Mask, gone: Mask) -> Array:
+    """What nodes that were not found count against a place: seen all the same, ended, or hidden."""
+    return np.where(there, 0.0, np.where(gone, _ENDED, _MISSED))
 
 
 def _dark_sectors(design: BoardDesign) -> Mask:
@@ -287,7 +290,25 @@ def numbered(
     seen[of[there]], start[of[there]] = True, xy[there]
     frame, origin = _to_lattice(design, turn, moved + lattice.least)
     located = Located(design.ids, design.xy, design.polarity, mapping, frame, origin, seen, start)
-    return Placed(located, _ambiguous(design, turn, [one for one in found[1:] if score - one[0] < _ALIKE]))
+    alike = [one for one in found[1:] if score - one[0] < _ALIKE]
+    texts = []
+    if turned := [one for one in alike if _same(lattice.numbers, (turn, moved), one[1:])]:
+        texts.append(
+            f"the board looks the same turned in {len(turned) + 1} ways: names are those of one of them"
+        )
+    if shifted := len(turned) < len(alike):
+        texts.append(
+            f"the frame shows a part of a regular pattern, which may be at "
+            f"{len(alike) - len(turned) + 1} places of the board: names may be off by rows or columns"
+        )
+    return Placed(located, tuple(Remark(text, Code.AMBIGUOUS) for text in texts), not shifted)
+
+
+def _same(numbers: Integers, place: tuple[Integers, Integers], other: tuple[Integers, Integers]) -> bool:
+    """Whether the whole board, turned and moved from one place to the other, covers itself."""
+    back = np.rint(np.linalg.inv(place[0])).astype(np.intp)
+    there = (numbers - place[1]) @ back.T @ other[0].T + other[1]
+    return set(map(tuple, there.tolist())) == set(map(tuple, numbers.tolist()))
 
 
 def _misread(design: BoardDesign, wrong: int, total: int, places: int) -> Failure | None:
@@ -355,8 +376,9 @@ class _Lattice:
             return 0.0
         where = images_of(self.mapping, gone)
         sight = ((where > 2) & (where < np.array(self.shape[::-1]) - 3)).all(axis=1)
-        each = np.full(len(gone), _MISSED) if cost is None else cost(gone)
-        return float(each[sight].sum())
+        each = (np.full(len(gone), _MISSED) if cost is None else cost(gone))[sight]
+        hidden = each == _MISSED
+        return float(each[~hidden].sum()) + min(float(each[hidden].sum()), _HIDDEN)
 
     def goes_on(self, cost: Callable[[Array], Array] | None, beyond: Array) -> Mask:
         """At which nodes beyond the design something is seen."""
@@ -412,24 +434,6 @@ def _to_lattice(design: BoardDesign, turn: Integers, shift: Integers) -> tuple[A
     return back @ scale, -back @ shift
 
 
-def _ambiguous(
-    design: BoardDesign, turn: Integers, alike: list[tuple[float, Integers, Integers]]
-) -> tuple[Remark, ...]:
-    if not alike:
-        return ()
-    turned = sum(not np.array_equal(other, turn) for _, other, _ in alike)
-    moved = len(alike) - turned
-    texts = []
-    if turned:
-        texts.append(f"the board looks the same turned in {turned + 1} ways: names are those of one of them")
-    if moved:
-        texts.append(
-            "the frame shows a part of a regular pattern that fits shifted, too: names may be off by rows or "
-            "columns"
-        )
-    return tuple(Remark(text, Code.AMBIGUOUS) for text in texts)
-
-
 def lay_circles(grey: NDArray[np.float32], disks: Disks, design: BoardDesign) -> Placed | Failure:
     """Find a grid of circles among the ellipses of a frame, and number them.
 
@@ -468,21 +472,25 @@ def lay_circles(grey: NDArray[np.float32], disks: Disks, design: BoardDesign) ->
         return failed(0 if best is None else len(best[0]), f"{width} in a lattice")
     nodes, rows, mapping = best
 
-    def seen(nodes: Array) -> tuple[Array, Array]:
-        """How much darker nodes are than the middles of the meshes around them, and the brightest one."""
+    def seen(nodes: Array) -> tuple[Array, Array, Array]:
+        """How much darker nodes are than meshes around them, their levels, and the brightest mesh."""
         around, centre = (sector_levels(grey, mapping, nodes, share) for share in (0.5, 0.0))
-        return np.asarray(np.median(around, axis=1) - centre[:, 0]), around.max(axis=1)
+        level = centre[:, 0]
+        return np.asarray(np.median(around, axis=1) - level), level, around.max(axis=1)
 
-    circle, paper = (float(np.median(each)) for each in seen(nodes))
+    circle, _, paper = (float(np.median(each)) for each in seen(nodes))
+
+    def gone(beyond: Array, *, beside: bool) -> Mask:
+        """Whether there is no circle, but paper, in its place or beside it: a hand would hide both."""
+        darker, level, brightest = seen(beyond)
+        return np.asarray((darker < circle / 2) & ((brightest if beside else level) > paper - circle / 2))
 
     def cost(missing: Array) -> Array:
         # Those that are blurred or cut by something are seen, but not found as disks.
-        return np.where(seen(missing)[0] > circle / 2, 0.0, _MISSED)
+        return _costs(seen(missing)[0] > circle / 2, gone(missing, beside=False))
 
     def ended(beyond: Array) -> Mask:
-        """Whether there is no circle beside paper: a hand would hide both."""
-        darker, beside = seen(beyond)
-        return np.asarray((darker < circle / 2) & (beside > paper - circle / 2))
+        return gone(beyond, beside=True)
 
     known = nodes.astype(np.intp), disks.xy[rows], mapping, shape
     return numbered(design, *known, None, cost, ends=ended)

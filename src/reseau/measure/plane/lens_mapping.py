@@ -11,6 +11,9 @@ with r = |d| (Brown 1971, Photogrammetric Engineering 37, eq. 10): sixteen param
 are known, contain the second derivatives that a free polynomial has only from its third degree on, with
 twenty. Written out it is a polynomial of the seventh degree. Behind a fisheye u is that by an equidistant
 one about the middle of the frame (:class:`reseau.optics.Equidistant`).
+
+Where the rows are read one by one (a rolling shutter) and the plane moves, the projectivity changes with the
+row v in which a point is seen: u becomes (u + v (A u + b)) / (1 + v c · u), with eight more parameters.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ from .lattice_mapping import (
     strength_of,
     with_coefficients,
 )
-from .plane_lens import distorted, projected
+from .plane_lens import distorted, moving, projected
 from .plane_mapping import fisheye_of, polynomial_through
 from .polynomial import monomials_of
 
@@ -42,6 +45,10 @@ UNFIT = 2.0
 
 _LENS_SIGMA = np.array([0.3, 0.3, 0.1, 0.1, 0.1, 0.005, 0.003, 0.003])
 """Usual sizes of k1, k2, k3, c, a, p1 and p2; half the width of a frame has r = 1."""
+_MOTION_SIGMA = np.full(8, 0.05)
+"""Usual changes of a projectivity while half the width of a frame is read."""
+_ROWS = 3
+"""Iterations by which the rows are found in which points are seen."""
 _FISHEYE = 0.25
 """Share of the weighted squares and parameters without a fisheye below which there is one."""
 _DEGREE, _USUAL = 7, 5
@@ -113,10 +120,15 @@ def mapping_through(at: Array, xy: Array, sigma: Array, shape: tuple[int, int]) 
             free = [free_through(mapping, at, xy, sigma, degree_of(mapping)) for mapping in free]
         best = min(free, key=lambda mapping: criterion(mapping, len(mapping.second.values)))
         least = criterion(best, len(best.second.values))
-        lens = lens_through(at, xy, sigma, shape, free[0])
-        if lens is not None and (own := criterion(lens.mapping, 8 + len(_LENS_SIGMA))) <= least:
-            return own, lens
-        return least, FoundMapping(best, _changes(best, at, xy, weight))
+        found = FoundMapping(best, _changes(best, at, xy, weight))
+        for parameters, moves in (
+            (8 + len(_LENS_SIGMA), False),
+            (8 + len(_LENS_SIGMA) + len(_MOTION_SIGMA), True),
+        ):
+            lens = lens_through(at, xy, sigma, shape, free[0], moves=moves)
+            if lens is not None and (own := criterion(lens.mapping, parameters)) <= least:
+                least, found = own, lens
+        return least, found
 
     least, found = best_of(0.0)
     if least > UNFIT**2 * 2 * len(at) and (strength := fisheye_of(at, xy, shape)) > 0:
@@ -163,16 +175,30 @@ def _changes(free: Chain, at: Array, xy: Array, weight: Array) -> Callable[[Arra
 
 
 def _seen(source: Array, x: Array, strength: float) -> tuple[Array, Array]:
-    """Images (n, 2) of points (n, 3) in homogeneous coordinates, and derivatives (n, 2, 16) by parameters."""
+    """Images (n, 2) of points (n, 3) in homogeneous coordinates, and derivatives (n, 2, p) by parameters."""
     u, by_matrix = projected(source, x[:8])
     if strength > 0:
         u, slope = Equidistant(np.array([strength])).derivatives(u)[:2]
         by_matrix = slope @ by_matrix
-    return distorted(u, by_matrix, x[8:])
+    return _through(u, by_matrix, x[8:])
+
+
+def _through(u: Array, by_others: Array, x: Array) -> tuple[Array, Array]:
+    """Images of points as :func:`distorted`, of a plane that moves if parameters of a motion follow."""
+    lens, motion = x[: len(_LENS_SIGMA)], x[len(_LENS_SIGMA) :]
+    image, by_all = distorted(u, by_others, lens)
+    for _ in range(_ROWS if len(motion) else 0):
+        moved, by_u, by_motion = moving(u, image[:, 1], motion)
+        image, by_all = distorted(moved, np.concatenate([by_u @ by_others, by_motion], axis=2), lens)
+    before, own = by_others.shape[2], len(motion)
+    # Those of the motion come last.
+    return image, np.concatenate(
+        [by_all[..., :before], by_all[..., before + own :], by_all[..., before : before + own]], axis=2
+    )
 
 
 def lens_through(
-    at: Array, xy: Array, sigma: Array, shape: tuple[int, int], start: Chain
+    at: Array, xy: Array, sigma: Array, shape: tuple[int, int], start: Chain, *, moves: bool = False
 ) -> FoundMapping | None:
     """Least-squares mapping with distortion, see :func:`mapping_through`; None if there is none.
 
@@ -182,6 +208,8 @@ def lens_through(
         See :func:`mapping_through`.
     start : Chain
         Whose projectivity the iteration starts from; its fisheye is kept.
+    moves : bool
+        Whether the plane moves while the rows are read one by one.
     """
     h, w = shape
     middle, half = np.array([w - 1, h - 1]) / 2, max(h, w) / 2
@@ -196,11 +224,15 @@ def lens_through(
 
     here = source(at)
     seen, weight = (xy - middle) / half, np.repeat(half / np.hypot(sigma, _ROUGH_PX), 2)
-    x = np.append((first / first[2, 2]).ravel()[:8], np.zeros(len(_LENS_SIGMA)))
-    prior = np.append(np.zeros(8), 1 / _LENS_SIGMA)
+    usual = np.concatenate([_LENS_SIGMA, _MOTION_SIGMA[: 8 * moves]])
+    x = np.append((first / first[2, 2]).ravel()[:8], np.zeros(len(usual)))
+    prior = np.append(np.zeros(8), 1 / usual)
     last = np.inf
     for _ in range(_STEPS):
-        image, slopes = _seen(here, x, strength)
+        with np.errstate(over="ignore", invalid="ignore"):  # where it diverges
+            image, slopes = _seen(here, x, strength)
+        if not np.isfinite(slopes).all():
+            return None
         jacobian = slopes.reshape(-1, len(x)) * weight[:, None]
         off = (seen - image).ravel() * weight
         data = jacobian.T @ jacobian
@@ -239,7 +271,7 @@ def _expanded(x: Array) -> Array:
     """Coefficients (36, 2) of distortion in the monomials 1, u, v, u², u v, v², …"""
     # They are found from values, of which a polynomial of that degree has no residuals.
     u, inverse = _expansion()
-    return np.asarray(inverse @ (distorted(u, np.zeros((len(u), 2, 0)), x)[0] - u))
+    return np.asarray(inverse @ (_through(u, np.zeros((len(u), 2, 0)), x)[0] - u))
 
 
 @lru_cache(maxsize=1)

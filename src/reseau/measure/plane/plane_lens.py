@@ -6,7 +6,7 @@ import numpy as np
 
 from ...core.data import Array
 
-__all__ = ["distorted", "projected"]
+__all__ = ["distorted", "moving", "projected"]
 
 
 def projected(source: Array, matrix: Array) -> tuple[Array, Array]:
@@ -76,3 +76,35 @@ def distorted(u: Array, by_others: Array, x: Array) -> tuple[Array, Array]:
     return u + q / scale, np.concatenate(
         [own, by_radial, -by_u, by_ratio[:, :, None], by_p / scale[:, None]], axis=2
     )
+
+
+def moving(u: Array, row: Array, motion: Array) -> tuple[Array, Array, Array]:
+    """Images of points of a plane that moves while the rows of an image are read one by one.
+
+    Parameters
+    ----------
+    u : ndarray (n, 2)
+        Images while the middle row is read, without distortion.
+    row : ndarray (n,)
+        Rows in which the points are seen, from the middle one.
+    motion : ndarray (8,)
+        Change of the projectivity with the row v: u becomes (u + v (A u + b)) / (1 + v c · u); the elements
+        of A, b and c in this order.
+
+    Returns
+    -------
+    images : ndarray (n, 2)
+    by_u : ndarray (n, 2, 2)
+        Their derivatives in a row.
+    by_motion : ndarray (n, 2, 8)
+    """
+    a, c, one = motion[:4].reshape(2, 2), motion[6:], np.eye(2)
+    depth = (1 + row * (u @ c))[:, None, None]
+    moved = (u + row[:, None] * (u @ a.T + motion[4:6])) / depth[..., 0]
+    by_motion = np.zeros((len(u), 2, 8))
+    by_motion[:, 0, :2] = by_motion[:, 1, 2:4] = u
+    by_motion[:, :, 4:6] = one
+    by_motion[:, :, 6:] = -moved[:, :, None] * u[:, None]
+    by_motion *= row[:, None, None] / depth
+    by_u = (one + row[:, None, None] * (a - moved[:, :, None] * c)) / depth
+    return moved, by_u, by_motion

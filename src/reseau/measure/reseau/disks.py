@@ -28,6 +28,8 @@ _ELLIPTIC = 0.97
 _NARROWEST = 0.2
 """Minimum ratio of the axes."""
 
+_Parts = tuple[Array, Array, Array, Array]
+
 
 @dataclass(frozen=True, eq=False)
 class Disks:
@@ -71,17 +73,18 @@ def find_disks(grey: NDArray[np.float32], valid: Mask, noise: float) -> Disks:
     noise : float
         Standard deviation of the grey values.
     """
-    found, values, before = [], _compact(grey), 1
-    low = high = values
-    # Integers are compared with an integer: with a number of another kind all of them would be converted.
-    least: Any = _LEAST_CONTRAST * noise
-    least = int(least) if values.dtype.kind in "ui" else least
-    for side in _SIDES_PX:
-        square = np.ones((side - before + 1,) * 2, np.uint8)  # minimum over a square of squares
-        low, high, before = cv2.erode(low, square), cv2.dilate(high, square), side
-        contrast = high - low
-        dark = (values - low < high - values) & (contrast > least) & valid
-        found.append(_parts(dark, contrast, side))
+    found = _of_sizes(_compact(grey), valid, noise, _SIDES_PX)
+    part, there, reduced = grey, valid, 1
+    # Larger ones are found as well in a smaller picture.
+    while min(grey.shape) > 2 * reduced * _SIDES_PX[-1]:
+        reduced *= 2
+        size = (grey.shape[1] // reduced, grey.shape[0] // reduced)
+        even = np.s_[: 2 * size[1], : 2 * size[0]]
+        part = cv2.resize(part[even], size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        there = there[even]
+        there = there[::2, ::2] & there[1::2, ::2] & there[::2, 1::2] & there[1::2, 1::2]
+        for xy, moments, quality, t in _of_sizes(part, there, noise, _SIDES_PX[-1:]):
+            found.append((reduced * (xy + 0.5) - 0.5, reduced**2 * moments, quality, reduced * t))
     xy, moments, quality, t = (np.concatenate(column) for column in zip(*found, strict=True))
     if not len(xy):
         return Disks(np.empty((0, 2)), np.empty((0, 2, 2)), t)
@@ -90,6 +93,21 @@ def find_disks(grey: NDArray[np.float32], valid: Mask, noise: float) -> Disks:
     keep, t = np.flatnonzero(_once(xy, 2 * np.sqrt(value[:, 0]), quality)), t / noise
     keep = keep[np.argsort(-t[keep], kind="stable")]
     return Disks(xy[keep], form[keep], t[keep])
+
+
+def _of_sizes(values: NDArray[Any], valid: Mask, noise: float, sides: tuple[int, ...]) -> list[_Parts]:
+    """Elliptic components of a frame thresholded in squares of some sides; see :func:`_parts`."""
+    found, before, low, high = [], 1, values, values
+    # Integers are compared with an integer: with a number of another kind all of them would be converted.
+    least: Any = _LEAST_CONTRAST * noise
+    least = int(least) if values.dtype.kind in "ui" else least
+    for side in sides:
+        square = np.ones((side - before + 1,) * 2, np.uint8)  # minimum over a square of squares
+        low, high, before = cv2.erode(low, square), cv2.dilate(high, square), side
+        contrast = high - low
+        dark = (values - low < high - values) & (contrast > least) & valid
+        found.append(_parts(dark, contrast, side))
+    return found
 
 
 def _compact(grey: NDArray[Any]) -> NDArray[Any]:
@@ -101,7 +119,7 @@ def _compact(grey: NDArray[Any]) -> NDArray[Any]:
     return whole if np.array_equal(whole, grey) else grey
 
 
-def _parts(mask: Mask, contrast: NDArray[Any], side: int) -> tuple[Array, Array, Array, Array]:
+def _parts(mask: Mask, contrast: NDArray[Any], side: int) -> _Parts:
     """Centres (m, 2), second moments (m, 2, 2), ellipticity (m,), strength (m,) of elliptic components."""
     h, w = mask.shape
     sums, (left, right, top, bottom) = part_sums(mask)

@@ -140,6 +140,7 @@ class PlaneMarks(MarkWindows):
         found = self._tempered(rows, found, alike) if self.precise_start else alike
         if self.precise_start:
             found = self._with_doubtful_light(rows, found)
+        found = self._in_shadows(rows, found)
         found = replace(found, cov=found.cov + self._misformed(rows, found))
         why, off = self._why(rows, found), None
         if self.precise_start and not with_field:
@@ -275,6 +276,10 @@ class PlaneMarks(MarkWindows):
 
     def _without_growth(self, rows: Rows, found: Matches) -> Matches:
         """Matches without the growth of ink that all marks have in common; balanced marks are not shifted."""
+        return found
+
+    def _in_shadows(self, rows: Rows, found: Matches) -> Matches:
+        """Matches of which those across which edges of shadows run are made with these edges."""
         return found
 
     def _with_doubtful_light(self, rows: Rows, found: Matches) -> Matches:
