@@ -486,6 +486,8 @@ def _may_be(design: Design, shown: Sequence[BoardDesign]) -> bool:
     if isinstance(design, TestfieldDesign):
         # Its targets are disks, too.
         return kinds <= {"circles"}
+    if isinstance(design, BoardDesign) and design.dictionary is not None:
+        return any(each.dictionary is not None for each in shown)
     if isinstance(design, BoardDesign) and _plain(design):
         return design.kind in kinds
     return not _plain(design) or not shown or "circles" in kinds
