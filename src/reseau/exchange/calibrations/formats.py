@@ -210,6 +210,9 @@ class Exported(NamedTuple):
     share: float
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"<Exported: {self.camera.name}, model {self.camera.model}, at most {self.greatest_px:.2g} px off>"
+
 
 def export_calibration(
     calibration: Calibration, to: str, path: Path | str, *, anyway: bool = False
