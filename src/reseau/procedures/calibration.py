@@ -291,33 +291,31 @@ def _without_scale(result: Result) -> Failure | None:
     for c, camera in enumerate(result.network.cameras):
         if camera.registered is None or not camera.has_plane_mapping:
             continue
-        lens = camera_mapping(result, c)
-        relative = _relative_scale(lens)
-        if not relative <= _HARDLY:
-            scales = [name for name in camera.registered.of_role("scale") if name in lens.names]
-            name = scales[0] if scales else "the scale"
-            how = "" if np.isnan(relative) else f", which is uncertain by {100 * relative:.0f} %"
-            return Failure(
-                f"{camera.label}: the images do not determine {name}{how}; {_MORE_TILTED}",
-                Code.NOT_IDENTIFIED,
-            )
+        names, how = list(camera.registered.of_role("scale")), ""
+        # A model that was led to where it does not even image its axis has no scale at all.
+        values = result.fit.values.cameras[c, : len(camera.values)]
+        if np.isfinite(camera.bare_mapping(values)(np.zeros((1, 2)))).all():
+            lens = camera_mapping(result, c)
+            names = [name for name in names if name in lens.names]
+            relative = _relative_scale(lens)
+            if relative <= _HARDLY:
+                continue
+            how = f", which is uncertain by {100 * relative:.0f} %"
+        name = names[0] if names else "the scale"
+        return Failure(
+            f"{camera.label}: the images do not determine {name}{how}; {_MORE_TILTED}", Code.NOT_IDENTIFIED
+        )
     return None
 
 
 def _relative_scale(lens: CameraMapping) -> float:
-    """Relative standard deviation of the scale at the centre, which some models share between parameters.
-
-    NaN where the camera does not even image its axis.
-    """
+    """Relative standard deviation of the scale at the centre; some models share it between parameters."""
     mapping, zero = lens.mapping, np.zeros((1, 2))
 
     def scale(values: Array) -> float:
         moved = mapping.with_values(dict(zip(mapping.names, values.tolist(), strict=True)))
-        (a, b), (c, d) = moved.derivatives(zero).d_xy[0]
-        return float(np.sqrt(abs(a * d - b * c)))
+        return float(np.sqrt(abs(np.linalg.det(moved.derivatives(zero).d_xy[0]))))
 
-    if not np.isfinite(scale(np.array(mapping.values, dtype=np.float64))):
-        return np.nan
     values, slope = np.array(mapping.values, dtype=np.float64), np.zeros(len(lens.rows))
     for k, row in enumerate(lens.rows):
         step = np.zeros(len(values))

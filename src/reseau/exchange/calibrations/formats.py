@@ -211,7 +211,8 @@ class Exported(NamedTuple):
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        return f"<Exported: {self.camera.name}, model {self.camera.model}, at most {self.greatest_px:.2g} px off>"
+        off = f"at most {self.greatest_px:.2g} px off"
+        return f"<Exported: {self.camera.name}, model {self.camera.model}, {off}>"
 
 
 def export_calibration(
