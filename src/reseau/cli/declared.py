@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import GenericAlias, NoneType
@@ -98,6 +99,8 @@ def declared(command: Callable[..., Any]) -> Callable[..., Any]:
     shown = sorted(made, key=_place)
     called.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
     called.__annotations__ = {each.name: each.annotation for each in shown}
+    # The terminal breaks lines, not the source; lists are kept.
+    called.__doc__ = re.sub(r"(?<=\S)\n(?=\w)", " ", inspect.cleandoc(command.__doc__ or ""))
     return called
 
 
