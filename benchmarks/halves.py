@@ -6,8 +6,8 @@ The image coordinates that this project measured are beside it, one table a set,
 Those of other sets are read from the folder $RESEAU_CORPUS: tables ``NAME.csv.gz``, or photographs in folders
 ``NAME``, which are measured and whose table is then written there; without them these sets are skipped.
 
-All photographs of a set are calibrated as ``reseau calibrate`` does with its defaults, then each half with
-the model that was chosen on all. Halves are odd and even photographs, and halves by pose: photographs of
+All photographs of a set are calibrated as ``reseau calibrate`` does with its defaults, and so is each half,
+which chooses a model of its own. Halves are odd and even photographs, and halves by pose: photographs of
 similar poses, such as frames of a video, are groups, and whole groups are given to the halves in turn. Two
 calibrations are compared as ``reseau compare`` does. The ratio is the difference by the 95 % bound that is
 claimed for it, at the centre, and root mean square of the four corners; in a circular image, of the places
@@ -237,7 +237,7 @@ def by_pose(of: Photographs, done: Calibrated) -> tuple[list[str], list[str]]:
     return halves
 
 
-def compared(of: Photographs, halves: Iterable[Sequence[str]], model: CameraOptions) -> Halves | str:
+def compared(of: Photographs, halves: Iterable[Sequence[str]], model: CameraOptions | None) -> Halves | str:
     """Calibrate two halves and compare them; or why not."""
     lenses = []
     for half in halves:
@@ -402,10 +402,11 @@ def _outcome(of: Photographs, photographs: int, model: str) -> Row:
     used = list(done.measured)
     chosen = model_of(done)
     residuals = np.asarray(done.result.residuals)
-    odd = compared(of, alternating(used), chosen)
+    given = chosen if model else None
+    odd = compared(of, alternating(used), given)
     pose: Halves | str = "too few"
     if len(used) >= 2 * LEAST:
-        pose = compared(of, by_pose(of, done), chosen)
+        pose = compared(of, by_pose(of, done), given)
     return Row(
         of.name, photographs, len(used), sum(map(len, done.measured.values())),
         f"{chosen.model}, {len(chosen.free)}", float(np.sqrt(np.nanmean(residuals**2))), causes_of(done),

@@ -303,7 +303,9 @@ class Calibration(Document):
         return full
 
     def __repr__(self) -> str:
-        estimated = f"{len(self.covariance.names)} of {len(self.parameters)} parameters estimated"
+        formal = self.validity.get("sigma_formal", {})
+        count = sum(formal.get(name, 1.0) != 0 for name in self.covariance.names)
+        estimated = f"{count} of {len(self.parameters)} parameters estimated"
         sigma0 = "" if self.sigma0 is None else f", sigma0 {self.sigma0:.3f}"
         verdict = "" if self.assessment is None else f", {self.assessment.short}"
         return f"<Calibration: {self.kind} {self.name!r}{verdict}, {estimated}{sigma0}>"

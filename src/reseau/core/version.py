@@ -1,3 +1,3 @@
 """The version, as every document's provenance states it."""
 
-__version__ = "0.2.0"
+__version__ = "1.0.0"

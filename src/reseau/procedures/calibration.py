@@ -275,6 +275,8 @@ class _Job:
             if found.code is Code.NOT_CONVERGED:
                 return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
             return found
+        # What was not chosen may yet be there.
+        found = replace(found, considers=bool(choices))
         calibrated = Calibrated(found, measured, self.declined, choices, board, notes, wrong)
         loose = _without_scale(calibrated.result)
         return calibrated if loose is None else loose

@@ -151,7 +151,7 @@ def next_photograph(result: Result, empty: Mask) -> NextPhotograph | None:
         return None
     if not camera.has_plane_mapping or camera.additional is not None:
         return None
-    lens = camera_mapping(result, 0)
+    lens = camera_mapping(result, 0, formal=True)
     if lens.mapping.parallel or not result.fit.cofactors.reduced.known:
         return None
     target = _Target.of(result, lens)

@@ -48,9 +48,9 @@ def camera_mapping(
         covariance = result.fit.cofactors.reduced.block(columns, columns) * result.fit.variance
         degrees = float("inf")
     else:
-        uncertain = result.uncertainty(columns)
-        covariance, degrees = uncertain.covariance, uncertain.degrees
-    found = camera.parameters | dict(zip(names, values.tolist(), strict=True))
+        degrees = result.uncertainty(columns).degrees
+        names, covariance, _ = result.with_considered(c, names, columns)
+    found = camera.parameters | dict(zip(names, values.tolist(), strict=False))
     size = (camera.width, camera.height)
     return CameraMapping.of_estimates(camera.plane_mapping(), size, found, names, covariance, dof=degrees)
 
@@ -132,7 +132,7 @@ def projection_field_at(
             where=result.network.cameras[c].label,
             do="use the field without a distance",
         )
-    camera = camera_mapping(result, c, additional)
+    camera = camera_mapping(result, c, additional, formal=True)
     _, columns, _ = own_columns(result, c, additional)
     covariance = _with_mean_pose(result, c, columns)
     xy, shape = places(camera, across, down)

@@ -24,6 +24,7 @@ from ..network import Network
 from ..network.stage import perpendicular
 from ..solver import BundleFit
 from ..solver.rank import missing_windows
+from .considered import Considered, considered
 from .estimates import (
     CameraEstimate,
     ImageEstimates,
@@ -102,6 +103,9 @@ class Result(Estimated, Display):
     validation : (float, float), optional
         Cross-validation: root mean square error of predicted image coordinates, in their standard deviations,
         with all parameters and with the kept ones.
+    considers : bool
+        Whether the covariances of cameras contain what coefficients could do that were held at zero; it suits
+        a model that was chosen by these observations.
 
     Examples
     --------
@@ -123,6 +127,7 @@ class Result(Estimated, Display):
     components: VarianceComponents[BundleFit] | None = None
     eliminated: tuple[Eliminated, ...] | None = None
     validation: tuple[float, float] | None = None
+    considers: bool = False
 
     @property
     def sigma0(self) -> float:
@@ -272,7 +277,40 @@ class Result(Estimated, Display):
         return shared_errors(self.fit) if self.fit.cofactors.reduced.known else None
 
     def uncertainty(self, columns: Rows) -> Uncertainty:
-        """Covariance of reduced unknowns (k,) that contains what the points of each image have in common."""
+        """Covariance of parameters of cameras (k,), by their columns among the reduced unknowns.
+
+        It contains what the points of each image have in common and, where the model was chosen, what
+        coefficients could do that were not estimated.
+        """
+        found = self._shared_uncertainty(columns)
+        more = [each.errors(columns)[: len(columns), : len(columns)] for each in self._considered.values()]
+        return found if not more else found.with_errors(np.sum(more, axis=0))
+
+    def with_considered(
+        self, c: int, names: tuple[str, ...], columns: Rows
+    ) -> tuple[tuple[str, ...], Array, Array | None]:
+        """Names and covariance of a camera's parameters with coefficients that were held, and their part."""
+        k, covariance, own = len(columns), self.uncertainty(columns).covariance, self._considered.get(c)
+        if own is None:
+            return names, covariance, None
+        part = own.errors(columns)
+        total = part.copy()
+        total[:k, :k] = covariance
+        return (*names, *own.names), total, part
+
+    @cached_property
+    def _considered(self) -> dict[int, Considered]:
+        """Coefficients of each camera that were held at zero, where some were."""
+        found = dict[int, Considered]()
+        for c in range(len(self.network.cameras) if self.considers else 0):
+            columns = self.camera_columns(c)[1]
+            own = considered(self.fit, c, columns, self._shared_uncertainty(columns).covariance)
+            if own is not None:
+                found[c] = own
+        return found
+
+    def _shared_uncertainty(self, columns: Rows) -> Uncertainty:
+        """The covariance that contains what the points of each image have in common."""
         if self.shared is not None and len(columns):
             return self.shared.uncertainty(columns)
         formal = self.fit.cofactors.reduced.block(columns, columns) * self.fit.variance

@@ -151,6 +151,14 @@ class Uncertainty:
     dof: Array
     degrees: float
 
+    def with_errors(self, square: Array) -> Uncertainty:
+        """The same with errors whose mean squares (k, k) are known."""
+        before, total = np.diag(self.covariance), self.covariance + square
+        share = np.divide(np.diag(total), before, out=np.ones(len(before)), where=before > 0)
+        root = np.linalg.pinv(self.formal, hermitian=True)
+        mean = np.trace(root @ total) / max(float(np.trace(root @ self.covariance)), 1e-300)
+        return Uncertainty(total, self.formal, self.dof * share**2, self.degrees * float(mean) ** 2)
+
 
 @dataclass(frozen=True, eq=False)
 class SharedErrors:

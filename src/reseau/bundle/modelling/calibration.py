@@ -62,35 +62,39 @@ def calibration_of(
     if not names:
         raise UsageError("no parameter was estimated", where=f"camera {camera}")
     found = result.camera(c)
-    covariance = result.uncertainty(result.camera_columns(c)[1]).covariance
-    sigma = np.sqrt(np.diag(covariance))
+    columns = result.camera_columns(c)[1]
+    every, covariance, held = result.with_considered(c, names, columns)
+    sigma = dict(zip(every, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     parameters = {
-        key: Quantity(value=value, sigma=0.0, unit=entry.unit_of(key))
-        for key, value in entry.parameters.items()
-    } | {
-        key: Quantity(value=float(value), sigma=float(s), unit=entry.unit_of(key))
-        for key, value, s in zip(names, values, sigma, strict=True)
+        key: Quantity(value=value, sigma=sigma.get(key, 0.0), unit=entry.unit_of(key))
+        for key, value in (entry.parameters | dict(zip(names, values.tolist(), strict=True))).items()
     }
-    degrees = result.uncertainty(result.camera_columns(c)[1]).degrees
+    degrees = result.uncertainty(columns).degrees
     dof = {"degrees_of_freedom": degrees} if np.isfinite(degrees) else {}
     used = result.fit.usable.observations & ~result.rejected
     xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
     targets = covariance_by_targets(result, c)
-    by_targets = {} if targets is None else {"covariance_of_targets": targets.tolist()}
+    targets = None if targets is None else np.pad(targets, (0, len(every) - len(names)))
+    parts = {
+        f"covariance_of_{name}": part.tolist()
+        for name, part in (("targets", targets), ("held", held)) if part is not None
+    }  # fmt: skip
+    # Coefficients that were held have no formal sigma.
+    formal = dict.fromkeys(every, 0.0) | dict(zip(names, found.sigma_formal.tolist(), strict=True))
     return Calibration(
         kind="camera",
         name=name,
         model=_model(entry),
         parameters=parameters,
-        covariance=Covariance(names=names, matrix=tuple(tuple(row) for row in covariance.tolist())),
+        covariance=Covariance(names=every, matrix=tuple(tuple(row) for row in covariance.tolist())),
         sigma0=result.sigma0 if result.redundancy > 0 else None,
         redundancy=result.redundancy,
         place=_place(result, camera),
         tests=tuple(vars(test) for test in result.camera_tests(c)),
         validity={"extent": [*xy.min(axis=0).tolist(), *xy.max(axis=0).tolist()], "unit": "px",
-                  "sigma_formal": dict(zip(names, found.sigma_formal.tolist(), strict=True)), **dof,
+                  "sigma_formal": formal, **dof,
                   "images": int(np.count_nonzero(result.fit.usable.images & (result.network.camera_of == c))),
-                  **by_targets, "rms_px": result.rms_px(c),
+                  **parts, "rms_px": result.rms_px(c),
                   "warnings": [remark.text for remark in result.warnings],
                   "warning_codes": [remark.code.value for remark in result.warnings]},
         provenance=dict(provenance or {}),

@@ -169,14 +169,20 @@ def _add_adjustment(
     """Contributions that share the variance factor of the adjustment; returns the covariance less these."""
     where = f"calibration {calibration.name}"
     degrees = float(calibration.redundancy) if calibration.sigma0 is not None else np.inf
-    part = calibration.validity.get("covariance_of_targets")
-    targets = np.zeros_like(covariance) if part is None else np.array(part, dtype=np.float64)
-    if targets.shape != covariance.shape:
-        raise UsageError("has a damaged `covariance_of_targets`", where=where)
+    parts = {name: calibration.validity.get(f"covariance_of_{name}") for name in ("targets", "held")}
+    for name, part in parts.items():
+        if part is not None and np.shape(part) != covariance.shape:
+            raise UsageError(f"has a damaged `covariance_of_{name}`", where=where)
+    none = np.zeros_like(covariance)
+    targets, held = (none if part is None else np.array(part, np.float64) for part in parts.values())
+    if parts["held"] is not None:
+        text = "model: coefficients that were not chosen"
+        found.append(("model", Contribution(text, held, np.inf)))
+        covariance = covariance - held
     shared = _shared(calibration, covariance - targets, np.diag(targets))
     grey = Contribution("grey values", covariance - targets - shared, degrees, group=_ADJUSTMENT)
     found.append(("grey values", grey))
-    if part is None:
+    if parts["targets"] is None:
         missing["target coordinates"] = "they were held, or estimated without observations of them"
     else:
         found.append(
@@ -196,7 +202,8 @@ def _shared(calibration: Calibration, rest: Array, targets: Array) -> Array:
         return np.zeros_like(rest)
     variance, names = np.diag(rest), calibration.covariance.names
     formal = np.array([given.get(name, np.inf) for name in names], dtype=np.float64) ** 2 - targets
-    ratio = np.sqrt(np.clip(formal / np.where(variance > 0, variance, 1.0), 0.0, 1.0))
+    none = variance <= 1e-12 * np.diag(calibration.covariance.matrix)
+    ratio = np.where(none, 1.0, np.sqrt(np.clip(formal / np.where(none, 1.0, variance), 0.0, 1.0)))
     if (ratio > 1 - 1e-9).all():
         return np.zeros_like(rest)
     return _between(rest, rest * np.outer(ratio, ratio))
