@@ -166,6 +166,7 @@ for (const choice of document.querySelectorAll('[data-choose]')) {
     }
   };
   choice.addEventListener('change', choose);
+  choice.form.addEventListener('reset', () => setTimeout(choose));
   choose();
 }
 
