@@ -11,7 +11,7 @@ import dataclasses
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -227,6 +227,26 @@ def options_of(cls: type) -> dict[str, Declared]:
     document = getattr(cls, "model_fields", None)
     fields = [each.name for each in dataclasses.fields(cls)] if document is None else document
     return {name: found[name] for name in fields if name in found}
+
+
+def values_of_texts(cls: type, texts: Mapping[str, str], where: object) -> dict[str, Any]:
+    """Return values of declared options that are written as on the command line; empty ones are left out.
+
+    Raises
+    ------
+    UsageError
+        If there is no such option, or a text cannot be interpreted.
+
+    Examples
+    --------
+    >>> from reseau.measure import BoardOptions
+    >>> values_of_texts(BoardOptions, {"mirrored": "true", "psf_px": "", "fill": "0.8"}, "monday")
+    {'mirrored': True, 'fill': 0.8}
+    """
+    known = options_of(cls)
+    for name in texts.keys() - known.keys():
+        raise UsageError(f"unknown key `{name}`", where=where)
+    return {name: known[name].read(text, name) for name, text in texts.items() if text.strip()}
 
 
 def words(texts: Iterable[str]) -> list[str]:

@@ -294,19 +294,16 @@ def _without_scale(result: Result) -> Failure | None:
         if camera.registered is None or not camera.has_plane_mapping:
             continue
         names, how = list(camera.registered.of_role("scale")), ""
-        # A model that was led to where it does not even image its axis has no scale at all.
+        # A model that does not even image its axis has no scale at all.
         values = result.fit.values.cameras[c, : len(camera.values)]
         if np.isfinite(camera.bare_mapping(values)(np.zeros((1, 2)))).all():
             lens = camera_mapping(result, c)
             names = [name for name in names if name in lens.names]
-            relative = _relative_scale(lens)
-            if relative <= _HARDLY:
+            if (relative := _relative_scale(lens)) <= _HARDLY:
                 continue
             how = f", which is uncertain by {100 * relative:.0f} %"
-        name = names[0] if names else "the scale"
-        return Failure(
-            f"{camera.label}: the images do not determine {name}{how}; {_MORE_TILTED}", Code.NOT_IDENTIFIED
-        )
+        what = f"{names[0] if names else 'the scale'}{how}; {_MORE_TILTED}"
+        return Failure(f"{camera.label}: the images do not determine {what}", Code.NOT_IDENTIFIED)
     return None
 
 

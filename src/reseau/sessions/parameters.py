@@ -19,7 +19,7 @@ from ..capture.by_hand import check_reach
 from ..capture.steps import HEIGHT, paper_steps, parse_steps
 from ..core import vocabulary as v
 from ..core.errors import FormatError, StateError, UsageError
-from ..core.options import Group, Option, options_of
+from ..core.options import Group, Option
 from ..instruments import Camera, CameraRig, EnvironmentSensor, Turntable
 from ..io import Document
 
@@ -60,17 +60,12 @@ def present_keys(parameters: Mapping[str, Any]) -> dict[str, Any]:
     return {_FORMERLY.get(key, key): value for key, value in parameters.items()}
 
 
-_Pose = tuple[str, dict[str, float]]
-
-
-def _poses(text: str) -> tuple[_Pose, ...]:
-    """Names and positions of the poses of a table."""
-    return tuple((step.name, dict(step.position)) for step in parse_steps(text, "poses"))
-
-
 _Poses = Annotated[
-    tuple[_Pose, ...],
-    Option("CSV of poses, one column for each axis, and one for the name if they have some.", parse=_poses),
+    tuple[tuple[str, dict[str, float]], ...],
+    Option(
+        "CSV of poses, one column for each axis, and one for the name if they have some.",
+        parse=lambda text: tuple((s.name, dict(s.position)) for s in parse_steps(text, "poses")),
+    ),
 ]
 
 
@@ -131,27 +126,6 @@ class SessionParameters(Document):
         except (TypeError, ValueError) as error:
             raise FormatError(f"not JSON ({error})", where=where) from None
         return cls.parse(text, where=where)
-
-    @classmethod
-    def from_texts(cls, texts: Mapping[str, str], *, where: object) -> dict[str, Any]:
-        """Return parameters that are written as on the command line; empty ones are left out.
-
-        Raises
-        ------
-        FormatError
-            If there is no such parameter.
-        UsageError
-            If a text cannot be interpreted.
-
-        Examples
-        --------
-        >>> FramesParameters.from_texts({"count": "3", "park": "tilt=0", "seed": ""}, where="monday")
-        {'count': 3, 'park': {'tilt': 0.0}}
-        """
-        known = options_of(cls)
-        for name in texts.keys() - known.keys():
-            raise FormatError(f"unknown key `{name}`", where=where)
-        return {name: known[name].read(text, name) for name, text in texts.items() if text.strip()}
 
     @classmethod
     def defaults(cls, bench: Bench) -> dict[str, Any]:

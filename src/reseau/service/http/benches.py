@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import Field
 
+from ...core.options import values_of_texts
 from ..accounts import Principal
 from .access import Here, NotFound, Operating, Reading, operating
 from .answers import Answer, refusals
@@ -304,7 +305,7 @@ def begin(bench: BenchName, given: NewSession, who: Operating, service: Here) ->
     the_bench(service, bench)
     new_name(service, given.name)
     order = given.model_dump(exclude={"texts"}) | {"by": who.name}
-    order["parameters"] |= kind_of(given.plan).parameters.from_texts(given.texts, where=given.name)
+    order["parameters"] |= values_of_texts(kind_of(given.plan).parameters, given.texts, given.name)
     _asked(service, bench, who, "begin session", "begin", order, 60.0)
     return bench_answer(service, the_bench(service, bench))
 
