@@ -504,21 +504,18 @@ class Calibration(Document):
         UsageError
             When one is not that of a camera, or the images differ in size.
         """
-        if isinstance(other, str | Path):
-            other = Calibration.read(Path(other))
-        elif callable(made := getattr(other, "calibration", None)):  # that of a result
-            other = made()
-        for each in (self, other):
+        second: Any = Calibration.read(Path(other)) if isinstance(other, str | Path) else other
+        if callable(made := getattr(second, "calibration", None)):  # that of a result
+            second = made()
+        for each in (self, second):
             if not isinstance(each, Calibration):
                 raise UsageError(
-                    f"is of type {type(each).__name__}",
-                    where="other",
-                    do="use reseau.read_calibration",
+                    f"is of type {type(each).__name__}", where="other", do="use reseau.read_calibration"
                 )
             if each.kind != "camera":
                 raise UsageError(each.not_of("camera"), where=f"calibration {each.name}")
         found: FieldDifference = above("reseau.calibration.compare:calibration_difference")(
-            self.mapping(), other.mapping()
+            self.mapping(), second.mapping()
         )
         return found
 

@@ -289,12 +289,11 @@ def _cameras_of(images: Iterable[str], taken: Mapping[str, Taken] | None) -> tup
 
 
 def _without_scale(result: Result) -> Failure | None:
-    """A failure where the pixels in a radian at the centre, or a magnification, are hardly known at all."""
+    """A failure where the pixels in a radian at the centre, or a magnification, are hardly known, if any."""
     for c, camera in enumerate(result.network.cameras):
         if camera.registered is None or not camera.has_plane_mapping:
             continue
         names, how = list(camera.registered.of_role("scale")), ""
-        # A model that does not even image its axis has no scale at all.
         values = result.fit.values.cameras[c, : len(camera.values)]
         if np.isfinite(camera.bare_mapping(values)(np.zeros((1, 2)))).all():
             lens = camera_mapping(result, c)
@@ -302,8 +301,8 @@ def _without_scale(result: Result) -> Failure | None:
             if (relative := _relative_scale(lens)) <= _HARDLY:
                 continue
             how = f", which is uncertain by {100 * relative:.0f} %"
-        what = f"{names[0] if names else 'the scale'}{how}; {_MORE_TILTED}"
-        return Failure(f"{camera.label}: the images do not determine {what}", Code.NOT_IDENTIFIED)
+        what = f"the images do not determine {names[0] if names else 'the scale'}{how}; {_MORE_TILTED}"
+        return Failure(f"{camera.label}: {what}", Code.NOT_IDENTIFIED)
     return None
 
 

@@ -219,11 +219,11 @@ def begin_session(place: Place, browser: Browser, name: str) -> None:
         "plan.dispatchEvent(new Event('change'))"
     )
     form = "fieldset[data-for=testfield]"
-    for name in ("free", "pitch_mm", "row_jitter_px", "fill"):
-        value: Any = PARAMETERS[name]
-        written(browser, f"{form} [name='texts.{name}']", ",".join(value) if name == "free" else str(value))
+    for key in ("free", "pitch_mm", "row_jitter_px", "fill"):
+        value: Any = PARAMETERS[key]
+        written(browser, f"{form} [name='texts.{key}']", ",".join(value) if key == "free" else str(value))
     poses = place.folder / "poses.csv"
-    rows = [",".join((name, *map(str, position.values()))) for name, position in STEPS]
+    rows = [",".join((step, *map(str, position.values()))) for step, position in STEPS]
     poses.write_text("\n".join(("name,tilt,roll,camera_roll", *rows)) + "\n")
     chosen(browser, f"{form} [data-text='texts.steps']", poses)
     chosen(browser, f"{form} [data-input]", place.folder / "design.json")

@@ -198,7 +198,7 @@ def bench_page(request: Request, bench: str, who: Reading, service: Here) -> Res
         busy=busy,
         plans={
             plan: _PlanForm.of(kind)
-            for plan, kind in reversed(kinds.KINDS.items())
+            for plan, kind in reversed(list(kinds.KINDS.items()))
             if plan not in ("own", *kinds.OF_FILES)
         },
     )
