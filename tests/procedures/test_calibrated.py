@@ -162,7 +162,7 @@ def test_a_file_is_written_in_the_format_of_its_suffix(
     for each in (done, read):
         with pytest.raises(UsageError, match=r"cam\.yml: is not \.json; export\(path, to="):
             each.write(tmp_path / "cam.yml")
-    with pytest.raises(UsageError, match=r"is not \.html"):
+    with pytest.raises(UsageError, match=r"has the suffix '\.pdf'; use \.html"):
         done.report(tmp_path / "report.pdf")
     assert not list(tmp_path.iterdir())
     done.report(tmp_path / "report.html")
