@@ -1,17 +1,19 @@
 """Draws pictures of the README, the tours and the how-to pages, for light and, with `-dark`, for dark pages.
 
     python docs/figures.py calibration
+    python docs/figures.py gallery
     python docs/figures.py tour-camera|seen|blurred|underwater|fiducial-marks|reseau-on-film FOLDER
 
-The first is drawn by `docs/desk.py`. The others show results of pages: the folder is the one in which the
-commands of `docs/tours/camera.md`, `blurred.md`, `blurred-under-water.md` or of
-`docs/howto/fiducial-marks.md` and `reseau-on-film.md` were followed.
+The first is drawn by `docs/desk.py`, the second ones by examples of the gallery. The others show results of
+pages: the folder is the one in which the commands of `docs/tours/camera.md`, `blurred.md`,
+`blurred-under-water.md` or of `docs/howto/fiducial-marks.md` and `reseau-on-film.md` were followed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import runpy
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -19,8 +21,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from desk import Desk
+from matplotlib import pyplot
 from matplotlib.figure import Figure
-from themes import save
+from themes import reset, save
 
 import reseau
 from reseau.core.data import Frame
@@ -164,14 +167,47 @@ def reseau_on_film(folder: Path) -> Figure:
     return figure
 
 
+def gallery() -> None:
+    """Draw the pictures of how-to pages that examples of the gallery make."""
+    for name, (example, number) in GALLERY.items():
+        reset({}, example)
+        runpy.run_path(str(Path(__file__).with_name("gallery") / f"{example}.py"))
+        save(pyplot.figure(number), IMAGES / f"{name}.png", dpi=80)
+        print(IMAGES / f"{name}.png")
+
+
+GALLERY = {
+    "camera-models": ("images/camera_models", 1),
+    "noise": ("images/noise", 1),
+    "refraction": ("images/refraction", 2),
+    "blunders": ("networks/blunders", 1),
+    "choice-of-model": ("networks/choose_model", 1),
+    "ellipses": ("networks/ellipses", 1),
+    "results": ("networks/plots", 2),
+    "network": ("networks/read_network", 1),
+    "photon-transfer": ("sensors/photon_transfer", 1),
+    "slanted-edge": ("sensors/slanted_edge", 1),
+    "disks": ("targets/disks", 1),
+    "film-frame": ("targets/film_edges", 1),
+    "reseau-wires": ("targets/reseau_crosses", 1),
+    "distortion": ("targets/reseau_crosses", 2),
+    "budget": ("uncertainty/certificate", 1),
+    "drift": ("uncertainty/drift", 1),
+}
+"""Pictures by their names: example, and number of its figure."""
+
+
 def main() -> None:
     """Draw the picture that is named."""
     parser = argparse.ArgumentParser(description="Pictures of the README and the tours.")
-    parser.add_argument("name", choices=["calibration", *TOURS])
+    parser.add_argument("name", choices=["calibration", "gallery", *TOURS])
     parser.add_argument("folder", nargs="?", type=Path, help="where the commands of the tour were followed")
     given = parser.parse_args()
-    if (given.folder is None) != (given.name == "calibration"):
+    if (given.folder is None) != (given.name not in TOURS):
         parser.error("the picture of a tour needs the folder of the tour")
+    if given.name == "gallery":
+        gallery()
+        return
     with drawing():
         figure = calibration() if given.folder is None else TOURS[given.name](given.folder)
         save(figure, IMAGES / f"{given.name}.png")

@@ -49,6 +49,7 @@ from .procedures.exposures import photographs_named
 from .procedures.film_frame import FrameOptions, FrameResult, orient_scan
 from .procedures.refined import Refined
 from .procedures.refining import Photographs, RefineOptions, refine_photographs
+from .procedures.which_target import measured_or_shown
 
 T = TypeVar("T")
 
@@ -246,7 +247,8 @@ def measure(
     Returns
     -------
     Measured or Failure
-        Image coordinates in pixels, `ok` and `why` of every mark; a failure when the target is not found.
+        Image coordinates in pixels, `ok` and `why` of every mark; a failure when the target is not found,
+        which says what board the image shows in its place.
 
     Raises
     ------
@@ -258,7 +260,8 @@ def measure(
     if isinstance(target, TestfieldDesign):
         return measure_testfield(frame, target, _options(options, TestfieldOptions))
     if isinstance(target, BoardDesign):
-        return measure_board(frame, target, _options(options, BoardOptions))
+        chosen = _options(options, BoardOptions)
+        return measured_or_shown(frame, target, lambda each: measure_board(each, target, chosen))
     if target.mark.shape == "rod":
         return measure_pins(frame, target, _options(options, PinOptions))
     return measure_reseau(frame, target, _options(options, ReseauOptions))

@@ -136,6 +136,7 @@ def test_a_how_to_is_one_task_on_at_most_two_screens(page: Path) -> None:
     assert len(re.findall(r"^# ", prose(page), re.MULTILINE)) == 1
     if page.stem != "index":
         assert len(text.splitlines()) <= TWO_SCREENS
+        assert re.search(r"Next:\s+\[", text)
         assert re.search(rf"^{page.stem}$", (DOCS / "howto" / "index.md").read_text("utf-8"), re.MULTILINE)
 
 

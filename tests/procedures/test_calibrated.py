@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, get_type_hints
 
@@ -13,6 +13,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
+import reseau
 from reseau.api import Adjusted
 from reseau.bundle import Result
 from reseau.calibration import Calibration
@@ -107,6 +108,29 @@ def test_two_calibrations_of_a_camera_agree_and_those_of_two_cameras_do_not(
     assert difference.plot().get_title(loc="left").startswith("difference × ")
 
 
+def test_a_stored_calibration_is_compared_and_reported_as_a_fresh_one(
+    done: Calibrated, read: Calibration, tmp_path: Path
+) -> None:
+    done.write(tmp_path / "camera.json")
+    for found in (done.compare(tmp_path / "camera.json"), read.compare(done), read.compare(read)):
+        assert found.greatest_px < 1e-6
+    read.report(tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text("utf-8")
+    assert all(line in page for line in done.assessments["camera"].lines)
+    assert all(text in page for text in read.printed().values())
+    with pytest.raises(UsageError, match=r"report\.txt: has the suffix"):
+        read.report(tmp_path / "report.txt")
+    with pytest.raises(UsageError, match="has no image points"):
+        read.residuals()
+
+
+def test_a_model_that_is_led_astray_is_refused_in_words(reference_data: Callable[[str], Path]) -> None:
+    case = reference_data("cases") / "newcomer" / "python-no-verdict"
+    found = reseau.calibrate(case / "s5", case / "board.json", model="double_sphere")
+    assert not found
+    assert "the images do not determine fx" in found.reason
+
+
 def test_a_result_is_pickled_and_copied(done: Calibrated) -> None:
     for again in (pickle.loads(pickle.dumps(done)), copy.deepcopy(done)):
         assert again.assessment == done.assessment
@@ -138,7 +162,7 @@ def test_a_file_is_written_in_the_format_of_its_suffix(
     for each in (done, read):
         with pytest.raises(UsageError, match=r"cam\.yml: is not \.json; export\(path, to="):
             each.write(tmp_path / "cam.yml")
-    with pytest.raises(UsageError, match=r"is not \.html"):
+    with pytest.raises(UsageError, match=r"has the suffix '\.pdf'; use \.html"):
         done.report(tmp_path / "report.pdf")
     assert not list(tmp_path.iterdir())
     done.report(tmp_path / "report.html")

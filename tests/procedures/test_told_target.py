@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import pytest
 
+import reseau
 from reseau.core.data import Frame
 from reseau.core.failure import Code, Failure
 from reseau.designs import board
@@ -16,6 +18,7 @@ from reseau.io import BoardDesign
 from reseau.procedures.calibration import calibrate_camera
 from reseau.procedures.target_measurement import drawing_overlays, measurer_of
 from reseau.procedures.told_target import TargetMeasured, measured_as_shown
+from reseau.procedures.which_target import corrected
 
 from .. import kept
 from ..measure.board_pictures import picture
@@ -56,6 +59,9 @@ def measured(printed: BoardDesign, told: BoardDesign) -> TargetMeasured:
         (CHESS, {"columns": 8, "rows": 7}, "columns 7 in place of 8, rows 6 in place of 7"),
         (CHARUCO, {"columns": 6, "rows": 7}, "columns 7 in place of 6, rows 6 in place of 7; calibrated"),
         (CHARUCO, {"dictionary": "DICT_4X4_50"}, "dictionary DICT_5X5_50 in place of DICT_4X4_50"),
+        (CHARUCO, {"rows": 5}, "rows 6 in place of 5; calibrated"),
+        (LEGACY, {"rows": 5}, "rows 6 in place of 5; calibrated"),
+        (APRIL, {"rows": 3}, "rows 4 in place of 3; calibrated"),
         (LEGACY, {"legacy": False}, "legacy True in place of False"),
         (APRIL, {"pitch": 40.0}, "in other proportions than was told: pitch 30.0 in place of 40.0"),
         (CIRCLES, {"columns": 8}, "columns 7 in place of 8; calibrated"),
@@ -117,6 +123,27 @@ def test_what_photographs_show_in_place_of_another_kind_of_board_is_said() -> No
     # All are declined for one reason, which is said once.
     assert found.reason.count("no marker of the board was read") == 1
     assert "; 0.png, 1.png, 2.png: board" in found.reason
+
+
+def test_a_frame_that_contradicts_the_design_says_what_it_shows() -> None:
+    told = CHESS.model_copy(update={"columns": 8})
+    found = reseau.measure(photographs(CHESS)[0], told)
+    assert not found
+    assert found.reason.endswith(
+        "; the photograph shows a chessboard of 7 × 6 squares: columns 7 in place of 8; correct the design"
+    )
+    other = reseau.measure(photographs(CHESS)[0], CIRCLES)
+    assert not other
+    assert other.reason.endswith("; the photograph shows a lattice of 7 × 6 squares without markers")
+
+
+def test_all_of_a_board_may_be_shown_where_a_part_is_recognised(
+    reference_data: Callable[[str], Path],
+) -> None:
+    case = reference_data("cases") / "reports1" / "light-circles-on-dark"
+    told = BoardDesign.read(case / "asym.json")
+    found = corrected([reseau.read_image(case / "thermal.png")], told)
+    assert found == told.model_copy(update={"polarity": "bright"})
 
 
 def test_photographs_that_show_a_target_are_named_where_there_are_too_few() -> None:

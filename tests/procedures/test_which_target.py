@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+import reseau
 from reseau.core.data import Frame
 from reseau.core.failure import Failure
 from reseau.designs import board, coded_sheet, coded_testfield
@@ -164,6 +166,13 @@ def test_parts_of_a_larger_chessboard_are_not_taken_for_a_smaller_one() -> None:
     assert not isinstance(found, Failure)
     assert found[0] == "a chessboard of 9 × 8 squares"
     assert which_target([part, part, part, frame], {"smaller": smaller, "larger": larger})
+
+
+def test_a_sheet_of_dots_without_a_design_is_declined(reference_data: Callable[[str], Path]) -> None:
+    files = sorted(reference_data("testfield_camcal").glob("*.JPG"))[:2]
+    found = which_target(map(reseau.read_image, files), dict(known_designs()), tried=2)
+    assert not found
+    assert found.reason.startswith("none of the known targets is seen")
 
 
 def test_photographs_with_another_zoom_are_named(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NotRequired, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NoReturn, NotRequired, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from typing_extensions import TypedDict  # pydantic needs this one before Python
 from ..core.data import Array
 from ..core.display import data_frame
 from ..core.errors import FormatError, UsageError
+from ..core.files import writable, write_whole
 from ..core.lazy import above
 from ..core.numbers import measured
 from ..io import Document, Strict
@@ -216,11 +217,8 @@ def readable_as(kind: Kind) -> Callable[[Callable[[Calibration], Any]], Callable
 
 def _table(calibration: Calibration) -> str:
     """The parameters as an HTML table."""
-    shown = {
-        name: measured(q.value, q.sigma, "" if q.unit == "1" else q.unit)
-        for name, q in calibration.parameters.items()
-    }
-    rows = "".join(f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>" for name, text in shown.items())
+    shown = calibration.printed().items()
+    rows = "".join(f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>" for name, text in shown)
     table = f"<table><caption>{escape(calibration.kind)} {escape(calibration.name)}</caption>{rows}</table>"
     return table if calibration.assessment is None else calibration.assessment._repr_html_() + table
 
@@ -338,6 +336,45 @@ class Calibration(Document):
         )
         return "\n".join((f"{self.kind} {self.name!r}", *verdict, *rows))
 
+    def printed(self) -> dict[str, str]:
+        """Return the parameters as text, with as many digits as their standard deviations support."""
+        return {
+            name: measured(q.value, q.sigma, "" if q.unit == "1" else q.unit)
+            for name, q in self.parameters.items()
+        }
+
+    def residuals(self) -> NoReturn:
+        """Refuse: residuals are those of :class:`reseau.Calibrated`, a calibration has no image points.
+
+        Raises
+        ------
+        UsageError
+            Always.
+        """
+        raise UsageError(
+            "has no image points", where=f"calibration {self.name}",
+            do="calibrate the photographs again, or see the report of that run",
+        )  # fmt: skip
+
+    def report(self, path: Path | str) -> None:
+        """Write verdict, errors over the image and parameters as an HTML page.
+
+        Parameters
+        ----------
+        path : path
+            File to write, ``.html``.
+
+        Raises
+        ------
+        UsageError
+            When the suffix is another one.
+        InputError
+            When the file cannot be written.
+        """
+        write_whole(
+            writable(Path(path), ".html"), above("reseau.report.calibration:calibration_report")(self)
+        )
+
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the error of the projection over the image with matplotlib.
 
@@ -454,30 +491,31 @@ class Calibration(Document):
         )
         return done
 
-    def compare(self, other: Calibration) -> FieldDifference:
+    def compare(self, other: Calibration | Path | str) -> FieldDifference:
         """Return the difference of another, independent calibration of the camera over the image.
 
         Parameters
         ----------
-        other : Calibration
-            Calibration of images of the same size; its model may be another one.
+        other : Calibration or path
+            Calibration of images of the same size, or its file; its model may be another one.
 
         Raises
         ------
         UsageError
             When one is not that of a camera, or the images differ in size.
         """
-        for each in (self, other):
+        second: Any = Calibration.read(Path(other)) if isinstance(other, str | Path) else other
+        if callable(made := getattr(second, "calibration", None)):  # that of a result
+            second = made()
+        for each in (self, second):
             if not isinstance(each, Calibration):
                 raise UsageError(
-                    f"is of type {type(each).__name__}",
-                    where="other",
-                    do="use reseau.read_calibration",
+                    f"is of type {type(each).__name__}", where="other", do="use reseau.read_calibration"
                 )
             if each.kind != "camera":
                 raise UsageError(each.not_of("camera"), where=f"calibration {each.name}")
         found: FieldDifference = above("reseau.calibration.compare:calibration_difference")(
-            self.mapping(), other.mapping()
+            self.mapping(), second.mapping()
         )
         return found
 

@@ -116,7 +116,7 @@ def at_heights(steps: Sequence[Step], heights: Sequence[float]) -> tuple[Step, .
 
 
 def read_steps(path: Path) -> tuple[Step, ...]:
-    """Read poses from a CSV file. Its header names axes of the table, and optionally a column `name`.
+    """Read poses from a CSV file; see :func:`parse_steps`.
 
     Raises
     ------
@@ -124,37 +124,44 @@ def read_steps(path: Path) -> tuple[Step, ...]:
         If the file cannot be read.
     FormatError
         If it is not such a table; the message names the line.
+    """
+    return parse_steps(read_text(path), path)
+
+
+def parse_steps(text: str, where: object) -> tuple[Step, ...]:
+    """Return the poses of a CSV table. Its header names axes of the table, and optionally a column `name`.
+
+    Raises
+    ------
+    FormatError
+        If it is not such a table; the message names the line.
 
     Examples
     --------
-    >>> import tempfile
-    >>> with tempfile.NamedTemporaryFile("w", suffix=".csv") as file:
-    ...     _ = file.write("name,tilt\\nfirst,0\\n,30\\n")
-    ...     file.flush()
-    ...     [step.name for step in read_steps(Path(file.name))]
+    >>> [step.name for step in parse_steps("name,tilt\\nfirst,0\\n,30\\n", "poses.csv")]
     ['first', 'tilt 30']
     """
-    rows = list(csv.reader(io.StringIO(read_text(path))))
+    rows = list(csv.reader(io.StringIO(text)))
     if len(rows) < 2 or not rows[0]:
-        raise FormatError("has no poses", where=path, do="write a header of axes and a line for each pose")
+        raise FormatError("has no poses", where=where, do="write a header of axes and a line for each pose")
     header = [cell.strip() for cell in rows[0]]
     steps: dict[str, Step] = {}
     for number, row in enumerate(rows[1:], 2):
         if not any(cell.strip() for cell in row):
             continue
         if len(row) != len(header):
-            raise FormatError(f"line {number} has {len(row)} cells, not {len(header)}", where=path)
+            raise FormatError(f"line {number} has {len(row)} cells, not {len(header)}", where=where)
         cells = dict(zip(header, (cell.strip() for cell in row), strict=True))
         name = cells.pop("name", None)
         try:
             position = {axis: float(value) for axis, value in cells.items()}
         except ValueError:
-            raise FormatError(f"line {number} has a value that is not a number", where=path) from None
+            raise FormatError(f"line {number} has a value that is not a number", where=where) from None
         if not all(math.isfinite(value) for value in position.values()):
-            raise FormatError(f"line {number} has a value that is not a number", where=path)
+            raise FormatError(f"line {number} has a value that is not a number", where=where)
         step = Step(name, position) if name else _named(position)
         if step.name in steps:
-            raise FormatError(f"line {number}: duplicate pose {step.name!r}", where=path, do="rename it")
+            raise FormatError(f"line {number}: duplicate pose {step.name!r}", where=where, do="rename it")
         steps[step.name] = step
     return tuple(steps.values())
 

@@ -157,9 +157,6 @@ def conduct(
         afterwards(session)
 
 
-_OPTION = {"object.json": "--test-object"}
-"""Options of input files that have another name in the archive."""
-
 _Started = tuple[str, "SessionParameters", "Bench", Callable[["Archive"], "Session"]]
 """Name, parameters and bench of a session, and a function that begins or recovers it once all is checked."""
 
@@ -177,9 +174,8 @@ def _new(
     texts = {}
     for role, path in inputs.items():
         if path is None:
-            raise UsageError(
-                "is missing", where=_OPTION.get(role, f"--{Path(role).stem}"), do="give the file"
-            )
+            option = sessions.input_option(role).replace("_", "-")
+            raise UsageError("is missing", where=f"--{option}", do="give the file")
         texts[role] = read_text(path)
         sessions.kind_of(plan).read(texts[role], role, path)
     path = where.bench or Path("bench.toml")

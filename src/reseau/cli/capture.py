@@ -86,32 +86,17 @@ def coded_field(
     on_stage: Heights,
     design: v.Design | None = None,
     poses: Annotated[v.Poses | None, "Default: the 36 poses of the paper."] = None,
-    until: Annotated[
-        str, Option("Choose poses until a goal is reached, as 'sigma_c < 0.5 um'.", value="GOAL")
-    ] = "",
-    first: Annotated[int, Option("With --until: number of poses before the first chosen one.", least=4)] = 5,
+    until: v.Until = "",
+    first: v.First = 5,
     pitch_mm: v.PitchMm | None = None,
     free: v.Free = (),
     row_jitter_px: v.RowJitterPx = 0.0,
     fill: v.Fill = 1.0,
-    park: Annotated[
-        str,
-        Option(
-            "Final position of the table. Default: the last pose.", Group.EXECUTION, value="tilt=0,roll=0"
-        ),
-    ] = "",
-    retreat: Annotated[
-        str,
-        Option(
-            "Position after an abort or an error. Default: no movement.",
-            Group.EXECUTION,
-            value="tilt=0,roll=0",
-        ),
-    ] = "",
+    park: v.Park | None = None,
+    retreat: v.Retreat | None = None,
     table: v.Table | None = None,
 ) -> None:
     """Record a testfield from many poses, and calibrate the camera during the acquisition."""
-    final, away = _position(park, "--park"), _position(retreat, "--retreat")
     levels = _numbers(on_stage.heights, "--heights")
 
     def parameters(bench: Bench) -> TestfieldParameters:
@@ -128,7 +113,8 @@ def coded_field(
         return TestfieldParameters(
             steps=tuple((step.name, dict(step.position)) for step in steps), until=until, first=first,
             pitch_mm=pitch_mm, free=free, sigmas=on_stage.sigmas if lifted else None,
-            row_jitter_px=row_jitter_px, fill=fill, park=final, retreat=away, table=table, **vars(exposing),
+            row_jitter_px=row_jitter_px, fill=fill, park=park or {}, retreat=retreat or {},
+            table=table, **vars(exposing),
         )  # fmt: skip
 
     conduct(where, "testfield", parameters, {"design.json": design})
@@ -170,7 +156,7 @@ def oscilloscope(
     exposing: Unchecked,
     reseau: v.Reseau | None = None,
     test_object: v.TestObject | None = None,
-    body: Annotated[bool, Option("Take PHOTO III.")] = True,
+    body: v.Body = True,
     scanner: v.Scanner | None = None,
     oscilloscope: v.Oscilloscope | None = None,
 ) -> None:
@@ -213,24 +199,13 @@ def _numbers(words: Sequence[str], option: str) -> tuple[float, ...]:
         ) from None
 
 
-def _position(text: str, option: str) -> dict[str, float]:
-    """Parse a position such as ``tilt=0,roll=0``."""
-    try:
-        pairs = [part.split("=") for part in text.split(",") if part.strip()]
-        return {axis.strip(): float(value) for axis, value in pairs}
-    except ValueError:
-        raise UsageError(
-            f"cannot interpret {text!r}", where=option, do="write axis=value, as tilt=0,roll=0"
-        ) from None
-
-
 @app.command()
 def sensor(
     where: Where,
     out: Annotated[v.Out | None, "Here the calibration, in addition to the archive."] = None,
     camera: v.Camera | None = None,
-    levels: Annotated[int, Option("Number of exposure times in light.", least=5)] = 14,
-    frames: Annotated[int, Option("Number of frames for each exposure time.", least=2)] = 8,
+    levels: v.Levels = 14,
+    frames: v.Frames = 8,
     longest_ms: v.LongestMs = 1000.0,
     mtf: Annotated[bool, Option("Also measure the MTF, with a slanted edge.")] = False,
     region: v.Region | None = None,

@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import inspect
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import GenericAlias, NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
@@ -19,10 +19,7 @@ import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 from typer.models import ArgumentInfo, OptionInfo
 
-from ..core.errors import UsageError
-from ..core.options import Declared, Group, declaration
-
-_VALUES = {int: "INTEGER", float: "NUMBER", str: "TEXT", Path: "PATH", bool: ""}
+from ..core.options import Declared, Group, declaration, value_name, words
 
 
 class _Plain:
@@ -102,6 +99,8 @@ def declared(command: Callable[..., Any]) -> Callable[..., Any]:
     shown = sorted(made, key=_place)
     called.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
     called.__annotations__ = {each.name: each.annotation for each in shown}
+    # The terminal breaks lines, not the source; lists are kept.
+    called.__doc__ = re.sub(r"(?<=\S)\n(?=\w)", " ", inspect.cleandoc(command.__doc__ or ""))
     return called
 
 
@@ -136,10 +135,10 @@ def _parameter(name: str, hint: Any, default: Any, splits: dict[str, Declared]) 
             name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=_with_value(name, hint)
         )
     kind = option.type
-    if get_origin(_inner(kind)) is tuple or get_origin(kind) is tuple:
+    if tuple in (get_origin(_inner(kind)), get_origin(kind)) or option.option.parse is not None:
         splits[name] = option
-        many = get_origin(kind) is list or _several(kind)
-        one = Path if get_args(kind)[0] is Path else str
+        many = get_origin(kind) is list or option.is_several
+        one = Path if get_args(kind)[:1] == (Path,) else str
         kind = GenericAlias(list, (one,)) if many else one
         if isinstance(default, tuple) and not many:
             default = ",".join(map(str, default))
@@ -161,16 +160,10 @@ def _info(name: str, declared: Declared, default: Any) -> OptionInfo:
         min=option.least,
         max=option.most,
         metavar=option.value or _value(kind),
-        parser=option.parse,
         envvar=option.environment or None,
         rich_help_panel=None if group is Group.BASIC else group.value,
     )
     return info
-
-
-def _several(kind: Any) -> bool:
-    """Whether a type is a tuple of any number of elements."""
-    return get_origin(kind) is tuple and get_args(kind)[-1] is Ellipsis
 
 
 def _inner(kind: Any) -> Any:
@@ -182,8 +175,8 @@ def _value(kind: Any) -> str | None:
     if get_origin(kind) is Literal:
         return f"[{'|'.join(map(str, get_args(kind)))}]"
     if get_origin(_inner(kind)) is tuple:
-        return ",".join(_VALUES.get(each, "") for each in get_args(_inner(kind))).strip()
-    return _VALUES.get(_inner(kind))
+        return ",".join(map(value_name, get_args(_inner(kind)))).strip()
+    return value_name(_inner(kind)) or None
 
 
 def _with_value(name: str, hint: Any) -> Any:
@@ -202,27 +195,12 @@ def _with_value(name: str, hint: Any) -> Any:
 
 
 def _whole(name: str, option: Declared, value: Any) -> Any:
-    """A tuple from its texts: names between commas, or as many numbers as it has.
-
-    Raises
-    ------
-    UsageError
-        If there are other numbers.
-    """
+    """The value of an option of the texts that were given."""
     kind = _inner(option.type)
     if value is None:
-        return None if option.optional else ()
-    if _several(kind):
-        return tuple(value if get_args(kind)[0] is Path else _words(value))
+        return None if option.optional else option.type() if get_origin(kind) is dict else ()
     if kind is not option.type:
         return [_whole(name, dataclasses.replace(option, type=kind), each) for each in value]
-    try:
-        return tuple(one(word) for one, word in zip(get_args(kind), re.split("[,x×]", value), strict=True))
-    except ValueError:
-        flag = f"--{name.replace('_', '-')}"
-        do = f"write {option.option.value or _value(kind)}"
-        raise UsageError(f"cannot interpret {value!r}", where=flag, do=do) from None
-
-
-def _words(texts: Iterable[str]) -> list[str]:
-    return [word for text in texts for each in text.split(",") if (word := each.strip())]
+    if option.is_several:
+        return tuple(value if get_args(kind)[0] is Path else words(value))
+    return option.read(value, f"--{name.replace('_', '-')}")

@@ -136,11 +136,15 @@ def board(
     """Measure a chessboard, PuzzleBoard, deltille, ChArUco board, circle grid or grid of tags."""
     from ..exchange import read_board
     from ..measure import BoardOptions, measure_board
+    from ..procedures.which_target import measured_or_shown
 
     task = Task(image, output, "points")
     target = read_board(design)
     options = BoardOptions(mirrored=mirrored, row_jitter_px=row_jitter_px, fill=fill)
-    task.run(reading, lambda frame: measure_board(frame, target, options))
+    task.run(
+        reading,
+        lambda frame: measured_or_shown(frame, target, lambda each: measure_board(each, target, options)),
+    )
 
 
 @app.command()

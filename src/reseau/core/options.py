@@ -9,12 +9,16 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 from types import GenericAlias, NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
+
+from .errors import UsageError
 
 if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
@@ -52,7 +56,8 @@ class Option:
     value : str
         What help writes for the value, as ``NAME=FILE``; by default it follows from the type.
     parse : callable, optional
-        Makes the value of its text on the command line; for types that have another form there.
+        Makes the value of its text, on the command line or in a form; raises ValueError. Values of other
+        types than numbers, texts and tuples of them have one.
     off : str
         For a switch, the name of its opposite, as ``--not-mirrored``; by default ``--no-…``.
     environment : str
@@ -128,6 +133,45 @@ class Declared:
         """Whether the value is a number."""
         return self.type in (int, float)
 
+    @property
+    def is_table(self) -> bool:
+        """Whether the value is a table, which a file has."""
+        return self.is_several and get_origin(get_args(self.type)[0]) is tuple
+
+    @property
+    def is_several(self) -> bool:
+        """Whether the value is a tuple of any number of elements."""
+        return get_origin(self.type) is tuple and get_args(self.type)[-1] is Ellipsis
+
+    def read(self, text: str, where: str) -> Any:
+        """Return the value that a text writes: names between commas, or as many numbers as it has.
+
+        Raises
+        ------
+        UsageError
+            If it writes none; `where` names the option.
+
+        Examples
+        --------
+        >>> Declared(tuple[int, int], False, Option("Size of images (px).")).read("640x480", "size")
+        (640, 480)
+        """
+        try:
+            if self.option.parse is not None:
+                return self.option.parse(text)
+            if self.is_several:
+                return tuple(words([text]))
+            if get_origin(self.type) is tuple:
+                parts = zip(get_args(self.type), re.split("[,x×]", text), strict=True)
+                return tuple(one(part) for one, part in parts)
+            if self.type is bool:
+                return {"true": True, "false": False}[text]
+            return self.type(text) if self.is_number else text
+        except (ValueError, KeyError):
+            kinds = get_args(self.type) if get_origin(self.type) is tuple else (self.type,)
+            form = self.option.value or ",".join(value_name(each) for each in kinds)
+            raise UsageError(f"cannot interpret {text!r}", where=where, do=f"write {form}") from None
+
 
 def declaration(hint: Any) -> Declared | None:
     """Return what a type declares; None if it is no option.
@@ -160,7 +204,7 @@ def declaration(hint: Any) -> Declared | None:
 
 
 def options_of(cls: type) -> dict[str, Declared]:
-    """Return the options that the fields of a dataclass declare, by their names.
+    """Return the options that the fields of a dataclass or document declare, by their names.
 
     Fields whose type is imported for type checkers only are no options.
 
@@ -180,7 +224,42 @@ def options_of(cls: type) -> dict[str, Declared]:
             declared = declaration(hint)
             if declared is not None:
                 found[name] = declared
-    return {each.name: found[each.name] for each in dataclasses.fields(cls) if each.name in found}
+    document = getattr(cls, "model_fields", None)
+    fields = [each.name for each in dataclasses.fields(cls)] if document is None else document
+    return {name: found[name] for name in fields if name in found}
+
+
+def values_of_texts(cls: type, texts: Mapping[str, str], where: object) -> dict[str, Any]:
+    """Return values of declared options that are written as on the command line; empty ones are left out.
+
+    Raises
+    ------
+    UsageError
+        If there is no such option, or a text cannot be interpreted.
+
+    Examples
+    --------
+    >>> from reseau.measure import BoardOptions
+    >>> values_of_texts(BoardOptions, {"mirrored": "true", "psf_px": "", "fill": "0.8"}, "monday")
+    {'mirrored': True, 'fill': 0.8}
+    """
+    known = options_of(cls)
+    for name in texts.keys() - known.keys():
+        raise UsageError(f"unknown key `{name}`", where=where)
+    return {name: known[name].read(text, name) for name, text in texts.items() if text.strip()}
+
+
+def words(texts: Iterable[str]) -> list[str]:
+    """Return the words of texts, between commas."""
+    return [word for text in texts for each in text.split(",") if (word := each.strip())]
+
+
+def value_name(kind: Any) -> str:
+    """Return what help writes for a value of a type."""
+    return _VALUES.get(kind, "")
+
+
+_VALUES = {int: "INTEGER", float: "NUMBER", str: "TEXT", Path: "PATH"}
 
 
 def _without_none(hint: Any) -> tuple[Any, bool]:

@@ -9,7 +9,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from .options import Declared, Group, Option, declaration
+from .options import Declared, Group, Option, declaration, words
+
+
+def _position(text: str) -> dict[str, float]:
+    """The position that a text such as ``tilt=0,roll=0`` writes."""
+    pairs = [part.split("=") for part in words([text])]
+    return {axis.strip(): float(value) for axis, value in pairs}
+
 
 # What is read.
 Design = Annotated[Path, Option("Design of the target.", Group.BASIC, "-d")]
@@ -236,10 +243,29 @@ Recorded = Annotated[
     list[str], Option("Covariate that a sensor measured with the frames: temperature; repeatable.")
 ]
 Bench = Annotated[Path, Option("Bench file.", Group.BASIC, "-b")]
-Camera = Annotated[str, Option("Camera of the bench. Default: the only one.")]
-Table = Annotated[str, Option("Turntable of the bench. Default: the only one.")]
-Scanner = Annotated[str, Option("Ultrasonic scanner of the bench. Default: the only one.")]
-Oscilloscope = Annotated[str, Option("Oscilloscope of the bench. Default: the only one.")]
+Camera = Annotated[str, Option("Camera of the bench. Default: the only one.", Group.EXECUTION)]
+Table = Annotated[str, Option("Turntable of the bench. Default: the only one.", Group.EXECUTION)]
+Scanner = Annotated[str, Option("Ultrasonic scanner of the bench. Default: the only one.", Group.EXECUTION)]
+Oscilloscope = Annotated[str, Option("Oscilloscope of the bench. Default: the only one.", Group.EXECUTION)]
+Park = Annotated[
+    dict[str, float],
+    Option(
+        "Final position of the table. Default: the last pose.", Group.EXECUTION, value="tilt=0,roll=0",
+        parse=_position,
+    ),
+]  # fmt: skip
+Retreat = Annotated[
+    dict[str, float],
+    Option(
+        "Position after an abort or an error. Default: no movement.", Group.EXECUTION, value="tilt=0,roll=0",
+        parse=_position,
+    ),
+]  # fmt: skip
+Until = Annotated[str, Option("Choose poses until a goal is reached, as 'sigma_c < 0.5 um'.", value="GOAL")]
+First = Annotated[int, Option("With a goal: number of poses before the first chosen one.", least=4)]
+Body = Annotated[bool, Option("Take PHOTO III.")]
+Levels = Annotated[int, Option("Number of exposure times in light.", least=5)]
+Frames = Annotated[int, Option("Number of frames for each exposure time.", least=2)]
 Count = Annotated[int, Option("Number of frames or sections to take.", least=1)]
 Check = Annotated[
     tuple[str, ...],

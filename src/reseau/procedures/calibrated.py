@@ -33,6 +33,7 @@ from ..core.data import Array, Frame, ImagePoints
 from ..core.display import Display, Table, html_table
 from ..core.errors import InputError, UsageError
 from ..core.failure import Estimated, Remark
+from ..core.files import writable
 from ..core.lazy import above
 from ..core.provenance import Provenance
 from ..exchange.calibrations import Exported, export_calibrations
@@ -265,13 +266,13 @@ class Calibrated(Estimated, Display):
         """Return an image of the only camera without distortion; see :meth:`reseau.Calibration.undistort`."""
         return self._only("undistort").undistort(image, fov, scale=scale, alpha=alpha, anyway=anyway)
 
-    def compare(self, other: Calibrated | Calibration) -> FieldDifference:
+    def compare(self, other: Calibrated | Calibration | Path | str) -> FieldDifference:
         """Return the difference of another calibration of the camera over the image.
 
         Parameters
         ----------
-        other : Calibrated or Calibration
-            The other one, independent of this.
+        other : Calibrated, Calibration or path
+            The other one, independent of this, or its file.
         """
         second = other._only("compare") if isinstance(other, Calibrated) else other
         return self._only("compare").compare(second)
@@ -315,9 +316,7 @@ class Calibrated(Estimated, Display):
         InputError
             When the file cannot be written.
         """
-        if Path(path).suffix.lower() not in (".html", ".htm"):
-            raise UsageError("is not .html", where=path)
-        write_whole(Path(path), self.report_page(**options))
+        write_whole(writable(Path(path), ".html"), self.report_page(**options))
 
     def report_page(self, **options: Unpack[ReportOptions]) -> str:
         """Return the page that :meth:`report` writes."""

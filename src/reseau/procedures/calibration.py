@@ -289,20 +289,20 @@ def _cameras_of(images: Iterable[str], taken: Mapping[str, Taken] | None) -> tup
 
 
 def _without_scale(result: Result) -> Failure | None:
-    """A failure where the pixels in a radian at the centre, or a magnification, are hardly known at all."""
+    """A failure where the pixels in a radian at the centre, or a magnification, are hardly known, if any."""
     for c, camera in enumerate(result.network.cameras):
         if camera.registered is None or not camera.has_plane_mapping:
             continue
-        lens = camera_mapping(result, c)
-        relative = _relative_scale(lens)
-        if relative > _HARDLY:
-            scales = [name for name in camera.registered.of_role("scale") if name in lens.names]
-            name = scales[0] if scales else "the scale"
-            return Failure(
-                f"{camera.label}: the images do not determine {name}, which is uncertain by "
-                f"{100 * relative:.0f} %; " + _MORE_TILTED,
-                Code.NOT_IDENTIFIED,
-            )
+        names, how = list(camera.registered.of_role("scale")), ""
+        values = result.fit.values.cameras[c, : len(camera.values)]
+        if np.isfinite(camera.bare_mapping(values)(np.zeros((1, 2)))).all():
+            lens = camera_mapping(result, c)
+            names = [name for name in names if name in lens.names]
+            if (relative := _relative_scale(lens)) <= _HARDLY:
+                continue
+            how = f", which is uncertain by {100 * relative:.0f} %"
+        what = f"the images do not determine {names[0] if names else 'the scale'}{how}; {_MORE_TILTED}"
+        return Failure(f"{camera.label}: {what}", Code.NOT_IDENTIFIED)
     return None
 
 

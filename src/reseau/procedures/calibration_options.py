@@ -85,7 +85,7 @@ class CameraOptions:
         if self.automatic and (self.free or self.options):
             raise UsageError("has no parameters or options of its own", where="camera model auto")
         if model.needs_pitch and self.pitch_mm is None:
-            raise UsageError("requires the pixel size", where=model.name)
+            raise UsageError("requires the pixel size", where=model.name, do="give pitch_mm (--pitch-mm)")
         unknown = [name for name in self.free if name not in model.names]
         if unknown:
             raise UsageError(f"is not one of {', '.join(model.names)}", where=unknown[0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 from typing import NamedTuple
 
 import cv2
@@ -15,8 +16,8 @@ from numpy.typing import NDArray
 from ..bundle import Result, Rig, camera_mapping
 from ..calibration import CameraMapping
 from ..core.data import Array, Frame, ImagePoints
-from ..core.errors import ImageError
-from ..core.failure import Code, Failure
+from ..core.errors import ImageError, UsageError
+from ..core.failure import Failure
 from ..designs.boards import unusual_size
 from ..execution import Executor, Outputs
 from ..io import BoardDesign
@@ -29,10 +30,10 @@ from .target_measurement import (
     measured_in_order,
     measurer_with,
 )
-from .which_target import corrected, described
+from .which_target import CONTRADICT, corrected, described, difference
 
-_CONTRADICT = (Code.OTHER_DESIGN, Code.NOT_FOUND, Code.INCONSISTENT, Code.AMBIGUOUS)
-"""Why a target is not measured, where a wrong design may be the reason."""
+_TRIED = 3
+"""Photographs in which further rows of markers are looked for."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,9 @@ def measured_as_shown(
 ) -> TargetMeasured:
     """Measure a target in photographs; where they contradict its design, the board that they show.
 
-    A board whose design is contradicted by more photographs than show it is compared with boards of the same
-    kind that the photographs show; see :func:`~reseau.procedures.which_target.corrected`.
+    A board whose design is contradicted by more photographs than show it, or whose markers go on beyond its
+    last row, is compared with boards of the same kind that the photographs show; see
+    :func:`~reseau.procedures.which_target.corrected`.
 
     Parameters
     ----------
@@ -90,13 +92,15 @@ def measured_as_shown(
     against = {
         each.name
         for each in done
-        if not each.certain or (isinstance(each.found, Failure) and each.found.code in _CONTRADICT)
+        if not each.certain or (isinstance(each.found, Failure) and each.found.code in CONTRADICT)
     }
-    if len(against) <= sum(each.certain and not isinstance(each.found, Failure) for each in done):
+    showing = {each.name for each in done if each.certain and not isinstance(each.found, Failure)}
+    contradicted = len(against) > len(showing)
+    if not contradicted and not _goes_on(_frames(seen, showing), design, measure):
         return TargetMeasured(tuple(done), None, notes)
-    other = corrected(_frames(seen, against), design)
+    other = corrected(_frames(seen, against if contradicted else showing), design)
     if isinstance(other, Failure):
-        return TargetMeasured(tuple(done), None, notes, other.reason)
+        return TargetMeasured(tuple(done), None, notes, other.reason if contradicted else "")
     again = measurer_with(measure, other)
     if again is None:  # the caller's own
         return TargetMeasured(tuple(done), None, notes, f"the photographs show {described(other)}")
@@ -106,15 +110,26 @@ def measured_as_shown(
     shown += (
         f", not {told} as was told" if told != described(other) else " in other proportions than was told"
     )
-    said = f"{shown}: {_difference(other, design)}; calibrated with what they show, correct the design"
+    said = f"{shown}: {difference(other, design)}; calibrated with what they show, correct the design"
     return TargetMeasured(tuple(done), other, (*notes, said), shown)
 
 
-def _difference(other: BoardDesign, told: BoardDesign) -> str:
-    """What of the design to change."""
-    new, old = other.to_dict(), told.to_dict()
-    fields = [key for key in BoardDesign.model_fields if new.get(key) != old.get(key)]
-    return ", ".join(f"{key} {getattr(other, key)} in place of {getattr(told, key)}" for key in fields)
+def _goes_on(frames: Iterable[Frame], design: BoardDesign, measure: Measurer) -> bool:
+    """Whether photographs show corners beyond the last row of a board whose markers are numbered by rows."""
+    # Two rows: the layout of some boards depends on whether their number is even.
+    longer = design.model_copy(update={"rows": design.rows + 2})
+    again = None if design.dictionary is None else measurer_with(measure, longer)
+    if again is None:
+        return False
+    own = set(design.ids)
+    for frame in islice(frames, _TRIED):
+        try:
+            found = again(frame)
+        except UsageError:  # the dictionary has no further markers
+            return False
+        if not isinstance(found, Failure) and not own.issuperset(found.points.names):
+            return True
+    return False
 
 
 def _remembered(photographs: Iterable[Photograph], seen: list[Photograph]) -> Iterator[Photograph]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, islice
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -22,6 +23,7 @@ from ..io.reading import is_points
 from ..measure import PuzzlePart, boards_shown, puzzle_part
 from .target_measurement import measurer_of
 
+T = TypeVar("T")
 Design = ReseauDesign | TestfieldDesign | BoardDesign
 _DESIGNS = (".json", ".yaml", ".yml", ".xml")
 _ENOUGH, _LEAST = 0.8, 8
@@ -35,6 +37,8 @@ _MORE, _LARGER = 6, 1 / 3
 """Further photographs in which a plain pattern is looked for; the most that may show a larger lattice, as a
 share of those that show it: something beside a board may continue it by chance."""
 _LATEST = 2
+CONTRADICT = (Code.OTHER_DESIGN, Code.NOT_FOUND, Code.INCONSISTENT, Code.AMBIGUOUS)
+"""Why a target is not measured, where a wrong design may be the reason."""
 _KINDS = {
     "chess": "a chessboard",
     "puzzle": "a PuzzleBoard",
@@ -149,11 +153,57 @@ def corrected(frames: Iterable[Frame], told: BoardDesign, tried: int = 3) -> Boa
     if found is not None and found[1] is not told:
         assert isinstance(found[1], BoardDesign)
         return found[1]
-    return Failure(_shown_words(shown) if shown else "", Code.NOT_FOUND)
+    return Failure(_shown_words(shown, len(photographs.full)) if shown else "", Code.NOT_FOUND)
+
+
+def measured_or_shown(frame: Frame, design: object, measure: Callable[[Frame], T | Failure]) -> T | Failure:
+    """Measure a target in a frame; where the frame contradicts its design, the failure says what it shows.
+
+    Parameters
+    ----------
+    frame : Frame
+        A photograph.
+    design : BoardDesign or object
+        The target.
+    measure : callable
+        Measures it in a frame.
+
+    Examples
+    --------
+    >>> frame = Frame(np.zeros((100, 100)), 255.0)
+    >>> measured_or_shown(frame, None, lambda frame: Failure("no target", Code.NOT_FOUND)).reason
+    'no target'
+    """
+    found = measure(frame)
+    if not (isinstance(found, Failure) and isinstance(design, BoardDesign) and found.code in CONTRADICT):
+        return found
+    other = corrected([frame], design)
+    if isinstance(other, Failure):
+        shown = other.reason
+    else:
+        shown = f"the photograph shows {described(other)}: {difference(other, design)}; correct the design"
+    return replace(found, reason=f"{found.reason}; {shown}") if shown else found
+
+
+def difference(other: BoardDesign, told: BoardDesign) -> str:
+    """Return what of a design to change, to have another one.
+
+    Examples
+    --------
+    >>> difference(board("chess", 7, 10, 23.0), board("chess", 6, 10, 23.0))
+    'columns 7 in place of 6'
+    """
+    new, old = other.to_dict(), told.to_dict()
+    fields = [key for key in BoardDesign.model_fields if new.get(key) != old.get(key)]
+    return ", ".join(f"{key} {getattr(other, key)} in place of {getattr(told, key)}" for key in fields)
 
 
 def _as_told(shown: BoardDesign, told: BoardDesign) -> list[BoardDesign]:
-    """A board that photographs show, with what else is known of one of its kind that was told; or none."""
+    """A board that photographs show, with what else is known of one of its kind that was told; or none.
+
+    Also the one that was told with all but its numbers of rows and columns, of which photographs may show a
+    part only.
+    """
     if shown.kind != told.kind:
         return []
     counts, turned = (shown.columns, shown.rows), (told.columns < told.rows) != (shown.columns < shown.rows)
@@ -165,12 +215,14 @@ def _as_told(shown: BoardDesign, told: BoardDesign) -> list[BoardDesign]:
     if _contains(told.dictionary, shown.dictionary):
         layout["dictionary"] = told.dictionary
     same = told.model_copy(update=layout)
+    all_of_it = same.model_copy(update={"columns": told.columns, "rows": told.rows})
     if shown.size is None or told.size is None:
-        return [same]
+        return [same, all_of_it]
     share = shown.size / shown.pitch
     # A tag is measured with a ruler, the gap beside it is not.
     other = {"pitch": told.size / share} if told.kind == "aprilgrid" else {"size": told.pitch * share}
-    return [same, same.model_copy(update={key: float(f"{value:.3g}") for key, value in other.items()})]
+    scaled = {key: float(f"{value:.3g}") for key, value in other.items()}
+    return [same, all_of_it, same.model_copy(update=scaled)]
 
 
 def _contains(larger: str | None, smaller: str | None) -> bool:
@@ -204,9 +256,10 @@ def described(design: BoardDesign) -> str:
     return text + (", every second row shifted" if design.asymmetric else "")
 
 
-def _shown_words(shown: Sequence[BoardDesign]) -> str:
+def _shown_words(shown: Sequence[BoardDesign], photographs: int = 2) -> str:
     """What photographs show, in words: that which most of them show."""
-    return f"the photographs show {Counter(map(_unturned, shown)).most_common(1)[0][0]}"
+    which = "the photographs show" if photographs > 1 else "the photograph shows"
+    return f"{which} {Counter(map(_unturned, shown)).most_common(1)[0][0]}"
 
 
 def _unturned(design: BoardDesign) -> str:
@@ -433,6 +486,8 @@ def _may_be(design: Design, shown: Sequence[BoardDesign]) -> bool:
     if isinstance(design, TestfieldDesign):
         # Its targets are disks, too.
         return kinds <= {"circles"}
+    if isinstance(design, BoardDesign) and design.dictionary is not None:
+        return any(each.dictionary is not None for each in shown)
     if isinstance(design, BoardDesign) and _plain(design):
         return design.kind in kinds
     return not _plain(design) or not shown or "circles" in kinds

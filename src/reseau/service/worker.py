@@ -318,7 +318,9 @@ class Worker:
         self._free()
         if plan == "own":
             raise UsageError("is a program of the user, which the service does not run", where="plan own")
-        given = sessions.check(name, plan, parameters, inputs, self._required())
+        bench = self._required()
+        parameters = sessions.kind_of(plan).parameters.defaults(bench) | parameters
+        given = sessions.check(name, plan, parameters, inputs, bench)
         with self._lock:
             self._prepare(given)
             session = sessions.begin(self._archive, name, plan, given, inputs, bench=self._text)

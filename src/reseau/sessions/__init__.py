@@ -23,7 +23,7 @@ from .conducting import (
     rerun_all,
     resume,
 )
-from .kinds import CORNERS, KINDS, OF_FILES, SCENE, SessionKind, kind_of
+from .kinds import CORNERS, KINDS, OF_FILES, SCENE, SessionKind, input_option, kind_of
 from .parameters import (
     FramesParameters,
     PhotographsParameters,
@@ -46,6 +46,7 @@ __all__ = [
     "calibration_of",
     "capture",
     "check",
+    "input_option",
     "kind_of",
     "lock",
     "parameters_of",

@@ -467,3 +467,14 @@ KINDS: Mapping[str, SessionKind] = {
 
 OF_FILES = ("photographs", "film")
 """Plans of sessions that are made of files, not on a bench."""
+
+
+def input_option(name: str) -> str:
+    """Return the option of an input file of a session, which is its name but for one.
+
+    Examples
+    --------
+    >>> input_option("design.json"), input_option("object.json")
+    ('design', 'test_object')
+    """
+    return {"object.json": "test_object"}.get(name, name.rpartition(".")[0])

@@ -11,14 +11,15 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
-from pydantic import Field, PositiveInt, model_validator
+from pydantic import Field, model_validator
 
 from ..capture import Bench, Goal, SensorSeriesPlan, Step
 from ..capture.bench import ROLES
 from ..capture.by_hand import check_reach
-from ..capture.steps import HEIGHT
+from ..capture.steps import HEIGHT, paper_steps, parse_steps
 from ..core import vocabulary as v
 from ..core.errors import FormatError, StateError, UsageError
+from ..core.options import Group, Option
 from ..instruments import Camera, CameraRig, EnvironmentSensor, Turntable
 from ..io import Document
 
@@ -59,6 +60,15 @@ def present_keys(parameters: Mapping[str, Any]) -> dict[str, Any]:
     return {_FORMERLY.get(key, key): value for key, value in parameters.items()}
 
 
+_Poses = Annotated[
+    tuple[tuple[str, dict[str, float]], ...],
+    Option(
+        "CSV of poses, one column for each axis, and one for the name if they have some.",
+        parse=lambda text: tuple((s.name, dict(s.position)) for s in parse_steps(text, "poses")),
+    ),
+]
+
+
 class SessionParameters(Document):
     """Parameters that all plans share.
 
@@ -93,8 +103,8 @@ class SessionParameters(Document):
     """Whether the camera may be a rig."""
 
     retakes: v.Retakes = 2
-    park: dict[str, float] = Field(default_factory=dict)
-    retreat: dict[str, float] | None = None
+    park: v.Park = Field(default_factory=dict)
+    retreat: v.Retreat | None = None
     home: v.Home = False
     camera: v.Camera | None = None
     table: v.Table | None = None
@@ -116,6 +126,11 @@ class SessionParameters(Document):
         except (TypeError, ValueError) as error:
             raise FormatError(f"not JSON ({error})", where=where) from None
         return cls.parse(text, where=where)
+
+    @classmethod
+    def defaults(cls, bench: Bench) -> dict[str, Any]:
+        """Return what a new session on a bench has where it is not given."""
+        return {}
 
     def to_archive(self) -> dict[str, Any]:
         """Return the JSON values that the archive stores: those keys that were given."""
@@ -319,7 +334,7 @@ class OscilloscopeParameters(SessionParameters):
     NEEDS: ClassVar[tuple[str, ...]] = ("camera",)
     USES: ClassVar[tuple[str, ...]] = ("scanner", "oscilloscope")
 
-    body: bool = True
+    body: v.Body = True
     average: v.Average = 1
     checks: v.Checks = 0
     check: v.Check = ()
@@ -352,7 +367,7 @@ class BlurredParameters(SessionParameters):
     SCHEMA: ClassVar[str] = "reseau-blurred-parameters/1"
     NEEDS: ClassVar[tuple[str, ...]] = ("camera", "table")
 
-    steps: tuple[tuple[str, dict[str, float]], ...]
+    steps: _Poses
     psf_px: v.PsfPx = 0.5
     search_px: v.SearchPx = 6.0
     rounds: v.Rounds = 6
@@ -413,16 +428,34 @@ class TestfieldParameters(SessionParameters):
     RIGS: ClassVar[bool] = True
     NEEDS: ClassVar[tuple[str, ...]] = ("camera", "table")
 
-    steps: tuple[tuple[str, dict[str, float]], ...]
+    steps: _Poses
     pitch_mm: v.PitchMm | None
     free: v.Free
     row_jitter_px: v.RowJitterPx
     fill: v.Fill
-    until: str = ""
-    first: PositiveInt = 5
-    sigmas: tuple[float, float, float] | None = None
+    until: v.Until = ""
+    first: v.First = 5
+    sigmas: (
+        Annotated[
+            tuple[float, float, float],
+            Option(
+                "On a z-stage: standard deviations of a height (mm), of the direction of the stage (rad), "
+                "and of the coordinates of the design (mm).",
+                Group.TARGET,
+                value="0.01,0.01,0.05",
+            ),
+        ]
+        | None
+    ) = None
     average: v.Average = 1
     checks: v.Checks = 0
+
+    @classmethod
+    def defaults(cls, bench: Bench) -> dict[str, Any]:
+        """Return the poses of the paper, as far as the table has their axes, and the usual model."""
+        steps = paper_steps(axes=tuple(bench.one(Turntable).axes)) if bench.has(Turntable) else ()
+        poses = tuple((step.name, dict(step.position)) for step in steps)
+        return {"steps": poses, "pitch_mm": None, "free": (), "row_jitter_px": 0.0, "fill": 1.0}
 
     @property
     def expected(self) -> int | None:
@@ -607,12 +640,17 @@ class SensorParameters(SessionParameters):
     NEEDS: ClassVar[tuple[str, ...]] = ("camera",)
 
     region: v.Region | None
-    levels: PositiveInt = 14
-    frames: PositiveInt = 8
-    longest_us: float = 1e6
-    edge_us: float | None = None
+    levels: v.Levels = 14
+    frames: v.Frames = 8
+    longest_us: Annotated[float, Option("Longest exposure time (µs).", least=1)] = 1e6
+    edge_us: Annotated[float, Option("Exposure time of a slanted edge (µs); none: no edge.")] | None = None
     count: v.Count | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
+
+    @classmethod
+    def defaults(cls, bench: Bench) -> dict[str, Any]:
+        """Return the whole image as region of an edge."""
+        return {"region": None}
 
     @classmethod
     def on_bench(

@@ -256,6 +256,23 @@ def test_a_session_that_was_aborted_is_resumed_without_repeating_poses(one: Serv
     assert len({(each["step"], each["take"]) for each in rows}) == len(rows)
 
 
+def test_a_form_of_declared_options_begins_a_session(one: Served) -> None:
+    client = one.client("operate")
+    page = client.get(BENCH.replace("/api/1", ""), headers={"Accept": "text/html"}).text
+    assert page.count("<fieldset data-for=") == 6
+    for name in ("count", "until", "region", "levels", "psf_px", "body", "retakes", "park"):
+        assert f'"texts.{name}"' in page
+    assert '<input type="file" data-input="object.json" required>' in page
+    given = {"name": "by form", "plan": "frames", "texts": {"count": "2", "park": "tilt=0", "average": ""}}
+    assert client.post(f"{BENCH}/sessions", json=given).status_code == 201
+    state(client, "ready")
+    stored = client.get("/api/1/sessions/by form").json()["parameters"]
+    assert (stored["count"], stored["park"], "average" in stored) == (2, {"tilt": 0.0}, False)
+    for texts, said in ({"count": "two"}, "cannot interpret 'two'"), ({"colour": "red"}, "unknown key"):
+        wrong = client.post(f"{BENCH}/sessions", json=given | {"name": "wrong", "texts": texts})
+        assert (wrong.status_code, said in wrong.json()["error"]["what"]) == (422, True)
+
+
 def test_a_plan_of_the_user_is_not_run_and_a_wrong_one_refused(one: Served) -> None:
     client = one.client("operate")
     own = {"name": "own", "plan": "own", "parameters": {}, "inputs": {"generator.py": "import os"}}

@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import cv2
 import httpx
@@ -29,7 +30,7 @@ from reseau_sims.serving.bench import SimulatedBench
 from ...capture.fieldrig import DESIGN
 from .browser import Browser, chromium
 from .driver import bench_of, install
-from .populated import FIELD_RULES, PARAMETERS
+from .populated import FIELD_RULES, PARAMETERS, STEPS
 from .proxy import Proxy
 from .test_benches import ROOT, until
 from .test_reading import _CERTIFICATE
@@ -213,9 +214,19 @@ def press(browser: Browser, css: str) -> None:
 def begin_session(place: Place, browser: Browser, name: str) -> None:
     """Begin a session of the testfield on the page of the bench."""
     browser.fill("[name=name]", name)
-    browser.run("document.querySelector('[name=plan]').value = 'testfield'")
-    written(browser, "[name=parameters]", json.dumps(PARAMETERS))
-    chosen(browser, "input[data-inputs]", place.folder / "design.json")
+    browser.run(
+        "const plan = document.querySelector('[name=plan]'); plan.value = 'testfield';"
+        "plan.dispatchEvent(new Event('change'))"
+    )
+    form = "fieldset[data-for=testfield]"
+    for key in ("free", "pitch_mm", "row_jitter_px", "fill"):
+        value: Any = PARAMETERS[key]
+        written(browser, f"{form} [name='texts.{key}']", ",".join(value) if key == "free" else str(value))
+    poses = place.folder / "poses.csv"
+    rows = [",".join((step, *map(str, position.values()))) for step, position in STEPS]
+    poses.write_text("\n".join(("name,tilt,roll,camera_roll", *rows)) + "\n")
+    chosen(browser, f"{form} [data-text='texts.steps']", poses)
+    chosen(browser, f"{form} [data-input]", place.folder / "design.json")
     browser.click("form[data-api$='/sessions'] button")
     browser.until(f"Session {name}")
 

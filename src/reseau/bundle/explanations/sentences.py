@@ -9,7 +9,7 @@ __all__ = ["advice", "described", "listed_places"]
 _SENTENCES = {
     "lens": (
         "the camera model does not describe the lens",
-        "choose the model without --model, or estimate more coefficients",
+        "leave out --model, so that models are compared; if they were, none describes it better",
     ),
     "refocus": (
         "the principal distance or point changed between the photographs",
@@ -68,7 +68,7 @@ def advice(code: str, form: str) -> str:
     'nothing: the uncertainties contain it'
     """
     if code == "lens" and form == "1 more":
-        return "estimate the next coefficient too, or choose the model without --model"
+        return "estimate the next coefficient too, or leave out --model"
     return _SENTENCES[code][1]
 
 

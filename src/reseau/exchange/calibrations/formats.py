@@ -215,6 +215,10 @@ class Exported(NamedTuple):
     share: float
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        off = f"at most {self.greatest_px:.2g} px off"
+        return f"<Exported: {self.camera.name}, model {self.camera.model}, {off}>"
+
 
 def export_calibration(
     calibration: Calibration, to: str, path: Path | str, *, anyway: bool = False

@@ -168,7 +168,7 @@ def _circles(
         return
     ends = (np.ptp(shifted, axis=0) + 1).tolist()
     for wide, high in (ends, ends[::-1]):
-        if wide % 2 == 0:
+        if wide % 2 == 0 and wide > 2:  # one column is no grid
             yield board(
                 "circles", wide // 2, high, _SIDE_MM, size=np.sqrt(2) * size * _SIDE_MM, polarity=polarity,
                 asymmetric=True,

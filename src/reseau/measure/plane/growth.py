@@ -93,9 +93,11 @@ def grown_through(
 
 def _within(tree: scipy.spatial.KDTree, places: Array, gate: Array) -> tuple[Array, Rows, Rows]:
     """Points within the distance `gate` of some places: their distances, and rows of places and of points."""
-    gap, row = tree.query(places, k=np.arange(1, min(_CHOICE, tree.n) + 1))
-    at, k = np.nonzero(gap < gate[:, None])
-    return gap[at, k], at, row[at, k]
+    # A lens does not image all nodes.
+    seen = np.flatnonzero(np.isfinite(places).all(axis=1))
+    gap, row = tree.query(places[seen], k=np.arange(1, min(_CHOICE, tree.n) + 1))
+    at, k = np.nonzero(gap < gate[seen, None])
+    return gap[at, k], seen[at], row[at, k]
 
 
 def _first(count: int, gap: Array, at: Rows, which: Rows, *, strongest: bool) -> tuple[Array, Rows]:

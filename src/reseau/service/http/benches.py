@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import Field
 
+from ...core.options import values_of_texts
 from ..accounts import Principal
 from .access import Here, NotFound, Operating, Reading, operating
 from .answers import Answer, refusals
@@ -117,11 +118,15 @@ class Tested(Answer):
 class NewSession(
     Answer, json_schema_extra={"example": {"name": "monday", "plan": "frames", "parameters": {"count": 5}}}
 ):
-    """A session: its name, plan, parameters and input files."""
+    """A session: its name, plan, parameters and input files.
+
+    `texts` are parameters as texts, in the form that options have on the command line; forms send them.
+    """
 
     name: str = Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00-\x1f.][^/\\\x00-\x1f]*$")
     plan: str = Field(max_length=40)
     parameters: dict[str, Any] = Field(default_factory=dict)
+    texts: dict[str, str] = Field(default_factory=dict)
     inputs: dict[str, str] = Field(default_factory=dict, description="Contents of files, by name.")
 
 
@@ -295,9 +300,13 @@ def release(bench: BenchName, who: Operating, service: Here) -> BenchAnswer:
 @router.post("/benches/{bench}/sessions", status_code=201)
 def begin(bench: BenchName, given: NewSession, who: Operating, service: Here) -> BenchAnswer:
     """Begin a session on a bench, with a plan."""
+    from ...sessions import kind_of
+
     the_bench(service, bench)
     new_name(service, given.name)
-    _asked(service, bench, who, "begin session", "begin", given.model_dump() | {"by": who.name}, 60.0)
+    order = given.model_dump(exclude={"texts"}) | {"by": who.name}
+    order["parameters"] |= values_of_texts(kind_of(given.plan).parameters, given.texts, given.name)
+    _asked(service, bench, who, "begin session", "begin", order, 60.0)
     return bench_answer(service, the_bench(service, bench))
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Self
 from urllib.parse import quote
 
 import jinja2
@@ -14,11 +15,15 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 
 from ...archive import Session
 from ...core.errors import ReseauError
+from ...core.options import Declared, Group, options_of
 from ...core.vocabulary import names
 from ...io.photographs import PHOTOGRAPHS
 from . import accounts, benches, calibrations, comparisons, history, operations, sessions
 from .access import Administering, Here, NotFound, Reading, Unknown, csrf_of, principal_of, service_of
 from .service import Service
+
+if TYPE_CHECKING:
+    from ...sessions import SessionKind
 
 router = APIRouter(include_in_schema=False)
 
@@ -191,8 +196,37 @@ def bench_page(request: Request, bench: str, who: Reading, service: Here) -> Res
         settings=settings,
         axes=axes,
         busy=busy,
-        plans=[each for each in kinds.KINDS if each not in ("own", *kinds.OF_FILES)],
+        plans={
+            plan: _PlanForm.of(kind)
+            for plan, kind in reversed(list(kinds.KINDS.items()))
+            if plan not in ("own", *kinds.OF_FILES)
+        },
     )
+
+
+@dataclass(frozen=True)
+class _PlanForm:
+    """Form of a session of a plan: its input files, what it needs, and the rest of its options."""
+
+    inputs: dict[str, Declared]
+    first: dict[str, tuple[Declared, Any]]
+    more: dict[str, tuple[Declared, Any]]
+
+    @classmethod
+    def of(cls, kind: SessionKind) -> Self:
+        from ...sessions import input_option
+
+        fields = kind.parameters.model_fields
+        found = {
+            name: (each, None if fields[name].is_required() else fields[name].default)
+            for name, each in options_of(kind.parameters).items()
+        }
+        later = {name for name, (each, _) in found.items() if each.option.group is Group.EXECUTION}
+        return cls(
+            {name: names()[input_option(name)] for name in kind.inputs},
+            {name: each for name, each in found.items() if name not in later},
+            {name: each for name, each in found.items() if name in later},
+        )
 
 
 @router.get("/sessions")

@@ -39,14 +39,15 @@ export async function call(operation, body, patience) {
 function fields(form) {
   const found = {};
   for (const each of form.elements) {
-    if (!each.name || each.disabled || each.type === 'file') continue;
+    if (!each.name || each.matches(':disabled') || each.type === 'file') continue;
     let value = each.value;
     if (each.dataset.list !== undefined) {  // boxes of one name are a list
       found[each.name] ??= [];
       if (each.checked) found[each.name].push(JSON.parse(value));
       continue;
     }
-    if (each.type === 'checkbox') value = each.checked;
+    if (each.dataset.words !== undefined) value = each.type === 'checkbox' ? String(each.checked) : value;  // as on the command line
+    else if (each.type === 'checkbox') value = each.checked;
     else if (each.type === 'radio') { if (!each.checked) continue; }
     else if (value === '' && each.dataset.empty === 'omit') continue;
     else if (each.type === 'number') value = value === '' ? null : Number(value);
@@ -82,9 +83,10 @@ function table_of(text) {
 
 async function with_files(form, body) {
   for (const input of form.querySelectorAll('input[data-table]')) body[input.dataset.table] = table_of(await input.files[0].text());
-  for (const input of form.querySelectorAll('input[data-inputs]')) {
-    body[input.dataset.inputs] = {};
-    for (const file of input.files) body[input.dataset.inputs][file.name] = await file.text();
+  for (const input of form.querySelectorAll('input[data-input]:enabled')) (body.inputs ??= {})[input.dataset.input] = await input.files[0].text();
+  for (const input of form.querySelectorAll('input[data-text]:enabled')) {
+    const [group, key] = input.dataset.text.split('.');
+    if (input.files.length) body[group][key] = await input.files[0].text();
   }
   return body;
 }
@@ -164,6 +166,7 @@ for (const choice of document.querySelectorAll('[data-choose]')) {
     }
   };
   choice.addEventListener('change', choose);
+  choice.form.addEventListener('reset', () => setTimeout(choose));
   choose();
 }
 
