@@ -495,7 +495,7 @@ def _pixels_around(start: Array, across: Array, half: tuple[int, int], reach: fl
     x, y = (off[:, i, None] + np.arange(-half[i], half[i] + 1.0) for i in range(2))
     away = across[:, :, :1, None] * x[:, None, None] + across[:, :, 1:, None] * y[:, None, :, None]
     beside = np.abs(away) < reach
-    near: Mask = beside.all(axis=1)
+    near: Mask = np.asarray(beside.all(axis=1))
     if along > reach:
         ahead = (away > 0) & (away < along)
         near |= (beside[:, 0] & ahead[:, 1]) | (beside[:, 1] & ahead[:, 0])

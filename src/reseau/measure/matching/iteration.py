@@ -9,11 +9,17 @@ linearises it again.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ...adjust import BatchAdjustment, BatchOptions, BatchReason
 from ...core.data import Array, Mask, Rows
 from .patches import CONTRAST, SHARPEST, WIDTH, Patches
+
+Floats = NDArray[Any]
+"""Of single or double precision."""
 
 __all__ = ["ACTIVE", "DONE", "FAILED", "STALE", "Iteration"]
 
@@ -77,7 +83,7 @@ class Iteration:
 
     # Images and their derivatives.
 
-    def _formed(self, x: Array, share: Array) -> tuple[Array, Array, Array]:
+    def _formed(self, x: Array, share: Floats) -> tuple[Array, Array, Array]:
         """Background, contrast and grey values (m, n) of windows of which `share` (m, n) is covered."""
         plane = self.patch.background(x).reshape(share.shape)
         contrast = self.patch.contrast(x).reshape(len(x), -1)
@@ -93,7 +99,7 @@ class Iteration:
         wide = np.exp(x[:, WIDTH])
         return np.asarray(wide * wide / np.hypot(self.psf[rows], wide))
 
-    def _derive(self, rows: Rows, share: Array, slopes: Array) -> Array:
+    def _derive(self, rows: Rows, share: Floats, slopes: Floats) -> Floats:
         """Keep derivatives of windows at their estimates; residuals (m, n) times the roots of the weights."""
         patch, x, root, out = self.patch, self.x[rows], self.root[rows], self.jacobian[rows]
         plane, contrast, grey = self._formed(x, share)
@@ -114,7 +120,7 @@ class Iteration:
         np.multiply(by_share[:, None], slopes[:, CONTRAST:], out=out[:, patch.form_at :])
         # Pixels that are not used may carry any value.
         residuals = np.where(self.used[rows], grey - self.observed[rows], 0.0)
-        left = residuals * root
+        left: Floats = residuals * root
         if len(self.common[0]):
             along = out[:, 0].reshape(len(out), *patch.shape[1:]).copy()
             length2 = self.variance * (along * along).sum(axis=2, keepdims=True)
@@ -127,7 +133,7 @@ class Iteration:
         self.residuals[rows], self.jacobian[rows] = residuals, out
         return left
 
-    def _without_common(self, rows: Rows, values: Array) -> Array:
+    def _without_common(self, rows: Rows, values: Floats) -> Floats:
         """Values (m, n) or (m, u, n) without their common error in each row; see `Patches.whiten`."""
         along, heavy = (
             v[rows].reshape(len(rows), *(1,) * (values.ndim - 2), *v.shape[1:]) for v in self.common
@@ -136,13 +142,13 @@ class Iteration:
         common = (heavy * rowwise).sum(axis=-1, keepdims=True)
         return np.asarray((rowwise - along * common).reshape(values.shape))
 
-    def _unweighted(self, rows: Rows, left: Array) -> Array:
+    def _unweighted(self, rows: Rows, left: Floats) -> Array:
         """Residuals (m, n) from weighted ones; 0 where a pixel is not used."""
         return np.divide(left, self.root[rows], out=np.zeros(left.shape), where=self.used[rows])
 
     # Steps.
 
-    def linearise(self, rows: Rows, share: Array, slopes: Array) -> None:
+    def linearise(self, rows: Rows, share: Floats, slopes: Floats) -> None:
         """Form the normal equations of windows `rows` (m,) at their estimates, and the next trial of each.
 
         Parameters
@@ -188,7 +194,7 @@ class Iteration:
         """Whether normal equations (m,) have a solution."""
 
         def pivots(scaled: Array) -> Array:
-            return np.linalg.cholesky(scaled)[..., self._diagonal, self._diagonal].min(axis=-1)
+            return np.asarray(np.linalg.cholesky(scaled)[..., self._diagonal, self._diagonal].min(axis=-1))
 
         scaled, _ = self._scaled(rows)
         try:
@@ -253,7 +259,7 @@ class Iteration:
         left = self.predicted[rows]
         return np.asarray(left * (change / 4) ** 2 <= self._limit(rows) * (1 - left / self.cost[rows]))
 
-    def _extrapolate(self, rows: Rows, left: Array, share: Array, slopes: Array, at: Rows) -> None:
+    def _extrapolate(self, rows: Rows, left: Floats, share: Floats, slopes: Floats, at: Rows) -> None:
         """Correct windows, and by their derivatives residuals and images `share[at]`."""
         if not len(rows):
             return
@@ -267,7 +273,7 @@ class Iteration:
         self.cost[rows] -= self.predicted[rows]
         self.state[rows] = DONE
 
-    def advance(self, rows: Rows, share: Array) -> Mask:
+    def advance(self, rows: Rows, share: Floats) -> Mask:
         """Accept or refuse the trials of windows `rows` (m,), in which `share` (m, n) was formed; next ones.
 
         Returns
@@ -277,7 +283,7 @@ class Iteration:
         """
         trial = self.trial[rows]
         off = np.where(self.used[rows], self._formed(trial, share)[2] - self.observed[rows], 0.0)
-        left = off * self.root[rows]
+        left: Floats = off * self.root[rows]
         if len(self.common[0]):
             left = self._without_common(rows, left)
             off = self._unweighted(rows, left)
@@ -317,7 +323,7 @@ class Iteration:
         found[good] = np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None]
         return found
 
-    def influences(self, rows: Rows) -> tuple[Array, Array]:
+    def influences(self, rows: Rows) -> tuple[Floats, Floats]:
         """Influence of each pixel on the position (m, 2, n), and its leverage (m, n).
 
         With derivatives A, weights W and cofactor Q they are the first rows of Q Aᵀ W, and the diagonal of

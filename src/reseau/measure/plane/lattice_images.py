@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from functools import cache
 from math import isqrt
+from typing import Any
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from ...core.data import Array, Rows
 
@@ -160,7 +162,7 @@ class _Crossings:
 
 
 def shade_lines(
-    free: Array, nodes: Array, beside: Array, path: tuple[Array, Array], longest: float, blur: float
+    free: NDArray[Any], nodes: Array, beside: Array, path: tuple[Array, Array], longest: float, blur: float
 ) -> None:
     """Multiply the free share of pixels by that which blurred lines leave.
 
