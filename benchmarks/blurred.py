@@ -41,22 +41,16 @@ from worlds.blurred import (
 )
 
 from reseau.core.data import Frame
-from reseau.measure.blurred import BlurredOptions, BlurredResult, measure_blurred
-from reseau.measure.matching import GrownOutline, MatchOptions, Window, match
+from reseau.measure.blurred import BlurredOptions, measure_blurred
+from reseau.measure.blurred.measure import BlurredResult
+from reseau.measure.matching import match
+from reseau.measure.matching.patches import MatchOptions
+from reseau.measure.matching.shapes import GrownOutline, Window
 from reseau.optics.formation import Outline, PixelResponse, mark_outline
-from reseau.optics.lenses import (
-    AIR,
-    LensCamera,
-    PlaneTarget,
-    Prescription,
-    PupilElements,
-    RayMap,
-    RaySurrogate,
-    SensorPlane,
-    glass,
-    in_order,
-    ray_image,
-)
+from reseau.optics.lenses import AIR, Prescription, PupilElements, RayMap, glass, in_order, ray_image
+from reseau.optics.lenses.images import PlaneTarget
+from reseau.optics.lenses.ray_maps import LensCamera, SensorPlane
+from reseau.optics.lenses.surrogate import RaySurrogate
 
 PITCH = 0.006
 SIZE = (1600, 1200)

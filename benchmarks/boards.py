@@ -41,7 +41,8 @@ from reseau.core.failure import Failure
 from reseau.execution import Executor
 from reseau.io import parse_design
 from reseau.io.images import read_image
-from reseau.measure import ReseauOptions, measure_reseau, measure_testfield
+from reseau.measure import measure_reseau, measure_testfield
+from reseau.measure.reseau.marks import ReseauOptions
 from reseau.procedures.calibration import calibrate_camera
 from reseau.procedures.target_measurement import measurer_of
 

@@ -29,12 +29,13 @@ from scipy.sparse import coo_array
 from shared import of_the_tests
 from worlds import lenses
 
-from reseau.bundle import BundleFit, BundleProblem, Camera, Network, problem_of
+from reseau.bundle import Camera, Network, problem_of
 from reseau.bundle.solver.posterior import cofactors_of
+from reseau.bundle.solver.problem import BundleFit, BundleProblem
 from reseau.core.threads import one_thread
-from reseau.exchange import read_bal
+from reseau.exchange.bal import read_bal
 from reseau.io.network import Network1
-from reseau.optics.cameras import Fisheye
+from reseau.optics.cameras.projections import Fisheye
 from reseau.optics.poses import rotation_matrix
 
 DATA = (

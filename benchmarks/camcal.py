@@ -31,7 +31,8 @@ from reseau.core.data import Array, Frame
 from reseau.io import ReseauDesign
 from reseau.io.images import Channel, read_image
 from reseau.io.network import Network1
-from reseau.measure import ReseauResult, measure_reseau
+from reseau.measure import measure_reseau
+from reseau.measure.reseau.measure import ReseauResult
 from reseau.optics.formation import Outline
 
 _LIMIT_PX = 0.03

@@ -26,21 +26,17 @@ from figures import record
 from parts import add_options, executor_of, main_of, outcomes
 from worlds import lenses
 
-from reseau.bundle import Camera, ModelChoice, Network, Result, adjust_network, choose_model
+from reseau.bundle import Camera, Network, Result, adjust_network, choose_model
+from reseau.bundle.modelling.choice import ModelChoice
 from reseau.calibration.camera import by_rotation
 from reseau.core.compiled import compiled, kernel
 from reseau.execution import Executor
 from reseau.io.network import Network1
 from reseau.optics import PixelGrid, camera_models
-from reseau.optics.cameras import (
-    Division,
-    Fisheye,
-    OpenCV,
-    SplinedStereographic,
-    SplineGrid,
-    Stereographic,
-)
 from reseau.optics.cameras.kernels import CameraColumns, camera
+from reseau.optics.cameras.opencv import OpenCV
+from reseau.optics.cameras.projections import Division, Fisheye, Stereographic
+from reseau.optics.cameras.splined import SplinedStereographic, SplineGrid
 from reseau.optics.poses import rotation_matrix
 
 DATA = Path(os.environ.get("RESEAU_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))

@@ -20,7 +20,7 @@ from parts import add_options, executor_of, main_of, outcomes
 from reseau.capture import Step, paper_steps, spread
 from reseau.core.data import Frame
 from reseau.designs import coded_testfield
-from reseau.measure import TestfieldOptions
+from reseau.measure.testfield.measure import TestfieldOptions
 from reseau.procedures.calibration_options import CameraOptions
 from reseau.procedures.target_measurement import measurer_of
 from reseau.procedures.testfield import TestfieldProcedure

@@ -21,7 +21,9 @@ import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from reseau.bundle import Camera, Network, Options, Rig, adjust_network, held_as_designed, problem_of
+from reseau.bundle import Camera, Network, Options, adjust_network, problem_of
+from reseau.bundle.modelling.board import held_as_designed
+from reseau.bundle.network.rig import Rig
 from reseau.core.data import Array, ImagePoints, Rows
 from reseau.core.failure import Failure
 from reseau.procedures.calibrated import Calibrated

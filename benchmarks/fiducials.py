@@ -21,7 +21,8 @@ from worlds.fiducials import KINDS, photograph, write
 from reseau.core.failure import Code, Failure
 from reseau.io import FiducialDesign
 from reseau.io.images import open_scan
-from reseau.measure.fiducials import FiducialOptions, measure_fiducials
+from reseau.measure.fiducials import measure_fiducials
+from reseau.measure.fiducials.measure import FiducialOptions
 
 WRONG_PX, WRONG_SIGMA = 0.15, 5.0
 

@@ -21,9 +21,10 @@ from frames import CASES, SEEDS
 
 from reseau.core.data import Array
 from reseau.io.scans import Scan, scan_of
-from reseau.measure.film import FrameOptions, orient_frames
+from reseau.measure.film import orient_frames
 from reseau.measure.film.adjacent_lines import ends_with_line
 from reseau.measure.film.border import read_band
+from reseau.measure.film.orientation import FrameOptions
 from reseau_sims.filmframe import Beside, FilmFrame
 
 LIMIT_PX = 0.33

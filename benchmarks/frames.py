@@ -33,7 +33,9 @@ from reseau.core.tone import ToneCurve
 from reseau.execution import Executor, Processes
 from reseau.io.images import open_scan
 from reseau.io.scans import scan_of
-from reseau.measure.film import FrameOptions, FrameResult, Roll, orient_frames, roll_of, transformed
+from reseau.measure.film import orient_frames
+from reseau.measure.film.orientation import FrameOptions, FrameResult
+from reseau.measure.film.roll import Roll, roll_of, transformed
 from reseau.procedures.film_frame import reorient_scan
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 

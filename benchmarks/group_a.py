@@ -34,7 +34,8 @@ from reseau.designs import standard_reseau
 from reseau.execution import Executor
 from reseau.measure import measure_reseau
 from reseau.measure.fitting import fit_mapping, mapping_problem
-from reseau.optics import RationalPolynomial, Similarity
+from reseau.optics import RationalPolynomial
+from reseau.optics.composition import Similarity
 from reseau.refine import CorrectionFit, FittedCamera, correct_camera
 from reseau_sims import World
 

@@ -23,7 +23,7 @@ from group_a import EVERYTHING, in_pixels
 from parts import outcomes
 from tables import ALPHA, SIZES, level_band, print_power
 
-from reseau.adjust import Elimination
+from reseau.adjust.elimination import Elimination
 from reseau.calibration import CameraCorrection
 from reseau.core.data import Array, ImagePoints
 from reseau.designs import standard_reseau, test_object

@@ -30,7 +30,8 @@ from figures import record
 from parts import add_options, executor_of, main_of, outcomes
 from scipy.stats import t as student
 
-from reseau.bundle import Result, adjust_network, camera_mapping
+from reseau.bundle import Result, adjust_network
+from reseau.bundle.diagnostics.fields import camera_mapping
 from reseau.calibration import CameraMapping, FieldDifference, calibration_difference
 from reseau.core.data import Array, ImagePoints, Rows
 from reseau.core.failure import Failure
@@ -188,7 +189,7 @@ def smooth(field: str, s: Array, rng: np.random.Generator) -> Array:
 def truth() -> CameraMapping:
     """The true camera, without any uncertainty."""
     from reseau.optics import PixelGrid
-    from reseau.optics.cameras import camera_model
+    from reseau.optics.cameras.registry import camera_model
 
     model = camera_model("opencv")
     values = [TRUE.values.get(name, 0.0) for name in model.names]

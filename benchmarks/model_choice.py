@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from worlds import lenses
 
-from reseau.bundle import camera_mapping
+from reseau.bundle.diagnostics.fields import camera_mapping
 from reseau.calibration import projection_field
 from reseau.core.data import Array, ImagePoints
 from reseau.designs import board

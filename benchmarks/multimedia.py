@@ -34,11 +34,13 @@ from shared import of_the_tests
 from worlds.water import Array, Scene, Surface, around
 
 from reseau.adjust import Options
-from reseau.bundle import BundleFit, BundleProblem, Camera, Network, Result, adjust_network, problem_of
+from reseau.bundle import Camera, Network, Result, adjust_network, problem_of
+from reseau.bundle.solver.problem import BundleFit, BundleProblem
 from reseau.core.threads import one_thread
 from reseau.execution import Executor
 from reseau.optics.poses import matrix_to_vector
-from reseau.optics.refraction import Refraction, RefractiveIndex, Window
+from reseau.optics.refraction import Window
+from reseau.optics.refraction.windows import Refraction, RefractiveIndex
 
 FOCAL, CENTRE, K1, SIZE = 1200.0, (639.5, 511.5), -0.08, (1280, 1024)
 SIGMA_PX = 0.05

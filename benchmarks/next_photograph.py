@@ -30,7 +30,7 @@ from figures import record
 from parts import add_options, executor_of, main_of, outcomes
 from worlds import prints
 
-from reseau.bundle import camera_mapping
+from reseau.bundle.diagnostics.fields import camera_mapping
 from reseau.calibration import projection_field
 from reseau.core.data import Array, ImagePoints
 from reseau.core.failure import Failure

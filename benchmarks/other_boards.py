@@ -32,7 +32,8 @@ from reseau.core.failure import Failure
 from reseau.designs import board
 from reseau.io import BoardDesign
 from reseau.io.images import read_image
-from reseau.measure import BoardOptions, measure_board
+from reseau.measure import measure_board
+from reseau.measure.boards.measure import BoardOptions
 
 DESIGNS = {
     "charuco": board("charuco", 11, 11, 23.0, size=17.0, dictionary="DICT_5X5_100"),

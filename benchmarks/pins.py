@@ -29,8 +29,10 @@ from reseau.core.failure import Failure
 from reseau.execution import Executor
 from reseau.io import ReseauDesign
 from reseau.io.images import read_image, write_image
-from reseau.measure import PinDetections, PinOptions, Wires, find_pins, lay_wires, measure_pins
+from reseau.measure import PinDetections, find_pins, measure_pins
 from reseau.measure.fitting import fit_mapping
+from reseau.measure.pins.detection import PinOptions
+from reseau.measure.pins.wires import Wires, lay_wires
 from reseau.optics import RationalPolynomial
 
 SAME_PX = 10.0

@@ -27,7 +27,9 @@ from figures import record
 from shared import of_the_tests
 
 from reseau.core.data import Array
-from reseau.optics.lenses import AIR, Aperture, Constant, Prescription, Rays, Tracer, in_order
+from reseau.optics.lenses import AIR, Aperture, Prescription, Tracer, in_order
+from reseau.optics.lenses.media import Constant
+from reseau.optics.lenses.trace import Rays
 
 THREADS = 2
 REPEATS = 5

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from reseau.core.data import Array
 from reseau.io.images import open_scan, write_image
 from reseau.io.scans import Scan
-from reseau.measure.film import PITCH_MM, FilmPlane, FrameOptions, edge_of, film_plane, orient_frames
+from reseau.measure.film import film_plane, orient_frames
+from reseau.measure.film.orientation import FrameOptions
+from reseau.measure.film.perforations import PITCH_MM, FilmPlane, edge_of
 from reseau.report.frames import contact_sheet, frame_tile
 
 __all__ = ["print_real"]

@@ -29,7 +29,8 @@ from reseau.core.failure import Failure
 from reseau.designs import regular_reseau
 from reseau.io import Mark, ReseauDesign
 from reseau.io.images import write_image
-from reseau.measure import ReseauOptions, measure_reseau
+from reseau.measure import measure_reseau
+from reseau.measure.reseau.marks import ReseauOptions
 from reseau.refine import correct_camera
 
 PX_PER_MM, ARM, LINE = 10.0, 1.2, 0.16

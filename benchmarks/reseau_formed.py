@@ -18,7 +18,7 @@ import numpy as np
 from figures import ORIGIN, record
 from shared import of_the_tests
 
-from reseau.optics import sigma_of_snr
+from reseau.optics.sensor import sigma_of_snr
 
 MOST_RATIO, MOST_BIAS_PX, MOST_BIAS_SIGMA_PX = 1.15, 0.002, 0.0005
 NORMALISED = (0.9, 1.1)

@@ -22,7 +22,9 @@ from shared import of_the_tests
 from reseau.core.data import Array
 from reseau.io import ReseauDesign
 from reseau.io.images import write_image
-from reseau.measure import ReseauOptions, ReseauResult, measure_reseau
+from reseau.measure import measure_reseau
+from reseau.measure.reseau.marks import ReseauOptions
+from reseau.measure.reseau.measure import ReseauResult
 from reseau.optics.field import SmoothField
 
 TRIALS = 499

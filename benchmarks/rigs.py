@@ -28,7 +28,7 @@ import numpy as np
 from parts import add_options, executor_of, main_of, outcomes
 
 from reseau.bundle import Camera, Network, adjust_network
-from reseau.bundle.network import Rig
+from reseau.bundle.network.rig import Rig
 from reseau.core.data import Array
 from reseau.execution import Executor
 from reseau.io.network import CameraEntry

@@ -30,7 +30,8 @@ from scale_networks import KINDS
 from watched import forget_peak, peak_mb, run_watched
 
 from bundle import colmap_command, compiled_peer
-from reseau.bundle import BundleFit, problem_of
+from reseau.bundle import problem_of
+from reseau.bundle.solver.problem import BundleFit
 
 __all__ = ["part_bundle"]
 

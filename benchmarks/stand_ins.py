@@ -44,8 +44,11 @@ from parts import add_options, executor_of, main_of, outcomes
 from scipy.optimize import least_squares
 
 from reseau.core.data import Frame
-from reseau.measure.blurred import BlurredOptions, BlurredResult, Varied, estimate_optics, measure_blurred
-from reseau.optics.lenses import AberratedLens, Paraxial, PlaneTarget, PupilElements, RayMap, ThinLens
+from reseau.measure.blurred import BlurredOptions, estimate_optics, measure_blurred
+from reseau.measure.blurred.measure import BlurredResult, Varied
+from reseau.optics.lenses import Paraxial, PupilElements, RayMap, ThinLens
+from reseau.optics.lenses.images import PlaneTarget
+from reseau.optics.lenses.stand_ins import AberratedLens
 
 DECIBELS = 40.0
 WRONG_FOCUS = 0.05

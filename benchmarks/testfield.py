@@ -33,8 +33,8 @@ from reseau.core.tone import ToneCurve
 from reseau.designs import HIDDEN, coded_testfield
 from reseau.execution import Processes
 from reseau.io import SHAPES
-from reseau.measure import TestfieldOptions, TestfieldResult, measure_testfield
-from reseau.measure.testfield.measure import FORMED_PX
+from reseau.measure import measure_testfield
+from reseau.measure.testfield.measure import FORMED_PX, TestfieldOptions, TestfieldResult
 from reseau.measure.testfield.recognition import read_clusters
 from reseau.optics.formation import PixelResponse
 from reseau_sims import FieldBench, Photograph, Stain, Station, paper_stations

@@ -17,21 +17,16 @@ import numpy as np
 import scipy.stats
 from parts import add_options, executor_of, main_of, outcomes
 
-from reseau.adjust import compare
-from reseau.bundle import (
-    Additional,
-    Camera,
-    Network,
-    Result,
-    adjust_network,
-    by_point,
-    camera_mapping,
-    common_pattern,
-)
+from reseau.adjust.fitted import compare
+from reseau.bundle import Camera, Network, Result, adjust_network
+from reseau.bundle.diagnostics.fields import camera_mapping
+from reseau.bundle.diagnostics.patterns import by_point, common_pattern
+from reseau.bundle.network.camera import Additional
 from reseau.core.data import Array, ImagePoints
 from reseau.designs import coded_testfield
 from reseau.io import SHAPES
-from reseau.measure import TestfieldOptions, measure_testfield
+from reseau.measure import measure_testfield
+from reseau.measure.testfield.measure import TestfieldOptions
 from reseau.procedures.calibration import network_of
 from reseau_sims import FieldBench, Station, paper_stations
 from reseau_sims.testfield import C_MM, JITTER_PX, PITCH_MM, PIXELS

@@ -48,18 +48,11 @@ from reseau.core.data import Frame
 from reseau.io.targets import SpaceTargets, TargetColumns
 from reseau.measure.blurred import BlurredOptions
 from reseau.measure.ordinary import ordinary_coordinates
-from reseau.optics.lenses import (
-    AIR,
-    LensCamera,
-    Paraxial,
-    Prescription,
-    SensorPlane,
-    ThinLens,
-    glass,
-    in_order,
-)
+from reseau.optics.lenses import AIR, Paraxial, Prescription, ThinLens, glass, in_order
+from reseau.optics.lenses.ray_maps import LensCamera, SensorPlane
 from reseau.optics.poses import matrix_to_vector
-from reseau.optics.refraction import Refraction, RefractiveIndex, Window
+from reseau.optics.refraction import Window
+from reseau.optics.refraction.windows import Refraction, RefractiveIndex
 from reseau.procedures.blurred import thin_lens_of
 from reseau.procedures.blurred_network import BlurredNetwork, NetworkOptions, measure_blurred_network
 

@@ -27,19 +27,10 @@ from worlds.counted import DOUBLE_GAUSS, TRIPLET, WATER, Array, View, drawn
 from reseau.core.data import Frame
 from reseau.measure.blurred import BlurredOptions, measure_blurred
 from reseau.optics.formation import mark_outline
-from reseau.optics.lenses import (
-    AIR,
-    Aperture,
-    LensCamera,
-    Medium,
-    PlaneTarget,
-    Prescription,
-    PupilElements,
-    Sellmeier,
-    SensorPlane,
-    glass,
-    in_order,
-)
+from reseau.optics.lenses import AIR, Aperture, Medium, Prescription, PupilElements, glass, in_order
+from reseau.optics.lenses.images import PlaneTarget
+from reseau.optics.lenses.media import Sellmeier
+from reseau.optics.lenses.ray_maps import LensCamera, SensorPlane
 
 WAVELENGTHS, WEIGHTS, REFERENCE = (480.0, 546.07, 620.0), (0.3, 1.0, 0.5), 1
 RINGS = {"centre": (0.0, 0.35), "middle": (0.35, 0.65), "rim": (0.65, 0.85), "corner": (0.85, 1.0)}

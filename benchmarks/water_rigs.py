@@ -36,9 +36,10 @@ from numpy.typing import NDArray
 from parts import add_options, executor_of, main_of, outcomes, timed
 
 from reseau.bundle import Camera, Network, Result, adjust_network
-from reseau.bundle.network import Rig
+from reseau.bundle.network.rig import Rig
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
-from reseau.optics.refraction import Refraction, RefractiveIndex, Window
+from reseau.optics.refraction import Window
+from reseau.optics.refraction.windows import Refraction, RefractiveIndex
 
 Array = NDArray[np.float64]
 

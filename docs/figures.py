@@ -33,8 +33,9 @@ from reseau.designs import board
 from reseau.exchange import read_lens, read_network
 from reseau.io import ReseauDesign
 from reseau.io.reading import read_design
-from reseau.measure import ReseauOptions, measure_reseau
+from reseau.measure import measure_reseau
 from reseau.measure.blurred import BlurredOptions
+from reseau.measure.reseau.marks import ReseauOptions
 from reseau.procedures.blurred import lens_camera, measure_blurred_frame
 from reseau.report.blurred import blurred_figure
 

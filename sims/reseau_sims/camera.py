@@ -10,17 +10,16 @@ import numpy as np
 from reseau.core.data import Array
 from reseau.optics import (
     Brown,
-    Chain,
-    Inverted,
     PixelGrid,
-    PlaneMapping,
     Pose,
     RationalPolynomial,
     Sensor,
     matrix_to_vector,
     rotation_matrix,
 )
+from reseau.optics.composition import Chain, Inverted
 from reseau.optics.formation import PixelResponse
+from reseau.optics.mapping import PlaneMapping
 
 __all__ = ["FilmCamera", "film"]
 

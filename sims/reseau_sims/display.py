@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
-from reseau.optics import Chain, Derivatives, PlaneMapping, RationalPolynomial, wong_display
-from reseau.optics.mapping import as_points, as_values
+from reseau.optics import RationalPolynomial
+from reseau.optics.composition import Chain
+from reseau.optics.displays import wong_display
+from reseau.optics.mapping import Derivatives, PlaneMapping, as_points, as_values
 from reseau.optics.resampling import on_lattice
 
 from .scanner import Video

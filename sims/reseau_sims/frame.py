@@ -22,19 +22,10 @@ from reseau.io.refraction import RefractionEntry
 from reseau.io.targets import SpaceTargets
 from reseau.optics import Pose
 from reseau.optics.formation import PixelResponse
-from reseau.optics.lenses import (
-    AIR,
-    LensCamera,
-    Paraxial,
-    PlaneTarget,
-    Prescription,
-    PupilElements,
-    SensorPlane,
-    behind_windows,
-    glass,
-    in_order,
-    ray_images,
-)
+from reseau.optics.lenses import AIR, Paraxial, Prescription, PupilElements, glass, in_order
+from reseau.optics.lenses.images import PlaneTarget, ray_images
+from reseau.optics.lenses.ray_maps import LensCamera, SensorPlane
+from reseau.optics.lenses.windows import behind_windows
 from reseau.optics.poses import matrix_to_vector
 
 from .water import Water

@@ -9,7 +9,7 @@ import numpy as np
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.io import ReseauDesign
-from reseau.optics import PlaneMapping
+from reseau.optics.mapping import PlaneMapping
 
 __all__ = ["Reflectors", "body_of", "rods_of"]
 

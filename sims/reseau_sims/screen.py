@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from reseau.core.data import Array
-from reseau.optics import PlaneMapping
+from reseau.optics.mapping import PlaneMapping
 from reseau.optics.resampling import on_lattice
 
 __all__ = ["Screen"]

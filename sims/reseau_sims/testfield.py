@@ -26,10 +26,10 @@ from reseau.optics import (
     matrix_to_vector,
     project,
     rotation_matrix,
-    sigma_of_snr,
 )
 from reseau.optics.formation import Outline, PixelResponse, draw
 from reseau.optics.grids import line_grid
+from reseau.optics.sensor import sigma_of_snr
 from reseau.optics.targets import target_outline
 
 from .frame import SpaceFrame

@@ -16,7 +16,7 @@ import numpy as np
 from reseau.core.data import Array, Mask
 from reseau.core.errors import UsageError
 from reseau.optics import rotation_matrix
-from reseau.optics.lenses import Water as WaterMedium
+from reseau.optics.lenses.media import Water as WaterMedium
 
 __all__ = ["Directions", "Water"]
 

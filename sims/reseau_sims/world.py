@@ -15,19 +15,11 @@ import numpy as np
 from reseau.core.data import Array, Frame
 from reseau.designs import standard_reseau, test_object
 from reseau.io import ReseauDesign
-from reseau.optics import (
-    Brown,
-    Chain,
-    Inverted,
-    PixelGrid,
-    PlaneMapping,
-    Pose,
-    Sensor,
-    Similarity,
-    angles_to_matrix,
-    matrix_to_vector,
-)
+from reseau.optics import Brown, PixelGrid, Pose, Sensor, matrix_to_vector
+from reseau.optics.composition import Chain, Inverted, Similarity
 from reseau.optics.grids import Wires
+from reseau.optics.mapping import PlaneMapping
+from reseau.optics.poses import angles_to_matrix
 
 from .camera import FilmCamera, film
 from .display import Display

@@ -24,24 +24,21 @@ from .calibration.sensor import SensorCorrection
 from .core.data import Frame, ImagePoints
 from .core.errors import UsageError
 from .core.failure import Failure
-from .exchange import Lens, read_network, read_target
 from .exchange import read_lens as _read_lens
+from .exchange import read_network
+from .exchange.boards import read_target
+from .exchange.lenses import Lens
 from .io import BoardDesign, ReseauDesign, TestfieldDesign
 from .io.images import Channel, grey_of, open_scan
 from .io.images import read_image as _read_image
 from .io.reading import is_points, read_measurement
 from .io.scans import scan_of
-from .measure import (
-    BoardOptions,
-    PinOptions,
-    ReseauOptions,
-    TestfieldOptions,
-    measure_board,
-    measure_pins,
-    measure_reseau,
-    measure_testfield,
-)
+from .measure import measure_board, measure_pins, measure_reseau, measure_testfield
+from .measure.boards.measure import BoardOptions
+from .measure.pins.detection import PinOptions
 from .measure.points import Measured
+from .measure.reseau.marks import ReseauOptions
+from .measure.testfield.measure import TestfieldOptions
 from .procedures.calibrated import Calibrated
 from .procedures.calibrating import calibrate_photographs
 from .procedures.calibration_options import CalibrationOptions, CameraOptions

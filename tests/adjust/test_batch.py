@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.adjust import BatchOptions, BatchReason, adjust_batch, weight_function
+from reseau.adjust import adjust_batch, weight_function
+from reseau.adjust.batch import BatchOptions, BatchReason
 from reseau.core.errors import UsageError
 
 T = np.linspace(0.0, 4.0, 40)

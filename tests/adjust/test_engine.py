@@ -10,17 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reseau.adjust import (
-    AdjustmentFailure,
-    Constraint,
-    GaussHelmert,
-    GaussMarkov,
-    Options,
-    Parameters,
-    Prior,
-    adjust,
-    check_jacobian,
-)
+from reseau.adjust import GaussMarkov, Options, Parameters, adjust
+from reseau.adjust.engine import AdjustmentFailure
+from reseau.adjust.parameters import Constraint, Prior
+from reseau.adjust.problem import GaussHelmert, check_jacobian
 from reseau.core.errors import EstimationError, UsageError
 
 T = np.linspace(0.0, 4.0, 30)

@@ -12,7 +12,8 @@ from decimal import Decimal
 import numpy as np
 import pytest
 
-from reseau.adjust import Options, adjust, check_jacobian
+from reseau.adjust import Options, adjust
+from reseau.adjust.problem import check_jacobian
 
 from . import nist
 

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from reseau.adjust import (
-    BatchOptions,
-    GaussHelmert,
     GaussMarkov,
     Options,
     Parameters,
@@ -15,9 +13,11 @@ from reseau.adjust import (
     adjust_batch,
     data_snooping,
     eliminate,
-    robust,
     variance_components,
 )
+from reseau.adjust.batch import BatchOptions
+from reseau.adjust.outliers import robust
+from reseau.adjust.problem import GaussHelmert
 from reseau.core.errors import UsageError
 from reseau.core.failure import Code, Failure
 

@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from reseau.adjust import (
-    GaussHelmert,
-    GaussMarkov,
-    Options,
-    Parameters,
-    adjust,
-    critical_tau,
-    critical_w,
-    noncentrality,
-)
+from reseau.adjust import GaussMarkov, Options, Parameters, adjust
+from reseau.adjust.problem import GaussHelmert
+from reseau.adjust.reliability import critical_tau, critical_w, noncentrality
 from reseau.core.errors import UsageError
 
 T = np.linspace(-1.0, 1.0, 12)

@@ -5,17 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.adjust import (
-    BatchOptions,
-    GaussHelmert,
-    GaussMarkov,
-    Parameters,
-    adjust,
-    adjust_batch,
-    data_snooping,
-    robust,
-    weight_function,
-)
+from reseau.adjust import GaussMarkov, Parameters, adjust, adjust_batch, data_snooping, weight_function
+from reseau.adjust.batch import BatchOptions
+from reseau.adjust.outliers import robust
+from reseau.adjust.problem import GaussHelmert
 from reseau.core.errors import UsageError
 from reseau.core.failure import Code
 

@@ -5,18 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.adjust import (
-    AdjustmentFailure,
-    Constraint,
-    GaussHelmert,
-    GaussMarkov,
-    Options,
-    Parameters,
-    adjust,
-    compare,
-    eliminate,
-    variance_components,
-)
+from reseau.adjust import GaussMarkov, Options, Parameters, adjust, eliminate, variance_components
+from reseau.adjust.engine import AdjustmentFailure
+from reseau.adjust.fitted import compare
+from reseau.adjust.parameters import Constraint
+from reseau.adjust.problem import GaussHelmert
 from reseau.core.errors import UsageError
 
 T = np.linspace(-1.0, 1.0, 40)

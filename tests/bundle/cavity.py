@@ -14,7 +14,8 @@ import numpy as np
 from reseau.bundle import Camera, Network
 from reseau.core.data import Array
 from reseau.optics.poses import Pose, matrix_to_vector
-from reseau.optics.refraction import RefractedRays, Refraction, RefractiveIndex, Window
+from reseau.optics.refraction import RefractedRays, Window
+from reseau.optics.refraction.windows import Refraction, RefractiveIndex
 
 PITCH = 0.012
 ADDITIONAL = ("K1", "P1", "P2", "B1", "B2")

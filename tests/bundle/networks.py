@@ -7,13 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from reseau.bundle import Additional, BundleProblem, Camera, Network, approximate
+from reseau.bundle import Camera, Network
+from reseau.bundle.network.camera import Additional
+from reseau.bundle.solver.approximation import approximate
+from reseau.bundle.solver.problem import BundleProblem
 from reseau.bundle.solver.unknowns import Unknowns
 from reseau.bundle.solver.values import Values
 from reseau.core.data import Array
-from reseau.optics import Chain, OpenCV, RationalPolynomial, Similarity, wong_display
+from reseau.optics import OpenCV, RationalPolynomial
+from reseau.optics.composition import Chain, Similarity
+from reseau.optics.displays import wong_display
 from reseau.optics.poses import Pose, matrix_to_vector, project
-from reseau.optics.refraction import RefractedRays, Refraction, RefractiveIndex, Window, window_parameters
+from reseau.optics.refraction import RefractedRays, Window
+from reseau.optics.refraction.windows import Refraction, RefractiveIndex, window_parameters
 
 BROWN = (8.0, 0.03, -0.02, 2e-3, -3e-5, 0.0, 4e-5, -3e-5, 2e-4, -1e-4)
 OPENCV = (810.0, 805.0, 321.0, 238.0, -0.2, 0.05, 4e-4, -3e-4, 0.01, 0.0, 0.0, 0.0)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from reseau.bundle import Camera, Network
-from reseau.bundle.network import Rig
+from reseau.bundle.network.rig import Rig
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
 
 __all__ = ["PLACES", "drawn"]

@@ -8,18 +8,9 @@ import numpy as np
 import pytest
 
 from reseau.adjust import variance_components
-from reseau.bundle import (
-    BundleFit,
-    BundleProblem,
-    Network,
-    Options,
-    Result,
-    Selection,
-    adjust_network,
-    calibration_of,
-    cross_validation,
-    eliminate_parameters,
-)
+from reseau.bundle import Network, Options, Result, adjust_network, calibration_of
+from reseau.bundle.modelling.search import Selection, cross_validation, eliminate_parameters
+from reseau.bundle.solver.problem import BundleFit, BundleProblem
 from reseau.calibration import Calibration
 from reseau.core.errors import UsageError
 from reseau.core.failure import Code, Failure

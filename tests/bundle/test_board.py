@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from reseau.bundle import BoardChoice, Network, choose_board, held_as_designed
+from reseau.bundle import Network, choose_board
+from reseau.bundle.modelling.board import BoardChoice, held_as_designed
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.io.network import Network1

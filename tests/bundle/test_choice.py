@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reseau.bundle import Camera, Candidate, ModelChoice, Network, Options, camera_candidates, choose_model
+from reseau.bundle import Camera, Candidate, Network, Options, choose_model
 from reseau.bundle.modelling import choice
+from reseau.bundle.modelling.candidates import camera_candidates
+from reseau.bundle.modelling.choice import ModelChoice
 from reseau.core.errors import UsageError
 from reseau.io.network import Network1
-from reseau.optics.cameras import camera_model
+from reseau.optics.cameras.registry import camera_model
 from reseau.optics.poses import rotation_matrix
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))

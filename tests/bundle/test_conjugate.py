@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reseau.bundle import BundleFit, BundleProblem, Network, Options, adjust_network
+from reseau.bundle import Network, Options, adjust_network
 from reseau.bundle.document import ResultDocument
 from reseau.bundle.solver.arrow import Arrow, full
+from reseau.bundle.solver.problem import BundleFit, BundleProblem
 from reseau.core.data import Array
 from reseau.core.failure import Code, Failure
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.bundle import Camera, Result, camera_mapping
+from reseau.bundle import Camera, Result
+from reseau.bundle.diagnostics.fields import camera_mapping
 from reseau.calibration import calibration_difference, projection_field
 from reseau.core.data import Array
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from reseau.bundle import Network, Options, adjust_network
-from reseau.bundle.diagnostics import control_shape
+from reseau.bundle.diagnostics.control_check import control_shape
 from reseau.core.data import Array
 from reseau.core.failure import Code
 

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from reseau.bundle import explain, misnamed
+from reseau.bundle import explain
+from reseau.bundle.explanations.names import misnamed
 from reseau.core.data import Array, ImagePoints
 from reseau.designs import coded_sheet
 from reseau.procedures.calibrated import Calibrated

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.bundle import Result, adjust_network, calibration_of, camera_mapping, projection_field_at
+from reseau.bundle import Result, adjust_network, calibration_of
+from reseau.bundle.diagnostics.fields import camera_mapping, projection_field_at
 from reseau.calibration import CameraMapping, FieldDifference, calibration_difference, projection_field
 from reseau.core.errors import UsageError
 

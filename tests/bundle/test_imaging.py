@@ -14,7 +14,7 @@ from reseau.bundle.solver.system import System, residuals
 from reseau.bundle.solver.unknowns import Unknowns
 from reseau.bundle.solver.values import Correction, Values
 from reseau.core.data import Array
-from reseau.optics import EbnerCorrection
+from reseau.optics.cameras.ebner import EbnerCorrection
 from reseau.optics.poses import Pose, matrix_to_vector, project
 
 from . import networks

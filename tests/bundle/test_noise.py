@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.bundle import BundleFit
 from reseau.bundle.solver.noise import determined_by_noise, part_by_noise
 from reseau.bundle.solver.orthogonal import cofactors_from_rows
-from reseau.bundle.solver.problem import expected_variance
+from reseau.bundle.solver.problem import BundleFit, expected_variance
 from reseau.core.failure import Code, Failure
 
 from . import networks

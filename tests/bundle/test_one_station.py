@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.bundle import Network, RotationOnly, adjust_network, problem_of, rotation_only
+from reseau.bundle import Network, adjust_network, problem_of, rotation_only
+from reseau.bundle.modelling.one_station import RotationOnly
 from reseau.core.failure import Code
 
 from . import networks

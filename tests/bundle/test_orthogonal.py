@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.bundle import BundleFit
 from reseau.bundle.solver.arrow import Singular
 from reseau.bundle.solver.orthogonal import cofactors_from_rows
+from reseau.bundle.solver.problem import BundleFit
 
 from . import networks
 from .test_conjugate import NEVER, banded_world, with_distances_and_observed_parameters

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.bundle import Network, Result, by_place, by_point, common_pattern
+from reseau.bundle import Network, Result
 from reseau.bundle.diagnostics import patterns
+from reseau.bundle.diagnostics.patterns import by_place, by_point, common_pattern
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.core.failure import Code

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from reseau.adjust import GaussMarkov, Parameters, Prior, adjust
+from reseau.adjust import GaussMarkov, Parameters, adjust
 from reseau.adjust import Options as AdjustOptions
-from reseau.bundle import BundleFit, BundleProblem, Network, Options, Result, adjust_network
+from reseau.adjust.parameters import Prior
+from reseau.bundle import Network, Options, Result, adjust_network
 from reseau.bundle.diagnostics.checks import checks
 from reseau.bundle.solver.orthogonal import cofactors_from_rows
-from reseau.bundle.solver.problem import _Run
+from reseau.bundle.solver.problem import BundleFit, BundleProblem, _Run
 from reseau.bundle.solver.system import residuals
 from reseau.core.data import Array
 from reseau.core.errors import UsageError

@@ -13,7 +13,8 @@ from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.io.refraction import RefractionEntry
 from reseau.optics.poses import rotation_matrix
-from reseau.optics.refraction import RefractedRays, Refraction, RefractiveIndex, Window
+from reseau.optics.refraction import RefractedRays, Window
+from reseau.optics.refraction.windows import Refraction, RefractiveIndex
 
 from .rigs import PLACES, SIGMA, drawn
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from reseau.bundle import Camera, Network, Options, Result, ResultDocument, adjust_network
-from reseau.bundle.network import Rig, network_document
+from reseau.bundle.network.rig import Rig
+from reseau.bundle.network.settings import network_document
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.core.failure import Failure

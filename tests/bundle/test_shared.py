@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import scipy.special
 
-from reseau.bundle import Network, Result, held_as_designed
+from reseau.bundle import Network, Result
+from reseau.bundle.modelling.board import held_as_designed
 from reseau.core.data import Array
 
 from . import networks

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.bundle import Network, Options, Result, ResultDocument, StageEstimate, adjust_network, problem_of
-from reseau.bundle.network import Stage, network_document
-from reseau.bundle.network.stage import perpendicular
+from reseau.bundle import Network, Options, Result, ResultDocument, adjust_network, problem_of
+from reseau.bundle.diagnostics.estimates import StageEstimate
+from reseau.bundle.network.settings import network_document
+from reseau.bundle.network.stage import Stage, perpendicular
 from reseau.bundle.solver.constraints import Constraints, Placed
 from reseau.bundle.solver.unknowns import Unknowns
 from reseau.core.data import Array

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from reseau.bundle import Network, Options, adjust_network
-from reseau.bundle.diagnostics import control_shape
+from reseau.bundle.diagnostics.control_check import control_shape
 from reseau.exchange import read_network
 from reseau.io.network import Network1
 

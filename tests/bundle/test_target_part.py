@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from reseau.bundle import adjust_network, example_network
-from reseau.bundle.diagnostics import covariance_by_targets
+from reseau.bundle.diagnostics.target_part import covariance_by_targets
 
 
 def test_it_is_what_errors_of_the_coordinates_do_to_the_camera() -> None:

@@ -7,18 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reseau.adjust import compare
-from reseau.bundle import (
-    Additional,
-    Camera,
-    Network,
-    Result,
-    Selection,
-    adjust_network,
-    by_place,
-    common_pattern,
-    eliminate_parameters,
-)
+from reseau.adjust.fitted import compare
+from reseau.bundle import Camera, Network, Result, adjust_network
+from reseau.bundle.diagnostics.patterns import by_place, common_pattern
+from reseau.bundle.modelling.search import Selection, eliminate_parameters
+from reseau.bundle.network.camera import Additional
 from reseau.bundle.solver.system import residuals
 from reseau.core.data import Array
 from reseau.optics.poses import matrix_to_vector

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from reseau.adjust import Options
-from reseau.bundle import BundleFit, Result, Stage, adjust_network, problem_of
+from reseau.bundle import Result, Stage, adjust_network, problem_of
+from reseau.bundle.solver.problem import BundleFit
 from reseau.core.errors import UsageError
-from reseau.optics.refraction import Refraction, RefractiveIndex, Window
+from reseau.optics.refraction import Window
+from reseau.optics.refraction.windows import Refraction, RefractiveIndex
 
 from . import cavity, networks
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from reseau.bundle import Camera, Network
-from reseau.bundle.network import Rig, Stage
+from reseau.bundle.network.rig import Rig
+from reseau.bundle.network.stage import Stage
 from reseau.core.data import Array
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
 

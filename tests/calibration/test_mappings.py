@@ -21,7 +21,8 @@ from reseau.calibration.sensor import Fields, SensorCorrection
 from reseau.core.data import Array, ImagePoints
 from reseau.core.errors import FormatError, UsageError
 from reseau.io import CORNERS, FrameOrientation
-from reseau.optics import RationalPolynomial, Similarity
+from reseau.optics import RationalPolynomial
+from reseau.optics.composition import Similarity
 
 DRAWS = 4000
 # Of a variance from 4000 draws: sqrt(2 / 4000) = 2.2 %; four of them.

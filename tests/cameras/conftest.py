@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from reseau.cli import run
-from reseau.optics.cameras import register_camera, registry
+from reseau.optics.cameras import registry
+from reseau.optics.cameras.registry import register_camera
 
 from . import division, equidistant
 

@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike
 
 from reseau.core.compiled import kernel
 from reseau.core.data import Array
-from reseau.optics import CameraModel, Derivatives, PixelGrid, PlaneMapping
+from reseau.optics import PixelGrid
 from reseau.optics.cameras import Parameter
 from reseau.optics.cameras.kernels import CameraColumns
-from reseau.optics.mapping import as_points, as_values
+from reseau.optics.cameras.registry import CameraModel
+from reseau.optics.mapping import Derivatives, PlaneMapping, as_points, as_values
 
 PARAMETERS = (
     Parameter("focal", "mm", "scale", usual=True, required=True),

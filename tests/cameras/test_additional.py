@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from reseau.bundle import Additional, Camera, Network, Result, adjust_network
+from reseau.bundle import Camera, Network, Result, adjust_network
+from reseau.bundle.network.camera import Additional
 from reseau.bundle.solver.system import residuals
 from reseau.bundle.solver.unknowns import Unknowns
 from reseau.core.data import Array
 from reseau.core.failure import Failure
 from reseau.io.network import AdditionalParameters
 from reseau.optics import PixelGrid, additional_models
-from reseau.optics.cameras import AdditionalModel, ChebyshevCorrection, FourierCorrection
+from reseau.optics.cameras.registry import AdditionalModel
+from reseau.optics.cameras.series import ChebyshevCorrection, FourierCorrection
 
 from ..bundle import networks
 

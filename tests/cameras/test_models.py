@@ -23,9 +23,10 @@ from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.core.failure import Failure
 from reseau.io.network import CameraEntry, Network1
-from reseau.optics import CameraModel, PixelGrid, PlaneMapping, camera_model, camera_models, convert
-from reseau.optics.cameras import distortion_names, register_camera, unit_of
+from reseau.optics import PixelGrid, camera_model, camera_models, convert
 from reseau.optics.cameras.kernels import CameraColumns
+from reseau.optics.cameras.registry import CameraModel, distortion_names, register_camera, unit_of
+from reseau.optics.mapping import PlaneMapping
 from reseau_sims import FieldBench, Station
 
 from ..bundle import networks

@@ -19,7 +19,7 @@ from reseau.exchange.calibrations import mrcal
 from reseau.exchange.calibrations.plain import PlainCamera
 from reseau.io.network import Network1
 from reseau.optics import PixelGrid, camera_model
-from reseau.optics.cameras import SplinedStereographic, SplineGrid
+from reseau.optics.cameras.splined import SplinedStereographic, SplineGrid
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 lenses = importlib.import_module("worlds.lenses")

@@ -11,7 +11,7 @@ from reseau.bundle import Camera, adjust_network
 from reseau.bundle.solver.parallel import resect_parallel
 from reseau.core.data import Array
 from reseau.core.failure import Code
-from reseau.optics.cameras import Telecentric
+from reseau.optics.cameras.telecentric import Telecentric
 from reseau.optics.poses import rotation_matrix
 
 from ..bundle import networks

@@ -14,14 +14,14 @@ import pytest
 from reseau.bundle import Network, adjust_network
 from reseau.core.data import Array
 from reseau.io.network import Network1
-from reseau.optics.cameras import (
+from reseau.optics.cameras.opencv import OpenCV
+from reseau.optics.cameras.projections import (
     Division,
     DoubleSphere,
     EnhancedUnified,
     Equisolid,
     Fisheye,
     Omni,
-    OpenCV,
     Orthographic,
     Stereographic,
 )

@@ -19,7 +19,7 @@ from reseau.core.errors import StateError
 from reseau.designs import coded_testfield
 from reseau.instruments import AxisState, BScan, Deadline, Device, Settings, Status
 from reseau.io import TestfieldDesign
-from reseau.measure import TestfieldOptions
+from reseau.measure.testfield.measure import TestfieldOptions
 from reseau.procedures.calibration_options import CameraOptions
 from reseau.procedures.target_measurement import measurer_of
 from reseau.procedures.testfield import TestfieldProcedure

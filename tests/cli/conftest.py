@@ -14,8 +14,10 @@ from reseau.core.data import Array
 from reseau.designs import regular_reseau
 from reseau.io import Mark, ReseauDesign, write_whole
 from reseau.io.images import write_image
-from reseau.optics import Chain, Inverted, PlaneMapping, RationalPolynomial, Similarity
+from reseau.optics import RationalPolynomial
+from reseau.optics.composition import Chain, Inverted, Similarity
 from reseau.optics.formation import draw, mark_outline
+from reseau.optics.mapping import PlaneMapping
 
 SHAPE = (300, 360)
 

@@ -16,7 +16,8 @@ from reseau.io.images import write_image
 from reseau.io.lens import LensSensor
 from reseau.optics import Pose
 from reseau.optics.formation import Outline, coverage
-from reseau.optics.lenses import AIR, LensCamera, Prescription, PupilElements, glass, in_order, ray_image
+from reseau.optics.lenses import AIR, Prescription, PupilElements, glass, in_order, ray_image
+from reseau.optics.lenses.ray_maps import LensCamera
 from reseau.procedures.blurred import focused, targets_of
 
 Run = Callable[..., tuple[int, str, str]]

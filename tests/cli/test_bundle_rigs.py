@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reseau.bundle.network import network_document
+from reseau.bundle.network.settings import network_document
 
 from ..bundle.rigs import PLACES, drawn
 

@@ -14,7 +14,7 @@ from reseau import calibrate as reseau_calibrate
 from reseau.calibration import Calibration, CameraMapping
 from reseau.core.errors import InputError
 from reseau.designs import board
-from reseau.exchange import import_calibration
+from reseau.exchange.calibrations.formats import import_calibration
 from reseau.io.images import write_image
 from reseau.procedures.calibrated import Calibrated
 from reseau.procedures.calibration_folder import write_calibrated

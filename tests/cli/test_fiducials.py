@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reseau.exchange import read_micmac
+from reseau.exchange.film import read_micmac
 from reseau.io import FiducialDesign
 from reseau.io.images import read_image, write_image
 

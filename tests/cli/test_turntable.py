@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reseau.bundle.network import network_document
+from reseau.bundle.network.settings import network_document
 from reseau.calibration import Calibration
 from reseau.designs import regular_reseau
 from reseau.io import Mark

@@ -19,9 +19,12 @@ from reseau.cli.declared import declared
 from reseau.core.errors import UsageError
 from reseau.core.options import Declared, Group, Option, declaration, options_of
 from reseau.core.vocabulary import names
-from reseau.measure import BoardOptions, PinOptions, ReseauOptions, TestfieldOptions
 from reseau.measure.blurred import BlurredOptions
-from reseau.measure.fiducials import FiducialOptions
+from reseau.measure.boards.measure import BoardOptions
+from reseau.measure.fiducials.measure import FiducialOptions
+from reseau.measure.pins.detection import PinOptions
+from reseau.measure.reseau.marks import ReseauOptions
+from reseau.measure.testfield.measure import TestfieldOptions
 from reseau.procedures.blurred_network import NetworkOptions
 from reseau.procedures.calibration import CalibrationOptions
 from reseau.procedures.film_frame import FrameOptions

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from reseau.core.data import Frame, ImagePoints
 from reseau.core.errors import ImageError, UsageError
 from reseau.io import MeasuredEdge
-from reseau.measure.film import FrameResult
+from reseau.measure.film.orientation import FrameResult
 
 
 def test_a_frame_knows_its_size() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from reseau.core.errors import FormatError
 from reseau.designs import board
-from reseau.exchange import read_board, read_target
+from reseau.exchange.boards import read_board, read_target
 
 XML = """<?xml version="1.0"?>
 <opencv_storage>

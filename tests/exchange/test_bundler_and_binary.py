@@ -11,7 +11,10 @@ import pytest
 
 from reseau.bundle import Network, adjust_network, example_network
 from reseau.core.errors import FormatError
-from reseau.exchange import read_bal, read_bundler, read_colmap, read_foreign
+from reseau.exchange.bal import read_bal
+from reseau.exchange.bundler import read_bundler
+from reseau.exchange.colmap import read_colmap
+from reseau.exchange.networks import read_foreign
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
 
 VIEW = np.diag([1.0, -1.0, -1.0])

@@ -10,18 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.bundle import (
-    Additional,
-    Network,
-    Result,
-    adjust_network,
-    calibrated_camera,
-    calibration_of,
-    example_network,
-)
+from reseau.bundle import Network, Result, adjust_network, calibrated_camera, calibration_of, example_network
+from reseau.bundle.network.camera import Additional
 from reseau.calibration import Calibration, FilmFrameMapping, calibration_of_frame
 from reseau.core.errors import FormatError, UsageError
-from reseau.exchange import calibration_files, read_network
+from reseau.exchange import read_network
+from reseau.exchange.networks import calibration_files
 from reseau.io import FrameOrientation
 from reseau.io.network import Network1
 

@@ -16,9 +16,10 @@ from reseau.calibration import Calibration
 from reseau.calibration.document import Covariance, Place, Quantity
 from reseau.core.data import Array
 from reseau.core.errors import FormatError, UsageError
-from reseau.exchange import export_calibration, export_rig, import_calibration
+from reseau.exchange import export_calibration
 from reseau.exchange.calibrations import calibration_formats
-from reseau.optics.cameras import unit_of
+from reseau.exchange.calibrations.formats import export_rig, import_calibration
+from reseau.optics.cameras.registry import unit_of
 from reseau.optics.poses import rotation_matrix
 
 SIZE = (1280, 960)

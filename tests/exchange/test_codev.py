@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import FormatError
-from reseau.exchange import read_codev, read_lens
-from reseau.optics.lenses import Paraxial, Rays, Tracer
+from reseau.exchange import read_lens
+from reseau.exchange.codev import read_codev
+from reseau.optics.lenses import Paraxial, Tracer
+from reseau.optics.lenses.trace import Rays
 
 Data = Callable[[str], Path]
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import FormatError, InputError
-from reseau.exchange import read_dbat, read_foreign
+from reseau.exchange.dbat import read_dbat
+from reseau.exchange.networks import read_foreign
 from reseau.optics.poses import matrix_to_angles
 
 from .scene import residuals, scene

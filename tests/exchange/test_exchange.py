@@ -12,7 +12,8 @@ import pytest
 from reseau.bundle import Network, Result, adjust_network
 from reseau.core.errors import FormatError, InputError
 from reseau.core.failure import Code
-from reseau.exchange import read_colmap, read_foreign
+from reseau.exchange.colmap import read_colmap
+from reseau.exchange.networks import read_foreign
 from reseau.io.network import Network1
 from reseau.optics import OpenCV
 from reseau.optics.poses import Pose, project

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import FormatError, UsageError
-from reseau.exchange import FilmMarks, metashape_script, read_film_marks, read_micmac, write_micmac
+from reseau.exchange.film import FilmMarks, metashape_script, read_film_marks, read_micmac, write_micmac
 from reseau.io import DesignPoint, Mark, ReseauDesign, ReseauMeasurement
 
 MM = np.array([[-106.0, 106.0], [106.0, 106.0], [106.0, -106.0], [-106.0, -106.0]])

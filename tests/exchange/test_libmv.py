@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import FormatError
-from reseau.exchange import read_foreign, read_libmv
+from reseau.exchange.libmv import read_libmv
+from reseau.exchange.networks import read_foreign
 
 from .scene import residuals, scene
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import FormatError
-from reseau.exchange import read_foreign, read_metashape
+from reseau.exchange.metashape import read_metashape
+from reseau.exchange.networks import read_foreign
 
 from .scene import residuals, scene
 

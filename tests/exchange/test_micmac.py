@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import FormatError, UsageError
-from reseau.exchange import export_calibration, import_calibration, read_network
+from reseau.exchange import export_calibration, read_network
+from reseau.exchange.calibrations.formats import import_calibration
 from reseau.optics.poses import rotation_matrix
 
 # A calibration, an orientation, and points that MicMac projects with both (``Verif``), from its test data.

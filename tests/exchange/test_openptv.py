@@ -11,7 +11,7 @@ import pytest
 from reseau.bundle import Options, adjust_network
 from reseau.core.data import Array
 from reseau.core.errors import FormatError, InputError
-from reseau.exchange import read_foreign
+from reseau.exchange.networks import read_foreign
 
 from .scene import residuals, scene
 

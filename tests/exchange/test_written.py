@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 
 from reseau.bundle import Options, Result, adjust_network, example_network
-from reseau.bundle.network import network_document
+from reseau.bundle.network.settings import network_document
 from reseau.calibration import CameraMapping
 from reseau.cli import run
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
-from reseau.exchange import read_network, write_network
-from reseau.exchange.calibrations import calibration_formats, exported_lens
+from reseau.exchange import read_network
+from reseau.exchange.calibrations import calibration_formats
+from reseau.exchange.calibrations.formats import exported_lens
+from reseau.exchange.networks import write_network
 from reseau.optics import PixelGrid
-from reseau.optics.cameras import camera_model
+from reseau.optics.cameras.registry import camera_model
 
 from .scene import residuals
 
@@ -45,7 +47,7 @@ def projected(result: Result) -> Array:
 
 
 def test_the_residuals_are_computed_minus_observed(result: Result) -> None:
-    from reseau.bundle import with_estimates
+    from reseau.bundle.modelling.calibration import with_estimates
 
     assert np.abs(residuals(with_estimates(result)) - result.residuals).max() < 1e-6
 

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import FormatError, InputError
-from reseau.exchange import read_lens, read_zemax
+from reseau.exchange import read_lens
+from reseau.exchange.zemax import read_zemax
 from reseau.io import LensDocument
-from reseau.optics.lenses import Paraxial, Prescription, Rays, Tracer
+from reseau.optics.lenses import Paraxial, Prescription, Tracer
+from reseau.optics.lenses.trace import Rays
 
 Data = Callable[[str], Path]
 

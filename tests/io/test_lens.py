@@ -11,24 +11,10 @@ import pytest
 from reseau.core.errors import FormatError
 from reseau.io import LensDocument, LensSensor
 from reseau.io.lens import LensMedium
-from reseau.optics.lenses import (
-    AIR,
-    Air,
-    Aperture,
-    Cauchy,
-    Constant,
-    Layout,
-    Paraxial,
-    Powers,
-    Prescription,
-    Rays,
-    Sellmeier,
-    Surface,
-    Tracer,
-    Water,
-    glass,
-    model_glass,
-)
+from reseau.optics.lenses import AIR, Aperture, Paraxial, Prescription, Tracer, glass
+from reseau.optics.lenses.media import Air, Cauchy, Constant, Powers, Sellmeier, Water, model_glass
+from reseau.optics.lenses.prescription import Layout, Surface
+from reseau.optics.lenses.trace import Rays
 
 SINGLET = """
 schema = "lens/1"

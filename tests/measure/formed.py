@@ -10,7 +10,9 @@ import numpy as np
 from reseau.core.data import Array, Frame, Mask
 from reseau.designs import regular_reseau
 from reseau.io import Mark, ReseauDesign
-from reseau.measure import ReseauOptions, ReseauResult, measure_reseau
+from reseau.measure import measure_reseau
+from reseau.measure.reseau.marks import ReseauOptions
+from reseau.measure.reseau.measure import ReseauResult
 from reseau.optics import Sensor, illumination
 from reseau.optics.formation import Outline, PixelResponse, coverage_derivatives, draw, mark_outline
 from reseau.optics.grids import line_grid

@@ -13,10 +13,13 @@ from reseau.core.data import Frame
 from reseau.core.failure import Code, Failure
 from reseau.designs import board, coded_testfield, regular_reseau
 from reseau.io import Mark
-from reseau.measure import find_pins, measure_tags
+from reseau.measure import find_pins
 from reseau.measure.blurred import BlurredOptions, measure_blurred
+from reseau.measure.boards.single_tags import measure_tags
 from reseau.optics.formation import Outline
-from reseau.optics.lenses import PlaneTarget, SensorPlane, ThinLens
+from reseau.optics.lenses import ThinLens
+from reseau.optics.lenses.images import PlaneTarget
+from reseau.optics.lenses.ray_maps import SensorPlane
 
 GREY = Frame(np.full((240, 320), 128, np.uint8), 255.0, "grey")
 RODS = regular_reseau(4, 2, 10.0, Mark(shape="rod", size=1.0), polarity="bright")

@@ -11,30 +11,18 @@ import pytest
 from reseau.core.data import Array, Frame
 from reseau.core.errors import UsageError
 from reseau.core.failure import Code, Failure
-from reseau.measure.blurred import (
-    BlurredOptions,
-    EstimatedOptics,
-    Moving,
-    Varied,
-    estimate_optics,
-    measure_blurred,
-)
+from reseau.measure.blurred import BlurredOptions, estimate_optics, measure_blurred
+from reseau.measure.blurred.estimate import EstimatedOptics
+from reseau.measure.blurred.measure import Moving, Varied
 from reseau.measure.blurred.shapes import RayShapes
-from reseau.measure.matching import Window
+from reseau.measure.matching.shapes import Window
 from reseau.optics.formation import Outline, PixelResponse
-from reseau.optics.lenses import (
-    AIR,
-    Cauchy,
-    LensCamera,
-    PlaneTarget,
-    Prescription,
-    PupilElements,
-    RaySurrogate,
-    SensorPlane,
-    Surface,
-    ThinLens,
-    ray_image,
-)
+from reseau.optics.lenses import AIR, Prescription, PupilElements, ThinLens, ray_image
+from reseau.optics.lenses.images import PlaneTarget
+from reseau.optics.lenses.media import Cauchy
+from reseau.optics.lenses.prescription import Surface
+from reseau.optics.lenses.ray_maps import LensCamera, SensorPlane
+from reseau.optics.lenses.surrogate import RaySurrogate
 
 from . import blurs
 

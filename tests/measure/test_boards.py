@@ -19,8 +19,10 @@ from reseau.designs.boards import marker_cells
 from reseau.designs.dots import dot_signs
 from reseau.io import BoardDesign
 from reseau.io.images import read_image
-from reseau.measure import BoardOptions, BoardResult, measure_board, measure_tags, puzzle_part
+from reseau.measure import measure_board
+from reseau.measure.boards.measure import BoardOptions, BoardResult, puzzle_part
 from reseau.measure.boards.placement import numbered
+from reseau.measure.boards.single_tags import measure_tags
 from reseau.measure.plane.lattice_mapping import started
 
 from .. import kept

@@ -10,8 +10,10 @@ from reseau.core.data import ImagePoints
 from reseau.core.failure import Code, Failure
 from reseau.io import FiducialDesign, FiducialMark, FiducialOrientation, MarkPart
 from reseau.io.scans import scan_of
-from reseau.measure.fiducials import FiducialOptions, FiducialResult, measure_fiducials
+from reseau.measure.fiducials import measure_fiducials
 from reseau.measure.fiducials.forms import contours_of
+from reseau.measure.fiducials.measure import FiducialOptions
+from reseau.measure.fiducials.result import FiducialResult
 from reseau.optics.formation import Outline, draw, mark_outline
 
 from .photographs import PLACES, UNEVEN, camera, photograph

@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from reseau.adjust import Adjustment, Elimination, Options, adjust, check_jacobian
+from reseau.adjust import Adjustment, Options, adjust
+from reseau.adjust.elimination import Elimination
+from reseau.adjust.problem import check_jacobian
 from reseau.core.data import ImagePoints
 from reseau.core.errors import UsageError
 from reseau.core.failure import Failure
 from reseau.measure.fitting import fit_mapping, mapping_problem, reduce_mapping, residual_field
-from reseau.optics import Chain, PlaneMapping, RationalPolynomial, Similarity
+from reseau.optics import RationalPolynomial
+from reseau.optics.composition import Chain, Similarity
+from reseau.optics.mapping import PlaneMapping
 
 X, Y = np.meshgrid(np.linspace(-60.0, 60.0, 9), np.linspace(-50.0, 50.0, 8))
 XY = np.stack([X.ravel(), Y.ravel()], axis=1)

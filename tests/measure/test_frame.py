@@ -12,9 +12,11 @@ from reseau.core.data import Array
 from reseau.core.failure import Code
 from reseau.core.tone import ToneCurve
 from reseau.io.scans import scan_of
-from reseau.measure.film import FrameOptions, FrameResult, Roll, orient_frames, roll_of
+from reseau.measure.film import orient_frames
 from reseau.measure.film.adjacent_lines import softness_of
 from reseau.measure.film.lines import EdgeData, FrameShape, departing_line, explained_shape, robust_line
+from reseau.measure.film.orientation import FrameOptions, FrameResult
+from reseau.measure.film.roll import Roll, roll_of
 from reseau.procedures.film_frame import reorient_scan
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 

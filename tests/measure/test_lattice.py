@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from reseau.core.data import Array
-from reseau.measure import TestfieldOptions, measure_testfield
+from reseau.measure import measure_testfield
 from reseau.measure.plane.lattice_mapping import second_order, slope_of
 from reseau.measure.plane.polynomial import refit
 from reseau.measure.testfield.lattice import LatticeFit
+from reseau.measure.testfield.measure import TestfieldOptions
 from reseau_sims import FieldBench, Station
 
 

@@ -13,7 +13,8 @@ from reseau.core.data import Array, Frame
 from reseau.core.failure import Code
 from reseau.designs import regular_reseau
 from reseau.io import Mark, ReseauDesign
-from reseau.measure import ReseauOptions, measure_reseau
+from reseau.measure import measure_reseau
+from reseau.measure.reseau.marks import ReseauOptions
 from reseau.measure.reseau.orientation import misfit
 
 from .formed import MARKS, PX_PER_MM, Scene, form

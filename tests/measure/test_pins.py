@@ -17,7 +17,9 @@ from reseau.core.errors import UsageError
 from reseau.core.failure import Code
 from reseau.io import ReseauDesign
 from reseau.io.images import read_image
-from reseau.measure import PinOptions, Wires, find_pins, lay_wires, measure_pins
+from reseau.measure import find_pins, measure_pins
+from reseau.measure.pins.detection import PinOptions
+from reseau.measure.pins.wires import Wires, lay_wires
 from reseau.optics import Arcs
 
 GROUND, NOISE = 8.0, 2.55

@@ -7,7 +7,9 @@ import pytest
 
 from reseau.core.failure import Code
 from reseau.io.images import open_scan
-from reseau.measure.film import PITCH_MM, FrameOptions, edge_of, film_plane, orient_frames
+from reseau.measure.film import film_plane, orient_frames
+from reseau.measure.film.orientation import FrameOptions
+from reseau.measure.film.perforations import PITCH_MM, edge_of
 
 STILLS = {
     "fac_neg.jpg": ((24.0, 36.0), [[106, 80], [2795, 88], [2800, 4185], [108, 4180]]),

@@ -13,9 +13,11 @@ from reseau.core.errors import UsageError
 from reseau.core.failure import Code, Failure
 from reseau.designs import regular_reseau
 from reseau.io import DesignPoint, Mark, ReseauMeasurement
-from reseau.measure import ReseauOptions, ReseauResult, measure_reseau
-from reseau.optics import sigma_of_snr
+from reseau.measure import measure_reseau
+from reseau.measure.reseau.marks import ReseauOptions
+from reseau.measure.reseau.measure import ReseauResult
 from reseau.optics.formation import Outline, PixelResponse, coverage_derivatives, draw, mark_outline
+from reseau.optics.sensor import sigma_of_snr
 
 from .formed import MARKS, Scene, bounds, form, measure_many, measured
 

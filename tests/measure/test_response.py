@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reseau.core.data import Array
-from reseau.measure.matching import GrownOutline, Window
+from reseau.measure.matching.shapes import GrownOutline, Window
 from reseau.measure.response import FilteredShape, Samples, estimate_kernel
 from reseau.optics.formation import Outline, PixelResponse
 

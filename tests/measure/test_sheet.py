@@ -17,7 +17,8 @@ from reseau.core.failure import Code
 from reseau.designs import coded_sheet
 from reseau.io import ReseauDesign, ReseauMeasurement
 from reseau.io.images import read_image, write_image
-from reseau.measure import ReseauResult, measure_reseau
+from reseau.measure import measure_reseau
+from reseau.measure.reseau.measure import ReseauResult
 
 from . import camcal, sheets
 

@@ -18,7 +18,8 @@ from reseau.core.tone import ToneCurve
 from reseau.designs import coded_testfield
 from reseau.designs.topology import TopologicalCode
 from reseau.io import TestfieldDesign
-from reseau.measure import TestfieldOptions, TestfieldResult, measure_testfield
+from reseau.measure import measure_testfield
+from reseau.measure.testfield.measure import TestfieldOptions, TestfieldResult
 from reseau.measure.testfield.recognition import Placement, Reading, locate
 from reseau.optics import Brown, PixelGrid, Sensor
 from reseau_sims import FieldBench, Stain, Station

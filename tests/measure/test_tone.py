@@ -9,7 +9,7 @@ import pytest
 
 from reseau.core.tone import ToneCurve
 from reseau.measure import tone
-from reseau.measure.matching import GrownOutline, Window
+from reseau.measure.matching.shapes import GrownOutline, Window
 from reseau.measure.response import Samples
 from reseau.measure.tone import Exponent, find_curve
 from reseau.optics.formation import Outline, PixelResponse

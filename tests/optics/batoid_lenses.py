@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from reseau.optics.lenses import Aperture, Constant, Medium, Powers, Prescription, Sellmeier, Surface
+from reseau.optics.lenses import Aperture, Medium, Prescription
+from reseau.optics.lenses.media import Constant, Powers, Sellmeier
+from reseau.optics.lenses.prescription import Surface
 
 __all__ = ["prescription"]
 

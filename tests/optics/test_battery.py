@@ -13,23 +13,12 @@ from hypothesis import strategies as st
 
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
-from reseau.optics import (
-    Brown,
-    BrownDistortion,
-    Chain,
-    DecenteredDisplay,
-    EbnerCorrection,
-    Equidistant,
-    Identity,
-    Inverted,
-    Mapping,
-    OpenCV,
-    PixelGrid,
-    PlaneMapping,
-    RationalPolynomial,
-    Similarity,
-    wong_display,
-)
+from reseau.optics import Brown, Equidistant, OpenCV, PixelGrid, RationalPolynomial
+from reseau.optics.cameras.brown import BrownDistortion
+from reseau.optics.cameras.ebner import EbnerCorrection
+from reseau.optics.composition import Chain, Identity, Inverted, Similarity
+from reseau.optics.displays import DecenteredDisplay, wong_display
+from reseau.optics.mapping import Mapping, PlaneMapping
 
 
 class Case(NamedTuple):

@@ -10,21 +10,10 @@ from hypothesis import strategies as st
 
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
-from reseau.optics import (
-    Brown,
-    BrownDistortion,
-    OpenCV,
-    PixelGrid,
-    PlaneMapping,
-    Pose,
-    angles_to_matrix,
-    convert,
-    matrix_to_angles,
-    matrix_to_vector,
-    project,
-    rotate,
-    rotation_matrix,
-)
+from reseau.optics import Brown, OpenCV, PixelGrid, Pose, convert, matrix_to_vector, project, rotation_matrix
+from reseau.optics.cameras.brown import BrownDistortion
+from reseau.optics.mapping import PlaneMapping
+from reseau.optics.poses import angles_to_matrix, matrix_to_angles, rotate
 
 PLAIN = [800.0, 805.0, 319.0, 241.0, -0.28, 0.09, 8e-4, -5e-4, -0.012]
 RATIONAL = [*PLAIN[:4], 0.3, -0.1, 8e-4, -5e-4, 0.02, 0.55, 0.04, -0.01]

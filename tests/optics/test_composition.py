@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import UsageError
-from reseau.optics import Chain, Identity, RationalPolynomial, Similarity
+from reseau.optics import RationalPolynomial
+from reseau.optics.composition import Chain, Identity, Similarity
 
 
 def test_common_system_has_its_origin_and_axis_in_the_two_marks() -> None:

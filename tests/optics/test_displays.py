@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from reseau.core.data import Array
-from reseau.optics import DecenteredDisplay, RationalPolynomial, wong_display
+from reseau.optics import RationalPolynomial
+from reseau.optics.displays import DecenteredDisplay, wong_display
 
 SYMMETRIC = {"k0": 0.01, "k1": 8e-6, "k2": -2e-9, "k3": 1e-13}
 ORIENTATION = {"P0": 0.2, "P1": 1e-5, "P2": -2e-5, "P3": 4e-3, "P4": -0.1}

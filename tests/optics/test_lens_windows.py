@@ -9,21 +9,13 @@ import pytest
 
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
-from reseau.optics.lenses import (
-    AIR,
-    Aiming,
-    Constant,
-    LensCamera,
-    Prescription,
-    PupilElements,
-    SensorPlane,
-    ThinLens,
-    Water,
-    behind_windows,
-    glass,
-    in_order,
-)
-from reseau.optics.refraction import Refraction, RefractiveIndex, Window
+from reseau.optics.lenses import AIR, Prescription, PupilElements, ThinLens, glass, in_order
+from reseau.optics.lenses.media import Constant, Water
+from reseau.optics.lenses.pupils import Aiming
+from reseau.optics.lenses.ray_maps import LensCamera, SensorPlane
+from reseau.optics.lenses.windows import behind_windows
+from reseau.optics.refraction import Window
+from reseau.optics.refraction.windows import Refraction, RefractiveIndex
 
 # A lens of two glasses with its stop behind; f = 48 mm.
 ROWS = [(0.025, 6.0, glass("N-BK7")), (-0.02, 2.0, glass("SF2")), (-0.004, 4.0, AIR), (0.0, 44.0, AIR)]

@@ -11,19 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reseau.core.errors import UsageError
-from reseau.optics.lenses import (
-    AIR,
-    SURFACE_PARAMETERS,
-    Aperture,
-    Constant,
-    Medium,
-    Prescription,
-    Rays,
-    Surface,
-    Tracer,
-    glass,
-    in_order,
-)
+from reseau.optics.lenses import AIR, Aperture, Medium, Prescription, Tracer, glass, in_order
+from reseau.optics.lenses.media import Constant
+from reseau.optics.lenses.prescription import Surface
+from reseau.optics.lenses.trace import SURFACE_PARAMETERS, Rays
 
 from .batoid_lenses import prescription
 

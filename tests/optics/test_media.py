@@ -6,19 +6,8 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import UsageError
-from reseau.optics.lenses import (
-    AIR,
-    Air,
-    Cauchy,
-    Constant,
-    Medium,
-    Powers,
-    Sellmeier,
-    Water,
-    glass,
-    glass_names,
-    model_glass,
-)
+from reseau.optics.lenses import AIR, Medium, glass, glass_names
+from reseau.optics.lenses.media import Air, Cauchy, Constant, Powers, Sellmeier, Water, model_glass
 
 F, D, C = 486.1327, 587.5618, 656.2725
 

@@ -12,31 +12,29 @@ from scipy.optimize import least_squares
 
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
-from reseau.measure.matching import GrownOutline, Window
+from reseau.measure.matching.shapes import GrownOutline, Window
 from reseau.optics import Brown, PixelGrid
 from reseau.optics.formation import Outline, PixelResponse, coverage, mark_outline
 from reseau.optics.lenses import (
     AIR,
-    AberratedLens,
     Aperture,
-    CalibratedLens,
-    LensCamera,
     Paraxial,
-    PlaneTarget,
     Prescription,
     PupilElements,
     RayMap,
-    RaySurrogate,
-    SensorPlane,
-    Surface,
     ThinLens,
     Tracer,
     aim,
     glass,
     in_order,
-    labels,
     ray_image,
 )
+from reseau.optics.lenses.images import PlaneTarget
+from reseau.optics.lenses.prescription import Surface
+from reseau.optics.lenses.pupils import labels
+from reseau.optics.lenses.ray_maps import CalibratedLens, LensCamera, SensorPlane
+from reseau.optics.lenses.stand_ins import AberratedLens
+from reseau.optics.lenses.surrogate import RaySurrogate
 
 ROWS = (
     (0.01779284094091543, 8.75, "N-SSK2"),

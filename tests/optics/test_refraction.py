@@ -12,7 +12,8 @@ import pytest
 from reseau.core.data import Array
 from reseau.core.errors import UsageError
 from reseau.optics.poses import rotation_matrix
-from reseau.optics.refraction import RefractedRays, Refraction, RefractiveIndex, Window, window_parameters
+from reseau.optics.refraction import RefractedRays, Window
+from reseau.optics.refraction.windows import Refraction, RefractiveIndex, window_parameters
 
 MEDIA = (
     RefractiveIndex("air", 1.0, free=True),

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import UsageError
-from reseau.optics import Sensor, illumination, jpeg, sigma_of_snr, snr_db
+from reseau.optics import Sensor, illumination, snr_db
+from reseau.optics.sensor import jpeg, sigma_of_snr
 
 SIZE = 300  # 90 000 pixels: a variance is known to 0.5 %, a mean to σ/300
 

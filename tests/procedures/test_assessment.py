@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reseau.bundle import camera_mapping
+from reseau.bundle.diagnostics.fields import camera_mapping
 from reseau.calibration import Calibration, CameraMapping, calibration_difference, projection_field
 from reseau.calibration.assessment import Use
 from reseau.core.data import ImagePoints

@@ -14,7 +14,8 @@ from reseau.core.errors import UsageError
 from reseau.core.executors import Processes
 from reseau.core.failure import Failure
 from reseau.io.targets import SpaceTargets
-from reseau.optics.lenses import LensCamera, Paraxial, in_order
+from reseau.optics.lenses import Paraxial, in_order
+from reseau.optics.lenses.ray_maps import LensCamera
 from reseau.optics.refraction import RefractedRays
 from reseau.procedures.blurred import focused, thin_lens_of
 from reseau.procedures.blurred_network import (

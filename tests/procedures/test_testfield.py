@@ -8,7 +8,7 @@ import pytest
 from reseau.core.data import Frame
 from reseau.core.errors import UsageError
 from reseau.core.failure import Code, Failure
-from reseau.measure import TestfieldOptions
+from reseau.measure.testfield.measure import TestfieldOptions
 from reseau.procedures.calibration import calibrate_camera
 from reseau.procedures.calibration_options import CameraOptions
 from reseau.procedures.target_measurement import measured_in_order, measurer_of

@@ -10,21 +10,14 @@ from reseau.bundle import Camera, Network
 from reseau.core.data import Array, Frame
 from reseau.io.targets import SpaceTargets, TargetColumns
 from reseau.optics.formation import PixelResponse
-from reseau.optics.lenses import (
-    AIR,
-    LensCamera,
-    PlaneTarget,
-    Prescription,
-    PupilElements,
-    SensorPlane,
-    Water,
-    behind_windows,
-    glass,
-    in_order,
-    ray_image,
-)
+from reseau.optics.lenses import AIR, Prescription, PupilElements, glass, in_order, ray_image
+from reseau.optics.lenses.images import PlaneTarget
+from reseau.optics.lenses.media import Water
+from reseau.optics.lenses.ray_maps import LensCamera, SensorPlane
+from reseau.optics.lenses.windows import behind_windows
 from reseau.optics.poses import matrix_to_vector
-from reseau.optics.refraction import Refraction, RefractiveIndex, Window
+from reseau.optics.refraction import Window
+from reseau.optics.refraction.windows import Refraction, RefractiveIndex
 from reseau.procedures.blurred import focused
 
 SIZE, PITCH, DISTANCE = (1000, 750), 0.024, 1500.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import UsageError
-from reseau.optics import wong_display
+from reseau.optics.displays import wong_display
 from reseau.refine import CAUSES, COEFFICIENTS, CONDITIONS, physical_causes
 
 _TRUE = dict(zip(CAUSES, np.linspace(-0.02, 0.03, len(CAUSES)), strict=True))

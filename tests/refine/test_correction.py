@@ -16,7 +16,8 @@ from reseau.core.failure import Failure
 from reseau.designs import regular_reseau
 from reseau.io import DesignPoint, Mark, ReseauDesign
 from reseau.measure.fitting import mapping_problem
-from reseau.optics import RationalPolynomial, Similarity
+from reseau.optics import RationalPolynomial
+from reseau.optics.composition import Similarity
 from reseau.refine import correct_camera
 
 GRID = regular_reseau(11, 9, 10.0, Mark(shape="disk", size=1.0), name="grid")

@@ -7,7 +7,7 @@ import pytest
 
 from reseau.core.data import ImagePoints
 from reseau.core.failure import Failure
-from reseau.optics import Similarity
+from reseau.optics.composition import Similarity
 from reseau.refine import correct_camera, register
 
 from .oscilloscope import RESEAU, SIGMA_PX, measured, pixels, reseau_marks

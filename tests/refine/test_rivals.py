@@ -7,7 +7,8 @@ import numpy as np
 from reseau.core.data import ImagePoints
 from reseau.core.failure import Failure
 from reseau.measure.fitting import fit_mapping
-from reseau.optics import RationalPolynomial, wong_display
+from reseau.optics import RationalPolynomial
+from reseau.optics.displays import wong_display
 from reseau.refine import leave_one_out, rivals
 
 _SIGMA = 0.05

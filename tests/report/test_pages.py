@@ -16,7 +16,7 @@ from reseau.core.numbers import power
 from reseau.core.provenance import Provenance
 from reseau.core.version import __version__
 from reseau.optics import PixelGrid
-from reseau.optics.cameras import camera_model
+from reseau.optics.cameras.registry import camera_model
 from reseau.procedures.assessment import assess
 from reseau.report import oscilloscope_report
 from reseau.report.bundle import bundle_report

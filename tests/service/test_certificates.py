@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau.adjust import validate
+from reseau.adjust.uncertainty import validate
 from reseau.archive import Archive
 from reseau.calibration import Calibration
 from reseau.calibration.assessment import Assessment, Use

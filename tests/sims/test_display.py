@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from reseau.core.data import Array
-from reseau.optics import PlaneMapping, RationalPolynomial
+from reseau.optics import RationalPolynomial
+from reseau.optics.mapping import PlaneMapping
 from reseau_sims import Bending, Display, Instrument, Scanner, Screen, Video, World
 
 POINTS = np.array([[12.0, -31.0], [-60.0, 44.0], [3.0, 2.0], [55.0, 20.0]])

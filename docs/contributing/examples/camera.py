@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reseau.core.data import Array
-from reseau.optics import CameraModel, Derivatives, PixelGrid, PlaneMapping
+from reseau.optics import PixelGrid
 from reseau.optics.cameras import Parameter
-from reseau.optics.mapping import as_points, as_values
+from reseau.optics.cameras.registry import CameraModel
+from reseau.optics.mapping import Derivatives, PlaneMapping, as_points, as_values
 
 PARAMETERS = (
     Parameter("f", "px", "scale", usual=True, required=True),

@@ -18,7 +18,8 @@ import numpy as np
 
 import reseau
 from reseau.bundle import example_network
-from reseau.exchange import read_network, write_network
+from reseau.exchange import read_network
+from reseau.exchange.networks import write_network
 from reseau.optics import rotation_matrix
 
 first = reseau.adjust_network(example_network()).required()

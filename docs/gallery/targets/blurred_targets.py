@@ -14,18 +14,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from reseau.optics.formation import Outline, PixelResponse, coverage
-from reseau.optics.lenses import (
-    AIR,
-    LensCamera,
-    Paraxial,
-    PlaneTarget,
-    Prescription,
-    PupilElements,
-    SensorPlane,
-    glass,
-    in_order,
-    ray_image,
-)
+from reseau.optics.lenses import AIR, Paraxial, Prescription, PupilElements, glass, in_order, ray_image
+from reseau.optics.lenses.images import PlaneTarget
+from reseau.optics.lenses.ray_maps import LensCamera, SensorPlane
 
 rows = [
     (0.0711714, 2.1875, glass("N-SSK2")),

@@ -19,8 +19,6 @@ from ..core.data import Array, Mask, Rows
 from ..core.errors import UsageError
 from ..core.threads import one_thread
 
-__all__ = ["BatchAdjustment", "BatchOptions", "BatchReason", "adjust_batch"]
-
 BatchFunction = Callable[[Array, Rows], tuple[Array, Array]]
 ValuesFunction = Callable[[Array, Rows], Array]
 Reweight = Callable[[Array], Array]

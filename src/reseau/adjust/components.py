@@ -16,8 +16,6 @@ from .engine import Options
 from .fitted import Adjustable, F
 from .stochastic import blocks_of
 
-__all__ = ["VarianceComponents", "variance_components"]
-
 # Greatest change of the logarithm of a variance in a step of scoring.
 _STEP = 1.5
 

@@ -9,8 +9,6 @@ import numpy as np
 
 from ..core.data import Array, Mask
 
-__all__ = ["JacobianCheck", "compare_jacobians", "differences"]
-
 # Truncation (h⁴) balances rounding (ε/h) at ε^(1/5) where x is the only scale; less is safer where it is not.
 _STEP = float(np.finfo(np.float64).eps) ** 0.25
 

@@ -15,8 +15,6 @@ from .fitted import compare
 from .problem import Adjustment, Problem, adjust
 from .significance import CoefficientTest
 
-__all__ = ["Elimination", "EliminationStep", "eliminate"]
-
 _LOOKED_AT = 2
 """Number of parameters tested in each step."""
 

@@ -21,8 +21,6 @@ from .linear import Linearised, constraint_matrix, linearise
 from .models import Model, State, Values
 from .reliability import Solution
 
-__all__ = ["AdjustmentFailure", "NullVector", "Options", "Solved", "solve"]
-
 NullVector = Mapping[str, float]
 
 _EPS = float(np.finfo(np.float64).eps)

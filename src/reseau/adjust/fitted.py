@@ -22,8 +22,6 @@ from .reliability import Standardised, Whitened, noncentrality
 from .significance import GlobalTest, NestedTest, global_test, nested_test
 from .stochastic import Covariance
 
-__all__ = ["Adjustable", "Fitted", "compare"]
-
 
 class Fitted(Estimated):
     """An adjustment that converged; truthy. For its attributes see :class:`~reseau.adjust.Adjustment`."""

@@ -17,8 +17,6 @@ from ..core.data import Array, Mask
 from ..core.errors import UsageError
 from .parameters import Constraint
 
-__all__ = ["ConstraintMatrix", "Linearised", "constraint_matrix", "linearise"]
-
 
 @dataclass(frozen=True, eq=False)
 class ConstraintMatrix:

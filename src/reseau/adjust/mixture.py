@@ -15,8 +15,6 @@ import scipy
 
 from ..core.data import Array, Mask
 
-__all__ = ["Mixture"]
-
 # Rounds of the estimation, and relative change of the standard deviation that ends it.
 _ROUNDS, _SETTLED = 60, 1e-3
 

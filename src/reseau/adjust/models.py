@@ -23,19 +23,6 @@ from .differences import JacobianCheck, compare_jacobians, differences
 from .parameters import Constraint, Parameters
 from .stochastic import Blocks, Covariance, Weighting, blocks_of
 
-__all__ = [
-    "Conditions",
-    "Function",
-    "HelmertModel",
-    "Jacobian",
-    "Jacobians",
-    "MarkovModel",
-    "Model",
-    "Specification",
-    "State",
-    "Values",
-]
-
 Values = NDArray[Any]
 Function = Callable[[Values], Any]
 Jacobian = Callable[[Array], Any]

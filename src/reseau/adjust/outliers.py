@@ -23,8 +23,6 @@ from .problem import GaussHelmert
 from .reliability import critical_tau, critical_w
 from .stochastic import Weighting, blocks_of
 
-__all__ = ["Rejection", "Robust", "SnoopingStep", "data_snooping", "robust", "weight_function"]
-
 WeightName = Literal["huber", "tukey", "danish"]
 TUNING = {"huber": 1.345, "tukey": 4.685, "danish": 2.0}
 """Constants of the weight functions."""

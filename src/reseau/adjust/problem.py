@@ -22,8 +22,6 @@ from .reliability import ExternalReliability, Solution, noncentrality
 from .significance import CoefficientTest, ratio_test
 from .stochastic import Covariance, blocks_of
 
-__all__ = ["Adjustment", "GaussHelmert", "GaussMarkov", "Problem", "adjust", "check_jacobian"]
-
 
 class Problem:
     """Common part of both kinds of problem.

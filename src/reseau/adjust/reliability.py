@@ -19,16 +19,6 @@ from ..core.data import Array
 from ..core.errors import UsageError
 from .stochastic import Blocks
 
-__all__ = [
-    "ExternalReliability",
-    "Solution",
-    "Standardised",
-    "Whitened",
-    "critical_tau",
-    "critical_w",
-    "noncentrality",
-]
-
 # A redundancy number below this is due to rounding: no other observation controls this one.
 _UNCONTROLLED = 1e-10
 

@@ -9,15 +9,6 @@ import scipy
 
 from ..core.errors import UsageError
 
-__all__ = [
-    "CoefficientTest",
-    "GlobalTest",
-    "NestedTest",
-    "global_test",
-    "nested_test",
-    "ratio_test",
-]
-
 
 @dataclass(frozen=True)
 class GlobalTest:

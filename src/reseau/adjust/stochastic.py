@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike
 from ..core.data import Array, Mask
 from ..core.errors import UsageError
 
-__all__ = ["Blocks", "Covariance", "Weighting", "blocks_of"]
-
 # Sigmas or blocks or a full matrix, or several of them one after the other, in the order of the observations.
 Covariance = ArrayLike | Sequence[ArrayLike] | None
 

@@ -23,17 +23,6 @@ from ..core.display import Display
 from ..core.errors import UsageError
 from .differences import differences
 
-__all__ = [
-    "Contribution",
-    "Distribution",
-    "Simulated",
-    "UncertaintyBudget",
-    "Validation",
-    "propagate",
-    "simulate",
-    "validate",
-]
-
 Distribution = Literal["normal", "rectangular", "triangular", "arcsine"]
 Model = Callable[[Array], Array]
 

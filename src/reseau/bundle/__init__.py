@@ -2,129 +2,45 @@
 
 from __future__ import annotations
 
-from .diagnostics import (
-    CameraEstimate,
-    CommonPattern,
-    Eliminated,
-    ImageEstimates,
-    MotionEstimates,
-    PointEstimates,
-    PriorInfluence,
-    RefractionEstimate,
-    Regularised,
-    Result,
-    RigEstimate,
-    StageEstimate,
-    by_place,
-    by_point,
-    camera_mapping,
-    common_pattern,
-    projection_field_at,
-    regularised,
-)
-from .document import ResultDocument, model_search_entries
-from .explanations import Explanation, Misnamed, explain, misnamed
-from .modelling import (
-    BoardChoice,
-    BoardModel,
-    Candidate,
-    Compared,
-    Kind,
-    ModelChoice,
-    Options,
-    RotationOnly,
-    Selection,
-    adjust_network,
-    calibration_of,
-    camera_candidates,
-    choose_board,
-    choose_model,
-    choose_models,
-    cross_validation,
-    eliminate_parameters,
-    estimate_components,
-    held_as_designed,
-    problem_of,
-    reweighted,
-    rotation_only,
-    search_model,
-    with_estimates,
-)
-from .network import (
-    Additional,
-    Camera,
-    ControlPoints,
-    Network,
-    Rig,
-    Shutter,
-    Stage,
-    calibrated_camera,
-    example_network,
-    film_camera,
-)
-from .solver import Approximate, BundleFit, BundleProblem, approximate
+from .diagnostics.estimates import PriorInfluence
+from .diagnostics.regularisation import regularised
+from .diagnostics.result import Result
+from .document import ResultDocument
+from .explanations import explain
+from .modelling.adjustment import Options, adjust_network, problem_of
+from .modelling.board import choose_board
+from .modelling.calibration import calibration_of
+from .modelling.candidates import Candidate
+from .modelling.choice import choose_model, choose_models
+from .modelling.one_station import rotation_only
+from .modelling.search import estimate_components, search_model
+from .network.calibrated import calibrated_camera, film_camera
+from .network.camera import Camera
+from .network.example import example_network
+from .network.network import Network
+from .network.stage import Stage
 
 __all__ = [
-    "Additional",
-    "Approximate",
-    "BoardChoice",
-    "BoardModel",
-    "BundleFit",
-    "BundleProblem",
     "Camera",
-    "CameraEstimate",
     "Candidate",
-    "CommonPattern",
-    "Compared",
-    "ControlPoints",
-    "Eliminated",
-    "Explanation",
-    "ImageEstimates",
-    "Kind",
-    "Misnamed",
-    "ModelChoice",
-    "MotionEstimates",
     "Network",
     "Options",
-    "PointEstimates",
     "PriorInfluence",
-    "RefractionEstimate",
-    "Regularised",
     "Result",
     "ResultDocument",
-    "Rig",
-    "RigEstimate",
-    "RotationOnly",
-    "Selection",
-    "Shutter",
     "Stage",
-    "StageEstimate",
     "adjust_network",
-    "approximate",
-    "by_place",
-    "by_point",
     "calibrated_camera",
     "calibration_of",
-    "camera_candidates",
-    "camera_mapping",
     "choose_board",
     "choose_model",
     "choose_models",
-    "common_pattern",
-    "cross_validation",
-    "eliminate_parameters",
     "estimate_components",
     "example_network",
     "explain",
     "film_camera",
-    "held_as_designed",
-    "misnamed",
-    "model_search_entries",
     "problem_of",
-    "projection_field_at",
     "regularised",
-    "reweighted",
     "rotation_only",
     "search_model",
-    "with_estimates",
 ]

@@ -15,20 +15,12 @@ from ..core.data import Rows as Indices
 from ..core.provenance import Provenance
 from ..io import Document, Strict
 from ..optics.poses import matrix_to_vector
-from ..optics.refraction import Refraction
-from .diagnostics import (
-    MotionEstimates,
-    PriorInfluence,
-    Regularised,
-    Result,
-    RigEstimate,
-    StageEstimate,
-    regularised,
-)
-from .network import Rig
+from ..optics.refraction.windows import Refraction
+from .diagnostics.estimates import MotionEstimates, PriorInfluence, RigEstimate, StageEstimate
+from .diagnostics.regularisation import Regularised, regularised
+from .diagnostics.result import Result
 from .network.network import finite
-
-__all__ = ["ResultDocument", "model_search_entries"]
+from .network.rig import Rig
 
 Column = tuple[float | None, ...]
 Rows = tuple[tuple[float, ...] | None, ...]

@@ -16,8 +16,9 @@ import numpy as np
 
 from ..core.data import Array, Mask, Rows
 from ..core.errors import FormatError, UsageError
-from ..optics import PixelGrid, PlaneMapping
-from ..optics.cameras import additional_model, camera_model
+from ..optics import PixelGrid
+from ..optics.cameras.registry import additional_model, camera_model
+from ..optics.mapping import PlaneMapping
 from .document import Calibration, readable_as
 from .mapping import CalibratedMapping, Target, extent_of, reasons
 

@@ -20,14 +20,14 @@ from ..core.files import writable, write_whole
 from ..core.lazy import above
 from ..core.numbers import measured
 from ..io import Document, Strict
-from ..optics.cameras import opencv_coefficients
+from ..optics.cameras.opencv import opencv_coefficients
 from .assessment import Assessment, required_use
 from .mapping import CalibratedMapping
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from ..exchange.calibrations import Exported
+    from ..exchange.calibrations.formats import Exported
     from .compare import FieldDifference
 
 

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ..adjust import Elimination
-from ..optics import RationalPolynomial, Similarity
+from ..adjust.elimination import Elimination
+from ..optics import RationalPolynomial
+from ..optics.composition import Similarity
 from ..optics.polynomials import monomials
 from .document import Calibration
 

@@ -14,7 +14,8 @@ from ..adjust import Adjustment
 from ..core.data import Array, ImagePoints
 from ..core.errors import FormatError, UsageError
 from ..core.failure import Estimated
-from ..optics import RationalPolynomial, Similarity
+from ..optics import RationalPolynomial
+from ..optics.composition import Similarity
 from .document import Calibration, Covariance, OscilloscopeModel, Quantity
 from .entries import system_from_dict, system_to_dict, unit_of, with_stored_values
 from .mapping import CalibratedMapping, Target, carried, extent_of, reasons

@@ -15,7 +15,8 @@ from ..core.errors import FormatError, UsageError
 from ..core.failure import Estimated
 from ..core.provenance import canonical_json
 from ..io import ReseauDesign, ReseauMeasurement
-from ..optics import RationalPolynomial, Similarity
+from ..optics import RationalPolynomial
+from ..optics.composition import Similarity
 from .document import Calibration, Covariance, Quantity, readable_as
 from .entries import system_from_dict, system_to_dict, unit_of, with_stored_values
 from .group_a import GROUPS_A_AND_B, CameraCorrection, FitRecord

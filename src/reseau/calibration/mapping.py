@@ -9,7 +9,7 @@ import numpy as np
 
 from ..core.data import Array, ImagePoints, Mask
 from ..core.errors import UsageError
-from ..optics import PlaneMapping
+from ..optics.mapping import PlaneMapping
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

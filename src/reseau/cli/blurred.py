@@ -16,7 +16,7 @@ from .measure import BY_DESIGN, NOT_NOMINAL, Image, Output, Task
 if TYPE_CHECKING:
     from ..core.data import Frame
     from ..core.failure import Failure
-    from ..measure.blurred import BlurredResult
+    from ..measure.blurred.measure import BlurredResult
     from ..procedures.blurred_files import BlurredImaging
     from ..procedures.blurred_network import BlurredNetwork
 
@@ -81,7 +81,7 @@ def blurred(
     from ..core.failure import Failure
     from ..exchange import read_network
     from ..io.reading import read_design
-    from ..measure import ReseauOptions
+    from ..measure.reseau.marks import ReseauOptions
     from ..procedures.blurred_files import measure_blurred_photograph
 
     kind = "" if figure is None else writable(figure, ".svg", ".png", ".pdf").suffix.lower()
@@ -141,7 +141,8 @@ def blurred_network(
     """Measure the blurred targets of a network by rays and adjust it, until sigma0 no longer falls."""
     from ..core.files import empty_folder, made_folder
     from ..core.provenance import Provenance, sha256_of
-    from ..exchange import calibration_files, read_network
+    from ..exchange import read_network
+    from ..exchange.networks import calibration_files
     from ..execution import executor_at
     from ..io import write_whole
     from ..io.network import Network1

@@ -91,7 +91,7 @@ def bundle(
 ) -> None:
     """Adjust a network of images: orientation, calibration and object points, with their uncertainty."""
     from ..bundle import Options, ResultDocument, search_model
-    from ..bundle.network import network_document
+    from ..bundle.network.settings import network_document
     from ..core.provenance import Provenance, sha256_of
     from ..exchange import read_network
     from ..io import write_whole
@@ -143,7 +143,7 @@ def bundle(
 
 def _export(result: Result, path: Path) -> None:
     """Write the adjusted network, and say where cameras had to be converted."""
-    from ..exchange import write_network
+    from ..exchange.networks import write_network
 
     for name, done in write_network(result, path).items():
         if done.greatest_px > 0:
@@ -162,9 +162,9 @@ def _with_settings(
     sigma_px: float | None,
 ) -> Network:
     """Return the network with what the user sets."""
-    from ..bundle.network import with_control, with_datum, with_parameters, with_sigma
+    from ..bundle.network.settings import with_control, with_datum, with_parameters, with_sigma
     from ..core.errors import UsageError
-    from ..exchange import read_control
+    from ..exchange.control import read_control
 
     network = with_parameters(network, free, fix)
     if control is not None:
@@ -179,7 +179,7 @@ def _with_settings(
 def _hashes(path: Path) -> dict[str, str]:
     """SHA-256 of a network file and its calibrations, or of the text files in a folder."""
     from ..core.provenance import sha256_of
-    from ..exchange import calibration_files
+    from ..exchange.networks import calibration_files
 
     if path.is_file():
         files = [path, *calibration_files(path)]

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 from .common import say
 
 if TYPE_CHECKING:
-    from ..bundle import (
+    from ..bundle import PriorInfluence, Result
+    from ..bundle.diagnostics.estimates import (
         CameraEstimate,
         MotionEstimates,
-        PriorInfluence,
         RefractionEstimate,
-        Result,
         RigEstimate,
         StageEstimate,
     )

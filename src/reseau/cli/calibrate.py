@@ -41,7 +41,8 @@ from .common import (
 )
 
 if TYPE_CHECKING:
-    from ..bundle import BoardChoice, ModelChoice
+    from ..bundle.modelling.board import BoardChoice
+    from ..bundle.modelling.choice import ModelChoice
     from ..calibration import CameraMapping, FieldDifference
     from ..calibration.camera import ProjectionField
     from ..execution import Executor
@@ -98,7 +99,7 @@ class _Camera(CameraChoice):
         UsageError
             When options contradict each other.
         """
-        from ..bundle import Shutter
+        from ..bundle.network.shutter import Shutter
         from ..procedures.calibration_options import CameraOptions
 
         options: dict[str, str | float] = {} if self.side is None else {"side": self.side}
@@ -168,7 +169,8 @@ class _Adjustment:
             When an option cannot be interpreted.
         """
         from ..bundle import Options
-        from ..exchange import read_control, read_turntable
+        from ..exchange.control import read_control
+        from ..exchange.turntable import read_turntable
         from ..io.refraction import RefractionFile
         from ..procedures.calibration_options import CalibrationOptions
 
@@ -239,9 +241,9 @@ def calibrate(
         raise UsageError("is drawn by this machine only", where="--overlay", do="leave out --cluster")
     from ..core.failure import Code, Failure
     from ..core.provenance import Provenance, sha256_of
-    from ..exchange import read_target
+    from ..exchange.boards import read_target
     from ..io import BoardDesign, write_whole
-    from ..measure import TestfieldOptions
+    from ..measure.testfield.measure import TestfieldOptions
     from ..procedures.calibrating import calibrate_photographs
     from ..procedures.calibration_folder import checked_output, folder_beside, write_calibrated
 
@@ -360,7 +362,7 @@ def _executor(images: list[Path], computing: Computing) -> Executor:
 
 
 def _differences(done: Calibrated, others: dict[str, CameraMapping]) -> dict[str, FieldDifference]:
-    from ..bundle import camera_mapping
+    from ..bundle.diagnostics.fields import camera_mapping
     from ..calibration import calibration_difference
 
     return {
@@ -379,7 +381,7 @@ def _uncertainty(field: ProjectionField) -> str:
 
 
 def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: list[float]) -> None:
-    from ..bundle import projection_field_at
+    from ..bundle.diagnostics.fields import projection_field_at
     from ..calibration.assessment import two_digits
     from ..procedures.target_measurement import by_reason
 

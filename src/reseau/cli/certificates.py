@@ -20,7 +20,7 @@ from .common import Place, say
 from .declared import Commands
 
 if TYPE_CHECKING:
-    from ..adjust import Simulated, UncertaintyBudget
+    from ..adjust.uncertainty import Simulated, UncertaintyBudget
     from ..calibration import Calibration
     from ..service.certificates import CertificateData
     from ..service.decisions import Decision
@@ -287,7 +287,7 @@ def uncertainty(
 def _document(
     budget: UncertaintyBudget, probability: float, missing: dict[str, str], simulated: Simulated | None
 ) -> dict[str, Any]:
-    from ..adjust import validate
+    from ..adjust.uncertainty import validate
 
     def finite(values: Any) -> list[float | None]:
         return [float(v) if math.isfinite(v) else None for v in values]
@@ -328,7 +328,7 @@ def _document(
 
 
 def _say_budget(budget: UncertaintyBudget, probability: float, simulated: Simulated | None) -> None:
-    from ..adjust import validate
+    from ..adjust.uncertainty import validate
     from ..core.numbers import measured
 
     columns = zip(

@@ -253,7 +253,7 @@ def board(
     from ..designs.boards import unusual_size
 
     if given is not None:
-        from ..exchange import read_board
+        from ..exchange.boards import read_board
         from ..io import BoardDesign as Board
 
         design = read_board(given)

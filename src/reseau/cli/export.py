@@ -49,7 +49,7 @@ def export(
         _calibration(files, to, out, anyway)
         if micmac is None and metashape is None:
             return
-    from ..exchange import film_files, metashape_script, read_film_marks, write_micmac
+    from ..exchange.film import film_files, metashape_script, read_film_marks, write_micmac
     from ..io import ReseauDesign, write_whole
 
     if micmac is None and metashape is None:
@@ -70,8 +70,8 @@ def export(
 def _calibration(files: list[Path], to: str | None, out: Path | None, anyway: bool) -> None:
     """Write a calibration, or those of a rig, in a format."""
     from ..core.numbers import plain
-    from ..exchange import any_calibration, export_calibrations
-    from ..exchange.calibrations import calibration_formats, formats_holding
+    from ..exchange.calibrations import calibration_formats
+    from ..exchange.calibrations.formats import any_calibration, export_calibrations, formats_holding
 
     if to is None or out is None:
         raise UsageError("must be given together", where="--to FORMAT and --out FILE")

@@ -61,7 +61,8 @@ def reseau(
 ) -> None:
     """Measure the marks of a reseau, or of a sheet of disks with coded rings."""
     from ..io import ReseauDesign
-    from ..measure import ReseauOptions, measure_reseau
+    from ..measure import measure_reseau
+    from ..measure.reseau.marks import ReseauOptions
 
     task = Task(image, output, "marks")
     target = ReseauDesign.read(design)
@@ -90,7 +91,8 @@ def pins(
 ) -> None:
     """Measure the rods of an ultrasonic test object, or the wires of an N-wire phantom."""
     from ..io import ReseauDesign
-    from ..measure import PinOptions, measure_pins
+    from ..measure import measure_pins
+    from ..measure.pins.detection import PinOptions
 
     task = Task(image, output, "rods")
     target = ReseauDesign.read(design)
@@ -113,7 +115,8 @@ def coded_field(
 ) -> None:
     """Measure the targets of a coded testfield."""
     from ..io import TestfieldDesign
-    from ..measure import TestfieldOptions, measure_testfield
+    from ..measure import measure_testfield
+    from ..measure.testfield.measure import TestfieldOptions
 
     task = Task(image, output, "targets", "deviations from the mapping of the field")
     target = TestfieldDesign.read(design)
@@ -134,8 +137,9 @@ def board(
     fill: v.Fill = 1.0,
 ) -> None:
     """Measure a chessboard, PuzzleBoard, deltille, ChArUco board, circle grid or grid of tags."""
-    from ..exchange import read_board
-    from ..measure import BoardOptions, measure_board
+    from ..exchange.boards import read_board
+    from ..measure import measure_board
+    from ..measure.boards.measure import BoardOptions
     from ..procedures.which_target import measured_or_shown
 
     task = Task(image, output, "points")
@@ -159,7 +163,8 @@ def tags(
 ) -> None:
     """Measure the corners of single ArUco markers or AprilTags, wherever they are in the scene."""
     from ..designs.boards import marker_dictionary
-    from ..measure import BoardOptions, measure_tags
+    from ..measure.boards.measure import BoardOptions
+    from ..measure.boards.single_tags import measure_tags
 
     task = Task(image, output, "points")
     marker_dictionary(dictionary)

@@ -164,7 +164,8 @@ def fiducials(
     from ..designs import aerial_camera
     from ..io import FiducialDesign, write_whole
     from ..io.images import open_scan, read_image
-    from ..measure.fiducials import FiducialOptions, measure_fiducials
+    from ..measure.fiducials import measure_fiducials
+    from ..measure.fiducials.measure import FiducialOptions
 
     out, overlay = output.out, output.overlay
     suffix = ".json" if out is None else writable(out, ".json", ".csv").suffix.lower()

@@ -43,7 +43,7 @@ def demo(
 def _camera_table(field: TestfieldSession) -> str:
     """Parameters of the camera with their errors, one line each."""
     from ..core.numbers import measured
-    from ..optics.cameras import unit_of
+    from ..optics.cameras.registry import unit_of
 
     facts = field.to_dict()
     lines = [f"\ntestfield, {facts['poses']} poses: sigma0 {facts['sigma0']:.3f}"]

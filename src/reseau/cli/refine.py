@@ -68,7 +68,8 @@ class _Files:
     def options(self) -> RefineOptions:
         """Options of the procedure; the points of the body are read."""
         from ..io.reading import read_measurement
-        from ..measure import PinOptions, ReseauOptions
+        from ..measure.pins.detection import PinOptions
+        from ..measure.reseau.marks import ReseauOptions
         from ..procedures.refining import RefineOptions
 
         return RefineOptions(

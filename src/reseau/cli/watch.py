@@ -42,7 +42,7 @@ def watch(
 
     from ..capture.lighting import steer
     from ..core.errors import InputError, InstrumentError
-    from ..exchange import read_target
+    from ..exchange.boards import read_target
     from ..instruments import Camera
     from ..procedures.target_measurement import measurer_of
     from ..procedures.watching import WatchedFolder, Watching

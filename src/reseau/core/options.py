@@ -210,7 +210,7 @@ def options_of(cls: type) -> dict[str, Declared]:
 
     Examples
     --------
-    >>> from reseau.measure import BoardOptions
+    >>> from reseau.measure.boards.measure import BoardOptions
     >>> list(options_of(BoardOptions))
     ['mirrored', 'psf_px', 'row_jitter_px', 'fill']
     """
@@ -239,7 +239,7 @@ def values_of_texts(cls: type, texts: Mapping[str, str], where: object) -> dict[
 
     Examples
     --------
-    >>> from reseau.measure import BoardOptions
+    >>> from reseau.measure.boards.measure import BoardOptions
     >>> values_of_texts(BoardOptions, {"mirrored": "true", "psf_px": "", "fill": "0.8"}, "monday")
     {'mirrored': True, 'fill': 0.8}
     """

@@ -11,14 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..bundle import Camera, Network, Result, camera_mapping
+from ..bundle import Camera, Network, Result
+from ..bundle.diagnostics.fields import camera_mapping
 from ..core.data import Array, Rows
 from ..core.errors import FormatError, UsageError
 from ..io import read_text, write_whole
 from ..optics.poses import matrix_to_vector, rotation_matrix
 from .lines import network_of
-
-__all__ = ["centred_network", "read_bal", "write_bal"]
 
 _VIEW = np.diag([1.0, -1.0, -1.0])
 

@@ -11,8 +11,6 @@ from ..designs.boards import board, dictionary_name
 from ..io import ReseauDesign, TestfieldDesign, read_design, read_text
 from ..io.board import BoardDesign, BoardKind
 
-__all__ = ["read_board", "read_target"]
-
 _SUFFIXES = (".yaml", ".yml", ".xml")
 """Suffixes of files of other programs."""
 

@@ -16,8 +16,6 @@ from ..core.errors import FormatError
 from ..io import read_text
 from .bal import centred_network
 
-__all__ = ["is_bundler", "read_bundler"]
-
 _HEAD = "# Bundle file v0.3"
 
 

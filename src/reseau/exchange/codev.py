@@ -11,7 +11,9 @@ from typing import Literal
 import numpy as np
 
 from ..core.errors import FormatError
-from ..optics.lenses import AIR, Aperture, Cauchy, Layout, Medium, Prescription, Surface, model_glass
+from ..optics.lenses import AIR, Aperture, Medium, Prescription
+from ..optics.lenses.media import Cauchy, model_glass
+from ..optics.lenses.prescription import Layout, Surface
 from .lines import read_bytes
 from .prescribed import (
     MOST_MB,
@@ -26,8 +28,6 @@ from .prescribed import (
     with_stop,
     within,
 )
-
-__all__ = ["read_codev"]
 
 _UNITS = {"M": ("mm", 1.0), "C": ("cm", 10.0), "I": ("inches", 25.4)}
 _LETTERS = "ABCDEFGHIJ"

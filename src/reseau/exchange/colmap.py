@@ -15,17 +15,17 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ..bundle import Camera, Network, Result, camera_mapping
+from ..bundle import Camera, Network, Result
+from ..bundle.diagnostics.fields import camera_mapping
 from ..core.data import Array
 from ..core.errors import FormatError, UsageError
 from ..core.files import made_folder
 from ..io import read_text, write_whole
 from ..optics import camera_model
 from ..optics.poses import matrix_to_vector
-from .calibrations import Exported, calibration_formats, exported_lens
+from .calibrations import calibration_formats
+from .calibrations.formats import Exported, exported_lens
 from .lines import network_of, numbers, read_bytes
-
-__all__ = ["read_colmap", "write_colmap"]
 
 # Parameters of each model, in COLMAP's order.
 _MODELS = {

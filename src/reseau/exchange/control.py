@@ -8,11 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..bundle import ControlPoints
+from ..bundle.network.network import ControlPoints
 from ..core.errors import FormatError
 from ..io import read_text
-
-__all__ = ["full_rows", "number_of", "read_control", "table_rows"]
 
 _COLUMNS = ["id", "x", "y", "z", "sx", "sy", "sz"]
 

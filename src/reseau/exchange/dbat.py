@@ -23,8 +23,6 @@ from ..optics.poses import angles_to_matrix, matrix_to_vector
 from .lines import network_of
 from .markup import Node, read_markup
 
-__all__ = ["camera_of", "is_dbat", "read_dbat"]
-
 _OPENING = re.compile(rb"<document\b[^>]*\bdbat_script_version")
 _TURN = {"radian": 1.0, "degrees": np.pi / 180, "gon": np.pi / 200}
 # DBAT's lens model of photogrammetry whose corrections belong to coordinates after the affinity.

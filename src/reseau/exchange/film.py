@@ -24,8 +24,6 @@ from ..core.files import made_folder
 from ..io import CORNERS, FiducialOrientation, FrameOrientation, ReseauDesign, ReseauMeasurement
 from ..io.document import read_text, write_whole
 
-__all__ = ["FilmMarks", "film_files", "metashape_script", "read_film_marks", "read_micmac", "write_micmac"]
-
 _FOLDER, _CAMERA = "Ori-InterneScan", "MeasuresCamera.xml"
 _SCHEMAS = (FiducialOrientation.SCHEMA, FrameOrientation.SCHEMA, ReseauMeasurement.SCHEMA)
 _TO_CORNER = 0.5

@@ -14,8 +14,6 @@ from .lines import read_bytes
 from .prescribed import MOST_MB
 from .zemax import read_zemax
 
-__all__ = ["Lens", "read_lens"]
-
 
 @dataclass(frozen=True, eq=False)
 class Lens:

@@ -20,8 +20,6 @@ from ..optics import camera_model
 from ..optics.poses import matrix_to_vector
 from .lines import network_of, read_bytes
 
-__all__ = ["is_libmv", "read_libmv"]
-
 _MOST_MB = 1000
 _CAMERA = [("image", "i4"), ("turn", "f4", (3, 3)), ("shift", "f4", 3)]
 _POINT = [("track", "i4"), ("xyz", "f4", 3)]

@@ -11,8 +11,6 @@ from ..bundle import Camera, Network
 from ..core.data import Array, Rows
 from ..core.errors import FormatError, InputError
 
-__all__ = ["network_of", "numbers", "read_bytes", "read_head"]
-
 
 def numbers(words: Sequence[str], count: int, path: Path, line: int) -> list[float]:
     """Convert words to `count` finite numbers.

@@ -13,8 +13,6 @@ from ..core.data import Array
 from ..core.errors import FormatError
 from .lines import read_bytes
 
-__all__ = ["Node", "read_markup"]
-
 _MOST_MB = 1000
 
 

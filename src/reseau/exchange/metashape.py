@@ -34,8 +34,6 @@ from ..optics.poses import matrix_to_vector
 from .lines import network_of, read_bytes
 from .markup import Node, read_markup
 
-__all__ = ["is_metashape", "read_metashape"]
-
 _RADIAL = ("k1", "k2", "k3", "k4")
 _DISTORTION = (*_RADIAL, "p1", "p2")
 _MOST_MB = 1000

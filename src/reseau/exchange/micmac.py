@@ -33,8 +33,6 @@ from ..optics.poses import matrix_to_vector
 from .lines import network_of, numbers, read_bytes, read_head
 from .markup import Node, read_markup
 
-__all__ = ["interior_text", "is_micmac", "read_interior", "read_micmac"]
-
 _PATTERN = "Orientation-*.xml"
 _SIDES = {"eConvApero_DistM2C": "object", "eConvApero_DistC2M": "image"}
 # Coefficients of Fraser's model, and their signs with y up.

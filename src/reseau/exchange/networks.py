@@ -12,15 +12,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..bundle import Camera, Network, Result, calibrated_camera, film_camera, with_estimates
-from ..bundle.network import network_document
+from ..bundle import Camera, Network, Result, calibrated_camera, film_camera
+from ..bundle.modelling.calibration import with_estimates
+from ..bundle.network.settings import network_document
 from ..calibration import read_calibration
 from ..core.errors import FormatError, InputError, UsageError
 from ..io import FrameOrientation, read_text
 from ..io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Network1
 from .bal import read_bal, write_bal
 from .bundler import is_bundler, read_bundler
-from .calibrations import Exported
+from .calibrations.formats import Exported
 from .colmap import read_colmap, write_colmap
 from .dbat import is_dbat, read_dbat
 from .libmv import is_libmv, read_libmv
@@ -30,8 +31,6 @@ from .micmac import is_micmac, read_micmac
 from .openptv import is_openptv, read_openptv
 from .photomodeler import read_photomodeler
 from .sfm import is_sfm, read_sfm
-
-__all__ = ["calibration_files", "read_foreign", "read_network", "write_network"]
 
 
 @dataclass(frozen=True)

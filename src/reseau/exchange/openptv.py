@@ -23,11 +23,10 @@ from ..core.data import Array, Rows
 from ..core.errors import FormatError, InputError
 from ..io import read_text
 from ..optics.poses import matrix_to_vector
-from ..optics.refraction import RefractedRays, Refraction, RefractiveIndex, Window
+from ..optics.refraction import RefractedRays, Window
+from ..optics.refraction.windows import Refraction, RefractiveIndex
 from .calibrations.openptv import OPENPTV, read
 from .lines import network_of, numbers
-
-__all__ = ["is_openptv", "read_openptv"]
 
 # Second nearest detection, in the distance of the nearest (px, at least one), that leaves no doubt.
 _DISTINCT = 2.0

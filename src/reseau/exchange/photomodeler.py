@@ -27,8 +27,6 @@ from ..io import read_text
 from ..optics.poses import angles_to_matrix, matrix_to_vector
 from .lines import network_of, numbers
 
-__all__ = ["camera_of_numbers", "read_photomodeler"]
-
 _FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
 
 

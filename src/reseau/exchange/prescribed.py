@@ -11,23 +11,11 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from ..core.errors import FormatError, UsageError
-from ..optics.lenses import Medium, Powers, Prescription, Rays, Sellmeier, Tracer, glass
+from ..optics.lenses import Medium, Prescription, Tracer, glass
+from ..optics.lenses.media import Powers, Sellmeier
 from ..optics.lenses.paraxial import Paraxial
+from ..optics.lenses.trace import Rays
 from .lines import read_bytes
-
-__all__ = [
-    "MOST_MB",
-    "Opening",
-    "UnknownGlass",
-    "catalogue_glass",
-    "far",
-    "finite",
-    "glasses_beside",
-    "kind_behind",
-    "schott",
-    "with_stop",
-    "within",
-]
 
 MOST_MB = 10
 """Largest size of a file with a prescription."""

@@ -24,8 +24,6 @@ from ..optics import camera_model
 from ..optics.poses import matrix_to_vector
 from .lines import network_of
 
-__all__ = ["is_sfm", "read_sfm"]
-
 # Coefficients of the models of distortion, by their names in both programs; others are refused by name.
 _RADIAL, _BROWN, _FISHEYE = ("k1", "k2", "k3"), ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
 _MODELS: dict[str, tuple[str, tuple[str, ...]]] = {

@@ -12,8 +12,6 @@ from ..io import read_text
 from ..io.network import TurntableEntry
 from .control import full_rows, number_of, table_rows
 
-__all__ = ["read_turntable"]
-
 _COLUMNS = ["image", "angle_deg", "sigma_deg", "pose"]
 
 

@@ -10,7 +10,9 @@ from typing import Literal
 import numpy as np
 
 from ..core.errors import FormatError
-from ..optics.lenses import AIR, Aperture, Layout, Medium, Prescription, Surface, model_glass
+from ..optics.lenses import AIR, Aperture, Medium, Prescription
+from ..optics.lenses.media import model_glass
+from ..optics.lenses.prescription import Layout, Surface
 from .lines import read_bytes
 from .prescribed import (
     MOST_MB,
@@ -23,8 +25,6 @@ from .prescribed import (
     with_stop,
     within,
 )
-
-__all__ = ["read_zemax"]
 
 _UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "METER": 1000.0}
 _TYPES = ("STANDARD", "EVENASPH", "COORDBRK")

@@ -12,24 +12,11 @@ import scipy
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..core.errors import FormatError, UsageError
-from ..optics.lenses import (
-    AIR,
-    Air,
-    Aperture,
-    Cauchy,
-    Constant,
-    Layout,
-    Medium,
-    Powers,
-    Prescription,
-    Sellmeier,
-    SensorPlane,
-    Surface,
-    Water,
-    glass,
-    model_glass,
-)
+from ..optics.lenses import AIR, Aperture, Medium, Prescription, glass
+from ..optics.lenses.media import Air, Cauchy, Constant, Powers, Sellmeier, Water, model_glass
 from ..optics.lenses.paraxial import Paraxial
+from ..optics.lenses.prescription import Layout, Surface
+from ..optics.lenses.ray_maps import SensorPlane
 from .document import Document, Strict, write_whole
 
 Positive = Annotated[float, Field(gt=0)]

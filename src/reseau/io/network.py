@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 from pydantic import ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
 
 from ..core.errors import UsageError
-from ..optics.cameras import additional_models, camera_model, camera_models
+from ..optics.cameras.registry import additional_models, camera_model, camera_models
 from .document import Document, Strict
 from .refraction import RefractionEntry
 

@@ -8,7 +8,8 @@ import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..core.errors import UsageError
-from ..optics.refraction import Refraction, RefractiveIndex, Window
+from ..optics.refraction import Window
+from ..optics.refraction.windows import Refraction, RefractiveIndex
 from .document import Document, Strict
 from .lens import GlassOrMedium, medium_of
 

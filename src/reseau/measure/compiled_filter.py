@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from ..core.compiled import compiled
 
-__all__ = ["filtered"]
-
 Floats = NDArray[Any]
 
 

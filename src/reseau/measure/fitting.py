@@ -9,21 +9,15 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from ..adjust import Adjustment, Elimination, GaussHelmert, Options, Parameters, adjust, eliminate
+from ..adjust import Adjustment, Options, Parameters, adjust, eliminate
+from ..adjust.elimination import Elimination
+from ..adjust.problem import GaussHelmert
 from ..core.data import Array, ImagePoints, Mask
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure
-from ..optics import PlaneMapping, RationalPolynomial
+from ..optics import RationalPolynomial
 from ..optics.field import SmoothField
-
-__all__ = [
-    "fit_mapping",
-    "gross_errors",
-    "is_mirrored",
-    "mapping_problem",
-    "reduce_mapping",
-    "residual_field",
-]
+from ..optics.mapping import PlaneMapping
 
 
 def mapping_problem(
@@ -91,7 +85,7 @@ def fit_mapping(
 
     Examples
     --------
-    >>> from reseau.optics import Similarity
+    >>> from reseau.optics.composition import Similarity
     >>> square = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]])
     >>> points = ImagePoints.with_sigma("abcd", square, 0.01)
     >>> fit = fit_mapping(Similarity(), points, 2 * square + 1).required()

@@ -13,8 +13,6 @@ import numpy as np
 
 from ..core.data import Array, Frame
 
-__all__ = ["ordinary_coordinates"]
-
 _WINDOW_PX = 64
 _ANGLES = 72
 """Profiles across the edge."""

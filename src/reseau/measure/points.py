@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from ..core.overlay import Layer
 
-__all__ = ["Measured", "Reason"]
-
 
 class Reason(str):
     """Why a point was not measured: a text with a code.

@@ -15,9 +15,8 @@ import numpy as np
 
 from ..core.data import Array, Mask, Rows
 from .compiled_filter import filtered
-from .matching import Shape, Window
-
-__all__ = ["FilteredShape", "Samples", "estimate_kernel", "sharpened_from_px", "unexplained"]
+from .matching import Shape
+from .matching.shapes import Window
 
 _REACH = 5
 """Half the side of a kernel, pixels."""
@@ -48,7 +47,7 @@ class FilteredShape:
 
     Examples
     --------
-    >>> from reseau.measure.matching import GrownOutline
+    >>> from reseau.measure.matching.shapes import GrownOutline
     >>> from reseau.optics.formation import Outline, PixelResponse
     >>> disk = Outline.circle(2.0, 0.5)
     >>> plain = GrownOutline(Outline(disk.xy[None], disk.dxy[None]), np.zeros((0, 2, 2)))
@@ -216,7 +215,7 @@ def estimate_kernel(samples: Samples, sharper: tuple[float, ...] = _SHARPER) -> 
 
     Examples
     --------
-    >>> from reseau.measure.matching import GrownOutline
+    >>> from reseau.measure.matching.shapes import GrownOutline
     >>> from reseau.optics.formation import Outline, PixelResponse
     >>> disk = Outline.circle(4.0, 0.5)
     >>> plain = GrownOutline(Outline(disk.xy[None], disk.dxy[None]), np.zeros((0, 2, 2)))

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from ..core.data import Array, Frame, Mask
 from ..core.failure import Code, Failure
 
-__all__ = ["Screened", "inner_pixels", "lost_in_blocks", "quiet_noise", "screen"]
-
 _BORDER = 3
 """Outermost lines of a frame whose level is compared with that of the lines further inside."""
 _ALONG = 41

@@ -23,8 +23,6 @@ from ..core.failure import Code, Remark
 from ..core.tone import ToneCurve
 from .response import Samples, unexplained
 
-__all__ = ["Exponent", "FoundCurve", "Matched", "estimate_gamma", "find_curve"]
-
 _LEAST_GAIN, _STRONG = 0.995, 0.9
 """Ratios of mean square residuals below which a curve matters, and is beyond doubt."""
 _CERTAIN, _CORRELATED = 6.0, 0.12
@@ -255,7 +253,7 @@ def estimate_gamma(samples: Samples, formed: Array, gamma: float, full_scale: fl
 
     Examples
     --------
-    >>> from reseau.measure.matching import GrownOutline, Window
+    >>> from reseau.measure.matching.shapes import GrownOutline, Window
     >>> from reseau.optics.formation import Outline, PixelResponse
     >>> disk = Outline.circle(4.0, 0.5)
     >>> plain = GrownOutline(Outline(disk.xy[None], disk.dxy[None]), np.zeros((0, 2, 2)))

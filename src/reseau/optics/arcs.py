@@ -36,8 +36,6 @@ import scipy
 from ..core.compiled import compiled
 from ..core.data import Array, Rows
 
-__all__ = ["Arcs"]
-
 _LEAST_FLATNESS = 1e-6
 """Flatness below which a profile is formed as one of this flatness: Gaussian within 1e-6 of its height."""
 _LINEAR = 1e-8

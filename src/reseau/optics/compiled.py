@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from ..core.compiled import Instruction, compiled
 
-__all__ = ["PER_SIGMA", "filtered", "formed", "gathered", "normal_table", "responses"]
-
 Single = NDArray[Any]
 Double = NDArray[Any]
 

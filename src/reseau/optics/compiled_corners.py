@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from ..core.compiled import compiled
 from .compiled import PER_SIGMA, normal_table
 
-__all__ = ["formed", "six_formed"]
-
 Floats = NDArray[Any]
 
 _FAR = 5.5

@@ -15,8 +15,6 @@ from ..core.errors import UsageError
 from .mapping import Derivatives, PlaneMapping, as_points, as_values
 from .newton import solve_2x2
 
-__all__ = ["Chain", "Identity", "Inverted", "Similarity"]
-
 
 @dataclass(frozen=True, eq=False)
 class Identity(PlaneMapping):

@@ -36,8 +36,6 @@ from ..core.data import Array, Mask, Rows
 from ..core.threads import one_thread
 from .compiled_corners import formed, six_formed
 
-__all__ = ["Corners", "corner_images"]
-
 
 @dataclass(frozen=True, eq=False)
 class Corners:

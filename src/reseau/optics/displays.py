@@ -35,8 +35,6 @@ from ..core.data import Array, Mask
 from .mapping import Derivatives, PlaneMapping, as_values
 from .polynomials import RationalPolynomial
 
-__all__ = ["DecenteredDisplay", "wong_display"]
-
 _RADII = ["x2 + y2", "x4 + 2x2y2 + y4", "x6 + 3x4y2 + 3x2y4 + y6"]
 _X_RADII = ["x", "x3 + xy2", "x5 + 2x3y2 + xy4", "x7 + 3x5y2 + 3x3y4 + xy6"]
 _Y_RADII = ["y", "y3 + yx2", "y5 + 2x2y3 + x4y", "y7 + 3x2y5 + 3x4y3 + x6y"]

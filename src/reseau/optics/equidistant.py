@@ -19,8 +19,6 @@ from numpy.typing import ArrayLike
 from ..core.data import Array
 from .mapping import Derivatives, PlaneMapping, as_points, as_values
 
-__all__ = ["Equidistant"]
-
 _FLAT = 1e-3
 """Value of w r² up to which series are used."""
 

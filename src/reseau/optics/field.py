@@ -21,8 +21,6 @@ from ..core.data import Array
 from ..core.errors import UsageError
 from ..core.threads import one_thread
 
-__all__ = ["SmoothField", "monomials", "trend_degree"]
-
 _LENGTHS = 0.12 * 2.0 ** np.arange(6)
 """Correlation lengths that are tried, in half extents of the field."""
 _RATIOS = np.concatenate([[0.0], 10.0 ** np.arange(-2, 3.01, 0.5)])

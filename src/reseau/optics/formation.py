@@ -28,18 +28,6 @@ from ..core.data import Array
 from ..core.errors import UsageError
 from .compiled import responses
 
-__all__ = [
-    "Outline",
-    "PixelResponse",
-    "coverage",
-    "coverage_derivatives",
-    "draw",
-    "mark_outline",
-    "polygons",
-    "rectangles",
-    "side_rule",
-]
-
 _MOST_NODES = 20
 """Maximum number of nodes of a panel; longer sides are divided."""
 _REACH = 5.5

@@ -25,8 +25,6 @@ from ..core.errors import UsageError
 from .compiled import gathered
 from .formation import Outline, PixelResponse
 
-__all__ = ["GriddedOutline"]
-
 _PER_PX = 4
 """Cells of the grid along a pixel."""
 _WIDEST = 400

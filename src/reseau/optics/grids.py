@@ -12,8 +12,6 @@ from ..core.data import Array, Mask
 from ..core.errors import UsageError
 from .formation import Outline, rectangles, side_rule
 
-__all__ = ["LineGrid", "Wires", "line_grid", "wire_grid"]
-
 
 class LineGrid(NamedTuple):
     """The pieces of a grid of wires in its own plane, which do not overlap.

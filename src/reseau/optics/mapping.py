@@ -24,8 +24,6 @@ from ..core.data import Array, Mask
 from ..core.errors import UsageError
 from .newton import determinant, in_blocks, newton, solve_2x2
 
-__all__ = ["Derivatives", "Mapping", "PlaneMapping"]
-
 # Positions between the centre and a point at which the orientation of the mapping is tested.
 ON_THE_WAY = (0.25, 0.5, 0.75, 1.0)
 
@@ -44,7 +42,7 @@ class Derivatives(NamedTuple):
 
     Examples
     --------
-    >>> from reseau.optics import Similarity
+    >>> from reseau.optics.composition import Similarity
     >>> value, d_xy, d_parameters = Similarity([1.0, 0.0, 2.0, 0.0]).derivatives([[3.0, 4.0]])
     >>> value, d_xy.shape, d_parameters.shape
     (array([[7., 8.]]), (1, 2, 2), (1, 2, 4))
@@ -61,7 +59,7 @@ class Mapping(Protocol):
 
     Examples
     --------
-    >>> from reseau.optics import Similarity
+    >>> from reseau.optics.composition import Similarity
     >>> isinstance(Similarity(), Mapping), isinstance(np.eye(2), Mapping)
     (True, False)
     """
@@ -125,7 +123,7 @@ class PlaneMapping(ABC):
 
     Examples
     --------
-    >>> from reseau.optics import Similarity
+    >>> from reseau.optics.composition import Similarity
     >>> doubled = Similarity().with_values({"a": 2.0})
     >>> doubled([[1.0, 3.0]]), doubled.inverse([[2.0, 6.0]]), doubled.value_of("a")
     (array([[2., 6.]]), array([[1., 3.]]), 2.0)

@@ -8,8 +8,6 @@ import numpy as np
 
 from ..core.data import Array
 
-__all__ = ["determinant", "in_blocks", "newton", "solve_2x2"]
-
 # Small enough for the work arrays to stay in the cache, large enough to make NumPy's call overhead
 # negligible.
 BLOCK = 16384

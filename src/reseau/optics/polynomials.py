@@ -26,8 +26,6 @@ from ..core.data import Array, Mask
 from ..core.errors import FormatError, UsageError
 from .mapping import Derivatives, PlaneMapping, as_points, as_values
 
-__all__ = ["RationalPolynomial"]
-
 PARTS = ("NX", "NY", "D", "X", "Y")
 NX, NY, D, PX, PY = range(5)
 

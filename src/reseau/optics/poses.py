@@ -16,18 +16,6 @@ from ..core.data import Array
 from ..core.errors import UsageError
 from .mapping import PlaneMapping
 
-__all__ = [
-    "Pose",
-    "Projection",
-    "angles_to_matrix",
-    "cross_matrix",
-    "matrix_to_angles",
-    "matrix_to_vector",
-    "project",
-    "rotate",
-    "rotation_matrix",
-]
-
 # From the camera of the angles (y up, z backwards, as in a vertical photograph) to that used here.
 _VIEW = np.diag([1.0, -1.0, -1.0])
 # Below this angle the series of (θ − sin θ)/θ³ is more exact than the formula, which cancels.
@@ -289,7 +277,7 @@ class Projection(NamedTuple):
     --------
     See :func:`project`:
 
-    >>> from reseau.optics import Identity
+    >>> from reseau.optics.composition import Identity
     >>> seen = project(Identity(), Pose([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]), [[1.0, 2.0, -4.0]])
     >>> isinstance(seen, Projection), bool(np.isnan(seen.xy).all())
     (True, True)
@@ -321,7 +309,7 @@ def project(camera: PlaneMapping, pose: Pose, points: ArrayLike) -> Projection:
 
     Examples
     --------
-    >>> from reseau.optics import Identity
+    >>> from reseau.optics.composition import Identity
     >>> seen = project(Identity(), Pose([0.0, 0.0, 0.0], [0.0, 0.0, -6.0]), [[1.0, 2.0, 4.0]])
     >>> seen.xy, seen.d_pose.shape, seen.d_point.shape, seen.d_camera.shape
     (array([[0.1, 0.2]]), (1, 2, 6), (1, 2, 3), (1, 2, 0))

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from ..core.data import Array
 
-__all__ = ["on_lattice", "resample"]
-
 _STEP = 12
 """Distance of the pixels at which a mapping is evaluated; cubic splines interpolate between them."""
 _MARGIN = 14

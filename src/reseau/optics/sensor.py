@@ -18,8 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.data import Array
 from ..core.errors import UsageError
 
-__all__ = ["Sensor", "illumination", "jpeg", "sigma_of_snr", "snr_db"]
-
 
 def snr_db(sigma: float, full_scale: float = 255.0) -> float:
     """Signal-to-noise ratio in dB of a noise of standard deviation `sigma` grey values: 20·log10(255/σ).

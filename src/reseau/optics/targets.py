@@ -8,8 +8,6 @@ from ..core.data import Array
 from ..core.errors import UsageError
 from .formation import Outline
 
-__all__ = ["target_corners", "target_outline"]
-
 _APEX = np.deg2rad([90.0, 210.0, 330.0])
 
 

@@ -14,8 +14,10 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from ..bundle import Explanation, Result, camera_mapping, explain
-from ..bundle.explanations import described
+from ..bundle import Result, explain
+from ..bundle.diagnostics.fields import camera_mapping
+from ..bundle.explanations.explain import Explanation
+from ..bundle.explanations.sentences import described
 from ..calibration import CameraMapping, Cause, projection_field
 from ..calibration.assessment import Assessment, ErrorMap, Use, two_digits
 from ..core.data import Array, Mask

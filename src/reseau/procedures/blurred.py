@@ -20,22 +20,15 @@ from ..bundle.solver.spatial import resect
 from ..core.data import Array, Frame, ImagePoints
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure, Remark
-from ..exchange import Lens
+from ..exchange.lenses import Lens
 from ..io import ReseauDesign, TestfieldDesign
-from ..measure.blurred import BlurredOptions, BlurredResult, Varied, estimate_optics, measure_blurred
+from ..measure.blurred import BlurredOptions, estimate_optics, measure_blurred
+from ..measure.blurred.measure import BlurredResult, Varied
 from ..optics import Pose
 from ..optics.formation import mark_outline
-from ..optics.lenses import (
-    CalibratedLens,
-    LensCamera,
-    Paraxial,
-    PlaneTarget,
-    Prescription,
-    RayMap,
-    SensorPlane,
-    ThinLens,
-    image_scale,
-)
+from ..optics.lenses import Paraxial, Prescription, RayMap, ThinLens
+from ..optics.lenses.images import PlaneTarget, image_scale
+from ..optics.lenses.ray_maps import CalibratedLens, LensCamera, SensorPlane
 from ..optics.newton import newton
 from ..optics.poses import matrix_to_vector, rotation_matrix
 from ..optics.targets import target_outline
@@ -106,7 +99,8 @@ def focused(lens: Prescription, distance: float) -> Prescription:
 
     Examples
     --------
-    >>> from reseau.optics.lenses import AIR, Constant, in_order
+    >>> from reseau.optics.lenses import AIR, in_order
+    >>> from reseau.optics.lenses.media import Constant
     >>> lens = Prescription(in_order([(0.02, 6.0, Constant(1.5)), (0.0, 96.0, AIR)]), stop=0, stop_radius=8.0)
     >>> round(float(focused(lens, 1000.0).surfaces[-1].vertex[2]), 2)
     113.11
@@ -154,7 +148,8 @@ def lens_camera(
 
     Examples
     --------
-    >>> from reseau.optics.lenses import AIR, Constant, in_order
+    >>> from reseau.optics.lenses import AIR, in_order
+    >>> from reseau.optics.lenses.media import Constant
     >>> lens = Prescription(in_order([(0.02, 6.0, Constant(1.5)), (0.0, 96.0, AIR)]), stop=0, stop_radius=8.0)
     >>> camera = lens_camera(Lens(lens), (1001, 801), pitch_mm=0.01, distance=1000.0)
     >>> camera.corresponding(np.array([[0.0, 0.0, 1000.0]]))
@@ -446,7 +441,8 @@ def refocused(camera: RayMap, by_mm: float) -> RayMap:
 
     Examples
     --------
-    >>> from reseau.optics.lenses import AIR, Constant, in_order
+    >>> from reseau.optics.lenses import AIR, in_order
+    >>> from reseau.optics.lenses.media import Constant
     >>> lens = Prescription(in_order([(0.02, 6.0, Constant(1.5)), (0.0, 96.0, AIR)]), stop=0, stop_radius=8.0)
     >>> moved = refocused(LensCamera(lens, SensorPlane((0.01, 0.01), (0.0, 0.0))), 0.5)
     >>> float(moved.lens.surfaces[-1].vertex[2])

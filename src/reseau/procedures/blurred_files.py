@@ -12,13 +12,15 @@ from ..core.data import Frame
 from ..core.errors import UsageError
 from ..core.failure import Failure
 from ..core.provenance import Provenance
-from ..exchange import Lens
+from ..exchange.lenses import Lens
 from ..io import BoardDesign, ReseauDesign, TestfieldDesign
 from ..io.network import Network1
 from ..io.photographs import PHOTOGRAPHS
-from ..measure import ReseauOptions, measure_reseau
+from ..measure import measure_reseau
 from ..measure.blurred import BlurredOptions
-from ..optics.lenses import LensCamera, RayMap, ThinLens
+from ..measure.reseau.marks import ReseauOptions
+from ..optics.lenses import RayMap, ThinLens
+from ..optics.lenses.ray_maps import LensCamera
 from .blurred import (
     BlurredFrame,
     calibrated_by,

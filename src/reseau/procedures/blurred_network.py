@@ -26,18 +26,15 @@ from ..core.executors import Executor, Here
 from ..core.failure import Code, Failure, Remark
 from ..io.network import Network1, ObservationColumns
 from ..io.targets import SpaceTargets
-from ..measure.blurred import BlurredOptions, BlurredResult, measure_blurred
+from ..measure.blurred import BlurredOptions, measure_blurred
+from ..measure.blurred.measure import BlurredResult
 from ..measure.ordinary import ordinary_coordinates
-from ..optics.lenses import (
-    CalibratedLens,
-    LensCamera,
-    PlaneTarget,
-    RayMap,
-    ThinLens,
-    behind_windows,
-    image_scale,
-)
-from ..optics.refraction import RefractedRays, Refraction
+from ..optics.lenses import RayMap, ThinLens
+from ..optics.lenses.images import PlaneTarget, image_scale
+from ..optics.lenses.ray_maps import CalibratedLens, LensCamera
+from ..optics.lenses.windows import behind_windows
+from ..optics.refraction import RefractedRays
+from ..optics.refraction.windows import Refraction
 from .blurred import SPACING_PX
 
 _NODES = 150
@@ -221,7 +218,8 @@ def measure_blurred_network(
     --------
     >>> from reseau.bundle import example_network
     >>> from reseau.io.targets import TargetColumns
-    >>> from reseau.optics.lenses import AIR, Prescription, SensorPlane, glass, in_order
+    >>> from reseau.optics.lenses import AIR, Prescription, glass, in_order
+    >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> lens = Prescription(in_order([(0.1, 1.0, glass("N-BK7")), (-0.1, 9.0, AIR)]), 0, 0.5)
     >>> camera = LensCamera(lens, SensorPlane((0.01, 0.01), (319.5, 239.5)))
     >>> one = TargetColumns(id=("none",), shape=("disk",), size=(0.1,), normal=((0.0, 0.0, 1.0),))
@@ -268,7 +266,7 @@ def final_document(document: Network1, found: BlurredNetwork) -> Network1:
     Examples
     --------
     >>> from reseau.bundle import example_network
-    >>> from reseau.bundle.network import network_document
+    >>> from reseau.bundle.network.settings import network_document
     >>> network, none = example_network(), np.zeros(160, dtype=bool)
     >>> found = BlurredNetwork((BlurredRound(adjust_network(network), {}, none, ~none, none, 0.0),), 0)
     >>> bool(final_document(network_document(network), found).observations.x[0] == network.xy[0, 0])

@@ -14,7 +14,7 @@ from ..core.environment import Surroundings
 from ..core.errors import EstimationError
 from ..core.failure import Failure
 from ..core.provenance import Provenance
-from ..exchange import Lens
+from ..exchange.lenses import Lens
 from ..io.network import Network1
 from ..io.targets import SpaceTargets
 from ..measure.ordinary import ordinary_coordinates
@@ -50,7 +50,7 @@ class BlurredProcedure:
     Examples
     --------
     >>> from reseau.bundle import example_network
-    >>> from reseau.bundle.network import network_document
+    >>> from reseau.bundle.network.settings import network_document
     >>> from reseau.designs import space_frame
     >>> from reseau.optics.lenses import AIR, Prescription, glass, in_order
     >>> rows = [(0.02, 5.0, glass("N-BK7")), (-0.02, 46.5, AIR)]

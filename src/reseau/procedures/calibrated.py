@@ -13,19 +13,13 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bundle import (
-    BoardChoice,
-    CameraEstimate,
-    Explanation,
-    ImageEstimates,
-    Misnamed,
-    ModelChoice,
-    PointEstimates,
-    Result,
-    calibration_of,
-    explain,
-    model_search_entries,
-)
+from ..bundle import Result, calibration_of, explain
+from ..bundle.diagnostics.estimates import CameraEstimate, ImageEstimates, PointEstimates
+from ..bundle.document import model_search_entries
+from ..bundle.explanations.explain import Explanation
+from ..bundle.explanations.names import Misnamed
+from ..bundle.modelling.board import BoardChoice
+from ..bundle.modelling.choice import ModelChoice
 from ..calibration import Calibration, FieldDifference
 from ..calibration.assessment import Assessment
 from ..calibration.document import Covariance
@@ -36,7 +30,7 @@ from ..core.failure import Estimated, Remark
 from ..core.files import writable
 from ..core.lazy import above
 from ..core.provenance import Provenance
-from ..exchange.calibrations import Exported, export_calibrations
+from ..exchange.calibrations.formats import Exported, export_calibrations
 from ..io import BoardDesign, write_whole
 from ..io.images import Channel, read_image
 from ..io.photographs import read_exif

@@ -13,7 +13,7 @@ from ..core.failure import Failure
 from ..core.provenance import sha256_of
 from ..execution import Executor, Outputs
 from ..io.images import Channel
-from ..measure import TestfieldOptions
+from ..measure.testfield.measure import TestfieldOptions
 from .calibrated import Calibrated
 from .calibration import calibrate_camera
 from .calibration_options import CalibrationOptions, CameraOptions

@@ -16,22 +16,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..bundle import (
-    Camera,
-    ControlPoints,
-    Misnamed,
-    ModelChoice,
-    Network,
-    Result,
-    Rig,
-    camera_mapping,
-    choose_board,
-    choose_models,
-    held_as_designed,
-    misnamed,
-    search_model,
-)
-from ..bundle.network import stage_of_turntable
+from ..bundle import Camera, Network, Result, choose_board, choose_models, search_model
+from ..bundle.diagnostics.fields import camera_mapping
+from ..bundle.explanations.names import Misnamed, misnamed
+from ..bundle.modelling.board import held_as_designed
+from ..bundle.modelling.choice import ModelChoice
+from ..bundle.network.network import ControlPoints
+from ..bundle.network.rig import Rig
+from ..bundle.network.turntable import stage_of_turntable
 from ..calibration import CameraMapping
 from ..core.data import Array, ImagePoints
 from ..core.errors import UsageError
@@ -41,7 +33,8 @@ from ..io import BoardDesign
 from ..io.network import TurntableEntry
 from ..io.photographs import Exif
 from ..optics import PixelGrid, camera_model
-from ..optics.refraction import RefractedRays, Refraction
+from ..optics.refraction import RefractedRays
+from ..optics.refraction.windows import Refraction
 from .calibrated import ONE_CAMERA, Calibrated
 from .calibration_options import CalibrationOptions, CameraOptions, PlaneDesign
 from .exposures import Taken

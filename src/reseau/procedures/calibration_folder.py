@@ -14,8 +14,8 @@ from ..calibration.assessment import Use
 from ..calibration.raster import planes_of, write_corrected
 from ..core.errors import UsageError
 from ..core.files import writable
-from ..exchange import export_calibration, export_rig
-from ..exchange.calibrations import formats_holding
+from ..exchange import export_calibration
+from ..exchange.calibrations.formats import export_rig, formats_holding
 from ..io import write_whole
 from ..io.images import open_scan
 from .calibrated import Calibrated

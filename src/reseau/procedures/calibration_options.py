@@ -6,14 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
-from ..bundle import ControlPoints, Options, Shutter
+from ..bundle import Options
+from ..bundle.network.network import ControlPoints
+from ..bundle.network.shutter import Shutter
 from ..core import vocabulary as v
 from ..core.data import Array
 from ..core.errors import UsageError
 from ..io.network import TurntableEntry
 from ..io.refraction import RefractionEntry
-from ..optics import CameraModel, camera_model
-from ..optics.cameras import default_camera_model
+from ..optics import camera_model
+from ..optics.cameras.registry import CameraModel, default_camera_model
 from .z_stage import Heights
 
 

@@ -19,15 +19,10 @@ from ..core.data import Array
 from ..core.failure import Failure
 from ..io import FrameCorners, FrameOrientation
 from ..io.scans import Scan
-from ..measure.film import (
-    FilmPlane,
-    FrameOptions,
-    FrameResult,
-    Kind,
-    Roll,
-    orient_frames,
-    transformed,
-)
+from ..measure.film import orient_frames
+from ..measure.film.orientation import FrameOptions, FrameResult
+from ..measure.film.perforations import FilmPlane
+from ..measure.film.roll import Kind, Roll, transformed
 
 __all__ = ["FrameOptions", "FrameResult"]
 

@@ -15,8 +15,7 @@ from ..core.provenance import Provenance
 from ..io import FrameCorners, FrameOrientation
 from ..io.frame import FrameOutcome, RollSummary
 from ..io.scans import Scan
-from ..measure.film import Kind
-from ..measure.film.roll import Roll, roll_of
+from ..measure.film.roll import Kind, Roll, roll_of
 from .film_frame import FrameOptions, FrameResult, orient_scan, orientation_of, reorient_scan
 
 

@@ -19,7 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..bundle import Network, Result, Stage, camera_mapping
+from ..bundle import Network, Result, Stage
+from ..bundle.diagnostics.fields import camera_mapping
 from ..calibration import CameraMapping
 from ..calibration.assessment import NextPhotograph
 from ..calibration.camera import by_rotation, places, projection_slopes, worst

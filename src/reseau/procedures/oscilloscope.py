@@ -18,16 +18,11 @@ from ..calibration import CameraCorrection, InstrumentCorrection
 from ..core.data import Array, Frame, ImagePoints
 from ..core.failure import Code, Failure, Remark
 from ..io import ReseauDesign
-from ..measure import (
-    PinDetections,
-    PinOptions,
-    PinResult,
-    ReseauOptions,
-    ReseauResult,
-    find_pins,
-    measure_pins,
-    measure_reseau,
-)
+from ..measure import PinDetections, find_pins, measure_pins, measure_reseau
+from ..measure.pins.detection import PinOptions
+from ..measure.pins.measure import PinResult
+from ..measure.reseau.marks import ReseauOptions
+from ..measure.reseau.measure import ReseauResult
 from ..optics import RationalPolynomial
 from ..refine import (
     Causes,

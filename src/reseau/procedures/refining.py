@@ -14,7 +14,8 @@ from ..core.data import Frame, ImagePoints
 from ..core.errors import UsageError
 from ..core.failure import Failure
 from ..io import ReseauDesign
-from ..measure import PinOptions, ReseauOptions
+from ..measure.pins.detection import PinOptions
+from ..measure.reseau.marks import ReseauOptions
 from .oscilloscope import photo_i, photo_ii, photo_iii, still_standard_in
 from .refined import Refined
 

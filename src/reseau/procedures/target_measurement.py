@@ -16,14 +16,10 @@ from ..core.errors import ImageError
 from ..core.failure import Code, Failure
 from ..execution import Executor, Here, Outputs
 from ..io import BoardDesign, PhotographPoints, ReseauDesign, TestfieldDesign
-from ..measure import (
-    BoardOptions,
-    TestfieldOptions,
-    measure_board,
-    measure_reseau,
-    measure_testfield,
-)
+from ..measure import measure_board, measure_reseau, measure_testfield
+from ..measure.boards.measure import BoardOptions
 from ..measure.points import Measured
+from ..measure.testfield.measure import TestfieldOptions
 
 _COUNTS = re.compile(r"(?<![\w.×-])\d+(?![\w.×-])")
 """Numbers in a reason, but those in names of files and in sizes of images."""

@@ -16,13 +16,9 @@ from typing import Any, ClassVar, Protocol, Self, TypeVar
 import numpy as np
 
 from ..archive import Verdict
-from ..bundle import (
-    Network,
-    Result,
-    camera_mapping,
-    problem_of,
-    with_estimates,
-)
+from ..bundle import Network, Result, problem_of
+from ..bundle.diagnostics.fields import camera_mapping
+from ..bundle.modelling.calibration import with_estimates
 from ..core.data import Array, Frame, ImagePoints
 from ..core.environment import Surroundings
 from ..core.errors import EstimationError

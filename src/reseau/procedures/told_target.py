@@ -13,7 +13,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ..bundle import Result, Rig, camera_mapping
+from ..bundle import Result
+from ..bundle.diagnostics.fields import camera_mapping
+from ..bundle.network.rig import Rig
 from ..calibration import CameraMapping
 from ..core.data import Array, Frame, ImagePoints
 from ..core.errors import ImageError, UsageError

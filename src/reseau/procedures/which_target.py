@@ -17,10 +17,12 @@ from ..core.errors import ImageError, ReseauError
 from ..core.failure import Code, Failure
 from ..designs import board
 from ..designs.known import known_designs
-from ..exchange import read_target
+from ..exchange.boards import read_target
 from ..io import BoardDesign, ReseauDesign, TestfieldDesign
 from ..io.reading import is_points
-from ..measure import PuzzlePart, boards_shown, puzzle_part
+from ..measure.boards.measure import puzzle_part
+from ..measure.boards.puzzles import PuzzlePart
+from ..measure.boards.shown import boards_shown
 from .target_measurement import measurer_of
 
 T = TypeVar("T")

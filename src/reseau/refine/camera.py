@@ -12,7 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..adjust import Adjustment, Elimination, Options
+from ..adjust import Adjustment, Options
+from ..adjust.elimination import Elimination
 from ..calibration import CameraCorrection, Datum
 from ..calibration.entries import tests_of
 from ..calibration.mapping import carried
@@ -27,7 +28,8 @@ from ..measure.fitting import (
     reduce_mapping,
     residual_field,
 )
-from ..optics import RationalPolynomial, Similarity
+from ..optics import RationalPolynomial
+from ..optics.composition import Similarity
 from ..optics.field import SmoothField
 
 __all__ = ["CorrectionFit", "FittedCamera", "correct_camera"]

@@ -13,7 +13,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..adjust import Adjustment, Elimination, Options
+from ..adjust import Adjustment, Options
+from ..adjust.elimination import Elimination
 from ..calibration import CameraCorrection, InstrumentCorrection, LocalModel, ObjectPlane
 from ..calibration.entries import tests_of
 from ..calibration.mapping import carried
@@ -21,7 +22,9 @@ from ..core.data import Array, ImagePoints
 from ..core.failure import Code, Failure
 from ..io import ReseauDesign
 from ..measure.fitting import beyond_chance, gross_errors, is_mirrored, reduce_mapping, residual_field
-from ..optics import RationalPolynomial, Similarity, wong_display
+from ..optics import RationalPolynomial
+from ..optics.composition import Similarity
+from ..optics.displays import wong_display
 from ..optics.field import SmoothField
 from .camera import defining_marks
 from .registration import Registration

@@ -21,7 +21,8 @@ from ..core.data import Array, ImagePoints, Mask
 from ..core.failure import Code, Failure
 from ..io import ReseauDesign
 from ..measure.fitting import fit_mapping
-from ..optics import RationalPolynomial, Similarity
+from ..optics import RationalPolynomial
+from ..optics.composition import Similarity
 from ..optics.field import SmoothField
 
 __all__ = ["Registration", "register"]

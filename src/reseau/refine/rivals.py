@@ -17,7 +17,7 @@ from ..adjust import Adjustment
 from ..core.data import Array, ImagePoints
 from ..core.failure import Code, Failure
 from ..measure.fitting import fit_mapping
-from ..optics import PlaneMapping
+from ..optics.mapping import PlaneMapping
 
 __all__ = ["Rivalry", "leave_one_out", "rivals"]
 

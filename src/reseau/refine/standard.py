@@ -126,7 +126,8 @@ def still_standard(
     >>> from reseau.calibration import CameraCorrection, ObjectPlane
     >>> from reseau.designs import regular_reseau
     >>> from reseau.io import Mark
-    >>> from reseau.optics import RationalPolynomial, Similarity
+    >>> from reseau.optics import RationalPolynomial
+    >>> from reseau.optics.composition import Similarity
     >>> rods = regular_reseau(3, 3, 20.0, Mark(shape="disk", size=0.75))
     >>> model, plane = RationalPolynomial.camera(), ObjectPlane(Similarity(), np.ones(2), Similarity())
     >>> camera = CameraCorrection(model, np.zeros((13, 13)), Similarity(), Similarity(), "mm")

@@ -9,9 +9,11 @@ import numpy as np
 from ..core.data import Array, Frame
 from ..core.errors import UsageError
 from ..core.figures import ACCENT, BLUE, FAINT, INK, drawing
-from ..measure.blurred import BlurredResult
+from ..measure.blurred.measure import BlurredResult
 from ..optics.formation import PixelResponse
-from ..optics.lenses import PlaneTarget, PupilElements, RayMap, RaySurrogate, ray_image
+from ..optics.lenses import PupilElements, RayMap, ray_image
+from ..optics.lenses.images import PlaneTarget
+from ..optics.lenses.surrogate import RaySurrogate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

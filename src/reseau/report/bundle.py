@@ -9,15 +9,9 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from ..bundle import (
-    CommonPattern,
-    Result,
-    by_place,
-    by_point,
-    camera_mapping,
-    common_pattern,
-    projection_field_at,
-)
+from ..bundle import Result
+from ..bundle.diagnostics.fields import camera_mapping, projection_field_at
+from ..bundle.diagnostics.patterns import CommonPattern, by_place, by_point, common_pattern
 from ..bundle.network.shutter import MOTION
 from ..calibration import CameraMapping, FieldDifference, projection_field
 from ..calibration.assessment import Assessment

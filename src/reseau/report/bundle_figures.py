@@ -12,7 +12,7 @@ from ..calibration import CameraMapping
 from ..calibration.assessment import Assessment, ErrorMap
 from ..core.data import Array, Rows
 from ..core.figures import ACCENT, BLUE, FAINT, INK, PALE, drawing, image_axes, nice, to_svg
-from ..optics.cameras import distortion_names
+from ..optics.cameras.registry import distortion_names
 
 _MANY_POINTS, _ELLIPSES, _CELLS, _WEAK = 4000, 250, 12, 5.0
 _BAND = 3.0

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from markupsafe import Markup
 
-from ..bundle import Result, camera_mapping
+from ..bundle import Result
+from ..bundle.diagnostics.fields import camera_mapping
 from .bundle_figures import distortion_figure, network_figure
 from .tables import Row, symbol
 

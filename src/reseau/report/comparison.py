@@ -10,7 +10,7 @@ from ..core.data import Array, ImagePoints
 from ..core.errors import UsageError
 from ..io import ReseauDesign
 from ..measure.fitting import fit_mapping
-from ..optics import PlaneMapping
+from ..optics.mapping import PlaneMapping
 from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
 from .factors import best_similarity, factor_by_factor, identified
 from .tables import rms_pair

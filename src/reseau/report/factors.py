@@ -12,7 +12,8 @@ from ..core.errors import UsageError
 from ..core.failure import Failure
 from ..io import ReseauDesign
 from ..measure.fitting import fit_mapping
-from ..optics import PlaneMapping, RationalPolynomial
+from ..optics import RationalPolynomial
+from ..optics.mapping import PlaneMapping
 from ..procedures.oscilloscope import PhotoII, PhotoIII
 from ..refine import correct_instrument
 from .tables import rms_pair

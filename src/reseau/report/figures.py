@@ -22,7 +22,7 @@ from ..core.figures import (
     to_svg,
     typical_pitch,
 )
-from ..optics import PlaneMapping
+from ..optics.mapping import PlaneMapping
 
 _WIDTH, _PANEL = 8.6, 3.75
 """Of a figure and of the plane of one of its two panels, in inches."""

@@ -18,7 +18,7 @@ from ..io import FrameOrientation
 from ..io.frame import RollSummary
 from ..io.images import write_image
 from ..io.scans import Scan
-from ..measure.film import FrameResult
+from ..measure.film.orientation import FrameResult
 from .template import rendered
 
 _STRIPE, _UNWRITTEN = 512, 50_000_000

@@ -15,7 +15,8 @@ from ..core.data import Array, Frame
 from ..core.figures import Panel
 from ..core.numbers import aligned, power
 from ..io import ReseauDesign
-from ..optics import RationalPolynomial, wong_display
+from ..optics import RationalPolynomial
+from ..optics.displays import wong_display
 from ..optics.polynomials import monomials
 from ..procedures.oscilloscope import PhotoII
 from ..refine import CAUSES, Causes, InstrumentFit, Rivalry

@@ -10,7 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 from markupsafe import Markup
 
-from ..adjust import Adjustment, Elimination
+from ..adjust import Adjustment
+from ..adjust.elimination import Elimination
 from ..core.data import Array, Mask
 from ..core.numbers import aligned, grouped, power
 from ..optics.field import SmoothField

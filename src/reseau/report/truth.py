@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 from ..core.data import Array
-from ..optics import PlaneMapping
+from ..optics.mapping import PlaneMapping
 
 Pair = tuple[float, float]
 """Root mean squares of x and of y."""

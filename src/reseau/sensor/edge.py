@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import scipy
 
-from ..adjust import Adjustment, CoefficientTest, NestedTest, compare
+from ..adjust import Adjustment
+from ..adjust.fitted import compare
+from ..adjust.significance import CoefficientTest, NestedTest
 from ..calibration.document import Quantity
 from ..core.data import Array, Frame, Mask
 from ..core.failure import Code, Failure

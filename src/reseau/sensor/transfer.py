@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..adjust import Adjustment, GaussHelmert, GaussMarkov, Options, Parameters, adjust
+from ..adjust import Adjustment, GaussMarkov, Options, Parameters, adjust
+from ..adjust.problem import GaussHelmert
 from ..calibration.sensor import Fields
 from ..core.data import Array, Mask
 from ..core.failure import Code, Failure

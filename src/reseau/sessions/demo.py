@@ -44,7 +44,7 @@ from .conducting import begin, procedure_of
 
 if TYPE_CHECKING:
     from ..io import ReseauDesign
-    from ..optics import PlaneMapping
+    from ..optics.mapping import PlaneMapping
     from ..procedures.calibrated import Calibrated
     from ..procedures.oscilloscope import PhotoI, PhotoII, PhotoIII
     from ..report.truth import Comparison, KnownPoints

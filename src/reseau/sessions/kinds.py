@@ -270,7 +270,7 @@ def _testfield(run: Acquisition, given: TestfieldParameters) -> Plan:
 def _testfield_procedure(
     session: Session, given: TestfieldParameters | PhotographsParameters
 ) -> TestfieldProcedure:
-    from ..measure import TestfieldOptions
+    from ..measure.testfield.measure import TestfieldOptions
     from ..procedures.target_measurement import measurer_of
     from ..procedures.testfield import TestfieldProcedure
 
@@ -375,7 +375,7 @@ def _read_blurred(text: str, name: str, where: object) -> Any:
 
 def _blurred_procedure(session: Session, given: BlurredParameters) -> BlurredProcedure:
     from ..bundle import Network
-    from ..exchange import Lens
+    from ..exchange.lenses import Lens
     from ..procedures.blurred_files import BlurredImaging
     from ..procedures.blurred_network import NetworkOptions
     from ..procedures.blurred_session import BlurredProcedure

@@ -465,7 +465,7 @@ class TestfieldParameters(SessionParameters):
     @property
     def units(self) -> Mapping[str, str]:
         """Units of the parameters of the camera."""
-        from ..optics.cameras import unit_of
+        from ..optics.cameras.registry import unit_of
 
         options = self.camera_options()
         return {name: unit_of(name, options.model) for name in options.chosen}

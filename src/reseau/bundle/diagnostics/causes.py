@@ -11,13 +11,11 @@ import numpy as np
 
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Remark
-from ..network import Camera, Network
-from ..network.network import finite
+from ..network.camera import Camera
+from ..network.network import Network, finite
 from ..solver.spatial import directions
 from .checks import listed
 from .evidence import ODDS
-
-__all__ = ["causes", "given_poses_that_do_not_fit", "outside_image", "seen_frontally"]
 
 # Half the diagonal of the image in the principal distance: tangents of half angles of view of real cameras.
 _NARROWEST, _WIDEST = 6e-4, 12.0

@@ -7,17 +7,15 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import scipy
 
-from ...adjust import critical_w
+from ...adjust.reliability import critical_w
 from ...core.data import Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Remark
-from ..network import Network
-from ..solver import BundleFit
+from ..network.network import Network
+from ..solver.problem import BundleFit
 from .patterns import CommonPattern, by_place, common_pattern
 from .regularisation import regularised
 from .result import Result
-
-__all__ = ["LISTED", "checks", "in_images", "listed", "unmodelled_pattern"]
 
 LISTED = 8
 SHOWN = 3

@@ -27,9 +27,9 @@ import numpy as np
 
 from ...calibration.camera import CameraMapping, by_rotation, places
 from ...core.data import Array, Mask, Rows
-from ...optics import PlaneMapping
-from ...optics.cameras import CameraModel
-from ..solver import BundleFit
+from ...optics.cameras.registry import CameraModel
+from ...optics.mapping import PlaneMapping
+from ..solver.problem import BundleFit
 from .evidence import Effect, scores, too_large, used_rows
 
 _SIZES = np.geomspace(1e-5, 0.1, 11)

@@ -16,15 +16,13 @@ import scipy
 
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure, Remark
-from ..network import Network
-from ..network.network import finite
-from ..solver import BundleFit, BundleProblem, approximate
+from ..network.network import Network, finite
+from ..solver.approximation import approximate
 from ..solver.datum import similarity_onto
+from ..solver.problem import BundleFit, BundleProblem
 from ..solver.unknowns import Unknowns
 from ..solver.values import Values
 from .checks import listed
-
-__all__ = ["ControlCheck", "ControlShape", "checked_control", "control_shape", "suspected", "without_control"]
 
 _TRIPLES, _SIGMAS, _LEAST = 500, 8.0, 4
 # Points that agree, from which on a figure is not symmetric in them.

@@ -12,17 +12,6 @@ from ...core.display import Display
 from ...core.numbers import measured, plain
 from ..network.shutter import MOTION
 
-__all__ = [
-    "CameraEstimate",
-    "ImageEstimates",
-    "MotionEstimates",
-    "PointEstimates",
-    "PriorInfluence",
-    "RefractionEstimate",
-    "RigEstimate",
-    "StageEstimate",
-]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CameraEstimate(Display):

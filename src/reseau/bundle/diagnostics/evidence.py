@@ -22,21 +22,8 @@ import numpy as np
 import scipy
 
 from ...core.data import Array, Rows
-from ..solver import BundleFit
 from ..solver.normal import SEGMENTS
-
-__all__ = [
-    "ODDS",
-    "Effect",
-    "Scores",
-    "lower_factor",
-    "places_seen",
-    "scores",
-    "sensitivities",
-    "sigma_seen",
-    "too_large",
-    "used_rows",
-]
+from ..solver.problem import BundleFit
 
 ODDS = np.log(10.0)
 """Logarithm of how much better a model with more parameters must predict what is left out: ten times, and as

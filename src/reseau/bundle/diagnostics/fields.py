@@ -10,8 +10,6 @@ from ...core.errors import UsageError
 from .checks import listed
 from .result import Result
 
-__all__ = ["camera_mapping", "projection_field_at"]
-
 
 def camera_mapping(
     result: Result, c: int, additional: str | None = None, *, formal: bool = False

@@ -28,8 +28,6 @@ from ...core.threads import one_thread
 from ..solver.normal import SEGMENTS
 from .result import Result
 
-__all__ = ["CommonPattern", "by_place", "by_point", "common_pattern"]
-
 # Eigenvalues of the scaled M below this belong to shifts that the unknowns absorb.
 _RANK = 1e-6
 # Maximum number of shift components, because of their full matrices, and columns processed at once.

@@ -14,8 +14,6 @@ from ...calibration.camera import CameraMapping, by_rotation, places, worst
 from ...core.data import Array, Mask
 from .result import Result
 
-__all__ = ["Regularised", "regularised"]
-
 # Places along the columns of the image; distance to the next image point, in steps between places, up to
 # which a place counts as observed; image points compared at once.
 _ACROSS, _NEAR, _AT_ONCE = 25, 1.5, 4096

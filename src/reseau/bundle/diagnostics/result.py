@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import scipy
 
-from ...adjust import VarianceComponents
+from ...adjust.components import VarianceComponents
 from ...adjust.outliers import SnoopingStep
 from ...adjust.significance import CoefficientTest, GlobalTest, ratio_test
 from ...core.data import Array, Mask, Rows
@@ -18,11 +18,11 @@ from ...core.display import Display, Table
 from ...core.errors import UsageError
 from ...core.failure import Code, Estimated, Remark
 from ...core.threads import one_thread
-from ...optics.cameras import distortion_names
+from ...optics.cameras.registry import distortion_names
 from ...optics.poses import matrix_to_angles, matrix_to_vector, rotation_matrix
-from ..network import Network
+from ..network.network import Network
 from ..network.stage import perpendicular
-from ..solver import BundleFit
+from ..solver.problem import BundleFit
 from ..solver.rank import missing_windows
 from .considered import Considered, considered
 from .estimates import (
@@ -41,7 +41,6 @@ from .shared import SharedErrors, Uncertainty, shared_errors
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Eliminated", "Result"]
 
 _STEP = 1e-6
 # Minimum redundancy of an image for a variance factor.

@@ -25,7 +25,7 @@ import scipy
 
 from ...core.data import Array, Rows
 from ...core.threads import one_thread
-from ..solver import BundleFit
+from ..solver.problem import BundleFit
 from ..solver.system import residuals
 from .evidence import (
     Effect,
@@ -38,8 +38,6 @@ from .evidence import (
     too_large,
     used_rows,
 )
-
-__all__ = ["SharedErrors", "Uncertainty", "shared_errors", "smooth_effects"]
 
 _LENGTHS = (0.3, 0.6, 1.2)
 """Distances, in half the diagonal of the image, over which displacements of an image are alike."""

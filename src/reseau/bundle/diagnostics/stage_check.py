@@ -8,12 +8,9 @@ import numpy as np
 
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Remark
-from ..network import Network, Stage
-from ..network.network import finite
-from ..network.stage import StageValues, nearest_rotation
+from ..network.network import Network, finite
+from ..network.stage import Stage, StageValues, nearest_rotation
 from .checks import listed
-
-__all__ = ["checked_readings", "without_readings"]
 
 # Rotations agree with the readings when they deviate by less than this (rad); readings in another unit must
 # agree better than those given, by this factor.

@@ -12,16 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...adjust import critical_w
+from ...adjust.reliability import critical_w
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure, Remark
-from ..network import Camera, Network
-from ..network.network import finite
-from ..solver import BundleFit, BundleProblem
+from ..network.camera import Camera
+from ..network.network import Network, finite
+from ..solver.problem import BundleFit, BundleProblem
 from .checks import listed
 from .evidence import ODDS
-
-__all__ = ["contradicting", "doubtful_parameters", "grouped", "without_false_bars"]
 
 _ALPHA, _MOST = 1e-4, 12
 # Times by which a false distance is too long or too short at the approximate values.

@@ -12,8 +12,6 @@ import numpy as np
 from ...core.data import Array
 from .result import Result
 
-__all__ = ["covariance_by_targets"]
-
 # Points whose joint cofactors are computed at once.
 _AT_ONCE = 64
 

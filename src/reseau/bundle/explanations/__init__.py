@@ -1,7 +1,5 @@
 """What is wrong in an adjusted network: explanations that compete for the same residuals."""
 
-from .explain import Explanation, explain
-from .names import Misnamed, misnamed
-from .sentences import described
+from .explain import explain
 
-__all__ = ["Explanation", "Misnamed", "described", "explain", "misnamed"]
+__all__ = ["explain"]

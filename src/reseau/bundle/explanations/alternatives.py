@@ -9,15 +9,15 @@ import numpy as np
 
 from ...core.errors import UsageError
 from ...core.failure import Failure
-from ...optics.cameras import camera_model, convert
-from ..diagnostics import Result
+from ...optics.cameras import convert
+from ...optics.cameras.registry import camera_model
 from ..diagnostics.evidence import Scores
+from ..diagnostics.result import Result
 from ..modelling.adjustment import problem_of
 from ..modelling.calibration import with_estimates
-from ..network import Camera, Network
+from ..network.camera import Camera
+from ..network.network import Network
 from .discrete import Single
-
-__all__ = ["alternatives"]
 
 _WIDER = ("opencv_full", "fisheye", "double_sphere")
 """Models that describe most lenses."""

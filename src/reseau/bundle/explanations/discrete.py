@@ -15,8 +15,6 @@ from ...core.data import Array, Rows
 from ..diagnostics.evidence import Effect, Scores, scores
 from .effects import Sight
 
-__all__ = ["Single", "gross_errors", "other_cameras"]
-
 _SUSPECTS, _PATIENCE = 120, 6
 """Image points that are looked at as gross errors, and how many more are tried when one does not help."""
 _SPLITS = 60

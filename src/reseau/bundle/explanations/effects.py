@@ -9,12 +9,11 @@ from functools import cached_property
 import numpy as np
 
 from ...core.data import Array, Mask, Rows
-from ...optics import PlaneMapping
-from ..diagnostics import Result, camera_mapping
+from ...optics.mapping import PlaneMapping
 from ..diagnostics.evidence import Effect, places_seen, sigma_seen, used_rows
+from ..diagnostics.fields import camera_mapping
+from ..diagnostics.result import Result
 from ..diagnostics.shared import smooth_effects
-
-__all__ = ["Family", "Sight", "camera_columns", "families", "lens_at"]
 
 _RADIAL = (3, 5, 7, 9)
 """Powers of the radius in the effects of a lens."""

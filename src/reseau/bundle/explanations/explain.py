@@ -20,15 +20,14 @@ from ...calibration.camera import by_rotation, places, projection_slopes, referr
 from ...core.data import Array, Rows
 from ...core.failure import Failure
 from ...core.threads import one_thread
-from ..diagnostics import Result, camera_mapping
 from ..diagnostics.evidence import Scores, scores, too_large, used_rows
+from ..diagnostics.fields import camera_mapping
+from ..diagnostics.result import Result
 from .alternatives import alternatives
 from .discrete import Single, gross_errors, other_cameras
 from .effects import Family, Sight, families, lens_at
 from .names import Misnamed
 from .sentences import advice, listed_places
-
-__all__ = ["Explanation", "explain"]
 
 _FALSE = 0.01
 """Probability that something is wrong, before the observations are seen. By Markov's inequality sound

@@ -17,10 +17,8 @@ import scipy
 
 from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
-from ...optics import PlaneMapping
-from ..network import Network
-
-__all__ = ["Misnamed", "misnamed"]
+from ...optics.mapping import PlaneMapping
+from ..network.network import Network
 
 _DEGREE, _ROUNDS = 5, 3
 """Degree of the polynomial that lenses bend images by, and how often it is improved."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["advice", "described", "listed_places"]
-
 _SENTENCES = {
     "lens": (
         "the camera model does not describe the lens",

@@ -8,13 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from ...adjust import SnoopingStep
+from ...adjust.outliers import SnoopingStep
 from ...core import vocabulary as v
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ...core.threads import one_thread
-from ..diagnostics import ControlCheck, ControlShape, Result, checked_control, checks, control_shape
+from ..diagnostics import ControlShape, checks
 from ..diagnostics.causes import (
     causes,
     given_poses_that_do_not_fit,
@@ -23,22 +23,27 @@ from ..diagnostics.causes import (
     seen_frontally,
 )
 from ..diagnostics.checks import in_images, listed
-from ..diagnostics.control_check import suspected, without_control
+from ..diagnostics.control_check import (
+    ControlCheck,
+    checked_control,
+    control_shape,
+    suspected,
+    without_control,
+)
+from ..diagnostics.result import Result
 from ..diagnostics.stage_check import checked_readings, without_readings
 from ..diagnostics.suspects import contradicting, doubtful_parameters, grouped, without_false_bars
-from ..network import Network, Stage
-from ..network.network import finite
+from ..network.network import Network, finite
 from ..network.rig import RigValues
-from ..solver import BundleFit, BundleProblem, approximate
+from ..network.stage import Stage
+from ..solver.approximation import approximate
 from ..solver.datum import Similarity
-from ..solver.problem import LAST_ROUND
+from ..solver.problem import LAST_ROUND, BundleFit, BundleProblem
 from ..solver.unknowns import Unknowns
 from ..solver.values import Values
 from .one_station import one_station
 from .rejection import MANY, bent_plane, many_rejected, suspects, without_gross_errors
 from .startup import RETRIED, adjusted_in_steps, lost_images, settled
-
-__all__ = ["Options", "adjust_network", "problem_of"]
 
 # Relative sigma of a principal distance that is hardly determined.
 _WEAK = 3e-3

@@ -18,12 +18,10 @@ from ...core.data import Array
 from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Estimated, Failure
-from ..diagnostics import Result
-from ..network import Network
-from ..solver import BundleFit, BundleProblem
+from ..diagnostics.result import Result
+from ..network.network import Network
+from ..solver.problem import BundleFit, BundleProblem
 from .adjustment import Options, adjust_network
-
-__all__ = ["BoardChoice", "BoardModel", "choose_board", "held_as_designed"]
 
 # Description lengths within this of the least are not worse; see the choice of a camera model.
 _EQUAL = 2.0

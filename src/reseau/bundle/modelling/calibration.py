@@ -11,10 +11,10 @@ import numpy as np
 from ...calibration.document import Calibration, CameraModel, Covariance, Place, Quantity
 from ...core.errors import UsageError
 from ...optics.poses import matrix_to_vector
-from ..diagnostics import Result, covariance_by_targets
-from ..network import Camera, Network
-
-__all__ = ["calibration_of", "with_estimates"]
+from ..diagnostics.result import Result
+from ..diagnostics.target_part import covariance_by_targets
+from ..network.camera import Camera
+from ..network.network import Network
 
 
 def calibration_of(

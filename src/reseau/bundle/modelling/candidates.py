@@ -10,28 +10,17 @@ import numpy as np
 from ...core.data import Array
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure
-from ...optics import PixelGrid, additional_model
-from ...optics.cameras import SplineGrid, camera_model, roughly
-from ..network import Additional, Camera, Network
-from ..network.network import finite
-from ..solver import BundleFit
+from ...optics import PixelGrid
+from ...optics.cameras.convert import roughly
+from ...optics.cameras.registry import additional_model, camera_model
+from ...optics.cameras.splined import SplineGrid
+from ..network.camera import Additional, Camera
+from ..network.network import Network, finite
+from ..solver.problem import BundleFit
 from .adjustment import Options, adjust_network, problem_of
 from .determined import whole_camera
 from .left_out import with_camera
 from .startup import adjusted_in_steps
-
-__all__ = [
-    "PARALLEL",
-    "SERIES",
-    "Candidate",
-    "adjusted_to",
-    "camera_candidates",
-    "families",
-    "first_fit",
-    "surface",
-    "wider_model",
-    "with_parallel_rays",
-]
 
 # Iterations of a candidate, which begins close to its solution, and the correction (relative to standard
 # deviations) that remains: predictions contain it.

@@ -22,11 +22,12 @@ from ...calibration.camera import projection_field
 from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Code, Estimated, Failure
-from ...optics.cameras import camera_model
+from ...optics.cameras.registry import camera_model
 from ..diagnostics.checks import unmodelled_pattern
 from ..diagnostics.evidence import ODDS
-from ..network import Camera, Network
-from ..solver import BundleFit
+from ..network.camera import Camera
+from ..network.network import Network
+from ..solver.problem import BundleFit
 from .adjustment import Options, adjust_network
 from .candidates import (
     PARALLEL,
@@ -42,8 +43,6 @@ from .candidates import (
 )
 from .determined import mapping_of, result_of
 from .left_out import Information, Prediction, information_of
-
-__all__ = ["Compared", "ModelChoice", "choose_model", "choose_models"]
 
 _LEVEL = 0.01
 # Least number of images, of which one is left out.

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from ...calibration.camera import CameraMapping
-from ...optics import PlaneMapping
-from ...optics.cameras import camera_model
-from ..diagnostics import Result, camera_mapping
-from ..solver import BundleFit
-
-__all__ = ["mapping_of", "result_of", "whole_camera"]
+from ...optics.cameras.registry import camera_model
+from ...optics.mapping import PlaneMapping
+from ..diagnostics.fields import camera_mapping
+from ..diagnostics.result import Result
+from ..solver.problem import BundleFit
 
 
 def mapping_of(fit: BundleFit, camera: int = 0) -> CameraMapping:

@@ -27,14 +27,12 @@ import scipy
 
 from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
-from ...optics.cameras import camera_model
-from ..network import Camera
-from ..solver import BundleFit, BundleProblem
+from ...optics.cameras.registry import camera_model
+from ..network.camera import Camera
 from ..solver.linear import Linear
 from ..solver.normal import SEGMENTS
+from ..solver.problem import BundleFit, BundleProblem
 from .determined import whole_camera
-
-__all__ = ["Information", "Prediction", "information_of", "with_camera"]
 
 # Variance that is added to directions which an image alone determines, relative to that of its coordinates:
 # they predict nothing, and the same for all cameras.

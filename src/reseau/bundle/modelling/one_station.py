@@ -23,14 +23,11 @@ from ...core.display import Display
 from ...core.failure import Code, Estimated, Failure
 from ...core.numbers import measured
 from ...optics.poses import cross_matrix, rotation_matrix
-from ..diagnostics import CameraEstimate
+from ..diagnostics.estimates import CameraEstimate
 from ..diagnostics.evidence import ODDS
-from ..network import Network
-from ..network.network import finite
+from ..network.network import Network, finite
 from ..network.stage import nearest_rotation
-from ..solver import BundleFit, BundleProblem
-
-__all__ = ["RotationOnly", "one_station", "rotation_only"]
+from ..solver.problem import BundleFit, BundleProblem
 
 # Iterations, decrease of vᵀPv that ends them, damping at first, and that at which nothing becomes better.
 _STEPS, _SMALL, _DAMPING, _STUCK = 60, 1e-9, 1e-3, 1e9

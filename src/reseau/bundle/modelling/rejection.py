@@ -10,20 +10,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...adjust import critical_tau, data_snooping, robust
+from ...adjust import data_snooping
 from ...adjust.mixture import Mixture
-from ...adjust.outliers import TUNING, Rejection, SnoopingStep
+from ...adjust.outliers import TUNING, Rejection, SnoopingStep, robust
+from ...adjust.reliability import critical_tau
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure, Remark
 from ...optics.poses import matrix_to_vector
-from ..diagnostics import control_shape
 from ..diagnostics.checks import listed
-from ..network import Network
-from ..network.network import finite
-from ..solver import BundleFit, BundleProblem, approximate
+from ..diagnostics.control_check import control_shape
+from ..network.network import Network, finite
+from ..solver.approximation import approximate
+from ..solver.problem import BundleFit, BundleProblem
 from .startup import adjusted_in_steps, lost_images
-
-__all__ = ["MANY", "bent_plane", "many_rejected", "suspects", "without_gross_errors"]
 
 MANY = 50_000
 """Maximum number of observations for the search for gross errors, because of its computing time."""

@@ -8,25 +8,17 @@ from typing import Literal
 
 import numpy as np
 
-from ...adjust import VarianceComponents, variance_components
+from ...adjust import variance_components
+from ...adjust.components import VarianceComponents
 from ...adjust.significance import CoefficientTest
 from ...core.data import Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Estimated, Failure
-from ..diagnostics import Eliminated, Result
-from ..network import Camera, Network
-from ..solver import BundleFit
+from ..diagnostics.result import Eliminated, Result
+from ..network.camera import Camera
+from ..network.network import Network
+from ..solver.problem import BundleFit
 from .adjustment import Options, adjust_network, problem_of
-
-__all__ = [
-    "Kind",
-    "Selection",
-    "cross_validation",
-    "eliminate_parameters",
-    "estimate_components",
-    "reweighted",
-    "search_model",
-]
 
 Kind = Literal["axes", "images", "cameras"]
 

@@ -16,12 +16,11 @@ import numpy as np
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
 from ...optics.poses import matrix_to_vector
-from ..network import Camera, Network
-from ..network.network import finite
-from ..solver import BundleFit, BundleProblem, approximate
+from ..network.camera import Camera
+from ..network.network import Network, finite
+from ..solver.approximation import approximate
+from ..solver.problem import BundleFit, BundleProblem
 from ..solver.values import Values
-
-__all__ = ["RETRIED", "adjusted_in_steps", "improved", "lost_images", "retried", "settled"]
 
 RETRIED = (Code.NOT_CONVERGED, Code.SINGULAR, Code.RANK_DEFECT, Code.NOT_FINITE, Code.NOT_IDENTIFIED)
 """Failures after which cameras are freed in steps."""

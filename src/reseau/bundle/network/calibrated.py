@@ -17,11 +17,9 @@ from ...calibration import (
 from ...core.data import Array
 from ...core.errors import UsageError
 from ...io import FrameOrientation
-from ...optics.cameras import camera_model
+from ...optics.cameras.registry import camera_model
 from .camera import Camera
 from .shutter import Shutter
-
-__all__ = ["calibrated_camera", "film_camera"]
 
 _KEYS = ("model", "width", "height", "pitch_mm", "additional", "shutter")
 """Keys of `Calibration.model` for every camera; all others are options of the camera model."""

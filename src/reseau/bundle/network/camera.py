@@ -12,11 +12,10 @@ from numpy.typing import ArrayLike
 from ...core.data import Array
 from ...core.errors import UsageError
 from ...io.network import CameraEntry
-from ...optics import CameraModel, PixelGrid, PlaneMapping, additional_model, camera_model
-from ...optics.cameras import distortion_names, unit_of
+from ...optics import PixelGrid, camera_model
+from ...optics.cameras.registry import CameraModel, additional_model, distortion_names, unit_of
+from ...optics.mapping import PlaneMapping
 from .shutter import Shutter
-
-__all__ = ["Additional", "Camera"]
 
 
 @dataclass(frozen=True, eq=False)

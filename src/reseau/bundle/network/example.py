@@ -8,8 +8,6 @@ from ...optics.poses import Pose, matrix_to_vector, project
 from .camera import Camera
 from .network import Network
 
-__all__ = ["example_network"]
-
 
 def example_network(noise_px: float = 0.05, seed: int = 0) -> Network:
     """Simulate eight convergent images of twenty points, taken with one camera, as a free network.

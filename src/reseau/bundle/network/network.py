@@ -13,13 +13,11 @@ from ...core.data import Array, Mask, Rows, rows_of_groups
 from ...core.display import Display
 from ...core.errors import UsageError
 from ...io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Network1
-from ...optics.refraction import Refraction
+from ...optics.refraction.windows import Refraction
 from .camera import Camera
 from .rig import Rig
 from .stage import Stage
 from .turntable import stage_of_turntable
-
-__all__ = ["ControlPoints", "Network", "Usable", "finite", "usable"]
 
 Datum = Literal["control", "minimal", "free"]
 

@@ -22,8 +22,6 @@ from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from .stage import nearest_rotation
 
-__all__ = ["Rig", "RigValues"]
-
 # An image was not taken at once with the others of its exposure: the difference of its orientation in the
 # median difference, and at least this angle (rad) or this part of the extent of the projection centres.
 _FACTOR, _TURNED, _SHIFTED = 8.0, 0.02, 0.1

@@ -24,8 +24,6 @@ from .camera import Camera
 from .network import ControlPoints, Datum, Network, finite
 from .turntable import turntable_of_stage
 
-__all__ = ["network_document", "with_control", "with_datum", "with_parameters", "with_sigma"]
-
 
 def with_parameters(network: Network, free: Sequence[str] = (), fix: Sequence[str] = ()) -> Network:
     """Return the network with other free parameters of its cameras.

@@ -26,8 +26,6 @@ import numpy as np
 from ...core.data import Array, Mask
 from ...core.errors import UsageError
 
-__all__ = ["MOTION", "Shutter"]
-
 MOTION = ("vx", "vy", "vz", "wx", "wy", "wz")
 """Names of velocity and rotation rates."""
 

@@ -23,8 +23,6 @@ from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from ...optics.poses import rotation_matrix
 
-__all__ = ["Stage", "StageValues", "nearest_rotation", "perpendicular"]
-
 # Iterations of the approximate axis, and change of its direction (rad) at which they end.
 _STEPS, _STILL = 50, 1e-12
 

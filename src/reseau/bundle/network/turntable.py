@@ -11,8 +11,6 @@ from ...core.errors import UsageError
 from ...io.network import TurntableEntry
 from .stage import Stage
 
-__all__ = ["stage_of_turntable", "turntable_of_stage"]
-
 
 def stage_of_turntable(
     entry: TurntableEntry, images: Sequence[str], exposures: Sequence[str | None] | None = None

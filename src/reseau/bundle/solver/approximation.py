@@ -12,9 +12,9 @@ from ...core.data import Array, Mask, Rows
 from ...core.display import Display
 from ...core.failure import Code, Remark
 from ...optics.poses import rotation_matrix
-from ...optics.refraction import RefractedRays, Refraction
-from ..network import Network
-from ..network.network import finite
+from ...optics.refraction import RefractedRays
+from ...optics.refraction.windows import Refraction
+from ..network.network import Network, finite
 from .datum import similarity_onto
 from .intersection import Rays
 from .parallel import resect_parallel
@@ -29,8 +29,6 @@ from .spatial import (
     resect_through,
 )
 from .values import Values
-
-__all__ = ["Approximate", "approximate"]
 
 # Largest misfit of a direction (rad) that is not a gross error while distortion and principal distance are
 # only roughly known.

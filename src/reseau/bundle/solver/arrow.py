@@ -9,8 +9,6 @@ import scipy
 
 from ...core.data import Array
 
-__all__ = ["Arrow", "Singular", "full"]
-
 
 class Singular(Exception):
     """The matrix is numerically not positive definite."""

@@ -20,8 +20,6 @@ from ...core.data import Array, Rows, rows_of_groups
 from .normal import Sums
 from .unknowns import Unknowns
 
-__all__ = ["CameraBasis", "camera_bases", "with_bases"]
-
 # Least eigenvalue of the normal equations of a camera with unit diagonal for which its parameters are used as
 # they are, and least singular value of its derivatives that is not rounding.
 _GOOD, _RANK = 1e-6, 1e-12

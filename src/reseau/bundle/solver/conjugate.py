@@ -20,8 +20,6 @@ import numpy as np
 from ...core.data import Array, Mask, Rows
 from .arrow import Singular
 
-__all__ = ["Blocks", "Conjugate"]
-
 # Steps of which the error is estimated, at least and as a part of all; most steps.
 _DELAY, _PART, _MOST = 10, 4, 5000
 # Length of the error of a solution, relative to its own: errors of correlations.

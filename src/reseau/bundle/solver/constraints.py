@@ -14,14 +14,12 @@ import numpy as np
 import scipy
 
 from ...core.data import Array, Mask, Rows
-from ..network import Network
+from ..network.network import Network
 from ..network.rig import RigValues
 from ..network.stage import StageValues
 from .rig_constraints import RigConstraints
 from .stage_constraints import Frames, StageConstraints
 from .unknowns import Unknowns
-
-__all__ = ["Constrained", "Constraints", "Placed"]
 
 
 class Constrained(NamedTuple):

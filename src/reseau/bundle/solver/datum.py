@@ -9,23 +9,13 @@ import numpy as np
 import scipy
 
 from ...core.data import Array, Mask, Rows
-from ..network import Camera
+from ..network.camera import Camera
 from ..network.stage import perpendicular
 from .arrow import Singular
 from .stage_constraints import cross_matrix
 from .system import System
 from .unknowns import Unknowns
 from .values import Values
-
-__all__ = [
-    "Freedom",
-    "Similarity",
-    "freedom_of",
-    "held_for",
-    "held_minimally",
-    "similarity_changes",
-    "similarity_onto",
-]
 
 # Names of the seven parameters.
 _NAMES = ("position in X", "position in Y", "position in Z", "rotation about X", "rotation about Y",

@@ -15,8 +15,6 @@ from .normal import Pattern, Sums, assemble, gradients, reduce_sides, substitute
 from .threads import in_parallel
 from .values import Correction
 
-__all__ = ["Normal", "formed"]
-
 # The sums of each part need as much memory as the matrix: large matrices are formed in one part.
 _LARGE = 2000
 

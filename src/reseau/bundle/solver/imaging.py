@@ -18,16 +18,14 @@ import numpy as np
 
 from ...core.compiled import Kernel, compiled, kernel
 from ...core.data import Array, Mask, Rows
-from ...optics import PlaneMapping
 from ...optics.cameras.kernels import CameraColumns, camera
 from ...optics.cameras.registry import additional_model, camera_model
+from ...optics.mapping import PlaneMapping
 from ...optics.poses import Pose, matrix_to_vector, project
 from ...optics.refraction import RefractedRays
 from ...optics.refraction.windows import Mounts
 from ..network.network import Network
 from ..network.rig import RigValues
-
-__all__ = ["Imaging", "Orientation", "Seen", "mapped"]
 
 # Kind of cameras without a kernel, for which the mapping is used.
 _NO_KERNEL = -1

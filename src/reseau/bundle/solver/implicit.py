@@ -12,8 +12,6 @@ from .linear import Linear
 from .normal import Sums, assemble_blocks, product
 from .threads import in_parallel
 
-__all__ = ["Implicit", "normal_of"]
-
 
 def normal_of(linear: Linear, damping: float) -> Normal:
     """Form the damped normal equations, reduced to the unknowns other than points.

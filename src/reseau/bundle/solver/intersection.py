@@ -10,8 +10,6 @@ from ...adjust.mixture import Mixture
 from ...core.data import Array, Mask, Rows
 from .spatial import intersect
 
-__all__ = ["Rays"]
-
 # Pairs of rays of a point that are tried, points of which this is done at once, and rounds of refinement.
 _PAIRS, _AT_ONCE, _ROUNDS = 28, 2000, 3
 # Standard deviations (rad) of rays that are tried where nothing is known.

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...adjust import AdjustmentFailure
+from ...adjust.engine import AdjustmentFailure
 from ...core.data import Rows
 from ...core.failure import Code, Failure
 from .arrow import Singular
@@ -23,8 +23,6 @@ from .implicit import normal_of
 from .linear import Linear, linearised
 from .system import System
 from .values import Correction, Values
-
-__all__ = ["Iterated", "iterate"]
 
 _LEAST_DAMPING, _MOST_DAMPING = 1e-16, 1e12
 # Ratio of actual to predicted decrease above which the damping is multiplied by the factor that follows.

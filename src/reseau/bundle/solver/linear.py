@@ -13,8 +13,6 @@ from .normal import through
 from .system import System
 from .values import Values
 
-__all__ = ["Linear", "linearised"]
-
 
 class Linear:
     """The linear problem at given values.

@@ -27,8 +27,6 @@ from .implicit import normal_of
 from .linear import Linear, linearised
 from .posterior import Cofactors
 
-__all__ = ["determined_by_noise", "part_by_noise"]
-
 # Variance of a parameter, relative to that with all others known, from which on it is looked at, and above
 # which cameras are not moved along a combination of their parameters.
 _INFLATED, _WEAK = 1e5, 1e4

@@ -18,21 +18,6 @@ import numpy as np
 from ...core.compiled import compiled, kernel
 from ...core.data import Array, Rows
 
-__all__ = [
-    "SEGMENTS",
-    "Pattern",
-    "Sums",
-    "assemble",
-    "assemble_blocks",
-    "gradients",
-    "locals_of",
-    "posterior",
-    "product",
-    "reduce_sides",
-    "substitute",
-    "through",
-]
-
 SEGMENTS = 6
 
 

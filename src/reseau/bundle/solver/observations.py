@@ -10,11 +10,10 @@ import scipy
 
 from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
-from ..network import Camera, Network
+from ..network.camera import Camera
+from ..network.network import Network
 from ..network.stage import perpendicular
 from .values import Values
-
-__all__ = ["OtherObservations"]
 
 
 @dataclass(frozen=True, eq=False)

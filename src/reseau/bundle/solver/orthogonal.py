@@ -31,8 +31,6 @@ from .arrow import Arrow, Singular
 from .linear import Linear
 from .normal import SEGMENTS, Pattern
 
-__all__ = ["ROUNDING", "FromRows", "cofactors_from_rows"]
-
 # Columns that are completed at once, and rows that are added to a triangle at once.
 _BLOCK, _ROWS = 64, 600
 # Standard deviation of an unknown, relative to that with all others known, from which on it is rounding.

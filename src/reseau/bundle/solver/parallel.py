@@ -7,8 +7,6 @@ import numpy as np
 from ...core.data import Array, Mask, Rows
 from .spatial import Resection
 
-__all__ = ["resect_parallel"]
-
 # Points are in a plane where their extent across it is this part of the largest.
 _FLAT = 1e-4
 # Distance of the camera from the points, in their largest extent: any would do.

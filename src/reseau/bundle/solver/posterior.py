@@ -27,8 +27,6 @@ from .rank import PARALLEL
 from .reduced import Reduced, Referral
 from .threads import in_parallel
 
-__all__ = ["BlockSolution", "Cofactors", "cofactors_of"]
-
 # Smallest pivot of the normal equations with unit diagonal that is not rounding.
 _RANK = 1e-14
 # Allowed deviation of the trace of the cofactors of the adjusted observations from the number of unknowns.

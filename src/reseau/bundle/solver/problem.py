@@ -11,8 +11,8 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from ...adjust import AdjustmentFailure
 from ...adjust import Options as AdjustOptions
+from ...adjust.engine import AdjustmentFailure
 from ...adjust.fitted import Fitted
 from ...adjust.stochastic import Weighting
 from ...core.data import Array, Mask, Rows
@@ -21,8 +21,7 @@ from ...core.errors import UsageError
 from ...core.failure import Code, Failure
 from ...core.memory import available_memory
 from ...core.threads import one_thread
-from ..network import Network
-from ..network.network import Usable, finite, usable
+from ..network.network import Network, Usable, finite, usable
 from .arrow import Singular
 from .datum import Freedom, freedom_of, held_minimally, scaled_by_windows, similarity_onto
 from .implicit import normal_of
@@ -47,8 +46,6 @@ from .rank import (
 from .system import System, residuals
 from .unknowns import Unknowns
 from .values import Values
-
-__all__ = ["LAST_ROUND", "BundleFit", "BundleProblem"]
 
 # Options of the dense engine that this solver does not support, and their defaults.
 _UNSUPPORTED, _DEFAULTS = ("method", "curvature", "rank_tolerance", "check_jacobian"), AdjustOptions()

@@ -8,8 +8,6 @@ import numpy as np
 
 from ...core.data import Array
 
-__all__ = ["Pushbroom", "resect_line"]
-
 # Smallest singular value of the equations, relative to the largest, with which they have one solution only.
 _RANK = 1e-6
 # Six points give eleven equations for the quotient and six for the lines.

@@ -4,32 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...adjust import AdjustmentFailure
+from ...adjust.engine import AdjustmentFailure
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
-from ...optics.refraction import RefractedRays, Refraction
-from ..network import Network
+from ...optics.refraction import RefractedRays
+from ...optics.refraction.windows import Refraction
+from ..network.network import Network
 from .arrow import full
 from .datum import Freedom, held_for, similarity_changes
 from .direct import formed
 from .linear import Linear, linearised
 from .system import System
 from .values import Values
-
-__all__ = [
-    "PARALLEL",
-    "SCALE_OF_WINDOWS",
-    "axis_without_effect",
-    "missing_windows",
-    "points_from_one_place",
-    "poorly_determined_points",
-    "steady_points",
-    "undetermined",
-    "weak_images",
-    "weak_points",
-    "why_without_effect",
-    "without_effect",
-]
 
 # What is wrong where nothing else gives the scale of a network.
 SCALE_OF_WINDOWS = (

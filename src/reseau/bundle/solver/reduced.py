@@ -21,8 +21,6 @@ import scipy
 from ...core.data import Array, Mask, Rows
 from .datum import Freedom
 
-__all__ = ["Factors", "Reduced", "Referral"]
-
 # Columns of the inverse that are solved for at once.
 _AT_ONCE = 256
 

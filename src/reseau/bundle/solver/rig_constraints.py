@@ -23,8 +23,6 @@ from ...optics.poses import rotation_matrix
 from ..network.rig import Rig, RigValues
 from .unknowns import Unknowns
 
-__all__ = ["RigConstraints"]
-
 
 @dataclass(frozen=True, eq=False)
 class RigConstraints:

@@ -15,21 +15,10 @@ import numpy as np
 from ...adjust.mixture import Mixture
 from ...core.data import Array, Mask, Rows
 from ...optics.poses import rotation_matrix
-from ...optics.refraction import RefractedRays, Refraction
-from ..network import Camera, Network
-
-__all__ = [
-    "Pair",
-    "Resection",
-    "behind_ports",
-    "directions",
-    "field_of",
-    "intersect",
-    "relative_orientation",
-    "resect",
-    "resect_through",
-]
-
+from ...optics.refraction import RefractedRays
+from ...optics.refraction.windows import Refraction
+from ..network.camera import Camera
+from ..network.network import Network
 
 # Distance of points that count as distant, in the largest dimension of a window.
 _DISTANT = 1e4

@@ -22,10 +22,7 @@ import numpy as np
 
 from ...core.data import Array, Mask, Rows
 from ...optics.poses import rotation_matrix
-from ..network import Stage
-from ..network.stage import StageValues, perpendicular
-
-__all__ = ["Frames", "StageConstraints", "cross_matrix"]
+from ..network.stage import Stage, StageValues, perpendicular
 
 
 class Frames(NamedTuple):

@@ -9,8 +9,8 @@ import numpy as np
 
 from ...adjust.stochastic import Weighting
 from ...core.data import Array, Mask, Rows, rows_of_groups
-from ...optics import PlaneMapping
-from ..network import Network
+from ...optics.mapping import PlaneMapping
+from ..network.network import Network
 from .constraints import Constraints
 from .imaging import Bent, Imaging, Seen, mapped
 from .normal import Pattern
@@ -18,8 +18,6 @@ from .observations import OtherObservations
 from .threads import chunks_of, in_parallel
 from .unknowns import Unknowns
 from .values import Values
-
-__all__ = ["System", "residuals"]
 
 # Relative rounding error of a computed image coordinate.
 _ROUNDING = 1e-14

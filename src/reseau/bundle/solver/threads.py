@@ -16,8 +16,6 @@ import numpy as np
 
 from ...core.data import Rows
 
-__all__ = ["chunks_of", "in_parallel"]
-
 # Sums are formed in this many parts for any number of processors, so that results do not depend on it.
 _PARTS = 4
 # Minimum number of observations in a part.

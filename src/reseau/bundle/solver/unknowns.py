@@ -9,12 +9,10 @@ import numpy as np
 import scipy
 
 from ...core.data import Mask, Rows
-from ..network import Network
+from ..network.network import Network
 from ..network.shutter import MOTION
 from .conjugate import Blocks
 from .normal import SEGMENTS, Pattern, locals_of
-
-__all__ = ["Unknowns"]
 
 # A matrix of more unknowns than the first number is factorised as a band where this is narrower than the part
 # of them that follows: above many unknowns, and above few.

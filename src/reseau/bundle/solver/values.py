@@ -14,8 +14,6 @@ from .constraints import Constraints, Placed
 from .imaging import Orientation
 from .unknowns import Unknowns
 
-__all__ = ["Correction", "Values"]
-
 
 @dataclass(frozen=True, eq=False)
 class Correction:

@@ -4,31 +4,6 @@ A format is one module: which registered camera models it holds, how it is writt
 camera whose model a format lacks is converted, with the differences over the image stated.
 """
 
-from .formats import (
-    CalibrationFormat,
-    Exported,
-    any_calibration,
-    calibration_formats,
-    export_calibration,
-    export_calibrations,
-    export_rig,
-    exported_lens,
-    formats_holding,
-    import_calibration,
-)
-from .plain import Mounted, PlainCamera
+from .formats import calibration_formats, export_calibration
 
-__all__ = [
-    "CalibrationFormat",
-    "Exported",
-    "Mounted",
-    "PlainCamera",
-    "any_calibration",
-    "calibration_formats",
-    "export_calibration",
-    "export_calibrations",
-    "export_rig",
-    "exported_lens",
-    "formats_holding",
-    "import_calibration",
-]
+__all__ = ["calibration_formats", "export_calibration"]

@@ -16,8 +16,6 @@ import numpy as np
 from ...core.errors import FormatError
 from .plain import RATIONAL, PlainCamera
 
-__all__ = ["read", "recognises", "write"]
-
 _CENTRE = ("fx", "fy", "cx", "cy")
 _TYPES: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
     "pinhole": ("opencv", _CENTRE),

@@ -19,20 +19,6 @@ from ..micmac import interior_text, read_interior
 from ..photomodeler import camera_of_numbers
 from .plain import PlainCamera
 
-__all__ = [
-    "BROWN",
-    "in_pixels",
-    "is_dbat",
-    "is_micmac",
-    "is_photomodeler",
-    "read_dbat",
-    "read_micmac",
-    "read_photomodeler",
-    "write_dbat",
-    "write_micmac",
-    "write_photomodeler",
-]
-
 BROWN = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
 """Parameters that both have."""
 _HEAD, _CAMERA_LINE = 4, 10

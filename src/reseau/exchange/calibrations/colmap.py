@@ -7,8 +7,6 @@ from pathlib import Path
 from ...core.errors import FormatError
 from .plain import RADIAL_TANGENTIAL, RATIONAL, PlainCamera, opencv_camera
 
-__all__ = ["read", "recognises", "write"]
-
 _CENTRE = ("fx", "fy", "cx", "cy")
 _FISHEYE = ("k1", "k2", "k3", "k4")
 # Models with their parameters, those with one focal length first.

@@ -15,23 +15,12 @@ from ...core.errors import FormatError, UsageError
 from ...core.provenance import Provenance, sha256_of
 from ...io import read_text, write_whole
 from ...optics import PixelGrid
-from ...optics.cameras import SplinedStereographic, SplineGrid, camera_model, convert, unit_of
+from ...optics.cameras import convert
+from ...optics.cameras.registry import camera_model, unit_of
+from ...optics.cameras.splined import SplinedStereographic, SplineGrid
 from ...optics.poses import rotation_matrix
 from . import basalt, brown, colmap, matlab, metashape, mrcal, opencv, openptv, yamls
 from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, TILTED, Mounted, PlainCamera
-
-__all__ = [
-    "CalibrationFormat",
-    "Exported",
-    "any_calibration",
-    "calibration_formats",
-    "export_calibration",
-    "export_calibrations",
-    "export_rig",
-    "exported_lens",
-    "formats_holding",
-    "import_calibration",
-]
 
 _CENTRE = ("fx", "fy", "cx", "cy")
 _RADTAN, _FIVE = (*_CENTRE, *RADIAL_TANGENTIAL), (*_CENTRE, *RADIAL_TANGENTIAL, "k3")
@@ -483,7 +472,8 @@ def exported_lens(
 
     Examples
     --------
-    >>> from reseau.bundle import adjust_network, camera_mapping, example_network
+    >>> from reseau.bundle import adjust_network, example_network
+    >>> from reseau.bundle.diagnostics.fields import camera_mapping
     >>> lens = camera_mapping(adjust_network(example_network()), 0)
     >>> brown = {"model": "brown", "pitch_mm": (0.01, 0.01)}
     >>> exported_lens(calibration_formats()["colmap"], "camera", lens, brown).camera.model

@@ -14,8 +14,6 @@ from pathlib import Path
 from ...core.errors import FormatError
 from .plain import RADIAL_TANGENTIAL, PlainCamera, opencv_camera
 
-__all__ = ["read", "recognises", "write"]
-
 _ASSIGNED = re.compile(r"^\s*(\w+)\s*=\s*(\[[^\]]*\]|[^;%\n]+)", re.MULTILINE)
 
 

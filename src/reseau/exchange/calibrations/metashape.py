@@ -20,8 +20,6 @@ from xml.etree import ElementTree
 from ...core.errors import FormatError
 from .plain import PlainCamera, opencv_camera
 
-__all__ = ["read", "recognises", "write"]
-
 _FISHEYE = ("fisheye", "equidistant_fisheye")
 
 

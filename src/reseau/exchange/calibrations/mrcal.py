@@ -11,10 +11,9 @@ from math import isfinite
 from pathlib import Path
 
 from ...core.errors import FormatError, UsageError
-from ...optics.cameras import SplinedStereographic, camera_model
+from ...optics.cameras.registry import camera_model
+from ...optics.cameras.splined import SplinedStereographic
 from .plain import RADIAL_TANGENTIAL, RATIONAL, THIN_PRISM, PlainCamera, opencv_camera
-
-__all__ = ["read", "recognises", "write"]
 
 _MODELS: dict[str, tuple[str, ...]] = {
     "LENSMODEL_PINHOLE": (),

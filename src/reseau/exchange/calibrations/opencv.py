@@ -14,10 +14,8 @@ import cv2
 import numpy as np
 
 from ...core.errors import FormatError
-from ...optics.cameras import opencv_coefficients
+from ...optics.cameras.opencv import opencv_coefficients
 from .plain import Mounted, PlainCamera, opencv_camera
-
-__all__ = ["coefficients", "read", "recognises", "write", "write_pair"]
 
 
 def write(camera: PlainCamera) -> str:

@@ -12,8 +12,6 @@ from ...core.errors import FormatError
 from ...io import read_text
 from .plain import PlainCamera
 
-__all__ = ["BESIDE", "OPENPTV", "read", "recognises", "write", "write_beside"]
-
 OPENPTV = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "B1", "she")
 BESIDE = ".addpar"
 _NUMBERS = 21

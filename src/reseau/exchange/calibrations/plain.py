@@ -11,9 +11,8 @@ import numpy as np
 
 from ...core.data import Array
 from ...core.errors import FormatError
-from ...optics import PixelGrid, PlaneMapping, camera_model
-
-__all__ = ["RADIAL_TANGENTIAL", "RATIONAL", "THIN_PRISM", "TILTED", "Mounted", "PlainCamera", "opencv_camera"]
+from ...optics import PixelGrid, camera_model
+from ...optics.mapping import PlaneMapping
 
 RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2")
 RATIONAL = (*RADIAL_TANGENTIAL, "k3", "k4", "k5", "k6")

@@ -19,8 +19,6 @@ from ...core.errors import FormatError
 from .opencv import coefficients
 from .plain import RADIAL_TANGENTIAL, Mounted, PlainCamera, opencv_camera
 
-__all__ = ["is_kalibr", "is_ros", "read_kalibr", "read_ros", "write_kalibr", "write_kalibr_rig", "write_ros"]
-
 _SHAPES = {
     "omni": ("omni", ("xi",)),
     "double_sphere": ("ds", ("xi", "alpha")),

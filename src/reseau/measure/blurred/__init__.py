@@ -10,15 +10,7 @@ parameters of the optics such as focus and media.
 Motion during the exposure is another physical cause: :class:`Moving` smears the images of any lens.
 """
 
-from .estimate import EstimatedOptics, estimate_optics
-from .measure import BlurredOptions, BlurredResult, Moving, Varied, measure_blurred
+from .estimate import estimate_optics
+from .measure import BlurredOptions, measure_blurred
 
-__all__ = [
-    "BlurredOptions",
-    "BlurredResult",
-    "EstimatedOptics",
-    "Moving",
-    "Varied",
-    "estimate_optics",
-    "measure_blurred",
-]
+__all__ = ["BlurredOptions", "estimate_optics", "measure_blurred"]

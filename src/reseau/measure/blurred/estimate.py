@@ -11,10 +11,9 @@ import numpy as np
 from ...core.data import Array, Frame
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure
-from ...optics.lenses import PlaneTarget, RayMap
+from ...optics.lenses import RayMap
+from ...optics.lenses.images import PlaneTarget
 from .measure import RINGS, BlurredOptions, Run, Varied
-
-__all__ = ["EstimatedOptics", "estimate_optics"]
 
 _ROUNDS = 20
 """Largest number of corrections of common parameters."""
@@ -42,7 +41,8 @@ class EstimatedOptics:
     --------
     :func:`estimate_optics` returns it.
 
-    >>> from reseau.optics.lenses import SensorPlane, ThinLens
+    >>> from reseau.optics.lenses import ThinLens
+    >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> lens = ThinLens(50.0, 12.5, 52.1, SensorPlane((0.01, 0.01), (40.0, 40.0)))
     >>> EstimatedOptics(("focus_mm",), np.array([0.1]), np.array([[4e-4]]), lens, 24).sigma
     array([0.02])
@@ -92,7 +92,8 @@ def estimate_optics(
     The distance of the sensor, from one disk:
 
     >>> from reseau.optics.formation import Outline, coverage
-    >>> from reseau.optics.lenses import PupilElements, SensorPlane, ThinLens, ray_image
+    >>> from reseau.optics.lenses import PupilElements, ThinLens, ray_image
+    >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> sensor = SensorPlane((0.01, 0.01), (40.0, 40.0))
     >>> disk = PlaneTarget(np.array([0.0, 0, 1000]), np.eye(3)[:, :2], Outline.circle(2.0, 0.05))
     >>> image = ray_image(ThinLens(50.0, 12.5, 52.9, sensor), disk, PupilElements.gauss(12))

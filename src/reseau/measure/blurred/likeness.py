@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from ...core.data import Array, Mask
 from ..matching.noise import LEAST, adjusted_grey, linear_variance
 
-__all__ = ["Likeness", "Residuals"]
-
 _BLOCK = 3
 """Side of the blocks, pixels: less than the parts of a blurred image that differ alike."""
 _BESIDE = 0.02

@@ -17,22 +17,15 @@ from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ...optics.formation import Outline, PixelResponse
-from ...optics.lenses import PlaneTarget, PupilElements, RayImage, RayMap, RaySurrogate, ray_image, ray_images
-from ..matching import Matches, MatchOptions, match, with_alike_errors
+from ...optics.lenses import PupilElements, RayMap, ray_image
+from ...optics.lenses.images import PlaneTarget, RayImage, ray_images
+from ...optics.lenses.surrogate import RaySurrogate
+from ..matching import Matches, match, with_alike_errors
+from ..matching.patches import MatchOptions
 from ..points import Measured, Reason
 from ..screening import Screened, screen
 from .likeness import Likeness, Residuals
 from .shapes import RayShapes
-
-__all__ = [
-    "RINGS",
-    "BlurredOptions",
-    "BlurredResult",
-    "Moving",
-    "Run",
-    "Varied",
-    "measure_blurred",
-]
 
 _WINDOWS = (8, 10, 12, 14, 17, 20, 24, 28, 34, 40, 48, 57, 68, 81, 96, 115, 137, 160)
 """Half sides of windows: targets of similar size are matched together."""
@@ -77,7 +70,8 @@ class Varied:
     --------
     The distance of the sensor from a thin lens:
 
-    >>> from reseau.optics.lenses import SensorPlane, ThinLens
+    >>> from reseau.optics.lenses import ThinLens
+    >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> sensor = SensorPlane((0.01, 0.01), (0.0, 0.0))
     >>> focus = Varied(("focus_mm",), (0.2,), lambda by: ThinLens(50.0, 12.5, 52.0 + by[0], sensor))
     >>> focus.camera(np.array([0.1])).corresponding(np.array([[10.0, 0.0, 1000.0]])).round(3) + 0.0
@@ -181,7 +175,8 @@ class Moving:
 
     Examples
     --------
-    >>> from reseau.optics.lenses import SensorPlane, ThinLens
+    >>> from reseau.optics.lenses import ThinLens
+    >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> still = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (0.0, 0.0)))
     >>> moving = Moving(still, np.array([[-2.0, 0.0], [0.0, 0.0], [2.0, 0.0]]))
     >>> moving.spots(np.array([[0.0, 0.0, 1000.0]]), PupilElements.gauss(2))[0].shape
@@ -247,7 +242,8 @@ def measure_blurred(
     A disk seen by a lens that is focused behind it; the image is drawn with the same rays:
 
     >>> from reseau.optics.formation import coverage
-    >>> from reseau.optics.lenses import SensorPlane, ThinLens
+    >>> from reseau.optics.lenses import ThinLens
+    >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> camera = ThinLens(50.0, 12.5, 52.9, SensorPlane((0.01, 0.01), (40.0, 40.0)))
     >>> disk = PlaneTarget(np.array([0.0, 0, 1000]), np.eye(3)[:, :2], Outline.circle(2.0, 0.05))
     >>> formed = ray_image(camera, disk, PupilElements.gauss(12)).outline

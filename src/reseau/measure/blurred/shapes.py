@@ -11,10 +11,8 @@ from ...core.data import Array, Rows
 from ...core.errors import UsageError
 from ...optics.formation import Outline
 from ...optics.gridded import GriddedOutline
-from ...optics.lenses import RayImage
-from ..matching import Window
-
-__all__ = ["RayShapes"]
+from ...optics.lenses.images import RayImage
+from ..matching.shapes import Window
 
 
 class RayShapes:

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...optics import Chain
+from ...optics.composition import Chain
 from ..plane.levels import levels_around
-
-__all__ = ["Bits", "Integers", "read_bits"]
 
 Integers = NDArray[np.signedinteger[Any]]
 _SURE = 0.15

@@ -17,21 +17,9 @@ import scipy
 from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
-from ...optics import Chain
+from ...optics.composition import Chain
 from ..plane.growth import grown_through
 from ..plane.levels import levels_around
-
-__all__ = [
-    "Saddles",
-    "along",
-    "bright_between",
-    "crossed",
-    "ended",
-    "find_saddles",
-    "grown",
-    "sector_levels",
-    "seeds",
-]
 
 _SMOOTH_PX = 1.5
 """Width of the smoothing, pixels."""

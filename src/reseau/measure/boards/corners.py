@@ -15,12 +15,14 @@ import scipy
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code
-from ...optics import Chain
+from ...optics.composition import Chain
 from ...optics.corners import Corners, corner_images
 from ...optics.formation import PixelResponse, polygons
 from ..compiled_filter import filtered
 from ..marks.judging import Objection
-from ..matching import GrownOutline, Matches, Shape, Window, add_windows
+from ..matching import Matches, Shape
+from ..matching.patches import add_windows
+from ..matching.shapes import GrownOutline, Window
 from ..plane.lattice_mapping import images_of, second_order
 from ..plane.lens_mapping import UNFIT, mapping_through
 from ..plane.levels import levels_around
@@ -31,8 +33,6 @@ from ..response import sharpened_from_px
 from ..screening import Screened
 from .candidates import ended
 from .shadows import pixels_alike, shaded
-
-__all__ = ["BORDER_PX", "CornerMarks", "CornerShape", "DeltilleMarks", "Sectors"]
 
 _TURN = 0.1
 """Standard deviation of the directions of edges before the mapping is known, radians."""

@@ -25,13 +25,11 @@ from numpy.typing import NDArray
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
 from ...io.board import BoardDesign
-from ...optics import Chain
+from ...optics.composition import Chain
 from ..plane.growth import first_mapping, grown_through
 from ..plane.lattice_mapping import images_of
 from ..plane.levels import levels_around
 from .placement import NO_ROWS, Placed, cost_of, failed, laid_once, numbered
-
-__all__ = ["find_deltille", "lattice_of_deltille"]
 
 _SMOOTH_PX = 1.8
 """Width of the smoothing, pixels."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure, Remark
 from ...io.board import BoardDesign
-from ...optics import Chain
+from ...optics.composition import Chain
 from ..plane.growth import LENS_FROM, SADDLE_PX
 from ..plane.lattice_mapping import images_of, slope_of
 from ..plane.lens_mapping import lens_through
@@ -18,8 +18,6 @@ from ..plane.plane_mapping import STRENGTHS, plane_through, projectivity_behind
 from ..reseau.mark_windows import Located
 from .candidates import Saddles, along, bright_between, sector_levels
 from .placement import FEWEST, SECOND, Placed, dark_sectors, failed
-
-__all__ = ["lay_marked"]
 
 _GROWN = 16
 """Most steps from the markers read to the corners beside them."""

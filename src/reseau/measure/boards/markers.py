@@ -15,8 +15,6 @@ from ...io.board import BoardDesign
 from .candidates import Saddles
 from .tags import SEARCHES, read_tags, tag_outlines
 
-__all__ = ["DICTIONARIES", "ReadMarkers", "find_markers", "find_tags", "markers_of_any_dictionary"]
-
 DICTIONARIES = (
     "DICT_4X4_1000",
     "DICT_5X5_1000",

@@ -33,8 +33,6 @@ from .placement import Placed, find_puzzle, lay_chessboard, lay_circles
 from .puzzles import PuzzlePart
 from .tags import with_seen_edges
 
-__all__ = ["BoardOptions", "BoardResult", "measure_board", "puzzle_part"]
-
 _BRIGHT = 0.75
 """Share of the range of the sensor below which no noise makes a pixel clipped."""
 _MIRRORED = "the board is seen mirrored: the print is, or the program that took the picture mirrors it"

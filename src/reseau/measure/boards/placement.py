@@ -21,7 +21,7 @@ from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure, Remark
 from ...designs.dots import dot_signs
 from ...io.board import BoardDesign
-from ...optics import Chain
+from ...optics.composition import Chain
 from ..plane.growth import first_mapping
 from ..plane.lattice_mapping import images_of, slope_of
 from ..reseau.disks import Disks
@@ -38,22 +38,6 @@ from .candidates import (
     seeds,
 )
 from .puzzles import MISREAD, QUARTER, PuzzlePart, part_of_code
-
-__all__ = [
-    "FEWEST",
-    "NO_ROWS",
-    "SECOND",
-    "THIRD",
-    "Placed",
-    "cost_of",
-    "dark_sectors",
-    "failed",
-    "find_puzzle",
-    "laid_once",
-    "lay_chessboard",
-    "lay_circles",
-    "numbered",
-]
 
 _MISSED, _HIDDEN, _ENDED, _FOREIGN = 0.4, 1.5, 3.0, 3.0
 """What counts against a place: a node in sight that was not found; all of them at most, as one thing may hide

@@ -22,8 +22,6 @@ from ...designs.dots import puzzle_maps
 from ...io.board import PUZZLE_CODE
 from .bits import Bits, Integers
 
-__all__ = ["MISREAD", "QUARTER", "PuzzlePart", "part_of_code"]
-
 MISREAD = 0.2
 """Largest share of the dots of a PuzzleBoard that are not as in the code."""
 _CHANCE = 1e-4

@@ -19,11 +19,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from ...adjust import BatchAdjustment, BatchOptions, adjust_batch
+from ...adjust import adjust_batch
+from ...adjust.batch import BatchAdjustment, BatchOptions
 from ...core.data import Array, Mask, Rows
-from ..matching import Matches, Shape, Window
-
-__all__ = ["Shaded", "pixels_alike", "shaded"]
+from ..matching import Matches, Shape
+from ..matching.shapes import Window
 
 _EDGES, _PER_EDGE = 2, 5
 """Most edges of shadows in a window, and their parameters: direction, distance, ln s, ln b, depth."""

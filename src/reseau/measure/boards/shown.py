@@ -17,7 +17,7 @@ from ...core.failure import Failure
 from ...core.threads import one_thread
 from ...designs.boards import board
 from ...io.board import BoardDesign, BoardKind
-from ...optics import Chain
+from ...optics.composition import Chain
 from ..plane.growth import first_mapping
 from ..plane.lattice_mapping import slope_of
 from ..reseau.disks import Disks, find_disks
@@ -29,8 +29,6 @@ from .deltilles import lattice_of_deltille
 from .markers import ReadMarkers, markers_of_any_dictionary
 from .placement import THIRD
 from .tags import with_seen_edges
-
-__all__ = ["boards_shown"]
 
 _SIDE_MM = 25.0
 """Distance of the points of a board of which nothing is known."""

@@ -16,8 +16,6 @@ from ..points import Reason
 from .markers import find_markers
 from .measure import BoardOptions, BoardResult, measure_board
 
-__all__ = ["measure_tags"]
-
 _AROUND = 0.3
 """Paper around a tag that is looked at, in sides of the tag; and at least so many pixels."""
 _LEAST_PX = 12.0

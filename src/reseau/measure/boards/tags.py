@@ -20,8 +20,6 @@ from ...core.data import Array, Mask, Rows
 from ..plane.levels import levels_at
 from .candidates import Saddles
 
-__all__ = ["SEARCHES", "read_tags", "tag_outlines", "with_seen_edges"]
-
 _NEIGHBOURS = 160
 """Saddles around a corner among which the next corner is looked for."""
 _AIMED = np.deg2rad(7)

@@ -17,9 +17,7 @@ import numpy as np
 from ...core.data import Array, Mask, Rows
 from ...io import FiducialMark, MarkPart
 from ...optics.formation import Outline, coverage, coverage_derivatives, side_rule
-from ..matching import Window
-
-__all__ = ["MovedOutline", "boldest_of", "contours_of", "margin_of", "outlined", "reach_of"]
+from ..matching.shapes import Window
 
 _SIDES = 72
 """Sides of the polygon of a circle."""

@@ -16,15 +16,13 @@ from ...core.failure import Code, Failure, Remark
 from ...io import FiducialDesign
 from ...io.scans import Scan
 from ...optics import RationalPolynomial
-from ..film import Kind
+from ..film.roll import Kind
 from ..fitting import fit_mapping
 from ..points import Reason
 from .forms import boldest_of, margin_of, reach_of
 from .result import FiducialResult
 from .search import Attitude, Pattern, attitudes, find_patterns, formed_mark, least_scales
 from .windows import match_marks, tracked
-
-__all__ = ["FiducialOptions", "measure_fiducials"]
 
 _MARK_PX, _BOLD_PX, _LONGEST = 24.0, 1.0, 3000
 """Size of the smallest mark with its surroundings, and width of its boldest part, in the overview; largest

@@ -14,14 +14,12 @@ from ...core.display import Display
 from ...core.failure import Code, Remark
 from ...core.overlaid import Overlaid
 from ...io import FiducialDesign, FiducialOrientation, FrameTransform, MeasuredCorner, MeasuredFiducial
-from ..film import Kind
+from ..film.roll import Kind
 from ..points import Reason
 from .search import Attitude
 
 if TYPE_CHECKING:
     from ...core.overlay import Layer
-
-__all__ = ["FiducialResult"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -22,10 +22,8 @@ from ...calibration import film_axes
 from ...core.data import Array, Rows
 from ...io import FiducialDesign
 from ...optics.formation import PixelResponse
-from ..matching import Window
+from ..matching.shapes import Window
 from .forms import contours_of, margin_of, outlined, reach_of
-
-__all__ = ["Attitude", "Pattern", "attitudes", "find_patterns", "formed_mark", "least_scales"]
 
 _CANDIDATES = 80
 """Most candidates for each form of a mark."""

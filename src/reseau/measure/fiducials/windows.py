@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from ...core.data import Array, Mask
 from ...io import FiducialDesign
 from ...io.scans import Scan
-from ..matching import Matches, MatchOptions, match
+from ..matching import Matches, match
+from ..matching.patches import MatchOptions
 from .forms import contours_of, margin_of, outlined, reach_of
 from .search import formed_mark, turned
-
-__all__ = ["MatchedMarks", "grey_window", "match_marks", "tracked"]
 
 _HALF = 48
 """Half side of a window in pixels after reduction, to which larger marks are reduced."""

@@ -25,23 +25,12 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from ...adjust import BatchOptions, adjust_batch
+from ...adjust import adjust_batch
+from ...adjust.batch import BatchOptions
 from ...core.data import Array, Rows
 from .border import Band, binned
 from .edges import NEIGHBOURS, EdgeProfiles
 from .steps import StepForm
-
-__all__ = [
-    "AdjacentEdge",
-    "Softness",
-    "common_forms",
-    "displaced_by_lines",
-    "edge_beside_line",
-    "ends_with_line",
-    "soft_steps",
-    "softness_of",
-    "student",
-]
 
 _QUANTILE, _EVEN = 0.3, 0.015
 """Quantile of the widths of profiles that is the width of an edge's steps, because content of the picture

@@ -23,18 +23,6 @@ from numpy.typing import NDArray
 from ...core.data import Array, Mask, Rows
 from ...io.scans import Scan
 
-__all__ = [
-    "Band",
-    "Border",
-    "Film",
-    "best_line",
-    "binned",
-    "border_of",
-    "likelihood",
-    "read_band",
-    "row_median",
-]
-
 _PROFILES = 400
 """Maximum number of profiles of an edge."""
 _COLUMNS, _MANY = 4, 12

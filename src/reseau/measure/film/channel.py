@@ -23,8 +23,6 @@ from .edges import EdgeProfiles, measure_profiles, merged
 from .lines import Contender, EdgeData, Rival, departing_line, robust_line
 from .steps import STRAIGHT, StepForm, Tone
 
-__all__ = ["WIDER_SEARCH", "Channel", "channels_by_contrast", "measure_channel"]
-
 _NEIGHBOURHOOD_PX = 0.05
 """Minimum contribution of an uneven gate and of picture content to the sigma of a profile."""
 _TONE = 0.12

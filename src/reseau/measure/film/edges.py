@@ -17,12 +17,11 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from ...adjust import BatchAdjustment, BatchOptions, adjust_batch, weight_function
+from ...adjust import adjust_batch, weight_function
+from ...adjust.batch import BatchAdjustment, BatchOptions
 from ...core.data import Array, Mask, Rows
 from .border import Band, Border, Film, binned, border_of, row_median
 from .steps import SHIFTS, STRAIGHT, StepForm, Tone, profile_function
-
-__all__ = ["NEIGHBOURS", "EdgeProfiles", "measure_profiles", "merged"]
 
 _CHANGE = 0.15
 """Standard deviation of a change of the picture's tone behind the edge, relative to the contrast."""

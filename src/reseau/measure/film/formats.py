@@ -13,8 +13,6 @@ from ...core.data import Array
 from .adjacent_lines import student
 from .perforations import PITCH_MM, ROWS_MM
 
-__all__ = ["ALL_FORMATS", "FORMATS", "format_probabilities", "scale_by_perforations"]
-
 FORMATS: tuple[tuple[float, float], ...] = ((36.0, 24.0), (56.0, 56.0), (56.0, 41.5), (69.0, 56.0))
 """Formats searched by default: 35 mm, 6×6, 6×4.5, 6×7; frames of all others have proportions like these."""
 ALL_FORMATS: tuple[tuple[float, float], ...] = (

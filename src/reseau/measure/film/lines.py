@@ -13,24 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...adjust import Adjustment, GaussMarkov, Options, Parameters, adjust, robust
+from ...adjust import Adjustment, GaussMarkov, Options, Parameters, adjust
+from ...adjust.outliers import robust
 from ...core.data import Array, Mask
 from ...core.failure import Code, Failure
 from ...io import EDGES
 from .search import crossings_of
-
-__all__ = [
-    "Contender",
-    "EdgeData",
-    "FrameShape",
-    "Lines",
-    "adjust_lines",
-    "departing_line",
-    "derived",
-    "explained_shape",
-    "robust_line",
-    "shape_of",
-]
 
 _BOW_PX, _LEAST_BOW_PX = 3.0, 0.2
 """Prior standard deviation of the bow of an edge in pixels, and its minimum once bows are measured."""

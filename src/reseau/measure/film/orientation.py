@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from ...core.overlay import Layer
 
-__all__ = ["FORMATS", "FrameOptions", "FrameResult", "orient_frames"]
 
 _OVERVIEWS = ((500, 60), (1000, 300))
 """Longer side of the overviews in pixels, and number of combinations of lines tested in each."""

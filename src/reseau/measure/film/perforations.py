@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...adjust import BatchOptions, GaussMarkov, Parameters, adjust_batch, robust
+from ...adjust import GaussMarkov, Parameters, adjust_batch
+from ...adjust.batch import BatchOptions
+from ...adjust.outliers import robust
 from ...core.data import Array
 from ...core.failure import Code, Failure
 from ...core.overlaid import Overlaid
@@ -27,7 +29,6 @@ from .steps import profile_function
 if TYPE_CHECKING:
     from ...core.overlay import Layer
 
-__all__ = ["PITCH_MM", "ROWS_MM", "FilmPlane", "edge_of", "film_plane"]
 
 PITCH_MM = 4.75
 """Distance between perforations."""

@@ -16,8 +16,6 @@ from ..fitting import fit_mapping
 from .lines import FrameShape, Lines, shape_of
 from .orientation import FrameOptions, FrameResult
 
-__all__ = ["KINDS", "Roll", "result_of", "roll_of", "transformed"]
-
 Kind = Literal["similarity", "affine", "projective", "bilinear"]
 
 KINDS: tuple[Kind, ...] = ("similarity", "affine", "projective", "bilinear")

@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 from ...core.data import Array
 from .border import best_line, likelihood
 
-__all__ = ["FrameGuess", "crossings_of", "overlap_of", "search_frames", "size_of"]
-
 Plane = NDArray[np.float32]
 
 _OUTWARD_MM = 0.8

@@ -25,8 +25,6 @@ import scipy
 from ...core.data import Array, Rows
 from ...core.tone import ToneCurve
 
-__all__ = ["SHIFTS", "STRAIGHT", "StepForm", "Tone", "profile_function"]
-
 SHIFTS = (3.0,)
 """Distances behind the edge, in widths of the step, at which the tone of the picture may change."""
 _FORMED = 1.3

@@ -15,7 +15,6 @@ from .search import FrameGuess, overlap_of, search_frames, size_of
 if TYPE_CHECKING:
     from .orientation import FrameOptions, FrameResult
 
-__all__ = ["in_reading_order", "overview_of", "rest_of_strip"]
 
 _FINE, _MOST = 1000, 4000
 """Longer side of the overview of a scan of one frame, and of any, pixels."""

@@ -13,8 +13,6 @@ from ...optics.field import SmoothField
 from ..matching import Matches
 from ..points import Reason
 
-__all__ = ["Objection", "columns_of", "judged_by_neighbours", "reasons_of", "robust_spread", "spread"]
-
 Objection = tuple[Mask, str, Code]
 """Which of some marks are declined, and why."""
 _FEWEST = 10

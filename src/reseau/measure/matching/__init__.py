@@ -1,23 +1,9 @@
 """Least-squares matching: windows of a frame are adjusted to formed images of marks."""
 
 from .correlation import with_alike_errors
-from .matcher import SIZE, match
+from .matcher import match
 from .matches import Matches
 from .noise import grey_variance
-from .patches import MatchOptions, add_windows
-from .shapes import FormedShape, GrownOutline, Shape, ShapeSubset, Window
+from .shapes import Shape
 
-__all__ = [
-    "SIZE",
-    "FormedShape",
-    "GrownOutline",
-    "MatchOptions",
-    "Matches",
-    "Shape",
-    "ShapeSubset",
-    "Window",
-    "add_windows",
-    "grey_variance",
-    "match",
-    "with_alike_errors",
-]
+__all__ = ["Matches", "Shape", "grey_variance", "match", "with_alike_errors"]

@@ -21,8 +21,6 @@ from ...core.data import Array, Mask, Rows
 from ..compiled_filter import filtered
 from .matches import Matches
 
-__all__ = ["with_alike_errors"]
-
 _LAGS = 7
 """Largest distance of pixels along either axis: errors of a compressed picture end with its blocks of 8."""
 _SIGNIFICANT = 4.0

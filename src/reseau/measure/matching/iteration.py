@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...adjust import BatchAdjustment, BatchOptions, BatchReason
+from ...adjust.batch import BatchAdjustment, BatchOptions, BatchReason
 from ...core.data import Array, Mask, Rows
 from .patches import CONTRAST, SHARPEST, WIDTH, Patches
 
 Floats = NDArray[Any]
 """Of single or double precision."""
 
-__all__ = ["ACTIVE", "DONE", "FAILED", "STALE", "Iteration"]
 
 ACTIVE, DONE, STALE, FAILED = 0, 1, 2, 3
 """States of a window: to be evaluated at its trial, converged, to be linearised at its estimates, without a

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...adjust import BatchAdjustment, BatchOptions, BatchReason, adjust_batch
+from ...adjust import adjust_batch
+from ...adjust.batch import BatchAdjustment, BatchOptions, BatchReason
 from ...core.data import Array, Mask, Rows
 from ...core.threads import one_thread
 from ...optics.formation import Outline
@@ -22,8 +23,6 @@ from .matches import Matches, matches_of, with_rows
 from .noise import medians
 from .patches import CONTRAST, WIDTH, MatchOptions, Patches, X, Y
 from .shapes import GrownOutline, Shape, ShapeSubset
-
-__all__ = ["SIZE", "match"]
 
 _PLAIN = 1.25
 """Multiple of the rejection limit from which blunders are searched for when good start values are known."""

@@ -7,11 +7,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from ...adjust import BatchAdjustment
+from ...adjust.batch import BatchAdjustment
 from ...core.data import Array, Mask, Rows
 from .patches import CONTRAST, LEVEL, Patches
-
-__all__ = ["Matches", "matches_of", "with_rows"]
 
 Columns = TypeVar("Columns", "Matches", BatchAdjustment)
 

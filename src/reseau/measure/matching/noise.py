@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask
 
-__all__ = ["LEAST", "adjusted_grey", "grey_variance", "linear_variance", "medians", "relative_weights"]
-
 _ENOUGH = 8000
 """Number of pixels that show how the variance grows."""
 LEAST = 0.05

@@ -18,8 +18,6 @@ from ...optics.formation import PixelResponse
 from .noise import medians, relative_weights
 from .shapes import Shape, Window
 
-__all__ = ["CONTRAST", "LEVEL", "SHARPEST", "WIDTH", "MatchOptions", "Patches", "X", "Y"]
-
 X, Y, WIDTH, CONTRAST, LEVEL = range(5)
 
 SHARPEST = 0.5

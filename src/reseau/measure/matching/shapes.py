@@ -16,8 +16,6 @@ from ...core.threads import one_thread
 from ...optics.compiled import formed
 from ...optics.formation import Outline, PixelResponse, coverage, coverage_derivatives
 
-__all__ = ["FormedShape", "GrownOutline", "Shape", "ShapeSubset", "Window"]
-
 
 @dataclass(frozen=True, eq=False)
 class Window:

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
 from ...optics import Arcs
-from ..matching import MatchOptions, match
+from ..matching import match
+from ..matching.patches import MatchOptions
 from .echoes import Echoes
 from .shapes import ACROSS_SIGMA, ArcShape, Form, ends_of
-
-__all__ = ["ArcMatches", "Windows"]
 
 _WINDOWS = np.array([6, 9, 13, 18, 25, 35, 50, 70])
 """Half sides of windows, pixels; arcs of similar size are matched in one batch."""

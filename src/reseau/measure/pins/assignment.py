@@ -18,8 +18,6 @@ from ...core.data import Array, Mask, Rows
 from ...optics.field import SmoothField, trend_degree
 from ..marks.judging import robust_spread
 
-__all__ = ["Assignment", "assign"]
-
 _GROSS = 0.05
 """Share of rods beside whose place something else is seen."""
 _ROUNDS = 12

@@ -10,11 +10,9 @@ import scipy
 
 from ...core.data import Array, Rows
 from ...optics import Arcs
-from ..matching import Window
+from ..matching.shapes import Window
 from .arcs import ArcMatches, Windows
 from .shapes import ACROSS_SIGMA, ArcShape, Form, ends_of, lines_with
-
-__all__ = ["Details", "details_of"]
 
 _MOST_OF_WIDTH = 0.8
 """Largest variance of a blur as a share of those of an arc across and of its ends."""

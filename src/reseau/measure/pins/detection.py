@@ -22,7 +22,7 @@ from ...core import vocabulary as v
 from ...core.data import Array, Frame, ImagePoints, Mask, Rows
 from ...core.failure import Code, Failure
 from ...core.overlaid import Overlaid
-from ..matching import MatchOptions
+from ..matching.patches import MatchOptions
 from ..points import Reason
 from ..screening import Screened, screen
 from .arcs import ArcMatches
@@ -36,7 +36,6 @@ from .shapes import ends_of, reach_of
 if TYPE_CHECKING:
     from ...core.overlay import Layer
 
-__all__ = ["PinDetections", "PinOptions", "find_pins"]
 
 _UPRIGHT_FROM = 1.8
 """Minimum length over thickness from which the direction of an arc is determined."""

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Rows
 
-__all__ = ["Echoes", "find_echoes", "ground_of"]
-
 _STEP = 0.85
 """Ratio of successive levels."""
 _JOINED = 0.7

@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
 from ...optics import Arcs
-from ..matching import MatchOptions
+from ..matching.patches import MatchOptions
 from .arcs import ArcMatches, Windows
 from .details import details_of
 from .echoes import Echoes
 from .hidden_ends import integrate_over_hidden_ends
 from .shapes import BEAM, FURTHER, LINE, Form, ends_of, lines_with
-
-__all__ = ["match_arcs"]
 
 _CLEAR = 10.0
 """Minimum contrast over its standard deviation of an echo by which a form is chosen."""

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from ...core.data import Array, Frame, Mask, Rows
 from .echoes import Echoes, Grey
 
-__all__ = ["bridged", "find_cuts", "is_sharp", "looks_drawn", "same_in_all", "series"]
-
 _SHARP = 0.16
 """Squared steps over squared light, in the direction where they are smaller: a Gaussian of 1.8 px."""
 _SUSPECT = 0.08

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...adjust import BatchOptions, adjust_batch
+from ...adjust import adjust_batch
+from ...adjust.batch import BatchOptions
 from ...core.data import Array, Mask, Rows
 from ...optics import Arcs
-from ..matching import Window
+from ..matching.shapes import Window
 from .arcs import ArcMatches, Windows
 from .shapes import ACROSS_SIGMA, BOLD, FURTHER, ArcShape, Form, ends_of
-
-__all__ = ["integrate_over_hidden_ends"]
 
 _END_HIDDEN = 0.15
 """Hidden share of an end of a line from which its place is integrated over."""

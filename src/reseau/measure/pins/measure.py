@@ -21,7 +21,6 @@ from .wires import Layout, LayoutOptions, Wires, lay_wires
 if TYPE_CHECKING:
     from ...core.overlay import Layer
 
-__all__ = ["PinResult", "measure_pins"]
 
 _AMBIGUOUS = Remark(
     "the design is symmetric and fits in more than one way; the upright one with y up was chosen",

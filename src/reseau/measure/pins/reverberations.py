@@ -16,8 +16,6 @@ import numpy as np
 from ...core.data import Array, Mask, Rows
 from ..marks.judging import robust_spread
 
-__all__ = ["Reverberations", "find_reverberations"]
-
 _SEEN = 0.95
 """Probability that a second echo is found where it is strong enough and nothing hides it."""
 _ACROSS, _ALONG = 0.06, 0.15

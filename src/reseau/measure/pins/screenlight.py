@@ -16,8 +16,6 @@ import scipy
 from ...core.data import Array, Mask
 from .echoes import Grey
 
-__all__ = ["blur_of_wires", "falloff"]
-
 _STEP = 20
 """Distance of the places at which the glow is sampled, pixels."""
 _INSIDE = 0.08

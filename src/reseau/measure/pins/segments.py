@@ -16,8 +16,6 @@ from ...core.data import Array, Rows
 from ...core.failure import Code
 from ..points import Reason
 
-__all__ = ["Cuts", "cut_segments"]
-
 _BEYOND = 0.05
 """A wire may be seen beyond the ends of its segment by this share of its length: its design is not exact. Its
 uncertainty may add as much again."""

@@ -9,20 +9,7 @@ import numpy as np
 
 from ...core.data import Array, Rows
 from ...optics import Arcs
-from ..matching import Window
-
-__all__ = [
-    "ACROSS_SIGMA",
-    "BEAM",
-    "BOLD",
-    "FURTHER",
-    "LINE",
-    "ArcShape",
-    "Form",
-    "ends_of",
-    "lines_with",
-    "reach_of",
-]
+from ..matching.shapes import Window
 
 BOLD = 5.0
 """Bound of the logarithm of a width, for steps that an iteration tries and refuses."""

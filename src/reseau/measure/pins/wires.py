@@ -17,8 +17,6 @@ import scipy
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
 
-__all__ = ["Layout", "LayoutOptions", "Wires", "lay_wires", "nearest_pairs"]
-
 _BASES = 30
 """Number of distant pairs of wires that are tried as a base."""
 _FOLLOWED = 40

@@ -9,12 +9,10 @@ import numpy as np
 import scipy
 
 from ...core.data import Array, Mask, Rows
-from ...optics import Chain
+from ...optics.composition import Chain
 from .lattice_mapping import images_of, second_order, started
 from .lens_mapping import lens_through
 from .plane_mapping import plane_through
-
-__all__ = ["LENS_FROM", "SADDLE_PX", "first_mapping", "grown_through"]
 
 _GATE = 0.22
 """Largest distance of a corner from its node, in steps of the lattice."""

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Rows
 
-__all__ = ["images", "monomials", "shade_lines"]
-
 Mapped = tuple[Array, Array, Array]
 
 _FLAT = 1e-3

@@ -15,24 +15,10 @@ from math import isqrt
 import numpy as np
 
 from ...core.data import Array
-from ...optics import Chain, Equidistant, PlaneMapping, RationalPolynomial
+from ...optics import Equidistant, RationalPolynomial
+from ...optics.composition import Chain
+from ...optics.mapping import PlaneMapping
 from .lattice_images import images
-
-__all__ = [
-    "degree_of",
-    "images_of",
-    "matrix_of",
-    "numbers_of",
-    "of_degree",
-    "reduced",
-    "second_order",
-    "slope_of",
-    "started",
-    "straightened",
-    "strength_of",
-    "stretches",
-    "with_coefficients",
-]
 
 
 @lru_cache(maxsize=64)

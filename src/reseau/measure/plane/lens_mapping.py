@@ -25,7 +25,8 @@ from functools import lru_cache
 import numpy as np
 
 from ...core.data import Array
-from ...optics import Chain, Equidistant
+from ...optics import Equidistant
+from ...optics.composition import Chain
 from .lattice_mapping import (
     degree_of,
     matrix_of,
@@ -37,8 +38,6 @@ from .lattice_mapping import (
 from .plane_lens import distorted, moving, projected
 from .plane_mapping import fisheye_of, polynomial_through
 from .polynomial import monomials_of
-
-__all__ = ["UNFIT", "FoundMapping", "free_through", "lens_through", "mapping_through"]
 
 UNFIT = 2.0
 """Misfit of the mapping through all marks, in their sigmas, from which it does not tell its derivatives."""

@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.data import Array
-from ...optics import Chain
+from ...optics.composition import Chain
 from .lattice_mapping import images_of
-
-__all__ = ["levels_around", "levels_at"]
 
 _WIDE = 16384
 """Columns of the map of places; OpenCV allows fewer than 32768 along an axis."""

@@ -6,8 +6,6 @@ import numpy as np
 
 from ...core.data import Array
 
-__all__ = ["distorted", "moving", "projected"]
-
 
 def projected(source: Array, matrix: Array) -> tuple[Array, Array]:
     """Images of points by a projectivity, and their derivatives by its elements.

@@ -11,11 +11,9 @@ import numpy as np
 import scipy
 
 from ...core.data import Array, Mask
-from ...optics import Chain
+from ...optics.composition import Chain
 from .lattice_mapping import images_of, started
 from .polynomial import refit
-
-__all__ = ["STRENGTHS", "fisheye_of", "plane_through", "polynomial_through", "projectivity_behind"]
 
 STRENGTHS = (0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0)
 """Of fisheyes that are tried: one that shows 180° along the longer side of the frame has 2.5."""

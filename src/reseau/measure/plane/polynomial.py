@@ -8,15 +8,14 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ...adjust import BatchOptions, adjust_batch, weight_function
+from ...adjust import adjust_batch, weight_function
+from ...adjust.batch import BatchOptions
 from ...core.data import Array, Rows
 from ...core.threads import one_thread
-from ...optics import Chain
+from ...optics.composition import Chain
 from ...optics.field import trend_degree
 from .lattice_images import monomials
 from .lattice_mapping import degree_of, numbers_of, of_degree, with_coefficients
-
-__all__ = ["common_part", "median", "monomials_of", "refit"]
 
 _MOST_PX = 20.0
 """Prior standard deviation of the coefficients of the polynomial, pixels."""

@@ -16,8 +16,6 @@ from ...core.data import Array, Mask, Rows
 from ...optics.field import SmoothField, monomials, trend_degree
 from .candidates import Candidates
 
-__all__ = ["Assignment", "assign", "in_sight", "nearest_candidates", "spacing", "voted"]
-
 # Widest search radius in the pitch; of common shifts that are closer than this, one is tried.
 _REACH = 0.2
 

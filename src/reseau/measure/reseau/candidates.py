@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask
 
-__all__ = ["Candidates", "find_candidates"]
-
 _BACKGROUND_PX = 41
 """Side of the square whose mean is subtracted first: larger than a mark, smaller than shading."""
 

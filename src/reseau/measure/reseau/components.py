@@ -7,8 +7,6 @@ import scipy
 
 from ...core.data import Array, Mask, Rows
 
-__all__ = ["part_sums"]
-
 
 def part_sums(mask: Mask) -> tuple[Array, Rows]:
     """Moments and extents of the components of a mask whose pixels are connected by their sides.

@@ -13,9 +13,6 @@ from numpy.typing import NDArray
 from ...core.data import Array, Mask, Rows
 from .components import part_sums
 
-__all__ = ["Disks", "find_disks"]
-
-
 _SIDES_PX = (25, 51, 101)
 """Sides of the squares; the threshold in each is the mean of its darkest and brightest grey value."""
 _SMALL = 8000

@@ -20,8 +20,6 @@ from ...optics.field import SmoothField, monomials, trend_degree
 from .assignment import Assignment, assign, in_sight, nearest_candidates, spacing, voted
 from .candidates import Candidates
 
-__all__ = ["NEARLY", "UPRIGHT", "GridOptions", "climbed", "grid_steps", "place_grid", "settled"]
-
 _NEIGHBOURS = 6
 UPRIGHT = np.deg2rad(12.0)
 """Rotation up to which a design counts as upright in the image."""

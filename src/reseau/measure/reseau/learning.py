@@ -23,8 +23,6 @@ from ..screening import inner_pixels
 from ..tone import find_curve
 from .mark_windows import DISTURBED, ENOUGH, Appearance, MarkWindows
 
-__all__ = ["learn", "weigh"]
-
 _GOLDEN = (np.sqrt(5) - 1) / 2
 _FEW = 3
 """One in so many of these shows whether a kernel is needed."""

@@ -16,23 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.data import Array, Frame, Mask, Rows
-from ...optics import Chain
+from ...optics.composition import Chain
 from ...optics.formation import PixelResponse
-from ..matching import (
-    Matches,
-    MatchOptions,
-    Shape,
-    ShapeSubset,
-    Window,
-    match,
-)
-from ..matching.patches import windows
+from ..matching import Matches, Shape, match
+from ..matching.patches import MatchOptions, windows
+from ..matching.shapes import ShapeSubset, Window
 from ..response import FilteredShape, Samples
 from ..screening import Screened
 from ..testfield.targets import merged
 from .marks import ReseauOptions
-
-__all__ = ["BESIDE", "DISTURBED", "ENOUGH", "SEEN", "Appearance", "Located", "MarkWindows"]
 
 _CLASS_PX = 4
 """Step of the window sizes."""

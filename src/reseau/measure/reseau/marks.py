@@ -17,14 +17,14 @@ from ...io import ReseauDesign
 from ...optics.field import SmoothField
 from ...optics.formation import Outline, PixelResponse, coverage, mark_outline
 from ..marks.judging import Objection, judged_by_neighbours, reasons_of, robust_spread, spread
-from ..matching import SIZE, Matches, MatchOptions, grey_variance, match, with_alike_errors
+from ..matching import Matches, grey_variance, match, with_alike_errors
+from ..matching.matcher import SIZE
+from ..matching.patches import MatchOptions
 from ..plane.levels import levels_at
 from ..points import Reason
 from .assignment import spacing
 from .placement import Placement
 from .wires import grid_wires
-
-__all__ = ["TOO_WEAK", "MarkMeasurement", "ReseauOptions", "Verdict"]
 
 TOO_WEAK = "too weak for the compression of the image"
 """Why a mark is declined whose image has lost its shape."""

@@ -36,8 +36,6 @@ from .placement import Placement, PlacingOptions, place
 from .sheet import measure_sheet
 from .wires import cover, grid_wires
 
-__all__ = ["ReseauOptions", "ReseauResult", "measure_reseau"]
-
 _ALIKE = 0.03
 """Share of the marks by which an orientation may explain fewer and still count as a rival."""
 _ORIENTATIONS = 3

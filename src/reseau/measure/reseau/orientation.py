@@ -18,8 +18,6 @@ from .grid_search import GridOptions, climbed
 from .placement import Placement
 from .wires import grid_wires
 
-__all__ = ["misfit", "rival_orientations"]
-
 _SAME, _SYMMETRIC = 0.2, 0.5
 """Distance, in pitches, at which two marks are in one place; share of such marks in a symmetric design."""
 _MIRROR = np.diag([1.0, -1.0])

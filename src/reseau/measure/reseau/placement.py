@@ -16,8 +16,6 @@ from .candidates import Candidates, find_candidates
 from .grid_search import NEARLY, UPRIGHT, GridOptions, climbed, place_grid, settled
 from .wires import grid_wires
 
-__all__ = ["Placement", "PlacingOptions", "place"]
-
 _BETTER = 0.05
 """Share of all marks that another position must find in addition to contradict the nominal positions."""
 _OF_ROW = 0.5

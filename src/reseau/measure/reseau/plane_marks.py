@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.failure import Code, Remark
-from ...optics import Chain
+from ...optics.composition import Chain
 from ...optics.field import SmoothField
 from ..marks.judging import Objection, columns_of, judged_by_neighbours, reasons_of, robust_spread
 from ..matching import (
@@ -32,8 +32,6 @@ from ..testfield.targets import replaced
 from .learning import learn, weigh
 from .mark_windows import BESIDE, DISTURBED, ENOUGH, SEEN, Located, MarkWindows
 from .marks import ReseauOptions
-
-__all__ = ["PlaneMarks", "intact"]
 
 _HIGH_RESIDUALS = 1.25
 """Multiple of the usual residuals from which something is suspected in front of a mark."""

@@ -16,10 +16,11 @@ from ...core.data import Array, Frame, Rows
 from ...core.failure import Code, Failure
 from ...core.threads import one_thread
 from ...io import ReseauDesign, Rings
-from ...optics import Chain
+from ...optics.composition import Chain
 from ...optics.formation import Outline, PixelResponse, side_rule
 from ..marks.judging import Objection
-from ..matching import GrownOutline, Matches, Shape, Window
+from ..matching import Matches, Shape
+from ..matching.shapes import GrownOutline, Window
 from ..plane.lattice_mapping import images_of, second_order, slope_of
 from ..plane.plane_mapping import plane_through
 from ..screening import Screened, screen
@@ -28,8 +29,6 @@ from .mark_windows import Located
 from .marks import ReseauOptions
 from .plane_marks import PlaneMarks
 from .sheet_placement import MOST_DISKS, SheetPlacement, lay_sheet
-
-__all__ = ["DiskMarks", "measure_sheet"]
 
 _FORM = np.array([[[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
 """Growth, stretch along an axis, stretch along a diagonal: paper is not plane. None moves the centre."""

@@ -19,20 +19,12 @@ from ...core.data import Array, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure
 from ...io import ReseauDesign
-from ...optics import Chain
+from ...optics.composition import Chain
 from ..plane.growth import first_mapping, grown_through
 from ..plane.lattice_mapping import second_order
 from ..plane.levels import levels_around
 from .assignment import spacing
 from .disks import Disks
-
-__all__ = [
-    "MOST_DISKS",
-    "SheetPlacement",
-    "disk_seeds",
-    "grown_disks",
-    "lay_sheet",
-]
 
 MOST_DISKS = 4
 """Number of ellipses examined, as a multiple of the disks of the design; others are specks."""

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Rows
 
-__all__ = ["GridWires", "cover", "grid_wires"]
-
 _NEIGHBOURS = 24
 """Neighbours of a mark that may be the next on its wire; crossings in between may be missing."""
 _APART = np.deg2rad(35.0)

@@ -19,11 +19,9 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Rows
 from ...io import TestfieldDesign
-from ...optics import Chain
+from ...optics.composition import Chain
 from ..plane.lattice_mapping import images_of, slope_of, started
 from ..plane.plane_mapping import plane_through, projectivity_behind
-
-__all__ = ["LatticeFit", "extremes", "lattices"]
 
 _SMOOTH_PX, _AROUND_PX = 0.4, 2.0
 """Widths of the Gaussians of which the difference shows targets of a few pixels."""

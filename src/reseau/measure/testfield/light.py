@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
 
-__all__ = ["attenuate", "bends", "curved", "illumination", "without_own"]
-
 
 def without_own(
     total: NDArray[Any], first: Rows, own: NDArray[Any], sign: float, others: NDArray[Any]

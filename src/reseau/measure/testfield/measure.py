@@ -21,7 +21,8 @@ from ...core.tone import ToneCurve
 from ...io import TestfieldDesign
 from ...optics.formation import PixelResponse
 from ..marks.judging import Objection, columns_of, reasons_of
-from ..matching import Matches, Window
+from ..matching import Matches
+from ..matching.shapes import Window
 from ..plane.lattice_mapping import images_of, numbers_of, slope_of, stretches
 from ..plane.plane_mapping import plane_through
 from ..plane.polynomial import common_part, median, refit
@@ -34,8 +35,6 @@ from .motion import MovedShape, anisotropy, path_of, spread_of
 from .recognition import Reading, SearchedFrame, shows_second
 from .target_images import form_targets
 from .targets import Light, Scene, match_targets, pixels_of_targets, replaced
-
-__all__ = ["FORMED_PX", "TestfieldOptions", "TestfieldResult", "measure_testfield"]
 
 _LEAST_FIRST, _MOST_FIRST, _FIRST_SHARE = 8, 36, 0.125
 """Minimum and maximum number of large targets matched first, to improve the mapping and the sharpness; more
@@ -144,7 +143,7 @@ class TestfieldResult(Measured):
 
     Examples
     --------
-    >>> from reseau.optics import Chain, Similarity
+    >>> from reseau.optics.composition import Chain, Similarity
     >>> lattice = LatticeFit(
     ...     Chain(Similarity(), Similarity(), ("camera.", "display.")), np.arange(2), np.arange(2)
     ... )

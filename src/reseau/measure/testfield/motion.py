@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...core.data import Array, Rows
-from ..matching import Shape, Window
-
-__all__ = ["MovedShape", "anisotropy", "path_of", "spread_of", "steps_of"]
+from ..matching import Shape
+from ..matching.shapes import Window
 
 _LEAST_PX = 1.0
 """Shortest path that is modelled."""
@@ -60,7 +59,7 @@ class MovedShape:
 
     Examples
     --------
-    >>> from reseau.measure.matching import GrownOutline
+    >>> from reseau.measure.matching.shapes import GrownOutline
     >>> from reseau.optics.formation import Outline, PixelResponse
     >>> disk = Outline.circle(2.0, 0.5)
     >>> still = GrownOutline(Outline(disk.xy[None], disk.dxy[None]), np.zeros((0, 2, 2)))

@@ -27,23 +27,13 @@ from ...core.failure import Code, Failure
 from ...designs.topology import HIDDEN, Decoded, TopologicalCode
 from ...io import TestfieldDesign
 from ...optics.formation import Outline, PixelResponse
-from ..matching import SIZE, GrownOutline, Window
+from ..matching.matcher import SIZE
+from ..matching.shapes import GrownOutline, Window
 from ..plane.lattice_mapping import images_of, reduced, slope_of, straightened, stretches
 from ..plane.levels import levels_at
 from ..plane.polynomial import median
 from .lattice import LatticeFit, extremes, lattices
 from .target_images import flat_outline, stacked
-
-__all__ = [
-    "Kinds",
-    "Placement",
-    "Read",
-    "Reading",
-    "SearchedFrame",
-    "locate",
-    "read_clusters",
-    "shows_second",
-]
 
 _ALIKE = 0.06
 """Relative difference of local frames below which they share one set of formed images."""

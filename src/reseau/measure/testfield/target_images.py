@@ -9,14 +9,13 @@ import numpy as np
 
 from ...core.data import Array, Rows
 from ...io import TestfieldDesign
-from ...optics import Chain
+from ...optics.composition import Chain
 from ...optics.formation import Outline
 from ...optics.targets import target_outline
-from ..matching import SIZE, GrownOutline
+from ..matching.matcher import SIZE
+from ..matching.shapes import GrownOutline
 from ..plane.lattice_mapping import second_order, stretches
 from .light import curved
-
-__all__ = ["flat_outline", "form_targets", "stacked"]
 
 _SPACING = 1.3
 """Distance of nodes on an outline in widths of the point-spread function; accurate to 1e-4 of the light."""

@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 
 from ...core.data import Array, Mask, Rows
 from ...io import TestfieldDesign
-from ...optics import Chain
+from ...optics.composition import Chain
 from ...optics.formation import PixelResponse
-from ..matching import FormedShape, Matches, MatchOptions, Shape, ShapeSubset, Window, add_windows, match
+from ..matching import Matches, Shape, match
+from ..matching.patches import MatchOptions, add_windows
+from ..matching.shapes import FormedShape, ShapeSubset, Window
 from ..plane.lattice_images import shade_lines
 from ..plane.lattice_mapping import images_of, slope_of
 from ..plane.polynomial import median
 from .light import attenuate, bends, illumination, without_own
 from .motion import MovedShape, steps_of
 from .target_images import form_targets
-
-__all__ = ["Light", "Scene", "match_targets", "merged", "pixels_of_targets", "replaced"]
 
 
 @dataclass(frozen=True, eq=False)

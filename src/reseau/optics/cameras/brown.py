@@ -20,8 +20,6 @@ from .kernels import CameraColumns, additional
 from .radial import Radial, first_root
 from .registry import CameraModel, Option, Parameter, register_camera
 
-__all__ = ["Brown", "BrownDistortion", "BrownWithAdditional"]
-
 PARAMETERS = (
     Parameter("c", "mm", "scale", usual=True, required=True),
     Parameter("x0", "mm", "centre", usual=True),
@@ -255,7 +253,7 @@ class BrownWithAdditional(PlaneMapping):
 
     Examples
     --------
-    >>> from reseau.optics import EbnerCorrection
+    >>> from reseau.optics.cameras.ebner import EbnerCorrection
     >>> camera = Brown(grid=PixelGrid(640, 480, (0.01, 0.01))).with_values({"c": 8.0})
     >>> extra = EbnerCorrection(base_mm=2.0).with_values({"b1": 1e-3})
     >>> BrownWithAdditional(camera, extra)([[0.1, 0.0]]).round(6)

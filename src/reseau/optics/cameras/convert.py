@@ -16,8 +16,6 @@ from ..mapping import PlaneMapping
 from .grid import PixelGrid
 from .registry import camera_model
 
-__all__ = ["Converted", "convert", "roughly"]
-
 # Points along the longer side of the image to which the camera is fitted, and at which it is compared: it may
 # be worst between the former.
 _POINTS, _COMPARED = 41, 161

@@ -15,8 +15,6 @@ from ..mapping import Derivatives, PlaneMapping, as_points, as_values
 from .kernels import CameraColumns
 from .registry import AdditionalModel, register_additional
 
-__all__ = ["EbnerCorrection"]
-
 
 @dataclass(frozen=True, eq=False)
 class EbnerCorrection(PlaneMapping):

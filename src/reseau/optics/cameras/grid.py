@@ -11,8 +11,6 @@ from ...core.data import Array
 from ...core.errors import UsageError
 from ..mapping import as_points
 
-__all__ = ["PixelGrid"]
-
 
 @dataclass(frozen=True)
 class PixelGrid:

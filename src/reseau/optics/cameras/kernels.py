@@ -23,8 +23,6 @@ from typing import NamedTuple
 from ...core.compiled import kernel
 from ...core.data import Array
 
-__all__ = ["CameraColumns", "additional", "camera"]
-
 
 class CameraColumns(NamedTuple):
     """Cameras and sets of additional parameters, as the kernels receive them.

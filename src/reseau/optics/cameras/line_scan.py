@@ -18,8 +18,6 @@ from .kernels import CameraColumns
 from .opencv import OpenCV
 from .registry import CameraModel, Parameter, register_camera
 
-__all__ = ["LineScan"]
-
 PARAMETERS = (
     Parameter("f", "px", "scale", usual=True, required=True),
     Parameter("cx", "px", "centre", usual=True, required=True),

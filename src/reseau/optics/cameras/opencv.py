@@ -20,8 +20,6 @@ from .kernels import CameraColumns
 from .radial import Radial, first_root
 from .registry import CameraModel, Parameter, register_camera
 
-__all__ = ["OpenCV", "opencv_coefficients"]
-
 PARAMETERS = (
     Parameter("fx", "px", "scale", usual=True, required=True),
     Parameter("fy", "px", "scale", usual=True, required=True),

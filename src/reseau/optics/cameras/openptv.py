@@ -24,8 +24,6 @@ from .brown import PARAMETERS, BrownDistortion
 from .grid import PixelGrid
 from .registry import CameraModel, Parameter, register_camera
 
-__all__ = ["OpenPtv"]
-
 # All of Brown's but its last, B2, in whose place there is the shear.
 _PARAMETERS = (*PARAMETERS[:-1], Parameter("she", "rad"))
 

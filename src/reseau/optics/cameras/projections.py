@@ -24,18 +24,6 @@ from .kernels import CameraColumns
 from .radial import Radial, first_root
 from .registry import CameraModel, Parameter, register_camera
 
-__all__ = [
-    "Division",
-    "DoubleSphere",
-    "EnhancedUnified",
-    "Equisolid",
-    "Fisheye",
-    "Omni",
-    "Orthographic",
-    "Projected",
-    "Stereographic",
-]
-
 # Kinds of projection; the first constant of the kernel. The second is the number of parameters of the shape.
 EQUIDISTANT, EQUISOLID, ORTHOGRAPHIC, STEREOGRAPHIC, SPHERE, TWO_SPHERES, ELLIPSOID, DIVISION = range(8)
 KIND, SHAPES = 0, 1

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike
 from ...core.data import Array, Mask
 from ..mapping import PlaneMapping, as_points
 
-__all__ = ["Radial", "first_root"]
-
 
 def first_root(*polynomials: ArrayLike) -> float:
     """The smallest positive root of polynomials (coefficients from the constant up), or infinity.

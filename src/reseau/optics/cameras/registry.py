@@ -22,23 +22,6 @@ from ...core.plugins import CAMERAS, plugin, plugins
 from ..mapping import PlaneMapping
 from .grid import PixelGrid
 
-__all__ = [
-    "AdditionalModel",
-    "CameraModel",
-    "Option",
-    "Parameter",
-    "additional_model",
-    "additional_models",
-    "camera_model",
-    "camera_models",
-    "default_camera_model",
-    "distortion_names",
-    "register_additional",
-    "register_camera",
-    "register_family",
-    "unit_of",
-]
-
 Options = Mapping[str, Any]
 T = TypeVar("T")
 

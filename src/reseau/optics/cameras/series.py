@@ -21,8 +21,6 @@ from ..mapping import Derivatives, PlaneMapping, as_points, as_values
 from .kernels import CameraColumns
 from .registry import AdditionalModel, register_additional
 
-__all__ = ["ChebyshevCorrection", "FourierCorrection"]
-
 # Parameters of the first two degrees of Chebyshev's series, which exclude those of the orientations.
 _LOW = 6
 

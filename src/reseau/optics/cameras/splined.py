@@ -23,8 +23,6 @@ from .grid import PixelGrid
 from .kernels import CameraColumns
 from .registry import CameraModel, Parameter, register_camera, register_family
 
-__all__ = ["SplineGrid", "SplinedStereographic"]
-
 NAME = "splined_stereographic"
 FX, FY, CX, CY, CONTROL = range(5)
 # Constants of the kernel.

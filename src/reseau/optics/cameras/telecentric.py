@@ -12,8 +12,6 @@ from .brown import PARAMETERS, Brown, brown_constants, brown_kernel, with_additi
 from .grid import PixelGrid
 from .registry import CameraModel, Option, Parameter, register_camera
 
-__all__ = ["Telecentric"]
-
 
 @dataclass(frozen=True, eq=False)
 class Telecentric(Brown):

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from ...core.compiled import compiled
 from .prescription import COEFFICIENTS
 
-__all__ = ["traced"]
-
 Numbers = NDArray[np.float64]
 
 _BLOCK = 256

@@ -28,8 +28,6 @@ from ..newton import determinant
 from .pupils import PupilElements
 from .ray_maps import CalibratedLens, LensCamera, RayMap
 
-__all__ = ["PlaneTarget", "RayImage", "image_scale", "ray_image", "ray_images"]
-
 _TOGETHER = 40_000
 """Largest number of rays of one wavelength in one call, for the sake of memory."""
 
@@ -201,7 +199,8 @@ def ray_image(camera: RayMap, target: PlaneTarget, elements: PupilElements) -> R
 
     Examples
     --------
-    >>> from reseau.optics.lenses import SensorPlane, ThinLens
+    >>> from reseau.optics.lenses import ThinLens
+    >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> camera = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (0.0, 0.0)))
     >>> disk = PlaneTarget(np.array([0.0, 0, 1000]), np.eye(3)[:, :2], Outline.circle(4.0, 0.2))
     >>> image = ray_image(camera, disk, PupilElements.gauss(6))
@@ -233,7 +232,8 @@ def ray_images(
 
     Examples
     --------
-    >>> from reseau.optics.lenses import SensorPlane, ThinLens
+    >>> from reseau.optics.lenses import ThinLens
+    >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> camera = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (0.0, 0.0)))
     >>> outline = Outline.circle(4.0, 0.2)
     >>> near, far = (PlaneTarget(np.array([0.0, 0, z]), np.eye(3)[:, :2], outline) for z in (1e3, 2e3))
@@ -340,7 +340,8 @@ def image_scale(camera: RayMap, centre: Array, axes: Array) -> Array:
 
     Examples
     --------
-    >>> from reseau.optics.lenses import SensorPlane, ThinLens
+    >>> from reseau.optics.lenses import ThinLens
+    >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> camera = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (0.0, 0.0)))
     >>> image_scale(camera, np.array([[0.0, 0.0, 1000.0]]), np.eye(3)[None, :, :2]).round(2)
     array([5.2])

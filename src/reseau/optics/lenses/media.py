@@ -17,20 +17,6 @@ import numpy as np
 
 from ...core.errors import UsageError
 
-__all__ = [
-    "AIR",
-    "Air",
-    "Cauchy",
-    "Constant",
-    "Medium",
-    "Powers",
-    "Sellmeier",
-    "Water",
-    "glass",
-    "glass_names",
-    "model_glass",
-]
-
 _LINES = {"F": 486.1327, "d": 587.5618, "C": 656.2725}
 """Fraunhofer lines (nm) that define index and Abbe number of a glass."""
 

@@ -17,8 +17,6 @@ from ...core.data import Array
 from ...core.errors import UsageError
 from .prescription import Prescription
 
-__all__ = ["Paraxial"]
-
 
 @dataclass(frozen=True, eq=False)
 class Paraxial:
@@ -34,7 +32,8 @@ class Paraxial:
     --------
     A plano-convex lens, with the light entering at its curved side:
 
-    >>> from reseau.optics.lenses import AIR, Constant, Prescription, in_order
+    >>> from reseau.optics.lenses import AIR, Prescription, in_order
+    >>> from reseau.optics.lenses.media import Constant
     >>> lens = Prescription(in_order([(0.02, 6.0, Constant(1.5)), (0.0, 96.0, AIR)]), stop=0, stop_radius=8.0)
     >>> first = Paraxial(lens)
     >>> round(first.focal_length, 6), round(first.back_focus, 6), round(first.f_number, 4)

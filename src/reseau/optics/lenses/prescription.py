@@ -22,9 +22,6 @@ from ...core.data import Array, Mask
 from ...core.errors import UsageError
 from .media import AIR, Medium
 
-__all__ = ["Aperture", "Layout", "Prescription", "Surface", "in_order"]
-
-
 COEFFICIENTS = 10
 """Largest number of coefficients of an asphere; Numba's cache of `compiled.py` does not notice a change."""
 _FARTHEST = 1e9

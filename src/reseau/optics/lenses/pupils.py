@@ -20,8 +20,6 @@ from .paraxial import Paraxial
 from .prescription import Prescription
 from .trace import Rays, Tracer
 
-__all__ = ["Aimed", "Aiming", "PupilElements", "RayKind", "aim", "labels"]
-
 RayKind = Literal["principal", "marginal", "meridional", "sagittal", "skew"]
 
 _STEPS = 12

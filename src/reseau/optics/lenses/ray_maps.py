@@ -23,8 +23,6 @@ from .pupils import Aiming, PupilElements
 from .trace import Tracer
 from .vignetting import Vignetting
 
-__all__ = ["ByRays", "CalibratedLens", "LensCamera", "RayMap", "SensorPlane"]
-
 _GOLDEN = np.pi * (3 - np.sqrt(5.0))
 
 
@@ -271,7 +269,8 @@ class CalibratedLens:
     Examples
     --------
     >>> from reseau.optics import Brown, PixelGrid
-    >>> from reseau.optics.lenses import SensorPlane, ThinLens
+    >>> from reseau.optics.lenses import ThinLens
+    >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> thin = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (49.5, 49.5)))
     >>> calibrated = Brown(side="object", grid=PixelGrid(100, 100, (0.01, 0.01))).with_values({"c": 52.5})
     >>> CalibratedLens(thin, calibrated).corresponding(np.array([[1.0, 0.0, 1000.0]]))

@@ -10,8 +10,6 @@ from ...core.data import Array
 from ...core.errors import UsageError
 from .ray_maps import ByRays, SensorPlane
 
-__all__ = ["AberratedLens", "ThinLens"]
-
 
 @dataclass(frozen=True)
 class ThinLens(ByRays):

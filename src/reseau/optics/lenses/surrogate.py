@@ -11,8 +11,6 @@ from ...core.errors import UsageError
 from .pupils import PupilElements
 from .ray_maps import ByRays, RayMap
 
-__all__ = ["RaySurrogate"]
-
 
 @dataclass(frozen=True, eq=False)
 class RaySurrogate:
@@ -76,7 +74,8 @@ class RaySurrogate:
 
         Examples
         --------
-        >>> from reseau.optics.lenses import SensorPlane, ThinLens
+        >>> from reseau.optics.lenses import ThinLens
+        >>> from reseau.optics.lenses.ray_maps import SensorPlane
         >>> camera = ThinLens(50.0, 12.5, 52.0, SensorPlane((0.01, 0.01), (0.0, 0.0)))
         >>> range_ = ((-0.3, 0.3), (-0.2, 0.2)), (900.0, 1100.0)
         >>> fast = RaySurrogate.of(camera, PupilElements.gauss(4), *range_)

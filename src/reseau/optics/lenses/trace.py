@@ -28,8 +28,6 @@ from ...core.errors import UsageError
 from .compiled import traced
 from .prescription import COEFFICIENTS, Aperture, Prescription, Surface
 
-__all__ = ["SURFACE_PARAMETERS", "RayDerivatives", "Rays", "Traced", "Tracer"]
-
 SURFACE_PARAMETERS = (
     "curvature",
     "conic",
@@ -134,7 +132,8 @@ class RayDerivatives:
     --------
     The image moves with a decentred lens by 1 - m of its shift; here the object is far away, and m is 0:
 
-    >>> from reseau.optics.lenses import AIR, Constant, Prescription, in_order
+    >>> from reseau.optics.lenses import AIR, Prescription, in_order
+    >>> from reseau.optics.lenses.media import Constant
     >>> surfaces = in_order([(0.02, 1e-6, Constant(1.5)), (-0.02, 50.0, AIR)])
     >>> lens = Prescription(surfaces, stop=0, stop_radius=1.0)
     >>> axial = Rays(np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 0.0, 1.0]]))

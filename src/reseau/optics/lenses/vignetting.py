@@ -17,8 +17,6 @@ from .prescription import Aperture, Prescription
 from .pupils import Aiming
 from .trace import Tracer
 
-__all__ = ["Vignetting"]
-
 _DEGREE = 8
 """Of the polynomials of where rays pass an aperture, by where they pass the stop."""
 _RADII = 9

@@ -15,14 +15,12 @@ import numpy as np
 
 from ...core.data import Array, Mask
 from ...core.errors import UsageError
-from ..refraction import RefractedRays, Refraction, RefractiveIndex
-from ..refraction.windows import RefractionColumns
+from ..refraction import RefractedRays
+from ..refraction.windows import Refraction, RefractionColumns, RefractiveIndex
 from .media import Constant, Medium
 from .prescription import Surface
 from .ray_maps import ByRays, LensCamera
 from .stand_ins import ThinLens
-
-__all__ = ["ThinLensBehindWindows", "behind_windows"]
 
 
 @dataclass(frozen=True)
@@ -165,7 +163,9 @@ def behind_windows(
 
     Examples
     --------
-    >>> from reseau.optics.lenses import AIR, Constant, Prescription, SensorPlane, glass, in_order
+    >>> from reseau.optics.lenses import AIR, Prescription, glass, in_order
+    >>> from reseau.optics.lenses.media import Constant
+    >>> from reseau.optics.lenses.ray_maps import SensorPlane
     >>> from reseau.optics.refraction import Window
     >>> lens = Prescription(in_order([(0.02, 5.0, glass("N-BK7")), (-0.02, 47.0, AIR)]), 0, 4.0)
     >>> camera = LensCamera(lens, SensorPlane((0.005, 0.005), (999.5, 749.5)))

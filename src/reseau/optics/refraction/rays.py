@@ -30,8 +30,6 @@ from ...core.compiled import compiled, kernel
 from ...core.data import Array, Mask, Rows
 from .windows import RefractionColumns
 
-__all__ = ["RefractedRays"]
-
 # Largest tangential component of Snell's condition at the solution; an image point is exact to 1e-9 px.
 _CONVERGED = 1e-12
 # Rounding, beside which another step gains nothing.
@@ -512,7 +510,8 @@ class RefractedRays(NamedTuple):
     --------
     A point 100 in front of the camera, seen through a surface of water at 40; Snell's law is satisfied:
 
-    >>> from reseau.optics.refraction import Refraction, RefractiveIndex, Window
+    >>> from reseau.optics.refraction import Window
+    >>> from reseau.optics.refraction.windows import Refraction, RefractiveIndex
     >>> media = (RefractiveIndex("air", 1.0), RefractiveIndex("water", 1.333))
     >>> surface = Window("surface", "plane", "camera", {"distance": 40.0}, ("air", "water"))
     >>> refraction = Refraction(media, (surface,), ((0,),), np.array([0]))

@@ -30,8 +30,6 @@ from ...core.data import Array, Mask, Rows
 from ...core.display import Display
 from ...core.errors import UsageError
 
-__all__ = ["Mounts", "Refraction", "RefractionColumns", "RefractiveIndex", "Window", "window_parameters"]
-
 Shape = Literal["plane", "sphere", "cylinder"]
 On = Literal["camera", "rig", "object"]
 

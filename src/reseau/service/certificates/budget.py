@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from ...adjust import Contribution, Simulated, UncertaintyBudget, propagate, simulate
+from ...adjust import Contribution, propagate, simulate
+from ...adjust.uncertainty import Simulated, UncertaintyBudget
 from ...calibration import Calibration, CameraMapping, projection_field
 from ...core.data import Array, ImagePoints
 from ...core.errors import UsageError

@@ -8,7 +8,7 @@ from datetime import date, datetime
 
 import numpy as np
 
-from ...adjust import UncertaintyBudget
+from ...adjust.uncertainty import UncertaintyBudget
 from ...calibration import Calibration, CameraMapping
 from ...calibration.assessment import Use
 from ...core.data import ImagePoints

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from typing import Any
 
-from ...adjust import UncertaintyBudget
+from ...adjust.uncertainty import UncertaintyBudget
 from ...core.errors import UsageError
 from ...core.version import __version__
 from .certificate import Certificate

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...adjust import UncertaintyBudget
+from ...adjust.uncertainty import UncertaintyBudget
 from ...core.errors import FormatError, UsageError
 from ...core.numbers import power
 from ...core.optional import optional

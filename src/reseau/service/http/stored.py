@@ -128,7 +128,7 @@ def marks_of(session: Session, archived: ArchivedFrame) -> tuple[Frame, Marks, s
     from ...core.errors import UsageError
     from ...core.failure import Failure
     from ...io import parse_design
-    from ...measure import TestfieldOptions
+    from ...measure.testfield.measure import TestfieldOptions
     from ...procedures.target_measurement import measurer_of
     from ...report.overlay import Marks
     from ...sessions import present_keys
