@@ -323,7 +323,7 @@ def _misfit(line: tuple[Array, Mask], place: Array, offset: Array, total: Array)
     """Factor on the standard deviations of the profiles that agree with a line."""
     values, agree = line
     rest = (_inward(values, place, offset) / total)[agree]
-    return float(np.sqrt(max(np.mean(rest**2), 1.0)))
+    return float(np.sqrt(max(float(np.mean(rest**2)), 1.0)))
 
 
 def _inward(line: Array, place: Array, offset: Array) -> Array:

@@ -408,7 +408,8 @@ def _window(
     low = np.maximum(-_OUTWARD * width - 2.0, border.outermost - start)
     at = band.distance - start[:, None]
     # A pixel leaves the window as gradually as the edge moves on the grid.
-    used = ((at > low[:, None]) & np.isfinite(grey)) * np.clip(high + band.half - at, 0.0, 1.0)
+    inside: Array = np.clip(high + band.half - at, 0.0, 1.0)
+    used: Array = np.where((at > low[:, None]) & np.isfinite(grey), inside, 0.0)
     size = int(np.count_nonzero(used, axis=1).max(initial=0))
     if size < 8:
         return None

@@ -39,6 +39,8 @@ _HEIGHT = 0.45
 _REGULAR = 0.52
 """Least share of the variance along both rows that has the period of perforations in phase: 0.57 to 0.89 in
 scans that show them, at most 0.47 in pictures."""
+_WINDOW_MM = 40.0
+"""Largest width of a window through which 35 mm film with its perforations is scanned."""
 _WITHIN = 3
 """Pixels of an overview inside the lines of a frame that are not taken for its interior."""
 _VISIBLE = 0.05
@@ -105,16 +107,19 @@ def scale_by_perforations(overview: NDArray[np.float32], corners: Array) -> tupl
     left, right = int(x[1]) + _WITHIN, int(x[2]) - _WITHIN
     inner = level[max(int(y[1]) + _WITHIN, 0) : int(y[2]) - _WITHIN, max(left, 0) : right]
     for part, within in ((inner, True), (level, False)):
-        share, pitch = max(_rows_of_perforations(np.asarray(p, dtype=np.float32)) for p in (part, part.T))
+        widest = _WINDOW_MM if within else np.inf
+        planes = (np.asarray(plane, dtype=np.float32) for plane in (part, part.T))
+        share, pitch = max(_rows_of_perforations(plane, widest) for plane in planes)
         if share > _REGULAR:
             return pitch / PITCH_MM, within
     return None
 
 
-def _rows_of_perforations(grey: NDArray[np.float32]) -> tuple[float, float]:
+def _rows_of_perforations(grey: NDArray[np.float32], widest: float) -> tuple[float, float]:
     """Share of the variance along the most regular two rows that perforations explain, and their pitch.
 
-    Perforations lie opposite to each other: only what both rows have in common, in phase, speaks for them.
+    Perforations lie opposite to each other: only what both rows have in common, in phase, speaks for them. At
+    their scale the picture is at most `widest` mm wide across the rows.
     """
     height, width = grey.shape
     rest = grey - scipy.ndimage.uniform_filter1d(grey, max(3, width // _PERIODS), axis=1)
@@ -125,7 +130,7 @@ def _rows_of_perforations(grey: NDArray[np.float32]) -> tuple[float, float]:
     for k in range(4 * _PERIODS, int(4 * width / _LEAST_PITCH)):
         pitch = 4 * width / k
         away, high = round(pitch * ROWS_MM / PITCH_MM), max(1, round(_HEIGHT * pitch))
-        if not 0 < away < height - high:
+        if not 0 < away < height - high or height / pitch * PITCH_MM > widest:
             continue
         # A line of a windowed spectrum is sixteen samples wide where it is sampled four times as finely.
         line = (

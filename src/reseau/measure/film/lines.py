@@ -202,13 +202,12 @@ def adjust_lines(
         return Failure(
             "fewer than three edges of a known format, or than four of an unknown one", Code.NOT_FOUND
         )
-    bow = _BOW_PX
-    for _ in range(2):
-        fit = adjust(_problem(corners, edges, shape, bow), _APRIORI)
-        if isinstance(fit, Failure):
-            return fit
-        bow = _bow_of(fit.values[2:12:3], fit.sigma[2:12:3])
-    return _lines(fit, corners, edges, rejected)
+    first = adjust(_problem(corners, edges, shape, _BOW_PX), _APRIORI)
+    if isinstance(first, Failure):
+        return first
+    bow = _bow_of(first.values[2:12:3], first.sigma[2:12:3])
+    fit = adjust(_problem(corners, edges, shape, bow), _APRIORI)
+    return fit if isinstance(fit, Failure) else _lines(fit, corners, edges, rejected)
 
 
 @dataclass(frozen=True)
