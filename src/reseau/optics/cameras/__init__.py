@@ -10,7 +10,11 @@ registry.
 """
 
 # The order of the imports is the order of the registry.
+from . import brown, opencv, projections, telecentric, openptv, line_scan, splined, ebner, series  # isort: skip
 from .convert import convert
 from .registry import Parameter
 
 __all__ = ["Parameter", "convert"]
+
+_MODELS = brown, opencv, projections, telecentric, openptv, line_scan, splined, ebner, series
+"""What registers itself where it is imported."""
