@@ -47,12 +47,16 @@ def main() -> int:
 
     def note(job: str, cache: Path) -> None:
         found, size = seen(cache)
-        for key in jobs:
-            jobs[key].discard(job)
         for loop in found:
             jobs.setdefault(json.dumps(loop), set()).add(job)
         for module, count in size.items():
             sizes[module] = max(count, sizes.get(module, 0))
+
+    def write() -> int:
+        rows = [json.loads(key) | {"jobs": sorted(who)} for key, who in jobs.items() if who]
+        rows.sort(key=lambda row: (-sizes.get(row["function"].partition(":")[0], 0), json.dumps(row)))
+        LOOPS.write_text("[\n" + ",\n".join(map(json.dumps, rows)) + "\n]\n", encoding="utf-8")
+        return len(rows)
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -60,13 +64,13 @@ def main() -> int:
             if job in ("version", "import") or (given.only and job not in given.only):
                 continue
             cache = folder / f"compiled for {job}"
+            for key in jobs:
+                jobs[key].discard(job)
+            write()  # a job compiles first what is listed for it, called or not
             spent(code, words, ROOT, cache)
             note(job, cache)
             print(f"{job}: {len(listed(cache / 'reseau'))} loops", flush=True)
-    rows = [json.loads(key) | {"jobs": sorted(who)} for key, who in jobs.items() if who]
-    rows.sort(key=lambda row: (-sizes.get(row["function"].partition(":")[0], 0), json.dumps(row)))
-    LOOPS.write_text("[\n" + ",\n".join(map(json.dumps, rows)) + "\n]\n", encoding="utf-8")
-    print(f"{len(rows)} loops in {LOOPS.relative_to(ROOT)}")
+    print(f"{write()} loops in {LOOPS.relative_to(ROOT)}")
     return 0
 
 

@@ -132,7 +132,7 @@ def corner_images(
     parts = 4 + form.shape[1] if derivatives else 1
     images = np.empty((len(corners), parts, rows.shape[1], columns.shape[1]), np.float32)
     wanted = np.zeros((0, 1, 1), dtype=bool) if needed is None else np.ascontiguousarray(needed)
-    form = np.ascontiguousarray(form)
+    xy, sigma, form = (np.ascontiguousarray(each) for each in (xy, sigma, form))
     pixels = np.ascontiguousarray(columns), np.ascontiguousarray(rows), fill, wanted, images
     with one_thread():
         if corners.normal.shape[1] == 3:

@@ -147,7 +147,9 @@ class GrownOutline:
         place, forms, sigma = (v.astype(np.float32) for v in (xy - corner, form, width))
         # A step of an adjustment may lead to values without an image.
         finite = np.isfinite(place).all(axis=1) & np.isfinite(forms).all(axis=1) & np.isfinite(sigma)
-        outlines = self.nodes.xy, self.nodes.dxy, self.generators.astype(np.float32)
+        # Another layout would be compiled by itself.
+        nodes, tangents = (np.ascontiguousarray(each) for each in (self.nodes.xy, self.nodes.dxy))
+        outlines = nodes, tangents, self.generators.astype(np.float32)
         with one_thread():
             if finite.all():
                 formed(*outlines, at, place, forms, sigma, window.response.fill, images)
