@@ -437,7 +437,7 @@ def formats_holding(calibration: Calibration) -> tuple[str, ...]:
     --------
     >>> camera = PlainCamera("front", 640, 480, "fisheye", {"fx": 300.0, "fy": 300.0, "k1": 0.1})
     >>> formats_holding(_calibration(camera, {}))
-    ('opencv', 'ros', 'kalibr', 'colmap', 'metashape')
+    ('opencv', 'ros', 'kalibr', 'basalt', 'colmap', 'metashape')
     """
     lens = calibration.mapping()
     if not isinstance(lens, CameraMapping):

@@ -86,6 +86,7 @@ def images(mapping: Mapped, at: Array, order: int = 0) -> tuple[Array, Array, Ar
     n, degree = len(at), isqrt(2 * coefficients.shape[1]) - 1
     i, j = _exponents(degree)
     x, y, depth = matrix[:, :2] @ at.T + matrix[:, 2:]
+    depth = np.where(depth == 0, np.nan, depth)  # on the horizon is no image
     plane = np.stack([x, y]) / depth
     seen = (plane - normal[:2, None]) / normal[2]
     if not order:
