@@ -354,8 +354,11 @@ def by_rotation(uv: Array, parallel: bool = False) -> Array:
 
 
 def referred(by_rotation: Array, slope: Array, root: Array | None = None) -> Array:
-    """Derivatives (g, 2, u) without the part that a rotation explains, with roots of weights (g,)."""
-    g, flat = by_rotation.reshape(-1, 3), slope.reshape(2 * len(slope), slope.shape[2])
+    """Derivatives (g, 2, u) without the part that a rotation explains, with roots of weights (g,).
+
+    Other derivatives may stand beside those by the rotation, (g, 2, 3 and more).
+    """
+    g, flat = (each.reshape(2 * len(slope), each.shape[2]) for each in (by_rotation, slope))
     weight = np.ones((len(g), 1)) if root is None else np.repeat(root, 2)[:, None]
     part = np.linalg.lstsq(weight * g, weight * flat, rcond=None)[0]
     free: Array = (flat - g @ part).reshape(slope.shape)

@@ -25,12 +25,11 @@ from itertools import product
 
 import numpy as np
 
-from ...calibration.camera import CameraMapping, by_rotation, places
+from ...calibration.camera import CameraMapping, by_rotation, places, referred
 from ...core.data import Array, Mask, Rows
 from ...optics.cameras.registry import CameraModel
-from ...optics.mapping import PlaneMapping
 from ..solver.problem import BundleFit
-from .evidence import Effect, scores, too_large, used_rows
+from .evidence import Effect, in_camera, scores, too_large, used_rows
 
 _SIZES = np.geomspace(1e-5, 0.1, 11)
 """Root mean square displacements by the first term, in the diagonal of the image; equally probable."""
@@ -107,8 +106,12 @@ def considered(fit: BundleFit, c: int, columns: Rows, covariance: Array) -> Cons
     held = [held[k] for k in kept]
     if not held:
         return None
-    slope, own = _slopes(fit, c, mapping)
-    seen = scores(fit, [Effect(slope[:, :, held], np.where(own, 0, -1), 1)])
+    own = network.camera_of[network.image_of[used_rows(fit)]] == c
+    x, y, z = in_camera(fit)[own].T
+    uv = np.column_stack([x, y]) / (1.0 if mapping.parallel else z[:, None])
+    slope = np.zeros((len(own), 2, len(held)))
+    slope[own] = np.nan_to_num(mapping.derivatives(uv).d_parameters[:, :, held])
+    seen = scores(fit, [Effect(slope, np.where(own, 0, -1), 1)])
     # The noise of the coefficients is that of the estimates, with what the points of an image share.
     formal = fit.cofactors.reduced.block(columns, columns)
     noise = float(np.trace(np.linalg.pinv(formal, hermitian=True) @ covariance)) / len(columns)
@@ -119,19 +122,6 @@ def considered(fit: BundleFit, c: int, columns: Rows, covariance: Array) -> Cons
     side[len(at) :] += seen.g / noise
     square = _mean_square(known, side, terms, radial, float(np.hypot(camera.width, camera.height)))
     return Considered(tuple(camera.names[k] for k in held), square[len(at) :, len(at) :], seen.carried)
-
-
-def _slopes(fit: BundleFit, c: int, mapping: PlaneMapping) -> tuple[Array, Mask]:
-    """Derivatives (n, 2, u) of the used image points by the parameters of a camera, and which are its own."""
-    network, rows, values = fit.problem.network, used_rows(fit), fit.values
-    image, point = network.image_of[rows], network.point_of[rows]
-    own = network.camera_of[image] == c
-    off = values.xyz[point[own]] - values.x0[image[own]]
-    x, y, z = (values.rotation[image[own]] @ off[:, :, None])[:, :, 0].T
-    uv = np.column_stack([x, y]) / (1.0 if mapping.parallel else z[:, None])
-    found = np.zeros((len(rows), 2, len(mapping.names)))
-    found[own] = np.nan_to_num(mapping.derivatives(uv).d_parameters)
-    return found, own
 
 
 def _terms(lens: CameraMapping, model: CameraModel, order: Rows, free: int) -> tuple[Array, Mask, list[int]]:
@@ -146,17 +136,13 @@ def _terms(lens: CameraMapping, model: CameraModel, order: Rows, free: int) -> t
     seen, names = lens.mapping.derivatives(uv), lens.mapping.names
     plain = [names.index(name) for name in model.of_role("scale", "centre")]
     turn = seen.d_xy @ by_rotation(uv, lens.mapping.parallel)
-    oriented = np.concatenate([seen.d_parameters[:, :, plain], turn], axis=2).reshape(2 * len(uv), -1)
+    oriented = np.concatenate([seen.d_parameters[:, :, plain], turn], axis=2)
     slope = seen.d_parameters[:, :, order]
     across = np.column_stack([-uv[:, 1], uv[:, 0]]) / np.maximum(np.hypot(*uv.T), _NONE)[:, None]
     moved = np.linalg.solve(seen.d_xy, slope)
     beside = (np.einsum("gi,gik->gk", across, moved) ** 2).sum(axis=0)
     radial = beside < _RADIAL * (moved**2).sum(axis=(0, 1))
-    oriented = oriented / np.maximum(np.linalg.norm(oriented, axis=0), 1e-300)
-    left, size, _ = np.linalg.svd(oriented, full_matrices=False)
-    left = left[:, size > _NONE * size[0]]
-    flat = slope.reshape(2 * len(uv), -1) / np.sqrt(max(len(uv), 1))
-    flat = flat - left @ (left.T @ flat)
+    flat = referred(oriented, slope).reshape(2 * len(uv), -1) / np.sqrt(max(len(uv), 1))
     # Radial terms first: what others have of them is theirs.
     place = np.argsort(~radial, kind="stable")
     own = np.abs(np.diag(np.linalg.qr(flat[:, place], mode="r"))) > _OWN * np.linalg.norm(

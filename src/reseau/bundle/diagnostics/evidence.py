@@ -317,6 +317,14 @@ def places_seen(fit: BundleFit) -> Array:
     return np.asarray(fit.problem.network.xy[rows] + fit.residuals[: 2 * n].reshape(n, 2)[rows])
 
 
+def in_camera(fit: BundleFit) -> Array:
+    """Used points in the axes of their cameras (n, 3)."""
+    network, rows, values = fit.problem.network, used_rows(fit), fit.values
+    image = network.image_of[rows]
+    off = values.xyz[network.point_of[rows]] - values.x0[image]
+    return np.asarray((values.rotation[image] @ off[:, :, None])[:, :, 0])
+
+
 def sigma_seen(fit: BundleFit) -> Array:
     """Standard deviations (n,) of the used image points, px, mean of both coordinates."""
     cov = fit.problem.network.cov[used_rows(fit)]

@@ -42,13 +42,14 @@ def camera_mapping(
     """
     camera = result.network.cameras[c]
     names, columns, values = own_columns(result, c, additional)
+    found = camera.parameters | dict(zip(names, values.tolist(), strict=True))
     if formal:
         covariance = result.fit.cofactors.reduced.block(columns, columns) * result.fit.variance
         degrees = float("inf")
     else:
-        degrees = result.uncertainty(columns).degrees
-        names, covariance, _ = result.with_considered(c, names, columns)
-    found = camera.parameters | dict(zip(names, values.tolist(), strict=False))
+        uncertain = result.uncertainty(columns)
+        degrees = uncertain.degrees
+        names, covariance, _ = result.with_considered(c, names, columns, uncertain.covariance)
     size = (camera.width, camera.height)
     return CameraMapping.of_estimates(camera.plane_mapping(), size, found, names, covariance, dof=degrees)
 

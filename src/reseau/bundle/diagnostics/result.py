@@ -286,10 +286,10 @@ class Result(Estimated, Display):
         return found if not more else found.with_errors(np.sum(more, axis=0))
 
     def with_considered(
-        self, c: int, names: tuple[str, ...], columns: Rows
+        self, c: int, names: tuple[str, ...], columns: Rows, covariance: Array
     ) -> tuple[tuple[str, ...], Array, Array | None]:
         """Names and covariance of a camera's parameters with coefficients that were held, and their part."""
-        k, covariance, own = len(columns), self.uncertainty(columns).covariance, self._considered.get(c)
+        k, own = len(columns), self._considered.get(c)
         if own is None:
             return names, covariance, None
         part = own.errors(columns)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...core.data import Array, Mask, Rows
 from ...optics.mapping import PlaneMapping
-from ..diagnostics.evidence import Effect, places_seen, sigma_seen, used_rows
+from ..diagnostics.evidence import Effect, in_camera, places_seen, sigma_seen, used_rows
 from ..diagnostics.fields import camera_mapping
 from ..diagnostics.result import Result
 from ..diagnostics.shared import smooth_effects
@@ -103,10 +103,7 @@ class Sight:
     @cached_property
     def in_camera(self) -> Array:
         """Points in the axes of their cameras (n, 3)."""
-        values = self.result.fit.values
-        off = values.xyz[self.point] - values.x0[self.image]
-        placed: Array = (values.rotation[self.image] @ off[:, :, None])[:, :, 0]
-        return placed
+        return in_camera(self.result.fit)
 
     @cached_property
     def _slopes(self) -> tuple[Array, list[Array]]:

@@ -58,19 +58,18 @@ def calibration_of(
         )
     c = ids.index(camera)
     entry = result.network.cameras[c]
-    names, _, values = result.camera_columns(c)
+    names, columns, values = result.camera_columns(c)
     if not names:
         raise UsageError("no parameter was estimated", where=f"camera {camera}")
     found = result.camera(c)
-    columns = result.camera_columns(c)[1]
-    every, covariance, held = result.with_considered(c, names, columns)
+    uncertain = result.uncertainty(columns)
+    every, covariance, held = result.with_considered(c, names, columns, uncertain.covariance)
     sigma = dict(zip(every, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     parameters = {
         key: Quantity(value=value, sigma=sigma.get(key, 0.0), unit=entry.unit_of(key))
         for key, value in (entry.parameters | dict(zip(names, values.tolist(), strict=True))).items()
     }
-    degrees = result.uncertainty(columns).degrees
-    dof = {"degrees_of_freedom": degrees} if np.isfinite(degrees) else {}
+    dof = {"degrees_of_freedom": uncertain.degrees} if np.isfinite(uncertain.degrees) else {}
     used = result.fit.usable.observations & ~result.rejected
     xy = result.network.xy[used & (result.network.camera_of[result.network.image_of] == c)]
     targets = covariance_by_targets(result, c)
