@@ -56,7 +56,7 @@ NOT_HERE = ("tele/", "points/")
 def test_every_page_with_output_is_followed_or_named() -> None:
     shown = {page.stem for page in (DOCS / "howto").glob("*.md") if "```console" in page.read_text("utf-8")}
     followed = {*CAMERA, *ALONE, "film-frames", "micmac-and-metashape"}
-    followed |= {"measure-a-reseau", "coordinates-from-elsewhere"}
+    followed |= {"correct-your-own-instrument", "measure-a-reseau", "coordinates-from-elsewhere"}
     assert shown == followed | set(APART)
 
 
@@ -97,13 +97,16 @@ def test_pages_that_continue_the_tour_of_film(tmp_path: Path, monkeypatch: pytes
 
 
 def test_pages_that_continue_the_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the photograph of the demo's world, without its bench."""
+    """With the photographs of the demo's world, without its bench."""
     monkeypatch.chdir(tmp_path)
     world, out = World.standard(seed=1), Path("out")
     out.mkdir()
     world.design.write(out / "reseau.json")
-    write_image(out / "photo_i.png", world.photo_i().pixels)
+    world.test_object.write(out / "rods.json")
+    for name in ("photo_i", "photo_ii", "photo_iii"):
+        write_image(out / f"{name}.png", getattr(world, name)().pixels)
     follow("howto/measure-a-reseau", tmp_path)
+    follow("howto/correct-your-own-instrument", tmp_path)
     lying = ["--not-mirrored", "--max-rotation-deg", "45", "--out", "marks.csv"]
     assert run(["measure", "reseau", "out/photo_i.png", "--design", "out/reseau.json", *lying]) == 0
     follow("howto/coordinates-from-elsewhere", tmp_path)

@@ -24,6 +24,9 @@ def test_numbers_may_differ_in_the_last_digits_and_words_not() -> None:
     assert not same("fx 689.986 ± 0.021 px", "fx 589.986 ± 0.021 px")
     assert not same("12 images", "14 images")
     assert not same("usable for measurement", "not usable")
+    assert same("3 points, ...; take 10 photographs", "3 points, 4 lines; take 10 photographs")
+    assert not same("3 points, ...; take 10 photographs", "3 points, 4 lines; take 20 photographs")
+    assert not same("3 points, ...", "5 points, 4 lines")
 
 
 def test_a_bench_is_automated_and_scheduled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

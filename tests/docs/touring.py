@@ -57,12 +57,15 @@ def same(shown: str, printed: str) -> bool:
     """Whether a line was printed as the page shows it, but for numbers: in their last digit, or by a tenth.
 
     Processors round differently, and one mark more or less is measured. What is true is asked elsewhere.
+    ``...`` stands for anything.
     """
-    if shown.strip() == "...":
-        return True
-    if _NUMBER.sub("0", shown.rstrip()) != _NUMBER.sub("0", printed.rstrip()):
+    parts = [re.escape(_NUMBER.sub("0", part)) for part in shown.rstrip().split("...")]
+    if not re.fullmatch(".*".join(parts), _NUMBER.sub("0", printed.rstrip())):
         return False
-    for a, b in zip(_NUMBER.findall(shown), _NUMBER.findall(printed), strict=True):
+    left, right = (_NUMBER.findall(part) for part in (shown.partition("...")[0], shown.rpartition("...")[2]))
+    numbers = _NUMBER.findall(printed)
+    pairs = [*zip(left, numbers, strict=False), *zip(right[::-1], numbers[::-1], strict=False)]
+    for a, b in pairs:
         digits = len(a.split("e")[0].partition(".")[2]) - int(a.partition("e")[2] or 0)
         last = _UNITS * 10.0**-digits * (digits > 0 or "e" in a)
         if abs(float(a) - float(b)) > max(last, 0.1 * abs(float(a))) + 1e-12:

@@ -174,13 +174,11 @@ def verify(
     file: Annotated[Path, typer.Argument(help="Certificate: DCC (XML), or PDF in which it is embedded.")],
     schema: Annotated[
         Path | None,
-        typer.Option(envvar="RESEAU_DCC", help="Folder with dcc.xsd, what it includes, and dcc.sch, of PTB."),
+        Option("Folder with dcc.xsd, what it includes, and dcc.sch, of PTB.", environment="RESEAU_DCC"),
     ] = None,
-    without_schema: Annotated[
-        bool, typer.Option("--without-schema", help="Check neither the schema nor the rules.")
-    ] = False,
+    without_schema: Annotated[bool, Option("Check neither the schema nor the rules.")] = False,
     trust: Annotated[
-        list[Path] | None, typer.Option(help="Certificate of a trusted signer (PEM); it must be signed then.")
+        list[Path] | None, Option("Certificate of a trusted signer (PEM); it must be signed then.")
     ] = None,
     as_json: v.AsJson = False,
 ) -> None:
@@ -223,12 +221,12 @@ def uncertainty(
     ] = None,
     data: Annotated[v.Data | None, "Here temperature and further contributions."] = None,
     draws: Annotated[
-        int, typer.Option(min=0, help="Draws of Monte Carlo to compare with; at least 4000, or 0 for none.")
+        int, Option("Draws of Monte Carlo to compare with; at least 4000, or 0 for none.", least=0)
     ] = 0,
     digits: Annotated[
         int | None,
-        typer.Option(
-            min=1, max=3, help="Stop drawing when results are stable to so many digits; --draws is the most."
+        Option(
+            "Stop drawing when results are stable to so many digits; --draws is the most.", least=1, most=3
         ),
     ] = None,
     seed: v.Seed = 0,
