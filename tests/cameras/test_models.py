@@ -338,7 +338,7 @@ def network_file(case: Case, path: Path) -> tuple[networks.World, Path]:
     return world, path
 
 
-@EVERY
+@pytest.mark.parametrize("case", cases(quick=("opencv", "fisheye", "telecentric", "division")))
 def test_the_bundle_recovers_the_truth(case: Case, tmp_path: Path) -> None:
     world, path = network_file(case, tmp_path / "network.json")
     result = adjust_network(Network.from_document(Network1.read(path)))

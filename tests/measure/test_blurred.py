@@ -13,6 +13,7 @@ from reseau.core.errors import UsageError
 from reseau.core.failure import Code, Failure
 from reseau.measure.blurred import BlurredOptions, estimate_optics, measure_blurred
 from reseau.measure.blurred.estimate import EstimatedOptics
+from reseau.measure.blurred.likeness import Residuals
 from reseau.measure.blurred.measure import Moving, Varied
 from reseau.measure.blurred.shapes import RayShapes
 from reseau.measure.matching.shapes import Window
@@ -229,3 +230,11 @@ def test_photon_noise_is_not_a_wrong_lens_and_a_wrong_focus_is() -> None:
             notes.append(any("lens, focus or aperture" in str(note) for note in found.notes))
     assert sum(right) <= 3  # of 40; 2 % are expected, and more than three with a probability of 0.8 %
     assert sum(other) >= 38
+
+
+def test_the_variance_of_grey_values_is_that_of_the_residuals() -> None:
+    grey = np.tile(np.linspace(20, 200, 96), (8, 96, 1))
+    off = np.random.default_rng(0).normal(size=grey.shape) * np.sqrt(0.5 + grey / 20)
+    found = Residuals(grey, off).variance()
+    assert found is not None
+    assert found[0] + 100 * found[1] == pytest.approx(5.5, rel=0.06)

@@ -23,6 +23,7 @@ from reseau.measure import measure_board
 from reseau.measure.boards.measure import BoardOptions, BoardResult, puzzle_part
 from reseau.measure.boards.placement import numbered
 from reseau.measure.boards.single_tags import measure_tags
+from reseau.measure.boards.tags import read_tags
 from reseau.measure.plane.lattice_mapping import started
 
 from .. import kept
@@ -252,7 +253,7 @@ class Action(Wide):
     _lens = (-0.25, 0.075, -0.0003, 0.0003)
 
 
-@pytest.mark.parametrize("seed", [62, 64])
+@pytest.mark.parametrize("seed", [62, pytest.param(64, marks=pytest.mark.slow)])
 def test_a_lattice_grows_through_the_many_saddles_of_sharpened_edges_behind_a_wide_lens(seed: int) -> None:
     """Where the next corner is expected, edges have saddles that are nearer than the corner."""
     design, printed = board("chess", 9, 7, 30.0), prints.chess(9, 7, 30.0)
@@ -509,7 +510,7 @@ def test_corners_of_a_deltille_are_measured_to_their_sigmas_and_named(
     assert isinstance(chess, Failure)
 
 
-@pytest.mark.parametrize(("k", "least"), [(0, 65), (1, 22)])
+@pytest.mark.parametrize(("k", "least"), [pytest.param(0, 65, marks=pytest.mark.slow), (1, 22)])
 def test_a_deltille_seen_at_60_degrees_is_numbered(k: int, least: int) -> None:
     """The directions of its edges are then too uneven for what finds corners seen from the front."""
     _, place = pose(90 + k, DELTILLE_PRINT, nearer=1.2)
@@ -937,3 +938,14 @@ def test_rows_hidden_at_both_ends_make_the_names_of_a_chessboard_uncertain(tone:
     pixels[: int(rows[0] + rows[1]) // 2] = tone
     found = measured_part(replace(frame, pixels=pixels), CHESS)
     assert np.abs(renamed(found, truth)).max() < 0.05
+
+
+def test_tags_are_read_where_ink_is_as_light_as_half_the_paper() -> None:
+    words = np.ones((2, 6, 6), dtype=np.bool_)
+    words[:, 1:5, 1:5] = np.random.default_rng(0).random((2, 4, 4)) < 0.5
+    grey = np.full((100, 100), 200, np.float32)
+    grey[20:80, 20:80] -= 100 * np.kron(words[1], np.ones((10, 10), np.float32))
+    square = 19.5 + 60 * np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
+    index, corners = read_tags(grey, np.roll(square, 1, axis=1), words, 1, 0)
+    assert index.tolist() == [1]
+    np.testing.assert_array_equal(corners, square)

@@ -45,13 +45,13 @@ def covered(result: FrameResult, frame: FilmFrame) -> bool:
 @pytest.mark.parametrize(
     "frame",
     [
-        FilmFrame(1),
-        FilmFrame(2, tilt_deg=14.0, beside=BUSY),
         FilmFrame(3, tilt_deg=-14.0, mirrored=True, format=HASSELBLAD, dpi=400),
         FilmFrame(4, negative=True, beside=BUSY),
         *(
             pytest.param(frame, marks=pytest.mark.slow)
             for frame in (
+                FilmFrame(1),
+                FilmFrame(2, tilt_deg=14.0, beside=BUSY),
                 FilmFrame(5, beside=Beside(lines=1)),
                 FilmFrame(6, beside=Beside(rods=1)),
                 FilmFrame(7, beside=Beside(blown=True)),
@@ -120,8 +120,10 @@ def test_a_bright_line_that_leaves_the_edge_is_told_from_it_or_stated() -> None:
 
 @pytest.mark.parametrize(
     "frame",
-    [FilmFrame(320006, beside=Beside(lines=2)), FilmFrame(320023, contrast=0.5, beside=Beside(lines=2))],
-    ids=["contrast 0.7", "contrast 0.5"],
+    [
+        pytest.param(FilmFrame(320006, beside=Beside(lines=2)), id="contrast 0.7", marks=pytest.mark.slow),
+        pytest.param(FilmFrame(320023, contrast=0.5, beside=Beside(lines=2)), id="contrast 0.5"),
+    ],
 )
 def test_lines_beside_two_edges_are_not_taken_for_a_scan_that_is_less_sharp_there(frame: FilmFrame) -> None:
     result = oriented(frame)  # corners were wrong by 3 px and 5 px, with sigmas of 0.1 px
@@ -195,7 +197,9 @@ def test_an_edge_hidden_by_a_line_is_no_unflagged_error_with_the_shape_of_its_ro
     "frame",
     [
         FilmFrame(6002, blur_px=1.5, noise=0.5, grain=0.5),  # its lower edge was found 1.5 px outside
-        FilmFrame(6003, dpi=1200, blur_px=2.5),  # a picture's forms were taken for a line along the edge
+        pytest.param(
+            FilmFrame(6003, dpi=1200, blur_px=2.5), marks=pytest.mark.slow
+        ),  # a picture's forms were taken for a line along the edge
         FilmFrame(1019, grain=10.0),  # the steps of its darkest edge were looked for beside them
     ],
     ids=["hardly noise", "fine", "grain"],

@@ -98,7 +98,7 @@ def test_lines_are_not_looked_for_where_markers_are_read(tried: list[str]) -> No
     assert tried == ["mine", "mine"]
 
 
-@pytest.mark.parametrize("start", [(100, 7), (333, 492)])
+@pytest.mark.parametrize("start", [pytest.param((100, 7), marks=pytest.mark.slow), (333, 492)])
 def test_a_puzzleboard_is_found_by_the_parts_that_photographs_show(start: tuple[int, int]) -> None:
     signs = dot_signs(board("puzzle", 12, 9, 22.0, start=start))
     bits = signs[1::2, 2:-1:2].T > 0, signs[2:-1:2, 1::2].T > 0

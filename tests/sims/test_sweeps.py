@@ -39,7 +39,7 @@ def alone(world: World) -> tuple[str, ...]:
     return tuple(name for name in world.test_object.ids if name[0] in ROWS)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("display", ["wong", "polynomial"])
 def test_middles_of_arcs_are_at_their_true_positions(seed: int, display: str) -> None:
     world = quiet(World.standard(seed, display=display))  # type: ignore[arg-type]

@@ -444,6 +444,7 @@ def test_an_instrument_that_was_silent_is_connected_when_it_answers(rig: Rig, tm
             assert check["sonar"] is None
 
 
+@pytest.mark.slow
 def test_a_defect_of_a_driver_is_an_answer_and_a_crash_restarts_the_worker(one: Served, rig: Rig) -> None:
     client = one.client("operate")
     pid = one.service.benches["cellar"].status["pid"]
