@@ -103,6 +103,7 @@ def test_the_cause_is_named_first(code: str, changes: dict[str, float]) -> None:
     assert found.sound == (code == "noise")
 
 
+@pytest.mark.slow
 def test_what_a_cause_explains_is_stated_in_pixels() -> None:
     found = calibrated(world(noise=1.0, focus=3.0)).explanation.causes[0]
     rms = np.sqrt(np.mean(calibrated(world(focus=3.0)).result.residuals ** 2))

@@ -125,6 +125,7 @@ def test_a_real_wide_lens_ends_in_the_same_place_from_cold_and_warm(outliers: An
         assert cameras[0].values[0] == pytest.approx(560.04, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA.exists(), reason="needs the networks of RESEAU_DATA")
 def test_rejection_works_where_the_plain_adjustment_does() -> None:
     """Published network: sigma0 1.094 of plain least squares, of images 8 to 41."""

@@ -175,6 +175,7 @@ def test_bad_input_is_reported_with_a_remedy(
     assert not list(out_folder.glob("*-marked.tif"))
 
 
+@pytest.mark.slow
 def test_without_a_resolution_tag_the_scale_is_that_of_the_format(tmp_path: Path, reseau: Run) -> None:
     tifffile.imwrite(tmp_path / "untagged.tif", FilmFrame(0, dpi=300).scan())
     status, out, _ = reseau("orient", tmp_path / "untagged.tif", "--format-mm", "36x24", "--json")

@@ -213,6 +213,7 @@ def test_errors_are_as_large_as_sigmas_say() -> None:
     assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.2
 
 
+@pytest.mark.slow
 def test_photon_noise_is_not_a_wrong_lens_and_a_wrong_focus_is() -> None:
     view, at = ThinLens(50.0, 12.5, 52.9, SensorPlane((0.01, 0.01), (40.0, 40.0))), np.arange(81.0)
     wrong = replace(view, image_distance=52.95)

@@ -201,8 +201,8 @@ def test_few_large_marks_through_a_lens_have_the_sigmas_of_their_errors(
     ("design", "printed", "wide", "seed", "nearer"),
     [
         (CLOSE, CLOSE_PRINT, True, 51, 1.7),
-        (CLOSE, CLOSE_PRINT, True, 52, 1.7),
-        (CLOSE, CLOSE_PRINT, False, 111, 2.6),
+        pytest.param(CLOSE, CLOSE_PRINT, True, 52, 1.7, marks=pytest.mark.slow),
+        pytest.param(CLOSE, CLOSE_PRINT, False, 111, 2.6, marks=pytest.mark.slow),
         (board("circles", 9, 7, 25.0, size=12.0), prints.circles(9, 7, 25.0, 12.0), False, 110, 2.6),
     ],
 )
@@ -914,6 +914,7 @@ def test_corners_towards_a_margin_where_all_are_less_sharp_are_measured() -> Non
     assert np.sqrt((renamed(found, truth) ** 2).mean()) < 0.02
 
 
+@pytest.mark.slow
 def test_corners_across_which_edges_of_shadows_run_are_measured_or_declined() -> None:
     printed = prints.aprilgrid(6, 6, 22.0, 0.3, "DICT_APRILTAG_36h11", 2)
     view = View(printed, *pose(7, printed, 40.0), seed=7, noise=1.0, shade=0.8)
@@ -926,7 +927,9 @@ def test_corners_across_which_edges_of_shadows_run_are_measured_or_declined() ->
     assert 0.75 < over_sigmas(found, error) < 1.2
 
 
-@pytest.mark.parametrize("tone", [30, 125, 210], ids=["dark", "grey", "as paper"])
+@pytest.mark.parametrize(
+    "tone", [pytest.param(30, marks=pytest.mark.slow), 125, 210], ids=["dark", "grey", "as paper"]
+)
 def test_rows_hidden_at_both_ends_make_the_names_of_a_chessboard_uncertain(tone: int) -> None:
     """Where one end is seen, the other one is known; nothing else tells whether the pattern goes on."""
     frame, truth = picture(CHESS, 0.0, 0.0)

@@ -135,7 +135,11 @@ def test_the_curve_that_a_file_states_is_used_unless_targets_contradict_it(gamma
 
 
 @pytest.mark.parametrize(
-    ("farther", "station", "read"), [(2.6, Station(30), 35), (3.0, Station(45), 0)], ids=["140 px", "97 px"]
+    ("farther", "station", "read"),
+    [
+        pytest.param(2.6, Station(30), 35, id="140 px", marks=pytest.mark.slow),
+        pytest.param(3.0, Station(45), 0, id="97 px"),
+    ],
 )
 def test_a_small_field_whose_lines_cannot_be_seen_is_read_by_its_targets(
     farther: float, station: Station, read: int
@@ -289,7 +293,7 @@ def test_a_testfield_is_found_beside_a_larger_one_whose_code_begins_alike() -> N
     np.testing.assert_allclose(found.xy - [frames[0].shape[1], 0], alone.xy, rtol=0, atol=0.01)
 
 
-@pytest.mark.parametrize("condition", ["gamma", "sharpened", "jpeg60"])
+@pytest.mark.parametrize("condition", [pytest.param("gamma", marks=pytest.mark.slow), "sharpened", "jpeg60"])
 def test_cameras_that_process_their_pictures_leave_sigmas_of_the_size_of_errors(condition: str) -> None:
     """Residuals are then larger than noise, but displace targets less."""
     design = coded_testfield()
