@@ -75,7 +75,7 @@ def test_a_target_that_is_held_wrongly_does_not_choose_the_model_of_the_lens() -
     assert found.explanation.causes[0].code == "target-scale"
 
 
-@pytest.mark.parametrize("target", ["flat", "free"])
+@pytest.mark.parametrize("target", [pytest.param("flat", marks=pytest.mark.slow), "free"])
 def test_nothing_is_wrong_in_sound_networks(target: str) -> None:
     found = [calibrated(world(seed=seed), target).explanation for seed in range(2)]
     assert [each.causes for each in found] == [()] * 2

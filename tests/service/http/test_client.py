@@ -115,6 +115,7 @@ def test_events_are_resumed_after_a_restart_of_the_service(archived: Path, tmp_p
     assert ("reset", "") in found
 
 
+@pytest.mark.slow
 def test_the_service_is_ready_in_less_than_3_s_of_processor_time(tmp_path: Path) -> None:
     import psutil
 
