@@ -253,20 +253,19 @@ def a_year(job: tuple[str, float, int]) -> tuple[float, float, float, float, flo
     }[kind]  # fmt: skip
     values = rng.normal(size=(WEEKS, 4)) + drift[:, None] * direction
     values -= values[0]
-    in_force, runs, missed, false, sound = 0, [0], False, 0, list[bool]()
+    in_force, rejects, missed, false, sound = 0, np.zeros(WEEKS, dtype=bool), False, 0, list[bool]()
     first = announced = np.nan
     for week in range(1, WEEKS):
-        rows, true = [*runs, week], abs(drift[week])
+        rows, true = np.arange(week + 1), abs(drift[week])
         covs = np.repeat(np.eye(4)[None], len(rows), axis=0)
         said = explain_runs(
-            RunHistory(7.0 * np.array(rows), values[rows], covs, basis), 1.0, runs.index(in_force)
+            RunHistory(7.0 * rows, values[rows], covs, basis, rejected=rejects[rows]), 1.0, in_force
         )
         changed = said.held(1.0, step=True)
         rejected = changed and said.p < 0.01
         held = changed or said.held(1.0)
         sound.append(not held and said.p >= 0.01 and said.beyond(0.5) <= 0.5)
-        if not rejected:
-            runs.append(week)
+        rejects[week] = rejected
         if held:
             first = true if np.isnan(first) else first
             false += true < 1 - 2 * SIGMA

@@ -7,7 +7,7 @@ began, are unknown; what is said of the present drift is the mean over all of th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -47,6 +47,8 @@ class RunHistory:
         Differences at places of the image by the coordinates.
     outside : float
         Largest difference of the last run from the reference that no coordinate describes.
+    rejected : ndarray of bool (n,), optional
+        Runs that were rejected: either each has an error of its own, or the instrument changed as they say.
     """
 
     days: Array
@@ -54,9 +56,10 @@ class RunHistory:
     covs: Array
     basis: Array
     outside: float = 0.0
+    rejected: Array | None = None
 
     @classmethod
-    def of(cls, days: Array, offs: Array, roots: list[Array]) -> RunHistory:
+    def of(cls, days: Array, offs: Array, roots: list[Array], rejected: Array) -> RunHistory:
         """Reduce differences (n, m, 2) from the reference, with roots (m, 2, k) of the covariance of each."""
         known = np.isfinite(offs).all(axis=(0, 2)) & np.array(
             [np.isfinite(each).all(axis=(1, 2)) for each in roots]
@@ -71,7 +74,14 @@ class RunHistory:
         scaled = [u.T @ each / s[:, None] for each in own]
         covs = np.array([each @ each.T for each in scaled]) + 1e-6 * np.eye(len(s))
         rest = np.hypot(*(flat[-1] - u @ (s * values[-1])).reshape(-1, 2).T)
-        return cls(days, values, covs, (u * s).reshape(-1, 2, len(s)), float(rest.max()))
+        return cls(days, values, covs, (u * s).reshape(-1, 2, len(s)), float(rest.max()), rejected)
+
+    def without(self, rows: Array) -> RunHistory:
+        """Return the runs without some of them."""
+        keep = ~rows
+        return replace(
+            self, days=self.days[keep], values=self.values[keep], covs=self.covs[keep], rejected=None
+        )
 
     def mean(self) -> tuple[Array, Array, float]:
         """Precisions (n, r, r), the mean of the runs, and the weighted squares of what deviates from it."""
@@ -79,6 +89,30 @@ class RunHistory:
         weighted = np.einsum("nij,nj->ni", precision, self.values)
         mean = np.linalg.solve(precision.sum(axis=0), weighted.sum(axis=0))
         return precision, mean, float(((self.values - mean) * weighted).sum())
+
+    def evidence(self) -> Array:
+        """Log likelihoods of the runs without a change, for each scale of their errors."""
+        (n, r), (precision, _, squares) = self.values.shape, self.mean()
+        log = -0.5 * squares / _SCALES**2 - (n - 1) * r * np.log(_SCALES * np.sqrt(2 * np.pi))
+        size = np.linalg.slogdet(precision)[1].sum() - np.linalg.slogdet(precision.sum(axis=0))[1]
+        found: Array = log + 0.5 * size - np.log(_HOLD) * np.arange(len(_SCALES))
+        return found
+
+    def spreads(self, limit: float) -> Array:
+        """Deviations (2, r) of a change of rms `limit`: as large in every coordinate of the field, or as errors."""
+        r = self.values.shape[1]
+        rms = np.sqrt(np.square(self.basis).sum(axis=(0, 1)) / len(self.basis))
+        return limit * np.array([1 / (rms * np.sqrt(r)), np.full(r, 1 / np.sqrt(np.square(rms).sum()))])
+
+    def own_errors(self, rows: Array, base: Array, limit: float) -> Array:
+        """Log likelihoods of some runs by an error of each of them, for each scale of the other errors."""
+        off, wide = self.values[rows] - base, np.square(self.spreads(limit))[:, :, None] * np.eye(len(base))
+        cov = np.square(_SCALES)[:, None, None, None, None, None] * self.covs[rows][:, None, None]
+        cov = cov + np.square(_WIDTHS)[:, None, None] * wide[:, None]
+        square = np.einsum("sjatik,ji,jk->sjat", np.linalg.inv(cov), off, off)
+        log = -0.5 * (square + np.linalg.slogdet(2 * np.pi * cov)[1])
+        found: Array = scipy.special.logsumexp(log, axis=(2, 3)).sum(axis=1)
+        return found - len(off) * np.log(2 * len(_WIDTHS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +163,8 @@ class History:
         return _LOSS * above > below
 
     def creeps(self, size: float) -> bool:
-        """Return whether the instrument has drifted by a size, and rather by creeping than at once."""
-        return self.creeping > self.changed and self.beyond(size) > _MORE_LIKELY
+        """Return whether the instrument has drifted by a size, and rather little by little than at once."""
+        return self.creeping + self.seasonal > self.changed and self.beyond(size) > _MORE_LIKELY
 
     def size(self, *, step: bool = False) -> tuple[float, float]:
         """Return the drift since the reference (or the step) and its standard deviation."""
@@ -161,17 +195,17 @@ def explain_runs(runs: RunHistory, limit: float, in_force: int) -> History:
     >>> round(found.changed, 2), round(found.beyond(0.5), 2)
     (1.0, 1.0)
     """
-    (n, r), days = runs.values.shape, runs.days - runs.days[0]
-    common = -0.5 * runs.mean()[2] / _SCALES**2 - (n - 1) * r * np.log(_SCALES)
-    common -= np.log(_HOLD) * np.arange(len(_SCALES))
-    found = [_Supposed.stable(common)]
-    for kind, (shapes, slopes) in _profiles(days).items():
-        found.append(_supposed(kind, shapes, slopes, runs, limit, common, in_force))
+    found = _all_supposed(runs, runs.evidence(), limit, in_force)
+    if runs.rejected is not None and runs.rejected.any():
+        others, now_in_force = runs.without(runs.rejected), in_force - int(runs.rejected[:in_force].sum())
+        common = others.evidence() + runs.own_errors(runs.rejected, others.mean()[1], limit)
+        found += _all_supposed(others, common, limit, now_in_force)
     log = np.concatenate([each.log for each in found])
     weights = np.exp(log - log.max())
     weights /= weights.sum()
     kinds = np.repeat([each.kind for each in found], [len(each.log) for each in found])
     stable, creeps, changed, seasonal = (float(weights[kinds == each].sum()) for each in range(4))
+    n, r = runs.values.shape
     scale = float(weights @ np.concatenate([each.scale for each in found])) if n > 2 else 1.0
     off = runs.values[-1] - runs.values[in_force]
     statistic = off @ np.linalg.solve(runs.covs[-1] + runs.covs[in_force], off) / scale**2
@@ -204,6 +238,13 @@ class _Supposed:
         return cls(0, common, _SCALES, none, none, none[0])
 
 
+def _all_supposed(runs: RunHistory, common: Array, limit: float, in_force: int) -> list[_Supposed]:
+    """All kinds of models; `common` are the log likelihoods without a change, for each scale."""
+    profiles = _profiles(runs.days - runs.days[0]).items()
+    changed = [_supposed(kind, *each, runs, limit, common, in_force) for kind, each in profiles]
+    return [_Supposed.stable(common), *changed]
+
+
 def _supposed(
     kind: int, shapes: Array, slopes: Array, runs: RunHistory, limit: float, common: Array, in_force: int
 ) -> _Supposed:
@@ -215,9 +256,7 @@ def _supposed(
     both = np.einsum("kpn,kqn,nij->kpiqj", shapes, shapes, precision)
     both -= np.einsum("kpia,ab,kqbj->kpiqj", one, np.linalg.inv(precision.sum(axis=0)), one)
     right = np.einsum("kpn,ni->kpi", shapes, weighted)
-    rms = np.sqrt(np.square(runs.basis).sum(axis=(0, 1)) / len(runs.basis))
-    # A change of rms `limit` over the image: as large in every coordinate of the field, or as errors are.
-    sigma = limit * np.array([1 / (rms * np.sqrt(r)), np.full(r, 1 / np.sqrt(np.square(rms).sum()))])
+    sigma = runs.spreads(limit)
     scaled = np.einsum("ai,kpiqj,aj->akpiqj", sigma, both, sigma).reshape(2, k, p * r, p * r)
     known, u = np.linalg.eigh(scaled)
     h = np.einsum("akji,akj->aki", u, np.einsum("ai,kpi->akpi", sigma, right).reshape(2, k, p * r))

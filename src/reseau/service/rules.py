@@ -37,6 +37,8 @@ from .fields import change, difference
 
 Outcome = Literal["accepted", "accepted with warning", "rejected", "needs review"]
 Level = Literal["ok", "warning", "action"]
+PastRun = tuple[datetime, Calibration, bool]
+"""Time of a run, its calibration, and whether it was rejected."""
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _RESOLVED = 2.0
@@ -158,7 +160,7 @@ def judge(
     new: Calibration,
     in_force: Calibration | None,
     rules: AcceptanceRules,
-    history: Sequence[tuple[datetime, Calibration]] = (),
+    history: Sequence[PastRun] = (),
     at: datetime | None = None,
 ) -> Judgement:
     """Judge a new calibration by the rules.
@@ -171,8 +173,9 @@ def judge(
         The one in force, if there is one.
     rules : AcceptanceRules
         The rules.
-    history : sequence of (datetime, Calibration)
-        Runs from the reference on, in the order of their times, with the calibration in force among them.
+    history : sequence of (datetime, Calibration, bool)
+        Runs from the reference on, in the order of their times, with the calibration in force among them;
+        and whether each was rejected.
     at : datetime, optional
         Time of the new calibration, after them.
 
@@ -203,10 +206,10 @@ def judge(
     if new.kind == "camera" and new.model != in_force.model:
         findings.append(_of_models(new, in_force, rules))
     found = difference(new, in_force)
-    runs = [*history] if history and at else [(_EPOCH, in_force)]
+    runs = [*history] if history and at else [(_EPOCH, in_force, False)]
     now = at if history and at else _EPOCH + timedelta(weeks=1)
     total = rules.total or rules.image
-    own = next(k for k, (_, each) in enumerate(runs) if each == in_force)
+    own = next(k for k, (_, each, _) in enumerate(runs) if each == in_force)
     known = _history(new, runs, now)
     said = explain_runs(known, total.action, own)
     sizes = [_step(said, known.outside, found.greatest, found.unit, rules.image)]
@@ -261,14 +264,15 @@ def _worst(*levels: Level) -> Level:
     return max(levels, key=order.index)
 
 
-def _history(new: Calibration, runs: Sequence[tuple[datetime, Calibration]], now: datetime) -> RunHistory:
+def _history(new: Calibration, runs: Sequence[PastRun], now: datetime) -> RunHistory:
     """The runs and the new calibration, as differences from the first."""
     reference = runs[0][1]
-    changes = [change(each, reference) for each in (*(each for _, each in runs), new)]
-    days = np.array([(time - runs[0][0]).total_seconds() / 86400 for time in (*(t for t, _ in runs), now)])
+    changes = [change(each, reference) for each in (*(each for _, each, _ in runs), new)]
+    days = np.array([(time - runs[0][0]).total_seconds() / 86400 for time in (*(t for t, _, _ in runs), now)])
     # Runs of one moment follow each other.
     days = np.maximum.accumulate(days) + 1e-6 * np.arange(len(days))
-    return RunHistory.of(days, np.array([each.off for each in changes]), [each.root for each in changes])
+    return RunHistory.of(days, np.array([each.off for each in changes]), [each.root for each in changes],
+                         np.array([*(each for _, _, each in runs), False]))  # fmt: skip
 
 
 def _level(said: History, limits: Limits, *, step: bool) -> Level:

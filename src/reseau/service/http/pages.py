@@ -18,7 +18,7 @@ from ...core.errors import ReseauError
 from ...core.options import Declared, Group, options_of
 from ...core.vocabulary import names
 from ...io.photographs import PHOTOGRAPHS
-from . import accounts, benches, calibrations, comparisons, history, operations, sessions
+from . import accounts, benches, calibrations, comparisons, history, operations, orders, sessions
 from .access import Administering, Here, NotFound, Reading, Unknown, csrf_of, principal_of, service_of
 from .service import Service
 
@@ -196,6 +196,7 @@ def bench_page(request: Request, bench: str, who: Reading, service: Here) -> Res
         settings=settings,
         axes=axes,
         busy=busy,
+        queue=orders.orders(bench, who, service),
         plans={
             plan: _PlanForm.of(kind)
             for plan, kind in reversed(list(kinds.KINDS.items()))
