@@ -99,7 +99,7 @@ class RunHistory:
         return found
 
     def spreads(self, limit: float) -> Array:
-        """Deviations (2, r) of a change of rms `limit`: as large in every coordinate of the field, or as errors."""
+        """Sizes (2, r) of a change of rms `limit`: equal in all coordinates of the field, or as of errors."""
         r = self.values.shape[1]
         rms = np.sqrt(np.square(self.basis).sum(axis=(0, 1)) / len(self.basis))
         return limit * np.array([1 / (rms * np.sqrt(r)), np.full(r, 1 / np.sqrt(np.square(rms).sum()))])

@@ -51,13 +51,15 @@ class Recalibration(Document):
     rules : dict
         ``reseau-acceptance/1``.
     warm_up_minutes : float
-        Time from the connection of the instruments to the first frame.
+        Time for which instruments warm up before the first frame (min).
     self_test : bool
-        Whether the instruments test themselves before it.
+        Test the instruments before it.
     certificate : dict, optional
         Data of the certificate of a calibration that is accepted, ``reseau-certificate/1``.
-    notify, inside : tuple of str
-        Where the outcome is sent, as by `reseau alarms send`.
+    notify : tuple of str
+        Where the outcome is sent: URLs of apprise.
+    inside : tuple of str
+        Networks inside to which it may be sent, such as 192.168.1.0/24.
 
     Examples
     --------

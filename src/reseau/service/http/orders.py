@@ -10,7 +10,7 @@ from pydantic import Field
 from ...core.errors import UsageError
 from ..accounts import Principal
 from ..orders import Order, Orders
-from .access import Here, Operating, Reading
+from .access import Administering, Here, Operating, Reading
 from .answers import Answer, Done, Instant, refusals
 from .benches import BenchName, NewSession, the_bench
 from .service import Service
@@ -53,6 +53,22 @@ class Queue(Answer):
     recalibrations: list[str] = Field(description="Recalibrations of this bench.")
 
 
+class Definition(
+    Answer, json_schema_extra={"example": {"name": "left", "session": "monday", "configuration": "left"}}
+):
+    """What a recalibration repeats, and what it does besides; rules are by default the last ones."""
+
+    name: str = Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00-\x1f.][^/\\\x00-\x1f]*$")
+    session: str = Field(max_length=200)
+    configuration: str = Field(max_length=200)
+    rules: dict[str, Any] | None = None
+    warm_up_minutes: float = Field(default=0.0, ge=0, le=1440)
+    self_test: bool = False
+    certificate: dict[str, Any] | None = None
+    notify: list[Annotated[str, Field(max_length=500)]] = Field(default_factory=list, max_length=10)
+    inside: list[Annotated[str, Field(max_length=50)]] = Field(default_factory=list, max_length=10)
+
+
 class NewRecalibration(Answer, json_schema_extra={"example": {"name": "left"}}):
     """A recalibration to carry out."""
 
@@ -69,6 +85,13 @@ def _queue(service: Service, bench: str) -> Orders:
     return Orders(service.archive, the_bench(service, bench).name)
 
 
+def every_recalibration(service: Service) -> list[str]:
+    """Return the recalibrations of the archive."""
+    from ..recalibration import Recalibrations
+
+    return service.current("recalibrations", lambda: Recalibrations(service.archive).names())
+
+
 def recalibrations_of(service: Service, bench: str) -> list[str]:
     """Return the recalibrations that a bench can carry out."""
     from ..recalibration import Recalibrations
@@ -79,6 +102,34 @@ def recalibrations_of(service: Service, bench: str) -> list[str]:
         return [each for each in known.names() if known.get(each).bench == text]
 
     return service.current(f"recalibrations {bench}", compute)
+
+
+@router.get("/recalibrations")
+def recalibrations(who: Reading, service: Here) -> list[str]:
+    """Recalibrations of the archive."""
+    return every_recalibration(service)
+
+
+@router.post("/recalibrations", status_code=201)
+def define(given: Definition, who: Administering, service: Here) -> Done:
+    """Define what a recalibration repeats, or change it."""
+    from ..recalibration import Recalibrations
+    from ..rules import AcceptanceRules
+    from .calibrations import rules_of, the_configuration
+    from .sessions import the_session
+
+    the_configuration(service, given.configuration)
+    rules = given.rules or rules_of(service, given.configuration)
+    if rules is None:
+        raise UsageError("has no rules yet", where=given.configuration, do="judge a calibration first")
+    steps = given.model_dump(exclude={"name", "session", "configuration", "rules"})
+    steps |= {each: tuple(steps[each]) for each in ("notify", "inside")}
+    with service.audited(who, "define recalibration", given.name, {"session": given.session}):
+        Recalibrations(service.archive).define(
+            given.name, the_session(service, given.session), given.configuration,
+            AcceptanceRules.from_content(rules, where="rules"), **steps,
+        )  # fmt: skip
+    return Done(done="defined")
 
 
 @router.get("/benches/{bench}/orders")
