@@ -268,13 +268,18 @@ def _supposed(
     log = log + common[:, None] - np.log(2 * k * len(_WIDTHS))
     to_field = u.reshape(2, k, p, r, p * r)
 
-    def of(part: Array) -> Array:
-        """Fields at now of parts (k, p) of the changes."""
-        return np.einsum("mci,ai,kp,akpij->akmcj", runs.basis, sigma, part, to_field)
+    def sizes(part: Array) -> Array:
+        """Largest changes over the image, and their standard deviations, of parts (k, p) of the functions."""
+        fields = np.einsum("mci,ai,kp,akpij->akmcj", runs.basis, sigma, part, to_field, optimize=True)
+        return _greatest(fields, mean, cov)
 
-    total = _greatest(of(shapes[:, :, -1]), mean, cov)
-    step = _greatest(of(shapes[:, :, -1] - shapes[:, :, in_force]), mean, cov)
-    slope = _greatest(of(slopes), mean, cov)[0]
+    now = shapes[:, :, -1]
+    if p == 1:  # what is said of one function is in proportion
+        total, count = sizes(now), len(_SCALES) * len(_WIDTHS)
+        step = total * np.tile(np.repeat(np.abs(now - shapes[:, :, in_force])[:, 0], count), 2)
+        slope = total[0] * np.tile(np.repeat(slopes[:, 0], count), 2)
+    else:
+        total, step, slope = sizes(now), sizes(now - shapes[:, :, in_force]), sizes(slopes)[0]
     scale = np.broadcast_to(_SCALES[:, None], log.shape).ravel()
     return _Supposed(kind, log.ravel(), scale, total, step, slope)
 
@@ -298,15 +303,14 @@ def _profiles(days: Array) -> dict[int, tuple[Array, Array]]:
 
 def _greatest(fields: Array, mean: Array, cov: Array) -> Array:
     """Largest length over the image of changes, and its standard deviation (2, …)."""
-    there = np.einsum("akmcj,akstj->akstmc", fields, mean)
-    size = np.hypot(there[..., 0], there[..., 1])
-    where = np.argmax(size, axis=-1)
-    most = np.take_along_axis(size, where[..., None], axis=-1)[..., 0]
-    a, k = np.ogrid[: fields.shape[0], : fields.shape[1]]
-    rows = fields[a[..., None, None], k[..., None, None], where]
-    along = (
-        np.take_along_axis(there, where[..., None, None], axis=-2)[..., 0, :]
-        / np.maximum(most, 1e-300)[..., None]
-    )
-    by = np.einsum("akstcj,akstc->akstj", rows, along)
-    return np.array([most.ravel(), np.sqrt((by**2 * cov).sum(axis=-1)).ravel()])
+    a, k, m, _, j = fields.shape
+    flat, of = mean.reshape(a, k, -1, j), fields.reshape(a, k, 2 * m, j)
+    there = (flat @ of.swapaxes(2, 3)).reshape(a, k, -1, m, 2)
+    square = np.square(there).sum(axis=-1)
+    where = np.argmax(square, axis=-1)[..., None]
+    most = np.sqrt(np.take_along_axis(square, where, axis=-1))
+    along = np.take_along_axis(there, where[..., None], axis=-2)[..., 0, :] / np.maximum(most, 1e-300)
+    rows = fields[np.arange(a)[:, None, None], np.arange(k)[:, None], where[..., 0]]
+    by = (rows * along[..., None]).sum(axis=-2)
+    sigma = np.sqrt((np.square(by) * cov.reshape(a, k, -1, j)).sum(axis=-1))
+    return np.array([most.ravel(), sigma.ravel()])

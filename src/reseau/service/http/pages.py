@@ -171,7 +171,7 @@ def _first_steps(
          f"/calibrations/{quote(configurations[0].name)}" if configurations else "/calibrations"),
         (any(each.in_force for each in configurations), "Accept it as the reference, from which drift counts",
          "/history"),
-        (bool(orders.every_recalibration(service)), "Define the recalibration that repeats the session", "/history"),
+        (bool(orders.every_recalibration(service)), "Define the recalibration that repeats it", "/history"),
         (scheduled, "Add its schedule", "/history"),
     ]  # fmt: skip
     return [] if all(done for done, _, _ in steps) else steps
