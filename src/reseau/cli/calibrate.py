@@ -228,7 +228,7 @@ def calibrate(
     row_jitter_px: v.RowJitterPx = 0.0,
     fill: v.Fill = 1.0,
     against: Annotated[
-        list[Path] | None, typer.Option(help="Calibration of the same camera to compare with; repeatable.")
+        list[Path] | None, Option("Calibration of the same camera to compare with; repeatable.")
     ] = None,
     distance: v.Distance | None = None,
     as_json: v.AsJson = False,
