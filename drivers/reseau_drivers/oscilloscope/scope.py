@@ -226,8 +226,11 @@ class Oscilloscope(Device[OscilloscopeSettings]):
             try:
                 volts = samples_of(data, dialect, scale)
                 start, step = float(dialect.start(scale)), float(dialect.step(scale))
+                one, two = (dialect.volts({**scale, "code": code}) for code in (0.0, 1.0))
             except ZeroDivisionError:
-                raise ProtocolError("the waveform has no extent in time") from None
+                one = two = step = 0.0
+            if not step > 0 or one == two:
+                raise ProtocolError(f"the waveform has no extent in {'volts' if step > 0 else 'time'}")
             return Waveform(volts, start, step, channel, asked)
 
     def _samples(

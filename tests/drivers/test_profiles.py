@@ -1,0 +1,191 @@
+"""Profiles of oscilloscopes and the fakes of ``transcripts.toml``: pictures, waveforms, faults, and their files."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import reseau_drivers.oscilloscope.dialects as dialects
+from reseau.core.errors import FormatError, InputError, InstrumentError, ProtocolError, SettingError
+from reseau_drivers.link import SerialLink
+from reseau_drivers.oscilloscope import DIALECTS, Oscilloscope, oscilloscope
+from reseau_drivers.oscilloscope.dialects import Formula, described, dialect_named, read_profiles
+
+from .fakes import Lines, Screen, Spoiled, Transcript, Wire, transcripts
+
+TOLD = transcripts()
+PROFILES = sorted((Path(dialects.__file__).parent / "profiles").glob("*.toml"))
+
+
+def opened(told: dict[str, Any], wire: Wire, **options: Any) -> Oscilloscope:
+    """The driver of an instrument; one that does not identify itself is named."""
+    named = {} if told["identity"] else {"dialect": told["profile"]}
+    return oscilloscope("scope", wire, **{"seconds": 0.5} | named | options)
+
+
+@pytest.mark.parametrize("told", TOLD, ids=lambda told: told["identity"].split(",")[1] if told["identity"] else "-")
+def test_screens_and_waveforms_are_those_of_the_instrument(told: dict[str, Any]) -> None:
+    fake = Transcript(told)
+    with opened(told, Wire(fake)) as scope:
+        for seed in (1, 2):
+            fake.screen = Screen(told.get("picture", "png"), seed)
+            assert fake.screen.shows(scope.screen().data)
+        assert scope.dialect is not None
+        assert scope.dialect.name == told["profile"]
+        if "volts" in told:
+            wave = scope.waveform(1)
+            assert wave.volts.tolist() == pytest.approx(told["volts"], abs=1e-9)
+            assert (wave.start_s, wave.step_s) == pytest.approx(told["time"], rel=1e-9)
+    assert fake.violations == []
+
+
+def test_every_profile_has_a_fake() -> None:
+    assert {told["profile"] for told in TOLD} == {dialect.name for dialect in DIALECTS}
+
+
+def endured(told: dict[str, Any], count: int, seed: int) -> Counter[str]:
+    """Work on an instrument until so many faults befell it; no picture and no waveform is wrong."""
+    fake, rng, run = Transcript(told), np.random.default_rng(seed), 0
+    wire, found = Spoiled(fake, rng, 0.0), Counter[str]()
+    with opened(told, wire, seconds=0.01) as scope:
+        wire.rate = 0.25
+        while len(wire.faults) < count:
+            run += 1
+            fake.screen = Screen(told.get("picture", "png"), run)
+            try:
+                if "volts" in told and run % 2:
+                    wave = scope.waveform(1)
+                    assert wave.volts.tolist() == pytest.approx(told["volts"], abs=1e-9), wire.faults[-5:]
+                    assert (wave.start_s, wave.step_s) == pytest.approx(told["time"], rel=1e-9)
+                else:
+                    assert fake.screen.shows(scope.screen().data), wire.faults[-5:]
+                found["right"] += 1
+            except InstrumentError as error:
+                found[type(error).__name__] += 1
+        wire.rate = 0.0
+        for _ in range(2):  # the first call may find what is left of the last fault
+            try:
+                assert fake.screen.shows(scope.screen().data)
+                break
+            except InstrumentError:
+                fake.reset()
+        else:
+            raise AssertionError("does not recover")
+    return found + Counter({f"fault: {kind}": n for kind, n in Counter(wire.faults).items()})
+
+
+def test_no_fault_gives_a_wrong_picture_or_waveform() -> None:
+    for k, told in enumerate(TOLD):
+        endured(told, 12, k)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+def test_ten_thousand_faults_give_no_wrong_picture_or_waveform(
+    record_property: Callable[[str, object], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    total = Counter[str]()
+    each = -(-int(os.environ.get("RESEAU_FAULTS", "10000")) // len(TOLD))
+    for k, told in enumerate(TOLD):
+        total += endured(told, each, 1000 + k)
+    for name, number in sorted(total.items()):
+        record_property(name, number)
+    with capsys.disabled():
+        print(f"\n{each * len(TOLD)} faults over {len(TOLD)} instruments: {dict(sorted(total.items()))}")
+
+
+@pytest.mark.parametrize("path", PROFILES, ids=lambda path: path.stem)
+def test_every_line_of_a_profile_names_a_source(path: Path) -> None:
+    text = path.read_text("utf-8")
+    maker, _ = read_profiles(text, where=path)
+    used = set[str]()
+    for line in text.split("\n[sources]")[0].splitlines()[2:] + text.split("[sources]")[1].splitlines():
+        if not line or line.startswith("[") or re.match(r'\d+ = "', line) or line.startswith("name = "):
+            continue
+        found = re.findall(r"\[(\d+)\]", line.rpartition("#")[2])
+        assert found, line
+        used.update(found)
+    assert used == set(maker.sources)
+
+
+def test_a_file_of_ones_own_is_a_dialect(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(described("Rigol 1000Z").replace('"Rigol 1000Z"', '"Rigol mine"'))
+    fake = Transcript(next(told for told in TOLD if told["profile"] == "Rigol 1000Z"))
+    with oscilloscope("scope", Wire(fake), dialect=str(path), seconds=0.5) as scope:
+        assert fake.screen.shows(scope.screen().data)
+        assert scope.dialect is not None
+        assert scope.dialect.name == "Rigol mine"
+    assert dialect_named(f"{path}#Rigol mine").models == r"(DS|MSO)1\d{3}Z"
+    with pytest.raises(SettingError, match="choose from Rigol mine"):
+        dialect_named(f"{path}#other")
+    with pytest.raises(InputError, match="cannot be read"):
+        dialect_named(str(tmp_path / "none.toml"))
+
+
+OWN = described("Rigol 1000Z")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("schema = 3", "schema 3 is not reseau-instrument-profile/1"),
+        ("x", "is not TOML"),
+        (OWN.replace("screen =", "scren ="), r"`screen`: Field required"),
+        (OWN.replace('waveform = "preamble"', 'waveform = "none"'), r"there are no \[waveforms.none\]"),
+        (OWN.replace("fetch :DISP", "send :DISP"), "needs one step that fetches"),
+        (OWN.replace("fetch :DISP", "grab :DISP"), r"`screen.0`: String should match"),
+        (OWN.replace("(code - y0 - yref) * dy", "code ** 2"), r"has more than \+ - \* /"),
+        (OWN.replace("(code - y0 - yref) * dy", "(code"), "is not a formula"),
+        (OWN.replace("(code - y0 - yref) * dy", "__import__('os')"), r"has more than \+ - \* /"),
+    ],
+)
+def test_a_file_that_is_no_profile_is_refused_in_one_line(text: str, message: str) -> None:
+    with pytest.raises(FormatError, match=message) as caught:
+        read_profiles(text, where="mine.toml")
+    assert "\n" not in str(caught.value)
+
+
+def test_formulas() -> None:
+    numbers = {"code": np.array([1.0, 3.0]), "a": 2.0}
+    assert Formula("-(code - 1) * 10 / a + .5")(numbers).tolist() == [0.5, -9.5]
+    with pytest.raises(ZeroDivisionError):
+        Formula("1 / b")({"b": 0.0})
+
+
+@pytest.mark.parametrize(("serial", "port"), [(True, "RS232"), (False, "GPIb")])
+def test_a_tds_220_prints_to_the_port_it_is_connected_by(serial: bool, port: str) -> None:
+    class SerialWire(Wire, SerialLink):  # type: ignore[misc]
+        pass
+
+    told = next(told for told in TOLD if told["profile"] == "Tektronix TDS 200")
+    fake = Transcript(told | {"lines": [
+        [name, heard.replace(r"(GPI\w*|RS232)", port), *rest] for name, heard, *rest in told["lines"]
+    ]})  # fmt: skip
+    with opened(told, (SerialWire if serial else Wire)(fake)) as scope:
+        assert fake.screen.shows(scope.screen().data)
+
+
+def test_one_that_may_lack_a_module_is_told_of_it() -> None:
+    mute = Lines({"*IDN?": b"TEKTRONIX,TDS 220,0,CF:91.1CT FV:v1.02\n"})
+    with oscilloscope("scope", Wire(mute), seconds=0.2) as scope, pytest.raises(InstrumentError, match="TDS2CM"):
+        scope.screen()
+
+
+def test_an_unknown_model_is_tried_by_its_nearest_relatives(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("reseau_drivers.oscilloscope.scope._TRIAL_S", 0.2)
+    told = next(told for told in TOLD if told["profile"] == "Tektronix with a file system")
+    fake = Transcript(told | {"identity": "TEKTRONIX,6-MSO,C1,CF:91.1CT"})
+    with opened(told, Wire(fake), seconds=5.0) as scope:
+        assert fake.screen.shows(scope.screen().data)
+        assert "set dialect = 'Tektronix with a file system'" in scope.check()["advice"]
+    mute = Lines({"*IDN?": b"ACME,X1,1,1\n"})
+    with pytest.raises(ProtocolError, match="reseau bench profile"):
+        oscilloscope("scope", Wire(mute), seconds=0.5).connect()
