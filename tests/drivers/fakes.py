@@ -19,7 +19,18 @@ from numpy.typing import NDArray
 
 from reseau.instruments import Deadline
 
-__all__ = ["GrblBoard", "Lines", "Receiver", "Screen", "Spoiled", "TCube", "Transcript", "Wire", "ZaberStage", "transcripts"]
+__all__ = [
+    "GrblBoard",
+    "Lines",
+    "Receiver",
+    "Screen",
+    "Spoiled",
+    "TCube",
+    "Transcript",
+    "Wire",
+    "ZaberStage",
+    "transcripts",
+]
 
 
 class Receiver(Protocol):

@@ -1,4 +1,4 @@
-"""Profiles of oscilloscopes and the fakes of ``transcripts.toml``: pictures, waveforms, faults, and their files."""
+"""Profiles of oscilloscopes and the fakes of ``transcripts.toml``: pictures, waveforms, faults, files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ def opened(told: dict[str, Any], wire: Wire, **options: Any) -> Oscilloscope:
     return oscilloscope("scope", wire, **{"seconds": 0.5} | named | options)
 
 
-@pytest.mark.parametrize("told", TOLD, ids=lambda told: told["identity"].split(",")[1] if told["identity"] else "-")
+@pytest.mark.parametrize(
+    "told", TOLD, ids=lambda told: told["identity"].split(",")[1] if told["identity"] else "-"
+)
 def test_screens_and_waveforms_are_those_of_the_instrument(told: dict[str, Any]) -> None:
     fake = Transcript(told)
     with opened(told, Wire(fake)) as scope:
@@ -107,7 +109,7 @@ def test_every_line_of_a_profile_names_a_source(path: Path) -> None:
     maker, _ = read_profiles(text, where=path)
     used = set[str]()
     for line in text.split("\n[sources]")[0].splitlines()[2:] + text.split("[sources]")[1].splitlines():
-        if not line or line.startswith("[") or re.match(r'\d+ = "', line) or line.startswith("name = "):
+        if not line or line.startswith(("[", "name = ")) or re.match(r'\d+ = "', line):
             continue
         found = re.findall(r"\[(\d+)\]", line.rpartition("#")[2])
         assert found, line
@@ -175,7 +177,10 @@ def test_a_tds_220_prints_to_the_port_it_is_connected_by(serial: bool, port: str
 
 def test_one_that_may_lack_a_module_is_told_of_it() -> None:
     mute = Lines({"*IDN?": b"TEKTRONIX,TDS 220,0,CF:91.1CT FV:v1.02\n"})
-    with oscilloscope("scope", Wire(mute), seconds=0.2) as scope, pytest.raises(InstrumentError, match="TDS2CM"):
+    with (
+        oscilloscope("scope", Wire(mute), seconds=0.2) as scope,
+        pytest.raises(InstrumentError, match="TDS2CM"),
+    ):
         scope.screen()
 
 

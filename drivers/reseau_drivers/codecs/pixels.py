@@ -167,9 +167,14 @@ GENICAM: dict[str, PixelFormat] = {
     **{
         f"{order}{bits}": PixelFormat(code, bits, size, order)
         for order, bits, size, code in (
-            ("RGB", 8, 3, 0x02180014), ("BGR", 8, 3, 0x02180015), ("RGB", 10, 6, 0x02300018),
-            ("BGR", 10, 6, 0x02300019), ("RGB", 12, 6, 0x0230001A), ("BGR", 12, 6, 0x0230001B),
-            ("RGB", 16, 6, 0x02300033), ("BGR", 16, 6, 0x0230004B),
+            ("RGB", 8, 3, 0x02180014),
+            ("BGR", 8, 3, 0x02180015),
+            ("RGB", 10, 6, 0x02300018),
+            ("BGR", 10, 6, 0x02300019),
+            ("RGB", 12, 6, 0x0230001A),
+            ("BGR", 12, 6, 0x0230001B),
+            ("RGB", 16, 6, 0x02300033),
+            ("BGR", 16, 6, 0x0230004B),
         )
     },
     "RGBa8": PixelFormat(0x02200016, 8, 4, "RGBA"),

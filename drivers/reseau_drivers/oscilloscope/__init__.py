@@ -38,8 +38,8 @@ def oscilloscope(
     settings : dict, optional
         Values for :class:`OscilloscopeSettings`.
     dialect : str, optional
-        Name of one of :data:`DIALECTS`, or of a file of profiles (``FILE.toml``, ``FILE.toml#NAME``); by default it
-        is chosen by the answer to ``*IDN?``.
+        Name of one of :data:`DIALECTS`, or of a file of profiles (``FILE.toml``, ``FILE.toml#NAME``); by
+        default it is chosen by the answer to ``*IDN?``.
     **options
         Further arguments of :class:`Oscilloscope`.
 

@@ -13,7 +13,6 @@ import re
 import struct
 import tomllib
 from collections.abc import Callable, Mapping
-from os.path import commonprefix
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -318,11 +317,7 @@ def dialect_named(name: str) -> Dialect:
     path, _, wanted = name.partition("#")
     known, chosen = DIALECTS, name
     if path.endswith(".toml"):
-        try:
-            text = Path(path).read_text("utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"cannot be read ({error})", where=path) from None
-        _, known = read_profiles(text, where=path)
+        _, known = read_profiles(_text_of(path), where=path)
         chosen = wanted or (known[0].name if len(known) == 1 else "")
     found = next((each for each in known if each.name == chosen), None)
     if found is None:
@@ -332,19 +327,32 @@ def dialect_named(name: str) -> Dialect:
     return found
 
 
-def described(name: str) -> str:
-    """Return the profile of a family as a file of its own, with the sources of its lines.
+def described(name: str = "") -> str:
+    """Return a profile as a file of its own, with the sources of its lines; entry point ``profiles``.
+
+    Parameters
+    ----------
+    name : str
+        Name of a dialect; a file of profiles, which is checked and listed; empty: list all.
 
     Raises
     ------
     SettingError
         If there is none of this name.
+    FormatError
+        If a file has no profiles.
 
     Examples
     --------
     >>> read_profiles(described("Rigol 1000Z"), where="")[1][0].examples[1]
     'RIGOL TECHNOLOGIES,MSO1104Z,M,1'
     """
+    if not name or (name.endswith(".toml") and "#" not in name):
+        known = DIALECTS if not name else read_profiles(_text_of(name), where=name)[1]
+        examples = {
+            each.name: ", ".join(example.split(",")[1] for example in each.examples) for each in known
+        }
+        return "".join(f"{each}: {models}".rstrip(": ") + "\n" for each, models in examples.items())
     dialect = dialect_named(name)
     text = next(text for text in _FILES.values() if f'name = "{dialect.name}"' in text)
     head, *parts = re.split(r"(?m)^(?=\[)", text)
@@ -355,6 +363,13 @@ def described(name: str) -> str:
     return "".join([head, *kept, own]).rstrip() + "\n"
 
 
+def _text_of(path: str) -> str:
+    try:
+        return Path(path).read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read ({error})", where=path) from None
+
+
 def _is(maker: Maker, models: str, identity: str) -> bool:
     """Whether an identity is of a maker and of models."""
     return re.match(rf"({maker.identities})[^,]*, *({models})", identity, re.IGNORECASE) is not None
@@ -363,7 +378,8 @@ def _is(maker: Maker, models: str, identity: str) -> bool:
 def _nearness(dialect: Dialect, model: str) -> int:
     """How many characters a model has in common with those of a family."""
     names = [example.split(",")[1].strip() for example in dialect.examples]
-    return max((len(commonprefix([model, name])) for name in names), default=0)
+    same = ([a == b for a, b in zip(model, name, strict=False)] + [False] for name in names)
+    return max((each.index(False) for each in same), default=0)
 
 
 def candidates_of(identity: str) -> tuple[Dialect, ...]:
@@ -380,7 +396,7 @@ def candidates_of(identity: str) -> tuple[Dialect, ...]:
     ['Rigol', 'Rigol 1000Z', 'Rigol DS1000D and DS1000E']
     """
     identity = identity.strip()
-    asked, model = DIALECTS, (identity.split(",") + [""])[1].strip()
+    asked, model = DIALECTS, identity.partition(",")[2].partition(",")[0].strip()
     for maker in MAKERS:
         if _is(maker, "", identity):
             asked = tuple(each for each in DIALECTS if each.maker is maker)
@@ -389,7 +405,9 @@ def candidates_of(identity: str) -> tuple[Dialect, ...]:
             break
     else:
         model = ""
-    return tuple(sorted((each for each in asked if each.identifies), key=lambda each: -_nearness(each, model)))
+    return tuple(
+        sorted((each for each in asked if each.identifies), key=lambda each: -_nearness(each, model))
+    )
 
 
 def dialect_of(identity: str) -> Dialect | None:

@@ -106,7 +106,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
             self._dialect = known
 
     def _asked(self, deadline: Deadline) -> Dialect:
-        """Find the dialect of an unknown model: the one of its nearest relatives in which it sends a picture."""
+        """Find the dialect of an unknown model: that of a near relative in which it sends a picture."""
         asked = candidates_of(self._idn)
         for dialect in asked:
             if deadline.expired:
@@ -127,7 +127,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         names = ", ".join(repr(each.name) for each in asked[:3])
         raise ProtocolError(
             f"{self._idn!r} sends a picture in none of the dialects tried ({names}, …)",
-            do="set the option dialect to the profile of a relative (`reseau bench profile`) or to a file of your own",
+            do="set the option dialect to the profile of a relative (`reseau bench profile`), or to a file",
         )
 
     def _disconnect(self) -> None:

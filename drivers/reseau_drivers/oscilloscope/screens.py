@@ -1,8 +1,8 @@
 """Screens that instruments send as bare pixels, or behind a head of their own, as PNG or BMP files.
 
 Sources: Rigol DS1000D and DS1000E, whose ``:LCD:DATA?`` is in no manual, as described at improwis.com ("Rigol
-scope wifi") and read by riglol-snap; GW Instek's own dso1kb.py for ``:DISPlay:OUTPut?``; Owon's SCPI protocol of
-the HDS200, and the one of port 3000 as robert-hh/owonread describes it.
+scope wifi") and read by riglol-snap; GW Instek's own dso1kb.py for ``:DISPlay:OUTPut?``; Owon's SCPI
+protocol of the HDS200, and the one of port 3000 as robert-hh/owonread describes it.
 """
 
 from __future__ import annotations
