@@ -190,7 +190,8 @@ def _connects(host: str, family: int, where: object, port: int, seconds: float) 
             try:
                 asking.connect(where)
             except ConnectionRefusedError:
-                do = f"is its remote interface on, and the port right? others: {_open_ports(host) or 'none found'}"
+                others = _open_ports(host) or "none found"
+                do = f"is its remote interface on, and the port right? others: {others}"
                 yield Finding(False, f"{host} is there, but nothing listens on port {port}", do)
                 return
             except TimeoutError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import tomllib
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -12,16 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-import reseau_drivers.oscilloscope.dialects as dialects
 from reseau.core.errors import FormatError, InputError, InstrumentError, ProtocolError, SettingError
 from reseau_drivers.link import SerialLink
 from reseau_drivers.oscilloscope import DIALECTS, Oscilloscope, oscilloscope
 from reseau_drivers.oscilloscope.dialects import Formula, described, dialect_named, read_profiles
+from reseau_drivers.profiles import FOLDER
 
 from .fakes import Lines, Screen, Spoiled, Transcript, Wire, transcripts
 
 TOLD = transcripts()
-PROFILES = sorted((Path(dialects.__file__).parent / "profiles").glob("*.toml"))
+PROFILES = sorted(FOLDER.glob("*.toml"))
 
 
 def opened(told: dict[str, Any], wire: Wire, **options: Any) -> Oscilloscope:
@@ -106,15 +107,18 @@ def test_ten_thousand_faults_give_no_wrong_picture_or_waveform(
 @pytest.mark.parametrize("path", PROFILES, ids=lambda path: path.stem)
 def test_every_line_of_a_profile_names_a_source(path: Path) -> None:
     text = path.read_text("utf-8")
-    maker, _ = read_profiles(text, where=path)
-    used = set[str]()
-    for line in text.split("\n[sources]")[0].splitlines()[2:] + text.split("[sources]")[1].splitlines():
-        if not line or line.startswith(("[", "name = ")) or re.match(r'\d+ = "', line):
+    used, sources = set[str](), tomllib.loads(text)["sources"]
+    for line in text.splitlines():
+        if (
+            not line
+            or line.startswith(("[", "name = ", "schema = ", "maker = "))
+            or re.match(r'\d+ = "', line)
+        ):
             continue
         found = re.findall(r"\[(\d+)\]", line.rpartition("#")[2])
         assert found, line
         used.update(found)
-    assert used == set(maker.sources)
+    assert used == set(sources)
 
 
 def test_a_file_of_ones_own_is_a_dialect(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from reseau.core.errors import FormatError, InputError, ProtocolError, SettingEr
 
 from ..codecs.ieee488 import picture
 from ..codecs.numbers import INFINITE
+from ..profiles import FOLDER
 from .screens import bytes_of_colours, picture_after, runs_of_colours
 
 __all__ = [
@@ -42,7 +43,6 @@ __all__ = [
 
 Numbers = Mapping[str, Any]
 SCHEMA = "reseau-instrument-profile/1"
-_FOLDER = Path(__file__).parent / "profiles"
 _ACTS: Mapping[type, Callable[..., Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
     ast.USub: operator.neg,
@@ -298,7 +298,7 @@ def _first(error: Exception) -> str:
     return f"`{'.'.join(map(str, first['loc']))}`: {first['msg'].removeprefix('Value error, ')}"
 
 
-_FILES = {path: path.read_text("utf-8") for path in sorted(_FOLDER.glob("*.toml"))}
+_FILES = {path: text for path in sorted(FOLDER.glob("*.toml")) if SCHEMA in (text := path.read_text("utf-8"))}
 _READ = [read_profiles(text, where=path.name) for path, text in _FILES.items()]
 MAKERS: tuple[Maker, ...] = tuple(maker for maker, _ in _READ)
 DIALECTS: tuple[Dialect, ...] = tuple(each for _, dialects in _READ for each in dialects)
