@@ -37,7 +37,8 @@ _BLOCK = re.compile(rb"#(?:([1-9])|\((\d{1,12})\))")
 _INDEFINITE = b"#0"
 _OTHERS = {
     b"\xff\xd8\xff": "a JPEG, which alters grey values", b"GIF8": "a GIF", b"II*\0": "a TIFF",
-    b"MM\0*": "a TIFF", b"\x1f\x8b": "compressed by gzip", b"%!PS": "PostScript", b"\x1b": "codes for a printer",
+    b"MM\0*": "a TIFF", b"\x1f\x8b": "compressed by gzip", b"%!PS": "PostScript",
+    b"\x1b": "codes for a printer",
 }  # fmt: skip
 """What pictures that are neither PNG nor BMP begin with."""
 

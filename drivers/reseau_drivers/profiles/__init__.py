@@ -1,7 +1,8 @@
 """What is known of families of instruments: TOML files, each line with its public source.
 
 Those of oscilloscopes (``reseau-instrument-profile/1``) are read by
-:mod:`reseau_drivers.oscilloscope.dialects`, those of controllers (``reseau-controller-profile/1``) by the codecs.
+:mod:`reseau_drivers.oscilloscope.dialects`, those of controllers
+(``reseau-controller-profile/1``) by the codecs.
 """
 
 from __future__ import annotations

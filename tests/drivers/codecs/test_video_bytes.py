@@ -135,8 +135,13 @@ def test_intervals_and_regions() -> None:
     assert uapi.Selection.parse(region) == uapi.Selection(16, 32, 640, 480)
 
 
-@pytest.mark.parametrize("name", ["GREY", "Y10", "Y12", "Y16", "YUYV", "UYVY", "NV12", "SRGGB8", "SBGGR16", "RGB24",
-                                  "RGB16", "BGRa8", "YUV422_8_UYVY", "YUV411_8_UYYVYY", "YUV8_UYV", "RGB12_Planar"])  # fmt: skip
+ROUND = (
+    "GREY Y10 Y12 Y16 YUYV UYVY NV12 SRGGB8 SBGGR16 RGB24 RGB16 BGRa8 YUV422_8_UYVY YUV411_8_UYYVYY YUV8_UYV "
+    "RGB12_Planar"
+)
+
+
+@pytest.mark.parametrize("name", ROUND.split())
 def test_grey_values_round_trip(name: str) -> None:
     layout, rng = (VIDEO | GENICAM)[name], np.random.default_rng(3)
     pixels = rng.integers(0, int(layout.full_scale) + 1, (5, 8)).astype(layout.dtype)
