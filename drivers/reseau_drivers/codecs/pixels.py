@@ -261,31 +261,52 @@ def decode(layout: PixelFormat, width: int, height: int, data: bytes, stride: in
 def _unpacked(layout: PixelFormat, rows: NDArray[np.uint8]) -> NDArray[np.uint16]:
     """Grey values of pixels that share bytes."""
     pixels, size = layout.group
-    shared = rows.reshape(len(rows), -1, size)
-    found = np.empty((*shared.shape[:2], pixels), np.uint16)
-    low = layout.bits - 8
-    for k in range(pixels):
-        if layout.packed == "stream":
-            first, shift = divmod(k * layout.bits, 8)
-            word = shared[..., first].astype(np.uint16) << 8 | shared[..., first + 1]
-            found[..., k] = word >> 16 - layout.bits - shift & (1 << layout.bits) - 1
-        elif layout.packed == "mipi" and layout.bits == 14:
-            rest = shared[..., 4:].astype(np.uint32)
-            bits = (rest[..., 0] | rest[..., 1] << 8 | rest[..., 2] << 16) >> 6 * k & 0x3F
-            found[..., k] = shared[..., k].astype(np.uint16) << 6 | bits.astype(np.uint16)
-        elif layout.packed == "p" and layout.bits == 14:
-            whole = sum(shared[..., j].astype(np.uint64) << np.uint64(8 * j) for j in range(size))
-            found[..., k] = whole >> np.uint64(14 * k) & np.uint64(0x3FFF)
-        elif layout.packed == "p":
-            first, shift = divmod(k * layout.bits, 8)
-            word = shared[..., first].astype(np.uint16) | shared[..., first + 1].astype(np.uint16) << 8
-            found[..., k] = word >> shift & (1 << layout.bits) - 1
-        else:
-            gige = layout.packed == "gige"
-            high, rest = shared[..., 2 * k if gige else k], shared[..., 1 if gige else -1]
-            bits = rest >> (4 if gige else low) * k & (1 << low) - 1
-            found[..., k] = high.astype(np.uint16) << low | bits
-    return found.reshape(len(rows), -1)
+    shared, low = rows.reshape(len(rows), -1, size), layout.bits - 8
+    if layout.packed in ("p", "stream"):
+        word, step = _number(shared, layout.packed == "stream"), layout.bits
+        order = range(pixels)[:: -1 if layout.packed == "stream" else 1]
+        found = [word >> np.uint64(step * k) & np.uint64((1 << step) - 1) for k in order]
+    elif layout.packed == "mipi":
+        found = _joined(shared[..., :pixels], _number(shared[..., pixels:]), low, low)
+    else:
+        found = _joined(shared[..., ::2], _number(shared[..., 1:2]), low, 4)
+    return np.stack(found, axis=-1).astype(np.uint16).reshape(len(rows), -1)
+
+
+def _joined(
+    high: NDArray[np.uint8], rest: NDArray[np.uint64], low: int, step: int
+) -> list[NDArray[np.uint64]]:
+    """High bytes of pixels with `low` further bits of each, `step` bits apart in the rest."""
+    mask = np.uint64((1 << low) - 1)
+    return [
+        high[..., k].astype(np.uint64) << np.uint64(low) | rest >> np.uint64(step * k) & mask
+        for k in range(high.shape[-1])
+    ]
+
+
+def _number(shared: NDArray[np.uint8], big: bool = False) -> NDArray[np.uint64]:
+    """The number that a few bytes are."""
+    order = range(shared.shape[-1])[:: -1 if big else 1]
+    return np.sum([shared[..., k].astype(np.uint64) << np.uint64(8 * n) for n, k in enumerate(order)], axis=0)
+
+
+def _packed(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
+    """Bytes of pixels that share them."""
+    count, size = layout.group
+    groups, low = pixels.reshape(-1, count).astype(np.uint64), layout.bits - 8
+    high = (groups >> np.uint64(low)).astype(np.uint8)
+    if layout.packed in ("p", "stream"):
+        step, big = layout.bits, layout.packed == "stream"
+        parts = groups[:, ::-1] if big else groups
+    else:
+        step, big, parts = 4 if layout.packed == "gige" else low, False, groups & np.uint64((1 << low) - 1)
+    word = np.sum([parts[:, k] << np.uint64(step * k) for k in range(count)], axis=0).astype("<u8")
+    coded = word.view(np.uint8).reshape(-1, 8)
+    if layout.packed in ("p", "stream"):
+        return coded[:, size - 1 :: -1].tobytes() if big else coded[:, :size].tobytes()
+    rest = coded[:, : size - count]
+    whole = [high[:, :1], rest, high[:, 1:]] if layout.packed == "gige" else [high, rest]
+    return np.hstack(whole).tobytes()
 
 
 def _words(rows: NDArray[np.uint8]) -> NDArray[Any]:
@@ -309,7 +330,7 @@ def _jpeg(width: int, height: int, data: bytes) -> NDArray[Any]:
 
 
 def encode(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
-    r"""Encode grey values as a camera with this format sends them, with neutral colours; none that is packed.
+    r"""Encode grey values as a camera with this format sends them, with neutral colours.
 
     Examples
     --------
@@ -328,7 +349,7 @@ def encode(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
     if layout.pattern == "NV12":
         return pixels.tobytes() + bytes([128]) * (pixels.size // 2)
     if layout.packed:
-        raise ProtocolError("packed formats are not encoded")
+        return _packed(layout, pixels)
     if not layout.stored:
         return bytes(cv2.imencode(".jpg", pixels.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 95])[1])
     return pixels.astype(layout.dtype).tobytes()

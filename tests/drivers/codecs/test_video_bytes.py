@@ -257,6 +257,7 @@ def test_pixels_that_share_bytes_are_those_that_were_packed(name: str) -> None:
     rows = [PACKERS[layout.packed](layout.bits, row.tolist()) for row in pixels]
     assert len(rows[0]) == layout.row(8)
     assert (decode(layout, 8, 5, b"".join(rows)) == pixels).all()
+    assert encode(layout, pixels) == b"".join(rows)
     padded = b"".join(row + b"\xff" * 3 for row in rows)
     assert (decode(layout, 8, 5, padded, len(rows[0]) + 3) == pixels).all()
     with pytest.raises(ProtocolError):
