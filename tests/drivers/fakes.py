@@ -219,7 +219,7 @@ class Spoiled(Wire):
 
     def __init__(self, there: Any, rng: np.random.Generator, rate: float) -> None:
         super().__init__(there)
-        self._rng, self.rate, self.faults = rng, rate, list[str]()
+        self._rng, self.rate, self.faults, self.kinds = rng, rate, list[str](), self.KINDS
         self._late, self._last, self._surplus = b"", b"", b""
 
     def open(self, deadline: Deadline) -> None:
@@ -246,8 +246,8 @@ class Spoiled(Wire):
         # A line of text has neither length nor checksum: its parts in another order may be another number.
         binary = b"#" in said or b"IDAT" in said or b"BM" in said
         hidden = set() if binary else {"reordered"}
-        hidden |= set() if b"IDAT" in said else {"bad checksum"}
-        kinds = [kind for kind in self.KINDS if kind not in hidden]
+        hidden |= set() if b"IDAT" in said or said[:1] == b"@" else {"bad checksum"}
+        kinds = [kind for kind in self.kinds if kind not in hidden]
         kind = kinds[self._rng.integers(len(kinds))]
         self.faults.append(kind)
         at = int(self._rng.integers(1, max(2, len(said))))
@@ -269,8 +269,8 @@ class Spoiled(Wire):
             case "reset":
                 self.there.reset()
                 return b""
-        start = said.index(b"IDAT") + 4
-        at = start + int(self._rng.integers(max(1, len(said) - start - 20)))
+        start = said.index(b"IDAT") + 4 if b"IDAT" in said else 1
+        at = start + int(self._rng.integers(max(1, len(said) - start - (20 if start > 1 else 6))))
         return said[:at] + bytes([said[at] ^ 1 << int(self._rng.integers(8))]) + said[at + 1 :]
 
 
@@ -303,6 +303,8 @@ class GrblBoard:
             banner, version, settings, locks, tells,
         )  # fmt: skip
         self.place, self.homed, self.moves = 12.0, False, list[str]()
+        self.off = 0.0
+        """Where the motor stands when it counts 0."""
         self.ends: Callable[[], bytes] = lambda: b""
         """What happens, and is said, in the midst of the next movement."""
         self.answers: dict[str, bytes] = {}
@@ -313,6 +315,11 @@ class GrblBoard:
         """Switch it off and on: positions are those of the motors no more."""
         self.homed = False
         return self._begin()
+
+    def reset(self) -> None:
+        """Switch it off and on, unheard; it counts from 0 where it stands."""
+        self.place, self.off = 0.0, self.off + self.place
+        self.start()
 
     def _begin(self) -> bytes:
         self.state = "Alarm" if self.locks and not self.homed else "Idle"
@@ -347,7 +354,7 @@ class GrblBoard:
                 return self._report(ends())
             if not self._left:
                 if self.state == "Home":
-                    self.homed, said = True, said + b"ok\r\n"
+                    self.homed, self.off, said = True, 0.0, said + b"ok\r\n"
                 self.place, self.state = self._target, "Idle"
         return self._report(said)
 
@@ -382,8 +389,12 @@ class ZaberStage:
     """One axis of a Zaber device; source: Zaber ASCII protocol, message format and warning flags."""
 
     def __init__(self) -> None:
-        self.place = self._target = 0
+        self.place = self._target = self.off = 0
         self.flags, self.then, self._left = ["WR"], list[str](), 0
+
+    def reset(self) -> None:
+        """Switch it off and on: it counts from 0 where it stands."""
+        self.off, self.place, self._target, self.flags, self._left = self.off + self.place, 0, 0, ["WR"], 0
 
     def receive(self, data: bytes) -> bytes:
         """Answer a command."""
@@ -394,7 +405,7 @@ class ZaberStage:
         if not self._left and self.place != self._target:
             self.place, self.flags, self.then = self._target, self.flags + self.then, []
         if words == "home":
-            self.flags, self._target, self.place, self._left = [], 0, 1, 3
+            self.flags, self._target, self.place, self._left, self.off = [], 0, 1, 3, 0
         elif words.startswith("move abs"):
             self._target, self._left = int(words.split()[2]), 3
         elif words.startswith("warnings"):
@@ -414,7 +425,12 @@ class TCube:
     """A TDC001, which gives 0 as its address (thorpy issue 10); messages as in the APT protocol, issue 25."""
 
     def __init__(self) -> None:
-        self.place, self._target, self._left, self._speed = 5, 5, 0, 1000
+        self.place, self._target, self._left, self._speed, self.off = 5, 5, 0, 1000, 0
+        self.homed = self._homing = False
+
+    def reset(self) -> None:
+        """Switch it off and on: it counts from 0 where it stands."""
+        self.off, self.place, self._target, self._left = self.off + self.place, 0, 0, 0
         self.homed = self._homing = False
 
     def receive(self, data: bytes) -> bytes:
@@ -443,6 +459,7 @@ class TCube:
                 self._left = max(0, self._left - 1)
                 if not self._left:
                     self.homed, self.place = self.homed or self._homing, self._target
+                    self.off = 0 if self._homing else self.off
                 bits = 0x80000000 | (0x400 if self.homed else 0) | (0x10 if self._left else 0)
                 said = struct.pack("<HihhI", 1, self.place, 0, 0, bits)
         return struct.pack("<HHBB", kind + 1, len(said), 0x81, 0) + said if said else b""

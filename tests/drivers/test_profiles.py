@@ -18,8 +18,10 @@ from reseau_drivers.link import SerialLink
 from reseau_drivers.oscilloscope import DIALECTS, Oscilloscope, oscilloscope
 from reseau_drivers.oscilloscope.dialects import Formula, described, dialect_named, read_profiles
 from reseau_drivers.profiles import FOLDER
+from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, Table, Zaber
 
-from .fakes import Lines, Screen, Spoiled, Transcript, Wire, transcripts
+from .fakes import GrblBoard, Lines, Screen, Spoiled, TCube, Transcript, Wire, ZaberStage, transcripts
+from .test_references import FLUID, FLUID_VERSION, HAL, HAL_VERSION
 
 TOLD = transcripts()
 PROFILES = sorted(FOLDER.glob("*.toml"))
@@ -84,24 +86,70 @@ def endured(told: dict[str, Any], count: int, seed: int) -> Counter[str]:
     return found + Counter({f"fault: {kind}": n for kind, n in Counter(wire.faults).items()})
 
 
+TABLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], float]] = {
+    "GRBL": (GrblBoard, lambda wire: Grbl(wire, 0.02), 1.0),
+    "GRBL without lock": (lambda: GrblBoard(locks=False), lambda wire: Grbl(wire, 0.02), 1.0),
+    "grblHAL": (
+        lambda: GrblBoard(HAL, HAL_VERSION, locks=False, tells=True),
+        lambda wire: Grbl(wire, 0.02),
+        1.0,
+    ),
+    "FluidNC": (lambda: GrblBoard(FLUID, FLUID_VERSION, locks=False), lambda wire: Grbl(wire, 0.02), 1.0),
+    "Zaber": (ZaberStage, lambda wire: Zaber(wire, 0.02), 1000.0),
+    "T-Cube": (TCube, lambda wire: Kinesis([wire], answer_s=0.02), 1919.64),
+}
+
+
+def moved(name: str, count: int, seed: int) -> Counter[str]:
+    """Move an axis until so many faults befell its controller; it is never elsewhere than it says."""
+    make, controller, per_unit = TABLES[name]
+    fake, rng, found = make(), np.random.default_rng(seed), Counter[str]()
+    wire = Spoiled(fake, rng, 0.0)
+    plan = AxisPlan(low=-90.0, high=90.0, per_unit=per_unit)
+    table = Table("table", controller(wire), {"tilt": plan}, seconds=0.25)
+    table.connect()
+    wire.rate = 0.05
+    while len(wire.faults) < count:
+        target = float(rng.integers(-80, 80))
+        try:
+            if not table.state("tilt").homed:
+                table.home("tilt")
+            position = table.move("tilt", target).position
+            assert (fake.place + fake.off) / per_unit == pytest.approx(target, abs=0.01), wire.faults[-5:]
+            assert position == pytest.approx(target, abs=0.01)
+            found["right"] += 1
+        except InstrumentError as error:
+            found[type(error).__name__] += 1
+    table.close()
+    return found + Counter({f"fault: {kind}": n for kind, n in Counter(wire.faults).items()})
+
+
 def test_no_fault_gives_a_wrong_picture_or_waveform() -> None:
     for k, told in enumerate(TOLD):
         endured(told, 12, k)
 
 
+@pytest.mark.parametrize("name", TABLES)
+def test_no_fault_moves_an_axis_elsewhere(name: str) -> None:
+    moved(name, 25, 3)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
-def test_ten_thousand_faults_give_no_wrong_picture_or_waveform(
+def test_ten_thousand_faults_give_no_wrong_value(
     record_property: Callable[[str, object], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     total = Counter[str]()
-    each = -(-int(os.environ.get("RESEAU_FAULTS", "10000")) // len(TOLD))
+    each = -(-int(os.environ.get("RESEAU_FAULTS", "10000")) // (len(TOLD) + len(TABLES)))
     for k, told in enumerate(TOLD):
         total += endured(told, each, 1000 + k)
+    for k, name in enumerate(TABLES):
+        total += moved(name, each, 2000 + k)
     for name, number in sorted(total.items()):
         record_property(name, number)
     with capsys.disabled():
-        print(f"\n{each * len(TOLD)} faults over {len(TOLD)} instruments: {dict(sorted(total.items()))}")
+        faults = sum(number for name, number in total.items() if name.startswith("fault"))
+        print(f"\n{faults} faults over {len(TOLD) + len(TABLES)} instruments: {dict(sorted(total.items()))}")
 
 
 @pytest.mark.parametrize("path", PROFILES, ids=lambda path: path.stem)
