@@ -56,6 +56,7 @@ def test_the_test_of_the_whole_field_has_its_significance_level(against_truth: l
     assert p.mean() == pytest.approx(0.5, abs=3.5 * np.sqrt(1 / 12 / len(p)))
 
 
+@pytest.mark.slow
 @draws(40, 200)
 def test_two_independent_calibrations_differ_as_their_covariances_predict(runs: int) -> None:
     world = networks.world(points=40, datum="free", control=0)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import tifffile
 
 from reseau.core.optional import missing
@@ -71,6 +72,7 @@ def test_a_tiff_in_an_unusual_compression_names_the_package_that_decodes_it(tmp_
     assert "imagecodecs" not in lines["b.tif"]
 
 
+@pytest.mark.slow
 def test_a_dicom_photograph_names_the_package_that_reads_it(tmp_path: Path) -> None:
     (tmp_path / "a.dcm").write_bytes(bytes(128) + b"DICM" + bytes(40))
     design = tmp_path / "field.json"

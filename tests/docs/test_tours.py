@@ -29,6 +29,7 @@ def test_numbers_may_differ_in_the_last_digits_and_words_not() -> None:
     assert not same("3 points, ...", "5 points, 4 lines")
 
 
+@pytest.mark.slow
 def test_a_bench_is_automated_and_scheduled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     enter(tmp_path, monkeypatch, FieldRig())
 
@@ -81,12 +82,14 @@ def test_a_camera_is_calibrated_its_report_read_and_its_certificate_issued(
     assert all(Path(name).stat().st_size > 5000 for name in ("result.png", "result.html", "difference.png"))
 
 
+@pytest.mark.slow
 def test_a_roll_of_film_is_oriented(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     follow("tours/film", tmp_path)
     assert Path("oriented/summary.html").exists()
 
 
+@pytest.mark.slow
 def test_a_camera_under_water_is_calibrated_without_and_with_the_water(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,6 +121,7 @@ def test_blurred_targets_are_measured_under_water(tmp_path: Path, monkeypatch: p
     assert Path("out/underwater/measured/report.html").exists()
 
 
+@pytest.mark.slow
 def test_an_instrument_is_corrected_in_three_photographs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -175,6 +175,58 @@ def check(
     raise typer.Exit(1 if failed else 0)
 
 
+@app.command()
+def doctor(
+    bench: v.Bench = Path("bench.toml"),
+    timeout_s: Annotated[float, Option("Time limit for each instrument (s).", least=0.1)] = 10.0,
+    as_json: v.AsJson = False,
+) -> None:
+    """Look for what keeps instruments from working, and say what to do.
+
+    Permissions, programs that hold a device, network and firewall, packet sizes and losses, time limits,
+    firmware. Nothing is changed.
+    """
+    from ..capture import Bench
+    from ..core.provenance import canonical_json
+
+    found = Bench.read(bench).diagnose(timeout_s)
+    wrong = sum(each.fine is False for findings in found.values() for each in findings)
+    if as_json:
+        rows = {name: [vars(each) for each in findings] for name, findings in found.items()}
+        say(canonical_json({"schema": "reseau-bench-doctor/1", "wrong": wrong, "instruments": rows}))
+    else:
+        marks = {True: "fine", None: "note", False: "wrong"}
+        say("".join(f"{name}: {marks[e.fine]}: {e}\n" for name, findings in found.items() for e in findings))
+    raise typer.Exit(1 if wrong else 0)
+
+
+@app.command()
+def profile(
+    name: Annotated[
+        str, typer.Argument(help="A profile, or a file FILE.toml of your own. Default: list all.")
+    ] = "",
+    address: Annotated[str, Option("Try it: fetch a picture of the screen at this address.")] = "",
+    out: v.Out | None = None,
+) -> None:
+    """Show what is known of a family of oscilloscopes, as a file; check a file of your own; try it.
+
+    Give a file of your own as `dialect` in the options of an oscilloscope in the bench file.
+    """
+    from ..core.plugins import INSTRUMENTS, TOOLS, plugin
+    from ..io import write_whole
+
+    if not address:
+        text = plugin(TOOLS, "profiles")(name)
+        say(text) if out is None else write_whole(out, text)
+        return
+    writable(out)
+    with plugin(INSTRUMENTS, "oscilloscope")("scope", address, dialect=name or None) as scope:
+        picture = scope.screen()
+        say(f"{scope.connect()}: {scope.dialect.name}, a picture of {len(picture.data)} bytes\n")
+    if out is not None:
+        write_whole(out, picture.data)
+
+
 @dataclass(frozen=True)
 class Simulated:
     """What a simulated bench has."""

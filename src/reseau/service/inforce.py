@@ -35,7 +35,7 @@ from .covariates import (
     series_of,
 )
 from .decisions import Applied, Decision, Drift
-from .rules import AcceptanceRules, Judgement, Outcome, judge
+from .rules import AcceptanceRules, Judgement, Outcome, PastRun, judge
 
 _PREFIX = "calibrations/"
 _KEY = re.compile(r"[0-9a-f]{12}")
@@ -210,23 +210,28 @@ class Configurations:
         document = {"key": decision.key, "by": by or _user(), "comment": comment}
         self._journal(name).add("reference", document)
 
-    def _runs(
-        self, name: str, current: Applied, until: datetime, but: str
-    ) -> list[tuple[datetime, Calibration]]:
-        """Calibrations from the reference to a time, without rejected ones; with the one in force."""
+    def _runs(self, name: str, current: Applied, until: datetime, but: str) -> list[PastRun]:
+        """Calibrations from the reference to a time, with the one in force.
+
+        Among them are those that the rules rejected as too different: others may say the same. Those that a
+        person rejected, or that are incomplete, say nothing.
+        """
         history = [each for each in self.history(name) if each.key != but]
         of, reference = {each.key: each for each in history}, self.reference(name)
         start = of[reference].since if reference in of else current.since
         rows = sorted(
             (each.since, each.key)
             for each in history
-            if start <= each.since <= until and (each.outcome != "rejected" or each.key == current.key)
+            if start <= each.since <= until and (each.says_something or each.key == current.key)
         )
         rows.sort(key=lambda each: each[1] != reference)
         if current.key not in {key for _, key in rows}:
             rows = [(current.since, current.key)]
         found = self._calibrations(name, [key for _, key in rows])
-        return [(since, each) for (since, _), each in zip(rows, found, strict=True)]
+        return [
+            (since, each, of[key].outcome == "rejected" and key != current.key)
+            for (since, key), each in zip(rows, found, strict=True)
+        ]
 
     def _origin(self, session: str, key: str) -> dict[str, str]:
         """The session from which a calibration is, and the SHA-256 of the result that is its proof."""
