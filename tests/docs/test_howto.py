@@ -34,15 +34,13 @@ CAMERA = {
 }
 """Pages that use what the tour of a camera has made."""
 ALONE = (
-    "fiducial-marks", "n-wire-phantom", "reseau-on-film", "several-cameras", "sharpness", "sheet-of-disks",
-    "turntable",
+    "coded-testfield", "fiducial-marks", "n-wire-phantom", "reseau-on-film", "sensor-from-files",
+    "several-cameras", "sharpness", "sheet-of-disks", "turntable",
 )  # fmt: skip
 """Pages that draw what they need."""
 APART = {
     "blurred-network": "follows the tour under water of blurred targets",
-    "coded-testfield": "shows one frame of the tour of a bench",
     "live-picture": "needs a camera",
-    "sensor-from-files": "needs a camera",
     "several-machines": "needs a cluster",
     "temperature-zoom-focus": "needs an archive of months",
     "through-water-or-glass": "follows the tour under water",
