@@ -287,7 +287,10 @@ def _joined(
 def _number(shared: NDArray[np.uint8], big: bool = False) -> NDArray[np.uint64]:
     """The number that a few bytes are."""
     order = range(shared.shape[-1])[:: -1 if big else 1]
-    return np.sum([shared[..., k].astype(np.uint64) << np.uint64(8 * n) for n, k in enumerate(order)], axis=0)
+    found = np.zeros(shared.shape[:-1], np.uint64)
+    for n, k in enumerate(order):
+        found |= shared[..., k].astype(np.uint64) << np.uint64(8 * n)
+    return found
 
 
 def _packed(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
@@ -306,7 +309,7 @@ def _packed(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
         return coded[:, size - 1 :: -1].tobytes() if big else coded[:, :size].tobytes()
     rest = coded[:, : size - count]
     whole = [high[:, :1], rest, high[:, 1:]] if layout.packed == "gige" else [high, rest]
-    return np.hstack(whole).tobytes()
+    return bytes(np.hstack(whole).tobytes())
 
 
 def _words(rows: NDArray[np.uint8]) -> NDArray[Any]:
