@@ -42,7 +42,8 @@ def gains_of(frame: Frame) -> Array:
         return even
     grey = frame.pixels[:height, :width].astype(np.float32)
     # The level of a place is the same for the four filters: each is in it with the weight of a quarter.
-    level = cv2.sepFilter2D(grey, -1, *[np.array([1, 2, 1], np.float32) / 4] * 2)
+    weights = np.array([1, 2, 1], np.float32) / 4
+    level = cv2.sepFilter2D(grey, -1, weights, weights)
     cells = (height // 2, 2, width // 2, 2)
     power = (level * level).reshape(cells).sum(axis=(0, 2), dtype=np.float64)
     found: Array = (grey * level).reshape(cells).sum(axis=(0, 2), dtype=np.float64) / np.maximum(power, 1e-30)
