@@ -306,7 +306,7 @@ def _packed(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
     word = np.sum([parts[:, k] << np.uint64(step * k) for k in range(count)], axis=0).astype("<u8")
     coded = word.view(np.uint8).reshape(-1, 8)
     if layout.packed in ("p", "stream"):
-        return coded[:, size - 1 :: -1].tobytes() if big else coded[:, :size].tobytes()
+        return bytes((coded[:, size - 1 :: -1] if big else coded[:, :size]).tobytes())
     rest = coded[:, : size - count]
     whole = [high[:, :1], rest, high[:, 1:]] if layout.packed == "gige" else [high, rest]
     return bytes(np.hstack(whole).tobytes())
