@@ -15,11 +15,12 @@ import pytest
 
 from reseau.core.errors import FormatError, InputError, InstrumentError, ProtocolError, SettingError
 from reseau_drivers.link import SerialLink
-from reseau_drivers.oscilloscope import DIALECTS, Oscilloscope, oscilloscope
+from reseau_drivers.oscilloscope import DIALECTS, Oscilloscope, dialect_of, oscilloscope
 from reseau_drivers.oscilloscope.dialects import Formula, described, dialect_named, read_profiles
 from reseau_drivers.profiles import FOLDER
 from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, Table, Zaber
 
+from .behaviours import named
 from .fakes import GrblBoard, Lines, Screen, Spoiled, TCube, Transcript, Wire, ZaberStage, transcripts
 from .test_references import FLUID, FLUID_VERSION, HAL, HAL_VERSION
 
@@ -49,6 +50,11 @@ def test_screens_and_waveforms_are_those_of_the_instrument(told: dict[str, Any])
             assert wave.volts.tolist() == pytest.approx(told["volts"], abs=1e-9)
             assert (wave.start_s, wave.step_s) == pytest.approx(told["time"], rel=1e-9)
     assert fake.violations == []
+
+
+@pytest.mark.parametrize("model", named())
+def test_models_that_public_packages_name_have_a_profile(model: str) -> None:
+    assert dialect_of(f"{model},1,1") is not None
 
 
 def test_every_profile_has_a_fake() -> None:
