@@ -13,6 +13,7 @@ from reseau.capture import BenchFile
 from reseau.cli import run
 from reseau.core.errors import RefusedError
 from reseau_drivers.camera import aravis, v4l2
+from reseau_drivers.codecs.pixels import GENICAM
 from reseau_sims.serving import GigeVisionCamera, SimulatedCamera, VideoCamera
 
 from .rigs import vision_cameras
