@@ -177,10 +177,14 @@ def test_every_line_of_a_profile_names_a_source(path: Path) -> None:
 
 def test_a_file_of_ones_own_is_a_dialect(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text(described("Rigol 1000Z").replace('"Rigol 1000Z"', '"Rigol mine"'))
+    own = described("Rigol 1000Z").replace('"Rigol 1000Z"', '"Rigol mine"')
+    path.write_text(own + 'ends = "\\r\\n"\n')
     fake = Transcript(next(told for told in TOLD if told["profile"] == "Rigol 1000Z"))
-    with oscilloscope("scope", Wire(fake), dialect=str(path), seconds=0.5) as scope:
+    wire, said = Wire(fake), list[bytes]()
+    wire.write = lambda data, deadline: (said.append(data), Wire.write(wire, data, deadline))[1]  # type: ignore[method-assign]
+    with oscilloscope("scope", wire, dialect=str(path), seconds=0.5) as scope:
         assert fake.screen.shows(scope.screen().data)
+        assert {data[-2:] for data in said} == {b"\r\n"}
         assert scope.dialect is not None
         assert scope.dialect.name == "Rigol mine"
     assert dialect_named(f"{path}#Rigol mine").models == r"(DS|MSO)1\d{3}Z"

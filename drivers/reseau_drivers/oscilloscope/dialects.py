@@ -211,6 +211,8 @@ class Dialect(_Part):
         Command that stops the acquisition.
     errors : str
         Query for the oldest error; empty if there is no error queue.
+    ends : str
+        What ends a command.
     identifies : bool
         Whether it answers ``*IDN?``.
     silent : str
@@ -233,6 +235,7 @@ class Dialect(_Part):
     setup: tuple[str, ...] = ()
     halt: str = ":STOP"
     errors: str = ":SYSTem:ERRor?"
+    ends: Annotated[str, Field(pattern=r"^[\r\n\x00;]*$")] = "\n"
     identifies: bool = True
     silent: str = ""
     maker: Maker
