@@ -128,12 +128,13 @@ def _user() -> str:
 
 
 def _holders(path: str) -> Iterator[str]:
-    """Other processes that have a device open."""
+    """Other processes that have a device open; who serves a pseudo-terminal has its other end."""
     for folder in Path("/proc").glob("[0-9]*"):
         if int(folder.name) == os.getpid():
             continue
         with suppress(OSError):
-            if any(os.readlink(fd) == path for fd in (folder / "fd").iterdir()):
+            opened = {os.readlink(fd) for fd in (folder / "fd").iterdir()}
+            if path in opened and not {"/dev/ptmx", "/dev/pts/ptmx"} & opened:
                 yield f"{(folder / 'comm').read_text().strip()} (process {folder.name})"
 
 
