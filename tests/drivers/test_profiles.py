@@ -217,6 +217,13 @@ def test_a_file_that_is_no_profile_is_refused_in_one_line(text: str, message: st
     assert "\n" not in str(caught.value)
 
 
+def test_all_profiles_are_listed_and_shown() -> None:
+    listed = [line.partition(":")[0] for line in described().splitlines()]
+    assert set(listed) == {dialect.name for dialect in DIALECTS} | {"grbl", "smc100", "zaber"}
+    for name in listed:
+        assert "[sources]" in described(name)
+
+
 def test_formulas() -> None:
     numbers = {"code": np.array([1.0, 3.0]), "a": 2.0}
     assert Formula("-(code - 1) * 10 / a + .5")(numbers).tolist() == [0.5, -9.5]

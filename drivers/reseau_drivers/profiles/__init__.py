@@ -11,9 +11,10 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-__all__ = ["FOLDER", "controller"]
+__all__ = ["CONTROLLERS", "FOLDER", "controller"]
 
 FOLDER = Path(__file__).parent
+CONTROLLERS = ("grbl", "smc100", "zaber")
 
 
 def controller(name: str) -> dict[str, Any]:
