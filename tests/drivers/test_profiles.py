@@ -165,7 +165,7 @@ def test_every_line_of_a_profile_names_a_source(path: Path) -> None:
     for line in text.splitlines():
         if (
             not line
-            or line.startswith(("[", "name = ", "schema = ", "maker = "))
+            or line.startswith(("[", "#", "name = ", "schema = ", "maker = "))
             or re.match(r'\d+ = "', line)
         ):
             continue
