@@ -20,7 +20,8 @@ from ..core.data import Array, Frame
 __all__ = ["balanced", "gains_of"]
 
 _LEAST = 16
-"""Smallest side of a frame in which gains are looked for (px)."""
+"""Smallest side of a frame in which gains are looked for, and height of the bands of a large one (px)."""
+_BANDS = 16
 
 
 def gains_of(frame: Frame) -> Array:
@@ -40,7 +41,12 @@ def gains_of(frame: Frame) -> Array:
     even: Array = np.ones((2, 2))
     if min(height, width) < _LEAST:
         return even
-    grey = frame.pixels[:height, :width].astype(np.float32)
+    if height > _BANDS * _LEAST:  # some bands of a large frame are enough
+        first = (np.linspace(0, height - _LEAST, _BANDS) // 2 * 2).astype(int)
+        rows, height = (first[:, None] + np.arange(_LEAST)).ravel(), _BANDS * _LEAST
+    else:
+        rows = np.arange(height)
+    grey = frame.pixels[rows, :width].astype(np.float32)
     # The level of a place is the same for the four filters: each is in it with the weight of a quarter.
     weights = np.array([1, 2, 1], np.float32) / 4
     level = cv2.sepFilter2D(grey, -1, weights, weights)
