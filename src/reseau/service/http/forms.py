@@ -101,7 +101,7 @@ def _fields(
     return tuple(
         _field(
             each, whole, prefix + name, said.get(name, name.replace("_", " ")), name in needed,
-            values.get(name, each.get("default")),
+            values.get(name, each.get("default") if required else None),
         )
         for name, each in schema.get("properties", {}).items()
         if name not in but
