@@ -88,6 +88,8 @@ class AcceptanceRules(Document):
         Smallest share of width and of height of the image that has observations.
     refused_warnings : tuple of str
         Codes of warnings with which a calibration is incomplete.
+    second_person : bool
+        Reviews need another person than the one who had the calibration judged.
 
     Examples
     --------
@@ -110,6 +112,7 @@ class AcceptanceRules(Document):
         "camera-moved", "camera-unstable", "inconsistent", "not-identified", "unmodelled",
         "weak-geometry",
     )  # fmt: skip
+    second_person: bool = False
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
