@@ -143,6 +143,7 @@ def test_photographs_become_a_calibration_its_file_and_its_plot(
     assert calibration.plot().get_title(loc="left") == "error of the projection / px"
 
 
+@pytest.mark.slow
 def test_a_folder_is_enough_and_the_target_is_found(photographs: list[reseau.Frame], tmp_path: Path) -> None:
     for frame in photographs:
         write_image(tmp_path / f"{frame.name}.png", frame.pixels)

@@ -258,3 +258,9 @@ def test_the_lengths_of_undetected_errors_need_no_effects():
     np.testing.assert_allclose(
         fit.external_lengths(0.01, 0.7), fit.external_reliability(0.01, 0.7).lengths, rtol=1e-9
     )
+
+
+@pytest.mark.parametrize(("alpha", "power"), [(0.001, 0.8), (0.4, 0.5)])
+def test_the_noncentrality_gives_the_power_of_the_test_on_both_sides(alpha: float, power: float) -> None:
+    square = noncentrality(alpha, power) ** 2
+    assert stats.ncx2.sf(critical_w(alpha) ** 2, 1, square) == pytest.approx(power, abs=1e-9)

@@ -413,3 +413,8 @@ def test_who_reads_up_to_a_number_misses_no_smaller_one(opened: Callable[[], Arc
         other.join(60.0)
         seen += second.notes(after=max((each.number for each in seen), default=0))
         assert sorted(each.session for each in seen) == ["a", "b"]
+
+
+def test_files_are_in_folders_of_the_first_two_letters_of_their_hash(tmp_path: Path) -> None:
+    name = LocalObjects(tmp_path).put(b"pixels", ".raw")
+    assert (tmp_path / name[:2] / f"{name}.raw").read_bytes() == b"pixels"

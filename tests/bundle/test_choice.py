@@ -105,6 +105,7 @@ def test_a_wide_lens_gets_a_projection_of_wide_lenses() -> None:
     assert standard.length > 1000
 
 
+@pytest.mark.slow
 def test_a_tilted_sensor_is_a_step_of_the_ladder_and_competes_with_a_thin_prism() -> None:
     tilt = (-0.11, 0.1, 0.0025, -0.0018, -0.02, *np.zeros(7), np.radians(7.0), np.radians(-3.0))
     found = choose_model(network_of(lenses.Lens(1280, 960, MATRIX, np.array(tilt))))

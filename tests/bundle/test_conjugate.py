@@ -177,6 +177,7 @@ def test_images_that_nothing_connects_are_not_adjusted() -> None:
         assert fit.code in (Code.SINGULAR, Code.RANK_DEFECT)
 
 
+@pytest.mark.slow
 def test_the_memory_of_the_factors_is_predicted() -> None:
     """With room, before it is taken: 60 images with a camera of their own each."""
     cams = tuple(replace(networks.camera(free=("c", "K1")), id=f"cam{k}") for k in range(60))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from reseau.adjust.stochastic import Weighting
+from reseau.bundle.solver.imaging import _turned
 from reseau.bundle.solver.linear import Linear, linearised
 from reseau.bundle.solver.observations import OtherObservations
 from reseau.bundle.solver.system import System, residuals
@@ -15,7 +16,7 @@ from reseau.bundle.solver.unknowns import Unknowns
 from reseau.bundle.solver.values import Correction, Values
 from reseau.core.data import Array
 from reseau.optics.cameras.ebner import EbnerCorrection
-from reseau.optics.poses import Pose, matrix_to_vector, project
+from reseau.optics.poses import Pose, matrix_to_vector, project, rotation_matrix
 
 from . import networks
 
@@ -204,3 +205,12 @@ def test_ebner_of_the_bundle_agrees_with_optics() -> None:
     photo = (ideal - [319.5, 239.5]) * [0.01, -0.01]
     off = (EbnerCorrection(values, 1.2)(photo) - photo) / [0.01, -0.01]
     np.testing.assert_allclose(bent, off, rtol=0, atol=1e-9)
+
+
+def test_a_moving_camera_turns_points_by_the_rotation_of_its_rate() -> None:
+    x = np.array([0.3, -0.7, 1.9])
+    for rate in ([0.2, -0.5, 0.3], [1e-5, 2e-5, -1e-5]):
+        y, z = np.empty(3), np.empty(3)
+        _turned(0.8, np.array([[0.0, 0.0, 0.0, *rate]]), 0, x, y, z)
+        np.testing.assert_allclose(y, rotation_matrix(0.8 * np.array(rate)) @ x, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(z, np.cross(rate, y), rtol=0, atol=1e-14)

@@ -63,3 +63,25 @@ def test_images_that_differ_in_the_principal_distance_have_a_larger_variance_fac
     )
     assert sound.predicted(sound.free).variance < 2
     assert found.predicted(found.free).variance > 2.5 * found.noise
+
+
+def test_of_linear_observations_images_are_predicted_exactly() -> None:
+    """What an image adds to the least squares of all others, with a parameter at zero that was estimated."""
+    rng = np.random.default_rng(0)
+    by, off, values = rng.normal(size=(5, 8, 3)), rng.normal(size=(5, 8)), np.array([0.2, -0.1, 0.3])
+    own, side, names = np.swapaxes(by, 1, 2) @ by, np.einsum("nri,nr->ni", by, off), ("a", "b", "c")
+    found = Information(
+        names, values, names, own.sum(axis=0), side.sum(axis=0), own, side, (off**2).sum(axis=1),
+        np.zeros(5), float((off**2).sum()), 40.0, np.zeros(3), 40,
+    ).predicted(("a", "b"))  # fmt: skip
+    off = off + values[2] * by[:, :, 2]
+
+    def least(images: list[int]) -> tuple[float, Array]:
+        x = np.linalg.lstsq(by[images, :, :2].reshape(-1, 2), off[images].ravel(), rcond=None)[0]
+        return float(((off[images] - by[images, :, :2] @ x) ** 2).sum()), x
+
+    cost, x = least([0, 1, 2, 3, 4])
+    assert found.cost == pytest.approx(cost)
+    np.testing.assert_allclose(found.values, [*(values[:2] + x), 0.0], rtol=0, atol=1e-12)
+    rest = [least([i for i in range(5) if i != image])[0] for image in range(5)]
+    np.testing.assert_allclose(found.squares, cost - np.array(rest), rtol=1e-9)

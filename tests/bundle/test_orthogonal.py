@@ -56,6 +56,7 @@ def test_cofactors_from_rows_are_those_of_the_normal_equations(
     sides = np.random.default_rng(0).normal(size=(len(held), 2))
     sides[held] = 0.0
     solved = found.arrow.solve(sides)
+    assert (np.diagonal(found.arrow.corner) > 0).all()
     solved[held] = 0.0
     expected = whole @ sides
     assert (np.abs(solved - expected) <= 1e-6 * np.abs(expected).max(axis=0)).all()

@@ -145,6 +145,7 @@ def test_errors_of_the_window_and_places_have_their_covariances(seeds: int) -> N
     assert np.mean(sigma0) == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_same_without_poses() -> None:
     network = wet(0, surface("plane", FREE))
     cold = replace(

@@ -49,8 +49,8 @@ def test_the_relative_orientation_is_the_same_in_all_exposures() -> None:
     assert result.redundancy == free.redundancy + 6 * 7
 
 
-@draws(20, 200)
-@pytest.mark.parametrize("control", [False, True])
+@draws(15, 200)
+@pytest.mark.parametrize("control", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_errors_of_places_cameras_and_points_have_their_covariances(runs: int, control: bool) -> None:
     q, points, principal = [], [], []
     for seed in range(runs):

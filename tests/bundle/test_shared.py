@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import scipy.special
 
 from reseau.bundle import Network, Result
@@ -72,6 +73,7 @@ def test_it_covers_a_camera_that_refocuses_where_the_formal_one_does_not() -> No
     assert (formal > 1).sum() > 6
 
 
+@pytest.mark.slow
 def test_it_covers_a_print_that_is_held_where_the_formal_one_does_not() -> None:
     _, holding, formal = drawn(2e-3, printed, LARGER)
     assert (holding > 1).sum() <= 4
@@ -96,3 +98,15 @@ def test_two_images_give_the_formal_one() -> None:
     assert result.shared is None
     found = result.camera(0)
     np.testing.assert_allclose(found.sigma, found.sigma_formal, rtol=1e-12)
+
+
+def test_fields_of_twice_the_size_carry_four_times_the_variance_to_the_cameras() -> None:
+    world = networks.world(images=6, points=30, datum="free", control=0)
+    found = adjusted(world, refocused(world.noisy(1), 4e-3, 1)).shared
+    assert found is not None
+    columns, some = found._of_cameras[0], np.full_like(found.smooth, 0.3)
+    once, twice = (
+        replace(found, smooth=size * some, weights=some, distance=0.0)._carried(columns) for size in (1, 2)
+    )
+    assert np.trace(once) > 0
+    np.testing.assert_allclose(twice, 4 * once, rtol=1e-12)

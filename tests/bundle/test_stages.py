@@ -134,7 +134,14 @@ def test_all_datums_give_the_same_shape_and_angles() -> None:
 
 
 @pytest.mark.parametrize(
-    "how", [{}, {"control": True}, {"control": True, "sigma": None}, {"control": True, "cameras": 2}]
+    "how",
+    [
+        {},
+        *(
+            pytest.param({"control": True} | more, marks=pytest.mark.slow)
+            for more in ({}, {"sigma": None}, {"cameras": 2})
+        ),
+    ],
 )
 def test_the_axis_is_found_from_images_without_poses(how: dict[str, Any]) -> None:
     warm, cold = (adjusted(turned(cold=cold, **how).network)[0] for cold in (False, True))
@@ -227,7 +234,7 @@ def test_the_sense_about_an_approximate_axis_is_reported() -> None:
     assert any("in the opposite sense" in str(warning) for warning in result.warnings)
 
 
-@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("cameras", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_wrong_angle_is_named_and_estimated_where_outliers_are_rejected(cameras: int) -> None:
     network = turned(cameras=cameras, cold=True).network
     stage = stage_of(network)

@@ -38,7 +38,10 @@ def cold(lens: Any) -> dict[str, float]:
     return {"fx": f, "fy": f, "cx": (lens.width - 1) / 2, "cy": (lens.height - 1) / 2}
 
 
-@pytest.mark.parametrize(("half_diagonal", "free", "seed"), [(62, FIVE, 2), (70, FIVE, 2), (70, EIGHT, 2)])
+@pytest.mark.parametrize(
+    ("half_diagonal", "free", "seed"),
+    [*(pytest.param(half, FIVE, 2, marks=pytest.mark.slow) for half in (62, 70)), (70, EIGHT, 2)],
+)
 def test_cold_and_warm_start_of_a_wide_lens_agree(half_diagonal: float, free: list[str], seed: int) -> None:
     lens = lenses.fisheye(half_diagonal)
     flat, true = lenses.board(8, 6, 1.0)
@@ -53,6 +56,7 @@ def test_cold_and_warm_start_of_a_wide_lens_agree(half_diagonal: float, free: li
     assert (np.abs(first.cameras["A"].values - again.cameras["A"].values) < 0.01 * sigma).all()
 
 
+@pytest.mark.slow
 def test_eight_coefficients_of_a_bent_board_converge() -> None:
     """Coefficients with correlations beyond 0.999999; a board held as designed that is bent."""
     lens = lenses.fisheye(74)
@@ -121,6 +125,7 @@ def test_a_real_wide_lens_ends_in_the_same_place_from_cold_and_warm(outliers: An
         assert cameras[0].values[0] == pytest.approx(560.04, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA.exists(), reason="needs the networks of RESEAU_DATA")
 def test_rejection_works_where_the_plain_adjustment_does() -> None:
     """Published network: sigma0 1.094 of plain least squares, of images 8 to 41."""

@@ -53,6 +53,7 @@ def test_cameras_of_the_cavity_adjusted_jointly_agree_with_each_by_itself(folder
         np.testing.assert_allclose(v[rows].ravel(), single.residuals, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_two_cameras_determine_the_window_before_them(folder: Path) -> None:
     """Their images reject the given distances of the windows: F-test of two more parameters."""
     found = []

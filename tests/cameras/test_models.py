@@ -338,7 +338,7 @@ def network_file(case: Case, path: Path) -> tuple[networks.World, Path]:
     return world, path
 
 
-@EVERY
+@pytest.mark.parametrize("case", cases(quick=("opencv", "telecentric", "division")))
 def test_the_bundle_recovers_the_truth(case: Case, tmp_path: Path) -> None:
     world, path = network_file(case, tmp_path / "network.json")
     result = adjust_network(Network.from_document(Network1.read(path)))
@@ -411,7 +411,7 @@ def test_standard_deviations_are_right_to_five_percent(case: Case) -> None:
     assert 0.95 < np.sqrt(joint.mean()) < 1.05
 
 
-@pytest.mark.parametrize("case", cases(quick=("brown",)))
+@pytest.mark.parametrize("case", cases(quick=("division",)))
 def test_commands_accept_the_model_and_write_report_and_calibration(
     case: Case, reseau: Run, tmp_path: Path
 ) -> None:

@@ -49,7 +49,9 @@ def test_the_plan_of_the_paper_has_36_named_recordings() -> None:
     assert [step.position for step in paper_steps(axes=("tilt",))] == [{"tilt": t} for t in (0.0, 30.0, 45.0)]
 
 
-def test_a_plan_stores_frames_verdicts_documents_and_results(rig: FieldRig, session: Session) -> None:
+def test_a_plan_stores_frames_verdicts_documents_and_results_that_are_the_same_offline(
+    rig: FieldRig, session: Session
+) -> None:
     run = rig.acquisition(session, rig.procedure())
     carry_out(run, plans.poses(run, FEW, checks=2))
     frames = session.frames(kind="frame")
@@ -76,6 +78,11 @@ def test_a_plan_stores_frames_verdicts_documents_and_results(rig: FieldRig, sess
     assert calibration["provenance"]["inputs"] == {f.step: f.sha256 for f in frames}
     assert session.status == "done"
     assert rig.table.stops > 0
+    (again,) = rerun(session, rig.procedure())
+    assert again.same
+    other = rig.procedure()
+    other.name = "another"
+    assert not rerun(session, other)[0].same
 
 
 def cofactors_of(made: TestfieldProcedure) -> dict[float, float]:
@@ -166,16 +173,6 @@ def test_a_clock_that_jumps_changes_neither_order_nor_result(
     assert rerun(session, rig.procedure())[0].same
 
 
-def test_offline_equals_live_to_the_byte(rig: FieldRig, session: Session) -> None:
-    run = rig.acquisition(session, rig.procedure())
-    carry_out(run, plans.poses(run, FEW))
-    (again,) = rerun(session, rig.procedure())
-    assert again.same
-    other = rig.procedure()
-    other.name = "another"
-    assert not rerun(session, other)[0].same
-
-
 @pytest.mark.slow
 def test_a_bad_frame_is_taken_again_and_both_are_kept(rig: FieldRig, session: Session) -> None:
     rig.camera.spoil = lambda number, pixels: np.full_like(pixels, 255) if number == 2 else pixels
@@ -215,7 +212,7 @@ def test_a_frame_exposed_while_the_table_moves_is_rejected(rig: FieldRig, sessio
     ]
 
 
-@pytest.mark.parametrize("when", ["moving", "exposing"])
+@pytest.mark.parametrize("when", [pytest.param("moving", marks=pytest.mark.slow), "exposing"])
 def test_after_a_pause_nothing_is_exposed_or_stored_twice(rig: FieldRig, session: Session, when: str) -> None:
     """The engine replays all messages since the checkpoint, the exposure among them."""
     pid, asked = os.getpid(), []
@@ -483,6 +480,7 @@ def test_a_goal_for_a_parameter_that_is_not_estimated_is_refused(rig: FieldRig, 
         carry_out(run, plans.until(run, Goal("fx", 1.0, ""), FEW, EVERY[-1:]))
 
 
+@pytest.mark.slow
 def test_frames_from_before_a_resumption_are_not_measured_again(rig: FieldRig, session: Session) -> None:
     run = rig.acquisition(session, rig.procedure())
     carry_out(run, plans.poses(run, FEW))

@@ -58,6 +58,7 @@ def captured(folder: Path) -> tuple[Session, Laboratory, Any]:
         return session, simulated.laboratory, sessions.procedure_of(session)
 
 
+@pytest.mark.slow
 def test_a_session_measures_blurred_targets_under_water_by_rays(tmp_path: Path) -> None:
     session, laboratory, _ = captured(tmp_path / "archive")
     assert session.status == "done"

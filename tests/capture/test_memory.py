@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from reseau.archive import Archive
 from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry, carry_out, plans
@@ -66,6 +67,7 @@ def growth(folder: Path) -> int:
     return last - first
 
 
+@pytest.mark.slow
 def test_frames_of_a_session_are_in_the_archive_and_not_in_memory(tmp_path: Path) -> None:
     # In a process of its own: what other tests have left there fills caches meanwhile.
     code = f"from pathlib import Path; from {__name__} import growth; print(growth(Path({str(tmp_path)!r})))"

@@ -126,7 +126,9 @@ SENSORS: dict[str, Callable[[], tuple[Machine, Callable[[InProcess], Device[Any]
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize(
+    "name", ["modbus", *(pytest.param(k, marks=pytest.mark.slow) for k in SENSORS if k != "modbus")]
+)
 def test_with_faults_in_a_sensor_no_frame_is_lost_or_doubled(name: str, tmp_path: Path) -> None:
     rig, script = _plain_rig(), FaultScript()
     machine, make = SENSORS[name]()
@@ -150,7 +152,9 @@ TABLES: dict[str, Callable[[], tuple[Any, Callable[[InProcess], Any]]]] = {
 }
 
 
-@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize(
+    "name", ["kinesis", *(pytest.param(k, marks=pytest.mark.slow) for k in TABLES if k != "kinesis")]
+)
 def test_with_faults_in_a_table_no_frame_is_lost_or_doubled_and_all_are_where_they_should_be(
     name: str, tmp_path: Path
 ) -> None:

@@ -19,6 +19,10 @@ from .test_bundle import looking_at
 Run = Callable[..., tuple[int, str, str]]
 SIGMA = 0.05
 CONTROL = (0, 1, 2, 3, 4, 5)
+PARTS = pytest.mark.parametrize(
+    "part", [0.05, 0.2, *(pytest.param(each, marks=pytest.mark.slow) for each in (0.01, 0.1))]
+)
+"""Of the observations that are wrong."""
 
 
 def block(factors: tuple[float, float] = (1.0, 1.0), rho: float = 0.0, seed: int = 3) -> dict[str, Any]:
@@ -66,7 +70,7 @@ def said(status: int, out: str, err: str) -> str:
     return " | ".join(json.loads(out)["warnings"])
 
 
-@pytest.mark.parametrize("part", [0.01, 0.05, 0.1, 0.2])
+@PARTS
 def test_gross_errors_are_rejected_and_listed_with_their_test_values(
     part: float, reseau: Run, tmp_path: Path
 ) -> None:
@@ -95,7 +99,7 @@ def test_gross_errors_are_rejected_and_listed_with_their_test_values(
     assert line in out or k in uncontrolled
 
 
-@pytest.mark.parametrize("part", [0.01, 0.05, 0.1, 0.2])
+@PARTS
 def test_gross_errors_that_are_kept_are_named(part: float, reseau: Run, tmp_path: Path) -> None:
     document, rng = block(), np.random.default_rng(7)
     table = document["observations"]

@@ -97,6 +97,7 @@ def test_a_folder_that_cannot_be_completed_is_left_as_it_was(
     assert [path.name for path in tmp_path.iterdir()] == ["copy"]
 
 
+@pytest.mark.slow
 def test_a_report_shows_the_photographs_that_are_still_there(photos: Path, tmp_path: Path) -> None:
     done = calibrated(photos, tmp_path / "copy")
     pictures = []

@@ -368,6 +368,7 @@ def test_the_operator_is_asked_and_a_photograph_without_a_reseau_ends_the_sessio
     assert rig.camera.exposures == 1
 
 
+@pytest.mark.slow
 def test_a_goal_is_not_reached_by_images_of_a_target_that_bends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

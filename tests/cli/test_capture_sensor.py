@@ -163,6 +163,7 @@ def test_an_interrupted_session_is_resumed_where_it_stopped(
     assert run(["capture", "sensor", "--resume"]) == 2
 
 
+@pytest.mark.slow
 def test_an_edge_that_cannot_be_measured_affects_the_sharpness_only(
     asked: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

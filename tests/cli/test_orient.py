@@ -107,6 +107,7 @@ def test_calibrated_corners_give_a_transformation_and_its_residuals_if_there_are
             assert np.abs(left).max() < 0.05
 
 
+@pytest.mark.slow
 def test_a_scan_in_floating_point_is_oriented_as_the_same_one_in_8_bits(tmp_path: Path, reseau: Run) -> None:
     pixels = FilmFrame(0, dpi=300).scan()
     found = []
@@ -174,6 +175,7 @@ def test_bad_input_is_reported_with_a_remedy(
     assert not list(out_folder.glob("*-marked.tif"))
 
 
+@pytest.mark.slow
 def test_without_a_resolution_tag_the_scale_is_that_of_the_format(tmp_path: Path, reseau: Run) -> None:
     tifffile.imwrite(tmp_path / "untagged.tif", FilmFrame(0, dpi=300).scan())
     status, out, _ = reseau("orient", tmp_path / "untagged.tif", "--format-mm", "36x24", "--json")
@@ -182,6 +184,7 @@ def test_without_a_resolution_tag_the_scale_is_that_of_the_format(tmp_path: Path
     assert json.loads(out)["px_per_mm"] == pytest.approx([300 / 25.4] * 2, rel=0.005)
 
 
+@pytest.mark.slow
 def test_the_frames_of_a_roll_are_resampled_by_one_command(roll: Path, tmp_path: Path, reseau: Run) -> None:
     reseau("orient", roll, "--format-mm", "36x24", "--out", tmp_path / "oriented", "--jobs", 1, "--no-marked")
     (tmp_path / "oriented" / "3.json").unlink()

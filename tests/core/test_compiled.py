@@ -66,29 +66,19 @@ def run(
     return done.stdout.strip()
 
 
-def test_a_loop_is_compiled_once_also_for_a_copy_of_its_file(tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    assert run(tmp_path / "here", cache) == "3.0 True"
-    assert run(tmp_path / "here", cache) == "3.0 False"
-    assert run(tmp_path / "there", cache) == "3.0 False"
-
-
-def test_what_was_changed_is_compiled_anew(tmp_path: Path) -> None:
+def test_a_loop_is_compiled_once_also_for_a_copy_of_its_file_and_anew_what_was_changed(
+    tmp_path: Path,
+) -> None:
     folder, cache = tmp_path / "here", tmp_path / "cache"
-    run(folder, cache)
+    assert run(folder, cache) == "3.0 True"
+    assert run(tmp_path / "there", cache) == "3.0 False"
+    (kept,) = cache.glob("reseau/*.nbc")
+    kept.write_bytes(kept.read_bytes()[:200])
+    assert run(folder, cache) == "3.0 True"
     assert run(folder, cache, factor=2.0) == "6.0 True"
     assert run(folder, cache, entry=3.0) == "9.0 True"
     assert run(folder, cache, part="x * x") == "5.0 True"
     assert run(folder, cache, "slot") == "-3.0 True"
-    assert run(folder, cache) == "3.0 False"
-
-
-def test_a_file_that_is_spoilt_is_compiled_anew(tmp_path: Path) -> None:
-    folder, cache = tmp_path / "here", tmp_path / "cache"
-    run(folder, cache)
-    (kept,) = cache.glob("reseau/*.nbc")
-    kept.write_bytes(kept.read_bytes()[:200])
-    assert run(folder, cache) == "3.0 True"
     assert run(folder, cache) == "3.0 False"
 
 

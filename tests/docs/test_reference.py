@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import sys
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -29,17 +30,23 @@ def generated() -> ModuleType:
     return generated
 
 
+@cache
+def nodes() -> list[ast.AST]:
+    """Attributes and raised exceptions of the packages."""
+    sources = (path for tree in ("src", "drivers") for path in (ROOT / tree).rglob("*.py"))
+    every = (node for path in sources for node in ast.walk(ast.parse(path.read_text("utf-8"))))
+    return [node for node in every if isinstance(node, ast.Attribute | ast.Raise)]
+
+
 def named_in_the_source(owner: str) -> set[str]:
     """Attributes of a name that the packages use, as ``Code.X``."""
     found = set()
-    for tree in ("src", "drivers"):
-        for path in (ROOT / tree).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-                match node:
-                    case ast.Attribute(value=ast.Name(id=name)) if name == owner:
-                        found.add(node.attr)
-                    case ast.Raise(exc=ast.Call(func=ast.Name(id=name))) if owner == "raise":
-                        found.add(name)
+    for node in nodes():
+        match node:
+            case ast.Attribute(value=ast.Name(id=name)) if name == owner:
+                found.add(node.attr)
+            case ast.Raise(exc=ast.Call(func=ast.Name(id=name))) if owner == "raise":
+                found.add(name)
     return found
 
 

@@ -18,7 +18,7 @@ from reseau_sims.serving import KINDS, Fault, FaultScript, Kind
 from .rigs import RIGS, Rig, aravis_is_missing, left_open, rig
 
 CELLS = [
-    (driver, transport, kind, at)
+    pytest.param(driver, transport, kind, at, marks=() if at in (0, 2) else pytest.mark.slow)
     for driver, transport in RIGS
     for kind in KINDS
     for at in ((0, 1, 2, 4) if transport == "in process" else (2,))

@@ -248,3 +248,10 @@ def test_a_missing_file_and_other_content_are_input_errors(tmp_path: Path) -> No
     path.write_text("so be it")
     with pytest.raises(FormatError, match="is not a lens"):
         read_lens(path)
+
+
+def test_an_even_asphere_of_the_second_order_alone_is_a_paraboloid(tmp_path: Path) -> None:
+    lens = singlet(tmp_path, ("  CURV 0.02\n", "  TYPE EVENASPH\n  PARM 1 0.01\n"))
+    (bent,) = [each for each in lens.surfaces if each.curvature != 0]
+    # z = 0.01 r².
+    assert (bent.curvature, bent.conic) == (0.02, -1.0)

@@ -112,3 +112,9 @@ def test_curves_of_icc_profiles_are_those_of_the_specification():
 def test_straight_unknown_and_damaged_curves_are_none(coded):
     assert curve_of_profile(profile(coded)) is None
     assert curve_of_profile(profile(coded)[:140]) is None
+
+
+def test_a_parametric_curve_that_begins_above_zero_has_its_values_from_the_first():
+    grey = np.linspace(0, 1, 11)
+    found = curve_of_profile(profile(parametric(1, 2.0, 0.9, 0.1)))
+    np.testing.assert_allclose(found.light(grey, 1.0), (0.9 * grey + 0.1) ** 2, rtol=0, atol=1e-3)

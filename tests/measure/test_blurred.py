@@ -13,6 +13,7 @@ from reseau.core.errors import UsageError
 from reseau.core.failure import Code, Failure
 from reseau.measure.blurred import BlurredOptions, estimate_optics, measure_blurred
 from reseau.measure.blurred.estimate import EstimatedOptics
+from reseau.measure.blurred.likeness import Residuals
 from reseau.measure.blurred.measure import Moving, Varied
 from reseau.measure.blurred.shapes import RayShapes
 from reseau.measure.matching.shapes import Window
@@ -212,6 +213,7 @@ def test_errors_are_as_large_as_sigmas_say() -> None:
     assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.2
 
 
+@pytest.mark.slow
 def test_photon_noise_is_not_a_wrong_lens_and_a_wrong_focus_is() -> None:
     view, at = ThinLens(50.0, 12.5, 52.9, SensorPlane((0.01, 0.01), (40.0, 40.0))), np.arange(81.0)
     wrong = replace(view, image_distance=52.95)
@@ -229,3 +231,11 @@ def test_photon_noise_is_not_a_wrong_lens_and_a_wrong_focus_is() -> None:
             notes.append(any("lens, focus or aperture" in str(note) for note in found.notes))
     assert sum(right) <= 3  # of 40; 2 % are expected, and more than three with a probability of 0.8 %
     assert sum(other) >= 38
+
+
+def test_the_variance_of_grey_values_is_that_of_the_residuals() -> None:
+    grey = np.tile(np.linspace(20, 200, 96), (8, 96, 1))
+    off = np.random.default_rng(0).normal(size=grey.shape) * np.sqrt(0.5 + grey / 20)
+    found = Residuals(grey, off).variance()
+    assert found is not None
+    assert found[0] + 100 * found[1] == pytest.approx(5.5, rel=0.06)

@@ -23,6 +23,7 @@ from reseau.measure import measure_board
 from reseau.measure.boards.measure import BoardOptions, BoardResult, puzzle_part
 from reseau.measure.boards.placement import numbered
 from reseau.measure.boards.single_tags import measure_tags
+from reseau.measure.boards.tags import read_tags
 from reseau.measure.plane.lattice_mapping import started
 
 from .. import kept
@@ -200,8 +201,8 @@ def test_few_large_marks_through_a_lens_have_the_sigmas_of_their_errors(
     ("design", "printed", "wide", "seed", "nearer"),
     [
         (CLOSE, CLOSE_PRINT, True, 51, 1.7),
-        (CLOSE, CLOSE_PRINT, True, 52, 1.7),
-        (CLOSE, CLOSE_PRINT, False, 111, 2.6),
+        pytest.param(CLOSE, CLOSE_PRINT, True, 52, 1.7, marks=pytest.mark.slow),
+        pytest.param(CLOSE, CLOSE_PRINT, False, 111, 2.6, marks=pytest.mark.slow),
         (board("circles", 9, 7, 25.0, size=12.0), prints.circles(9, 7, 25.0, 12.0), False, 110, 2.6),
     ],
 )
@@ -252,7 +253,7 @@ class Action(Wide):
     _lens = (-0.25, 0.075, -0.0003, 0.0003)
 
 
-@pytest.mark.parametrize("seed", [62, 64])
+@pytest.mark.parametrize("seed", [62, pytest.param(64, marks=pytest.mark.slow)])
 def test_a_lattice_grows_through_the_many_saddles_of_sharpened_edges_behind_a_wide_lens(seed: int) -> None:
     """Where the next corner is expected, edges have saddles that are nearer than the corner."""
     design, printed = board("chess", 9, 7, 30.0), prints.chess(9, 7, 30.0)
@@ -509,7 +510,7 @@ def test_corners_of_a_deltille_are_measured_to_their_sigmas_and_named(
     assert isinstance(chess, Failure)
 
 
-@pytest.mark.parametrize(("k", "least"), [(0, 65), (1, 22)])
+@pytest.mark.parametrize(("k", "least"), [pytest.param(0, 65, marks=pytest.mark.slow), (1, 22)])
 def test_a_deltille_seen_at_60_degrees_is_numbered(k: int, least: int) -> None:
     """The directions of its edges are then too uneven for what finds corners seen from the front."""
     _, place = pose(90 + k, DELTILLE_PRINT, nearer=1.2)
@@ -913,6 +914,7 @@ def test_corners_towards_a_margin_where_all_are_less_sharp_are_measured() -> Non
     assert np.sqrt((renamed(found, truth) ** 2).mean()) < 0.02
 
 
+@pytest.mark.slow
 def test_corners_across_which_edges_of_shadows_run_are_measured_or_declined() -> None:
     printed = prints.aprilgrid(6, 6, 22.0, 0.3, "DICT_APRILTAG_36h11", 2)
     view = View(printed, *pose(7, printed, 40.0), seed=7, noise=1.0, shade=0.8)
@@ -925,7 +927,9 @@ def test_corners_across_which_edges_of_shadows_run_are_measured_or_declined() ->
     assert 0.75 < over_sigmas(found, error) < 1.2
 
 
-@pytest.mark.parametrize("tone", [30, 125, 210], ids=["dark", "grey", "as paper"])
+@pytest.mark.parametrize(
+    "tone", [pytest.param(30, marks=pytest.mark.slow), 125, 210], ids=["dark", "grey", "as paper"]
+)
 def test_rows_hidden_at_both_ends_make_the_names_of_a_chessboard_uncertain(tone: int) -> None:
     """Where one end is seen, the other one is known; nothing else tells whether the pattern goes on."""
     frame, truth = picture(CHESS, 0.0, 0.0)
@@ -937,3 +941,14 @@ def test_rows_hidden_at_both_ends_make_the_names_of_a_chessboard_uncertain(tone:
     pixels[: int(rows[0] + rows[1]) // 2] = tone
     found = measured_part(replace(frame, pixels=pixels), CHESS)
     assert np.abs(renamed(found, truth)).max() < 0.05
+
+
+def test_tags_are_read_where_ink_is_as_light_as_half_the_paper() -> None:
+    words = np.ones((2, 6, 6), dtype=np.bool_)
+    words[:, 1:5, 1:5] = np.random.default_rng(0).random((2, 4, 4)) < 0.5
+    grey = np.full((100, 100), 200, np.float32)
+    grey[20:80, 20:80] -= 100 * np.kron(words[1], np.ones((10, 10), np.float32))
+    square = 19.5 + 60 * np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
+    index, corners = read_tags(grey, np.roll(square, 1, axis=1), words, 1, 0)
+    assert index.tolist() == [1]
+    np.testing.assert_array_equal(corners, square)

@@ -45,13 +45,13 @@ def covered(result: FrameResult, frame: FilmFrame) -> bool:
 @pytest.mark.parametrize(
     "frame",
     [
-        FilmFrame(1),
-        FilmFrame(2, tilt_deg=14.0, beside=BUSY),
         FilmFrame(3, tilt_deg=-14.0, mirrored=True, format=HASSELBLAD, dpi=400),
         FilmFrame(4, negative=True, beside=BUSY),
         *(
             pytest.param(frame, marks=pytest.mark.slow)
             for frame in (
+                FilmFrame(1),
+                FilmFrame(2, tilt_deg=14.0, beside=BUSY),
                 FilmFrame(5, beside=Beside(lines=1)),
                 FilmFrame(6, beside=Beside(rods=1)),
                 FilmFrame(7, beside=Beside(blown=True)),
@@ -60,7 +60,7 @@ def covered(result: FrameResult, frame: FilmFrame) -> bool:
                 FilmFrame(10, bits=16),
             )
         ),
-        FilmFrame(11, contrast=0.3),
+        pytest.param(FilmFrame(11, contrast=0.3), marks=pytest.mark.slow),
     ],
     ids=lambda frame: f"seed {frame.seed}",
 )
@@ -100,6 +100,7 @@ def test_a_bowed_edge_is_measured_and_its_chord_gives_the_corner() -> None:
     assert any(bow for bow in reported)
 
 
+@pytest.mark.slow
 def test_a_line_that_touches_an_edge_makes_its_end_uncertain() -> None:
     # A bright line within half a pixel of the upper edge at one end: told by the width of its steps alone.
     frame = FilmFrame(320035, beside=Beside(lines=1))
@@ -109,6 +110,7 @@ def test_a_line_that_touches_an_edge_makes_its_end_uncertain() -> None:
     assert covered(result, frame)
 
 
+@pytest.mark.slow
 def test_a_bright_line_that_leaves_the_edge_is_told_from_it_or_stated() -> None:
     frame = FilmFrame(300088, beside=Beside(lines=1))  # by steps alone its corners were 1.2 px off
     result = oriented(frame)
@@ -120,8 +122,10 @@ def test_a_bright_line_that_leaves_the_edge_is_told_from_it_or_stated() -> None:
 
 @pytest.mark.parametrize(
     "frame",
-    [FilmFrame(320006, beside=Beside(lines=2)), FilmFrame(320023, contrast=0.5, beside=Beside(lines=2))],
-    ids=["contrast 0.7", "contrast 0.5"],
+    [
+        pytest.param(FilmFrame(320006, beside=Beside(lines=2)), id="contrast 0.7", marks=pytest.mark.slow),
+        pytest.param(FilmFrame(320023, contrast=0.5, beside=Beside(lines=2)), id="contrast 0.5"),
+    ],
 )
 def test_lines_beside_two_edges_are_not_taken_for_a_scan_that_is_less_sharp_there(frame: FilmFrame) -> None:
     result = oriented(frame)  # corners were wrong by 3 px and 5 px, with sigmas of 0.1 px
@@ -129,6 +133,7 @@ def test_lines_beside_two_edges_are_not_taken_for_a_scan_that_is_less_sharp_ther
     assert covered(result, frame)
 
 
+@pytest.mark.slow
 def test_a_line_beside_an_edge_is_suspected_where_another_line_crosses_its_end() -> None:
     frame = FilmFrame(320035, beside=Beside(lines=2))  # it was wrong by 1.1 px at 14 sigma
     assert covered(oriented(frame), frame)
@@ -194,11 +199,15 @@ def test_an_edge_hidden_by_a_line_is_no_unflagged_error_with_the_shape_of_its_ro
 @pytest.mark.parametrize(
     "frame",
     [
-        FilmFrame(6002, blur_px=1.5, noise=0.5, grain=0.5),  # its lower edge was found 1.5 px outside
-        FilmFrame(6003, dpi=1200, blur_px=2.5),  # a picture's forms were taken for a line along the edge
-        FilmFrame(1019, grain=10.0),  # the steps of its darkest edge were looked for beside them
+        # Its lower edge was found 1.5 px outside.
+        pytest.param(
+            FilmFrame(6002, blur_px=1.5, noise=0.5, grain=0.5), id="hardly noise", marks=pytest.mark.slow
+        ),
+        # A picture's forms were taken for a line along the edge.
+        pytest.param(FilmFrame(6003, dpi=1200, blur_px=2.5), id="fine", marks=pytest.mark.slow),
+        # The steps of its darkest edge were looked for beside them.
+        pytest.param(FilmFrame(1019, grain=10.0), id="grain"),
     ],
-    ids=["hardly noise", "fine", "grain"],
 )
 def test_edges_of_any_softness_and_grain_are_found(frame: FilmFrame) -> None:
     result = oriented(frame)
@@ -227,6 +236,7 @@ def test_edge_positions_are_unbiased_in_noise() -> None:
     assert abs(np.mean(inwards)) < 0.025
 
 
+@pytest.mark.slow
 def test_a_scratch_parallel_to_an_edge_is_ignored() -> None:
     frame = FilmFrame(300017, beside=Beside(scratches=8))
     result = oriented(frame)
@@ -254,6 +264,7 @@ def test_the_channel_with_the_highest_contrast_is_used() -> None:
     assert np.abs(errors(result, frame)).max() < 0.3
 
 
+@pytest.mark.slow
 def test_another_channel_is_used_if_that_with_the_highest_contrast_hides_an_edge() -> None:
     frame = FilmFrame(320035, colour=True)
     pixels = frame.scan()
@@ -287,6 +298,7 @@ def test_a_frame_seen_at_an_angle_is_oriented_with_a_remark() -> None:
     np.testing.assert_allclose(result.lines.corners, corners, rtol=0, atol=0.3)
 
 
+@pytest.mark.slow
 def test_four_edges_without_a_perspective_frame_are_declined() -> None:
     # One corner moved alone: its edges are turned by a degree and more.
     by = np.array([[24.0, 16.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
@@ -311,6 +323,7 @@ def test_images_without_a_frame_are_declined_with_a_remedy() -> None:
         assert document.corners is None
 
 
+@pytest.mark.slow
 def test_a_wrong_format_is_declined() -> None:
     (result,) = orient_frames(scan_of(FilmFrame(1).scan()), FrameOptions(formats=((56.0, 56.0),)))
     assert not result
@@ -354,6 +367,7 @@ def test_the_resolution_of_the_file_decides_between_rectangles() -> None:
     assert "opening of a mount" in mount.why
 
 
+@pytest.mark.slow
 def test_a_picture_that_fades_on_one_side_is_no_frame_of_three_edges() -> None:
     frame = FilmFrame(33, dpi=300.0, noise=0.7, grain=0.3)
     fading = np.clip(np.linspace(2.5, -0.8, frame.shape[1]), 0, 1)
@@ -361,6 +375,7 @@ def test_a_picture_that_fades_on_one_side_is_no_frame_of_three_edges() -> None:
     assert not orient_frames(scan_of(scan), FrameOptions(((36.0, 24.0),)))[0]
 
 
+@pytest.mark.slow
 def test_a_scan_that_is_sharper_in_one_direction_has_no_lines_beside_its_edges() -> None:
     frame = FilmFrame(31, blur_px=0.5, carriage_px=0.45)
     result = oriented(frame)
@@ -430,6 +445,7 @@ def test_a_line_is_found_through_profiles_of_which_half_may_be_displaced() -> No
     np.testing.assert_allclose(found[0][:2], [1.5, 0.5], rtol=0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_frames_of_a_strip_are_delivered_in_order() -> None:
     frames = [FilmFrame(40, tilt_deg=0.0).scan(), FilmFrame(41, tilt_deg=0.0).scan()]
     rows = min(len(each) for each in frames)

@@ -30,7 +30,7 @@ def rms(deviation):
     return np.sqrt((deviation**2).mean(axis=0))
 
 
-@pytest.mark.parametrize("name", [*VOYAGER, JRINGS])
+@pytest.mark.parametrize("name", [*VOYAGER, pytest.param(JRINGS, marks=pytest.mark.slow)])
 def test_at_least_as_many_marks_are_measured_as_by_nasa_s_program(measured, name):
     case, result = measured(name)
     assert result.found >= np.isfinite(case.others["vicar"][:, 0]).sum()

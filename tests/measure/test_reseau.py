@@ -46,8 +46,15 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", sorted(CASES))
-@pytest.mark.parametrize("shape", sorted(MARKS))
+@pytest.mark.parametrize(
+    ("shape", "case"),
+    [
+        # Every shape, and every case, once; all pairs as slow ones.
+        pytest.param(shape, case, marks=() if (k - j) % len(CASES) == 0 else pytest.mark.slow)
+        for k, shape in enumerate(sorted(MARKS))
+        for j, case in enumerate(sorted(CASES))
+    ],
+)
 def test_errors_reach_the_cramer_rao_bound_and_agree_with_their_sigmas(shape, case):
     s = measure_many(small(mark=MARKS[shape], **CASES[case]), 1 if shape == "line-grid" else 2, seed=2)
     count = s.error.size

@@ -7,7 +7,7 @@ import pytest
 
 from reseau.core.data import Frame
 from reseau.core.failure import Failure
-from reseau.measure.screening import screen
+from reseau.measure.screening import quiet_noise, screen
 
 
 def noise(level: float = 120.0, sigma: float = 2.0, shape: tuple[int, int] = (160, 200)) -> np.ndarray:
@@ -83,3 +83,7 @@ def test_uneven_border_lines_are_levelled_and_marks_in_them_preserved():
     assert np.median(grey[-1]) == pytest.approx(120, abs=2)
     assert grey[:2, 100:104].max() < 60
     assert grey[20:-20] == pytest.approx(pixels[20:-20], abs=1e-4)
+
+
+def test_noise_is_at_least_that_of_rounding() -> None:
+    assert quiet_noise(np.full((160, 200), 77, np.float32)) == pytest.approx(1 / np.sqrt(12))

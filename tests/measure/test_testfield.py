@@ -25,6 +25,7 @@ from reseau.optics import Brown, PixelGrid, Sensor
 from reseau_sims import FieldBench, Stain, Station
 from reseau_sims.testfield import DISTANCE_MM, JITTER_PX
 
+from .. import kept
 from .fields import bounds
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -134,7 +135,11 @@ def test_the_curve_that_a_file_states_is_used_unless_targets_contradict_it(gamma
 
 
 @pytest.mark.parametrize(
-    ("farther", "station", "read"), [(2.6, Station(30), 35), (3.0, Station(45), 0)], ids=["140 px", "97 px"]
+    ("farther", "station", "read"),
+    [
+        pytest.param(2.6, Station(30), 35, id="140 px", marks=pytest.mark.slow),
+        pytest.param(3.0, Station(45), 0, id="97 px"),
+    ],
 )
 def test_a_small_field_whose_lines_cannot_be_seen_is_read_by_its_targets(
     farther: float, station: Station, read: int
@@ -260,8 +265,11 @@ def test_images_without_the_testfield_are_failures_with_a_reason(
 
 @pytest.mark.parametrize(
     ("left", "right"),
-    [(STATION, STATION), (Station(0), Station(0)), (Station(30, 0, 37), Station(30, 90))],
-    ids=["alike", "at right angles", "from other sides"],
+    [
+        pytest.param(STATION, STATION, id="alike", marks=pytest.mark.slow),
+        pytest.param(Station(0), Station(0), id="at right angles", marks=pytest.mark.slow),
+        pytest.param(Station(30, 0, 37), Station(30, 90), id="from other sides"),
+    ],
 )
 def test_of_two_testfields_one_is_measured_as_if_it_were_alone(left: Station, right: Station) -> None:
     halves = [PLAIN.record(station).pixels for station in (left, right)]
@@ -285,12 +293,12 @@ def test_a_testfield_is_found_beside_a_larger_one_whose_code_begins_alike() -> N
     np.testing.assert_allclose(found.xy - [frames[0].shape[1], 0], alone.xy, rtol=0, atol=0.01)
 
 
-@pytest.mark.parametrize("condition", ["gamma", "sharpened", "jpeg60"])
+@pytest.mark.parametrize("condition", [pytest.param("gamma", marks=pytest.mark.slow), "sharpened", "jpeg60"])
 def test_cameras_that_process_their_pictures_leave_sigmas_of_the_size_of_errors(condition: str) -> None:
     """Residuals are then larger than noise, but displace targets less."""
     design = coded_testfield()
     (view,) = views(condition, 1, Field(json.loads(design.to_json())))
-    found = measure_testfield(Frame(view.picture(), 255.0), design)
+    found = measure_testfield(Frame(kept.picture(view), 255.0), design)
     assert found.ok.all()
     sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
     assert np.sqrt((((found.xy - view.truth) / sigma) ** 2).mean()) == pytest.approx(1.0, abs=0.15)

@@ -124,6 +124,7 @@ def test_a_stored_calibration_is_compared_and_reported_as_a_fresh_one(
         read.residuals()
 
 
+@pytest.mark.slow
 def test_a_model_that_is_led_astray_is_refused_in_words(reference_data: Callable[[str], Path]) -> None:
     case = reference_data("cases") / "newcomer" / "python-no-verdict"
     found = reseau.calibrate(case / "s5", case / "board.json", model="double_sphere")

@@ -92,6 +92,7 @@ def photo_of(world: World, bench: tuple[PhotoI, PhotoII]) -> PhotoII:
     return photo_ii(world.photo_ii(), world.design, world.test_object, first.camera).required()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pushed", [0.4, pytest.param(20.0, marks=pytest.mark.slow)])
 def test_a_displaced_camera_is_detected_and_corrected(pushed: float, bench):
     _, before = bench

@@ -55,24 +55,29 @@ def measured(printed: BoardDesign, told: BoardDesign) -> TargetMeasured:
 @pytest.mark.parametrize(
     ("printed", "told", "said"),
     [
-        (CHESS, {"columns": 6, "rows": 5}, "columns 7 in place of 6, rows 6 in place of 5"),
         (CHESS, {"columns": 8, "rows": 7}, "columns 7 in place of 8, rows 6 in place of 7"),
-        (CHARUCO, {"columns": 6, "rows": 7}, "columns 7 in place of 6, rows 6 in place of 7; calibrated"),
         (CHARUCO, {"dictionary": "DICT_4X4_50"}, "dictionary DICT_5X5_50 in place of DICT_4X4_50"),
-        (CHARUCO, {"rows": 5}, "rows 6 in place of 5; calibrated"),
-        (LEGACY, {"rows": 5}, "rows 6 in place of 5; calibrated"),
-        (APRIL, {"rows": 3}, "rows 4 in place of 3; calibrated"),
         (LEGACY, {"legacy": False}, "legacy True in place of False"),
         (APRIL, {"pitch": 40.0}, "in other proportions than was told: pitch 30.0 in place of 40.0"),
-        (CIRCLES, {"columns": 8}, "columns 7 in place of 8; calibrated"),
-        (SHIFTED, {"rows": 6}, "rows 5 in place of 6; calibrated"),
-        (LONG, {"columns": 9}, "columns 10 in place of 9; calibrated"),
-        (LONG, {"rows": 6}, "rows 7 in place of 6; calibrated"),
-        (CIRCLES, {"columns": 6}, "columns 7 in place of 6; calibrated"),
         (CIRCLES, {"rows": 4}, "rows 5 in place of 4; calibrated"),
-        (SHIFTED, {"rows": 4}, "rows 5 in place of 4; calibrated"),
         (SHIFTED, {"columns": 2}, "columns 3 in place of 2; calibrated"),
         (CIRCLES.model_copy(update={"polarity": "bright"}), {"polarity": "dark"}, "bright in place of dark"),
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in (
+                (CHESS, {"columns": 6, "rows": 5}, "columns 7 in place of 6, rows 6 in place of 5"),
+                (CHARUCO, {"columns": 6, "rows": 7}, "columns 7 in place of 6, rows 6 in place of 7"),
+                (CHARUCO, {"rows": 5}, "rows 6 in place of 5; calibrated"),
+                (LEGACY, {"rows": 5}, "rows 6 in place of 5; calibrated"),
+                (APRIL, {"rows": 3}, "rows 4 in place of 3; calibrated"),
+                (CIRCLES, {"columns": 8}, "columns 7 in place of 8; calibrated"),
+                (SHIFTED, {"rows": 6}, "rows 5 in place of 6; calibrated"),
+                (LONG, {"columns": 9}, "columns 10 in place of 9; calibrated"),
+                (LONG, {"rows": 6}, "rows 7 in place of 6; calibrated"),
+                (CIRCLES, {"columns": 6}, "columns 7 in place of 6; calibrated"),
+                (SHIFTED, {"rows": 4}, "rows 5 in place of 4; calibrated"),
+            )
+        ),
     ],
 )  # fmt: skip
 def test_the_board_that_photographs_show_is_measured_in_place_of_the_told_one(
@@ -90,7 +95,14 @@ def test_the_board_that_photographs_show_is_measured_in_place_of_the_told_one(
         assert len(each.found) > 0.9 * len(printed.ids)
 
 
-@pytest.mark.parametrize("told", [(7, 9), (7, 7), (6, 8)], ids=["too large", "a row less", "a column less"])
+@pytest.mark.parametrize(
+    "told",
+    [
+        pytest.param((7, 9), id="too large", marks=pytest.mark.slow),
+        pytest.param((7, 7), id="a row less", marks=pytest.mark.slow),
+        pytest.param((6, 8), id="a column less"),
+    ],
+)
 def test_a_deltille_told_wrongly_is_measured_as_it_is_printed(told: tuple[int, int]) -> None:
     printed = prints.Deltille(7, 8, 20.0)
     frames = [

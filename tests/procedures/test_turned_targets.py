@@ -50,7 +50,9 @@ def photographs(design: BoardDesign, print_mm: float, shifted: int = 0) -> list[
     return found
 
 
-@pytest.mark.parametrize("print_mm", [0.0, 0.03, 0.15])
+@pytest.mark.parametrize(
+    "print_mm", [0.03, *(pytest.param(each, marks=pytest.mark.slow) for each in (0.0, 0.15))]
+)
 @pytest.mark.parametrize(
     ("design", "ways"),
     [

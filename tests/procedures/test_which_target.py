@@ -17,6 +17,7 @@ from reseau.designs import board, coded_sheet, coded_testfield
 from reseau.designs.dots import dot_signs
 from reseau.designs.known import known_designs
 from reseau.io import BoardDesign
+from reseau.io.photographs import read_exif
 from reseau.procedures.exposures import of_another_lens
 from reseau.procedures.target_measurement import Measurer, measurer_of
 from reseau.procedures.which_target import Design, designs_beside, which_target
@@ -98,7 +99,7 @@ def test_lines_are_not_looked_for_where_markers_are_read(tried: list[str]) -> No
     assert tried == ["mine", "mine"]
 
 
-@pytest.mark.parametrize("start", [(100, 7), (333, 492)])
+@pytest.mark.parametrize("start", [pytest.param((100, 7), marks=pytest.mark.slow), (333, 492)])
 def test_a_puzzleboard_is_found_by_the_parts_that_photographs_show(start: tuple[int, int]) -> None:
     signs = dot_signs(board("puzzle", 12, 9, 22.0, start=start))
     bits = signs[1::2, 2:-1:2].T > 0, signs[2:-1:2, 1::2].T > 0
@@ -129,6 +130,7 @@ def test_a_puzzleboard_is_found_by_the_parts_that_photographs_show(start: tuple[
     assert (moved[1].start, moved[1].pitch) == (start, 15.0)
 
 
+@pytest.mark.slow
 def test_boards_that_are_drawn_by_default_are_known() -> None:
     boards = {name: design for name, design in known_designs().items() if isinstance(design, BoardDesign)}
     for printed, name in (
@@ -168,6 +170,7 @@ def test_parts_of_a_larger_chessboard_are_not_taken_for_a_smaller_one() -> None:
     assert which_target([part, part, part, frame], {"smaller": smaller, "larger": larger})
 
 
+@pytest.mark.slow
 def test_a_sheet_of_dots_without_a_design_is_declined(reference_data: Callable[[str], Path]) -> None:
     files = sorted(reference_data("testfield_camcal").glob("*.JPG"))[:2]
     found = which_target(map(reseau.read_image, files), dict(known_designs()), tried=2)
@@ -181,8 +184,10 @@ def test_photographs_with_another_zoom_are_named(tmp_path: Path) -> None:
         exif = Image.Exif()
         inner = exif.get_ifd(0x8769)
         inner[0x920A], inner[0xA405] = focal, int(1.5 * focal)
+        exif[0x010F], exif[0x0110] = "Canon", "Canon EOS 5D"
         Image.new("L", (8, 8)).save(tmp_path / name, exif=exif)
         files[name] = tmp_path / name
     said, others = of_another_lens(files)
     assert said == pytest.approx(36)
+    assert read_exif(files["a.jpg"]).camera == "Canon EOS 5D"
     assert others == {"c.jpg": "was taken with a focal length of 35 mm, most with 24 mm"}

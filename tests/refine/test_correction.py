@@ -250,6 +250,25 @@ def test_the_covariance_of_coefficients_contains_the_errors_of_o_and_s(lost):
     assert alone > (5 if not lost else 1) * squares
 
 
+def test_the_covariance_of_coefficients_contains_the_errors_of_the_design():
+    stated = tuple(p.model_copy(update={"sigma": 0.02}) for p in GRID.points)
+    exact, squares = corrected(measured(world=PROJECTIVE)), 0.0
+    for seed in range(12):
+        rng = np.random.default_rng(100 + seed)
+        # O and S are where the design has them, so that the common system is the same.
+        shifts = [rng.normal(0, 0.0 if p.id in (GRID.origin, GRID.axis) else 0.02, 2) for p in stated]
+        moved = [
+            p.model_copy(update={"x": p.x + x, "y": p.y + y})
+            for p, (x, y) in zip(stated, shifts, strict=True)
+        ]
+        points = measured(GRID.model_copy(update={"points": tuple(moved)}), PROJECTIVE, seed=seed)
+        camera = corrected(points, GRID.model_copy(update={"points": stated}))
+        off = camera.model.values - exact.model.values
+        squares += off @ np.linalg.solve(camera.coefficient_covariance, off)
+    low, high = chi2.ppf([0.0005, 0.9995], 12 * 13)
+    assert low < squares < high
+
+
 def test_corrected_covariances_are_those_of_points_and_model():
     camera = corrected(measured(seed=3))
     place = np.array([[400.0, 300.0]])

@@ -35,6 +35,7 @@ def squares() -> Array:
     return chart(6.0, 0.8, np.random.default_rng(2))
 
 
+@pytest.mark.slow
 def test_the_edges_of_a_chart_are_found_and_true_within_their_sigmas(squares: Array) -> None:
     found = measure_edges(Frame(squares, 255.0))
     assert not isinstance(found, Failure)

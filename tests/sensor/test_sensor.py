@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -136,3 +138,18 @@ def test_a_flickering_lamp_does_not_count_as_noise() -> None:
     still = Level.of(4000.0, [sensor.expose(LIGHT, 4000.0, rng) for _ in range(20)])
     flickering = Level.of(4000.0, [sensor.expose(LIGHT * f, 4000.0, rng) for f in rng.normal(1.0, 0.02, 20)])
     assert flickering.variance.mean() == pytest.approx(still.variance.mean(), rel=0.02)
+
+
+def test_the_variance_of_a_corrected_frame_is_that_of_read_noise_and_electrons() -> None:
+    """At the dark level and above it, with a bent response and one that is half as steep."""
+    fields = SimpleNamespace(
+        dark=lambda exposure_us: np.full((2, 2), 100.0), response=np.full((2, 2), 0.5, np.float32)
+    )
+    sensor: Any = SimpleNamespace(
+        fields=fields, full_scale=1000.0, correction=SimpleNamespace(b2=0.1, b3=0.0),
+        transfer=SimpleNamespace(fit={"read_noise": 2.0, "gain": 4.0}),
+    )  # fmt: skip
+    found = SensorResult.variance(sensor, Frame(np.array([[100.0, 300.0]] * 2), 1000.0), 3, 50.0)
+    read = 4.0 + 1 / 12
+    expected = [read, 1.04**2 * read + 200 * 1.02 / 4.0]
+    np.testing.assert_allclose(found, np.array([expected] * 2) / (3 * 0.25), rtol=1e-6)

@@ -377,6 +377,7 @@ def test_a_stable_camera_is_accepted(archive: Archive) -> None:
     assert found.count("accepted") >= 19, found
 
 
+@pytest.mark.slow
 def test_a_drift_of_one_parameter_is_signalled_and_named(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     with Archive.open(tmp_path / "archive", create=True) as archive:

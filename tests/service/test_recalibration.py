@@ -70,6 +70,7 @@ def rig(defined: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Field
     return rig
 
 
+@pytest.mark.slow
 def test_a_recalibration_is_acquired_adjusted_compared_and_put_in_force(
     rig: FieldRig, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,6 +26,7 @@ def lived(place: Path, weeks: int, seed: int = 1) -> list[str]:
     return log
 
 
+@pytest.mark.slow
 def test_weeks_with_a_bench_in_use_a_computer_off_summer_time_and_a_bad_run_go_as_expected(
     tmp_path: Path,
 ) -> None:

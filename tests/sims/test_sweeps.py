@@ -39,7 +39,7 @@ def alone(world: World) -> tuple[str, ...]:
     return tuple(name for name in world.test_object.ids if name[0] in ROWS)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("display", ["wong", "polynomial"])
 def test_middles_of_arcs_are_at_their_true_positions(seed: int, display: str) -> None:
     world = quiet(World.standard(seed, display=display))  # type: ignore[arg-type]
@@ -155,6 +155,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(1)
 
 
+@pytest.mark.slow
 def test_a_parallax_shifts_the_echoes_but_not_the_reseau() -> None:
     near, far = (quiet(World.standard(2, faults=Faults(parallax_mm=gap))) for gap in (0.0, 2.0))
     np.testing.assert_array_equal(near.truth("PHOTO II").xy, far.truth("PHOTO II").xy)
@@ -213,6 +214,7 @@ def test_swapped_marks_are_the_same_marks() -> None:
     assert other.points == design.points
 
 
+@pytest.mark.slow
 def test_bright_areas_deflect_the_beam_and_the_truth_includes_it() -> None:
     straight = quiet(World.standard(6))
     disk = (-30.0, 0.0, 12.0)
@@ -264,6 +266,7 @@ def test_impossible_worlds_are_refused(impossible: object, message: str) -> None
         impossible()  # type: ignore[operator]
 
 
+@pytest.mark.slow
 def test_the_reseau_is_redrawn_after_a_change() -> None:
     world, fresh = World.standard(3), World.standard(3)
     light = np.ones(world.camera.shape)

@@ -24,6 +24,7 @@ def frame(world: World) -> Frame:
     return world.photo_i()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_frame_in_any_order(world: World, frame: Frame) -> None:
     again = World.standard(3)
     again.photograph("something else")

@@ -72,7 +72,7 @@ def show(
     name: Name,
     place: Place,
     at: v.At | None = None,
-    ahead: Annotated[int, typer.Option(min=0, help="Number of later runs.")] = 3,
+    ahead: Annotated[int, Option("Number of later runs.", least=0)] = 3,
     as_json: v.AsJson = False,
 ) -> None:
     """Show all runs of a schedule; exit status 1 if one is overdue, or the last one failed."""
@@ -113,7 +113,7 @@ def export(
 @app.command("run")
 def run_(
     place: Place,
-    once: Annotated[bool, typer.Option("--once", help="Carry out what is due now, and end.")] = False,
+    once: Annotated[bool, Option("Carry out what is due now, and end.")] = False,
     every: v.Every = 300.0,
     notify: v.Notify | None = None,
     inside: v.Inside | None = None,
@@ -246,7 +246,7 @@ def recalibrate(
 @alarms.command("list")
 def list_alarms(
     place: Place,
-    everything: Annotated[bool, typer.Option("--all", help="Also acknowledged ones.")] = False,
+    everything: Annotated[bool, Option("Also acknowledged ones.", called="all")] = False,
     as_json: v.AsJson = False,
 ) -> None:
     """List the alarms that nobody acknowledged; exit status 1 if there are any."""

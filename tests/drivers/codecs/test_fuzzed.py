@@ -141,10 +141,12 @@ def test_decoders_recover_after_noise(name: str, garbage: bytes, data: st.DataOb
 def test_an_endless_message_uses_bounded_memory(name: str, piece: bytes) -> None:
     decoder, chunk = STREAMS[name](), (piece * 65536)[:65536]
     kept = 0
-    # Marks of frames are met by the million; twenty chunks of them are enough.
-    for _ in range(20 if piece == b"\x01\x01" else 160):
+    for fed in range(160):
         decoder.feed(chunk)
         kept = max(kept, sum(len(v) for v in vars(decoder).values() if isinstance(v, bytes | bytearray)))
+        # What has kept less than a chunk of five takes none for the begin of a message.
+        if fed == 4 and kept < len(chunk):
+            break
     assert kept < 8.6e6
 
 

@@ -426,6 +426,7 @@ def test_an_instrument_that_does_not_answer_is_named_and_does_not_take_the_other
             assert client.get("/api/1/sessions/deaf").status_code == 404
 
 
+@pytest.mark.slow
 def test_an_instrument_that_was_silent_is_connected_when_it_answers(rig: Rig, tmp_path: Path) -> None:
     with SimulatedBench(seed=5) as sim:
         another, plugged = Rig(tmp_path, sim), tmp_path / "tty"
@@ -444,6 +445,7 @@ def test_an_instrument_that_was_silent_is_connected_when_it_answers(rig: Rig, tm
             assert check["sonar"] is None
 
 
+@pytest.mark.slow
 def test_a_defect_of_a_driver_is_an_answer_and_a_crash_restarts_the_worker(one: Served, rig: Rig) -> None:
     client = one.client("operate")
     pid = one.service.benches["cellar"].status["pid"]

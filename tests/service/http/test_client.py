@@ -83,6 +83,7 @@ def test_photographs_are_uploaded(place: tuple[Path, str, str], tmp_path: Path) 
     assert (found["status"], found["good"]) == ("done", 3)
 
 
+@pytest.mark.slow
 def test_events_are_resumed_after_a_restart_of_the_service(archived: Path, tmp_path: Path) -> None:
     shutil.copytree(archived, tmp_path, dirs_exist_ok=True)
     found: list[tuple[str, str]] = []
@@ -114,6 +115,7 @@ def test_events_are_resumed_after_a_restart_of_the_service(archived: Path, tmp_p
     assert ("reset", "") in found
 
 
+@pytest.mark.slow
 def test_the_service_is_ready_in_less_than_3_s_of_processor_time(tmp_path: Path) -> None:
     import psutil
 

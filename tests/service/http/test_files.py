@@ -54,6 +54,7 @@ def finished(client: TestClient, number: int) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 def test_photographs_become_a_calibration_with_a_verdict_that_is_computed_again(
     one: Served, photographs: dict[str, bytes]
 ) -> None:

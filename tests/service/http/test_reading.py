@@ -464,6 +464,7 @@ def test_events_published_at_the_same_time_arrive_once_and_in_their_order() -> N
     assert numbers == list(range(8 * count + 1))
 
 
+@pytest.mark.slow
 def test_answers_do_not_wait_for_acknowledgements_of_tcp(tmp_path: Path) -> None:
     with process(tmp_path) as (address, token, _), httpx.Client(base_url=address) as http:
         headers = {"Authorization": f"Bearer {token}"}
