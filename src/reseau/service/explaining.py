@@ -87,8 +87,8 @@ class RunHistory:
         """Precisions (n, r, r), the mean of the runs, and the weighted squares of what deviates from it."""
         precision: Array = np.linalg.inv(self.covs)
         weighted = np.einsum("nij,nj->ni", precision, self.values)
-        mean: Array = np.linalg.solve(precision.sum(axis=0), weighted.sum(axis=0))
-        return precision, mean, float(((self.values - mean) * weighted).sum())
+        mean = np.linalg.solve(precision.sum(axis=0), weighted.sum(axis=0))
+        return precision, np.asarray(mean, dtype=np.float64), float(((self.values - mean) * weighted).sum())
 
     def evidence(self) -> Array:
         """Log likelihoods of the runs without a change, for each scale of their errors."""
@@ -114,8 +114,9 @@ class RunHistory:
         cov = cov + np.square(_WIDTHS)[:, None, None] * wide[:, None]
         square = np.einsum("sjatik,ji,jk->sjat", np.linalg.inv(cov), off, off)
         log = -0.5 * (square + np.linalg.slogdet(2 * np.pi * cov)[1])
-        found: Array = scipy.special.logsumexp(log, axis=(2, 3)).sum(axis=1)
-        return found - len(off) * np.log(2 * len(_WIDTHS))
+        log = scipy.special.logsumexp(log, axis=(2, 3)) - np.log(2 * len(_WIDTHS))
+        found: Array = log.sum(axis=1)
+        return found
 
 
 @dataclass(frozen=True, eq=False)

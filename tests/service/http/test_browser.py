@@ -259,7 +259,7 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
         press(browser, f'button[aria-label="Home {axis}"]')
         until(lambda: "done" in browser.text("#message") or browser.text("#message"))
     browser.until("tilt")
-    browser.fill("#step", "10")
+    written(browser, "#step", "10")
     press(browser, 'button[aria-label="plus a step, tilt"]')
     until(lambda: "10.0" in browser.text("#axes-title ~ div"))
     browser.click("button.stop")
