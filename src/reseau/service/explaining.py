@@ -85,7 +85,7 @@ class RunHistory:
 
     def mean(self) -> tuple[Array, Array, float]:
         """Precisions (n, r, r), the mean of the runs, and the weighted squares of what deviates from it."""
-        precision: Array = np.linalg.inv(self.covs)
+        precision = np.asarray(np.linalg.inv(self.covs), dtype=np.float64)
         weighted = np.einsum("nij,nj->ni", precision, self.values)
         mean = np.linalg.solve(precision.sum(axis=0), weighted.sum(axis=0))
         return precision, np.asarray(mean, dtype=np.float64), float(((self.values - mean) * weighted).sum())
