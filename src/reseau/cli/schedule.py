@@ -202,7 +202,7 @@ def recalibrate(
         float, Option("With --repeats: wait before the first frame (min).", least=0)
     ] = 0.0,
     self_test: Annotated[bool, Option("With --repeats: test the instruments first.")] = False,
-    data: Annotated[v.Data | None, "With --repeats: issue one with each calibration."] = None,
+    data: Annotated[v.Data | None, "With --repeats: issue a certificate with these data."] = None,
     notify: v.Notify | None = None,
     inside: v.Inside | None = None,
     resume: v.Resume = False,
