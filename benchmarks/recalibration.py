@@ -24,7 +24,7 @@ from parts import add_options, executor_of, main_of, outcomes
 from reseau.core.data import Array
 from reseau.execution import Executor
 from reseau.service.charts import ChartOptions, KnownSeries, monitor
-from reseau.service.rules import RunHistory, explain_runs
+from reseau.service.explaining import RunHistory, explain_runs
 from reseau.service.runlength import Cusum, Ewma, Prerun, Shewhart
 
 PARAMETERS, YEAR, AT_ONCE = 10, 52, 2500
@@ -217,13 +217,13 @@ def error_fields() -> Array:
     return np.asarray((u * s).reshape(-1, 2, 4))
 
 
-def acceptance(executor: Executor, count: int) -> None:
+def acceptance(executor: Executor, count: int, seed: int) -> None:
     """Simulate years of weekly runs in which something happens, each accepted or not as by `judge`."""
     print(
         f"acceptance against a reference: years of 52 runs, errors of a run {SIGMA} limits, four directions"
     )
     for kind, size in HAPPENINGS:
-        jobs = [(kind, size, seed) for seed in range(count)]
+        jobs = [(kind, size, 1000 * seed + k) for k in range(count)]
         found = np.array(list(outcomes(executor, a_year, jobs, together=20)))
         missed, held, accepted, first, announced = found.T
         line = (
@@ -253,26 +253,26 @@ def a_year(job: tuple[str, float, int]) -> tuple[float, float, float, float, flo
     }[kind]  # fmt: skip
     values = rng.normal(size=(WEEKS, 4)) + drift[:, None] * direction
     values -= values[0]
-    in_force, runs, missed, false, sound = 0, [0], False, 0, list[bool]()
+    in_force, rejects, missed, false, sound = 0, np.zeros(WEEKS, dtype=bool), False, 0, list[bool]()
     first = announced = np.nan
     for week in range(1, WEEKS):
-        rows, true = [*runs, week], abs(drift[week])
+        rows, true = np.arange(week + 1), abs(drift[week])
         covs = np.repeat(np.eye(4)[None], len(rows), axis=0)
         said = explain_runs(
-            RunHistory(7.0 * np.array(rows), values[rows], covs, basis), 1.0, runs.index(in_force)
+            RunHistory(7.0 * rows, values[rows], covs, basis, rejected=rejects[rows]), 1.0, in_force
         )
-        rejected = said.beyond(1.0, step=True) > 0.5 and said.p < 0.01
-        held = rejected or said.beyond(1.0) > 0.5 or said.beyond(1.0, step=True) > 0.5
+        changed = said.held(1.0, step=True)
+        rejected = changed and said.p < 0.01
+        held = changed or said.held(1.0)
         sound.append(not held and said.p >= 0.01 and said.beyond(0.5) <= 0.5)
-        if not rejected:
-            runs.append(week)
+        rejects[week] = rejected
         if held:
             first = true if np.isnan(first) else first
             false += true < 1 - 2 * SIGMA
         else:
             in_force = week
             missed |= true > 1 + 2 * SIGMA
-        if len(rows) > 4 and said.creeping > 0.5 and said.size()[0] >= 0.5 and np.isnan(announced):
+        if len(rows) > 4 and said.creeps(0.5) and np.isnan(announced):
             announced = true
         if held and kind == "creeping" and true > 1 + 2 * SIGMA:
             break
@@ -297,7 +297,7 @@ def main() -> None:
         if given.part in (None, "delays"):
             delays(executor, 5000, given.seed)
         if given.part in (None, "acceptance"):
-            acceptance(executor, 200)
+            acceptance(executor, 200, given.seed)
     print(f"{time.monotonic() - start:.0f} s")
 
 

@@ -58,8 +58,7 @@ class MachineCode(BuildHookInterface[Any]):
         self._made = tempfile.TemporaryDirectory()
         source = Path(self.root) / "src"
         name = usual(source)
-        environment = os.environ | {
-            "PYTHONPATH": os.pathsep.join(str(Path(self.root) / each) for each in ("src", "drivers", "sims")),
+        environment = beside(*(Path(self.root) / each for each in ("src", "drivers", "sims"))) | {
             "NUMBA_CACHE_DIR": self._made.name,
             "NUMBA_CPU_NAME": name,
             "NUMBA_CPU_FEATURES": "",
@@ -75,11 +74,18 @@ class MachineCode(BuildHookInterface[Any]):
         self._made.cleanup()
 
 
+def beside(*folders: Path) -> dict[str, str]:
+    """The environment with packages of these folders, beside those that pip has installed for this build."""
+    paths = [*map(str, folders), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+
+
 def usual(source: Path) -> str:
     """The usual processor of this platform, as LLVM names it."""
     command = "from reseau.core.compiled import usual_processor; print(*(usual_processor() or ['']))"
-    environment = os.environ | {"PYTHONPATH": str(source)}
-    found = subprocess.run([sys.executable, "-c", command], env=environment, capture_output=True, text=True)
+    found = subprocess.run(
+        [sys.executable, "-c", command], env=beside(source), capture_output=True, text=True
+    )
     name = found.stdout.partition(" ")[0].strip()
     if not name:
         raise SystemExit(f"{platform.machine()} has no usual processor that this one is: {found.stderr}")

@@ -1,12 +1,12 @@
 """Draws pictures of the README, the tours and the how-to pages, for light and, with `-dark`, for dark pages.
 
-    python docs/figures.py calibration
+    python docs/figures.py calibration|several-machines
     python docs/figures.py gallery
-    python docs/figures.py tour-camera|seen|blurred|underwater|fiducial-marks|reseau-on-film FOLDER
+    python docs/figures.py tour-camera|seen|blurred|underwater|PAGE FOLDER
 
-The first is drawn by `docs/desk.py`, the second ones by examples of the gallery. The others show results of
-pages: the folder is the one in which the commands of `docs/tours/camera.md`, `blurred.md`,
-`blurred-under-water.md` or of `docs/howto/fiducial-marks.md` and `reseau-on-film.md` were followed.
+The first is drawn by `docs/desk.py`, those of the gallery by its examples. The others show results of pages:
+the folder is the one in which the commands of `docs/tours/camera.md`, `blurred.md`, `blurred-under-water.md`
+were followed, or those of the page of `docs/howto` that has the name of the picture.
 """
 
 from __future__ import annotations
@@ -23,12 +23,13 @@ import numpy as np
 from desk import Desk
 from matplotlib import pyplot
 from matplotlib.figure import Figure
+from matplotlib.patches import FancyBboxPatch
 from themes import reset, save
 
 import reseau
 from reseau.core.data import Frame
 from reseau.core.failure import Failure
-from reseau.core.figures import ACCENT, FAINT, drawing, image_axes
+from reseau.core.figures import ACCENT, FAINT, INK, PALE, drawing, image_axes
 from reseau.designs import board
 from reseau.exchange import read_lens, read_network
 from reseau.io import ReseauDesign
@@ -168,6 +169,69 @@ def reseau_on_film(folder: Path) -> Figure:
     return figure
 
 
+def _photographs(folder: Path, rows: list[list[str]], wide: float, high: float) -> Figure:
+    """Photographs in rows, each with its name."""
+    figure = Figure(figsize=(wide, high), layout="constrained")
+    grid = figure.subplots(len(rows), len(rows[0]), squeeze=False)
+    for axes, name in zip(grid.flat, (name for row in rows for name in row), strict=True):
+        axes.imshow(reseau.read_image(folder / name).pixels, cmap="gray", vmin=0, vmax=255)
+        axes.set_title(name, loc="left")
+        axes.set_axis_off()
+    return figure
+
+
+def several_cameras(folder: Path) -> Figure:
+    """Three exposures, as both cameras took them."""
+    taken = ("02.png", "04.png", "08.png")
+    return _photographs(
+        folder, [[f"{camera}/{name}" for name in taken] for camera in ("left", "right")], 9.0, 5.0
+    )
+
+
+def turntable(folder: Path) -> Figure:
+    """The series before and after the camera was moved."""
+    return _photographs(
+        folder, [[f"table/{series + k:02}.png" for k in (1, 3, 5, 6)] for series in (0, 6)], 9.0, 4.0
+    )
+
+
+def n_wire_phantom(folder: Path) -> Figure:
+    """The overlay of the frame, and its upper right part."""
+    seen = cv2.cvtColor(cv2.imread(str(folder / "wires.png")), cv2.COLOR_BGR2RGB)
+    scale = seen.shape[1] / 620
+    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+    whole, part = figure.subplots(1, 2)
+    whole.imshow(seen)
+    part.imshow(seen[int(60 * scale) : int(300 * scale), int(290 * scale) : int(600 * scale)])
+    for axes in (whole, part):
+        axes.set_axis_off()
+    return figure
+
+
+def several_machines() -> Figure:
+    """Who speaks with whom."""
+    figure = Figure(figsize=(9.0, 2.9), layout="constrained")
+    axes = figure.add_subplot()
+    boxes = {
+        "here": (0.0, 1.0, "reseau calibrate photos/\nadjusts"),
+        "scheduler": (3.4, 1.7, "dask scheduler\ndistributes"),
+        "store": (3.4, 0.3, "store\nphotographs, measurements"),
+        **{f"worker {k}": (6.8, 2.0 - k, "dask worker\nmeasures") for k in range(3)},
+    }
+    at = {name: np.array((x, y)) for name, (x, y, _) in boxes.items()}
+    for x, y, text in boxes.values():
+        axes.add_patch(FancyBboxPatch((x - 1.0, y - 0.3), 2.0, 0.6, "round,pad=0.04", fc=PALE, ec=FAINT))
+        axes.text(x, y, text, ha="center", va="center", color=INK)
+    arrow = {"arrowstyle": "<->", "color": ACCENT, "shrinkA": 0, "shrinkB": 0}
+    for a, b in [("here", middle) for middle in ("scheduler", "store")] + [
+        (middle, name) for middle in ("scheduler", "store") for name in boxes if name.startswith("worker")
+    ]:
+        axes.annotate("", at[b] - (1.06, 0.0), at[a] + (1.06, 0.0), arrowprops=arrow)
+    axes.set(xlim=(-1.2, 8.0), ylim=(-0.5, 2.5))
+    axes.set_axis_off()
+    return figure
+
+
 def gallery() -> None:
     """Draw the pictures of how-to pages that examples of the gallery make."""
     for name, (example, number) in GALLERY.items():
@@ -201,7 +265,7 @@ GALLERY = {
 def main() -> None:
     """Draw the picture that is named."""
     parser = argparse.ArgumentParser(description="Pictures of the README and the tours.")
-    parser.add_argument("name", choices=["calibration", "gallery", *TOURS])
+    parser.add_argument("name", choices=[*DRAWN, "gallery", *TOURS])
     parser.add_argument("folder", nargs="?", type=Path, help="where the commands of the tour were followed")
     given = parser.parse_args()
     if (given.folder is None) != (given.name not in TOURS):
@@ -210,11 +274,12 @@ def main() -> None:
         gallery()
         return
     with drawing():
-        figure = calibration() if given.folder is None else TOURS[given.name](given.folder)
+        figure = DRAWN[given.name]() if given.folder is None else TOURS[given.name](given.folder)
         save(figure, IMAGES / f"{given.name}.png")
     print(IMAGES / f"{given.name}.png")
 
 
+DRAWN = {"calibration": calibration, "several-machines": several_machines}
 TOURS = {
     "tour-camera": tour_camera,
     "seen": seen,
@@ -222,6 +287,9 @@ TOURS = {
     "underwater": underwater,
     "fiducial-marks": fiducial_marks,
     "reseau-on-film": reseau_on_film,
+    "several-cameras": several_cameras,
+    "turntable": turntable,
+    "n-wire-phantom": n_wire_phantom,
 }
 
 if __name__ == "__main__":

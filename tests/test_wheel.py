@@ -31,7 +31,8 @@ def pip(python: Path | str, *arguments: object) -> None:
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
-    pip(sys.executable, "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", folder, ".")
+    # Isolated, as `pip install .` builds it: with what pip installs for the build.
+    pip(sys.executable, "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, ".")
     (path,) = folder.glob("reseau-*.whl")
     return path
 

@@ -79,6 +79,9 @@ def test_a_lens_that_changed_is_found_significant() -> None:
     found = calibration_difference(before, lens_of(changed, 6))
     assert found.p < 1e-6
     assert np.nanmin(found.p_at) < 1e-6
+    cov = found.cov.copy()
+    cov[0, 0] = np.nan  # no ray is imaged there
+    assert np.flatnonzero(np.isnan(replace(found, cov=cov).p_at)).tolist() == [0]
 
 
 def test_a_rotation_compensated_by_the_principal_point_is_no_difference() -> None:

@@ -24,6 +24,9 @@ def test_numbers_may_differ_in_the_last_digits_and_words_not() -> None:
     assert not same("fx 689.986 ± 0.021 px", "fx 589.986 ± 0.021 px")
     assert not same("12 images", "14 images")
     assert not same("usable for measurement", "not usable")
+    assert same("3 points, ...; take 10 photographs", "3 points, 4 lines; take 10 photographs")
+    assert not same("3 points, ...; take 10 photographs", "3 points, 4 lines; take 20 photographs")
+    assert not same("3 points, ...", "5 points, 4 lines")
 
 
 @pytest.mark.slow
@@ -31,7 +34,10 @@ def test_a_bench_is_automated_and_scheduled(tmp_path: Path, monkeypatch: pytest.
     enter(tmp_path, monkeypatch, FieldRig())
 
     def simulated(words: list[str]) -> bool:
-        return words[1:3] == ["bench", "sim"]
+        """The bench of the tests has other instruments: it is checked, and prints others."""
+        if words[1:3] == ["bench", "check"]:
+            assert run(words[1:]) == 0
+        return words[1:3] in (["bench", "sim"], ["bench", "check"])
 
     def waiting() -> str:
         with Archive.open("archive") as archive:
@@ -39,7 +45,7 @@ def test_a_bench_is_automated_and_scheduled(tmp_path: Path, monkeypatch: pytest.
 
     Path("bench.toml").write_text(BENCH, "utf-8")
     DESIGN.write("field.json")
-    follow("bench", tmp_path, instead=simulated, values={"KEY": waiting})
+    follow("tours/bench", tmp_path, instead=simulated, values={"KEY": waiting})
     with Archive.open("archive") as archive:
         assert len(archive.sessions()) >= 2
     assert "SUMMARY:weekly: scheduled" in Path("weekly.ics").read_text("utf-8")
@@ -54,7 +60,7 @@ def test_a_camera_is_calibrated_its_report_read_and_its_certificate_issued(
         with Archive.open("archive") as archive:
             return str(Configurations(archive).history("d1")[0].key)
 
-    follow("camera", tmp_path)
+    follow("tours/camera", tmp_path)
     truth = {
         "fx": 690.0,
         "fy": 689.0,
@@ -68,18 +74,18 @@ def test_a_camera_is_calibrated_its_report_read_and_its_certificate_issued(
     camera = Calibration.read("camera.json")
     for name, true in truth.items():
         assert abs(camera.values()[name] - true) < 4 * camera.parameters[name].sigma
-    follow("report", tmp_path)
+    follow("tours/report", tmp_path)
     pytest.importorskip("lxml", reason="certificates need the extra `certificates`")
-    follow("certificate", tmp_path, values={"KEY": waiting})
+    follow("tours/certificate", tmp_path, values={"KEY": waiting})
     assert "R-7" in Path("certificate.html").read_text("utf-8")
-    follow("notebook", tmp_path)
+    follow("tours/notebook", tmp_path)
     assert all(Path(name).stat().st_size > 5000 for name in ("result.png", "result.html", "difference.png"))
 
 
 @pytest.mark.slow
 def test_a_roll_of_film_is_oriented(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    follow("film", tmp_path)
+    follow("tours/film", tmp_path)
     assert Path("oriented/summary.html").exists()
 
 
@@ -88,7 +94,7 @@ def test_a_camera_under_water_is_calibrated_without_and_with_the_water(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    follow("underwater", tmp_path)
+    follow("tours/underwater", tmp_path)
     c = Calibration.read("dry.json").parameters["c"]
     assert abs(c.value - 8.0) < 4 * c.sigma
 
@@ -98,7 +104,7 @@ def test_blurred_targets_are_measured_by_the_rays_of_their_lens(
 ) -> None:
     pytest.importorskip("batoid", reason="batoid's rays draw the photograph")
     monkeypatch.chdir(tmp_path)
-    follow("blurred", tmp_path)
+    follow("tours/blurred", tmp_path)
     truth = json.loads(Path("out/blurred/truth.json").read_text("utf-8"))
     points = json.loads(Path("out/blurred/targets.json").read_text("utf-8"))["points"]
     assert len(points) == len(truth) == 24
@@ -111,7 +117,7 @@ def test_blurred_targets_are_measured_by_the_rays_of_their_lens(
 def test_blurred_targets_are_measured_under_water(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("batoid", reason="batoid's rays draw the photographs")
     monkeypatch.chdir(tmp_path)
-    follow("blurred-under-water", tmp_path)
+    follow("tours/blurred-under-water", tmp_path)
     assert Path("out/underwater/measured/report.html").exists()
 
 
@@ -135,7 +141,7 @@ def test_an_instrument_is_corrected_in_three_photographs(
         designs = ["--reseau", "out/reseau.json", "--test-object", "out/rods.json"]
         return run(["refine", *photos, *designs, "--out", "out/calibration.json"]) == 0
 
-    follow("instrument", tmp_path, instead=demo)
+    follow("tours/instrument", tmp_path, instead=demo)
     header, *points = Path("true.csv").read_text("utf-8").splitlines()
     assert header == "id,x,y,sx,sy"
     true = World.standard(seed=1).truth_iii().object_xy

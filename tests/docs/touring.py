@@ -1,4 +1,4 @@
-"""Runs a tour: its commands in the order of the page, in a folder that has only what the page says."""
+"""Runs a page: its commands in the order of the page, in a folder that has only what the page says."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathlib import Path
 from reseau.cli import run
 
 ROOT = Path(__file__).parents[2]
-TOURS = ROOT / "docs" / "tours"
+DOCS = ROOT / "docs"
 _BLOCK = re.compile(
     r"^```(\{code-block\} \w+|console|python)\n(?::caption: (\S+)\n)?(.*?)^```$", re.DOTALL | re.M
 )
@@ -36,9 +36,9 @@ class Step:
 
 
 def steps(page: str) -> list[Step]:
-    """The steps of a tour."""
+    """The steps of a page, such as ``tours/camera``."""
     found: list[Step] = []
-    for kind, caption, body in _BLOCK.findall((TOURS / f"{page}.md").read_text("utf-8")):
+    for kind, caption, body in _BLOCK.findall((DOCS / f"{page}.md").read_text("utf-8")):
         if kind == "console":
             for part in re.split(r"^\$ ", body, flags=re.MULTILINE)[1:]:
                 command, *shown = part.rstrip("\n").split("\n")
@@ -57,12 +57,15 @@ def same(shown: str, printed: str) -> bool:
     """Whether a line was printed as the page shows it, but for numbers: in their last digit, or by a tenth.
 
     Processors round differently, and one mark more or less is measured. What is true is asked elsewhere.
+    ``...`` stands for anything.
     """
-    if shown.strip() == "...":
-        return True
-    if _NUMBER.sub("0", shown.rstrip()) != _NUMBER.sub("0", printed.rstrip()):
+    parts = [re.escape(_NUMBER.sub("0", part)) for part in shown.rstrip().split("...")]
+    if not re.fullmatch(".*".join(parts), _NUMBER.sub("0", printed.rstrip())):
         return False
-    for a, b in zip(_NUMBER.findall(shown), _NUMBER.findall(printed), strict=True):
+    left, right = (_NUMBER.findall(part) for part in (shown.partition("...")[0], shown.rpartition("...")[2]))
+    numbers = _NUMBER.findall(printed)
+    pairs = [*zip(left, numbers, strict=False), *zip(right[::-1], numbers[::-1], strict=False)]
+    for a, b in pairs:
         digits = len(a.split("e")[0].partition(".")[2]) - int(a.partition("e")[2] or 0)
         last = _UNITS * 10.0**-digits * (digits > 0 or "e" in a)
         if abs(float(a) - float(b)) > max(last, 0.1 * abs(float(a))) + 1e-12:
@@ -87,8 +90,8 @@ def follow(
     instead: Callable[[list[str]], bool] = lambda words: False,
     values: dict[str, Callable[[], str]] | None = None,
 ) -> None:
-    """Follow a tour in a folder, which is the current one; `instead` carries out some of the commands."""
-    for script in TOURS.glob("*.py"):
+    """Follow a page in a folder, which is the current one; `instead` carries out some of the commands."""
+    for script in (DOCS / page).parent.glob("*.py"):
         shutil.copy(script, folder)
     names: dict[str, object] = {}
     for step in steps(page):
@@ -101,14 +104,17 @@ def follow(
             for word, value in (values or {}).items():
                 if re.search(rf"\b{word}\b", command):
                     command = re.sub(rf"\b{word}\b", value(), command)
-            may_fail = command.endswith("|| true")
-            words = shlex.split(command.removesuffix("|| true"))
+            command, _, if_it_fails = command.partition(" || ")
+            command, _, into = command.partition(" > ")
+            words = shlex.split(command)
             if instead(words):
                 continue
             status, printed = _carried_out(words)
             print(f"$ {command}\n{printed}")
-            assert status == 0 or may_fail, f"{command}: exit status {status}\n{printed}"
-            check_output(step, printed)
+            assert status == 0 or if_it_fails, f"{command}: exit status {status}\n{printed}"
+            if into:
+                (folder / into).write_text(printed, encoding="utf-8")
+            check_output(step, f"{printed}{status}\n" if if_it_fails == "echo $?" else printed)
 
 
 def _carried_out(words: list[str]) -> tuple[int, str]:
@@ -121,7 +127,7 @@ def _carried_out(words: list[str]) -> tuple[int, str]:
             status = run([*words[1:], *alone])
         return status, written.getvalue()
     if words[0] == "python":
-        # A tour that needs a checkout begins in its folder; here it writes to the folder of the test.
+        # A page that needs a checkout begins in its folder; here it writes to the folder of the test.
         words = [sys.executable, str(ROOT / words[1]) if "/" in words[1] else words[1], *words[2:]]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout + done.stderr

@@ -8,12 +8,29 @@ from __future__ import annotations
 import re
 import struct
 import time
+import tomllib
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from reseau.instruments import Deadline
 
-__all__ = ["GrblBoard", "Lines", "Receiver", "TCube", "Wire", "ZaberStage"]
+__all__ = [
+    "GrblBoard",
+    "Lines",
+    "Receiver",
+    "Screen",
+    "Spoiled",
+    "TCube",
+    "Transcript",
+    "Wire",
+    "ZaberStage",
+    "transcripts",
+]
 
 
 class Receiver(Protocol):
@@ -82,6 +99,181 @@ class Lines:
         )
 
 
+class Screen:
+    """A screen of random colours, and the bytes in which an instrument keeps it.
+
+    Parameters
+    ----------
+    kind : str
+        png, bmp, bytes of colours, or runs of colours.
+    seed : int
+        Of the colours.
+    """
+
+    def __init__(self, kind: str = "png", seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        self.colours: NDArray[np.uint8]
+        match kind:
+            case "bytes of colours":  # red in the highest two bits, green in three, blue in three
+                value = rng.integers(0, 256, (234, 320), dtype=np.uint8)
+                self.colours = np.stack([value << 5, (value & 0x38) << 2, value & 0xC0], axis=-1)
+                self.data = value.tobytes()
+            case "runs of colours":  # 5, 6 and 5 bits
+                value = rng.integers(0, 1 << 16, 480).astype("<u2")
+                line = np.stack([value << 3 & 0xF8, value >> 3 & 0xFC, value >> 8 & 0xF8], axis=-1)
+                self.colours = np.repeat(line.astype(np.uint8)[:, None], 800, axis=1)
+                self.data = np.stack([np.full(480, 800, "<u2"), value], axis=1).tobytes()
+            case _:
+                self.colours = rng.integers(0, 256, (24, 32, 3), dtype=np.uint8)
+                self.data = bytes(cv2.imencode(f".{kind}", self.colours)[1])
+
+    def shows(self, picture: bytes) -> bool:
+        """Whether a picture is of this screen."""
+        found = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+        return found is not None and found.shape == self.colours.shape and bool((found == self.colours).all())
+
+
+class Transcript:
+    """An oscilloscope that does what ``transcripts.toml`` says.
+
+    Parameters
+    ----------
+    told : mapping
+        One of its instruments.
+    """
+
+    def __init__(self, told: Mapping[str, Any]) -> None:
+        self.told, self.screen = told, Screen(told.get("picture", "png"))
+        self.violations = list[str]()
+        self._line = b""
+        self.reset()
+
+    def reset(self) -> None:
+        """Switch it off and on."""
+        self._heard, self._file = set[str](), ""
+
+    def receive(self, data: bytes) -> bytes:
+        """Answer the lines that end in these bytes."""
+        *lines, self._line = (self._line + data).split(b"\n")
+        return b"".join(self._answer(line.decode().strip()) for line in lines)
+
+    def _answer(self, line: str) -> bytes:
+        identity = self.told["identity"]
+        if identity and line in ("*IDN?", "*CLS", "*OPC?"):
+            return {"*IDN?": f"{identity}\n".encode(), "*OPC?": b"1\n"}.get(line, b"")
+        for name, heard, *rest in self.told["lines"]:
+            if (found := re.fullmatch(heard, line, re.IGNORECASE)) is None:
+                continue
+            file = found.groupdict().get("file", self._file)
+            if set(rest[1:]) - self._heard or (name == "read" and file != self._file):
+                return b""
+            self._heard = self._heard - {name[1:]} if name[0] == "-" else self._heard | {name}
+            self._file = file
+            return self._said(rest[0]) if rest else b""
+        self.violations.append(line)
+        return b""
+
+    def _said(self, text: str) -> bytes:
+        picture = self.screen.data
+        length = str(len(picture)).encode()
+        parts = {
+            "picture": picture,
+            "block": b"#%d%b%b" % (len(length), length, picture),
+            "length": struct.pack("<I", len(picture)),
+        }
+        found = b""
+        for part in re.split(r"(\{[^}]+\})", text):
+            inner = part[1:-1]
+            if part[:1] != "{":
+                found += part.encode()
+            else:
+                found += bytes.fromhex(inner[4:]) if inner[:4] == "hex " else parts[inner]
+        return found
+
+
+def transcripts() -> list[dict[str, Any]]:
+    """The oscilloscopes of ``transcripts.toml``."""
+    told = tomllib.loads(Path(__file__).with_name("transcripts.toml").read_text("utf-8"))["instruments"]
+    return list(told)
+
+
+class Spoiled(Wire):
+    """A wire on which answers are spoiled at random, as a protocol can reveal.
+
+    Parameters
+    ----------
+    there : Transcript
+        The other end.
+    rng : Generator
+        Chooses the faults.
+    rate : float
+        Fraction of answers with a fault.
+
+    Attributes
+    ----------
+    faults : list of str
+        What happened.
+    """
+
+    KINDS = ("truncated", "delayed", "dropped", "repeated", "stale", "reordered", "reset", "bad checksum")
+
+    def __init__(self, there: Any, rng: np.random.Generator, rate: float) -> None:
+        super().__init__(there)
+        self._rng, self.rate, self.faults, self.kinds = rng, rate, list[str](), self.KINDS
+        self._late, self._last, self._surplus = b"", b"", b""
+
+    def open(self, deadline: Deadline) -> None:
+        """Open it anew: what was under way is lost."""
+        super().open(deadline)
+        self._late = self._surplus = b""
+
+    def write(self, data: bytes, deadline: Deadline) -> None:
+        """Pass the bytes on; what was delayed arrives before the answer."""
+        said = self.there.receive(data)
+        late, self._late = self._late, b""
+        if said and self._rng.random() < self.rate:
+            said = self._spoiled(said)
+        self.said += late + said
+        self._last = said or self._last
+
+    def read(self, deadline: Deadline) -> bytes:
+        """Return the answer; what is stale arrives behind it."""
+        said = super().read(deadline)
+        self.said, self._surplus = self.said + self._surplus, b""
+        return said
+
+    def _spoiled(self, said: bytes) -> bytes:
+        # A line of text has neither length nor checksum: its parts in another order may be another number.
+        binary = b"#" in said or b"IDAT" in said or b"BM" in said
+        hidden = set() if binary else {"reordered"}
+        hidden |= set() if b"IDAT" in said or said[:1] == b"@" else {"bad checksum"}
+        kinds = [kind for kind in self.kinds if kind not in hidden]
+        kind = kinds[self._rng.integers(len(kinds))]
+        self.faults.append(kind)
+        at = int(self._rng.integers(1, max(2, len(said))))
+        match kind:
+            case "truncated":
+                return said[:at] if at < len(said) else b""
+            case "delayed":
+                self._late = said
+                return b""
+            case "dropped":
+                return b""
+            case "repeated":
+                return said + said
+            case "stale":
+                self._surplus = self._last or said
+                return said
+            case "reordered":
+                return said[at:] + said[:at]
+            case "reset":
+                self.there.reset()
+                return b""
+        start = said.index(b"IDAT") + 4 if b"IDAT" in said else 1
+        at = start + int(self._rng.integers(max(1, len(said) - start - (20 if start > 1 else 6))))
+        return said[:at] + bytes([said[at] ^ 1 << int(self._rng.integers(8))]) + said[at + 1 :]
+
+
 class GrblBoard:
     """A board with GRBL 1.1 or a relative of it, of one axis.
 
@@ -111,6 +303,8 @@ class GrblBoard:
             banner, version, settings, locks, tells,
         )  # fmt: skip
         self.place, self.homed, self.moves = 12.0, False, list[str]()
+        self.off = 0.0
+        """Where the motor stands when it counts 0."""
         self.ends: Callable[[], bytes] = lambda: b""
         """What happens, and is said, in the midst of the next movement."""
         self.answers: dict[str, bytes] = {}
@@ -121,6 +315,11 @@ class GrblBoard:
         """Switch it off and on: positions are those of the motors no more."""
         self.homed = False
         return self._begin()
+
+    def reset(self) -> None:
+        """Switch it off and on, unheard; it counts from 0 where it stands."""
+        self.place, self.off = 0.0, self.off + self.place
+        self.start()
 
     def _begin(self) -> bytes:
         self.state = "Alarm" if self.locks and not self.homed else "Idle"
@@ -155,7 +354,7 @@ class GrblBoard:
                 return self._report(ends())
             if not self._left:
                 if self.state == "Home":
-                    self.homed, said = True, said + b"ok\r\n"
+                    self.homed, self.off, said = True, 0.0, said + b"ok\r\n"
                 self.place, self.state = self._target, "Idle"
         return self._report(said)
 
@@ -190,8 +389,12 @@ class ZaberStage:
     """One axis of a Zaber device; source: Zaber ASCII protocol, message format and warning flags."""
 
     def __init__(self) -> None:
-        self.place = self._target = 0
+        self.place = self._target = self.off = 0
         self.flags, self.then, self._left = ["WR"], list[str](), 0
+
+    def reset(self) -> None:
+        """Switch it off and on: it counts from 0 where it stands."""
+        self.off, self.place, self._target, self.flags, self._left = self.off + self.place, 0, 0, ["WR"], 0
 
     def receive(self, data: bytes) -> bytes:
         """Answer a command."""
@@ -202,7 +405,7 @@ class ZaberStage:
         if not self._left and self.place != self._target:
             self.place, self.flags, self.then = self._target, self.flags + self.then, []
         if words == "home":
-            self.flags, self._target, self.place, self._left = [], 0, 1, 3
+            self.flags, self._target, self.place, self._left, self.off = [], 0, 1, 3, 0
         elif words.startswith("move abs"):
             self._target, self._left = int(words.split()[2]), 3
         elif words.startswith("warnings"):
@@ -222,7 +425,12 @@ class TCube:
     """A TDC001, which gives 0 as its address (thorpy issue 10); messages as in the APT protocol, issue 25."""
 
     def __init__(self) -> None:
-        self.place, self._target, self._left, self._speed = 5, 5, 0, 1000
+        self.place, self._target, self._left, self._speed, self.off = 5, 5, 0, 1000, 0
+        self.homed = self._homing = False
+
+    def reset(self) -> None:
+        """Switch it off and on: it counts from 0 where it stands."""
+        self.off, self.place, self._target, self._left = self.off + self.place, 0, 0, 0
         self.homed = self._homing = False
 
     def receive(self, data: bytes) -> bytes:
@@ -251,6 +459,7 @@ class TCube:
                 self._left = max(0, self._left - 1)
                 if not self._left:
                     self.homed, self.place = self.homed or self._homing, self._target
+                    self.off = 0 if self._homing else self.off
                 bits = 0x80000000 | (0x400 if self.homed else 0) | (0x10 if self._left else 0)
                 said = struct.pack("<HihhI", 1, self.place, 0, 0, bits)
         return struct.pack("<HHBB", kind + 1, len(said), 0x81, 0) + said if said else b""

@@ -28,6 +28,7 @@ from reseau.core.errors import (
 )
 from reseau_drivers import camera as cameras
 from reseau_drivers.camera import AravisSettings, aravis
+from reseau_drivers.codecs.pixels import GENICAM
 from reseau_sims import World
 from reseau_sims.laboratory import Laboratory
 from reseau_sims.serving import (
@@ -41,7 +42,7 @@ from reseau_sims.serving import (
     View,
 )
 
-from .rigs import gige_camera
+from .rigs import gige_camera, vision_cameras
 
 Cam = cameras.CameraDriver[AravisSettings]
 SIZE = {"width": 640, "height": 480}
@@ -457,3 +458,14 @@ def test_aravis_s_own_client_receives_whole_frames(simulated: GigeCamera) -> Non
     failed = int(message.split("n_failures")[1].split()[1])
     assert whole >= 20
     assert failed <= whole // 20  # what a busy machine loses of packets is its own
+
+
+@pytest.mark.parametrize("name", GENICAM)
+def test_every_format_of_the_convention_is_decoded(name: str) -> None:
+    body = SimulatedCamera()
+    with ExitStack() as stack:
+        (simulated,) = vision_cameras(stack, body)
+        settings = {"format": name, "trigger": "software"}
+        shot = stack.enter_context(aravis("camera", simulated.address, settings=settings)).expose(10.0)
+        assert (shot.pixels == body.drawn[-1]).all()
+        assert bool(shot.raw) == name.startswith(("RGB", "BGR", "YUV", "YCb"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from zaber_motion.ascii import WarningFlags
 
-from reseau.core.errors import RefusedError, StateError
+from reseau.core.errors import StateError
 from reseau_drivers.codecs.zaber import FAULTS, UNREFERENCED, UNRELIABLE
 from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, References, Table, Zaber
 
@@ -47,22 +47,6 @@ def test_an_unlocked_grbl_has_no_reference() -> None:
     with table_of(board) as table:
         board.receive(b"$X\n")  # another program
         assert not table.state("tilt").homed
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        "$10=1\r\n$13=0\r\n$22=5",
-        "$10=1\r\n$13=0",
-        "$10=1 (Status report options, mask)\r\n$13=0 (Report in inches, boolean)\r\n$22=1 (Homing cycle)",
-    ],
-    ids=["bit mask", "not listed", "with descriptions"],
-)
-def test_settings_of_homing_are_not_asked_for(settings: str) -> None:
-    board = GrblBoard(HAL, HAL_VERSION, settings, tells=True)
-    with table_of(board) as table:
-        table.home("tilt")
-        assert table.move("tilt", 20.0).position == 20.0
 
 
 @pytest.mark.parametrize(
@@ -125,17 +109,6 @@ def test_an_alarm_is_named_and_voids_the_reference(after_ok: bool) -> None:
         board.state = "Idle"
         with pytest.raises(StateError, match="a limit switch was reached; home tilt first"):
             table.move("tilt", 5.0)
-
-
-def test_a_grbl_that_does_not_home_is_refused_and_an_old_one_named() -> None:
-    board = GrblBoard(settings="$13=0\r\n$22=0", locks=False)
-    board.answers["$H"] = b"error:5\r\n"
-    with table_of(board) as table, pytest.raises(RefusedError, match=r"homing is not enabled"):
-        table.home("tilt")
-    old = GrblBoard("Grbl 0.9j ['$' for help]")
-    old.answers["$G"] = b"[G0 G54 G17 G21 G90 G94 M0 M5 M9 T0 F0. S0.]\r\nok\r\n"
-    with pytest.raises(StateError, match=r"GRBL up to 0\.9 does; install GRBL 1\.1"):
-        table_of(old).connect()
 
 
 FLAGS = {value for name, value in vars(WarningFlags).items() if name.isupper()}

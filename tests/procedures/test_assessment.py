@@ -128,6 +128,26 @@ def test_a_bent_target_that_is_held_flat_is_no_fault_of_the_photographs() -> Non
     assert calibrated(bent).assessments["camera"].use is Use.MEASUREMENT
 
 
+def test_gross_errors_are_left_out_where_nothing_explains_them_as_well_unless_told() -> None:
+    images, rng, wrong = measured(), np.random.default_rng(8), set[tuple[str, str]]()
+    for name, points in images[:4]:
+        rows = rng.choice(len(points), 2, replace=False)
+        points.xy[rows] += 0.3 * rng.choice([-1.0, 1.0], (2, 2))
+        wrong |= {(name, points.names[k]) for k in rows}
+    found, kept = calibrated(images), calibrated(images, options=CalibrationOptions(reject=False))
+    assert kept.assessments["camera"].causes[0].code == "blunders"
+    assert kept.result.rejected.sum() == 0
+    network, rows = found.result.network, np.flatnonzero(found.result.rejected)
+    left = {(network.images[network.image_of[k]], network.points[network.point_of[k]]) for k in rows}
+    # Of 630 good points a few look wrong.
+    assert wrong <= left
+    assert len(left - wrong) <= 6
+    said = f"{len(rows)} image points are gross errors, and are left out: in image 0.png: points"
+    assert found.notes[-1].startswith(said)
+    assert found.assessments["camera"].causes == ()
+    assert found.sigma0 < 1.1
+
+
 def test_points_with_the_names_of_others_are_left_out_and_said() -> None:
     images = measured()
     name, points = images[3]

@@ -17,6 +17,7 @@ from reseau.designs import board, coded_sheet, coded_testfield
 from reseau.designs.dots import dot_signs
 from reseau.designs.known import known_designs
 from reseau.io import BoardDesign
+from reseau.io.photographs import read_exif
 from reseau.procedures.exposures import of_another_lens
 from reseau.procedures.target_measurement import Measurer, measurer_of
 from reseau.procedures.which_target import Design, designs_beside, which_target
@@ -184,8 +185,10 @@ def test_photographs_with_another_zoom_are_named(tmp_path: Path) -> None:
         exif = Image.Exif()
         inner = exif.get_ifd(0x8769)
         inner[0x920A], inner[0xA405] = focal, int(1.5 * focal)
+        exif[0x010F], exif[0x0110] = "Canon", "Canon EOS 5D"
         Image.new("L", (8, 8)).save(tmp_path / name, exif=exif)
         files[name] = tmp_path / name
     said, others = of_another_lens(files)
     assert said == pytest.approx(36)
+    assert read_exif(files["a.jpg"]).camera == "Canon EOS 5D"
     assert others == {"c.jpg": "was taken with a focal length of 35 mm, most with 24 mm"}

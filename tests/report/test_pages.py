@@ -15,6 +15,7 @@ from reseau.core.figures import contour_levels
 from reseau.core.numbers import power
 from reseau.core.provenance import Provenance
 from reseau.core.version import __version__
+from reseau.io.photographs import Exif
 from reseau.optics import PixelGrid
 from reseau.optics.cameras.registry import camera_model
 from reseau.procedures.assessment import assess
@@ -160,11 +161,12 @@ def test_the_first_screen_has_camera_days_version_verdict_map_and_every_photogra
     assessed = assess(result)
     page = bundle_report(
         result, title="Block", assessments={"camera": assessed}, photograph=lambda name: FRAME,
-        days={"2026-03-05", "2026-03-07"},
+        exif=[Exif(day="2026-03-05", camera="Zeiss RMK"), Exif(day="2026-03-07", camera="Zeiss RMK"), Exif()],
     )  # fmt: skip
     first = page.split("<header>")[1].split("</header>")[0]
     camera = result.network.cameras[0]
-    assert f"{camera.model}, {camera.width} × {camera.height} px · {len(result.network.images)} " in first
+    described = f"{camera.model}, {camera.width} × {camera.height} px"
+    assert f"Zeiss RMK · {described} · {len(result.network.images)} photographs" in first
     assert f"2026-03-05 to 2026-03-07 · reseau {__version__}" in first
     assert first.index(assessed.lines[0][1:]) < first.index("the total error of the projection")
     captions = re.findall(r'<figcaption id="thumbnail-\d+">(.*?): \d+ points, [\d.e-]+ px rms<', first)

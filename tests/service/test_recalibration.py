@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 import json
 import os
 import shutil
@@ -83,7 +84,8 @@ def test_a_recalibration_is_acquired_adjusted_compared_and_put_in_force(
         assert len(archive.sessions()) == 2
         applied = Configurations(archive).applied("left", datetime.now(UTC))
         assert applied is not None
-        assert (applied.key, made["by"]) == (made["key"], "recalibration left")
+        assert applied.key == made["key"]
+        assert made["by"] == f"{getpass.getuser()}, recalibration left"
 
 
 def test_a_recalibration_that_stops_is_continued_where_it_stopped(

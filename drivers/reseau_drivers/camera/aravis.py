@@ -473,9 +473,10 @@ class Aravis:
         arrived = int(buffer.get_system_timestamp()) - realtime_offset()[0]
         before = (exposure_ns or 0) if self._settings.stamp == "end" else 0
         began = self._stamps.began(int(buffer.get_timestamp()), arrived, before, exposure_ns or 0)
-        pixels = decode(layout, width, height, buffer.get_data(), stride)
+        data = buffer.get_data()
+        pixels, raw = decode(layout, width, height, data, stride), data if layout.coloured else b""
         exposure_us = float("nan") if exposure_ns is None else exposure_ns / 1000
-        return RawFrame(pixels, layout.full_scale, layout.pattern, b"", sequence, began, exposure_us, gain)
+        return RawFrame(pixels, layout.full_scale, layout.pattern, raw, sequence, began, exposure_us, gain)
 
     def _read_clock(self) -> None:
         self._stamps.offset, self._stamps.read_at = self._latched(), time.monotonic_ns()

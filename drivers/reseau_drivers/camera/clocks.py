@@ -139,12 +139,12 @@ class ExposureTimes:
         self.offset: tuple[int, int] | None = None
         self.read_at = 0
         self.triggered: int | None = None
-        self._period = 0
+        self._period, self._last = 0, 0
         self._least_delay: int | None = None
 
     def restart(self, period: int) -> None:
         """Start a new acquisition with the given frame period (ns)."""
-        self._period, self._least_delay, self.triggered = period, None, None
+        self._period, self._last, self._least_delay, self.triggered = period, 0, None, None
 
     def began(self, stamped: int, arrived: int, before: int, exposure: int) -> TimeInterval:
         """Return the interval that contains the start of the exposure.
@@ -158,6 +158,9 @@ class ExposureTimes:
         exposure : int
             Exposure time (ns).
         """
+        if stamped < self._last:  # the camera's clock began anew: what was known of it is void
+            self.offset = self._least_delay = None
+        self._last = stamped
         if self.offset is not None:
             start, doubt = stamped + self.offset[0] - before, self.offset[1]
             doubt += max(0, arrived - self.read_at) // _DRIFT + 1

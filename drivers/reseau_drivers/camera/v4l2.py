@@ -294,7 +294,7 @@ class V4l2:
             self._damaged += 1
             return None
         exposure_us = float("nan") if self._exposure_ns is None else self._exposure_ns / 1000
-        raw = data if self._layout.pattern in ("YUYV", "UYVY", "NV12", "MJPEG") else b""
+        raw = data if self._layout.coloured else b""
         return RawFrame(
             pixels,
             self._layout.full_scale,

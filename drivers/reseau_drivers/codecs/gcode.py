@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 from reseau.core.errors import ProtocolError, SettingError
 
+from ..profiles import controller
 from .numbers import number
 from .stream import LineMessageDecoder, excerpt
 
@@ -44,47 +45,10 @@ LIMIT = 256
 AXES = "XYZABC"
 """Letters of the axes, in order."""
 
-ERRORS: dict[int, str] = {
-    1: "a G-code word has no letter",
-    2: "a number is not valid",
-    3: "not a command of Grbl",
-    4: "a value is negative",
-    5: "homing is not enabled ($22)",
-    7: "stored settings could not be read",
-    8: "not allowed unless idle",
-    9: "locked by an alarm",
-    10: "soft limits need homing",
-    11: "the line is too long",
-    12: "a step rate is too large",
-    13: "the safety door is open",
-    15: "the target is outside the travel",
-    16: "a jog has no '=' or a word that is not allowed",
-    20: "an unsupported command",
-    21: "two commands of one group",
-    22: "the feed rate is undefined",
-    33: "the target is not valid",
-}
+_KNOWN = controller("grbl")
+ERRORS: dict[int, str] = {int(code): meaning for code, meaning in _KNOWN["errors"].items()}
 """Codes of ``error:``, those that a table can meet."""
-ALARMS: dict[int, str] = {
-    1: "a limit switch was reached",
-    2: "the target is outside the travel",
-    3: "a reset during a movement: the position is lost",
-    4: "the probe was not in its initial state",
-    5: "the probe found nothing",
-    6: "homing was interrupted by a reset",
-    7: "the safety door was opened during homing",
-    8: "homing did not clear the limit switch",
-    9: "homing did not find the limit switch",
-    10: "the emergency stop was pressed",
-    11: "it is to be homed first",
-    12: "a limit switch is closed",
-    13: "the probe is protected",
-    14: "the spindle reports an error",
-    15: "homing did not find the second limit switch of an axis with two motors",
-    16: "its self-test failed",
-    17: "a motor reports a fault",
-    18: "homing failed",
-}
+ALARMS: dict[int, str] = {int(code): meaning for code, meaning in _KNOWN["alarms"].items()}
 """Codes of ``ALARM:``; from 10 those of grblHAL."""
 
 _WORD = re.compile(r"([A-Z])\s*([-+]?\d*\.?\d+|[-+]?\d+\.)")
@@ -92,7 +56,7 @@ _NUMBERED = re.compile(rb"\s*N(-?\d+)\s*(.*?)\s*\*(\d{1,3})\s*")
 _REPORT = re.compile(r"<([A-Z][a-z]+)(?::(\d+))?((?:\|[^|<>]+)*)>")
 _OUTDATED = re.compile(r"<[A-Z][a-z]+,[MW]Pos:[^|<>]*>|\[G\d[^:\]]*\]")
 """Status, and modes of the parser, as GRBL up to 0.9 gives them."""
-_BANNER = re.compile(r"start|grbl\S* \S+ .*\[.*", re.IGNORECASE)
+_BANNER = re.compile(_KNOWN["banner"], re.IGNORECASE)
 
 
 def checksum(line: bytes) -> int:

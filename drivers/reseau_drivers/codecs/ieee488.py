@@ -35,6 +35,12 @@ LARGEST = 64_000_000
 _PNG = b"\x89PNG\r\n\x1a\n"
 _BLOCK = re.compile(rb"#(?:([1-9])|\((\d{1,12})\))")
 _INDEFINITE = b"#0"
+_OTHERS = {
+    b"\xff\xd8\xff": "a JPEG, which alters grey values", b"GIF8": "a GIF", b"II*\0": "a TIFF",
+    b"MM\0*": "a TIFF", b"\x1f\x8b": "compressed by gzip", b"%!PS": "PostScript",
+    b"\x1b": "codes for a printer",
+}  # fmt: skip
+"""What pictures that are neither PNG nor BMP begin with."""
 
 
 def block(data: bytes) -> bytes:
@@ -125,12 +131,28 @@ def missing_bytes(data: bytes, ended: bool = False) -> int | None:
         if end is not None and not 54 <= end <= LARGEST:
             raise ProtocolError(f"a BMP of {end} bytes")
     else:
-        raise ProtocolError(f"neither block nor picture: {excerpt(data)}")
+        raise _strange("neither block nor picture", data)
     return None if end is None else max(0, end - len(data))
 
 
 def _is_picture(data: bytes) -> bool:
     return data[:8] == _PNG or data[:2] == b"BM"
+
+
+def _strange(what: str, data: bytes) -> ProtocolError:
+    """An error that names a picture of another kind."""
+    kind = next((name for start, name in _OTHERS.items() if data.startswith(start)), None)
+    if kind is None:
+        return ProtocolError(f"{what}: {excerpt(data)}")
+    return ProtocolError(f"the picture is {kind}", do="set the format of its screen pictures to PNG or BMP")
+
+
+def _require_rows(data: bytes) -> None:
+    """Raise ProtocolError if a BMP is too small for its rows."""
+    start, width, height, bits, packed = struct.unpack_from("<I4xii2xHI", data, 10)
+    need = start + (width * bits + 31) // 32 * 4 * abs(height)
+    if width < 1 or (packed in (0, 3) and len(data) < need):
+        raise ProtocolError(f"a BMP of {width}×{abs(height)} pixels has {len(data)} of {need} bytes")
 
 
 def parse_block(data: bytes) -> bytes:
@@ -159,12 +181,15 @@ def picture(data: bytes) -> bytes:
     """
     inner = parse_block(data) if data[:1] == b"#" else data
     if not _is_picture(inner):
-        raise ProtocolError(f"not a picture: {excerpt(data)}")
+        raise _strange("not a picture", inner)
     lacking = missing_bytes(inner)
     if lacking != 0:
         raise ProtocolError(f"an incomplete picture ({len(inner)} bytes)")
-    end = _png_end(inner) if inner[:8] == _PNG else int.from_bytes(inner[2:6], "little")
-    return inner[:end]
+    if inner[:8] == _PNG:
+        return inner[: _png_end(inner)]
+    found = inner[: int.from_bytes(inner[2:6], "little")]
+    _require_rows(found)
+    return found
 
 
 @dataclass(frozen=True)

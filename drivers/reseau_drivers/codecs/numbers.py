@@ -18,6 +18,11 @@ INFINITE = 9.9e37
 """From here on, SCPI's numbers stand for infinity, or for none."""
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3, "G": 1e9}
 """M is milli for some instruments and mega for others: only rates have it."""
+_SPELLINGS = {
+    "s": ("s", "S"), "°C": ("°C", "C", "degC", "DEGC", "CEL"), "%": ("%", "%RH", "RH", "PCT"),
+    "hPa": ("hPa", "HPA", "mbar", "MBAR"),
+}  # fmt: skip
+"""Other ways in which instruments write units."""
 
 
 def number(text: str, unit: str | None = "", *, to: str = "") -> float:
@@ -65,11 +70,13 @@ def number(text: str, unit: str | None = "", *, to: str = "") -> float:
 
 
 def _scale(word: str, unit: str) -> float | None:
-    """What a unit stands for, in terms of the wanted one; instruments write seconds as S, too."""
-    for written in {unit, "S" if unit == "s" else unit} - {""}:
+    """What a unit stands for, in terms of the wanted one."""
+    for written in _SPELLINGS.get(unit, (unit,) if unit else ()):
         if word.endswith(written):
             prefix = word[: -len(written)]
-            return 1e6 if prefix == "M" and unit == "Sa/s" else _PREFIXES.get(prefix)
+            scale = 1e6 if prefix == "M" and unit == "Sa/s" else _PREFIXES.get(prefix)
+            if scale is not None:
+                return scale
     return None
 
 

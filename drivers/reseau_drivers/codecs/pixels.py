@@ -19,9 +19,16 @@ __all__ = ["GENICAM", "VIDEO", "PixelFormat", "decode", "encode", "size_of"]
 
 
 _PACKED = {
-    ("p", 10): (4, 5), ("p", 12): (2, 3), ("gige", 10): (2, 3), ("gige", 12): (2, 3), ("mipi", 10): (4, 5),
-    ("mipi", 12): (2, 3),
+    ("p", 10): (4, 5), ("p", 12): (2, 3), ("p", 14): (4, 7), ("gige", 10): (2, 3), ("gige", 12): (2, 3),
+    ("mipi", 10): (4, 5), ("mipi", 12): (2, 3), ("mipi", 14): (4, 7), ("stream", 10): (4, 5),
 }  # fmt: skip
+_LUMINANCE = {
+    "YUYV": (4, (0, 2)), "UYVY": (4, (1, 3)), "UYYVYY": (6, (1, 2, 4, 5)), "UYV": (3, (1,)),
+}  # fmt: skip
+"""Bytes of pixels with common colours, and those of them that are luminances."""
+_COLOURS = {"RGB": cv2.COLOR_RGB2GRAY, "BGR": cv2.COLOR_BGR2GRAY, "RGBA": cv2.COLOR_RGBA2GRAY,
+            "BGRA": cv2.COLOR_BGRA2GRAY}  # fmt: skip
+_PLANES = "planes of RGB"
 
 
 @dataclass(frozen=True)
@@ -37,11 +44,13 @@ class PixelFormat:
     stored : int
         Bytes per pixel; 0 for packed and compressed frames.
     pattern : str
-        Colour pattern of raw data: filters of the first two rows (RGGB …), YUYV, UYVY, NV12 or MJPEG; empty
-        for grey.
+        Colour pattern of raw data: filters of the first two rows (RGGB …), the order of luminance and colours
+        (YUYV, UYVY, UYYVYY, UYV, NV12), the order of colours (RGB, BGRA …, planes of RGB) or MJPEG; empty for
+        grey.
     packed : str
-        How pixels share bytes: ``p``, a stream of bits from the lowest on; ``gige``, two pixels in three
-        bytes, the middle one with the low bits of both; ``mipi``, the last byte with the low bits of all.
+        How pixels share bytes: ``p``, a stream of bits from the lowest on; ``stream``, from the highest on;
+        ``gige``, two pixels in three bytes, the middle one with the low bits of both; ``mipi``, the last
+        bytes with the low bits of all.
     """
 
     code: str | int
@@ -53,7 +62,15 @@ class PixelFormat:
     @property
     def group(self) -> tuple[int, int]:
         """Pixels that share bytes, and the number of these bytes."""
+        if self.pattern in _LUMINANCE:
+            size, luminances = _LUMINANCE[self.pattern]
+            return len(luminances), size
         return _PACKED[self.packed, self.bits] if self.packed else (1, self.stored)
+
+    @property
+    def coloured(self) -> bool:
+        """Whether grey values are not all that a frame has."""
+        return self.pattern in (*_LUMINANCE, *_COLOURS, _PLANES, "NV12", "MJPEG")
 
     def row(self, width: int) -> int:
         """Return the number of bytes of a row, without padding; 0 if compressed.
@@ -97,6 +114,11 @@ VIDEO: dict[str, PixelFormat] = {
     "Y14": PixelFormat("Y14 ", 14, 2),
     "Y16": PixelFormat("Y16 ", 16, 2),
     "Y10P": PixelFormat("Y10P", 10, 0, packed="mipi"),
+    "Y12P": PixelFormat("Y12P", 12, 0, packed="mipi"),
+    "Y14P": PixelFormat("Y14P", 14, 0, packed="mipi"),
+    "Y10BPACK": PixelFormat("Y10B", 10, 0, packed="stream"),
+    "RGB24": PixelFormat("RGB3", 8, 3, "RGB"),
+    "BGR24": PixelFormat("BGR3", 8, 3, "BGR"),
     "YUYV": PixelFormat("YUYV", 8, 2, "YUYV"),
     "UYVY": PixelFormat("UYVY", 8, 2, "UYVY"),
     "NV12": PixelFormat("NV12", 8, 1, "NV12"),
@@ -108,6 +130,7 @@ VIDEO: dict[str, PixelFormat] = {
     **_video(16, 2, "GR16 RG16 GB16 BYR2"),
     **_video(10, 0, "pgAA pRAA pGAA pBAA", "mipi"),
     **_video(12, 0, "pgCC pRCC pGCC pBCC", "mipi"),
+    **_video(14, 0, "pgEE pREE pGEE pBEE", "mipi"),
 }
 """Formats of V4L2, by the names of its documentation."""
 
@@ -128,16 +151,43 @@ GENICAM: dict[str, PixelFormat] = {
     "Mono16": PixelFormat(0x01100007, 16, 2),
     "Mono10p": PixelFormat(0x010A0046, 10, 0, packed="p"),
     "Mono12p": PixelFormat(0x010C0047, 12, 0, packed="p"),
+    "Mono14p": PixelFormat(0x010E0104, 14, 0, packed="p"),
     "Mono10Packed": PixelFormat(0x010C0004, 10, 0, packed="gige"),
     "Mono12Packed": PixelFormat(0x010C0006, 12, 0, packed="gige"),
     **_genicam("8", 8, 1, *range(0x01080008, 0x0108000C)),
     **_genicam("10", 10, 2, *range(0x0110000C, 0x01100010)),
     **_genicam("12", 12, 2, *range(0x01100010, 0x01100014)),
+    **_genicam("14", 14, 2, *range(0x01100109, 0x0110010D)),
+    **_genicam("14p", 14, 0, *range(0x010E0105, 0x010E0109), packed="p"),
     **_genicam("16", 16, 2, *range(0x0110002E, 0x01100032)),
     **_genicam("10p", 10, 0, 0x010A0056, 0x010A0058, 0x010A0054, 0x010A0052, packed="p"),
     **_genicam("12p", 12, 0, 0x010C0057, 0x010C0059, 0x010C0055, 0x010C0053, packed="p"),
     **_genicam("10Packed", 10, 0, *range(0x010C0026, 0x010C002A), packed="gige"),
     **_genicam("12Packed", 12, 0, *range(0x010C002A, 0x010C002E), packed="gige"),
+    **{
+        f"{order}{bits}": PixelFormat(code, bits, size, order)
+        for order, bits, size, code in (
+            ("RGB", 8, 3, 0x02180014),
+            ("BGR", 8, 3, 0x02180015),
+            ("RGB", 10, 6, 0x02300018),
+            ("BGR", 10, 6, 0x02300019),
+            ("RGB", 12, 6, 0x0230001A),
+            ("BGR", 12, 6, 0x0230001B),
+            ("RGB", 16, 6, 0x02300033),
+            ("BGR", 16, 6, 0x0230004B),
+        )
+    },
+    "RGBa8": PixelFormat(0x02200016, 8, 4, "RGBA"),
+    "BGRa8": PixelFormat(0x02200017, 8, 4, "BGRA"),
+    "RGB8_Planar": PixelFormat(0x02180021, 8, 1, _PLANES),
+    "RGB10_Planar": PixelFormat(0x02300022, 10, 2, _PLANES),
+    "RGB12_Planar": PixelFormat(0x02300023, 12, 2, _PLANES),
+    "RGB16_Planar": PixelFormat(0x02300024, 16, 2, _PLANES),
+    "YCbCr422_8": PixelFormat(0x0210003B, 8, 2, "YUYV"),
+    "YUV422_8": PixelFormat(0x02100032, 8, 2, "YUYV"),
+    "YUV422_8_UYVY": PixelFormat(0x0210001F, 8, 2, "UYVY"),
+    "YUV411_8_UYYVYY": PixelFormat(0x020C001E, 8, 0, "UYYVYY"),
+    "YUV8_UYV": PixelFormat(0x02180020, 8, 3, "UYV"),
 }
 """Formats of GenICam, by the names of the convention."""
 
@@ -145,12 +195,13 @@ GENICAM: dict[str, PixelFormat] = {
 def size_of(layout: PixelFormat, width: int, height: int, stride: int = 0) -> int:
     """Return the size of a frame with rows `stride` bytes apart (bytes); 0 if compressed."""
     row = layout.row(width)
-    rows = height * 3 // 2 if layout.pattern == "NV12" else height  # colours are below the luminance
+    # Colours are below the luminance.
+    rows = {"NV12": height * 3 // 2, _PLANES: 3 * height}.get(layout.pattern, height)
     return (rows - 1) * max(stride, row) + row if row else 0
 
 
 def decode(layout: PixelFormat, width: int, height: int, data: bytes, stride: int = 0) -> NDArray[Any]:
-    """Decode the grey values of a frame: luminance of YUYV, UYVY, NV12 and MJPEG, all raw pixels of a mosaic.
+    """Decode the grey values of a frame: luminance of colours, all raw pixels of a mosaic.
 
     Parameters
     ----------
@@ -187,13 +238,22 @@ def decode(layout: PixelFormat, width: int, height: int, data: bytes, stride: in
         raise ProtocolError(f"a frame of {width}×{height} pixels has {len(data)} of {need} bytes")
     size = layout.row(width)
     raw = np.frombuffer(data, np.uint8, need)
-    rows = np.lib.stride_tricks.as_strided(raw, (height, size), (max(stride, size), 1), writeable=False)
-    if layout.pattern in ("YUYV", "UYVY"):
-        return rows[:, layout.pattern == "UYVY" :: 2]
+    count = 3 * height if layout.pattern == _PLANES else height
+    rows = np.lib.stride_tricks.as_strided(raw, (count, size), (max(stride, size), 1), writeable=False)
+    if layout.pattern in _LUMINANCE:
+        together, luminances = _LUMINANCE[layout.pattern]
+        return rows.reshape(height, -1, together)[..., list(luminances)].reshape(height, width)
     if layout.packed:
         return _unpacked(layout, rows)
-    pixels = rows if layout.stored == 1 else _words(rows)
-    if layout.stored == 2 and layout.bits < 16 and int(pixels.max()) >> layout.bits:
+    pixels = rows if layout.bits == 8 else _words(rows)
+    if layout.pattern in (*_COLOURS, _PLANES):
+        if layout.pattern == _PLANES:
+            coloured = np.moveaxis(pixels.reshape(3, height, width), 0, -1)
+        else:
+            coloured = pixels.reshape(height, width, -1)
+        kind = _COLOURS.get(layout.pattern, cv2.COLOR_RGB2GRAY)
+        pixels = np.asarray(cv2.cvtColor(np.ascontiguousarray(coloured), kind))
+    if 8 < layout.bits < 16 and int(pixels.max()) >> layout.bits:
         raise ProtocolError(f"a frame of {layout.bits} bits contains the grey value {int(pixels.max())}")
     return pixels
 
@@ -201,20 +261,52 @@ def decode(layout: PixelFormat, width: int, height: int, data: bytes, stride: in
 def _unpacked(layout: PixelFormat, rows: NDArray[np.uint8]) -> NDArray[np.uint16]:
     """Grey values of pixels that share bytes."""
     pixels, size = layout.group
-    shared = rows.reshape(len(rows), -1, size)
-    found = np.empty((*shared.shape[:2], pixels), np.uint16)
-    low = layout.bits - 8
-    for k in range(pixels):
-        if layout.packed == "p":
-            first, shift = divmod(k * layout.bits, 8)
-            word = shared[..., first].astype(np.uint16) | shared[..., first + 1].astype(np.uint16) << 8
-            found[..., k] = word >> shift & (1 << layout.bits) - 1
-        else:
-            gige = layout.packed == "gige"
-            high, rest = shared[..., 2 * k if gige else k], shared[..., 1 if gige else -1]
-            bits = rest >> (4 if gige else low) * k & (1 << low) - 1
-            found[..., k] = high.astype(np.uint16) << low | bits
-    return found.reshape(len(rows), -1)
+    shared, low = rows.reshape(len(rows), -1, size), layout.bits - 8
+    if layout.packed in ("p", "stream"):
+        word, step = _number(shared, layout.packed == "stream"), layout.bits
+        order = range(pixels)[:: -1 if layout.packed == "stream" else 1]
+        found = [word >> np.uint64(step * k) & np.uint64((1 << step) - 1) for k in order]
+    elif layout.packed == "mipi":
+        found = _joined(shared[..., :pixels], _number(shared[..., pixels:]), low, low)
+    else:
+        found = _joined(shared[..., ::2], _number(shared[..., 1:2]), low, 4)
+    return np.stack(found, axis=-1).astype(np.uint16).reshape(len(rows), -1)
+
+
+def _joined(
+    high: NDArray[np.uint8], rest: NDArray[np.uint64], low: int, step: int
+) -> list[NDArray[np.uint64]]:
+    """High bytes of pixels with `low` further bits of each, `step` bits apart in the rest."""
+    mask = np.uint64((1 << low) - 1)
+    return [
+        high[..., k].astype(np.uint64) << np.uint64(low) | rest >> np.uint64(step * k) & mask
+        for k in range(high.shape[-1])
+    ]
+
+
+def _number(shared: NDArray[np.uint8], big: bool = False) -> NDArray[np.uint64]:
+    """The number that a few bytes are."""
+    order = range(shared.shape[-1])[:: -1 if big else 1]
+    return np.sum([shared[..., k].astype(np.uint64) << np.uint64(8 * n) for n, k in enumerate(order)], axis=0)
+
+
+def _packed(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
+    """Bytes of pixels that share them."""
+    count, size = layout.group
+    groups, low = pixels.reshape(-1, count).astype(np.uint64), layout.bits - 8
+    high = (groups >> np.uint64(low)).astype(np.uint8)
+    if layout.packed in ("p", "stream"):
+        step, big = layout.bits, layout.packed == "stream"
+        parts = groups[:, ::-1] if big else groups
+    else:
+        step, big, parts = 4 if layout.packed == "gige" else low, False, groups & np.uint64((1 << low) - 1)
+    word = np.sum([parts[:, k] << np.uint64(step * k) for k in range(count)], axis=0).astype("<u8")
+    coded = word.view(np.uint8).reshape(-1, 8)
+    if layout.packed in ("p", "stream"):
+        return coded[:, size - 1 :: -1].tobytes() if big else coded[:, :size].tobytes()
+    rest = coded[:, : size - count]
+    whole = [high[:, :1], rest, high[:, 1:]] if layout.packed == "gige" else [high, rest]
+    return np.hstack(whole).tobytes()
 
 
 def _words(rows: NDArray[np.uint8]) -> NDArray[Any]:
@@ -238,21 +330,26 @@ def _jpeg(width: int, height: int, data: bytes) -> NDArray[Any]:
 
 
 def encode(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
-    r"""Encode grey values as a camera with this format sends them, with neutral colours; none that is packed.
+    r"""Encode grey values as a camera with this format sends them, with neutral colours.
 
     Examples
     --------
     >>> encode(VIDEO["Y16"], np.array([[1, 256]], np.uint16))
     b'\x01\x00\x00\x01'
     """
-    if layout.pattern in ("YUYV", "UYVY"):
-        coloured = np.full((*pixels.shape, 2), 128, np.uint8)
-        coloured[..., layout.pattern.index("Y")] = pixels
+    if layout.pattern in _LUMINANCE:
+        together, luminances = _LUMINANCE[layout.pattern]
+        coloured = np.full((len(pixels), pixels.shape[1] // len(luminances), together), 128, np.uint8)
+        coloured[..., list(luminances)] = pixels.reshape(len(pixels), -1, len(luminances))
         return coloured.tobytes()
+    if layout.pattern in _COLOURS:
+        return np.repeat(pixels.astype(layout.dtype)[..., None], len(layout.pattern), axis=-1).tobytes()
+    if layout.pattern == _PLANES:
+        return pixels.astype(layout.dtype).tobytes() * 3
     if layout.pattern == "NV12":
         return pixels.tobytes() + bytes([128]) * (pixels.size // 2)
     if layout.packed:
-        raise ProtocolError("packed formats are not encoded")
+        return _packed(layout, pixels)
     if not layout.stored:
         return bytes(cv2.imencode(".jpg", pixels.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 95])[1])
     return pixels.astype(layout.dtype).tobytes()

@@ -13,6 +13,7 @@ from enum import Enum
 
 from reseau.core.errors import ProtocolError, SettingError
 
+from ..profiles import controller
 from .stream import excerpt
 
 __all__ = ["BITS", "ERRORS", "LIMIT", "Line", "Phase", "Status", "decode", "decode_status", "encode", "phase"]
@@ -22,43 +23,10 @@ LIMIT = 128
 
 _LINE = re.compile(rb"(\d{1,2})([A-Z]{2})([ -~]*)")
 
-ERRORS: dict[str, str] = {
-    "@": "no error",
-    "A": "unknown message code or floating point controller address",
-    "B": "controller address not correct",
-    "C": "parameter missing or out of range",
-    "D": "command not allowed",
-    "E": "home sequence already started",
-    "F": "ESP stage name unknown",
-    "G": "displacement out of limits",
-    "H": "command not allowed in NOT REFERENCED state",
-    "I": "command not allowed in CONFIGURATION state",
-    "J": "command not allowed in DISABLE state",
-    "K": "command not allowed in READY state",
-    "L": "command not allowed in HOMING state",
-    "M": "command not allowed in MOVING state",
-    "N": "current position out of software limit",
-    "P": "command not allowed in TRACKING state",
-    "S": "communication time-out",
-    "U": "error during EEPROM access",
-    "V": "error during command execution",
-    "W": "command not allowed for PP version",
-    "X": "command not allowed for CC version",
-}
+_KNOWN = controller("smc100")
+ERRORS: dict[str, str] = _KNOWN["errors"]
 """Answers to TE."""
-
-BITS: dict[int, str] = {
-    0x0001: "negative end of run",
-    0x0002: "positive end of run",
-    0x0004: "peak current limit",
-    0x0008: "RMS current limit",
-    0x0010: "short circuit",
-    0x0020: "following error",
-    0x0040: "homing time-out",
-    0x0080: "wrong ESP stage",
-    0x0100: "DC voltage too low",
-    0x0200: "80 W output power exceeded",
-}
+BITS: dict[int, str] = {int(bit, 16): meaning for bit, meaning in _KNOWN["bits"].items()}
 """Error bits in the first four digits of TS."""
 
 

@@ -14,6 +14,7 @@ from typing import ClassVar
 
 from reseau.core.errors import ProtocolError, SettingError
 
+from ..profiles import controller
 from .stream import LineMessageDecoder, excerpt
 
 __all__ = [
@@ -36,36 +37,12 @@ __all__ = [
 LIMIT = 512
 """Largest size of an accepted message (bytes); devices send at most 80 by default."""
 
-FAULTS: dict[str, str] = {
-    "FF": "a critical error switched the driver off",
-    "FN": "the peripheral is not supported",
-    "FZ": "the peripheral is not activated",
-    "FH": "the emergency stop was pressed",
-    "FV": "the supply is out of range: the driver is off",
-    "FO": "the driver is off",
-    "FC": "inrush of current: the driver is off",
-    "FM": "the motor is too hot",
-    "FD": "the driver is off: it was overloaded",
-    "FQ": "the encoder failed: the position is unreliable",
-    "FI": "the index mark was not where it should be",
-    "FA": "the analogue encoder lost its synchronisation",
-    "FR": "the limit of overdrive was exceeded: the driver is off",
-    "FS": "the axis stalled and stopped",
-    "FB": "a stream left its bounds",
-    "FP": "the axis left its interpolated path",
-    "FE": "a limit switch was reached",
-    "FT": "the twist of axes in lockstep is excessive",
-    "WL": "a limit switch closed unexpectedly",
-    "WV": "the supply is out of range",
-    "WT": "the controller is too hot",
-    "WS": "the axis stalled, and recovered",
-    "WM": "the axis was displaced at rest",
-    "WP": "the type of its calibration is not valid",
-}
+_KNOWN = controller("zaber")
+FAULTS: dict[str, str] = _KNOWN["flags"]
 """Fault and warning flags of an axis that may not be where it says, or will not move, with their meaning."""
-UNREFERENCED = ("WR", "WH")
+UNREFERENCED: tuple[str, ...] = tuple(_KNOWN["unreferenced"])
 """Flags of an axis without a reference: no reference position, not homed."""
-UNRELIABLE = frozenset({"FF", "FN", "FZ", "FV", "FQ", "FI", "FA", "FS", "FP", "FT", "WL", "WS", "WM"})
+UNRELIABLE: frozenset[str] = frozenset(_KNOWN["unreliable"])
 """Flags after which positions are those of the axis only once it is homed again."""
 
 _REPLY = re.compile(rb"(\d{1,2}) (\d)(?: (\d{2}))? (OK|RJ) (IDLE|BUSY) ([A-Z]{2}|--) ([ -~]+)")

@@ -61,7 +61,9 @@ def environment_scpi(
     """
     known, own = quantities_of(quantities, ("query",))
     queries = {key: _needed(key, fields, "query") for key, fields in own.items()}
-    probe = ScpiProbe(scpi_link(address), queries, answer_s)
+    # A sensor whose numbers are converted tells them in another unit.
+    units = {key: each.unit for key, each in known.items() if (each.scale, each.offset) == (1.0, 0.0)}
+    probe = ScpiProbe(scpi_link(address), queries, answer_s, units)
     return EnvironmentSensor(name, probe, known, SensorSettings().changed(settings or {}), **options)
 
 

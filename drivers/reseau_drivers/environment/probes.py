@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Literal
 
 from reseau.core.errors import DeadlineError, ProtocolError, SettingError
@@ -29,9 +30,11 @@ class ScpiProbe:
     link : Link
         Link to the sensor.
     queries : mapping of str to str
-        Query of each quantity, as ``MEAS:TEMP?``; the answer is a number, and may have a unit after it.
+        Query of each quantity, as ``MEAS:TEMP?``.
     answer_s : float
         Time limit of an answer (s).
+    units : mapping of str to str
+        Unit that may follow the number of a quantity; without an entry any word.
 
     Raises
     ------
@@ -49,12 +52,18 @@ class ScpiProbe:
 
     checked = False
 
-    def __init__(self, link: Link, queries: Mapping[str, str], answer_s: float = 1.0) -> None:
+    def __init__(
+        self,
+        link: Link,
+        queries: Mapping[str, str],
+        answer_s: float = 1.0,
+        units: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
         for name, query in queries.items():
             if not query.isascii() or not query.isprintable() or "?" not in query:
                 raise SettingError(f"{query!r} is no query", where=f"quantity {name}", do="write MEAS:TEMP?")
         self._link: MessageLink[bytes] = MessageLink(link, LineDecoder(limit=_LONGEST))
-        self._queries, self._answer_s = dict(queries), answer_s
+        self._queries, self._answer_s, self._units = dict(queries), answer_s, dict(units)
         self._synchronised = False
 
     def open(self, deadline: Deadline) -> None:
@@ -78,10 +87,15 @@ class ScpiProbe:
         if not self._synchronised:
             # Answers arrive in order: after that to *IDN? no answer to an earlier query is left.
             self.identify(deadline)
-        return {name: self._number(query, deadline) for name, query in self._queries.items()}
+        return {name: self._number(name, query, deadline) for name, query in self._queries.items()}
 
-    def _number(self, query: str, deadline: Deadline) -> float:
-        return number(self._ask(query, lambda line: True, deadline).decode("latin-1"), None, to=query)
+    def _number(self, name: str, query: str, deadline: Deadline) -> float:
+        said = self._ask(query, lambda line: True, deadline)
+        try:
+            text = said.decode("utf-8")
+        except UnicodeDecodeError:
+            text = said.decode("latin-1")
+        return number(text, self._units.get(name), to=query)
 
     def _ask(self, query: str, is_answer: Callable[[bytes], bool], deadline: Deadline) -> bytes:
         return self._link.query(query.encode("ascii") + b"\n", is_answer, deadline.part(self._answer_s))

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from reseau.core.errors import SettingError
-
 from ..link import Link
 from ..visa import scpi_link
-from .dialects import DIALECTS, Dialect, dialect_of
+from .dialects import DIALECTS, Dialect, dialect_named, dialect_of
 from .scope import Oscilloscope, OscilloscopeSettings
 
 __all__ = [
@@ -40,7 +38,8 @@ def oscilloscope(
     settings : dict, optional
         Values for :class:`OscilloscopeSettings`.
     dialect : str, optional
-        Name of one of :data:`DIALECTS`; by default it is chosen by the answer to ``*IDN?``.
+        Name of one of :data:`DIALECTS`, or of a file of profiles (``FILE.toml``, ``FILE.toml#NAME``); by
+        default it is chosen by the answer to ``*IDN?``.
     **options
         Further arguments of :class:`Oscilloscope`.
 
@@ -57,9 +56,6 @@ def oscilloscope(
     >>> scope.settings.channel
     2
     """
-    by_name = {each.name: each for each in DIALECTS}
-    if dialect is not None and dialect not in by_name:
-        raise SettingError("is not a known dialect", where=dialect, do=f"choose from {', '.join(by_name)}")
-    chosen = by_name[dialect] if dialect is not None else None
+    chosen = None if dialect is None else dialect_named(dialect)
     checked = OscilloscopeSettings().changed(settings or {})
     return Oscilloscope(name, scpi_link(address), checked, dialect=chosen, **options)

@@ -1,48 +1,116 @@
-"""Commands for screen pictures and waveforms of each manufacturer's oscilloscopes, selected by ``*IDN?``.
+"""Commands for screen pictures and waveforms of families of oscilloscopes, read from ``profiles/*.toml``.
 
-Source: programming manuals of the manufacturers. The first pattern that matches the identity selects the
-family.
+A profile says by which answers to ``*IDN?`` a family is known, which commands it takes, how its answers begin
+and end, and how numbers become volts; every line names its public source. Users add a family by a file of the
+same form, without code.
 """
 
 from __future__ import annotations
 
+import ast
+import operator
 import re
 import struct
+import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import partial
-from types import MappingProxyType
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from reseau.core.data import Array
-from reseau.core.errors import ProtocolError
+from reseau.core.errors import FormatError, InputError, ProtocolError, SettingError
 
 from ..codecs.ieee488 import picture
 from ..codecs.numbers import INFINITE
-from .screens import bytes_of_colours, runs_of_colours
+from ..profiles import FOLDER
+from .screens import bytes_of_colours, picture_after, runs_of_colours
 
 __all__ = [
     "DIALECTS",
-    "UNITS",
     "Dialect",
-    "Step",
+    "Formula",
     "WaveformDialect",
     "candidates_of",
+    "described",
+    "dialect_named",
     "dialect_of",
     "fields_of",
+    "read_profiles",
     "samples_of",
 ]
 
-Numbers = dict[str, float]
-Step = tuple[Literal["send", "query", "fetch"], str]
-"""``send`` a command, where ``{port}`` is the port that it is connected to;
-``query``: wait for a line and ignore it; ``fetch`` a picture or block."""
+Numbers = Mapping[str, Any]
+SCHEMA = "reseau-instrument-profile/1"
+_ACTS: Mapping[type, Callable[..., Any]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
+    ast.USub: operator.neg,
+}  # fmt: skip
+_ANSWERS: Mapping[str, Callable[[bytes], bytes]] = {
+    "picture": picture,
+    "bytes of colours": bytes_of_colours,
+    "runs of colours": runs_of_colours,
+    "picture after 4 bytes": lambda answer: picture_after(answer, 4),
+    "picture after 12 bytes": lambda answer: picture_after(answer, 12),
+}
 
 
-@dataclass(frozen=True)
-class WaveformDialect:
+class Formula:
+    """Arithmetic of numbers by their names: ``+ - * /`` and parentheses.
+
+    Raises
+    ------
+    ValueError
+        If the text has anything else.
+
+    Examples
+    --------
+    >>> Formula("(code - yoff) * dy")({"code": 3.0, "yoff": 1.0, "dy": 0.5})
+    1.0
+    """
+
+    def __init__(self, text: str) -> None:
+        try:
+            self._tree = ast.parse(text, mode="eval").body
+        except SyntaxError:
+            raise ValueError(f"{text!r} is not a formula") from None
+        for node in ast.walk(self._tree):
+            known = isinstance(node, ast.Name | ast.Load | ast.BinOp | ast.UnaryOp) or type(node) in _ACTS
+            if not (known or (isinstance(node, ast.Constant) and type(node.value) in (int, float))):
+                raise ValueError(f"{text!r} has more than + - * / of names and numbers")
+
+    def __call__(self, numbers: Numbers) -> Any:
+        """Return the value for these numbers."""
+        return self._value(self._tree, numbers)
+
+    def _value(self, node: ast.expr, numbers: Numbers) -> Any:
+        match node:
+            case ast.Constant(value):
+                return value
+            case ast.Name(name):
+                return numbers[name]
+            case ast.BinOp(left, act, right):
+                return _ACTS[type(act)](self._value(left, numbers), self._value(right, numbers))
+            case ast.UnaryOp(act, operand):
+                return _ACTS[type(act)](self._value(operand, numbers))
+        raise AssertionError(node)
+
+
+def _formula(text: Any) -> Any:
+    return Formula(text) if isinstance(text, str) else text
+
+
+_Formula = Annotated[Formula, BeforeValidator(_formula)]
+
+
+class _Part(BaseModel):
+    """A part of a profile: no unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+
+
+class WaveformDialect(_Part):
     """Commands that transfer a waveform; ``{n}`` stands for the channel.
 
     Parameters
@@ -56,10 +124,12 @@ class WaveformDialect:
         Query for the block of samples.
     dtype : str
         Data type of the samples.
-    volts : callable
-        Converts samples to volts, given the numbers.
-    start, step : callable
-        Time of the first sample and time step (s), given the numbers.
+    volts : Formula
+        Of the samples (``code``) and numbers.
+    start, step : Formula
+        Time of the first sample and time step (s), of the numbers.
+    units : mapping
+        Units that may follow numbers, by their names.
     preamble : str
         Query for a block with further numbers.
     fields : mapping
@@ -74,14 +144,15 @@ class WaveformDialect:
     """
 
     setup: tuple[str, ...]
-    scale: Mapping[str, str]
+    scale: dict[str, str]
     data: str
     dtype: str
-    volts: Callable[[Array, Numbers], Array]
-    start: Callable[[Numbers], float] = lambda f: f["x0"]
-    step: Callable[[Numbers], float] = lambda f: f["dx"]
+    volts: _Formula
+    start: _Formula = Formula("x0")
+    step: _Formula = Formula("dx")
+    units: dict[str, str] = Field(default_factory=dict)
     preamble: str = ""
-    fields: Mapping[str, tuple[int, str]] = field(default_factory=dict)
+    fields: dict[str, tuple[int, str]] = Field(default_factory=dict)
     wide: tuple[str, str] | None = None
     piece: str = ""
     more: tuple[int, ...] = (0,)
@@ -91,8 +162,32 @@ class WaveformDialect:
         return self.wide if self.wide and numbers.get("bits", 8) > 8 else ("", self.dtype)
 
 
-@dataclass(frozen=True)
-class Dialect:
+class Maker(_Part):
+    """A maker: what ``*IDN?`` begins with, and models that are no oscilloscopes.
+
+    Parameters
+    ----------
+    maker : str
+        Its name.
+    identities, others : str
+        Regular expressions for the beginning of the identity, and of the model of what is no oscilloscope.
+    greetings : str
+        Regular expression for what it may send before its first answer.
+    refusals : mapping
+        What to do, by a text in answers that are none.
+    sources : mapping
+        Public sources, by their numbers in the comments of the lines.
+    """
+
+    maker: str
+    identities: str
+    others: str = ""
+    greetings: str = ""
+    refusals: dict[str, str] = Field(default_factory=dict)
+    sources: dict[str, str]
+
+
+class Dialect(_Part):
     """Commands of one family of oscilloscopes.
 
     Parameters
@@ -101,8 +196,13 @@ class Dialect:
         Name of the family; begins with that of the maker.
     models : str
         Regular expression for the beginning of the model.
-    screen : tuple of Step
-        Steps to obtain the screen picture; one of them fetches it.
+    examples : tuple of str
+        Identities of instruments of this family.
+    screen : tuple of str
+        Steps to obtain the screen picture: ``send`` a command, where ``{port}`` is the port that it is
+        connected to; ``query``: wait for a line and ignore it; ``fetch`` the picture.
+    answer : str
+        What the answer with the picture is.
     waveform : WaveformDialect, optional
         None if waveforms are not supported.
     setup : tuple of str
@@ -111,298 +211,179 @@ class Dialect:
         Command that stops the acquisition.
     errors : str
         Query for the oldest error; empty if there is no error queue.
-    decode : callable
-        Makes a PNG or BMP file from the answer with the picture.
+    identifies : bool
+        Whether it answers ``*IDN?``.
+    silent : str
+        What it may lack if it does not answer.
+    maker : Maker
+        Its maker.
 
     Examples
     --------
-    >>> [step for step, _ in DIALECTS[1].screen]
-    ['send', 'fetch']
+    >>> dialect_named("Keysight InfiniiVision X").screen[1]
+    'fetch :DISPlay:DATA? PNG, COLor'
     """
 
     name: str
     models: str
-    screen: tuple[Step, ...]
+    examples: tuple[str, ...] = ()
+    screen: tuple[Annotated[str, Field(pattern="^(send|query|fetch) .")], ...]
+    answer: Literal[tuple(_ANSWERS)] = "picture"  # type: ignore[valid-type]
     waveform: WaveformDialect | None = None
     setup: tuple[str, ...] = ()
     halt: str = ":STOP"
     errors: str = ":SYSTem:ERRor?"
-    decode: Callable[[bytes], bytes] = picture
+    identifies: bool = True
+    silent: str = ""
+    maker: Maker
 
     @property
-    def maker(self) -> str:
-        """The maker."""
-        return next(maker for maker in _MAKERS if self.name.startswith(maker))
+    def ahead(self) -> int:
+        """Number of bytes before a picture."""
+        return int(self.answer.split()[2]) if self.answer.startswith("picture after") else 0
+
+    def decode(self, answer: bytes) -> bytes:
+        """Make a PNG or BMP file from the answer with the picture."""
+        return _ANSWERS[self.answer](answer)
 
 
-UNITS = {"vdiv": "V", "ofst": "V", "rate": "Sa/s", "tdiv": "s"}
-"""Units that may follow numbers, by their names."""
-_TEN = "- - points - dx x0 - dy y0 yref"
-"""The ten numbers of a Keysight or Rigol preamble: format, type, points, count, x, y."""
+def read_profiles(text: str, *, where: object) -> tuple[Maker, tuple[Dialect, ...]]:
+    """Read a maker and the profiles of its families.
+
+    Parameters
+    ----------
+    text : str
+        TOML of the schema ``reseau-instrument-profile/1``.
+    where : object
+        Names the text in messages.
+
+    Raises
+    ------
+    FormatError
+        If it is not such a document.
+
+    Examples
+    --------
+    >>> read_profiles('schema = "other/1"', where="mine.toml")
+    Traceback (most recent call last):
+    reseau.core.errors.FormatError: mine.toml: schema 'other/1' is not reseau-instrument-profile/1
+    """
+    try:
+        content = tomllib.loads(text)
+        if (found := content.pop("schema", None)) != SCHEMA:
+            raise FormatError(f"schema {found!r} is not {SCHEMA}", where=where)
+        profiles, waveforms = content.pop("profiles", []), content.pop("waveforms", {})
+        maker, dialects = Maker(**content), list[Dialect]()
+        for each in profiles:
+            if "waveform" in each:
+                each["waveform"] = waveforms[each["waveform"]]
+            dialects.append(Dialect(maker=maker, **each))
+    except tomllib.TOMLDecodeError as error:
+        raise FormatError(f"is not TOML ({error})", where=where) from None
+    except KeyError as error:
+        raise FormatError(f"there are no [waveforms.{error.args[0]}]", where=where) from None
+    except (ValidationError, TypeError) as error:
+        raise FormatError(_first(error), where=where) from None
+    fetches = [sum(step.startswith("fetch") for step in each.screen) for each in dialects]
+    if fetches != [1] * len(dialects):
+        raise FormatError("each `screen` needs one step that fetches the picture", where=where)
+    return maker, tuple(dialects)
 
 
-def _with_preamble(dtype: str, *setup: str, shifted: bool = False) -> WaveformDialect:
-    """Bytes scaled by a preamble of ten numbers; `shifted`: its origin counts codes, not volts."""
-
-    def volts(codes: Array, f: Numbers) -> Array:
-        return (codes - f["y0"] - f["yref"]) * f["dy"] if shifted else (codes - f["yref"]) * f["dy"] + f["y0"]
-
-    return WaveformDialect(
-        (":WAVeform:SOURce CHANnel{n}", ":WAVeform:FORMat BYTE", *setup),
-        MappingProxyType({_TEN: ":WAVeform:PREamble?"}),
-        ":WAVeform:DATA?",
-        dtype,
-        volts,
-    )
+def _first(error: Exception) -> str:
+    """The first error of a validation in one line."""
+    if not isinstance(error, ValidationError):
+        return str(error)
+    first = error.errors(include_url=False, include_context=False)[0]
+    return f"`{'.'.join(map(str, first['loc']))}`: {first['msg'].removeprefix('Value error, ')}"
 
 
-def _curve(group: str, **more: str) -> WaveformDialect:
-    """The curve of a Tektronix, scaled by the numbers of a group; some count samples from the trigger."""
-    names = {"dx": "XINcr", "x0": "XZEro", "dy": "YMUlt", "yoff": "YOFf", "y0": "YZEro"} | more
-    return WaveformDialect(
-        ("HEADer OFF", "DATa:SOUrce CH{n}", "DATa:ENCdg RIBinary", "DATa:WIDth 1"),
-        MappingProxyType({name: f"{group}:{written}?" for name, written in names.items()}),
-        "CURVe?",
-        "i1",
-        lambda codes, f: (codes - f["yoff"]) * f["dy"] + f["y0"],
-        start=lambda f: f["x0"] - f.get("first", 0.0) * f["dx"],
-    )
+_FILES = {path: text for path in sorted(FOLDER.glob("*.toml")) if SCHEMA in (text := path.read_text("utf-8"))}
+_READ = [read_profiles(text, where=path.name) for path, text in _FILES.items()]
+MAKERS: tuple[Maker, ...] = tuple(maker for maker, _ in _READ)
+DIALECTS: tuple[Dialect, ...] = tuple(each for _, dialects in _READ for each in dialects)
 
 
-_KEYSIGHT = _with_preamble("u1", ":WAVeform:UNSigned ON")
-# Coupling, ranges, date and the like follow; the number of segments in segmented memory.
-_INFINIIUM = replace(_with_preamble("i1", ":WAVeform:STReaming OFF"), more=(0, 14, 15))
-_RIGOL = _with_preamble("u1", ":WAVeform:MODE NORMal", shifted=True)
-_RIGOL_E = WaveformDialect(
-    (":WAVeform:POINts:MODE NORMal",),
-    MappingProxyType(
-        {
-            "vdiv": ":CHANnel{n}:SCALe?",
-            "ofst": ":CHANnel{n}:OFFSet?",
-            "tdiv": ":TIMebase:SCALe?",
-            "delay": ":TIMebase:OFFSet?",
+def dialect_named(name: str) -> Dialect:
+    """Return a dialect by its name, or the one of a file of profiles (``FILE.toml``, ``FILE.toml#NAME``).
+
+    Raises
+    ------
+    SettingError
+        If there is none.
+    FormatError
+        If the file has no profiles.
+    """
+    path, _, wanted = name.partition("#")
+    known, chosen = DIALECTS, name
+    if path.endswith(".toml"):
+        _, known = read_profiles(_text_of(path), where=path)
+        chosen = wanted or (known[0].name if len(known) == 1 else "")
+    found = next((each for each in known if each.name == chosen), None)
+    if found is None:
+        raise SettingError(
+            "is not a known dialect", where=name, do=f"choose from {', '.join(each.name for each in known)}"
+        )
+    return found
+
+
+def described(name: str = "") -> str:
+    """Return a profile as a file of its own, with the sources of its lines; entry point ``profiles``.
+
+    Parameters
+    ----------
+    name : str
+        Name of a dialect; a file of profiles, which is checked and listed; empty: list all.
+
+    Raises
+    ------
+    SettingError
+        If there is none of this name.
+    FormatError
+        If a file has no profiles.
+
+    Examples
+    --------
+    >>> read_profiles(described("Rigol 1000Z"), where="")[1][0].examples[1]
+    'RIGOL TECHNOLOGIES,MSO1104Z,M,1'
+    """
+    if not name or (name.endswith(".toml") and "#" not in name):
+        known = DIALECTS if not name else read_profiles(_text_of(name), where=name)[1]
+        examples = {
+            each.name: ", ".join(example.split(",")[1] for example in each.examples) for each in known
         }
-    ),
-    ":WAVeform:DATA? CHANnel{n}",
-    "u1",
-    # 125 is the middle of the screen, and a smaller number is higher; 600 samples are twelve divisions.
-    lambda codes, f: (125 - codes) * f["vdiv"] / 25 - f["ofst"],
-    start=lambda f: f["delay"] - 6 * f["tdiv"],
-    step=lambda f: f["tdiv"] / 50,
-)
-_SIGLENT = WaveformDialect(
-    ("CHDR OFF", "WFSU SP,0,NP,0,FP,0"),
-    MappingProxyType({"vdiv": "C{n}:VDIV?", "ofst": "C{n}:OFST?", "rate": "SARA?", "tdiv": "TDIV?"}),
-    "C{n}:WF? DAT2",
-    "i1",
-    lambda codes, f: codes * f["vdiv"] / 25 - f["ofst"],
-    # Fourteen divisions with the trigger in the middle.
-    start=lambda f: -7 * f["tdiv"],
-    step=lambda f: 1 / f["rate"],
-)
-_SIGLENT_BLOCK = WaveformDialect(
-    (":WAVeform:SOURce C{n}", ":WAVeform:WIDTh BYTE", ":WAVeform:INTerval 1", ":WAVeform:POINt 0"),
-    MappingProxyType({"tdiv": ":TIMebase:SCALe?"}),
-    ":WAVeform:DATA?",
-    "i1",
-    lambda codes, f: f["probe"] * (codes / f["codes"] * f["vdiv"] - f["ofst"]),
-    # Ten divisions; the delay refers to their middle.
-    start=lambda f: f["delay"] - 5 * f["tdiv"],
-    step=lambda f: f["dx"],
-    preamble=":WAVeform:PREamble?",
-    # The wave descriptor of the programming guide EN11.
-    fields=MappingProxyType(
-        {
-            "points": (116, "<i"),
-            "vdiv": (156, "<f"),
-            "ofst": (160, "<f"),
-            "codes": (164, "<f"),
-            "bits": (172, "<H"),
-            "dx": (176, "<f"),
-            "delay": (180, "<d"),
-            "probe": (328, "<f"),
-        }
-    ),
-    wide=(":WAVeform:WIDTh WORD", "<i2"),
-    piece=":WAVeform:STARt {at}",
-)
-_TEKTRONIX = _curve("WFMOutpre")
-_TEKTRONIX_TDS = _curve("WFMPre", first="PT_Off")
-_ROHDE = WaveformDialect(
-    ("FORMat REAL,32", "FORMat:BORDer LSBFirst"),
-    MappingProxyType({"x0 x1 points -": "CHANnel{n}:DATA:HEADer?"}),
-    "CHANnel{n}:DATA?",
-    "<f4",
-    lambda volts, f: volts,
-    step=lambda f: (f["x1"] - f["x0"]) / f["points"],
-)
+        return "".join(f"{each}: {models}".rstrip(": ") + "\n" for each, models in examples.items())
+    dialect = dialect_named(name)
+    text = next(text for text in _FILES.values() if f'name = "{dialect.name}"' in text)
+    head, *parts = re.split(r"(?m)^(?=\[)", text)
+    kept = [part for part in parts if not part.startswith(("[[profiles]]", "[waveforms"))]
+    own = next(part for part in parts if f'name = "{dialect.name}"' in part)
+    if found := re.search(r'(?m)^waveform = "(\w+)"', own):
+        kept += [part for part in parts if part.startswith(f"[waveforms.{found[1]}]")]
+    return "".join([head, *kept, own]).rstrip() + "\n"
 
 
-def _hardcopy(kind: str, port: str) -> tuple[Step, ...]:
-    """Steps of a Tektronix TDS; without LAYout and COMPRession it may send what was last printed with."""
-    return (
-        ("send", f"HARDCopy:FORMat {kind}"),
-        ("send", "HARDCopy:LAYout PORTRait"),
-        ("send", f"HARDCopy:PORT {port}"),
-        ("fetch", "HARDCopy STARt"),
-    )
+def _text_of(path: str) -> str:
+    try:
+        return Path(path).read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read ({error})", where=path) from None
 
 
-_no_queue = partial(Dialect, halt="STOP", errors="", setup=("CHDR OFF",))
-_tektronix = partial(Dialect, halt="ACQuire:STATE STOP", errors="", setup=("HEADer OFF",))
-
-DIALECTS: tuple[Dialect, ...] = (
-    Dialect(
-        "Keysight Infiniium",
-        r"(MXR|EXR|UXR)\d|(DSO|MSO|DSA)(S|V|Z|X?9)\d",
-        (("fetch", ":DISPlay:DATA? PNG,SCReen,ON,NORMal"),),
-        _INFINIIUM,
-    ),
-    Dialect(
-        "Keysight InfiniiVision X",
-        r"(DSO|MSO|EDU)-?X ?[1-6]\d{3}|(DSO|MSO)[5-7]\d{3}|HD3\d|M924|P924",
-        (("send", ":HARDcopy:INKSaver OFF"), ("fetch", ":DISPlay:DATA? PNG, COLor")),
-        _KEYSIGHT,
-    ),
-    Dialect("Rigol 1000Z", r"(DS|MSO)1\d{3}Z", (("fetch", ":DISPlay:DATA? ON,0,PNG"),), _RIGOL),
-    Dialect(
-        "Rigol DS1000D and DS1000E",
-        r"DS1\d{3}[CDEM]+\b",
-        (("fetch", ":LCD:DATA?"),),
-        _RIGOL_E,
-        errors="",
-        decode=bytes_of_colours,
-    ),
-    Dialect("Rigol", r"(DS|MSO|DHO|MHO|HDO)\d", (("fetch", ":DISPlay:DATA?"),), _RIGOL),
-    _no_queue(
-        "Siglent with PRINt",
-        r"SDS(\d+X (Plus|HD)|[567]\d{3})",
-        (("fetch", "PRINt? PNG"),),
-        _SIGLENT_BLOCK,
-    ),
-    _no_queue("Siglent", r"SDS\d", (("fetch", "SCDP"),), _SIGLENT),
-    _tektronix(
-        "Tektronix with a file system",
-        r"(MSO|DPO|LPD)(2[24]|4[46]|5[468]|58LP|6[468])B?\b",
-        (
-            ("send", 'SAVe:IMAGe "C:/Temp/reseau.png"'),
-            ("query", "*OPC?"),
-            ("fetch", 'FILESystem:READFile "C:/Temp/reseau.png"'),
-            ("send", 'FILESystem:DELEte "C:/Temp/reseau.png"'),
-        ),
-        _TEKTRONIX,
-    ),
-    _tektronix(
-        "Tektronix with Windows",
-        r"(MSO|DPO)5\d{3}B?\b|(DPO|DSA|MSO)7\d{3,4}",
-        (
-            ("send", "HARDCopy:PORT FILE"),
-            ("send", "EXPort:FORMat PNG"),
-            ("send", 'HARDCopy:FILEName "C:\\TEMP\\RESEAU.PNG"'),
-            ("send", "HARDCopy STARt"),
-            ("query", "*OPC?"),
-            ("fetch", 'FILESystem:READFile "C:\\TEMP\\RESEAU.PNG"'),
-            ("send", 'FILESystem:DELEte "C:\\TEMP\\RESEAU.PNG"'),
-        ),
-        _TEKTRONIX,
-    ),
-    _tektronix(
-        "Tektronix TDS 200",
-        r"TDS ?2[1-4]\d\b",
-        _hardcopy("BMP", "{port}"),
-        _TEKTRONIX_TDS,
-    ),
-    _tektronix(
-        "Tektronix TDS 3000",
-        r"TDS ?3\d{3}",
-        (("send", "HARDCopy:COMPRession OFF"), *_hardcopy("BMPColor", "GPIb")),
-        _TEKTRONIX_TDS,
-    ),
-    _tektronix(
-        "Tektronix TDS 1000 and 2000",
-        r"(TDS ?[12]0\d\d|TPS ?2\d{3}|TBS ?1\d{3})",
-        _hardcopy("BMP", "USB"),
-        _TEKTRONIX_TDS,
-    ),
-    _tektronix(
-        "Tektronix",
-        r"(MSO|DPO|MDO|TDS|TBS|TPS|DSA|CSA) ?\d",
-        (
-            ("send", "SAVe:IMAGe:FILEFormat PNG"),
-            ("send", "HARDCopy:INKSaver OFF"),
-            ("fetch", "HARDCopy STARt"),
-        ),
-        _TEKTRONIX,
-    ),
-    Dialect(
-        "Rohde & Schwarz with a file system",
-        r"RTO|RTE|RTP|MXO",
-        (
-            ("send", "HCOPy:DEVice1:LANGuage PNG"),
-            ("send", "MMEMory:NAME 'C:\\reseau.png'"),
-            ("send", "HCOPy:IMMediate1"),
-            ("query", "*OPC?"),
-            ("fetch", "MMEMory:DATA? 'C:\\reseau.png'"),
-            ("send", "MMEMory:DELete 'C:\\reseau.png'"),
-        ),
-        _ROHDE,
-    ),
-    Dialect(
-        "Rohde & Schwarz handheld",
-        r"RTH",
-        (
-            ("send", "HCOPy:LANGuage PNG"),
-            ("send", "MMEMory:NAME '/media/SD/reseau.png'"),
-            ("send", "HCOPy:IMMediate"),
-            ("query", "*OPC?"),
-            ("fetch", "MMEMory:DATA? '/media/SD/reseau.png'"),
-            ("send", "MMEMory:DELete '/media/SD/reseau.png'"),
-        ),
-        _ROHDE,
-    ),
-    Dialect(
-        "Rohde & Schwarz",
-        r"RTB|RTM|RTA|RTC|HMO",
-        (("send", "HCOPy:FORMat PNG"), ("fetch", "HCOPy:DATA?")),
-        _ROHDE,
-    ),
-    _no_queue("LeCroy T3DSO", r"T3DSO", (("fetch", "SCDP"),), _SIGLENT),
-    Dialect(
-        "GW Instek",
-        r"GDS-?[123]\d{3}|MSO-?2\d{3}|MDO-?2\d{3}",
-        (("fetch", ":DISPlay:OUTPut?"),),
-        errors="",
-        decode=runs_of_colours,
-    ),
-    _no_queue(
-        "LeCroy",
-        r"",
-        (("send", "HCSU DEV,PNG,BCKG,BLACK,AREA,DSOWINDOW,DEST,REMOTE"), ("fetch", "SCDP")),
-    ),
-)
-
-_MAKERS = {
-    "Keysight": ("KEYSIGHT|AGILENT|HEWLETT", r"34|U?12|U34|L44|EDU3[46]|3[35]\d|N\d|E\d"),
-    "Rigol": ("RIGOL", r"(DM|DG|DP|DSA|DL|RSA)\d"),
-    "Siglent": ("SIGLENT", r"SDM|SDG|SPD|SSA|SSG|SVA|SDL"),
-    "Tektronix": ("TEKTRONIX", r"DMM|AFG|AWG|PWS|RSA|PA"),
-    "Rohde & Schwarz": ("ROHDE|HAMEG", r"HMC|NG|FP|FS|SM|HMP|UDS"),
-    "LeCroy": ("LECROY|TELEDYNE", r"WAVESTATION|T3(?!DSO)|WS(20[125]|3(08|12|16))2\b"),
-    "GW Instek": ("GW|GOOD WILL|INSTEK", r"GDM|GPP|PSW|GPD|AFG|MFG|GSP|PPH"),
-    "Keithley": ("KEITHLEY", ""),
-}
-"""Makers as in the names of their dialects: what ``*IDN?`` begins with, and models that are no oscilloscopes:
-multimeters, generators, supplies and analyzers.
-"""
-
-
-def _is(maker: str, models: str, identity: str) -> bool:
+def _is(maker: Maker, models: str, identity: str) -> bool:
     """Whether an identity is of a maker and of models."""
-    return re.match(rf"({_MAKERS[maker][0]})[^,]*, *({models})", identity.strip(), re.IGNORECASE) is not None
+    return re.match(rf"({maker.identities})[^,]*, *({models})", identity, re.IGNORECASE) is not None
+
+
+def _nearness(dialect: Dialect, model: str) -> int:
+    """How many characters a model has in common with those of a family."""
+    names = [example.split(",")[1].strip() for example in dialect.examples]
+    same = ([a == b for a, b in zip(model, name, strict=False)] + [False] for name in names)
+    return max((each.index(False) for each in same), default=0)
 
 
 def candidates_of(identity: str) -> tuple[Dialect, ...]:
-    """Return the dialects that an instrument of an unknown model may have: those of its maker, or all.
+    """Return the dialects that an instrument of an unknown model may have: its nearest relatives first.
 
     Raises
     ------
@@ -411,15 +392,22 @@ def candidates_of(identity: str) -> tuple[Dialect, ...]:
 
     Examples
     --------
-    >>> [dialect.name for dialect in candidates_of("RIGOL TECHNOLOGIES,XYZ9,1,1")]
-    ['Rigol 1000Z', 'Rigol DS1000D and DS1000E', 'Rigol']
+    >>> [dialect.name for dialect in candidates_of("RIGOL TECHNOLOGIES,MSO5999,1,1")]
+    ['Rigol', 'Rigol 1000Z', 'Rigol DS1000D and DS1000E']
     """
-    for maker, (_, others) in _MAKERS.items():
-        if _is(maker, others, identity):
-            raise ProtocolError(f"{identity!r} is no oscilloscope", do="check the address")
+    identity = identity.strip()
+    asked, model = DIALECTS, identity.partition(",")[2].partition(",")[0].strip()
+    for maker in MAKERS:
         if _is(maker, "", identity):
-            return tuple(dialect for dialect in DIALECTS if dialect.maker == maker)
-    return DIALECTS
+            asked = tuple(each for each in DIALECTS if each.maker is maker)
+            if not asked or (maker.others and _is(maker, maker.others, identity)):
+                raise ProtocolError(f"{identity!r} is no oscilloscope", do="check the address")
+            break
+    else:
+        model = ""
+    return tuple(
+        sorted((each for each in asked if each.identifies), key=lambda each: -_nearness(each, model))
+    )
 
 
 def dialect_of(identity: str) -> Dialect | None:
@@ -435,11 +423,12 @@ def dialect_of(identity: str) -> Dialect | None:
     >>> dialect_of("RIGOL TECHNOLOGIES,DS1104Z,DS1ZA000000001,00.04.04").name
     'Rigol 1000Z'
     """
-    possible = candidates_of(identity)
-    return next((dialect for dialect in possible if _is(dialect.maker, dialect.models, identity)), None)
+    possible = {each.name for each in candidates_of(identity)}
+    fitting = (each for each in DIALECTS if _is(each.maker, each.models, identity.strip()))
+    return next((each for each in fitting if each.name in possible), None)
 
 
-def fields_of(block: bytes, dialect: WaveformDialect) -> Numbers:
+def fields_of(block: bytes, dialect: WaveformDialect) -> dict[str, float]:
     """Decode the numbers of a preamble.
 
     Raises
@@ -473,7 +462,7 @@ def samples_of(data: bytes, dialect: WaveformDialect, numbers: Numbers) -> Array
     codes = np.frombuffer(data, dtype).astype(np.float64)
     if "points" in numbers and len(codes) != numbers["points"]:
         raise ProtocolError(f"received {len(codes)} samples; {numbers['points']:g} were announced")
-    volts = dialect.volts(codes, numbers)
+    volts: Array = dialect.volts({**numbers, "code": codes})
     if not np.all(np.abs(volts) < INFINITE):
         raise ProtocolError("some samples stand for no value", do="is the channel on?")
     return volts

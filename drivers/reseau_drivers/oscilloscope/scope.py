@@ -17,7 +17,7 @@ from ..codecs.ieee488 import LARGEST, Header, error_entry, missing_bytes, parse_
 from ..codecs.numbers import numbers
 from ..codecs.stream import excerpt
 from ..link import Link, SerialLink
-from .dialects import UNITS, Dialect, WaveformDialect, candidates_of, dialect_of, fields_of, samples_of
+from .dialects import MAKERS, Dialect, WaveformDialect, candidates_of, dialect_of, fields_of, samples_of
 
 __all__ = ["Oscilloscope", "OscilloscopeSettings"]
 
@@ -26,6 +26,7 @@ _TRIAL_S = 3.0
 _LONGEST_LINE = 65536
 _LINE = re.compile(rb"[\r\n\0]*(?:\xef\xbb\xbf)?([^\r\n\0]+)[\r\n\0]")
 """A line, after a byte order mark: it ends with LF, CR or NUL."""
+_GREETINGS = re.compile("|".join(f"^({maker.greetings})" for maker in MAKERS if maker.greetings))
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         self._link, self._forced_dialect, self._dialect = link, dialect, dialect
         self._serial = isinstance(link, SerialLink)
         self._idn, self._received, self._answer_pending = "", bytearray(), False
+        self._guessed = False
 
     @property
     def dialect(self) -> Dialect | None:
@@ -90,15 +92,25 @@ class Oscilloscope(Device[OscilloscopeSettings]):
     def _open(self, deadline: Deadline) -> None:
         self._link.open(deadline)
         self._received.clear()
+        self._dialect, self._guessed = self._forced_dialect, False
+        if self._dialect is not None and not self._dialect.identifies:
+            self._idn = f"{self._dialect.maker.maker},{self._dialect.name},"
+            return
         self._send("*CLS", deadline)
         self._idn = self._query("*IDN?", deadline)
         if self._idn.count(",") < 2:
             raise ProtocolError(f"{self._idn!r} is not a valid answer to *IDN?")
-        self._dialect = self._forced_dialect or dialect_of(self._idn) or self._asked(deadline)
+        if self._dialect is None and (known := dialect_of(self._idn)) is None:
+            self._dialect, self._guessed = self._asked(deadline), True
+        elif self._dialect is None:
+            self._dialect = known
 
     def _asked(self, deadline: Deadline) -> Dialect:
-        """Find the dialect of an unknown model: the one in which it sends a picture."""
-        for dialect in candidates_of(self._idn):
+        """Find the dialect of an unknown model: that of a near relative in which it sends a picture."""
+        asked = candidates_of(self._idn)
+        for dialect in asked:
+            if deadline.expired:
+                break
             trial = Deadline(min(_TRIAL_S, deadline.left_or_minimum))
             try:
                 for command in dialect.setup:
@@ -112,8 +124,10 @@ class Oscilloscope(Device[OscilloscopeSettings]):
                 self._received.clear()
                 self._answer_pending = False
                 self._send("*CLS", deadline)
+        names = ", ".join(repr(each.name) for each in asked[:3])
         raise ProtocolError(
-            f"{self._idn!r} sends a picture in none of the known dialects", do="set the option dialect"
+            f"{self._idn!r} sends a picture in none of the dialects tried ({names}, …)",
+            do="set the option dialect to the profile of a relative (`reseau bench profile`), or to a file",
         )
 
     def _disconnect(self) -> None:
@@ -128,7 +142,8 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         return Identity(maker, model, *rest)
 
     def _halt(self, deadline: Deadline) -> None:
-        self._send(self._required_dialect.halt, deadline)
+        if self._required_dialect.halt:
+            self._send(self._required_dialect.halt, deadline)
 
     def _acquire(self) -> dict[str, Any]:
         picture_ = self.screen()
@@ -141,6 +156,8 @@ class Oscilloscope(Device[OscilloscopeSettings]):
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
         found = {"dialect": self._required_dialect.name}
+        if self._guessed:
+            found["advice"] = f"its model has no profile; set dialect = {found['dialect']!r} to ask no more"
         if self._required_dialect.errors:
             with self._exchange("check", deadline.left_or_minimum) as time:
                 number, text = error_entry(self._query(self._required_dialect.errors, time))
@@ -161,13 +178,14 @@ class Oscilloscope(Device[OscilloscopeSettings]):
 
     def _picture_of(self, dialect: Dialect, deadline: Deadline) -> bytes:
         data = b""
-        for how, text in dialect.screen:
+        for step in dialect.screen:
+            how, _, text = step.partition(" ")
             if how == "send":
                 self._send(text.format(port="RS232" if self._serial else "GPIb"), deadline)
             elif how == "query":
                 self._query(text, deadline)
             else:
-                data = dialect.decode(self._fetch(text, deadline))
+                data = dialect.decode(self._fetch(text, deadline, dialect.ahead))
         _verify_png(data)
         return data
 
@@ -199,7 +217,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
             scale: dict[str, float] = {}
             for names, question in dialect.scale.items():
                 asked_for = question.format(n=channel)
-                scale |= _numbers(names, self._query(asked_for, deadline), asked_for, dialect.more)
+                scale |= _numbers(dialect, names, self._query(asked_for, deadline), asked_for)
             if dialect.preamble:
                 scale |= fields_of(parse_block(self._fetch(dialect.preamble, deadline)), dialect)
             data = self._samples(dialect, scale, channel, deadline)
@@ -207,9 +225,12 @@ class Oscilloscope(Device[OscilloscopeSettings]):
                 raise ProtocolError(f"sent no samples of channel {channel}", do="switch the channel on")
             try:
                 volts = samples_of(data, dialect, scale)
-                start, step = dialect.start(scale), dialect.step(scale)
+                start, step = float(dialect.start(scale)), float(dialect.step(scale))
+                one, two = (dialect.volts({**scale, "code": code}) for code in (0.0, 1.0))
             except ZeroDivisionError:
-                raise ProtocolError("the waveform has no extent in time") from None
+                one = two = step = 0.0
+            if not step > 0 or one == two:
+                raise ProtocolError(f"the waveform has no extent in {'volts' if step > 0 else 'time'}")
             return Waveform(volts, start, step, channel, asked)
 
     def _samples(
@@ -268,20 +289,36 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         while True:
             line = _LINE.match(self._received)
             if line is not None:
-                return line[1].strip().decode("latin-1")
+                said, greeted = _GREETINGS.subn("", line[1].strip().decode("latin-1"))
+                self._require_willing(said)
+                if said or not greeted:
+                    return said
+                del self._received[: line.end()]
+                continue
             if len(self._received) > _LONGEST_LINE:
                 raise ProtocolError(f"the answer to {text} does not end: {excerpt(bytes(self._received))}")
             self._receive(deadline, text)
 
-    def _fetch(self, text: str, deadline: Deadline) -> bytes:
+    def _require_willing(self, said: str) -> None:
+        """Raise if an instrument answers that it does not answer."""
+        for text, do in ((text, do) for maker in MAKERS for text, do in maker.refusals.items()):
+            if text in said:
+                raise ProtocolError(f"refuses: {excerpt(said.encode())}", do=do)
+
+    def _fetch(self, text: str, deadline: Deadline, ahead: int = 0) -> bytes:
+        """Return a block or picture, with the bytes that are ahead of it."""
         self._start_query(text, deadline)
         lacking: int | None = None
         while True:
             # Parse again only when the missing bytes have arrived: a picture is large.
-            if self._received and not lacking:
-                start = _start_of_binary(self._received)
+            if len(self._received) > ahead and not lacking:
+                start = 0 if ahead else _start_of_binary(self._received)
                 ended = getattr(self._link, "ended", False)
-                lacking = missing_bytes(bytes(self._received[start:]), ended)
+                try:
+                    lacking = missing_bytes(bytes(self._received[start + ahead :]), ended)
+                except ProtocolError:
+                    self._require_willing(self._received[:200].decode("latin-1"))
+                    raise
                 if lacking == 0:
                     return bytes(self._received[start:])
             before = len(self._received)
@@ -295,9 +332,10 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         if deadline.expired:
             if self._received:
                 raise ProtocolError(f"the answer to {text} broke off after {len(self._received)} bytes")
+            silent = self._dialect.silent if self._dialect else ""
             raise DeadlineError(
                 f"{text} was not answered within {deadline.seconds:g} s",
-                do="check whether it is busy or its screen is locked",
+                do=f"it {silent}" if silent else "check whether it is busy or its screen is locked",
             )
         self._received += self._link.read(deadline)
 
@@ -310,14 +348,14 @@ def _start_of_binary(data: bytearray) -> int:
     return sign if word.endswith(b",") and word.isascii() else start
 
 
-def _numbers(names: str, answer: str, question: str, more: tuple[int, ...]) -> dict[str, float]:
+def _numbers(dialect: WaveformDialect, names: str, answer: str, question: str) -> dict[str, float]:
     """Parse an answer, which may repeat the header of its question, into numbers by name."""
     wanted = names.split()
     header, space, rest = answer.partition(" ")
     if space and header[:1].isalpha() and Header(question).matches(f"{header}?"):
         answer = rest
-    unit = UNITS.get(names, "")
-    found = numbers(answer, *(len(wanted) + each for each in more), unit=unit, to=question)
+    counts = (len(wanted) + each for each in dialect.more)
+    found = numbers(answer, *counts, unit=dialect.units.get(names, ""), to=question)
     return {name: value for name, value in zip(wanted, found, strict=True) if name != "-"}
 
 

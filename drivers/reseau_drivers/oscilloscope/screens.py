@@ -1,7 +1,8 @@
-"""Screens that instruments send as bare pixels, as PNG files.
+"""Screens that instruments send as bare pixels, or behind a head of their own, as PNG or BMP files.
 
 Sources: Rigol DS1000D and DS1000E, whose ``:LCD:DATA?`` is in no manual, as described at improwis.com ("Rigol
-scope wifi") and read by riglol-snap; GW Instek's own dso1kb.py for ``:DISPlay:OUTPut?``.
+scope wifi") and read by riglol-snap; GW Instek's own dso1kb.py for ``:DISPlay:OUTPut?``; Owon's SCPI
+protocol of the HDS200, and the one of port 3000 as robert-hh/owonread describes it.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 
 from reseau.core.errors import ProtocolError
 
-from ..codecs.ieee488 import parse_block
+from ..codecs.ieee488 import parse_block, picture
 
-__all__ = ["bytes_of_colours", "runs_of_colours"]
+__all__ = ["bytes_of_colours", "picture_after", "runs_of_colours"]
 
 
 def bytes_of_colours(answer: bytes) -> bytes:
@@ -62,6 +63,26 @@ def runs_of_colours(answer: bytes) -> bytes:
     values = np.repeat(pairs[:, 1], pairs[:, 0]).reshape(-1, 800)
     blue, green, red = (values & 0x1F) << 3, values >> 3 & 0xFC, values >> 8 & 0xF8
     return _png(np.stack([blue, green, red], axis=-1).astype(np.uint8))
+
+
+def picture_after(answer: bytes, ahead: int) -> bytes:
+    r"""Return the picture behind bytes of which the first four are its size.
+
+    Raises
+    ------
+    ProtocolError
+        If it has another size.
+
+    Examples
+    --------
+    >>> picture_after(b"\x09\0\0\0BM", 4)
+    Traceback (most recent call last):
+    reseau.core.errors.ProtocolError: an incomplete picture (2 bytes)
+    """
+    found, announced = picture(answer[ahead:]), int.from_bytes(answer[:4], "little")
+    if len(found) != announced:
+        raise ProtocolError(f"a picture of {len(found)} bytes; {announced} were announced")
+    return found
 
 
 def _png(pixels: NDArray[Any]) -> bytes:

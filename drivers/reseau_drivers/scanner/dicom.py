@@ -145,11 +145,9 @@ class DicomFiles(Device[DicomSettings]):
 
     def _identify(self, deadline: Deadline) -> Identity:
         header = self._header(self._frames[0][0])
-        said = [
-            str(header.get(key, "") or "")
-            for key in ("Manufacturer", "ManufacturerModelName", "DeviceSerialNumber", "SoftwareVersions")
-        ]
-        return Identity(*said)
+        keys = ("Manufacturer", "ManufacturerModelName", "DeviceSerialNumber", "SoftwareVersions")
+        values = [header.get(key, "") or "" for key in keys]
+        return Identity(*(each if isinstance(each, str) else ", ".join(map(str, each)) for each in values))
 
     def _halt(self, deadline: Deadline) -> None:
         """Do nothing."""

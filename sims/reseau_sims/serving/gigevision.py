@@ -38,7 +38,7 @@ from reseau_drivers.codecs.gige import (
     data_packet,
     trailer,
 )
-from reseau_drivers.codecs.pixels import GENICAM, encode
+from reseau_drivers.codecs.pixels import GENICAM, encode, size_of
 
 from .faults import Fault
 from .genicam import Feature, description, placed
@@ -65,7 +65,7 @@ _OFF_AUTO = {"Off": 0, "Once": 1, "Continuous": 2}
 def _features(width: int, height: int, serial: str) -> dict[str, Feature]:
     """The features of a camera with such a sensor."""
     image, taking, analog = "ImageFormatControl", "AcquisitionControl", "AnalogControl"
-    formats = {name: int(GENICAM[name].code) for name in ("Mono8", "Mono12", "Mono16", "BayerRG8")}
+    formats = {name: int(GENICAM[name].code) for name in GENICAM}
     return placed([
         Feature("DeviceControl", "DeviceVendorName", "string", "reseau", access="RO", address=0x48),
         Feature("DeviceControl", "DeviceModelName", "string", "GigE simulator", access="RO", address=0x68),
@@ -287,7 +287,8 @@ class GigeVisionCamera:
             size = (self._word(at) & 0xFFFF) - _OVERHEAD_IP
             self._deliver([bytes(max(8, size))])
         pixels = GENICAM[self.value("PixelFormat") or "Mono8"]
-        self.set("PayloadSize", self.value("Width") * self.value("Height") * pixels.stored)
+        width = self.value("Width") // pixels.group[0] * pixels.group[0]
+        self.set("PayloadSize", size_of(pixels, width, self.value("Height")))
         return Status.SUCCESS
 
     def _execute(self, command: str) -> None:

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import gzip
 import struct
+import tomllib
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -78,118 +81,16 @@ class Family:
     saves: tuple[str, ...] = ()
 
 
+def _frozen(value: Any) -> Any:
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+
+
 FAMILIES: Mapping[str, Family] = MappingProxyType(
     {
-        "keysight": Family(
-            "KEYSIGHT TECHNOLOGIES,MSO-X 3024T,MY00000001,07.50",
-            ":DISPlay:DATA?",
-            picture=".bmp",
-            options=(("BMP", "BMP8bit", "PNG"), ("COLor", "GRAYscale")),
-        ),
-        "keysight-infiniium": Family(
-            "KEYSIGHT TECHNOLOGIES,MXR058A,MY00000002,11.20.00601",
-            ":DISPlay:DATA?",
-            picture=".bmp",
-            options=(
-                ("BMP", "JPG", "GIF", "TIF", "PNG"),
-                ("SCReen", "GRATicule"),
-                ("ON", "OFF", "1", "0"),
-                ("NORMal", "INVert"),
-            ),
-            waveform="infiniium",
-        ),
-        "rigol-1000z": Family(
-            "RIGOL TECHNOLOGIES,DS1104Z,DS1ZA000000001,00.04.04",
-            ":DISPlay:DATA?",
-            "ON,0,PNG",
-            waveform="rigol",
-        ),
-        "rigol-2000": Family(
-            "RIGOL TECHNOLOGIES,DS2202,DS2A000000001,00.03.00",
-            ":DISPlay:DATA?",
-            picture=".bmp",
-            waveform="rigol",
-        ),
-        "siglent": Family(
-            "SIGLENT,SDS1104X-E,SDSMM00000001,8.2.6.1.37",
-            "SCDP",
-            picture=".bmp",
-            as_block=False,
-            newline=False,
-            waveform="siglent",
-        ),
-        "siglent-plus": Family(
-            "SIGLENT,SDS2104X Plus,SDS2P00000001,1.3.9R6",
-            "PRINt?",
-            "PNG",
-            as_block=False,
-            waveform="siglent-block",
-        ),
-        "siglent-hd": Family(
-            "SIGLENT,SDS2104X HD,SDS2H00000001,1.2.3.6",
-            "PRINt?",
-            "PNG",
-            waveform="siglent-wide",
-        ),
-        "tektronix": Family(
-            "TEKTRONIX,MSO2024B,C000001,CF:91.1CT FV:v1.52",
-            "HARDCopy",
-            format="SAVe:IMAGe:FILEFormat",
-            as_block=False,
-            newline=False,
-            prepared_by=("SAVe:IMAGe:FILEFormat",),
-            waveform="tektronix",
-            options=(("STARt",),),
-        ),
-        "tektronix-tds2000": Family(
-            "TEKTRONIX,TDS 2024C,C000002,CF:91.1CT FV:v24.26",
-            "HARDCopy",
-            format="HARDCopy:FORMat",
-            as_block=False,
-            newline=False,
-            prepared_by=("HARDCopy:FORMat", "HARDCopy:PORT"),
-            waveform="tektronix-tds",
-            options=(("STARt",),),
-        ),
-        "tektronix-tds3000": Family(
-            "TEKTRONIX,TDS 3054B,0,CF:91.1CT FV:v3.41 TDS3FFT:v1.00 TDS3TRG:v1.00",
-            "HARDCopy",
-            format="HARDCopy:FORMat",
-            as_block=False,
-            newline=False,
-            prepared_by=("HARDCopy:FORMat", "HARDCopy:PORT"),
-            waveform="tektronix-tds",
-            options=(("STARt",),),
-        ),
-        "tektronix-files": Family(
-            "TEKTRONIX,MSO54,C012345,CF:91.1CT FV:1.28.3.7430",
-            "SAVe:IMAGe",
-            as_block=False,
-            newline=False,
-            waveform="tektronix",
-            saves=("SAVe:IMAGe", "FILESystem:READFile", "FILESystem:DELEte"),
-        ),
-        "rohde": Family(
-            "Rohde&Schwarz,RTB2004,1333.1005k04/000001,02.400",
-            "HCOPy:DATA?",
-            prepared_by=("HCOPy:FORMat",),
-            waveform="rohde",
-        ),
-        "rohde-files": Family(
-            "Rohde&Schwarz,RTO2044,1329.7002k44/100001,4.70.1.0",
-            "HCOPy:IMMediate<n>",
-            prepared_by=("MMEMory:NAME",),
-            waveform="rohde",
-            saves=("HCOPy:IMMediate<n>", "MMEMory:DATA?", "MMEMory:DELete"),
-        ),
-        "lecroy": Family(
-            "LECROY,WAVERUNNER8104,LCRY0000000001,8.5.0",
-            "SCDP",
-            as_block=False,
-            newline=False,
-            prepared_by=("HCSU",),
-            waveform="",
-        ),
+        name: Family(**{key: _frozen(value) for key, value in told.items()})
+        for name, told in tomllib.loads(
+            Path(__file__).with_name("oscilloscopes.toml").read_text("utf-8")
+        ).items()
     }
 )
 

@@ -11,7 +11,7 @@ import os
 import time
 
 from reseau_drivers.codecs import v4l2 as uapi
-from reseau_drivers.codecs.pixels import VIDEO
+from reseau_drivers.codecs.pixels import VIDEO, size_of
 
 from .imaging import SimulatedCamera
 from .video import CONTROLS, FORMATS, Memory, Stream, Video
@@ -178,9 +178,10 @@ class VideoNode:
         left, top = self._camera.region
         width = min(max(asked.width, 2), body.width - left)
         height = min(max(asked.height, 2), body.height - top)
-        stride = width * names[fourcc].stored
+        width -= width % names[fourcc].group[0]
         # A compressed image may be as large as the raw one plus a header.
-        size = stride * height or width * height * 2 + 4096
+        stride = names[fourcc].row(width)
+        size = size_of(names[fourcc], width, height) or width * height * 2 + 4096
         self._camera.format = uapi.Format(width, height, fourcc, stride, size)
         return self._camera.format.build()
 

@@ -24,7 +24,7 @@ CONTROLS = (
     uapi.Control(uapi.EXPOSURE_AUTO, "Auto Exposure", 3, 0, 3, 1, 3),
     uapi.Control(uapi.EXPOSURE_ABSOLUTE, "Exposure Time, Absolute", 1, 1, 10000, 1, 50),
 )
-FORMATS = ("GREY", "Y10", "Y12", "Y16", "YUYV", "MJPEG", "SRGGB8")
+FORMATS = tuple(VIDEO)
 
 
 class Memory:

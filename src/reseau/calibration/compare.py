@@ -108,7 +108,8 @@ class FieldDifference(Display):
     @property
     def p_at(self) -> Array:
         """The same for each place alone (rows, columns); NaN where no ray is imaged."""
-        known = np.isfinite(self.sigma) & (np.linalg.det(self.cov) > 0)
+        known = np.isfinite(self.sigma)
+        known[known] = np.linalg.det(self.cov[known]) > 0
         p = np.full(known.shape, np.nan)
         d = self.difference[known]
         square = np.einsum("ni,ni->n", d, np.linalg.solve(self.cov[known], d[:, :, None])[:, :, 0])

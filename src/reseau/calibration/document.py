@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from hashlib import sha256
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NoReturn, NotRequired, Self
@@ -302,6 +303,12 @@ class Calibration(Document):
         full[np.ix_(where, where)] = np.array(self.covariance.matrix).reshape(len(where), len(where))
         return full
 
+    @property
+    def key(self) -> str:
+        """Its name in archives: start of its SHA-256 without clock times."""
+        text = self.model_copy(update={"times": {}}).to_json()
+        return sha256(text.encode("utf-8")).hexdigest()[:12]
+
     def __repr__(self) -> str:
         formal = self.validity.get("sigma_formal", {})
         count = sum(formal.get(name, 1.0) != 0 for name in self.covariance.names)
@@ -330,18 +337,15 @@ class Calibration(Document):
             ("no verdict",) if self.assessment is None else self.assessment.lines or (self.assessment.short,)
         )
         rows = (
-            f"  {name:8} {measured(q.value, q.sigma, q.unit)}"
-            for name, q in self.parameters.items()
+            f"  {name:8} {text}"
+            for (name, text), q in zip(self.printed().items(), self.parameters.values(), strict=True)
             if q.value or q.sigma
         )
         return "\n".join((f"{self.kind} {self.name!r}", *verdict, *rows))
 
     def printed(self) -> dict[str, str]:
         """Return the parameters as text, with as many digits as their standard deviations support."""
-        return {
-            name: measured(q.value, q.sigma, "" if q.unit == "1" else q.unit)
-            for name, q in self.parameters.items()
-        }
+        return {name: measured(q.value, q.sigma, q.unit) for name, q in self.parameters.items()}
 
     def residuals(self) -> NoReturn:
         """Refuse: residuals are those of :class:`reseau.Calibrated`, a calibration has no image points.

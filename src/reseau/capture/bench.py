@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import copy
 import json
+import time
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -35,8 +36,8 @@ from ..core.errors import (
     SettingError,
     UsageError,
 )
-from ..core.plugins import DISCOVERY, INSTRUMENTS, plugin, plugins
-from ..instruments import Camera, Identity, Instrument, Oscilloscope, Turntable, UltrasonicScanner
+from ..core.plugins import DISCOVERY, INSTRUMENTS, TOOLS, plugin, plugins
+from ..instruments import Camera, Finding, Identity, Instrument, Oscilloscope, Turntable, UltrasonicScanner
 from ..io import Document, Strict, read_text
 from ..io.refraction import RefractionEntry
 from .lock import BenchLock
@@ -389,6 +390,27 @@ class Bench:
             found.append(Checked(name, entry.driver, entry.address, tested, error))
         return found
 
+    def diagnose(self, seconds: float = 10.0) -> dict[str, list[Finding]]:
+        """Return what is found on the way to each instrument: what holds it, permissions, network, answers.
+
+        An instrument is connected only if nothing stands in the way and no other process uses it.
+        """
+        examine = plugin(TOOLS, "doctor")
+
+        def found(instrument: Instrument) -> list[Finding]:
+            entry = self.file.instruments[instrument.name]
+            if (holder := BenchLock.holder(entry.address)) is not None:
+                return [Finding(False, f"is used by {holder}", "wait, or stop it with `reseau bench stop`")]
+            findings = list(examine(entry.driver, entry.address))
+            if all(each.fine is not False for each in findings):
+                findings.append(_answers(instrument, seconds))
+            return findings
+
+        return {
+            name: each if isinstance(each, list) else [Finding(False, each.what, each.do or "")]
+            for name, each in self._all(found).items()
+        }
+
     def stop(self) -> None:
         """Stop all instruments.
 
@@ -465,6 +487,22 @@ class Bench:
             return {}
         with ThreadPoolExecutor(len(self.instruments), "bench") as pool:
             return dict(zip(self.instruments, pool.map(outcome, self.instruments.values()), strict=True))
+
+
+def _answers(instrument: Instrument, seconds: float) -> Finding:
+    """How an instrument answers, and what its firmware is."""
+    began = time.monotonic()
+    try:
+        identity = instrument.connect(seconds)
+    except ReseauError as error:
+        return Finding(False, error.what, error.do or "")
+    finally:
+        instrument.close()
+    took = time.monotonic() - began
+    who, firmware = f"{identity.maker} {identity.model}", identity.firmware or "not told"
+    text = f"answers in {took:.2g} s: {who}, firmware {firmware}"
+    slow = took > seconds / 2
+    return Finding(None if slow else True, text, "set `seconds` in its options higher" if slow else "")
 
 
 def built(name: str, entry: InstrumentEntry) -> Instrument:

@@ -18,6 +18,7 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
+from ..core.options import Group
 from .common import Place, remark_lines, say
 
 if TYPE_CHECKING:
@@ -73,7 +74,12 @@ class Where(Place):
     options: Annotated[
         Path | None,
         typer.Option(
-            "--options", is_eager=True, callback=_from_toml, help="TOML file with values of options."
+            "--options",
+            is_eager=True,
+            callback=_from_toml,
+            metavar="PATH",
+            help="TOML file with values of options.",
+            rich_help_panel=Group.FILES.value,
         ),
     ] = None
     as_json: Annotated[v.AsJson, "Each event is a line."] = False

@@ -47,50 +47,48 @@ def apply(
     out: v.Out | None = None,
     scale: Annotated[
         float | None,
-        typer.Option(
-            help="Resolution of the corrected image: pixels per mm, or for a camera per pixel of the image. "
+        Option(
+            "Resolution of the corrected image: pixels per mm, or for a camera per pixel of the image. "
             "Default: that of the image."
         ),
     ] = None,
     fov: Annotated[
         str,
-        typer.Option(
-            help="Field of view of an undistorted image: keep (size and scale of the image), "
+        Option(
+            "Field of view of an undistorted image: keep (size and scale of the image), "
             "all (every pixel of the image), or the horizontal angle in degrees."
         ),
     ] = "keep",
     opencv_alpha: Annotated[
         float | None,
-        typer.Option(
-            min=0.0,
-            max=1.0,
-            help="In place of --fov: from 0, only pixels that the image has, to 1, all pixels of the image; "
+        Option(
+            "In place of --fov: from 0, only pixels that the image has, to 1, all pixels of the image; "
             "the size stays, as in OpenCV.",
+            least=0.0,
+            most=1.0,
         ),
     ] = None,
     tables: Annotated[
         Path | None,
-        typer.Option(
-            help="Tables of the undistorted image to write: .npz, .yml or .xml for OpenCV's remap, .pgm (two "
+        Option(
+            "Tables of the undistorted image to write: .npz, .yml or .xml for OpenCV's remap, .pgm (two "
             "files) for the filter remap of ffmpeg."
         ),
     ] = None,
     inverse: Annotated[
         bool,
-        typer.Option("--inverse", help="Distort points: undistorted pixels, or --directions."),
+        Option("Distort points: undistorted pixels, or --directions."),
     ] = False,
     directions: Annotated[
         bool,
-        typer.Option(
-            "--directions", help="Write points of a camera as directions x/z, y/z instead of pixels."
-        ),
+        Option("Write points of a camera as directions x/z, y/z instead of pixels."),
     ] = False,
     object_coordinates: Annotated[
         bool, Option("Write points of an oscilloscope in the object coordinate system.")
     ] = False,
     exposure_ms: Annotated[
         float | None,
-        typer.Option(min=0.0, help="Exposure time of the frame (ms). Default: that of the calibration."),
+        Option("Exposure time of the frame (ms). Default: that of the calibration.", least=0.0),
     ] = None,
     archive: Annotated[v.Archive | None, "Here with the calibrations in force of a configuration."] = None,
     objects: v.Objects | None = None,

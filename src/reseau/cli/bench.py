@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -25,10 +26,10 @@ def features(
     bench: v.Bench = Path("bench.toml"),
     camera: v.Camera | None = None,
     set_: Annotated[v.Set | None, "Here a feature, within its range."] = None,
-    save: Annotated[str, typer.Option("--save-set", help="Keep the present values in this user set.")] = "",
+    save: Annotated[str, Option("Keep the present values in this user set.", called="save-set")] = "",
     compare: Annotated[
         str,
-        typer.Option("--compare", help="User sets to compare, as UserSet1,UserSet2; one: with the present."),
+        Option("User sets to compare, as UserSet1,UserSet2; one: with the present."),
     ] = "",
     as_json: v.AsJson = False,
 ) -> None:
@@ -111,9 +112,7 @@ app.command()(features)
 @app.command("list")
 def list_(
     as_json: v.AsJson = False,
-    write: Annotated[
-        Path | None, typer.Option("--write", help="Write a bench file for what was found; a new file.")
-    ] = None,
+    write: Annotated[Path | None, Option("Write a bench file for what was found; a new file.")] = None,
 ) -> None:
     """Search for cameras, VISA instruments and serial ports, and list the installed drivers."""
     from ..capture import found_instruments
@@ -177,53 +176,111 @@ def check(
 
 
 @app.command()
-def sim(
-    out: v.Out | None = None,
-    seed: v.Seed = 0,
-    controller: Annotated[
-        str, typer.Option(help="Controller of the turntable: zaber, smc100, kinesis, grbl, marlin, hand.")
-    ] = "zaber",
-    family: Annotated[str, typer.Option(help="Oscilloscope family: keysight, rigol-1000z, …")] = "keysight",
-    scene: Annotated[
-        str, typer.Option(help="Scene of the camera: screen, testfield, frame or sensor. Default: no camera.")
-    ] = "",
-    scanners: Annotated[
-        str, typer.Option(help="Ultrasonic scanner: ping360, bk, compactpulser, or all of them.")
-    ] = "ping360",
-    environment: Annotated[
-        str, typer.Option(help="Sensor of the environment: scpi, modbus, line, or all. Default: none.")
-    ] = "",
-    repeatable: Annotated[
-        bool, typer.Option("--repeatable", help="Identical frames for identical states, without drift.")
-    ] = False,
-    flat: Annotated[
-        bool,
-        typer.Option("--flat", help="Plane testfield. Default: bent by its mount, as in the paper."),
-    ] = False,
-    water: Annotated[
-        bool,
-        typer.Option("--water", help="Testfield or frame under water, camera behind a plane port."),
-    ] = False,
-    port_distance: Annotated[
-        float,
-        typer.Option(min=1.0, max=200.0, help="With --water: distance of the port from the camera (mm)."),
-    ] = 60.0,
-    port_thickness: Annotated[
-        float, typer.Option(min=0.1, max=100.0, help="With --water: thickness of the port (mm).")
-    ] = 12.0,
-    port_tilt: Annotated[
-        float,
-        typer.Option(min=-15.0, max=15.0, help="With --water: tilt of the port about the y-axis (degrees)."),
-    ] = 0.0,
-    temperature: Annotated[
-        float, typer.Option(min=2.0, max=28.0, help="With --water: its temperature (°C), and so its index.")
-    ] = 18.0,
-    cameras: Annotated[
-        int,
-        typer.Option(min=1, max=4, help="Number of cameras before the testfield; several are a rig."),
-    ] = 1,
-    seconds: v.Seconds = 0.0,
+def doctor(
+    bench: v.Bench = Path("bench.toml"),
+    timeout_s: Annotated[float, Option("Time limit for each instrument (s).", least=0.1)] = 10.0,
+    as_json: v.AsJson = False,
 ) -> None:
+    """Look for what keeps instruments from working, and say what to do.
+
+    Permissions, programs that hold a device, network and firewall, packet sizes and losses, time limits,
+    firmware. Nothing is changed.
+    """
+    from ..capture import Bench
+    from ..core.provenance import canonical_json
+
+    found = Bench.read(bench).diagnose(timeout_s)
+    wrong = sum(each.fine is False for findings in found.values() for each in findings)
+    if as_json:
+        rows = {name: [vars(each) for each in findings] for name, findings in found.items()}
+        say(canonical_json({"schema": "reseau-bench-doctor/1", "wrong": wrong, "instruments": rows}))
+    else:
+        marks = {True: "fine", None: "note", False: "wrong"}
+        say("".join(f"{name}: {marks[e.fine]}: {e}\n" for name, findings in found.items() for e in findings))
+    raise typer.Exit(1 if wrong else 0)
+
+
+@app.command()
+def profile(
+    name: Annotated[
+        str, typer.Argument(help="A profile, or a file FILE.toml of your own. Default: list all.")
+    ] = "",
+    address: Annotated[str, Option("Try it: fetch a picture of the screen at this address.")] = "",
+    out: v.Out | None = None,
+) -> None:
+    """Show what is known of a family of oscilloscopes, as a file; check a file of your own; try it.
+
+    Give a file of your own as `dialect` in the options of an oscilloscope in the bench file.
+    """
+    from ..core.plugins import INSTRUMENTS, TOOLS, plugin
+    from ..io import write_whole
+
+    if not address:
+        text = plugin(TOOLS, "profiles")(name)
+        say(text) if out is None else write_whole(out, text)
+        return
+    writable(out)
+    with plugin(INSTRUMENTS, "oscilloscope")("scope", address, dialect=name or None) as scope:
+        picture = scope.screen()
+        say(f"{scope.connect()}: {scope.dialect.name}, a picture of {len(picture.data)} bytes\n")
+    if out is not None:
+        write_whole(out, picture.data)
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What a simulated bench has."""
+
+    controller: Annotated[
+        Literal["zaber", "smc100", "kinesis", "grbl", "marlin", "hand"],
+        Option("Controller of the turntable."),
+    ] = "zaber"
+    family: Annotated[str, Option("Oscilloscope family: keysight, rigol-1000z, …")] = "keysight"
+    scene: Annotated[
+        Literal["screen", "testfield", "frame", "sensor"] | None,
+        Option("Scene of the camera. Default: no camera."),
+    ] = None
+    scanners: Annotated[
+        Literal["ping360", "bk", "compactpulser", "all"], Option("Ultrasonic scanner, or all of them.")
+    ] = "ping360"
+    environment: Annotated[
+        Literal["scpi", "modbus", "line", "all"] | None,
+        Option("Sensor of the environment, or all of them. Default: none."),
+    ] = None
+    repeatable: Annotated[bool, Option("Identical frames for identical states, without drift.")] = False
+    flat: Annotated[bool, Option("Plane testfield. Default: bent by its mount, as in the paper.")] = False
+    water: Annotated[bool, Option("Testfield or frame under water, camera behind a plane port.")] = False
+    port_distance: Annotated[
+        float, Option("With --water: distance of the port from the camera (mm).", least=1.0, most=200.0)
+    ] = 60.0
+    port_thickness: Annotated[
+        float, Option("With --water: thickness of the port (mm).", least=0.1, most=100.0)
+    ] = 12.0
+    port_tilt: Annotated[
+        float, Option("With --water: tilt of the port about the y-axis (degrees).", least=-15.0, most=15.0)
+    ] = 0.0
+    temperature: Annotated[
+        float, Option("With --water: its temperature (°C), and so its index.", least=2.0, most=28.0)
+    ] = 18.0
+    cameras: Annotated[
+        int, Option("Number of cameras before the testfield; several are a rig.", least=1, most=4)
+    ] = 1
+
+    def options(self) -> dict[str, Any]:
+        """Return the options of the simulator."""
+        water = {
+            "distance_mm": self.port_distance, "thickness_mm": self.port_thickness,
+            "tilt_deg": (0.0, self.port_tilt), "temperature_c": self.temperature,
+        }  # fmt: skip
+        return {
+            "table": self.controller, "family": self.family, "camera": self.scene, "scanner": self.scanners,
+            "repeatable": self.repeatable, "flat": self.flat, "cameras": self.cameras,
+            "environment": self.environment, **({"water": water} if self.water else {}),
+        }  # fmt: skip
+
+
+@app.command()
+def sim(simulated: Simulated, out: v.Out | None = None, seed: v.Seed = 0, seconds: v.Seconds = 0.0) -> None:
     """Start simulated instruments on their real protocols, and print a bench.toml for them."""
     import threading
 
@@ -231,17 +288,8 @@ def sim(
     from ..io import write_whole
 
     writable(out)
-    options: dict[str, Any] = {"table": controller, "family": family, "camera": scene or None}
-    options |= {"scanner": scanners}
-    options |= {"repeatable": repeatable, "flat": flat, "cameras": cameras}
-    options |= {"environment": environment or None}
-    if water:
-        options["water"] = {
-            "distance_mm": port_distance, "thickness_mm": port_thickness, "tilt_deg": (0.0, port_tilt),
-            "temperature_c": temperature,
-        }  # fmt: skip
-    with plugin("reseau.simulators", "bench")(seed, **options) as bench:
-        if scene and cameras == 1 and "[instruments.camera]" not in bench.toml:
+    with plugin("reseau.simulators", "bench")(seed, **simulated.options()) as bench:
+        if simulated.scene and simulated.cameras == 1 and "[instruments.camera]" not in bench.toml:
             typer.echo(
                 "no camera: it needs Aravis and PyGObject, which are not installed (on Debian: apt-get "
                 "install gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev pkg-config gcc, then "

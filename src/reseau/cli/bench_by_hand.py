@@ -254,15 +254,13 @@ def expose(
     bench: v.Bench = _BENCH,
     camera: v.Camera | None = None,
     exposure_us: Annotated[
-        float | None, typer.Option(min=0.1, help="Exposure of this frame (µs). Default: as set.")
+        float | None, Option("Exposure of this frame (µs). Default: as set.", least=0.1)
     ] = None,
     auto: Annotated[v.Auto, "They are kept in the bench file."] = False,
     percentile: Annotated[
-        float, typer.Option(min=1.0, max=100.0, help="With --auto: percentile of the grey values.")
+        float, Option("With --auto: percentile of the grey values.", least=1.0, most=100.0)
     ] = 99.5,
-    share: Annotated[
-        float, typer.Option(min=0.01, max=0.99, help="With --auto: its share of full scale.")
-    ] = 0.8,
+    share: Annotated[float, Option("With --auto: its share of full scale.", least=0.01, most=0.99)] = 0.8,
     longest_ms: Annotated[v.LongestMs, "Here with --auto; then the gain is raised."] = 50.0,
     as_json: v.AsJson = False,
 ) -> None:

@@ -10,6 +10,7 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.files import writable
+from ..core.options import Group, Option
 from .common import Reading, orientation, progress, required, say
 from .measure import BY_DESIGN, NOT_NOMINAL, Image, Output, Task
 
@@ -59,12 +60,11 @@ def blurred(
     ] = None,
     focus_sigma_mm: Annotated[
         float | None,
-        typer.Option(
-            min=1e-4,
-            max=10,
-            rich_help_panel="Adjustment",
-            help="Standard deviation of the place of the image plane (mm): it is then estimated from all "
-            "targets.",
+        Option(
+            "Standard deviation of the place of the image plane (mm): it is then estimated from all targets.",
+            Group.ADJUSTMENT,
+            least=1e-4,
+            most=10,
         ),
     ] = None,
     mirrored: Annotated[v.Mirrored | None, BY_DESIGN] = None,
@@ -114,7 +114,7 @@ def blurred_network(
     ],
     images: Annotated[
         Path,
-        typer.Option("--images", help="Folder with the photographs, named as the images of the network."),
+        Option("Folder with the photographs, named as the images of the network."),
     ],
     targets: v.Targets,
     out: Annotated[v.Out, "Here a folder: every round, the final network, its result, a report."],
@@ -129,11 +129,11 @@ def blurred_network(
     initial: v.Initial = "given",
     keep_sharp: Annotated[
         bool,
-        typer.Option(
-            "--keep-sharp/--replace-sharp",
-            rich_help_panel="Adjustment",
-            help="Whether sharp targets keep coordinates that do not differ significantly from those by "
+        Option(
+            "Whether sharp targets keep coordinates that do not differ significantly from those by "
             "rays: given ones always, others where they are as certain.",
+            Group.ADJUSTMENT,
+            off="--replace-sharp",
         ),
     ] = True,
     jobs: v.Jobs | None = None,

@@ -71,19 +71,15 @@ def bundle(
     distance: v.Distance | None = None,
     cov: Annotated[
         bool,
-        typer.Option(
-            "--cov", help="Include full covariances of the points in the result.", rich_help_panel="Files"
-        ),
+        Option("Include full covariances of the points in the result.", Group.FILES),
     ] = False,
     convert: Annotated[
         Path | None,
-        typer.Option(help="Write the network as reseau-network/1 with these settings; nothing is adjusted."),
+        Option("Write the network as reseau-network/1 with these settings; nothing is adjusted."),
     ] = None,
     export: Annotated[
         Path | None,
-        typer.Option(
-            help="Write the adjusted network: .json (reseau-network/1), .bal, or a folder for COLMAP."
-        ),
+        Option("Write the adjusted network: .json (reseau-network/1), .bal, or a folder for COLMAP."),
     ] = None,
     report: v.Report | None = None,
     memory_gb: v.MemoryGb | None = None,

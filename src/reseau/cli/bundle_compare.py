@@ -9,6 +9,7 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.files import writable
+from ..core.options import Option
 from .bundle_options import say_difference
 from .common import say
 
@@ -24,7 +25,7 @@ def compare(
     second: Annotated[Path, typer.Argument(help="Another calibration of the same camera.")],
     out: v.Out | None = None,
     figure: Annotated[v.Figure | None, "Here a map of the difference, SVG."] = None,
-    places: Annotated[int, typer.Option(min=2, help="Number of positions across the image.")] = 25,
+    places: Annotated[int, Option("Number of positions across the image.", least=2)] = 25,
     as_json: v.AsJson = False,
 ) -> None:
     """Compare two calibrations of a camera: map their difference over the image and test its significance."""

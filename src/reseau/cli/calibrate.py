@@ -150,7 +150,9 @@ class _Adjustment:
         list[str] | None,
         Option("Image point to leave out; repeatable.", Group.ADJUSTMENT, value="PHOTO:POINT"),
     ] = None
-    reject: v.Reject = False
+    reject: Annotated[
+        v.Reject | None, "By default where that explains the residuals better than all else."
+    ] = None
     components: v.Components | None = None
     eliminate: v.Eliminate | None = None
     memory_gb: v.MemoryGb | None = None
@@ -181,7 +183,7 @@ class _Adjustment:
                 raise UsageError(f"is {text!r}", where="--leave-out", do="write image:point, as photo.jpg:A1")
             pairs.append((image, point))
         return CalibrationOptions(
-            Options(outliers="reject" if self.reject else "keep", memory_gb=self.memory_gb),
+            Options(memory_gb=self.memory_gb),
             self.sigma_px,
             None if self.control is None else read_control(self.control),
             tuple(pairs),
@@ -190,6 +192,7 @@ class _Adjustment:
             refraction=None if self.refraction is None else RefractionFile.read(self.refraction),
             target=self.target,
             turntable=None if self.turntable is None else read_turntable(self.turntable),
+            reject=self.reject,
         )
 
 
@@ -228,7 +231,7 @@ def calibrate(
     row_jitter_px: v.RowJitterPx = 0.0,
     fill: v.Fill = 1.0,
     against: Annotated[
-        list[Path] | None, typer.Option(help="Calibration of the same camera to compare with; repeatable.")
+        list[Path] | None, Option("Calibration of the same camera to compare with; repeatable.")
     ] = None,
     distance: v.Distance | None = None,
     as_json: v.AsJson = False,

@@ -58,9 +58,7 @@ def time_of(text: str | None, option: str) -> datetime | None:
 @app.command()
 def define(
     name: Name,
-    part: Annotated[
-        list[str], typer.Option("--part", "-p", help="Part, KEY=VALUE: camera, lens, settings, firmware.")
-    ],
+    part: Annotated[list[str], Option("Part, KEY=VALUE: camera, lens, settings, firmware.", letter="-p")],
     place: Place,
 ) -> None:
     """Define a configuration of an instrument."""
@@ -268,8 +266,8 @@ def say_decision(made: Decision, as_json: bool) -> None:
 def drift(
     name: Name,
     place: Place,
-    rate: Annotated[float, typer.Option(min=0.001, help="False alarms per year, of all charts.")] = 0.1,
-    runs_per_year: Annotated[float, typer.Option(min=1, help="Number of runs in a year.")] = 52.0,
+    rate: Annotated[float, Option("False alarms per year, of all charts.", least=0.001)] = 0.1,
+    runs_per_year: Annotated[float, Option("Number of runs in a year.", least=1)] = 52.0,
     chart: Annotated[Literal["cusum", "ewma", "shewhart"], Option("Kind of the charts.")] = "cusum",
     covariates: v.Covariates | None = None,
     recorded: v.Recorded | None = None,
@@ -357,7 +355,7 @@ def function(
     place: Place,
     covariates: v.Covariates | None = None,
     recorded: v.Recorded | None = None,
-    degree: Annotated[int, typer.Option(min=1, max=2, help="Degree of the polynomial.")] = 1,
+    degree: Annotated[int, Option("Degree of the polynomial.", least=1, most=2)] = 1,
 ) -> None:
     """Fit the calibrations since the last service event as a function of covariates.
 
@@ -390,7 +388,7 @@ def at(
     source: Annotated[Path, typer.Argument(metavar="FUNCTION", help="reseau-calibration-function/1.")],
     covariate: Annotated[
         list[str],
-        typer.Option("--covariate", "-c", help="NAME=VALUE, or NAME=VALUE±SIGMA."),
+        Option("NAME=VALUE, or NAME=VALUE±SIGMA.", letter="-c"),
     ],
     out: Annotated[v.Out, "Here the calibration (.json)."],
 ) -> None:

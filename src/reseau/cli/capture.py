@@ -262,7 +262,7 @@ def _print_result(session: Session, out: Path | None, as_json: bool) -> None:
 def own(
     where: Where,
     generator: Annotated[
-        Path | None, typer.Option("--generator", "-g", help="Python file with a generator `plan(run, …)`.")
+        Path | None, Option("Python file with a generator `plan(run, …)`.", letter="-g")
     ] = None,
     set_: Annotated[v.Set | None, "Here arguments of the plan, as tilt=30."] = None,
     retakes: v.Retakes = 0,

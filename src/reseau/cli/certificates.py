@@ -65,14 +65,14 @@ def _find(source: str, place: Decided) -> _Found:
         If there is none.
     """
     from ..calibration import read_calibration
-    from ..service import Configurations
-    from ..service.inforce import key_of
 
     file, archive, key = Path(source), place.archive, place.decision
     stored = read_calibration(file) if file.is_file() or archive is None else None
     if archive is None:
         assert stored is not None
         return _Found(stored, None, "", [])
+    from ..service import Configurations
+
     with Place(archive, place.objects).open() as opened:
         known = Configurations(opened)
         if stored is None:
@@ -86,7 +86,7 @@ def _find(source: str, place: Decided) -> _Found:
             assert decision is not None
             calibration = known.calibration(name, decision.key)
         else:
-            calibration, own = stored, key_of(stored)
+            calibration, own = stored, stored.key
             decided = [(each, d) for each in known.names() for d in known.history(each) if d.key == own]
             # Any rejection counts, whatever another configuration says.
             decided.sort(key=lambda pair: pair[1].outcome.startswith("accepted"))
@@ -174,13 +174,11 @@ def verify(
     file: Annotated[Path, typer.Argument(help="Certificate: DCC (XML), or PDF in which it is embedded.")],
     schema: Annotated[
         Path | None,
-        typer.Option(envvar="RESEAU_DCC", help="Folder with dcc.xsd, what it includes, and dcc.sch, of PTB."),
+        Option("Folder with dcc.xsd, what it includes, and dcc.sch, of PTB.", environment="RESEAU_DCC"),
     ] = None,
-    without_schema: Annotated[
-        bool, typer.Option("--without-schema", help="Check neither the schema nor the rules.")
-    ] = False,
+    without_schema: Annotated[bool, Option("Check neither the schema nor the rules.")] = False,
     trust: Annotated[
-        list[Path] | None, typer.Option(help="Certificate of a trusted signer (PEM); it must be signed then.")
+        list[Path] | None, Option("Certificate of a trusted signer (PEM); it must be signed then.")
     ] = None,
     as_json: v.AsJson = False,
 ) -> None:
@@ -223,12 +221,12 @@ def uncertainty(
     ] = None,
     data: Annotated[v.Data | None, "Here temperature and further contributions."] = None,
     draws: Annotated[
-        int, typer.Option(min=0, help="Draws of Monte Carlo to compare with; at least 4000, or 0 for none.")
+        int, Option("Draws of Monte Carlo to compare with; at least 4000, or 0 for none.", least=0)
     ] = 0,
     digits: Annotated[
         int | None,
-        typer.Option(
-            min=1, max=3, help="Stop drawing when results are stable to so many digits; --draws is the most."
+        Option(
+            "Stop drawing when results are stable to so many digits; --draws is the most.", least=1, most=3
         ),
     ] = None,
     seed: v.Seed = 0,
@@ -337,7 +335,7 @@ def _say_budget(budget: UncertaintyBudget, probability: float, simulated: Simula
     )  # fmt: skip
     say(f"expanded uncertainties, {100 * probability:g} %\n")
     for i, (name, unit, value, expanded, u, k, nu) in enumerate(columns):
-        shown = measured(float(value), float(expanded), "" if unit == "1" else unit)
+        shown = measured(float(value), float(expanded), unit)
         degrees = "∞" if not math.isfinite(nu) else f"{nu:.0f}"
         say(f"{name:<8} {shown}  u {u:.2g}, k {k:.2f}, ν {degrees}\n")
         for each, part in zip(budget.contributions, budget.by_contribution[:, i], strict=True):

@@ -12,7 +12,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import GenericAlias, NoneType
+from types import GenericAlias
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
@@ -182,15 +182,9 @@ def _value(kind: Any) -> str | None:
 def _with_value(name: str, hint: Any) -> Any:
     """The type of a parameter that is declared to Typer itself, with what help writes for its value."""
     if get_origin(hint) is Annotated:
-        kind, *about = get_args(hint)
-        one = get_args(kind)[0] if NoneType in get_args(kind) else kind
-        for each in about:
+        for each in get_args(hint)[1:]:
             if isinstance(each, ArgumentInfo) and each.metavar is None:
                 each.metavar = name.upper()
-            if isinstance(each, OptionInfo) and each.metavar is None:
-                each.metavar = _value(one)
-                if _inner(one) is Path and each.rich_help_panel is None:
-                    each.rich_help_panel = Group.FILES.value
     return hint
 
 

@@ -104,9 +104,9 @@ def sheet(
 @app.command("n-wires")
 def n_wires(
     drawn: Drawn,
-    layers: Annotated[int, typer.Option(help="Number of layers, each with one N.")] = 3,
-    width: Annotated[float, typer.Option(help="Distance of the parallel wires of a layer (mm).")] = 40.0,
-    spacing: Annotated[float, typer.Option(help="Distance of the layers (mm).")] = 15.0,
+    layers: Annotated[int, Option("Number of layers, each with one N.")] = 3,
+    width: Annotated[float, Option("Distance of the parallel wires of a layer (mm).")] = 40.0,
+    spacing: Annotated[float, Option("Distance of the layers (mm).")] = 15.0,
     name: v.Name = "n-wires",
 ) -> None:
     """Design an N-wire phantom: coordinates of parallel and slanted wires, to be edited to one's own."""
@@ -164,11 +164,9 @@ def coded_field(
         ),
     ] = None,
     spread: Annotated[
-        float | None, typer.Option(help="Distance between targets in a square (mm). Default: 0.24 × --pitch.")
+        float | None, Option("Distance between targets in a square (mm). Default: 0.24 × --pitch.")
     ] = None,
-    turn_seed: Annotated[
-        int | None, typer.Option(help="Rotate each target by an angle drawn from this seed.")
-    ] = None,
+    turn_seed: Annotated[int | None, Option("Rotate each target by an angle drawn from this seed.")] = None,
     polarity: v.Polarity = "dark",
     name: v.Name = "testfield",
 ) -> None:
@@ -225,26 +223,24 @@ def board(
     ] = None,
     size: Annotated[v.Size | None, "Diameter of a circle, or side of a marker or tag."] = None,
     dictionary: v.Dictionary | None = None,
-    first_id: Annotated[int, typer.Option(min=0, help="Number of the first marker.")] = 0,
+    first_id: Annotated[int, Option("Number of the first marker.", least=0)] = 0,
     border_bits: v.BorderBits = 1,
-    legacy: Annotated[bool, typer.Option("--legacy", help="ChArUco layout of OpenCV before 4.6.")] = False,
+    legacy: Annotated[bool, Option("ChArUco layout of OpenCV before 4.6.")] = False,
     polarity: Annotated[v.Polarity, "Of circles."] = "dark",
-    asymmetric: Annotated[
-        bool, typer.Option("--asymmetric", help="Shift every second row of circles by half a step.")
-    ] = False,
+    asymmetric: Annotated[bool, Option("Shift every second row of circles by half a step.")] = False,
     dots: Annotated[
         str | None,
-        typer.Option(help="Squares of a chessboard with a dot, column row …, as OpenCV's: '7 4 7 5 8 5'."),
+        Option("Squares of a chessboard with a dot, column row …, as OpenCV's: '7 4 7 5 8 5'."),
     ] = None,
     start: Annotated[
         tuple[int, int], Option("Column and row of a PuzzleBoard's first corner in its code.")
     ] = (0, 0),
     given: Annotated[
         Path | None,
-        typer.Option(
-            "--from",
-            help="Board file to read, of Kalibr or OpenCV (YAML, XML) or a design; --pitch and --size "
+        Option(
+            "Board file to read, of Kalibr or OpenCV (YAML, XML) or a design; --pitch and --size "
             "replace what it says.",
+            called="from",
         ),
     ] = None,
     name: v.Name = "board",

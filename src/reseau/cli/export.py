@@ -10,6 +10,7 @@ import typer
 from ..core import vocabulary as v
 from ..core.errors import UsageError
 from ..core.files import writable
+from ..core.options import Option
 from .common import say
 
 _SAME, _FAR = 1e-5, 0.3
@@ -27,19 +28,19 @@ def export(
     ],
     to: Annotated[
         str | None,
-        typer.Option(
-            metavar="FORMAT",
-            help="Format of the calibration: opencv, ros, kalibr, basalt, colmap, mrcal, metashape, "
+        Option(
+            "Format of the calibration: opencv, ros, kalibr, basalt, colmap, mrcal, metashape, "
             "photomodeler, dbat, matlab, openptv, reseau.",
+            value="FORMAT",
         ),
     ] = None,
     out: v.Out | None = None,
     micmac: Annotated[
         Path | None,
-        typer.Option(help="Folder of the images for MicMac: writes Ori-InterneScan and id_fiducial.txt."),
+        Option("Folder of the images for MicMac: writes Ori-InterneScan and id_fiducial.txt."),
     ] = None,
     metashape: Annotated[
-        Path | None, typer.Option(help="Script to write, which defines the marks in Metashape (.py).")
+        Path | None, Option("Script to write, which defines the marks in Metashape (.py).")
     ] = None,
     anyway: v.Anyway = False,
     design: Annotated[v.Design | None, "Here the reseau, for its measurements."] = None,

@@ -11,6 +11,7 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.files import writable
+from ..core.options import Option
 from .common import Reading, orientation, overlay_files, progress, required, say
 from .declared import Commands
 
@@ -52,7 +53,7 @@ def reseau(
     reading: Reading,
     output: Output,
     mark_px: Annotated[
-        float | None, typer.Option(help="Size of a mark (px); for a grid, the width of its lines.")
+        float | None, Option("Size of a mark (px); for a grid, the width of its lines.")
     ] = None,
     mirrored: Annotated[v.Mirrored | None, BY_DESIGN] = None,
     max_rotation_deg: Annotated[v.MaxRotationDeg | None, NOT_NOMINAL] = None,
@@ -80,11 +81,11 @@ def pins(
     output: Output,
     also: Annotated[
         list[Path] | None,
-        typer.Option(help="Other image of the sequence, to reject static spots; repeatable."),
+        Option("Other image of the sequence, to reject static spots; repeatable."),
     ] = None,
     max_length_px: Annotated[
         float | None,
-        typer.Option(min=1, help="Largest length of an echo (px). Default: 6 % of the frame diagonal."),
+        Option("Largest length of an echo (px). Default: 6 % of the frame diagonal.", least=1),
     ] = None,
     mirrored: Annotated[v.Mirrored | None, BY_DESIGN] = None,
     max_rotation_deg: Annotated[v.MaxRotationDeg | None, NOT_NOMINAL] = None,

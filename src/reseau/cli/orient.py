@@ -10,7 +10,7 @@ import typer
 from ..core import vocabulary as v
 from ..core.errors import InputError
 from ..core.files import writable
-from ..core.options import Option
+from ..core.options import Group, Option
 from .common import Computing, overlay_files, progress, required, say, say_files_left_out
 from .measure import Output
 
@@ -34,13 +34,9 @@ def orient(
         Option("Approximate position of the frame (px).", value="LEFT,TOP,RIGHT,BOTTOM"),
     ] = None,
     out: v.Out | None = None,
-    marked: Annotated[
-        bool, typer.Option(help="Write copies of the scans with marked corners.", rich_help_panel="Files")
-    ] = True,
-    cut: Annotated[
-        bool, typer.Option(help="Write one picture for each frame, upright.", rich_help_panel="Files")
-    ] = False,
-    roll: Annotated[bool, typer.Option(help="Use the common shape of the frames of a roll.")] = True,
+    marked: Annotated[bool, Option("Write copies of the scans with marked corners.", Group.FILES)] = True,
+    cut: Annotated[bool, Option("Write one picture for each frame, upright.", Group.FILES)] = False,
+    roll: Annotated[bool, Option("Use the common shape of the frames of a roll.")] = True,
     overlay: Annotated[v.Overlay | None, "Here a folder, for each scan; FILE.png for a single one."] = None,
     as_json: v.AsJson = False,
 ) -> int:
@@ -145,8 +141,8 @@ def fiducials(
     dpi: v.Dpi | None = None,
     rotation: Annotated[
         Literal["0", "90", "180", "270"] | None,
-        typer.Option(
-            help="Rotation of the camera's x-axis in the scan, degrees counter-clockwise. Default: "
+        Option(
+            "Rotation of the camera's x-axis in the scan, degrees counter-clockwise. Default: "
             "determined by the marks if they are not symmetric."
         ),
     ] = None,
@@ -252,12 +248,10 @@ def perforations(
             value="LEFT,TOP,RIGHT,BOTTOM",
         ),
     ],
-    perforation_px: Annotated[
-        float, typer.Option(min=1.0, help="Approximate pitch of the perforations (px).")
-    ],
+    perforation_px: Annotated[float, Option("Approximate pitch of the perforations (px).", least=1.0)],
     number: Annotated[v.Number, "Here of perforations in a row, at least 2."],
     channel: Annotated[v.Channel | None, "Here that with the darkest rims. Default: the last."] = None,
-    reach: Annotated[float, typer.Option(min=1.0, help="Search distance from the given edges (px).")] = 12.0,
+    reach: Annotated[float, Option("Search distance from the given edges (px).", least=1.0)] = 12.0,
     overlay: v.Overlay | None = None,
     as_json: v.AsJson = False,
 ) -> None:

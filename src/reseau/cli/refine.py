@@ -9,8 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from ..core import vocabulary as v
 from ..core.files import writable
 from ..core.options import Option
@@ -37,18 +35,18 @@ if TYPE_CHECKING:
 class _Files:
     """The input files and options of a run."""
 
-    photo_i: Annotated[Path | None, typer.Option(help="PHOTO I: the reseau alone.")] = None
+    photo_i: Annotated[Path | None, Option("PHOTO I: the reseau alone.")] = None
     photo_ii: Annotated[
         Path | None,
-        typer.Option(help="PHOTO II: the test object behind the reseau; with --calibration, test it."),
+        Option("PHOTO II: the test object behind the reseau; with --calibration, test it."),
     ] = None
     photo_iii: Annotated[tuple[Path, ...], Option("PHOTO III: the body to measure; repeatable.")] = ()
     reseau: v.Reseau | None = None
     test_object: v.TestObject | None = None
     calibration: Annotated[
-        Path | None, typer.Option(help="Stored calibration: apply it to PHOTO III, or test it with PHOTO II.")
+        Path | None, Option("Stored calibration: apply it to PHOTO III, or test it with PHOTO II.")
     ] = None
-    points: Annotated[Path | None, typer.Option(help="Points of the body in PHOTO III (JSON, CSV).")] = None
+    points: Annotated[Path | None, Option("Points of the body in PHOTO III (JSON, CSV).")] = None
     check: Annotated[v.Check, "Here also rods."] = ()
     alpha: Annotated[v.Alpha, "Here of the coefficients."] = 0.05
     mirrored: Annotated[v.Mirrored | None, BY_DESIGN] = None
@@ -128,7 +126,7 @@ class _Files:
 def refine(
     files: _Files,
     out: v.Out | None = None,
-    true: Annotated[Path | None, typer.Option(help="File to write true coordinates to (CSV, JSON).")] = None,
+    true: Annotated[Path | None, Option("File to write true coordinates to (CSV, JSON).")] = None,
     report: v.Report | None = None,
     as_json: v.AsJson = False,
 ) -> None:

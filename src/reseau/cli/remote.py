@@ -13,6 +13,7 @@ import typer
 from ..core import vocabulary as v
 from ..core.errors import UsageError
 from ..core.files import made_folder, writable
+from ..core.options import Option
 from .common import CameraChoice, say
 from .declared import Commands
 
@@ -51,7 +52,7 @@ def _shown(value: Any, as_json: bool, lines: list[str]) -> None:
 @app.command()
 def sessions(
     service: Service,
-    like: Annotated[str, typer.Option(help="Part of the name or the plan.")] = "",
+    like: Annotated[str, Option("Part of the name or the plan.")] = "",
     limit: v.Limit = 50,
     as_json: v.AsJson = False,
 ) -> None:
@@ -135,9 +136,9 @@ def begin(
     bench: Bench,
     name: Annotated[str, typer.Argument(help="Name of the session.")],
     service: Service,
-    plan: Annotated[str, typer.Option(help="Plan: testfield, frames, sensor, …")] = "frames",
-    parameters: Annotated[str, typer.Option(help="Parameters of the plan, JSON.")] = "{}",
-    file: Annotated[list[Path] | None, typer.Option("--input", "-i", help="Input file; repeatable.")] = None,
+    plan: Annotated[str, Option("Plan: testfield, frames, sensor, …")] = "frames",
+    parameters: Annotated[str, Option("Parameters of the plan, JSON.")] = "{}",
+    file: Annotated[list[Path] | None, Option("Input file; repeatable.", called="input", letter="-i")] = None,
 ) -> None:
     """Begin a session on a bench."""
     from ..io import read_text

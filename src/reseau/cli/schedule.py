@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 import signal
 import threading
 import time
@@ -71,7 +72,7 @@ def show(
     name: Name,
     place: Place,
     at: v.At | None = None,
-    ahead: Annotated[int, typer.Option(min=0, help="Number of later runs.")] = 3,
+    ahead: Annotated[int, Option("Number of later runs.", least=0)] = 3,
     as_json: v.AsJson = False,
 ) -> None:
     """Show all runs of a schedule; exit status 1 if one is overdue, or the last one failed."""
@@ -112,7 +113,7 @@ def export(
 @app.command("run")
 def run_(
     place: Place,
-    once: Annotated[bool, typer.Option("--once", help="Carry out what is due now, and end.")] = False,
+    once: Annotated[bool, Option("Carry out what is due now, and end.")] = False,
     every: v.Every = 300.0,
     notify: v.Notify | None = None,
     inside: v.Inside | None = None,
@@ -197,14 +198,23 @@ def recalibrate(
         str | None, Option("With --repeats: the configuration that it calibrates.", value="NAME")
     ] = None,
     rules: Annotated[v.Rules | None, "With --repeats."] = None,
+    warm_up_minutes: Annotated[
+        float, Option("With --repeats: wait before the first frame (min).", least=0)
+    ] = 0.0,
+    self_test: Annotated[bool, Option("With --repeats: test the instruments first.")] = False,
+    certificate: Annotated[v.Data | None, "With --repeats: issue a certificate with these data."] = None,
+    notify: v.Notify | None = None,
+    inside: v.Inside | None = None,
     resume: v.Resume = False,
     as_json: v.AsJson = False,
 ) -> None:
     """Check the bench, acquire, measure, adjust, compare with the calibration in force, and decide.
 
-    With --repeats it is defined and not carried out. The exit status is 0 if the new calibration is accepted.
+    With --repeats it is defined and not carried out. A service that holds the bench carries it out in its
+    turn. The exit status is 0 if the new calibration is accepted.
     """
     from ..service import AcceptanceRules, Recalibrations
+    from ..service.certificates import CertificateData
 
     if repeats is None and (configuration is not None or rules is not None):
         raise UsageError("needs --repeats", where="--configuration, --rules")
@@ -215,7 +225,12 @@ def recalibrate(
         if repeats is not None:
             assert configuration is not None
             assert rules is not None
-            made = known.define(name, found.session(repeats), configuration, AcceptanceRules.read(rules))
+            data = None if certificate is None else CertificateData.read(certificate).to_dict()
+            made = known.define(
+                name, found.session(repeats), configuration, AcceptanceRules.read(rules),
+                warm_up_minutes=warm_up_minutes, self_test=self_test, certificate=data,
+                notify=tuple(notify or ()), inside=tuple(inside or ()),
+            )  # fmt: skip
             say(f"{name}: repeats {repeats}, plan {made.plan}, for {configuration}\n")
             return
         unfinished = known.unfinished(name)
@@ -223,15 +238,15 @@ def recalibrate(
             raise UsageError("has no session that can be continued", where=name)
         if not resume and unfinished is not None:
             typer.echo(f"note: {unfinished} is not done; --resume continues it", err=True)
-        done = known.run(name, unfinished or "" if resume else "")
-    say_decision(done.decision, as_json)
-    raise typer.Exit(0 if done.decision.outcome.startswith("accepted") else 1)
+        decision = known.ask(name, unfinished or "" if resume else "", getpass.getuser())
+    say_decision(decision, as_json)
+    raise typer.Exit(0 if decision.outcome.startswith("accepted") else 1)
 
 
 @alarms.command("list")
 def list_alarms(
     place: Place,
-    everything: Annotated[bool, typer.Option("--all", help="Also acknowledged ones.")] = False,
+    everything: Annotated[bool, Option("Also acknowledged ones.", called="all")] = False,
     as_json: v.AsJson = False,
 ) -> None:
     """List the alarms that nobody acknowledged; exit status 1 if there are any."""

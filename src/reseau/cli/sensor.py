@@ -11,6 +11,7 @@ import typer
 from ..core import vocabulary as v
 from ..core.errors import EstimationError, UsageError
 from ..core.files import writable
+from ..core.options import Option
 from .common import Reading, overlay_files, probability, progress, required, say
 from .measure import Output
 
@@ -28,14 +29,10 @@ def sensor(
             "EMVA 1288, or CSV with the columns file, kind (dark, light, edge), exposure_us, [light]."
         ),
     ] = None,
-    light: Annotated[
-        list[Path] | None, typer.Option(help="Folder or file of evenly lit exposures; repeatable.")
-    ] = None,
-    dark: Annotated[
-        list[Path] | None, typer.Option(help="Folder or file of dark exposures; repeatable.")
-    ] = None,
+    light: Annotated[list[Path] | None, Option("Folder or file of evenly lit exposures; repeatable.")] = None,
+    dark: Annotated[list[Path] | None, Option("Folder or file of dark exposures; repeatable.")] = None,
     edge: Annotated[
-        list[Path] | None, typer.Option(help="Folder or file of a slanted edge, for the MTF; repeatable.")
+        list[Path] | None, Option("Folder or file of a slanted edge, for the MTF; repeatable.")
     ] = None,
     region: v.Region | None = None,
     out: v.Out | None = None,

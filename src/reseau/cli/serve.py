@@ -138,8 +138,8 @@ def _address(text: str) -> tuple[str, int]:
 @app.command()
 def worker(
     bench: Annotated[Path, typer.Argument(help="Bench file; the service has the same.")],
-    listen: Annotated[str, typer.Option(help="Address and port to listen on, such as 192.0.2.5:8490.")],
-    certificates: Annotated[Path, typer.Option(help="Folder made by `reseau service worker-certificate`.")],
+    listen: Annotated[str, Option("Address and port to listen on, such as 192.0.2.5:8490.")],
+    certificates: Annotated[Path, Option("Folder made by `reseau service worker-certificate`.")],
     archive: v.Archive,
     objects: v.Objects | None = None,
 ) -> None:
@@ -242,11 +242,11 @@ def list_users(
 def change_user(
     name: Annotated[str, typer.Argument(help="Name of the user.")],
     known: Registered,
-    password: Annotated[bool, typer.Option("--password", help="Ask for a new password.")] = False,
+    password: Annotated[bool, Option("Ask for a new password.")] = False,
     scope: v.Scope | None = None,
     one_time: Annotated[
         bool | None,
-        typer.Option("--one-time/--no-one-time", help="Require a one-time password (TOTP), or not."),
+        Option("Require a one-time password (TOTP), or not."),
     ] = None,
 ) -> None:
     """Change password, scope or one-time password of a user; their logins end."""
@@ -280,9 +280,9 @@ def create_token(
     known: Registered,
     scope: v.Scope = "read",
     user: Annotated[
-        str, typer.Option(help="Whose it is: it may do at most what they may, and ends with them.")
+        str, Option("Whose it is: it may do at most what they may, and ends with them.")
     ] = "local",
-    days: Annotated[int, typer.Option(min=1, max=731, help="How long it lasts.")] = 90,
+    days: Annotated[int, Option("How long it lasts.", least=1, most=731)] = 90,
 ) -> None:
     """Create a token for a program, and print it; it is not kept."""
     from datetime import timedelta
@@ -402,7 +402,7 @@ def verify(
     public_key: Annotated[Path | None, Option("Public key (PEM). Default: that of the state folder.")] = None,
     head: Annotated[
         list[str] | None,
-        typer.Option(help="Head that was kept elsewhere, a line of `reseau audit head`; repeatable."),
+        Option("Head that was kept elsewhere, a line of `reseau audit head`; repeatable."),
     ] = None,
     as_json: v.AsJson = False,
 ) -> None:

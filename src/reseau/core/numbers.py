@@ -97,7 +97,7 @@ def measured(value: float, sigma: float | None = None, unit: str = "") -> str:
     sigma : float, optional
         Its standard deviation; 0 or None where it is held or unknown.
     unit : str
-        Unit of both; empty for a number.
+        Unit of both; empty or 1 for a number.
 
     Examples
     --------
@@ -108,7 +108,7 @@ def measured(value: float, sigma: float | None = None, unit: str = "") -> str:
     >>> measured(12.5, None, "px")
     '12.5 px'
     """
-    tail = f" {unit}" if unit else ""
+    tail = f" {unit}" if unit not in ("", "1") else ""
     if sigma is None or not np.isfinite(sigma) or sigma <= 0:
         return f"{value:.7g}{tail}"
     shown = power(value, sigma)

@@ -11,6 +11,8 @@ INSTRUMENTS, DISCOVERY, SIMULATORS = "reseau.instruments", "reseau.discovery", "
 """Groups of entry points: drivers; functions that list addresses; simulated benches."""
 CAMERAS, SESSIONS = "reseau.cameras", "reseau.sessions"
 """Groups of entry points: camera models; kinds of sessions."""
+TOOLS = "reseau.tools"
+"""Group of entry points: what packages of drivers know about instruments: ``profiles``, ``doctor``."""
 
 
 def plugins(group: str) -> tuple[str, ...]:

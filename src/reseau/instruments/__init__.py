@@ -24,7 +24,7 @@ from .protocols import (
 )
 from .settings import Limits, Settings, choice, quantity, text
 from .status import Status
-from .values import AxisState, BScan, Environment, Identity, ScreenPicture, Waveform
+from .values import AxisState, BScan, Environment, Finding, Identity, ScreenPicture, Waveform
 
 __all__ = [
     "AxisState",
@@ -37,6 +37,7 @@ __all__ = [
     "EnvironmentSensor",
     "Exposure",
     "ExposureSet",
+    "Finding",
     "Identity",
     "ImageStore",
     "Instrument",

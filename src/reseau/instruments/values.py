@@ -48,6 +48,31 @@ class Identity:
 
 
 @dataclass(frozen=True)
+class Finding:
+    """One thing found on the way to an instrument.
+
+    Parameters
+    ----------
+    fine : bool or None
+        True if it is as it should be, False if the instrument cannot work, None if it may not.
+    text, do : str
+        What was found, and what to do.
+
+    Examples
+    --------
+    >>> print(Finding(False, "/dev/ttyUSB0 does not exist", "plug it in"))
+    /dev/ttyUSB0 does not exist; plug it in
+    """
+
+    fine: bool | None
+    text: str
+    do: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.text}; {self.do}" if self.do else self.text
+
+
+@dataclass(frozen=True)
 class ScreenPicture:
     """Picture of an instrument's own screen, as the file that the instrument sent.
 

@@ -28,7 +28,7 @@ PHOTOGRAPHS = (
 )  # fmt: skip
 """Suffixes of photographs in a folder."""
 _BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
-_ORIENTATION, _EXIF = 0x0112, 0x8769
+_MAKER, _MODEL, _ORIENTATION, _EXIF = 0x010F, 0x0110, 0x0112, 0x8769
 _FOCAL, _FOCAL_35, _EXPOSURE, _TAKEN = 0x920A, 0xA405, 0x829A, 0x9003
 _DIAGONAL_35 = float(np.hypot(36.0, 24.0))
 """Of the format to which the equivalent focal length refers, mm."""
@@ -50,6 +50,8 @@ class Exif:
         Exposure time.
     day : str
         Day on which it was taken, as 2026-03-05; empty if it is not known.
+    camera : str
+        Maker and model of the camera; empty if they are not known.
 
     Examples
     --------
@@ -62,6 +64,7 @@ class Exif:
     focal_35_mm: float | None = None
     exposure_us: float | None = None
     day: str = ""
+    camera: str = ""
 
     def focal_px(self, width: int, height: int) -> float | None:
         """Approximate focal length in pixels; None if it is not known."""
@@ -161,7 +164,7 @@ def read_exif(path: Path) -> Exif:
     Examples
     --------
     >>> read_exif(Path("missing.jpg"))
-    Exif(orientation=1, focal_mm=None, focal_35_mm=None, exposure_us=None, day='')
+    Exif(orientation=1, focal_mm=None, focal_35_mm=None, exposure_us=None, day='', camera='')
     """
     try:
         from PIL import Image
@@ -184,4 +187,7 @@ def read_exif(path: Path) -> Exif:
     seconds = numbers[2] if numbers[2] is not None and 0 < numbers[2] < 1e5 else None
     exposure = None if seconds is None else seconds * 1e6
     taken = "" if day is None else "-".join(day.groups())
-    return Exif(int(shown) if shown in range(1, 9) else 1, focal, equivalent, exposure, taken)
+    maker, model = (str(found.get(tag, "")).strip(" \0") for tag in (_MAKER, _MODEL))
+    # Many models repeat the name of their maker.
+    camera = model if model.lower().startswith(maker.lower()) else f"{maker} {model}".strip()
+    return Exif(int(shown) if shown in range(1, 9) else 1, focal, equivalent, exposure, taken, camera)

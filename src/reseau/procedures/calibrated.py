@@ -33,7 +33,7 @@ from ..core.provenance import Provenance
 from ..exchange.calibrations.formats import Exported, export_calibrations
 from ..io import BoardDesign, write_whole
 from ..io.images import Channel, read_image
-from ..io.photographs import read_exif
+from ..io.photographs import Exif, read_exif
 from ..io.reading import is_points
 from .assessment import assess, sorted_remarks
 
@@ -63,8 +63,8 @@ class ReportOptions(TypedDict, total=False):
         Distances at which the uncertainty of the projection is mapped.
     declined : mapping of str to str
         Further photographs that were left out, and why.
-    days : collection of str
-        When the photographs were taken; by default as their files say.
+    exif : collection of Exif
+        What the camera says about the photographs; by default as their files have it.
 
     Examples
     --------
@@ -78,7 +78,7 @@ class ReportOptions(TypedDict, total=False):
     against: Mapping[str, FieldDifference]
     distances: Sequence[float]
     declined: Mapping[str, str]
-    days: Collection[str]
+    exif: Collection[Exif]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -318,7 +318,7 @@ class Calibrated(Estimated, Display):
         usual: ReportOptions = {
             "title": f"Calibration with {self.target}" if self.target else "Calibration",
             "photograph": self.photograph,
-            "days": sorted({day for path in self.sources.values() if (day := read_exif(path).day)}),
+            "exif": [read_exif(path) for path in self.sources.values()],
         }
         page: str = above("reseau.report.bundle:bundle_report")(
             self.result, **(usual | options), assessments=self.assessments, declined=declined

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from ..bundle import Camera, Network, Result, choose_board, choose_models, search_model
+from ..bundle.diagnostics.checks import in_images
 from ..bundle.diagnostics.fields import camera_mapping
 from ..bundle.explanations.names import Misnamed, misnamed
 from ..bundle.modelling.board import held_as_designed
@@ -55,6 +56,7 @@ _SHIFTED = (
     "photograph may be shifted, too; the camera is not affected"
 )
 _UNNAMED = "which part of the target it shows is not certain, and no other photograph tells"
+_LEFT_OUT = "{} image points are gross errors, and are left out: {}; --no-reject keeps them"
 _MORE_TILTED = "add images with the camera tilted by 20 to 40 degrees in different directions"
 # Relative standard deviation of a diagonal of the target.
 _PRINTED = 1e-4
@@ -196,7 +198,7 @@ class _Job:
         stand_in = Camera(ONE_CAMERA, 1, 1, (1.0, 1.0), "opencv", np.zeros(len(camera_model("opencv").names)))
         wrong = left_out(network_of(measured, design, stand_in), cameras, sizes, of)
         if wrong is None:
-            return self._adjusted(measured, None)
+            return self._decided(measured, None)
         # Which points are wrong is seen best with the target as designed: its errors are small beside theirs.
         more = options.target != "free" or options.control or options.heights or options.refraction
         first = self if more else replace(self, options=replace(options, target="flat"))
@@ -206,12 +208,29 @@ class _Job:
         if still is not None and same and more:
             return done if isinstance(done, Failure) else replace(done, misnamed=still.found)
         kept, found = (measured, None) if still is None else (still.kept(measured), still.found)
-        return self._adjusted(kept, found)
+        return self._decided(kept, found)
+
+    def _decided(self, measured: dict[str, ImagePoints], wrong: Misnamed | None) -> Calibrated | Failure:
+        """Adjust the points; without gross errors where these explain what is left, unless told."""
+        done = self._adjusted(measured, wrong)
+        if isinstance(done, Failure) or self.options.reject is not None:
+            return done
+        causes = done.explanation.causes
+        if not causes or causes[0].code != "blunders":
+            return done
+        without = replace(self, options=replace(self.options, reject=True))._adjusted(measured, wrong)
+        if isinstance(without, Failure):
+            return done
+        rows = np.flatnonzero(without.result.rejected)
+        said = _LEFT_OUT.format(len(rows), in_images(without.result.network, rows))
+        return replace(without, notes=(*without.notes, said))
 
     def _adjusted(self, measured: dict[str, ImagePoints], wrong: Misnamed | None) -> Calibrated | Failure:
         """Adjust the points of photographs, of which those that are wrong were left out."""
         design, sizes, options, taken = self.design, self.sizes, self.options, self.taken
-        notes = self.notes
+        notes, adjustment = self.notes, options.adjustment
+        if options.reject is not None:
+            adjustment = replace(adjustment, outliers="reject" if options.reject else "keep")
         measured = {name: points for name, points in measured.items() if len(points) >= _LEAST_POINTS}
         cameras, of = _cameras_of(measured, taken)
         refraction = None
@@ -246,7 +265,7 @@ class _Job:
         choices = dict[str, ModelChoice]()
         # With all points free: what is wrong with a target must not choose the model of the lens.
         if model.automatic:
-            chosen = choose_models(network, options=options.adjustment)
+            chosen = choose_models(network, options=adjustment)
             if isinstance(chosen, Failure):
                 notes = (
                     *notes,
@@ -259,11 +278,11 @@ class _Job:
         if options.target == "flat":
             network = held_as_designed(network)
         if options.target == "auto":
-            bent = choose_board(network, options.adjustment)
+            bent = choose_board(network, adjustment)
             if isinstance(bent, Failure):
                 return bent
             board, network = bent, bent.network
-        found = search_model(network, options.adjustment, options.components, options.eliminate)
+        found = search_model(network, adjustment, options.components, options.eliminate)
         if isinstance(found, Failure):
             if found.code is Code.NOT_CONVERGED:
                 return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")

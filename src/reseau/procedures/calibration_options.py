@@ -142,6 +142,9 @@ class CalibrationOptions:
     turntable : TurntableEntry, optional
         Turntable that carried the target, or the cameras; the axis is estimated. Photographs that are not in
         it were taken without.
+    reject : bool, optional
+        Whether gross errors among the image points are left out; by default where nothing explains as well
+        what the adjustment leaves, see :mod:`reseau.bundle.explanations`. The notes of the result name them.
     target : {"free", "flat", "auto"}
         Whether all points of the target are unknowns, or are held as designed; ``auto`` holds them where
         :func:`reseau.bundle.choose_board` finds the target flat and as designed.
@@ -162,6 +165,7 @@ class CalibrationOptions:
     refraction: RefractionEntry | None = None
     focal_35_mm: float | None = None
     turntable: TurntableEntry | None = None
+    reject: v.Reject | None = None
     target: Literal["free", "flat", "auto"] = "free"
 
     def __post_init__(self) -> None:

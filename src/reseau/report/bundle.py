@@ -20,6 +20,7 @@ from ..core.errors import UsageError
 from ..core.figures import ACCENT, FAINT, INK, drawing, nice, to_svg
 from ..core.numbers import aligned, at_power, measured, plain, power
 from ..core.provenance import Provenance
+from ..io.photographs import Exif
 from ..procedures.assessment import sorted_remarks
 from .bundle_figures import distortion_figure, network_figure, next_figure, residual_figure
 from .fields import difference_figure, errors_figure, uncertainty_figure
@@ -48,7 +49,7 @@ def bundle_report(
     assessments: Mapping[str, Assessment] | None = None,
     photograph: Callable[[str], Frame | None] | None = None,
     declined: Mapping[str, str] | None = None,
-    days: Collection[str] = (),
+    exif: Collection[Exif] = (),
 ) -> str:
     """Render the report of a bundle adjustment.
 
@@ -72,8 +73,8 @@ def bundle_report(
         shown.
     declined : mapping of str to str, optional
         Photographs that were left out, and why.
-    days : collection of str
-        Days on which the photographs were taken, as 2026-03-05.
+    exif : collection of Exif
+        What the camera says about the photographs: what it is called, when it took them.
 
     Returns
     -------
@@ -89,7 +90,7 @@ def bundle_report(
     return rendered(
         "bundle.html.j2",
         title=title,
-        facts=_facts(result, days, provenance or Provenance()),
+        facts=_facts(result, exif, provenance or Provenance()),
         summary=_summary(result),
         verdicts=[_verdict(result, name, each) for name, each in assessments.items()],
         warnings=warnings,
@@ -135,7 +136,7 @@ def _verdict(result: Result, name: str, assessed: Assessment) -> dict[str, Any]:
     }
 
 
-def _facts(result: Result, days: Collection[str], provenance: Provenance) -> list[str]:
+def _facts(result: Result, exif: Collection[Exif], provenance: Provenance) -> list[str]:
     """What was calibrated, from how many photographs, when they were taken, and by which version."""
     network, software = result.network, provenance.to_dict()["software"]
     alone = len(network.cameras) == 1
@@ -144,8 +145,11 @@ def _facts(result: Result, days: Collection[str], provenance: Provenance) -> lis
         for entry in network.cameras[:_NAMED]
     ]
     cameras += [f"{len(network.cameras)} cameras"] * (len(network.cameras) > _NAMED)
-    taken = [" to ".join(sorted({min(days), max(days)}))] if days else []
-    return [*cameras, f"{int(result.fit.usable.images.sum())} photographs", *taken, software]
+    called = sorted({each.camera for each in exif if each.camera})
+    days = sorted({each.day for each in exif if each.day})
+    taken = " to ".join(dict.fromkeys((days[0], days[-1]))) if days else "no date in the photographs"
+    photographs = f"{int(result.fit.usable.images.sum())} photographs"
+    return [*called[:_NAMED], *cameras, photographs, *([taken] if exif else []), software]
 
 
 def _photographs(

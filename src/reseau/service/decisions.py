@@ -65,6 +65,12 @@ class Decision:
     session: str | None = None
     earlier: tuple[tuple[str, datetime, Judgement], ...] = ()
 
+    @property
+    def says_something(self) -> bool:
+        """Whether it says how the instrument is: it is complete, and no person rejected it."""
+        compared = any(each.rule == "image" for each in self.judgement.findings)
+        return self.outcome != "rejected" or (compared and not self.reviewed_by)
+
 
 @dataclass(frozen=True)
 class Applied:

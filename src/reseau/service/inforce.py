@@ -9,7 +9,6 @@ apply, last May?" are both answered.
 from __future__ import annotations
 
 import getpass
-import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -36,11 +35,10 @@ from .covariates import (
     series_of,
 )
 from .decisions import Applied, Decision, Drift
-from .rules import AcceptanceRules, Judgement, Outcome, judge
+from .rules import AcceptanceRules, Judgement, Outcome, PastRun, judge
 
 _PREFIX = "calibrations/"
-_KEY_LENGTH = 12
-_KEY = re.compile(rf"[0-9a-f]{{{_KEY_LENGTH}}}")
+_KEY = re.compile(r"[0-9a-f]{12}")
 """The form of keys, which no name has."""
 _ACCEPTED = ("accepted", "accepted with warning")
 
@@ -154,7 +152,7 @@ class Configurations:
             without a new version, or the calibration is of another instrument than the one in force.
         """
         entries = self._entries(name)
-        key = key_of(calibration)
+        key = calibration.key
         made = [each for each in entries if key in (each.key, each.document.get("key")) and _judges(each)]
         if made and made[-1].document["judgement"]["rules"]["version"] == rules.version:
             return self.decision(name, key)
@@ -212,23 +210,28 @@ class Configurations:
         document = {"key": decision.key, "by": by or _user(), "comment": comment}
         self._journal(name).add("reference", document)
 
-    def _runs(
-        self, name: str, current: Applied, until: datetime, but: str
-    ) -> list[tuple[datetime, Calibration]]:
-        """Calibrations from the reference to a time, without rejected ones; with the one in force."""
+    def _runs(self, name: str, current: Applied, until: datetime, but: str) -> list[PastRun]:
+        """Calibrations from the reference to a time, with the one in force.
+
+        Among them are those that the rules rejected as too different: others may say the same. Those that a
+        person rejected, or that are incomplete, say nothing.
+        """
         history = [each for each in self.history(name) if each.key != but]
         of, reference = {each.key: each for each in history}, self.reference(name)
         start = of[reference].since if reference in of else current.since
         rows = sorted(
             (each.since, each.key)
             for each in history
-            if start <= each.since <= until and (each.outcome != "rejected" or each.key == current.key)
+            if start <= each.since <= until and (each.says_something or each.key == current.key)
         )
         rows.sort(key=lambda each: each[1] != reference)
         if current.key not in {key for _, key in rows}:
             rows = [(current.since, current.key)]
         found = self._calibrations(name, [key for _, key in rows])
-        return [(since, each) for (since, _), each in zip(rows, found, strict=True)]
+        return [
+            (since, each, of[key].outcome == "rejected" and key != current.key)
+            for (since, key), each in zip(rows, found, strict=True)
+        ]
 
     def _origin(self, session: str, key: str) -> dict[str, str]:
         """The session from which a calibration is, and the SHA-256 of the result that is its proof."""
@@ -238,7 +241,7 @@ class Configurations:
         for each in of.results():
             if each.name == CALIBRATION:
                 found = parse_calibration(of.content(each).decode("utf-8"), where=f"{session}: {each.name}")
-                if key_of(found) == key:
+                if found.key == key:
                     return {"session": session, "sha256": each.sha256}
         raise UsageError("does not have this calibration among its results", where=f"session {session}")
 
@@ -529,19 +532,6 @@ class Configurations:
             do = f"use {', '.join(self.names())}" if self.names() else "define it"
             raise UsageError("is not a configuration of this archive", where=name, do=do)
         return [each for each in found if kind is None or each.kind == kind]
-
-
-def key_of(calibration: Calibration) -> str:
-    """Name of a calibration: start of its SHA-256 without clock times.
-
-    Examples
-    --------
-    >>> from reseau.service.covariates import example_calibration
-    >>> len(key_of(example_calibration()))
-    12
-    """
-    text = calibration.model_copy(update={"times": {}}).to_json()
-    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:_KEY_LENGTH]
 
 
 def a_time(given: datetime) -> datetime:

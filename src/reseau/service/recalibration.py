@@ -5,7 +5,9 @@ A recalibration repeats an archived session: its plan, parameters, input files a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -19,16 +21,45 @@ from ..capture import Bench, BenchFile
 from ..capture.judging import Watch
 from ..core.errors import InstrumentError, UsageError
 from ..io import Document
+from .alarms import sender
 from .decisions import Decision
 from .inforce import Configurations
+from .orders import asked, held_by_service
 from .rules import AcceptanceRules
 from .schedule import Run, Schedule
 
-_PREFIX = "recalibrations/"
+_PREFIX, _TEST_S = "recalibrations/", 20.0
+Using = Callable[[Bench, Archive, str], AbstractContextManager[Any]]
+
+
+@contextmanager
+def locked(bench: Bench, archive: Archive, session: str) -> Iterator[None]:
+    """Lock and connect a bench for a session."""
+    with sessions.lock(bench, archive, session), bench:
+        yield
 
 
 class Recalibration(Document):
     """What is repeated, and how its result is judged, ``reseau-recalibration/1``.
+
+    Parameters
+    ----------
+    name, configuration : str
+        Name, and the configuration that it calibrates.
+    plan, parameters, inputs, bench
+        Those of the session that it repeats.
+    rules : dict
+        ``reseau-acceptance/1``.
+    warm_up_minutes : float
+        Time for which instruments warm up before the first frame (min).
+    self_test : bool
+        Test the instruments before it.
+    certificate : dict, optional
+        Data of the certificate of a calibration that is accepted, ``reseau-certificate/1``.
+    notify : tuple of str
+        Where the outcome is sent: URLs of apprise.
+    inside : tuple of str
+        Networks inside to which it may be sent, such as 192.168.1.0/24.
 
     Examples
     --------
@@ -47,6 +78,11 @@ class Recalibration(Document):
     inputs: dict[str, str]
     bench: str
     rules: dict[str, Any]
+    warm_up_minutes: float = Field(default=0.0, ge=0, le=1440)
+    self_test: bool = False
+    certificate: dict[str, Any] | None = None
+    notify: tuple[str, ...] = ()
+    inside: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -97,7 +133,7 @@ class Recalibrations:
         return self._archive.journals(_PREFIX)
 
     def define(
-        self, name: str, session: Session, configuration: str, rules: AcceptanceRules
+        self, name: str, session: Session, configuration: str, rules: AcceptanceRules, **steps: Any
     ) -> Recalibration:
         """Define a recalibration that repeats a session, or change one.
 
@@ -111,6 +147,8 @@ class Recalibrations:
             Configuration whose calibration it is.
         rules : AcceptanceRules
             Rules by which new calibrations are judged.
+        **steps
+            `warm_up_minutes`, `self_test`, `certificate`, `notify` and `inside` of :class:`Recalibration`.
 
         Raises
         ------
@@ -122,7 +160,7 @@ class Recalibrations:
         made = Recalibration(
             name=name, configuration=configuration, plan=session.plan, parameters=session.parameters,
             inputs={each: session.input(each) for each in session.inputs()}, bench=session.bench,
-            rules=rules.to_dict(),
+            rules=rules.to_dict(), **steps,
         )  # fmt: skip
         self._archive.journal(_PREFIX + name).add("definition", made.to_dict())
         return made
@@ -160,11 +198,16 @@ class Recalibrations:
         name: str,
         session: str = "",
         *,
+        by: str = "",
         watch: Watch = lambda kind, facts: None,
         bench: Callable[[BenchFile], Bench] = Bench,
+        using: Using = locked,
         capture: Callable[..., Any] = sessions.capture,
+        wait: Callable[[float], Any] = time.sleep,
     ) -> Recalibrated:
         """Carry out a recalibration, or continue it.
+
+        Its steps: warm up, self-test, acquire, decide, certificate, notify; each is said to `watch`.
 
         Parameters
         ----------
@@ -173,12 +216,18 @@ class Recalibrations:
         session : str
             Name of its session; one that exists is resumed, and one that is done is only judged. Default:
             name and time.
+        by : str
+            Who asked for it.
         watch : callable
             Called with events of the acquisition.
         bench : callable
             Makes the bench of its file.
+        using : callable
+            Holds the instruments of a bench for a session, in a ``with`` block.
         capture : callable
             Carries out the session on the bench.
+        wait : callable
+            Waits for some seconds while the instruments warm up.
 
         Raises
         ------
@@ -194,12 +243,23 @@ class Recalibrations:
         if there and self._archive.session(title).status == "done":
             found = self._archive.session(title)
         else:
-            found = self._carried_out(made, title, there, bench, partial(capture, watch=watch))
-        calibration = sessions.calibration_of(found)
-        decision = Configurations(self._archive).decide(
-            made.configuration, calibration, rules, since=found.begun, by=f"recalibration {name}",
-            session=title,
+            instruments = bench(BenchFile.parse_toml(made.bench, where=f"bench of {name}"))
+            found = self._carried_out(made, title, there, instruments, using, partial(capture, watch=watch),
+                                      lambda: _prepared(made, instruments, watch, wait))  # fmt: skip
+        calibration, known = sessions.calibration_of(found), Configurations(self._archive)
+        decision = known.decide(
+            made.configuration, calibration, rules, since=found.begun, session=title,
+            by=f"{by}, recalibration {name}" if by else f"recalibration {name}",
         )  # fmt: skip
+        watch("step", {"text": f"decided: {decision.outcome} ({decision.key})"})
+        if made.certificate is not None and decision.outcome.startswith("accepted"):
+            self._certify(made, found, decision)
+            watch("step", {"text": "certificate issued"})
+        if made.notify:
+            why = "; ".join(each.text for each in decision.judgement.findings if each.level != "ok")
+            text = f"{made.configuration}: {title} {decision.outcome}{f' ({why})' if why else ''}"
+            sent = sender(made.notify, made.inside)(f"reseau: {name} {decision.outcome}", text)
+            watch("step", {"text": "notified" if sent else "could not be notified"})
         return Recalibrated(title, calibration, decision)
 
     def carry_out(self, schedule: Schedule, run: Run, **options: Any) -> str:
@@ -210,7 +270,7 @@ class Recalibrations:
         schedule, run
             As given by :meth:`~reseau.service.Schedules.run_due`.
         **options
-            `watch`, `bench` and `capture`, as for :meth:`run`.
+            As for :meth:`ask`.
 
         Returns
         -------
@@ -223,22 +283,62 @@ class Recalibrations:
             As :meth:`run`.
         """
         name = f"{schedule.name}-{run.key.replace(' ', '-')}"
-        decision = self.run(schedule.recalibration, name, **options).decision
+        decision = self.ask(schedule.recalibration, name, f"schedule {schedule.name}", **options)
         return f"{decision.outcome}: {decision.key}"
 
+    def ask(
+        self, name: str, session: str = "", by: str = "",
+        over: Callable[[float], bool] = lambda seconds: bool(time.sleep(seconds)), **options: Any,
+    ) -> Decision:  # fmt: skip
+        """Have a recalibration carried out by the service that holds its bench, or, without one, do it here.
+
+        Parameters
+        ----------
+        name, session
+            As for :meth:`run`.
+        by : str
+            Who asks.
+        over : callable
+            Waits for some seconds, and returns whether the waiting for the service should end.
+        **options
+            For :meth:`run`, where no service holds the bench.
+
+        Raises
+        ------
+        ReseauError
+            As :meth:`run`.
+        """
+        made = self.get(name)
+        if not held_by_service(BenchFile.parse_toml(made.bench, where=f"bench of {name}")):
+            return self.run(name, session, by=by, **options).decision
+        order = asked(self._archive, made.bench, "recalibration", {"name": name}, by, session, over)
+        decided = Configurations(self._archive).history(made.configuration)
+        return next(each for each in reversed(decided) if each.session == order.session)
+
+    def _certify(self, made: Recalibration, session: Session, decision: Decision) -> None:
+        """Issue the certificate of an accepted calibration, kept among the results of its session."""
+        from .certificates import CertificateData, certify, html_of
+        from .certificates.dcc import dcc_of
+
+        known = Configurations(self._archive)
+        found = certify(
+            known.calibration(made.configuration, decision.key),
+            CertificateData.from_content(dict(made.certificate or {}), where=f"certificate of {made.name}"),
+            issued=self._archive.clock().date(), decision=decision, configuration=made.configuration,
+            earlier=known.earlier(made.configuration, decision),
+        )  # fmt: skip
+        session.keep("certificate.html", html_of(found).encode(), {"certificate": found.identifier})
+        session.keep("certificate.xml", dcc_of(found, ""), {"certificate": found.identifier})
+
     def _carried_out(
-        self,
-        made: Recalibration,
-        title: str,
-        there: bool,
-        bench: Callable[[BenchFile], Bench],
-        capture: Callable[[Session, Bench], Any],
-    ) -> Session:
+        self, made: Recalibration, title: str, there: bool, instruments: Bench, using: Using,
+        capture: Callable[[Session, Bench], Any], prepare: Callable[[], None],
+    ) -> Session:  # fmt: skip
         """Begin or resume the session, and carry it out to its end."""
-        instruments = bench(BenchFile.parse_toml(made.bench, where=f"bench of {made.name}"))
         if not there:
             sessions.check(title, made.plan, made.parameters, made.inputs, instruments)
-        with sessions.lock(instruments, self._archive, title), instruments:
+        with using(instruments, self._archive, title):
+            prepare()
             if there:
                 found = sessions.resume(self._archive, made.plan, title)
                 found.recover()
@@ -253,3 +353,15 @@ class Recalibrations:
                 f"is {found.status}", where=f"session {title}", do="continue it with --resume"
             )
         return found
+
+
+def _prepared(made: Recalibration, bench: Bench, watch: Watch, wait: Callable[[float], Any]) -> None:
+    """Warm up, and test the instruments."""
+    if made.warm_up_minutes:
+        watch("step", {"text": f"warms up for {made.warm_up_minutes:g} min"})
+        wait(60 * made.warm_up_minutes)
+    if made.self_test:
+        failed = [f"{each.name}: {each.error}" for each in bench.check(_TEST_S) if each.error is not None]
+        if failed:
+            raise InstrumentError("; ".join(failed), where="self-test")
+        watch("step", {"text": "self-test passed"})

@@ -330,7 +330,10 @@ class Schedules:
             return None
         return Claim(journal, run.key, attempt, self._lease, self._archive.clock)
 
-    def run_due(self, carry_out: Callable[[Schedule, Run], str], now: datetime | None = None) -> list[Run]:
+    def run_due(
+        self, carry_out: Callable[[Schedule, Run], str], now: datetime | None = None,
+        only: Callable[[Schedule], bool] = lambda schedule: True,
+    ) -> list[Run]:  # fmt: skip
         """Carry out all runs that may start now.
 
         Parameters
@@ -341,6 +344,8 @@ class Schedules:
             any other error of the project fails it.
         now : datetime, optional
             The present time.
+        only : callable
+            Which schedules are looked at.
 
         Returns
         -------
@@ -350,7 +355,7 @@ class Schedules:
         found = []
         for name in self.names():
             schedule = self.get(name)
-            for run in self.runs(name, now):
+            for run in self.runs(name, now) if only(schedule) else ():
                 claim = self.claim(run, now) if run.startable else None
                 if claim is None:
                     continue

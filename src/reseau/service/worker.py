@@ -1,7 +1,8 @@
 """The process that holds the hardware of a bench: `python -m reseau.service.worker`.
 
-One thread carries out commands in their order, one a session, one takes live pictures, one connects
-instruments that were silent. `stop` is none of these: the thread that reads it carries it out. The archive
+One thread carries out commands in their order, and begins what waits in the queue of the bench; one carries
+out a session, one takes live pictures, one connects instruments that were silent, and one looks for scheduled
+runs that are due. `stop` is none of these: the thread that reads it carries it out. The archive
 has what happened; the status follows from it and from the instruments, so that a service that is started
 again, or another browser, sees the same.
 """
@@ -20,8 +21,9 @@ import ssl
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,7 @@ from ..core.errors import BenchError, InstrumentError, ReseauError, StateError, 
 from ..core.memory import keep_loaded, share_freed_memory
 from ..instruments import Camera, Turntable
 from ..io import read_text
+from .orders import Order, Orders, owner
 from .state import StateFolder, private_file
 from .wire import Certificates, Wire, checked_peer, to_error
 
@@ -46,6 +49,8 @@ _INSIST_S = 2.0
 """For how long a stop is repeated while a movement that it ends has not ended."""
 _ASIDE = frozenset({"status", "bench", "settings", "axes", "picture", "pause", "abort", "end", "release"})
 """Commands that set nothing into motion."""
+_QUEUE_S, _SCHEDULE_S = 1.0, 5.0
+"""Time between looks at the queue, and at the schedules."""
 _ALONE_S = 600.0
 """Time after which the worker of a service ends that has gone, when no session runs."""
 
@@ -79,7 +84,7 @@ class Worker:
     def __init__(self, text: str, archive: Archive, certificates: Certificates) -> None:
         self.file = BenchFile.parse_toml(text, where="bench")
         self.name, self._text, self._archive = self.file.name, text, archive
-        self._certificates = certificates
+        self._certificates, self._orders = certificates, Orders(archive, self.name)
         every = Bench(self.file)
         self._bench = every.part(every.instruments, required=())
         self._silent: dict[str, ReseauError] = {}
@@ -110,7 +115,7 @@ class Worker:
                 return
             stack = contextlib.ExitStack()
             try:
-                stack.enter_context(self._bench.lock(f"reseau serve, bench {self.name}"))
+                stack.enter_context(self._bench.lock(owner(self.name)))
                 stack.enter_context(self._bench)
                 self._silent = dict(self._bench.silent)
                 if self._silent and len(self._silent) == len(self._bench.instruments):
@@ -125,6 +130,7 @@ class Worker:
                 self._error = str(known)
                 raise known from None
             self._held, self._error = stack, ""
+            self._orders.interrupted()
 
     @property
     def _answering(self) -> Bench:
@@ -316,15 +322,19 @@ class Worker:
         self, name: str, plan: str, parameters: dict[str, Any], inputs: dict[str, str], by: str = ""
     ) -> dict[str, Any]:
         self._free()
-        if plan == "own":
-            raise UsageError("is a program of the user, which the service does not run", where="plan own")
-        bench = self._required()
-        parameters = sessions.kind_of(plan).parameters.defaults(bench) | parameters
-        given = sessions.check(name, plan, parameters, inputs, bench)
+        given = self._checked(name, plan, parameters, inputs)
         with self._lock:
             self._prepare(given)
             session = sessions.begin(self._archive, name, plan, given, inputs, bench=self._text)
             return self._run(session, by)
+
+    def _checked(self, name: str, plan: str, parameters: dict[str, Any], inputs: dict[str, str]) -> Any:
+        """Parameters of a session on this bench, checked."""
+        if plan == "own":
+            raise UsageError("is a program of the user, which the service does not run", where="plan own")
+        bench = self._required()
+        parameters = sessions.kind_of(plan).parameters.defaults(bench) | parameters
+        return sessions.check(name, plan, parameters, inputs, bench)
 
     def _resume_session(self, name: str, by: str = "") -> dict[str, Any]:
         self._free()
@@ -352,11 +362,7 @@ class Worker:
 
     def _run(self, session: Any, by: str) -> dict[str, Any]:
         given = sessions.parameters_of(session)
-        self._session = {
-            "name": session.name, "plan": session.plan, "by": by, "state": "running", "good": 0,
-            "expected": given.expected, "reached": {}, "predicted": {}, "step": "", "rejected": [],
-            "units": dict(given.units),
-        }  # fmt: skip
+        self._describe(session.name, session.plan, by, given.expected, dict(given.units))
         control = self._control = Control(lambda: self._set("paused"))
         self._thread = threading.Thread(target=self._carry_out, args=(session, control), name="session")
         self._thread.start()
@@ -369,19 +375,126 @@ class Worker:
 
     def _carry_out(self, session: Any, control: Control) -> None:
         """Carry out a session in a thread of its own."""
+        with self._reported(), self._archive_lock(session.name):
+            sessions.capture(session, self._bench, watch=self._watched, operator=self._ask, control=control)
+        self._control = None
+        self._set(session.status)
+
+    @contextlib.contextmanager
+    def _reported(self) -> Iterator[None]:
+        """Have what fails in the session, also by a defect, said, and the worker go on."""
         try:
-            with self._archive_lock(session.name):
-                sessions.capture(
-                    session, self._bench, watch=self._watched, operator=self._ask, control=control
-                )
-        except ReseauError as error:
-            self._session["why"] = str(error)
-        except Exception as error:  # a defect ends the session, not the worker
-            self._session["why"] = f"{type(error).__name__}: {error}"
+            yield
+        except Exception as error:
+            self._session["why"] = str(_known(error, "session"))
         finally:
             self._question = None
-            self._control = None
-            self._set(session.status)
+
+    # The queue of the bench.
+
+    def _take_order(self) -> None:
+        """Begin the order whose turn it is, in a thread of its own."""
+        with self._lock, contextlib.suppress(ReseauError):
+            if self._held is None or self._control is not None or self._moving:
+                return
+            order = self._orders.next()
+            order = None if order is None else self._orders.begin(order)
+            if order is None:
+                return
+            self._control = Control(lambda: self._set("paused"))
+            self._describe(order.session, order.given.get("plan", order.what), order.by, None, {})
+            self._thread = threading.Thread(target=self._fulfil, args=(order, self._control), name="session")
+            self._thread.start()
+
+    def _fulfil(self, order: Order, control: Control) -> None:
+        """Carry out an order, and note what became of it."""
+        self._say("begin", {"session": order.session})
+        try:
+            outcome = (self._recalibrated if order.what == "recalibration" else self._acquired)(
+                order, control
+            )
+            self._orders.end(order, outcome)
+        except Exception as error:
+            known = _known(error, order.session)
+            if self._session["state"] == "ending":
+                known = UsageError("was aborted", where=order.session)
+            self._session["why"] = str(known)
+            with contextlib.suppress(ReseauError):
+                self._orders.fail(order, known)
+        finally:
+            self._question = self._control = None
+            self._set("done" if not self._session.get("why") else "failed")
+
+    def _recalibrated(self, order: Order, control: Control) -> str:
+        """Carry out a recalibration; return the outcome."""
+        from .recalibration import Recalibrations
+
+        def watch(kind: str, facts: dict[str, Any]) -> None:
+            if kind == "step":
+                self._orders.note(order, facts["text"])
+            self._watched(kind, facts)
+
+        def capture(session: Any, bench: Bench, watch: Any) -> None:
+            given = sessions.parameters_of(session)
+            self._prepare(given)
+            self._describe(session.name, session.plan, order.by, given.expected, dict(given.units))
+            sessions.capture(session, bench, watch=watch, operator=self._ask, control=control)
+
+        found = Recalibrations(self._archive).run(
+            order.given["name"], order.session, by=order.by, watch=watch, bench=lambda file: self._bench,
+            using=lambda bench, archive, session: self._archive_lock(session), capture=capture,
+            wait=self._wait,
+        )  # fmt: skip
+        return f"{found.decision.outcome}: {found.decision.key}"
+
+    def _wait(self, seconds: float) -> None:
+        """Wait, unless the order is aborted, or the worker ends."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            if self.over.wait(0.2) or self._session["state"] == "ending":
+                raise StateError("was interrupted", where="warming up")
+
+    def _acquired(self, order: Order, control: Control) -> str:
+        """Carry out a session, or continue it; return its status."""
+        given = order.given
+        if any(each.name == order.session for each in self._archive.sessions()):
+            session = self._archive.session(order.session)
+            session.recover()
+        else:
+            checked = self._checked(order.session, given["plan"], given["parameters"], given["inputs"])
+            self._prepare(checked)
+            session = sessions.begin(
+                self._archive, order.session, given["plan"], checked, given["inputs"], bench=self._text
+            )
+        made = sessions.parameters_of(session)
+        self._describe(session.name, session.plan, order.by, made.expected, dict(made.units))
+        with self._archive_lock(session.name):
+            sessions.capture(session, self._bench, watch=self._watched, operator=self._ask, control=control)
+        if session.status != "done":
+            raise StateError(f"is {session.status}", where=f"session {session.name}", do="resume it")
+        return session.status
+
+    def _describe(self, name: str, plan: str, by: str, expected: int | None, units: dict[str, str]) -> None:
+        """Describe the session that begins, as pages show it."""
+        self._session = {
+            "name": name, "plan": plan, "by": by, "state": "running", "good": 0, "expected": expected,
+            "reached": {}, "predicted": {}, "step": "", "rejected": [], "units": units,
+        }  # fmt: skip
+
+    def schedule(self) -> None:
+        """Put scheduled runs that are due into the queue, and note their outcome."""
+        from .recalibration import Recalibrations
+        from .schedule import Schedules
+
+        known = Recalibrations(self._archive)
+        while not self.over.wait(_SCHEDULE_S):
+            if self._held is None:
+                continue
+            with contextlib.suppress(ReseauError):
+                Schedules(self._archive).run_due(
+                    partial(known.carry_out, over=self.over.wait),
+                    only=lambda each: known.get(each.recalibration).bench == self._text,
+                )
 
     def _archive_lock(self, name: str) -> Any:
         """The lock of the session itself; the instruments are locked already."""
@@ -515,8 +628,11 @@ class Worker:
 
     def work(self) -> None:
         """Carry out commands in their order, and keep the bench connected."""
-        retry = 0.0
+        retry = looked = 0.0
         while not self.over.is_set():
+            if time.monotonic() >= looked + _QUEUE_S:
+                looked = time.monotonic()
+                self._take_order()
             if self._held is None and self._wanted and time.monotonic() >= retry:
                 retry = time.monotonic() + _RETRY_S
                 with contextlib.suppress(ReseauError):
@@ -629,7 +745,7 @@ class Worker:
             about = {"port": server.getsockname()[1], "pid": os.getpid(), "bench": self._text}
             if place is not None:
                 private_file(place, json.dumps(about).encode())
-            for each in (self.work, self.live, self.reconnect):
+            for each in (self.work, self.live, self.reconnect, self.schedule):
                 threading.Thread(target=each, name=each.__name__, daemon=True).start()
             server.settimeout(0.3)
             heard = time.monotonic()

@@ -1,5 +1,7 @@
 """Sessions: acquisitions that are measured live and can be computed again from the archive.
 
+Names are imported when they are first used: scans of film need neither archive nor bench.
+
 Examples
 --------
 Compute the results of a session again, in a program:
@@ -11,26 +13,33 @@ Compute the results of a session again, in a program:
 True
 """
 
-from .conducting import (
-    begin,
-    calibration_of,
-    capture,
-    check,
-    lock,
-    parameters_of,
-    procedure_of,
-    rerun,
-    rerun_all,
-    resume,
-)
-from .kinds import CORNERS, KINDS, OF_FILES, SCENE, SessionKind, input_option, kind_of
-from .parameters import (
-    FramesParameters,
-    PhotographsParameters,
-    SessionParameters,
-    TestfieldParameters,
-    present_keys,
-)
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..core.lazy import lazily
+
+if TYPE_CHECKING:
+    from .conducting import (
+        begin,
+        calibration_of,
+        capture,
+        check,
+        lock,
+        parameters_of,
+        procedure_of,
+        rerun,
+        rerun_all,
+        resume,
+    )
+    from .kinds import CORNERS, KINDS, OF_FILES, SCENE, SessionKind, input_option, kind_of
+    from .parameters import (
+        FramesParameters,
+        PhotographsParameters,
+        SessionParameters,
+        TestfieldParameters,
+        present_keys,
+    )
 
 __all__ = [
     "CORNERS",
@@ -56,3 +65,31 @@ __all__ = [
     "rerun_all",
     "resume",
 ]
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "CORNERS": ".kinds",
+        "FramesParameters": ".parameters",
+        "KINDS": ".kinds",
+        "OF_FILES": ".kinds",
+        "PhotographsParameters": ".parameters",
+        "SCENE": ".kinds",
+        "SessionKind": ".kinds",
+        "SessionParameters": ".parameters",
+        "TestfieldParameters": ".parameters",
+        "begin": ".conducting",
+        "calibration_of": ".conducting",
+        "capture": ".conducting",
+        "check": ".conducting",
+        "input_option": ".kinds",
+        "kind_of": ".kinds",
+        "lock": ".conducting",
+        "parameters_of": ".conducting",
+        "present_keys": ".parameters",
+        "procedure_of": ".conducting",
+        "rerun": ".conducting",
+        "rerun_all": ".conducting",
+        "resume": ".conducting",
+    },
+)

@@ -248,8 +248,9 @@ def test_from_the_first_start_to_a_roll_back(place: Place, browser: Browser) -> 
         press(browser, f'button[aria-label="Home {axis}"]')
         until(lambda: "done" in browser.text("#message") or browser.text("#message"))
     browser.until("tilt")
-    press(browser, 'button[aria-label="+10 deg, tilt"]')
-    until(lambda: "10.0" in browser.text("#axes-title + div"))
+    browser.fill("#step", "10")
+    press(browser, 'button[aria-label="plus a step, tilt"]')
+    until(lambda: "10.0" in browser.text("#axes-title ~ div"))
     browser.click("button.stop")
     shot(browser, "service-bench")
 
@@ -380,7 +381,7 @@ def test_axe_has_no_serious_finding_on_any_page(place: Place, browser: Browser, 
 
 def position(browser: Browser) -> str:
     """The tilt as the page shows it."""
-    rows = browser.text("#axes-title + div").splitlines()
+    rows = browser.text("#axes-title ~ div").splitlines()
     return next((row.split("\t")[1] for row in rows if row.startswith("tilt")), "")
 
 
@@ -400,7 +401,7 @@ def test_two_browsers_show_the_same_bench_also_where_connections_are_cut(
         for number in range(4):
             jogs = browser if number % 2 else other
             before = position(browser)
-            button = "+1 deg, tilt" if number < 2 else "-1 deg, tilt"
+            button = "plus a step, tilt" if number < 2 else "minus a step, tilt"
             until(lambda jogs=jogs: jogs.text("#state").startswith("ready"))
             press(jogs, f'button[aria-label="{button}"]')
             until(lambda before=before: position(browser) not in ("", before))
@@ -476,7 +477,7 @@ def test_pages_stay_true_when_the_clock_is_set_back_and_forth(
         browser.until("ready", "#state")
         for axis in ("tilt", "roll", "camera_roll"):
             browser.click(f'button[aria-label="Home {axis}"]')
-            until(lambda axis=axis: f"{axis}\t0.000 deg" in browser.text("#axes-title + div"))
+            until(lambda axis=axis: f"{axis}\t0.000 deg" in browser.text("#axes-title ~ div"))
             browser.until("ready", "#state")
         # Half a minute, as by a time server, also in the browser: the page goes on.
         clock.shift("-30")

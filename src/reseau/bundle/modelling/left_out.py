@@ -159,8 +159,10 @@ class Information:
         contradiction = np.einsum("mji,mj->mi", turn, left) ** 2
         q = residual + (contradiction / alone).sum(axis=1)
         known = (tau > _RANK**0.5) & (tau < 1 - _RANK**0.5)
-        square, variance = contradiction[known] / (tau * (1 - tau))[known], self.noise
-        variance = max(variance, float(square.mean())) if known.any() else variance
+        variance = self.noise
+        if known.any():
+            # By the sums: what images share that tell much is much larger beside their noise.
+            variance = max(variance, float(contradiction[known].sum() / (tau * (1 - tau))[known].sum()))
         found = basis @ basis.T
         return Prediction(
             self.offset + 0.5 * np.log(alone).sum(axis=1), q, cost - float(x @ x),

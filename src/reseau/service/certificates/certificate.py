@@ -14,7 +14,6 @@ from ...calibration.assessment import Use
 from ...core.data import ImagePoints
 from ...core.errors import UsageError
 from ..decisions import Decision
-from ..inforce import key_of
 from .budget import CalibrationUncertainty, measurement_budget, uncertainty_of
 from .data import CertificateData, Contact, Item
 
@@ -73,7 +72,7 @@ class Certificate:
     @property
     def key(self) -> str:
         """Name of the calibration: start of its SHA-256 without clock times."""
-        return key_of(self.calibration)
+        return self.calibration.key
 
     @property
     def identifier(self) -> str:

@@ -14,7 +14,18 @@ from fastapi import FastAPI, Request
 from ...core.errors import UsageError
 from ...core.memory import share_freed_memory
 from ...core.version import __version__
-from . import accounts, benches, calibrations, comparisons, files, history, operations, pages, sessions
+from . import (
+    accounts,
+    benches,
+    calibrations,
+    comparisons,
+    files,
+    history,
+    operations,
+    orders,
+    pages,
+    sessions,
+)
 from .access import principal_of
 from .answers import add_error_handlers
 from .guard import Guard, log
@@ -56,6 +67,7 @@ def create_app(service: Service) -> Any:
         history.router,
         files.router,
         benches.router,
+        orders.router,
     ):
         app.include_router(each, prefix=API)
     app.include_router(pages.router)

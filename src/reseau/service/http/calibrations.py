@@ -352,7 +352,7 @@ def calibration_detail(service: Service, name: str, key: str) -> CalibrationDeta
         parameters=[
             ParameterRow(
                 name=each, value=q.value, sigma=q.sigma, unit=q.unit,
-                text=measured(q.value, q.sigma, "" if q.unit == "1" else q.unit),
+                text=measured(q.value, q.sigma, q.unit),
             )
             for each, q in found.parameters.items()
         ],

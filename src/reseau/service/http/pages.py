@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Annotated, Any, Self
@@ -18,8 +19,9 @@ from ...core.errors import ReseauError
 from ...core.options import Declared, Group, options_of
 from ...core.vocabulary import names
 from ...io.photographs import PHOTOGRAPHS
-from . import accounts, benches, calibrations, comparisons, history, operations, sessions
+from . import accounts, benches, calibrations, comparisons, history, operations, orders, sessions
 from .access import Administering, Here, NotFound, Reading, Unknown, csrf_of, principal_of, service_of
+from .forms import FormField, form_of
 from .service import Service
 
 if TYPE_CHECKING:
@@ -44,11 +46,8 @@ NAV = (
 _BUSY = ("running", "pausing", "paused", "asking", "ending")
 _SHOWN = 400
 """Frames on the page of a session."""
-_RULES = """{
- "schema": "reseau-acceptance/1",
- "version": 1,
- "image": {"warning": 0.1, "action": 0.3}
-}"""
+_RULES = {"version": 1, "image": {"warning": 0.1, "action": 0.3}}
+"""Rules that are proposed where a configuration has none."""
 
 
 @cache
@@ -148,11 +147,34 @@ def login(request: Request, service: Here, next: Annotated[str, Query(max_length
 @router.get("/")
 def home(request: Request, who: Reading, service: Here) -> Response:
     """The overview."""
+    schedules, configurations = history.scheduled(service), calibrations.listed(service)
+    runs = [(each.name, run) for each in schedules for run in each.runs if run.state != "done"]
+    kept, charted = sessions.rows(service, 10), [each for each in configurations if each.decisions > 1]
     return _rendered(
         request, "home.html.j2", alarms=[a for a in history.all_alarms(service) if not a.acknowledged],
         benches=[_card(benches.bench_answer(service, each)) for each in service.benches.values()],
-        sessions=sessions.rows(service, 10), configurations=calibrations.listed(service),
+        sessions=kept, configurations=configurations, charted=charted,
+        runs=sorted(runs, key=lambda each: each[1].time)[-8:],
+        steps=_first_steps(service, bool(kept), configurations, bool(schedules)),
     )  # fmt: skip
+
+
+def _first_steps(
+    service: Service, captured: bool, configurations: list[calibrations.ConfigurationRow], scheduled: bool
+) -> list[tuple[bool, str, str]]:
+    """What leads from an empty archive to scheduled recalibrations: whether it is done, what, and where."""
+    bench = f"/benches/{quote(next(iter(service.benches)))}" if service.benches else "/files"
+    steps = [
+        (captured, "Begin a session on a bench, or drop photographs of a target", bench),
+        (bool(configurations), "Define the configuration: camera, lens, …", "/calibrations"),
+        (any(each.decisions for each in configurations), "Judge the calibration of the session by rules",
+         f"/calibrations/{quote(configurations[0].name)}" if configurations else "/calibrations"),
+        (any(each.in_force for each in configurations), "Accept it as the reference, from which drift counts",
+         "/history"),
+        (bool(orders.every_recalibration(service)), "Define the recalibration that repeats it", "/history"),
+        (scheduled, "Add its schedule", "/history"),
+    ]  # fmt: skip
+    return [] if all(done for done, _, _ in steps) else steps
 
 
 def _card(found: benches.BenchAnswer) -> dict[str, str]:
@@ -196,6 +218,7 @@ def bench_page(request: Request, bench: str, who: Reading, service: Here) -> Res
         settings=settings,
         axes=axes,
         busy=busy,
+        queue=orders.orders(bench, who, service),
         plans={
             plan: _PlanForm.of(kind)
             for plan, kind in reversed(list(kinds.KINDS.items()))
@@ -328,18 +351,13 @@ def configuration_page(request: Request, name: str, who: Reading, service: Here)
             drift = history.drift(name, who, service)
         except ReseauError:  # such as calibrations of different cameras: the alarms say so
             drift = None
+    from ..rules import AcceptanceRules
+
+    rules = calibrations.rules_of(service, name) or _RULES
     return _rendered(
         request, "configuration.html.j2", c=found, charted=drift is not None, drift=drift,
-        sessions=comparisons.calibrated(service), rules=_last_rules(service, name),
+        sessions=comparisons.calibrated(service), rules=form_of(AcceptanceRules, rules, "rules."),
     )  # fmt: skip
-
-
-def _last_rules(service: Service, name: str) -> str:
-    """The rules by which a configuration was judged last, or an example."""
-    from ...core.provenance import canonical_json
-
-    found = calibrations.rules_of(service, name)
-    return _RULES if found is None else canonical_json(found).strip()
 
 
 @router.get("/compare")
@@ -378,8 +396,11 @@ def calibration_page(request: Request, name: str, key: str, who: Reading, servic
     for each in found.tests:
         if {"parameter", "p"} <= each.keys():
             tests[each["parameter"]] = f"p = {each['p']:.2g}"
+    from ..certificates import CertificateData
+
     return _rendered(
         request, "calibration.html.j2", c=found, report=report, scene=scene, tests=tests,
+        certificate=form_of(CertificateData, prefix="data."),
         in_force=current is not None and current.key == found.decision.key,
     )  # fmt: skip
 
@@ -393,6 +414,8 @@ def files_page(request: Request, who: Reading, service: Here) -> Response:
 @router.get("/history")
 def history_page(request: Request, who: Reading, service: Here) -> Response:
     """Alarms, reviews, schedules and drift."""
+    from ..recalibration import Recalibration
+
     alarms = history.all_alarms(service)
     found = calibrations.listed(service)
     waiting = [
@@ -405,8 +428,23 @@ def history_page(request: Request, who: Reading, service: Here) -> Response:
     return _rendered(
         request, "history.html.j2", alarms=[a for a in alarms if not a.acknowledged],
         acknowledged=[a for a in alarms if a.acknowledged], schedules=history.scheduled(service),
-        configurations=found, to_review=waiting,
+        configurations=found, to_review=waiting, recalibrations=orders.every_recalibration(service),
+        sessions=comparisons.calibrated(service), schedule=_schedule_form(),
+        repeated=form_of(Recalibration, prefix="", but=_OF_SESSION),
     )  # fmt: skip
+
+
+_OF_SESSION = ("name", "configuration", "plan", "parameters", "inputs", "bench", "rules", "certificate")
+"""Keys of a recalibration that its session determines, or that are chosen among what there is."""
+
+
+def _schedule_form() -> tuple[FormField, ...]:
+    """The form of a schedule, filled with one that is due each week from tomorrow on."""
+    from ..schedule import Schedule
+
+    tomorrow = f"{datetime.now(UTC) + timedelta(days=1):%Y-%m-%dT08:00}"
+    values = {"rule": "FREQ=WEEKLY;COUNT=520", "start": tomorrow, "zone": "UTC"}
+    return form_of(Schedule, values, but=("recalibration", "configuration", "except_for"))
 
 
 @router.get("/account")

@@ -53,12 +53,13 @@ function fields(form) {
     else if (each.type === 'number') value = value === '' ? null : Number(value);
     else if (each.dataset.json !== undefined) value = JSON.parse(value);
     else if (each.dataset.pairs !== undefined) {
-      value = Object.fromEntries(value.split('\n').filter(l => l.includes('=')).map(l => l.split(/=(.*)/).slice(0, 2).map(s => s.trim())));
-    }
-    // a.b names the key b of the object a
+      const written = text => text !== '' && each.dataset.empty !== undefined && Number.isFinite(Number(text)) ? Number(text) : text;
+      value = Object.fromEntries(value.split('\n').filter(l => l.includes('=')).map(l => l.split(/=(.*)/).slice(0, 2).map(s => s.trim())).map(([k, v]) => [k, written(v)]));
+    } else if (each.dataset.lines !== undefined) value = value.split('\n').map(l => l.trim()).filter(l => l);
+    // a.b names the key b of the object a, a.0 the first of the list a
     const parts = each.name.split('.');
     let at = found;
-    for (const part of parts.slice(0, -1)) at = at[part] ??= {};
+    parts.slice(0, -1).forEach((part, k) => { at = at[part] ??= /^[0-9]+$/.test(parts[k + 1]) ? [] : {}; });
     at[parts.at(-1)] = value;
   }
   return found;
@@ -155,7 +156,13 @@ document.addEventListener('click', event => {
   const button = event.target.closest('button[data-api]');
   if (!button) return;
   event.preventDefault();
-  act(button, button.dataset.body ? JSON.parse(button.dataset.body) : undefined);
+  const body = button.dataset.body ? JSON.parse(button.dataset.body) : undefined;
+  if (button.dataset.step) {
+    const step = document.getElementById('step');
+    if (!step.reportValidity()) return;
+    body.position = Number(button.dataset.step) * Number(step.value);
+  }
+  act(button, body);
 });
 
 // Fields that belong to what is chosen; those of other choices are neither shown nor sent.

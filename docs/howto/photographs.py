@@ -1,0 +1,101 @@
+"""Photographs of some how-to pages, drawn by OpenCV; nothing of reseau is used.
+
+python photographs.py rig          # left/, right/: a board before two cameras that are fixed to each other
+python photographs.py turntable    # table/, angles.csv: a board on a turntable
+python photographs.py wires        # frame.png: an ultrasonic scan of an N-wire phantom
+"""
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+WIDTH, HEIGHT, FINE = 640, 480, 3  # samples of the image per pixel and direction
+COLUMNS, ROWS, SQUARE_MM, MARKER_MM, PER_MM = 7, 10, 23.0, 17.25, 12
+SIZE_MM, MARGIN_MM = np.array([COLUMNS, ROWS]) * SQUARE_MM, 20.0
+RNG = np.random.default_rng(7)
+
+
+def printed():
+    """The board on paper."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    board = cv2.aruco.CharucoBoard((COLUMNS, ROWS), SQUARE_MM, MARKER_MM, dictionary)
+    picture = board.generateImage(tuple(int(mm * PER_MM) for mm in SIZE_MM))
+    paper = cv2.copyMakeBorder(picture, *[int(MARGIN_MM * PER_MM)] * 4, cv2.BORDER_CONSTANT, value=255)
+    return cv2.GaussianBlur(25 + 0.7 * paper.astype(np.float32), (0, 0), 1.5)
+
+
+def photograph(path, sheet, camera, turn, middle):
+    """Write what a camera (fx, fy, cx, cy, k1, k2) sees of the board; `middle` is the place of its middle."""
+    fx, fy, cx, cy, k1, k2 = camera
+    # Where each sample of the image looks: pixels are squares around their coordinates.
+    x, y = ((np.arange(n * FINE) + 0.5) / FINE - 0.5 for n in (WIDTH, HEIGHT))
+    seen = np.stack(np.meshgrid((x - cx) / fx, (y - cy) / fy))
+    flat = seen
+    for _ in range(25):  # the inverse of OpenCV's distortion, by its own iteration
+        r2 = (flat**2).sum(axis=0)
+        flat = seen / (1 + r2 * (k1 + r2 * k2))
+    to_image = np.column_stack([turn[:, :2], middle - turn[:, :2] @ (SIZE_MM / 2)])
+    across, down, depth = (a * flat[0] + b * flat[1] + c for a, b, c in np.linalg.inv(to_image))
+    at = [((mm / depth + MARGIN_MM) * PER_MM - 0.5).astype(np.float32) for mm in (across, down)]
+    light = cv2.remap(sheet, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110.0)
+    light = cv2.GaussianBlur(light, (0, 0), 0.6 * FINE)
+    pixels = light.reshape(HEIGHT, FINE, WIDTH, FINE).mean(axis=(1, 3))
+    write(path, pixels + RNG.normal(0, 1.5, pixels.shape))
+
+
+def write(path, pixels):
+    """Write an image of 8 bit."""
+    Path(path).parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(path), np.clip(np.rint(pixels), 0, 255).astype(np.uint8))
+    print(path)
+
+
+def turned(*degrees):
+    """A rotation about x, y, then z."""
+    x, y, z = (cv2.Rodrigues(row)[0] for row in np.diag(np.deg2rad(degrees)))
+    return z @ y @ x
+
+
+def rig():
+    """Twelve exposures; the right camera stands 90 mm beside the left one, turned by 6 degrees."""
+    sheet, beside = printed(), turned(1.0, 5.9, -0.5)
+    for k in range(12):
+        lean, way = (0, 30, 38)[k % 3], 2 * np.pi * k / 12
+        turn = turned(lean * np.sin(way), lean * np.cos(way), 90 * (k % 4) + 8 * np.sin(k))
+        place = (k % 5 != 0) * np.array([(-1) ** k, (-1) ** (k // 2)]) * (70.0, 50.0)
+        middle = np.array([place[0] + 45, place[1], 330.0 + 25 * (k % 3)])
+        photograph(f"left/{k + 1:02}.png", sheet, (530, 531, 322, 235, -0.28, 0.08), turn, middle)
+        middle = beside @ (middle - (90, 2, -4))
+        photograph(f"right/{k + 1:02}.png", sheet, (545, 544, 314, 241, -0.25, 0.06), beside @ turn, middle)
+
+
+def turntable():
+    """The board turns about an axis behind it; between two series the camera was moved by hand."""
+    sheet, rows = printed(), ["image,angle_deg,sigma_deg,pose"]
+    axis, beside = np.array([0.1, 1.0, 0.05]), np.array([20.0, 0.0, 30.0])
+    axis /= np.linalg.norm(axis)
+    for pose, rest in enumerate((turned(30, 0, 3), turned(-25, 10, 92))):
+        for k, angle in enumerate((-40, -25, -10, 5, 20, 35)):
+            turn = rest @ cv2.Rodrigues(np.deg2rad(angle) * axis)[0]
+            middle = np.array([0, 0, 430.0]) + (rest - turn) @ beside
+            name = f"{6 * pose + k + 1:02}.png"
+            photograph(f"table/{name}", sheet, (900, 901, 322, 235, -0.28, 0.08), turn, middle)
+            rows.append(f"{name},{angle + 0.05 * RNG.normal():.3f},0.05,{pose}")
+    Path("angles.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+
+def wires():
+    """Nine echoes, 9 px/mm: narrow along the beam, wide across it. N1 to N3 are cut at 0.3, 0.55, 0.8."""
+    at_mm = [(20, 0), (8, 0), (-20, 0), (20, 15), (2, 15), (-20, 15), (12, 30), (-13.6, 30), (-20, 30)]
+    y, x = np.mgrid[0:480, 0:620]
+    echoes = sum(
+        np.exp(-(((x - 310.25 - 9 * mm_x) / 7) ** 2) / 2 - ((y - 110.4 - 9 * mm_y) / 1.6) ** 2 / 2)
+        for mm_x, mm_y in at_mm
+    )
+    write("frame.png", 5 + 150 * echoes + RNG.normal(0, 1.5, echoes.shape))
+
+
+if __name__ == "__main__":
+    {"rig": rig, "turntable": turntable, "wires": wires}[sys.argv[1]]()

@@ -1,0 +1,316 @@
+"""Competing models of all calibrations of an instrument: stable, creeping, changed at once, with the seasons.
+
+The runs differ by their errors, whose covariances are known up to a scale, and by a change of the instrument,
+a field over the image that grows as a function of time. Scale, size and direction of the change, and when it
+began, are unknown; what is said of the present drift is the mean over all of them by their probabilities.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+import scipy.special
+
+from ..core.data import Array
+
+_MORE_LIKELY = 0.5
+_LOSS = 10.0
+"""What it costs to accept by mistake, by what it costs to hold back by mistake: allowed in 1 % of the years,
+and 0.1 times a year."""
+_SCALES = np.array([1.0, 1.5, 2.2, 3.3, 5.0])
+"""Scales of the errors between runs, in the standard deviations that the calibrations state."""
+_HOLD = 8.0
+"""How much more probable it is that these hold than that errors are a step of the scale larger."""
+_LEAST = 0.02
+"""Part of the largest error below which a direction is not one of errors: changes in it are `outside`."""
+_YEAR = 365.25
+"""Period of seasons, days."""
+_WIDTHS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
+"""Sizes τ of changes (rms over the image), in limits, all equally probable."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunHistory:
+    """Calibrations of an instrument from its reference to now, in coordinates of their errors.
+
+    Parameters
+    ----------
+    days : ndarray (n,)
+        Times, rising; the first run is the reference, the last one is judged.
+    values : ndarray (n, r)
+        Coordinates of the differences from the reference.
+    covs : ndarray (n, r, r)
+        Their covariances, each by the errors of its own run.
+    basis : ndarray (m, 2, r)
+        Differences at places of the image by the coordinates.
+    outside : float
+        Largest difference of the last run from the reference that no coordinate describes.
+    rejected : ndarray of bool (n,), optional
+        Runs that were rejected: either each has an error of its own, or the instrument changed as they say.
+    """
+
+    days: Array
+    values: Array
+    covs: Array
+    basis: Array
+    outside: float = 0.0
+    rejected: Array | None = None
+
+    @classmethod
+    def of(cls, days: Array, offs: Array, roots: list[Array], rejected: Array) -> RunHistory:
+        """Reduce differences (n, m, 2) from the reference, with roots (m, 2, k) of the covariance of each."""
+        known = np.isfinite(offs).all(axis=(0, 2)) & np.array(
+            [np.isfinite(each).all(axis=(1, 2)) for each in roots]
+        ).all(axis=0)
+        flat = offs[:, known].reshape(len(offs), -1)
+        own = [each[known].reshape(flat.shape[1], -1) for each in roots]
+        # Errors of the first and of the last run span what may change; their models may differ.
+        u, s, _ = np.linalg.svd(np.hstack([own[0], own[-1]]) / np.sqrt(2), full_matrices=False)
+        keep = s > _LEAST * s[0]
+        u, s = u[:, keep], s[keep]
+        values = flat @ u / s
+        scaled = [u.T @ each / s[:, None] for each in own]
+        covs = np.array([each @ each.T for each in scaled]) + 1e-6 * np.eye(len(s))
+        rest = np.hypot(*(flat[-1] - u @ (s * values[-1])).reshape(-1, 2).T)
+        return cls(days, values, covs, (u * s).reshape(-1, 2, len(s)), float(rest.max()), rejected)
+
+    def without(self, rows: Array) -> RunHistory:
+        """Return the runs without some of them."""
+        keep = ~rows
+        return replace(
+            self, days=self.days[keep], values=self.values[keep], covs=self.covs[keep], rejected=None
+        )
+
+    def mean(self) -> tuple[Array, Array, float]:
+        """Precisions (n, r, r), the mean of the runs, and the weighted squares of what deviates from it."""
+        precision = np.linalg.inv(self.covs)
+        weighted = np.einsum("nij,nj->ni", precision, self.values)
+        mean = np.linalg.solve(precision.sum(axis=0), weighted.sum(axis=0))
+        return precision, mean, float(((self.values - mean) * weighted).sum())
+
+    def evidence(self) -> Array:
+        """Log likelihoods of the runs without a change, for each scale of their errors."""
+        (n, r), (precision, _, squares) = self.values.shape, self.mean()
+        log = -0.5 * squares / _SCALES**2 - (n - 1) * r * np.log(_SCALES * np.sqrt(2 * np.pi))
+        size = np.linalg.slogdet(precision)[1].sum() - np.linalg.slogdet(precision.sum(axis=0))[1]
+        found: Array = log + 0.5 * size - np.log(_HOLD) * np.arange(len(_SCALES))
+        return found
+
+    def spreads(self, limit: float) -> Array:
+        """Sizes (2, r) of a change of rms `limit`: equal in all coordinates of the field, or as of errors."""
+        r = self.values.shape[1]
+        rms = np.sqrt(np.square(self.basis).sum(axis=(0, 1)) / len(self.basis))
+        return limit * np.array([1 / (rms * np.sqrt(r)), np.full(r, 1 / np.sqrt(np.square(rms).sum()))])
+
+    def own_errors(self, rows: Array, base: Array, limit: float) -> Array:
+        """Log likelihoods of some runs by an error of each of them, for each scale of the other errors."""
+        off, wide = self.values[rows] - base, np.square(self.spreads(limit))[:, :, None] * np.eye(len(base))
+        cov = np.square(_SCALES)[:, None, None, None, None, None] * self.covs[rows][:, None, None]
+        cov = cov + np.square(_WIDTHS)[:, None, None] * wide[:, None]
+        square = np.einsum("sjatik,ji,jk->sjat", np.linalg.inv(cov), off, off)
+        log = -0.5 * (square + np.linalg.slogdet(2 * np.pi * cov)[1])
+        found: Array = scipy.special.logsumexp(log, axis=(2, 3)).sum(axis=1)
+        return found - len(off) * np.log(2 * len(_WIDTHS))
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """What the models say of the last run.
+
+    Parameters
+    ----------
+    stable, creeping, changed, seasonal : float
+        Probabilities that the instrument is as at its reference, creeps, changed at once, or follows the
+        seasons.
+    scale : float
+        Scale of the errors between runs, in the standard deviations that the calibrations state.
+    sigma : float
+        Largest standard deviation of a run over the image.
+    p : float
+        Probability that errors alone let the last run differ so much from the one in force.
+    rate_day : float
+        Growth of the drift a day, as far as it creeps.
+    """
+
+    stable: float
+    creeping: float
+    changed: float
+    seasonal: float
+    scale: float
+    sigma: float
+    p: float
+    rate_day: float
+    _weights: Array
+    _total: Array
+    _step: Array
+
+    def beyond(self, limit: float, *, step: bool = False) -> float:
+        """Return the probability that the drift, or the step from the run in force, exceeds a limit."""
+        size, sigma = self._step if step else self._total
+        return float(self._weights @ scipy.special.ndtr((size - limit) / np.maximum(sigma, 1e-300)))
+
+    def held(self, limit: float, *, step: bool = False) -> bool:
+        """Return whether accepting the drift, or the step, would be the dearer mistake than holding it back.
+
+        One is accepted by mistake where it exceeds the limit by two sigma of a run, and held back by mistake
+        where it is below the limit by as much.
+        """
+        margin = 2 * self.sigma
+        above = self.beyond(limit + margin, step=step)
+        below = 1 - self.beyond(max(limit - margin, 0.0), step=step)
+        return _LOSS * above > below
+
+    def creeps(self, size: float) -> bool:
+        """Return whether the instrument has drifted by a size, and rather little by little than at once."""
+        return self.creeping + self.seasonal > self.changed and self.beyond(size) > _MORE_LIKELY
+
+    def size(self, *, step: bool = False) -> tuple[float, float]:
+        """Return the drift since the reference (or the step) and its standard deviation."""
+        size, sigma = self._step if step else self._total
+        mean = float(self._weights @ size)
+        return mean, float(np.sqrt(self._weights @ (sigma**2 + (size - mean) ** 2)))
+
+
+def explain_runs(runs: RunHistory, limit: float, in_force: int) -> History:
+    """Explain runs by competing models.
+
+    Parameters
+    ----------
+    runs : RunHistory
+        Two runs at least.
+    limit : float
+        Limit of the drift, in the unit of the field: changes of this order are expected.
+    in_force : int
+        Run that is in force.
+
+    Examples
+    --------
+    Twelve runs, of which the last four have changed by eight standard deviations:
+
+    >>> values = np.where(np.arange(12) < 8, 0.0, 8.0)[:, None] + [[0.3], [-0.4]] * 6
+    >>> runs = RunHistory(7.0 * np.arange(12), values, np.ones((12, 1, 1)), np.full((1, 2, 1), 0.1))
+    >>> found = explain_runs(runs, 0.5, 7)
+    >>> round(found.changed, 2), round(found.beyond(0.5), 2)
+    (1.0, 1.0)
+    """
+    found = _all_supposed(runs, runs.evidence(), limit, in_force)
+    if runs.rejected is not None and runs.rejected.any():
+        others, now_in_force = runs.without(runs.rejected), in_force - int(runs.rejected[:in_force].sum())
+        common = others.evidence() + runs.own_errors(runs.rejected, others.mean()[1], limit)
+        found += _all_supposed(others, common, limit, now_in_force)
+    log = np.concatenate([each.log for each in found])
+    weights = np.exp(log - log.max())
+    weights /= weights.sum()
+    kinds = np.repeat([each.kind for each in found], [len(each.log) for each in found])
+    stable, creeps, changed, seasonal = (float(weights[kinds == each].sum()) for each in range(4))
+    n, r = runs.values.shape
+    scale = float(weights @ np.concatenate([each.scale for each in found])) if n > 2 else 1.0
+    off = runs.values[-1] - runs.values[in_force]
+    statistic = off @ np.linalg.solve(runs.covs[-1] + runs.covs[in_force], off) / scale**2
+    rates = np.concatenate([each.rate for each in found])
+    rate = float((weights * rates)[kinds == 1].sum()) / max(creeps, 1e-300)
+    sigma = scale * float(np.linalg.svd(runs.basis, compute_uv=False)[:, 0].max())
+    total, step = (
+        np.concatenate(each, axis=1) for each in zip(*((f.total, f.step) for f in found), strict=True)
+    )
+    return History(
+        stable, creeps, changed, seasonal, scale, sigma, float(scipy.special.chdtrc(r, statistic)), rate,
+        weights, total, step,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Supposed:
+    """A kind of model for every shape, direction, scale and width: log evidence, and what it says of now."""
+
+    kind: int
+    log: Array
+    scale: Array
+    total: Array
+    step: Array
+    rate: Array
+
+    @classmethod
+    def stable(cls, common: Array) -> Self:
+        none = np.zeros((2, len(common)))
+        return cls(0, common, _SCALES, none, none, none[0])
+
+
+def _all_supposed(runs: RunHistory, common: Array, limit: float, in_force: int) -> list[_Supposed]:
+    """All kinds of models; `common` are the log likelihoods without a change, for each scale."""
+    profiles = _profiles(runs.days - runs.days[0]).items()
+    changed = [_supposed(kind, *each, runs, limit, common, in_force) for kind, each in profiles]
+    return [_Supposed.stable(common), *changed]
+
+
+def _supposed(
+    kind: int, shapes: Array, slopes: Array, runs: RunHistory, limit: float, common: Array, in_force: int
+) -> _Supposed:
+    """Changes of shapes (k, p, n), each a field of random direction and size for every function of time."""
+    k, p, r = *shapes.shape[:2], runs.values.shape[1]
+    precision, base, _ = runs.mean()
+    weighted = np.einsum("nij,nj->ni", precision, runs.values - base)
+    one = np.einsum("kpn,nij->kpij", shapes, precision)
+    both = np.einsum("kpn,kqn,nij->kpiqj", shapes, shapes, precision)
+    both -= np.einsum("kpia,ab,kqbj->kpiqj", one, np.linalg.inv(precision.sum(axis=0)), one)
+    right = np.einsum("kpn,ni->kpi", shapes, weighted)
+    sigma = runs.spreads(limit)
+    scaled = np.einsum("ai,kpiqj,aj->akpiqj", sigma, both, sigma).reshape(2, k, p * r, p * r)
+    known, u = np.linalg.eigh(scaled)
+    h = np.einsum("akji,akj->aki", u, np.einsum("ai,kpi->akpi", sigma, right).reshape(2, k, p * r))
+    s, tau = _SCALES[:, None, None], _WIDTHS[:, None]
+    at = (slice(None), slice(None), None, None)
+    cov = 1 / (np.maximum(known, 0.0)[at] / s**2 + 1 / tau**2)
+    mean = h[at] / s**2 * cov
+    log = 0.5 * (h[at] / s**2 * mean + np.log(cov) - 2 * np.log(tau)).sum(axis=-1)
+    log = log + common[:, None] - np.log(2 * k * len(_WIDTHS))
+    to_field = u.reshape(2, k, p, r, p * r)
+
+    def sizes(part: Array) -> Array:
+        """Largest changes over the image, and their standard deviations, of parts (k, p) of the functions."""
+        fields = np.einsum("mci,ai,kp,akpij->akmcj", runs.basis, sigma, part, to_field, optimize=True)
+        return _greatest(fields, mean, cov)
+
+    now = shapes[:, :, -1]
+    if p == 1:  # what is said of one function is in proportion
+        total, count = sizes(now), len(_SCALES) * len(_WIDTHS)
+        step = total * np.tile(np.repeat(np.abs(now - shapes[:, :, in_force])[:, 0], count), 2)
+        slope = total[0] * np.tile(np.repeat(slopes[:, 0], count), 2)
+    else:
+        total, step, slope = sizes(now), sizes(now - shapes[:, :, in_force]), sizes(slopes)[0]
+    scale = np.broadcast_to(_SCALES[:, None], log.shape).ravel()
+    return _Supposed(kind, log.ravel(), scale, total, step, slope)
+
+
+def _profiles(days: Array) -> dict[int, tuple[Array, Array]]:
+    """Functions of time (k, p, n), 0 at the reference, and their slopes (k, p) now.
+
+    Kinds: 1 creeping, 2 at once, 3 with the seasons.
+    """
+    n = len(days)
+    left = days[-1] - days[: max(1, n - 2)]
+    rising = np.maximum(0.0, days - days[: len(left), None]) / left[:, None]
+    at_once = np.array([np.arange(n) >= k for k in range(1, n)], dtype=np.float64)
+    found = {2: (at_once[:, None], np.zeros((n - 1, 1)))}
+    if n > 2:
+        found[1] = rising[:, None], 1 / left[:, None]
+        year = 2 * np.pi * days / _YEAR
+        found[3] = np.array([[np.sin(year), 1 - np.cos(year)]]), np.zeros((1, 2))
+    return found
+
+
+def _greatest(fields: Array, mean: Array, cov: Array) -> Array:
+    """Largest length over the image of changes, and its standard deviation (2, …)."""
+    a, k, m, _, j = fields.shape
+    flat, of = mean.reshape(a, k, -1, j), fields.reshape(a, k, 2 * m, j)
+    there = (flat @ of.swapaxes(2, 3)).reshape(a, k, -1, m, 2)
+    square = np.square(there).sum(axis=-1)
+    where = np.argmax(square, axis=-1)[..., None]
+    most = np.sqrt(np.take_along_axis(square, where, axis=-1))
+    along = np.take_along_axis(there, where[..., None], axis=-2)[..., 0, :] / np.maximum(most, 1e-300)
+    rows = fields[np.arange(a)[:, None, None], np.arange(k)[:, None], where[..., 0]]
+    by = (rows * along[..., None]).sum(axis=-2)
+    sigma = np.sqrt((np.square(by) * cov.reshape(a, k, -1, j)).sum(axis=-1))
+    return np.array([most.ravel(), sigma.ravel()])

@@ -1,0 +1,248 @@
+"""Profiles of oscilloscopes and the fakes of ``transcripts.toml``: pictures, waveforms, faults, files."""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reseau.core.errors import FormatError, InputError, InstrumentError, ProtocolError, SettingError
+from reseau_drivers.link import SerialLink
+from reseau_drivers.oscilloscope import DIALECTS, Oscilloscope, oscilloscope
+from reseau_drivers.oscilloscope.dialects import Formula, described, dialect_named, read_profiles
+from reseau_drivers.profiles import FOLDER
+from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, Table, Zaber
+
+from .fakes import GrblBoard, Lines, Screen, Spoiled, TCube, Transcript, Wire, ZaberStage, transcripts
+from .test_references import FLUID, FLUID_VERSION, HAL, HAL_VERSION
+
+TOLD = transcripts()
+PROFILES = sorted(FOLDER.glob("*.toml"))
+
+
+def opened(told: dict[str, Any], wire: Wire, **options: Any) -> Oscilloscope:
+    """The driver of an instrument; one that does not identify itself is named."""
+    named = {} if told["identity"] else {"dialect": told["profile"]}
+    return oscilloscope("scope", wire, **{"seconds": 0.5} | named | options)
+
+
+@pytest.mark.parametrize(
+    "told", TOLD, ids=lambda told: told["identity"].split(",")[1] if told["identity"] else "-"
+)
+def test_screens_and_waveforms_are_those_of_the_instrument(told: dict[str, Any]) -> None:
+    fake = Transcript(told)
+    with opened(told, Wire(fake)) as scope:
+        for seed in (1, 2):
+            fake.screen = Screen(told.get("picture", "png"), seed)
+            assert fake.screen.shows(scope.screen().data)
+        assert scope.dialect is not None
+        assert scope.dialect.name == told["profile"]
+        if "volts" in told:
+            wave = scope.waveform(1)
+            assert wave.volts.tolist() == pytest.approx(told["volts"], abs=1e-9)
+            assert (wave.start_s, wave.step_s) == pytest.approx(told["time"], rel=1e-9)
+    assert fake.violations == []
+
+
+def test_every_profile_has_a_fake() -> None:
+    assert {told["profile"] for told in TOLD} == {dialect.name for dialect in DIALECTS}
+
+
+def endured(told: dict[str, Any], count: int, seed: int) -> Counter[str]:
+    """Work on an instrument until so many faults befell it; no picture and no waveform is wrong."""
+    fake, rng, run = Transcript(told), np.random.default_rng(seed), 0
+    wire, found = Spoiled(fake, rng, 0.0), Counter[str]()
+    with opened(told, wire, seconds=0.01) as scope:
+        wire.rate = 0.25
+        while len(wire.faults) < count:
+            run += 1
+            fake.screen = Screen(told.get("picture", "png"), run)
+            try:
+                if "volts" in told and run % 2:
+                    wave = scope.waveform(1)
+                    assert wave.volts.tolist() == pytest.approx(told["volts"], abs=1e-9), wire.faults[-5:]
+                    assert (wave.start_s, wave.step_s) == pytest.approx(told["time"], rel=1e-9)
+                else:
+                    assert fake.screen.shows(scope.screen().data), wire.faults[-5:]
+                found["right"] += 1
+            except InstrumentError as error:
+                found[type(error).__name__] += 1
+        wire.rate = 0.0
+        for _ in range(2):  # the first call may find what is left of the last fault
+            try:
+                assert fake.screen.shows(scope.screen().data)
+                break
+            except InstrumentError:
+                fake.reset()
+        else:
+            raise AssertionError("does not recover")
+    return found + Counter({f"fault: {kind}": n for kind, n in Counter(wire.faults).items()})
+
+
+TABLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], float]] = {
+    "GRBL": (GrblBoard, lambda wire: Grbl(wire, 0.02), 1.0),
+    "GRBL without lock": (lambda: GrblBoard(locks=False), lambda wire: Grbl(wire, 0.02), 1.0),
+    "grblHAL": (
+        lambda: GrblBoard(HAL, HAL_VERSION, locks=False, tells=True),
+        lambda wire: Grbl(wire, 0.02),
+        1.0,
+    ),
+    "FluidNC": (lambda: GrblBoard(FLUID, FLUID_VERSION, locks=False), lambda wire: Grbl(wire, 0.02), 1.0),
+    "Zaber": (ZaberStage, lambda wire: Zaber(wire, 0.02), 1000.0),
+    "T-Cube": (TCube, lambda wire: Kinesis([wire], answer_s=0.02), 1919.64),
+}
+
+
+def moved(name: str, count: int, seed: int) -> Counter[str]:
+    """Move an axis until so many faults befell its controller; it is never elsewhere than it says."""
+    make, controller, per_unit = TABLES[name]
+    fake, rng, found = make(), np.random.default_rng(seed), Counter[str]()
+    wire = Spoiled(fake, rng, 0.0)
+    plan = AxisPlan(low=-90.0, high=90.0, per_unit=per_unit)
+    table = Table("table", controller(wire), {"tilt": plan}, seconds=0.25)
+    table.connect()
+    wire.rate = 0.05
+    while len(wire.faults) < count:
+        target = float(rng.integers(-80, 80))
+        try:
+            if not table.state("tilt").homed:
+                table.home("tilt")
+            position = table.move("tilt", target).position
+            assert (fake.place + fake.off) / per_unit == pytest.approx(target, abs=0.01), wire.faults[-5:]
+            assert position == pytest.approx(target, abs=0.01)
+            found["right"] += 1
+        except InstrumentError as error:
+            found[type(error).__name__] += 1
+    table.close()
+    return found + Counter({f"fault: {kind}": n for kind, n in Counter(wire.faults).items()})
+
+
+def test_no_fault_gives_a_wrong_picture_or_waveform() -> None:
+    for k, told in enumerate(TOLD):
+        endured(told, 12, k)
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_no_fault_moves_an_axis_elsewhere(name: str) -> None:
+    moved(name, 25, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+def test_ten_thousand_faults_give_no_wrong_value(
+    record_property: Callable[[str, object], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    total = Counter[str]()
+    each = -(-int(os.environ.get("RESEAU_FAULTS", "10000")) // (len(TOLD) + len(TABLES)))
+    for k, told in enumerate(TOLD):
+        total += endured(told, each, 1000 + k)
+    for k, name in enumerate(TABLES):
+        total += moved(name, each, 2000 + k)
+    for name, number in sorted(total.items()):
+        record_property(name, number)
+    with capsys.disabled():
+        faults = sum(number for name, number in total.items() if name.startswith("fault"))
+        print(f"\n{faults} faults over {len(TOLD) + len(TABLES)} instruments: {dict(sorted(total.items()))}")
+
+
+@pytest.mark.parametrize("path", PROFILES, ids=lambda path: path.stem)
+def test_every_line_of_a_profile_names_a_source(path: Path) -> None:
+    text = path.read_text("utf-8")
+    used, sources = set[str](), tomllib.loads(text)["sources"]
+    for line in text.splitlines():
+        if (
+            not line
+            or line.startswith(("[", "name = ", "schema = ", "maker = "))
+            or re.match(r'\d+ = "', line)
+        ):
+            continue
+        found = re.findall(r"\[(\d+)\]", line.rpartition("#")[2])
+        assert found, line
+        used.update(found)
+    assert used == set(sources)
+
+
+def test_a_file_of_ones_own_is_a_dialect(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(described("Rigol 1000Z").replace('"Rigol 1000Z"', '"Rigol mine"'))
+    fake = Transcript(next(told for told in TOLD if told["profile"] == "Rigol 1000Z"))
+    with oscilloscope("scope", Wire(fake), dialect=str(path), seconds=0.5) as scope:
+        assert fake.screen.shows(scope.screen().data)
+        assert scope.dialect is not None
+        assert scope.dialect.name == "Rigol mine"
+    assert dialect_named(f"{path}#Rigol mine").models == r"(DS|MSO)1\d{3}Z"
+    with pytest.raises(SettingError, match="choose from Rigol mine"):
+        dialect_named(f"{path}#other")
+    with pytest.raises(InputError, match="cannot be read"):
+        dialect_named(str(tmp_path / "none.toml"))
+
+
+OWN = described("Rigol 1000Z")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("schema = 3", "schema 3 is not reseau-instrument-profile/1"),
+        ("x", "is not TOML"),
+        (OWN.replace("screen =", "scren ="), r"`screen`: Field required"),
+        (OWN.replace('waveform = "preamble"', 'waveform = "none"'), r"there are no \[waveforms.none\]"),
+        (OWN.replace("fetch :DISP", "send :DISP"), "needs one step that fetches"),
+        (OWN.replace("fetch :DISP", "grab :DISP"), r"`screen.0`: String should match"),
+        (OWN.replace("(code - y0 - yref) * dy", "code ** 2"), r"has more than \+ - \* /"),
+        (OWN.replace("(code - y0 - yref) * dy", "(code"), "is not a formula"),
+        (OWN.replace("(code - y0 - yref) * dy", "__import__('os')"), r"has more than \+ - \* /"),
+    ],
+)
+def test_a_file_that_is_no_profile_is_refused_in_one_line(text: str, message: str) -> None:
+    with pytest.raises(FormatError, match=message) as caught:
+        read_profiles(text, where="mine.toml")
+    assert "\n" not in str(caught.value)
+
+
+def test_formulas() -> None:
+    numbers = {"code": np.array([1.0, 3.0]), "a": 2.0}
+    assert Formula("-(code - 1) * 10 / a + .5")(numbers).tolist() == [0.5, -9.5]
+    with pytest.raises(ZeroDivisionError):
+        Formula("1 / b")({"b": 0.0})
+
+
+@pytest.mark.parametrize(("serial", "port"), [(True, "RS232"), (False, "GPIb")])
+def test_a_tds_220_prints_to_the_port_it_is_connected_by(serial: bool, port: str) -> None:
+    class SerialWire(Wire, SerialLink):  # type: ignore[misc]
+        pass
+
+    told = next(told for told in TOLD if told["profile"] == "Tektronix TDS 200")
+    fake = Transcript(told | {"lines": [
+        [name, heard.replace(r"(GPI\w*|RS232)", port), *rest] for name, heard, *rest in told["lines"]
+    ]})  # fmt: skip
+    with opened(told, (SerialWire if serial else Wire)(fake)) as scope:
+        assert fake.screen.shows(scope.screen().data)
+
+
+def test_one_that_may_lack_a_module_is_told_of_it() -> None:
+    mute = Lines({"*IDN?": b"TEKTRONIX,TDS 220,0,CF:91.1CT FV:v1.02\n"})
+    with (
+        oscilloscope("scope", Wire(mute), seconds=0.2) as scope,
+        pytest.raises(InstrumentError, match="TDS2CM"),
+    ):
+        scope.screen()
+
+
+def test_an_unknown_model_is_tried_by_its_nearest_relatives(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("reseau_drivers.oscilloscope.scope._TRIAL_S", 0.2)
+    told = next(told for told in TOLD if told["profile"] == "Tektronix with a file system")
+    fake = Transcript(told | {"identity": "TEKTRONIX,6-MSO,C1,CF:91.1CT"})
+    with opened(told, Wire(fake), seconds=5.0) as scope:
+        assert fake.screen.shows(scope.screen().data)
+        assert "set dialect = 'Tektronix with a file system'" in scope.check()["advice"]
+    mute = Lines({"*IDN?": b"ACME,X1,1,1\n"})
+    with pytest.raises(ProtocolError, match="reseau bench profile"):
+        oscilloscope("scope", Wire(mute), seconds=0.5).connect()
