@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "benchmarks"))
-from mutations import Mutation, mutations
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from mutations import ROOT, Mutation, mutations
 
 EVERY = mutations()
 
