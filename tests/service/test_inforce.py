@@ -233,6 +233,17 @@ def test_a_review_is_made_once_and_with_a_reason(archive: Archive) -> None:
     assert known.review("left", open_one.key, "rejected", comment="too weak").outcome == "rejected"
 
 
+def test_a_review_is_made_by_a_second_person_where_the_rules_ask_for_one(archive: Archive) -> None:
+    known, _ = started(archive)
+    strict = RULES.model_copy(update={"version": 7, "second_person": True})
+    for number, by in enumerate(("Ada", "Ada, recalibration left")):
+        known.event("left", "camera dropped", at=day(8 + 2 * number))
+        made = known.decide("left", camera(c=8.0 + 1e-3 * number), strict, since=day(9 + 2 * number), by=by)
+        with pytest.raises(UsageError, match="needs another person than Ada"):
+            known.review("left", made.key, "accepted", by="Ada", comment="as expected")
+        assert known.review("left", made.key, "accepted", by="Grace", comment="agreed").reviewed_by == "Grace"
+
+
 def test_after_a_service_event_nothing_applies_until_the_next_calibration(archive: Archive) -> None:
     known, first = started(archive)
     known.event("left", "lens changed", at=day(5))

@@ -24,7 +24,7 @@ from reseau.core.errors import FormatError, InputError, ProtocolError, SettingEr
 
 from ..codecs.ieee488 import picture
 from ..codecs.numbers import INFINITE
-from ..profiles import FOLDER
+from ..profiles import CONTROLLERS, FOLDER
 from .screens import bytes_of_colours, picture_after, runs_of_colours
 
 __all__ = [
@@ -211,6 +211,8 @@ class Dialect(_Part):
         Command that stops the acquisition.
     errors : str
         Query for the oldest error; empty if there is no error queue.
+    ends : str
+        What ends a command.
     identifies : bool
         Whether it answers ``*IDN?``.
     silent : str
@@ -233,6 +235,7 @@ class Dialect(_Part):
     setup: tuple[str, ...] = ()
     halt: str = ":STOP"
     errors: str = ":SYSTem:ERRor?"
+    ends: Annotated[str, Field(pattern=r"^[\r\n\x00;]*$")] = "\n"
     identifies: bool = True
     silent: str = ""
     maker: Maker
@@ -333,7 +336,7 @@ def described(name: str = "") -> str:
     Parameters
     ----------
     name : str
-        Name of a dialect; a file of profiles, which is checked and listed; empty: list all.
+        Name of a dialect or a controller; a file of profiles, which is checked and listed; empty: list all.
 
     Raises
     ------
@@ -352,7 +355,10 @@ def described(name: str = "") -> str:
         examples = {
             each.name: ", ".join(example.split(",")[1] for example in each.examples) for each in known
         }
+        examples |= {} if name else dict.fromkeys(CONTROLLERS, "codes, flags and banners of a controller")
         return "".join(f"{each}: {models}".rstrip(": ") + "\n" for each, models in examples.items())
+    if name in CONTROLLERS:
+        return (FOLDER / f"{name}.toml").read_text("utf-8")
     dialect = dialect_named(name)
     text = next(text for text in _FILES.values() if f'name = "{dialect.name}"' in text)
     head, *parts = re.split(r"(?m)^(?=\[)", text)

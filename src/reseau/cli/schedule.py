@@ -202,7 +202,7 @@ def recalibrate(
         float, Option("With --repeats: wait before the first frame (min).", least=0)
     ] = 0.0,
     self_test: Annotated[bool, Option("With --repeats: test the instruments first.")] = False,
-    certificate: Annotated[v.Data | None, "With --repeats: issue a certificate with these data."] = None,
+    data: Annotated[v.Data | None, "With --repeats: issue a certificate with these data."] = None,
     notify: v.Notify | None = None,
     inside: v.Inside | None = None,
     resume: v.Resume = False,
@@ -225,10 +225,10 @@ def recalibrate(
         if repeats is not None:
             assert configuration is not None
             assert rules is not None
-            data = None if certificate is None else CertificateData.read(certificate).to_dict()
+            certificate = None if data is None else CertificateData.read(data).to_dict()
             made = known.define(
                 name, found.session(repeats), configuration, AcceptanceRules.read(rules),
-                warm_up_minutes=warm_up_minutes, self_test=self_test, certificate=data,
+                warm_up_minutes=warm_up_minutes, self_test=self_test, certificate=certificate,
                 notify=tuple(notify or ()), inside=tuple(inside or ()),
             )  # fmt: skip
             say(f"{name}: repeats {repeats}, plan {made.plan}, for {configuration}\n")

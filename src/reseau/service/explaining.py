@@ -78,17 +78,17 @@ class RunHistory:
 
     def without(self, rows: Array) -> RunHistory:
         """Return the runs without some of them."""
-        keep = ~rows
+        keep = np.flatnonzero(np.logical_not(rows))
         return replace(
             self, days=self.days[keep], values=self.values[keep], covs=self.covs[keep], rejected=None
         )
 
     def mean(self) -> tuple[Array, Array, float]:
         """Precisions (n, r, r), the mean of the runs, and the weighted squares of what deviates from it."""
-        precision = np.linalg.inv(self.covs)
+        precision = np.asarray(np.linalg.inv(self.covs), dtype=np.float64)
         weighted = np.einsum("nij,nj->ni", precision, self.values)
         mean = np.linalg.solve(precision.sum(axis=0), weighted.sum(axis=0))
-        return precision, mean, float(((self.values - mean) * weighted).sum())
+        return precision, np.asarray(mean, dtype=np.float64), float(((self.values - mean) * weighted).sum())
 
     def evidence(self) -> Array:
         """Log likelihoods of the runs without a change, for each scale of their errors."""
@@ -102,7 +102,10 @@ class RunHistory:
         """Sizes (2, r) of a change of rms `limit`: equal in all coordinates of the field, or as of errors."""
         r = self.values.shape[1]
         rms = np.sqrt(np.square(self.basis).sum(axis=(0, 1)) / len(self.basis))
-        return limit * np.array([1 / (rms * np.sqrt(r)), np.full(r, 1 / np.sqrt(np.square(rms).sum()))])
+        found: Array = limit * np.array(
+            [1 / (rms * np.sqrt(r)), np.full(r, 1 / np.sqrt(np.square(rms).sum()))]
+        )
+        return found
 
     def own_errors(self, rows: Array, base: Array, limit: float) -> Array:
         """Log likelihoods of some runs by an error of each of them, for each scale of the other errors."""
@@ -111,8 +114,9 @@ class RunHistory:
         cov = cov + np.square(_WIDTHS)[:, None, None] * wide[:, None]
         square = np.einsum("sjatik,ji,jk->sjat", np.linalg.inv(cov), off, off)
         log = -0.5 * (square + np.linalg.slogdet(2 * np.pi * cov)[1])
-        found: Array = scipy.special.logsumexp(log, axis=(2, 3)).sum(axis=1)
-        return found - len(off) * np.log(2 * len(_WIDTHS))
+        log = scipy.special.logsumexp(log, axis=(2, 3)) - np.log(2 * len(_WIDTHS))
+        found: Array = log.sum(axis=1)
+        return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -264,7 +264,13 @@ class Configurations:
             raise UsageError(f"is {decision.outcome} and needs no review", where=key)
         if not comment.strip():
             raise UsageError("needs a reason", where=f"review of {key}", do="give a comment")
-        document = {"key": decision.key, "outcome": outcome, "by": by or _user(), "comment": comment}
+        person = by or _user()
+        if decision.judgement.rules.get("second_person") and person in (
+            decision.by,
+            decision.by.split(",")[0],
+        ):
+            raise UsageError(f"needs another person than {person}", where=f"review of {key}")
+        document = {"key": decision.key, "outcome": outcome, "by": person, "comment": comment}
         again = f" {len(decision.earlier)}" if decision.earlier else ""
         if self._journal(name).append(f"review {decision.key}{again}", "review", document) is None:
             raise UsageError("has been reviewed", where=key)

@@ -71,13 +71,15 @@ class AcceptanceRules(Document):
     Parameters
     ----------
     version : int
-        Increased with every change; decisions keep the rules they were made by.
+        Version, increased with every change: decisions keep the rules by which they were made.
     image : Limits
-        Largest difference over the image, in the unit of `unit` (pixels, for a camera).
+        Largest difference over the image (pixels, for a camera) from the calibration in force.
     total : Limits, optional
         Largest drift since the reference calibration, in the same unit; by default as `image`.
     object : Limits, optional
-        Largest difference in object space at `distance_mm` from a camera, mm.
+        Largest difference in object space at a distance from a camera (mm).
+    distance_mm : float, optional
+        That distance (mm).
     significance : Limits
         Levels of the congruence test; the one for action is the smaller.
     redundancy : int
@@ -86,6 +88,8 @@ class AcceptanceRules(Document):
         Smallest share of width and of height of the image that has observations.
     refused_warnings : tuple of str
         Codes of warnings with which a calibration is incomplete.
+    second_person : bool
+        Reviews need another person than the one who had the calibration judged.
 
     Examples
     --------
@@ -108,6 +112,7 @@ class AcceptanceRules(Document):
         "camera-moved", "camera-unstable", "inconsistent", "not-identified", "unmodelled",
         "weak-geometry",
     )  # fmt: skip
+    second_person: bool = False
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

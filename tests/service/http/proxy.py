@@ -25,7 +25,7 @@ class Proxy:
     def __init__(
         self, server: int, host: str = "127.0.0.1", port: int = 0, cut_s: float | None = None
     ) -> None:
-        self._to, self._cut_s, self._pairs = port, cut_s, set[tuple[socket.socket, socket.socket]]()
+        self._to, self._cut_s, self._pairs = server, cut_s, set[tuple[socket.socket, socket.socket]]()
         self._over, self._open, self.cut = threading.Event(), threading.Event(), 0
         self._open.set()
         family = socket.AF_INET6 if ":" in host else socket.AF_INET

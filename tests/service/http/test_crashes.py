@@ -28,7 +28,8 @@ from .populated import PARAMETERS, STEPS
 from .test_benches import ROOT, until
 from .test_browser import Place
 
-pytestmark = pytest.mark.slow
+KILLS = int(os.environ.get("RESEAU_KILLS", "4"))
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900 + 60 * KILLS)]
 
 AXES = ("tilt", "roll", "camera_roll")
 
@@ -99,7 +100,7 @@ def test_after_a_kill_the_state_is_right_nothing_moves_and_nothing_is_lost(
     place.start()
     bench = Bench(place)
     with bench.http:
-        begun = killed_at_random(place, sim, bench, int(os.environ.get("RESEAU_KILLS", "4")))
+        begun = killed_at_random(place, sim, bench, KILLS)
     place.end()
     with Archive.open(place.folder / "archive") as archive:
         assert verify(archive)

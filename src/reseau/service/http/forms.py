@@ -86,7 +86,7 @@ def form_of(
 def _described(model: type[BaseModel]) -> dict[str, str]:
     """The first sentence about each parameter of a class."""
     found = _PARAMETERS.search(inspect.getdoc(model) or "")
-    said = {}
+    said = dict[str, str]()
     for names, text in _ENTRY.findall("" if found is None else found[1] + "\n"):
         sentence = " ".join(text.split()).replace("`", "")
         said |= {each: sentence.rstrip(".") for each in names.split(", ")}
@@ -101,7 +101,7 @@ def _fields(
     return tuple(
         _field(
             each, whole, prefix + name, said.get(name, name.replace("_", " ")), name in needed,
-            values.get(name, each.get("default")),
+            values.get(name, each.get("default") if required else None),
         )
         for name, each in schema.get("properties", {}).items()
         if name not in but

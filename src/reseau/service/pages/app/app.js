@@ -224,8 +224,9 @@ function renew(page) {
     delete old.dataset.stale;
     if (!fresh || fresh.innerHTML === old.dataset.was) continue;
     const active = document.activeElement;
-    if (old.contains(active) && active.matches('input, select, textarea')) { old.dataset.stale = ''; continue; }
-    const key = old.contains(active) ? active.dataset.api ?? active.getAttribute('href') : null;
+    if (old.contains(active) && active.matches('input:not([data-again]), select, textarea')) { old.dataset.stale = ''; continue; }
+    const keyed = e => e.dataset.api ?? e.getAttribute('href') ?? e.id;
+    const key = old.contains(active) ? keyed(active) : null;
     const open = [...old.querySelectorAll('details[open]')].map(d => d.id);
     const given = new Map([...old.querySelectorAll('input, select, textarea')].filter(edited).map(e => [field(e), e]));
     old.innerHTML = fresh.innerHTML;
@@ -236,7 +237,7 @@ function renew(page) {
       if (!before) continue;
       if (boxed(e)) e.checked = before.checked; else e.value = before.value;
     }
-    if (key) [...old.querySelectorAll('button, a')].find(e => (e.dataset.api ?? e.getAttribute('href')) === key)?.focus();
+    if (key) [...old.querySelectorAll('button, a, input[data-again]')].find(e => keyed(e) === key)?.focus();
   }
 }
 // What was not replaced under the hands of somebody is, as soon as they leave it.
