@@ -73,17 +73,10 @@ def noticed(mutation: Mutation, copy: Path) -> str:
         )
     paths = os.pathsep.join(str(copy / each) for each in ("src", "sims", "drivers", "", "benchmarks"))
     tests = [f"src/reseau/{mutation.file}", *mutation.tests]
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x",
-        "-n",
-        "0",
-        "-o",
-        f"cache_dir={ROOT / '.pytest_cache'}",
-    ]
+    # A file of the package is searched for its examples alone.
+    settings = {"cache_dir": ROOT / ".pytest_cache", "python_functions": "test_*", "python_classes": "none"}
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0"]
+    command += [word for key, value in settings.items() for word in ("-o", f"{key}={value}")]
     path.write_text(source.replace(mutation.was, mutation.becomes), "utf-8")
     try:
         done = subprocess.run(

@@ -30,7 +30,6 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from reseau import sessions
 from reseau.archive import Archive, Session
 from reseau.calibration import Calibration
 from reseau.capture import Bench, BenchFile, BenchLock, InstrumentEntry
@@ -49,6 +48,7 @@ from reseau.service import (
     Schedule,
     Schedules,
 )
+from reseau.sessions import conducting
 
 NAME, WEEKS = "left", 52
 AXES = ("tilt", "roll", "camera_roll")
@@ -141,7 +141,7 @@ class Year:
     def capture(self, session: Session, bench: Bench, **_: Any) -> None:
         """Take and adjust the photographs of a session, or draw its calibration."""
         if self.week in self.on_bench:
-            sessions.capture(session, bench)
+            conducting.capture(session, bench)
         else:
             session.keep("calibration.json", self._drawn().to_json())
             session.end("done")
@@ -174,14 +174,14 @@ class Year:
         given = {"steps": steps, "pitch_mm": 0.027, "free": list(FREE), "row_jitter_px": 0.0086, "fill": 0.8,
                  "home": True}  # fmt: skip
         inputs = {"design.json": self.simulated.laboratory.field.design.to_json()}
-        session = sessions.begin(self.archive, "first", "testfield", given, inputs, bench=self._toml())
+        session = conducting.begin(self.archive, "first", "testfield", given, inputs, bench=self._toml())
         if -1 in self.on_bench:
             with self.bench(self.file) as bench:
-                sessions.capture(session, bench)
+                conducting.capture(session, bench)
         else:
             session.keep("calibration.json", drawn_base(self.truth).to_json())
             session.end("done")
-        self.base = sessions.calibration_of(session)
+        self.base = conducting.calibration_of(session)
         self.known.define(NAME, {"camera": "simulated", "lens": "57.5 mm", "firmware": "1.0"})
         self.known.decide(NAME, self.base, RULES, since=self.now, by="Ada")
         self.review("first calibration")

@@ -17,6 +17,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import psutil  # type: ignore[import-untyped, unused-ignore]
@@ -67,8 +68,8 @@ def examine(driver: str, address: str, seconds: float = 2.0) -> Iterator[Finding
 def _endpoint(address: str) -> tuple[str, int] | None:
     """Host and port of an address; port 0 for datagrams."""
     if "://" in address:
-        parts = urlsplit(address)
-        return (parts.hostname or "", 0 if parts.scheme == "udp" else parts.port or 0)
+        url = urlsplit(address)
+        return (url.hostname or "", 0 if url.scheme == "udp" else url.port or 0)
     parts = address.split("::")
     if len(parts) < 2 or not parts[0].upper().startswith("TCPIP"):
         return None
@@ -127,12 +128,13 @@ def _user() -> str:
 
 
 def _holders(path: str) -> Iterator[str]:
-    """Other processes that have a device open."""
+    """Other processes that have a device open; who serves a pseudo-terminal has its other end."""
     for folder in Path("/proc").glob("[0-9]*"):
         if int(folder.name) == os.getpid():
             continue
         with suppress(OSError):
-            if any(os.readlink(fd) == path for fd in (folder / "fd").iterdir()):
+            opened = {os.readlink(fd) for fd in (folder / "fd").iterdir()}
+            if path in opened and not {"/dev/ptmx", "/dev/pts/ptmx"} & opened:
                 yield f"{(folder / 'comm').read_text().strip()} (process {folder.name})"
 
 
@@ -180,7 +182,7 @@ def _network(host: str, port: int, seconds: float) -> Iterator[Finding]:
     yield from _echoes(str(where[0]))
 
 
-def _connects(host: str, family: int, where: object, port: int, seconds: float) -> Iterator[Finding]:
+def _connects(host: str, family: int, where: Any, port: int, seconds: float) -> Iterator[Finding]:
     """How often a connection comes about, and how fast."""
     took = list[float]()
     for _ in range(_CONNECTS):

@@ -111,6 +111,7 @@ def test_what_a_cause_explains_is_stated_in_pixels() -> None:
     assert 0.3 < found.share < 1.0
 
 
+@pytest.mark.slow
 def test_errors_of_the_projection_contain_what_the_lens_could_have() -> None:
     sound = calibrated(world()).explanation.projection_variance(0, 9)
     wrong = calibrated(world(lens=np.array([-0.2, 0.05, 3e-4, -2e-4, 0.05]))).explanation.projection_variance(

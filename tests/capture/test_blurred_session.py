@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau import sessions
 from reseau.archive import Archive, Session
 from reseau.capture import Bench, BenchFile, InstrumentEntry
 from reseau.capture.bench import built
@@ -18,6 +17,7 @@ from reseau.core.data import Frame
 from reseau.core.errors import FormatError, UsageError
 from reseau.instruments import Instrument
 from reseau.io.network import Network1
+from reseau.sessions import conducting
 from reseau_drivers.camera import v4l2
 from reseau_sims import Water
 from reseau_sims.frame import PROJECT_POSES, SpaceFrame, project
@@ -51,11 +51,11 @@ def captured(folder: Path) -> tuple[Session, Laboratory, Any]:
             "psf_px": 0.7,
         }
         archive = Archive.open(folder, create=True)
-        session = sessions.begin(archive, "wet", "blurred", parameters, inputs, bench=text)
+        session = conducting.begin(archive, "wet", "blurred", parameters, inputs, bench=text)
         with Bench(file.model_copy(update={"instruments": used}), build) as bench:
-            sessions.capture(session, bench)
+            conducting.capture(session, bench)
         assert not any(simulated.violations.values())
-        return session, simulated.laboratory, sessions.procedure_of(session)
+        return session, simulated.laboratory, conducting.procedure_of(session)
 
 
 @pytest.mark.slow
@@ -65,7 +65,7 @@ def test_a_session_measures_blurred_targets_under_water_by_rays(tmp_path: Path) 
     results = {each.name: session.content(each) for each in session.results()}
     assert {"round-0.json", "round-1.json", "result.json", "network.json", "report.html"} <= set(results)
     # The same frames of the archive give the same bytes.
-    assert all(each.same for each in sessions.rerun(session))
+    assert all(each.same for each in conducting.rerun(session))
 
     frame = laboratory.field.frame
     assert frame is not None
@@ -93,9 +93,9 @@ def test_frames_without_the_targets_are_declined(tmp_path: Path) -> None:
     inputs = {"network.json": project(frame, poses, water), **frame.documents}
     parameters = {"steps": [[name, dict(at)] for name, at in PROJECT_POSES.items()]}
     archive = Archive.open(tmp_path / "archive", create=True)
-    session = sessions.begin(archive, "dry", "blurred", parameters, inputs)
-    procedure: Any = sessions.procedure_of(session)
-    step = sessions.parameters_of(session).poses()[0]  # type: ignore[attr-defined]
+    session = conducting.begin(archive, "dry", "blurred", parameters, inputs)
+    procedure: Any = conducting.procedure_of(session)
+    step = conducting.parameters_of(session).poses()[0]  # type: ignore[attr-defined]
     blank = Frame(np.random.default_rng(0).normal(200.0, 1.0, (480, 640)), 255.0, "blank")
     assert not procedure.on_frame(blank, step).ok
     assert "stand out" in procedure.on_frame(blank, step).why
@@ -108,8 +108,8 @@ def test_frames_without_the_targets_are_declined(tmp_path: Path) -> None:
 def test_an_input_of_another_kind_is_refused(tmp_path: Path) -> None:
     archive = Archive.open(tmp_path / "archive", create=True)
     with pytest.raises(UsageError, match="missing input"):
-        sessions.begin(archive, "mine", "blurred", {"steps": []}, {})
+        conducting.begin(archive, "mine", "blurred", {"steps": []}, {})
     frame = SpaceFrame()
     inputs = {"network.json": frame.documents["targets.json"], **frame.documents}
     with pytest.raises(FormatError, match=r"network\.json"):
-        sessions.begin(archive, "mine", "blurred", {"steps": []}, inputs)
+        conducting.begin(archive, "mine", "blurred", {"steps": []}, inputs)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau import sessions
 from reseau.archive import Archive, Session
 from reseau.archive.verification import verify
 from reseau.calibration import Calibration
@@ -19,8 +18,13 @@ from reseau.capture.bench import built
 from reseau.core.errors import UsageError
 from reseau.instruments import CameraRig, ExposureSet, Instrument
 from reseau.optics.poses import matrix_to_vector, rotation_matrix
-from reseau.sessions import FramesParameters, TestfieldParameters
-from reseau.sessions.parameters import BlurredParameters, SensorParameters
+from reseau.sessions import conducting
+from reseau.sessions.parameters import (
+    BlurredParameters,
+    FramesParameters,
+    SensorParameters,
+    TestfieldParameters,
+)
 from reseau_drivers.camera import Rig, RigSettings, v4l2
 from reseau_sims.serving import SimulatedCamera, StripeScene, VideoCamera, View
 from reseau_sims.serving.bench import SEATS, SimulatedBench
@@ -61,7 +65,7 @@ def taken(session: Session) -> list[tuple[str, int, bool]]:
 def test_frames_of_a_rig_are_stored_by_exposure_with_their_skew(archive: Archive) -> None:
     session = archive.begin("monday", "frames", {"count": 3, "camera": "rig"})
     with pair(striped()) as bench:
-        sessions.capture(session, bench)
+        conducting.capture(session, bench)
     assert session.status == "done"
     assert taken(session) == [(f"{side}/{k:05d}", 0, True) for k in range(3) for side in SIDES]
     view = View(10_000.0, 0.0, 0.0, 0, 0, 96, 64, 255.0)
@@ -87,7 +91,7 @@ def test_a_stopped_session_of_a_rig_is_resumed_without_another_exposure(archive:
         with pytest.raises(UsageError):
             carry_out(run, half(run))
         before = [frame.sha256 for frame in session.frames(kind="frame")]
-        sessions.capture(session, bench)
+        conducting.capture(session, bench)
     frames = session.frames(kind="frame")
     assert [frame.sha256 for frame in frames][:4] == before
     assert taken(session) == [(f"{side}/{k:05d}", 0, True) for k in range(4) for side in SIDES]
@@ -160,8 +164,8 @@ def test_a_rig_is_calibrated_live_and_computed_again_to_the_byte(count: int, arc
     events: list[tuple[str, dict[str, Any]]] = []
     with before_field(count) as (bench, simulated):
         design = simulated.laboratory.field.design.to_json()
-        session = sessions.begin(archive, "monday", "testfield", given(), {"design.json": design})
-        assert sessions.capture(session, bench, watch=lambda k, v: events.append((k, v))) is None
+        session = conducting.begin(archive, "monday", "testfield", given(), {"design.json": design})
+        assert conducting.capture(session, bench, watch=lambda k, v: events.append((k, v))) is None
         distance = simulated.laboratory.field.distance_mm
     names = list(SEATS)[:count]
     assert len(session.frames(kind="frame")) == count * len(POSES)
@@ -186,7 +190,7 @@ def test_a_rig_is_calibrated_live_and_computed_again_to_the_byte(count: int, arc
         error = np.concatenate([off, np.array(place.base) - seat.base_mm])
         # Chi square of six degrees of freedom, 1e-5.
         assert error @ np.linalg.solve(np.array(place.covariance), error) < 33.0
-    assert all(each.same for each in sessions.rerun(session))
+    assert all(each.same for each in conducting.rerun(session))
 
 
 def test_poses_are_not_chosen_and_heights_not_used_for_a_rig() -> None:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reseau import sessions
 from reseau.archive import Archive
 from reseau.bundle import Result
 from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry, Step, carry_out, plans
@@ -18,6 +17,7 @@ from reseau.instruments import Instrument
 from reseau.procedures.calibration import calibrate_camera
 from reseau.procedures.calibration_options import CalibrationOptions, CameraOptions
 from reseau.procedures.target_measurement import measurer_of
+from reseau.sessions import conducting
 from reseau_drivers.camera import v4l2
 from reseau_sims import Water
 from reseau_sims.serving import SimulatedBench
@@ -55,10 +55,10 @@ def test_a_session_under_water_gives_the_calibration_of_the_camera_in_air(tmp_pa
         file = BenchFile.parse_toml(text, where="bench.toml")
         used = {name: file.instruments[name] for name in ("table", "camera")}
         archive = Archive.open(tmp_path / "archive", create=True)
-        session = sessions.begin(
+        session = conducting.begin(
             archive, "wet", "testfield", TESTFIELD, {"design.json": design.to_json()}, bench=text
         )
-        procedure: Any = sessions.procedure_of(session)
+        procedure: Any = conducting.procedure_of(session)
         with Bench(file.model_copy(update={"instruments": used}), build) as bench:
             acquisition = Acquisition(bench, session, procedure)
             carry_out(acquisition, plans.homed(acquisition, plans.poses(acquisition, STEPS)))

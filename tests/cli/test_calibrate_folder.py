@@ -83,6 +83,7 @@ def test_where_nothing_can_be_calibrated_no_folder_is_made(reseau: Run, photos: 
     assert list(tmp_path.iterdir()) == [few]
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_completed_is_left_as_it_was(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,7 +18,6 @@ import pytest
 from tests.capture.simple import CameraSettings, Simple, Taken
 
 import reseau
-from reseau import sessions
 from reseau.archive import Archive
 from reseau.bundle import Camera, adjust_network, example_network
 from reseau.capture import Acquisition, Bench, BenchFile, InstrumentEntry, carry_out
@@ -30,6 +29,7 @@ from reseau.optics import PixelGrid, Pose, Sensor, camera_model, project
 from reseau.optics.cameras import registry
 from reseau.optics.formation import Outline, draw
 from reseau.optics.mapping import PlaneMapping
+from reseau.sessions import conducting, kinds
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "contributing" / "examples"
 GRID = PixelGrid(640, 480, (0.01, 0.01))
@@ -198,12 +198,12 @@ def test_a_session_runs_the_procedure_live_and_again_from_the_archive(tmp_path: 
     camera = _Flickering("camera", CameraSettings())
     bench = Bench(BenchFile(name="lamp", instruments={"camera": entry}), lambda name, entry: camera)
     with Archive.open(tmp_path / "archive", create=True) as archive, bench:
-        session = sessions.begin(archive, "monday", "flicker", {"count": 40})
-        given = sessions.parameters_of(session)
-        kind = sessions.kind_of("flicker")
-        run = Acquisition(bench, session, sessions.procedure_of(session), camera="camera")
+        session = conducting.begin(archive, "monday", "flicker", {"count": 40})
+        given = conducting.parameters_of(session)
+        kind = kinds.kind_of("flicker")
+        run = Acquisition(bench, session, conducting.procedure_of(session), camera="camera")
         carry_out(run, kind.acquire(run, given))
-        again = sessions.rerun(archive.session("monday"))
+        again = conducting.rerun(archive.session("monday"))
         assert [(each.result.name, each.same) for each in again] == [("flicker.json", True)]
         result = json.loads(again[0].content or "")
         assert result["frames"] == 40
@@ -212,6 +212,6 @@ def test_a_session_runs_the_procedure_live_and_again_from_the_archive(tmp_path: 
 
 def test_unknown_names_are_one_line_that_lists_what_there_is() -> None:
     with pytest.raises(UsageError, match="unknown plan; use testfield"):
-        sessions.kind_of("nothing")
+        kinds.kind_of("nothing")
     with pytest.raises(UsageError, match="use one of brown"):
         camera_model("nothing")

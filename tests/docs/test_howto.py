@@ -34,18 +34,16 @@ CAMERA = {
 }
 """Pages that use what the tour of a camera has made."""
 ALONE = (
-    "fiducial-marks", "n-wire-phantom", "reseau-on-film", "several-cameras", "sharpness", "sheet-of-disks",
-    "turntable",
+    "coded-testfield", "fiducial-marks", "n-wire-phantom", "reseau-on-film", "sensor-from-files",
+    "several-cameras", "sharpness", "sheet-of-disks", "turntable",
 )  # fmt: skip
 """Pages that draw what they need."""
+OF_TOURS = {"blurred-network": "blurred-under-water", "through-water-or-glass": "underwater"}
+"""Pages that show commands of a tour, with their output."""
 APART = {
-    "blurred-network": "follows the tour under water of blurred targets",
-    "coded-testfield": "shows one frame of the tour of a bench",
     "live-picture": "needs a camera",
-    "sensor-from-files": "needs a camera",
     "several-machines": "needs a cluster",
     "temperature-zoom-focus": "needs an archive of months",
-    "through-water-or-glass": "follows the tour under water",
     "when-an-adjustment-fails": "needs a network that fails",
 }
 """Pages whose output is not made anew here."""
@@ -57,7 +55,14 @@ def test_every_page_with_output_is_followed_or_named() -> None:
     shown = {page.stem for page in (DOCS / "howto").glob("*.md") if "```console" in page.read_text("utf-8")}
     followed = {*CAMERA, *ALONE, "film-frames", "micmac-and-metashape"}
     followed |= {"correct-your-own-instrument", "measure-a-reseau", "coordinates-from-elsewhere"}
-    assert shown == followed | set(APART)
+    assert shown == followed | set(APART) | set(OF_TOURS)
+
+
+@pytest.mark.parametrize("page", OF_TOURS)
+def test_pages_that_show_a_command_of_a_tour_show_its_output(page: str) -> None:
+    followed = {step.text: step.shown for step in steps(f"tours/{OF_TOURS[page]}")}
+    for step in steps(f"howto/{page}"):
+        assert step.kind != "command" or set(step.shown) <= {*followed[step.text], "..."}
 
 
 @pytest.fixture(scope="module")

@@ -131,11 +131,12 @@ def test_a_command_or_an_option_that_does_not_exist_is_seen() -> None:
 
 
 @pytest.mark.parametrize("page", sorted((DOCS / "howto").glob("*.md")), ids=lambda page: page.stem)
-def test_a_how_to_is_one_task_on_at_most_two_screens(page: Path) -> None:
+def test_a_how_to_is_one_task_on_at_most_two_screens_with_a_picture_and_the_next_step(page: Path) -> None:
     text = page.read_text("utf-8")
     assert len(re.findall(r"^# ", prose(page), re.MULTILINE)) == 1
     if page.stem != "index":
         assert len(text.splitlines()) <= TWO_SCREENS
+        assert re.search(r"^!\[", text, re.MULTILINE)
         assert re.search(r"Next:\s+\[", text)
         assert re.search(rf"^{page.stem}$", (DOCS / "howto" / "index.md").read_text("utf-8"), re.MULTILINE)
 

@@ -11,7 +11,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-__all__ = ["behaviours", "counted"]
+__all__ = ["behaviours", "counted", "named"]
 
 _HERE = Path(__file__).parent
 
@@ -20,6 +20,13 @@ def behaviours() -> dict[str, list[dict[str, Any]]]:
     """Rows of ``behaviours.toml`` by their kind."""
     found: dict[str, list[dict[str, Any]]] = tomllib.loads((_HERE / "behaviours.toml").read_text("utf-8"))
     return found
+
+
+def named() -> list[str]:
+    """Makers and models of ``models.toml``, as in answers to ``*IDN?``."""
+    told = tomllib.loads((_HERE / "models.toml").read_text("utf-8"))["named"]
+    whole = (f"{row['maker']},{model}" if row["maker"] else model for row in told for model in row["models"])
+    return list(dict.fromkeys(whole))
 
 
 def counted() -> tuple[Counter[str], set[str]]:
@@ -41,3 +48,4 @@ if __name__ == "__main__":
     for kind, count in number.items():
         print(f"{count:5d} {kind}")
     print(f"{number.total():5d} distinct behaviours from {len(sources)} public sources")
+    print(f"{len(named()):5d} models of oscilloscopes that public packages name")

@@ -24,6 +24,11 @@ Faults of the line: late (0.2 s), dropped, truncated, repeated, corrupted, disco
 instrument: stuck, wrong state, out of range, power-cycled. `test_endurance` continues with one fault in a
 hundred answers.
 
+Fakes that are written from threads and manuals are worked on, too: `pytest -m slow
+tests/drivers/test_profiles.py` spoils 10 000 answers of all profiles of oscilloscopes, of GRBL and its kin,
+Zaber and T-Cubes at random (truncated, delayed, dropped, repeated, stale, reordered, reset, wrong checksum);
+no picture, waveform or position that is returned is wrong.
+
 For cameras an answer is a frame. Late: it is sent late; dropped: it is lost completely; truncated: half of
 its packets are lost (GigE Vision) or half of its data are missing (V4L2); corrupted: the same, because
 packets with a wrong checksum are discarded, or its buffer is marked as damaged; repeated: the previous frame

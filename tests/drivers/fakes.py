@@ -267,8 +267,7 @@ class Spoiled(Wire):
             case "reordered":
                 return said[at:] + said[:at]
             case "reset":
-                self.there.reset()
-                return b""
+                return self.there.reset() or b""
         start = said.index(b"IDAT") + 4 if b"IDAT" in said else 1
         at = start + int(self._rng.integers(max(1, len(said) - start - (20 if start > 1 else 6))))
         return said[:at] + bytes([said[at] ^ 1 << int(self._rng.integers(8))]) + said[at + 1 :]
@@ -316,10 +315,11 @@ class GrblBoard:
         self.homed = False
         return self._begin()
 
-    def reset(self) -> None:
-        """Switch it off and on, unheard; it counts from 0 where it stands."""
+    def reset(self) -> bytes:
+        """Switch it off and on; it counts from 0 where it stands. Its banner is lost if a status tells."""
         self.place, self.off = 0.0, self.off + self.place
-        self.start()
+        said = self.start()
+        return b"" if self.locks or self.tells or "FluidNC" not in self.version else said
 
     def _begin(self) -> bytes:
         self.state = "Alarm" if self.locks and not self.homed else "Idle"

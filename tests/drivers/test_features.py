@@ -13,6 +13,7 @@ from reseau.capture import BenchFile
 from reseau.cli import run
 from reseau.core.errors import RefusedError
 from reseau_drivers.camera import aravis, v4l2
+from reseau_drivers.codecs.pixels import GENICAM
 from reseau_sims.serving import GigeVisionCamera, SimulatedCamera, VideoCamera
 
 from .rigs import vision_cameras
@@ -32,7 +33,7 @@ def test_features_have_values_ranges_and_units(served: GigeVisionCamera) -> None
         assert (exposure.kind, exposure.unit, exposure.low, exposure.high) == ("float", "us", 10.0, 1e7)
         assert (width.kind, width.value, width.low, width.high) == ("integer", "64", 1.0, 96.0)
         assert str(gain) == "Gain = 0 dB, 0 to 24 dB"
-        assert found["PixelFormat"].entries == ("Mono8", "Mono12", "Mono16", "BayerRG8")
+        assert found["PixelFormat"].entries == tuple(GENICAM)
         assert not found["SensorWidth"].writable
         assert found["AcquisitionStart"].kind == "command"
         assert {each.name for each in camera.features("trigger")} >= {"TriggerMode", "TriggerSource"}
@@ -43,7 +44,7 @@ def test_features_have_values_ranges_and_units(served: GigeVisionCamera) -> None
     ("name", "value", "said"),
     [
         ("Gain", "99", "Gain = 99: Gain = 0 dB, 0 to 24 dB"),
-        ("PixelFormat", "RGB8", "it is one of Mono8, Mono12, Mono16, BayerRG8"),
+        ("PixelFormat", "Coord3D_A8", "it is one of Mono8, Mono10, Mono12"),
         ("SensorWidth", "5", "SensorWidth cannot be changed now"),
         ("Nope", "1", "has no feature Nope"),
     ],

@@ -15,11 +15,12 @@ import pytest
 
 from reseau.core.errors import FormatError, InputError, InstrumentError, ProtocolError, SettingError
 from reseau_drivers.link import SerialLink
-from reseau_drivers.oscilloscope import DIALECTS, Oscilloscope, oscilloscope
+from reseau_drivers.oscilloscope import DIALECTS, Oscilloscope, dialect_of, oscilloscope
 from reseau_drivers.oscilloscope.dialects import Formula, described, dialect_named, read_profiles
 from reseau_drivers.profiles import FOLDER
 from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, Table, Zaber
 
+from .behaviours import named
 from .fakes import GrblBoard, Lines, Screen, Spoiled, TCube, Transcript, Wire, ZaberStage, transcripts
 from .test_references import FLUID, FLUID_VERSION, HAL, HAL_VERSION
 
@@ -49,6 +50,11 @@ def test_screens_and_waveforms_are_those_of_the_instrument(told: dict[str, Any])
             assert wave.volts.tolist() == pytest.approx(told["volts"], abs=1e-9)
             assert (wave.start_s, wave.step_s) == pytest.approx(told["time"], rel=1e-9)
     assert fake.violations == []
+
+
+@pytest.mark.parametrize("model", named())
+def test_models_that_public_packages_name_have_a_profile(model: str) -> None:
+    assert dialect_of(f"{model},1,1") is not None
 
 
 def test_every_profile_has_a_fake() -> None:
@@ -159,7 +165,7 @@ def test_every_line_of_a_profile_names_a_source(path: Path) -> None:
     for line in text.splitlines():
         if (
             not line
-            or line.startswith(("[", "name = ", "schema = ", "maker = "))
+            or line.startswith(("[", "#", "name = ", "schema = ", "maker = "))
             or re.match(r'\d+ = "', line)
         ):
             continue
@@ -171,12 +177,17 @@ def test_every_line_of_a_profile_names_a_source(path: Path) -> None:
 
 def test_a_file_of_ones_own_is_a_dialect(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text(described("Rigol 1000Z").replace('"Rigol 1000Z"', '"Rigol mine"'))
+    own = described("Rigol 1000Z").replace('"Rigol 1000Z"', '"Rigol mine"')
+    path.write_text(own + 'ends = "\\r\\n"\n')
     fake = Transcript(next(told for told in TOLD if told["profile"] == "Rigol 1000Z"))
-    with oscilloscope("scope", Wire(fake), dialect=str(path), seconds=0.5) as scope:
+    wire, said = Wire(fake), list[bytes]()
+    wire.write = lambda data, deadline: (said.append(data), Wire.write(wire, data, deadline))[1]  # type: ignore[method-assign]
+    with oscilloscope("scope", wire, dialect=str(path), seconds=0.5) as scope:
         assert fake.screen.shows(scope.screen().data)
+        assert {data[-2:] for data in said} == {b"\r\n"}
         assert scope.dialect is not None
         assert scope.dialect.name == "Rigol mine"
+    assert read_profiles(described(f"{path}#Rigol mine"), where=path)[1][0].ends == "\r\n"
     assert dialect_named(f"{path}#Rigol mine").models == r"(DS|MSO)1\d{3}Z"
     with pytest.raises(SettingError, match="choose from Rigol mine"):
         dialect_named(f"{path}#other")
@@ -198,6 +209,15 @@ OWN = described("Rigol 1000Z")
         (OWN.replace("fetch :DISP", "grab :DISP"), r"`screen.0`: String should match"),
         (OWN.replace("(code - y0 - yref) * dy", "code ** 2"), r"has more than \+ - \* /"),
         (OWN.replace("(code - y0 - yref) * dy", "(code"), "is not a formula"),
+        (OWN.replace("(code - y0 - yref) * dy", "code * gain"), "no query gives gain"),
+        (OWN.replace('dtype = "u1"', 'dtype = "u9"'), "'u9' is no data type"),
+        (OWN.replace("fetch :DISPlay", "fetch {name}:DISPlay"), r"`screen.0`: String should match"),
+        (
+            OWN.replace(
+                'examples = ["RIGOL TECHNOLOGIES,DS1104Z', 'examples = ["DS1104Z", "RIGOL TECHNOLOGIES,'
+            ),
+            "`examples.0`",
+        ),
         (OWN.replace("(code - y0 - yref) * dy", "__import__('os')"), r"has more than \+ - \* /"),
     ],
 )
@@ -205,6 +225,13 @@ def test_a_file_that_is_no_profile_is_refused_in_one_line(text: str, message: st
     with pytest.raises(FormatError, match=message) as caught:
         read_profiles(text, where="mine.toml")
     assert "\n" not in str(caught.value)
+
+
+def test_all_profiles_are_listed_and_shown() -> None:
+    listed = [line.partition(":")[0] for line in described().splitlines()]
+    assert set(listed) == {dialect.name for dialect in DIALECTS} | {"grbl", "smc100", "zaber"}
+    for name in listed:
+        assert "[sources]" in described(name)
 
 
 def test_formulas() -> None:

@@ -345,6 +345,7 @@ def test_the_document_contains_principal_point_axes_and_scale() -> None:
     assert 0 < t < 1
 
 
+@pytest.mark.slow
 def test_a_sharp_edge_is_not_displaced_by_the_grid_of_the_pixels() -> None:
     """Its pixels are smoothed with their neighbours; by a Gaussian step it was displaced by up to 0.4 px."""
     frame = FilmFrame(31, tilt_deg=-0.05, blur_px=0.2, noise=0.7, grain=0.3, contrast=0.6)

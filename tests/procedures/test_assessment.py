@@ -119,6 +119,7 @@ def test_photographs_with_another_zoom_are_named_and_not_made_up_for_by_another_
     assert "; some photographs have another zoom, size or crop (" in found.lines[0]
 
 
+@pytest.mark.slow
 def test_a_bent_target_that_is_held_flat_is_no_fault_of_the_photographs() -> None:
     bent = measured(bent=1.5)
     found = calibrated(bent, options=CalibrationOptions(target="flat")).assessments["camera"]

@@ -95,14 +95,8 @@ def test_the_board_that_photographs_show_is_measured_in_place_of_the_told_one(
         assert len(each.found) > 0.9 * len(printed.ids)
 
 
-@pytest.mark.parametrize(
-    "told",
-    [
-        pytest.param((7, 9), id="too large", marks=pytest.mark.slow),
-        pytest.param((7, 7), id="a row less", marks=pytest.mark.slow),
-        pytest.param((6, 8), id="a column less"),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("told", [(7, 9), (7, 7), (6, 8)], ids=["too large", "a row less", "a column less"])
 def test_a_deltille_told_wrongly_is_measured_as_it_is_printed(told: tuple[int, int]) -> None:
     printed = prints.Deltille(7, 8, 20.0)
     frames = [

@@ -155,6 +155,7 @@ def test_boards_of_other_programs_beside_photographs_are_candidates(tmp_path: Pa
     assert str(tmp_path / "camchain.yaml") not in found
 
 
+@pytest.mark.slow
 def test_parts_of_a_larger_chessboard_are_not_taken_for_a_smaller_one() -> None:
     larger, smaller = board("chess", 9, 8, 24.0), board("chess", 7, 7, 24.0)
     frame, xy = picture(larger)

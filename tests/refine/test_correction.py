@@ -251,12 +251,12 @@ def test_the_covariance_of_coefficients_contains_the_errors_of_o_and_s(lost):
 
 
 def test_the_covariance_of_coefficients_contains_the_errors_of_the_design():
-    stated = tuple(p.model_copy(update={"sigma": 0.02}) for p in GRID.points)
+    stated = tuple(p.model_copy(update={"sigma": 1e-3}) for p in GRID.points)
     exact, squares = corrected(measured(world=PROJECTIVE)), 0.0
     for seed in range(12):
         rng = np.random.default_rng(100 + seed)
         # O and S are where the design has them, so that the common system is the same.
-        shifts = [rng.normal(0, 0.0 if p.id in (GRID.origin, GRID.axis) else 0.02, 2) for p in stated]
+        shifts = [rng.normal(0, 0.0 if p.id in (GRID.origin, GRID.axis) else 1e-3, 2) for p in stated]
         moved = [
             p.model_copy(update={"x": p.x + x, "y": p.y + y})
             for p, (x, y) in zip(stated, shifts, strict=True)

@@ -54,8 +54,9 @@ def test_m_and_n_define_the_system():
     np.testing.assert_allclose(ends, refined[[m, n]], atol=1e-9)
 
 
-@pytest.mark.parametrize("trials", [20, pytest.param(80, marks=pytest.mark.slow)])
-def test_predicted_covariances_of_true_coordinates_cover(trials):
+@pytest.mark.slow
+def test_predicted_covariances_of_true_coordinates_cover():
+    trials = 80
     rng = np.random.default_rng(1)
     squares = []
     for _ in range(trials):
@@ -71,6 +72,7 @@ def test_predicted_covariances_of_true_coordinates_cover(trials):
     assert abs(rms - 1) < 4 / np.sqrt(4 * trials)
 
 
+@pytest.mark.slow
 def test_errors_that_rods_share_act_together_in_the_covariance():
     camera, rods = _noise_free()
     exact = RODS.model_copy(

@@ -12,11 +12,12 @@ from threading import Barrier
 
 import pytest
 
-from reseau import sessions
 from reseau.archive import Archive
 from reseau.capture import Bench, BenchFile, BenchLock, InstrumentEntry
 from reseau.capture.bench import IN_PROCESS
 from reseau.core.errors import FormatError, ReseauError, StateError, UsageError
+from reseau.sessions import conducting, kinds
+from reseau.sessions.parameters import PhotographsParameters, TestfieldParameters
 
 from ..capture.fieldrig import DESIGN, FieldRig
 
@@ -38,22 +39,22 @@ def archive(tmp_path: Path) -> Archive:
 
 def test_a_program_captures_and_reruns_a_session(archive: Archive) -> None:
     rig, given = FieldRig(), {"design.json": DESIGN.to_json()}
-    sessions.check("monday", "testfield", TESTFIELD, given, rig.bench)
-    session = sessions.begin(archive, "monday", "testfield", TESTFIELD, given)
+    conducting.check("monday", "testfield", TESTFIELD, given, rig.bench)
+    session = conducting.begin(archive, "monday", "testfield", TESTFIELD, given)
     assert session.parameters == TESTFIELD  # as given, without defaults
-    assert sessions.capture(session, rig.bench) is None
+    assert conducting.capture(session, rig.bench) is None
     assert session.status == "done"
-    done = sessions.rerun(archive.session("monday"))
+    done = conducting.rerun(archive.session("monday"))
     assert [each.result.name for each in done] == ["calibration.json", "report.html", "scene.json"]
     assert all(each.same for each in done)
-    assert sessions.calibration_of(session).parameters["c"].unit == "mm"
+    assert conducting.calibration_of(session).parameters["c"].unit == "mm"
 
 
 def test_the_report_of_a_session_lists_the_frames_that_were_left_out(archive: Archive) -> None:
     away = [["edge on", {"tilt": 88.0, "roll": 0.0, "camera_roll": 0.0}]]
     given = {"design.json": DESIGN.to_json()}
-    session = sessions.begin(archive, "monday", "testfield", {**TESTFIELD, "steps": STEPS + away}, given)
-    sessions.capture(session, FieldRig().bench)
+    session = conducting.begin(archive, "monday", "testfield", {**TESTFIELD, "steps": STEPS + away}, given)
+    conducting.capture(session, FieldRig().bench)
     declined = session.frames(step="edge on", ok=False)[-1].verdict
     assert declined is not None
     results = {each.name: each for each in session.results()}
@@ -65,7 +66,7 @@ def test_the_report_of_a_session_lists_the_frames_that_were_left_out(archive: Ar
 def test_a_rerun_does_not_import_the_command_line() -> None:
     code = """
         import sys
-        from reseau import sessions
+        from reseau.sessions import conducting, kinds, parameters
         assert not [name for name in sys.modules if name.startswith("reseau.cli") or name == "typer"]
         """
     subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=True)
@@ -85,7 +86,7 @@ def test_wrong_parameters_are_refused_in_one_line_that_names_the_key(
     archive: Archive, plan: str, parameters: dict[str, object], text: str
 ) -> None:
     with pytest.raises(FormatError) as error:
-        sessions.begin(archive, "mine", plan, parameters, {"design.json": DESIGN.to_json()})
+        conducting.begin(archive, "mine", plan, parameters, {"design.json": DESIGN.to_json()})
     assert str(error.value).startswith(text)
     assert "\n" not in str(error.value)
     assert not archive.sessions()
@@ -93,9 +94,9 @@ def test_wrong_parameters_are_refused_in_one_line_that_names_the_key(
 
 def test_parameters_that_were_archived_unchecked_are_refused_by_a_rerun(archive: Archive) -> None:
     with pytest.raises(FormatError, match="mine: parameters of plan `sensor`: missing key `region`"):
-        sessions.rerun(archive.begin("mine", "sensor", {}))
+        conducting.rerun(archive.begin("mine", "sensor", {}))
     with pytest.raises(UsageError, match="mystery: unknown plan; use testfield, oscilloscope"):
-        sessions.rerun(archive.begin("other", "mystery", {}))
+        conducting.rerun(archive.begin("other", "mystery", {}))
 
 
 def test_parameters_of_older_versions_are_read(archive: Archive) -> None:
@@ -104,27 +105,27 @@ def test_parameters_of_older_versions_are_read(archive: Archive) -> None:
     session = archive.begin(
         "older", "testfield", {**older, "park": {}}, inputs={"design.json": DESIGN.to_json()}
     )
-    found = sessions.parameters_of(session)
-    assert isinstance(found, sessions.TestfieldParameters)
+    found = conducting.parameters_of(session)
+    assert isinstance(found, TestfieldParameters)
     assert (found.sigmas, found.retreat, found.expected) == (None, None, 4)
-    assert sessions.procedure_of(session) is not None
+    assert conducting.procedure_of(session) is not None
 
 
 def test_a_missing_input_is_named(archive: Archive) -> None:
     with pytest.raises(UsageError, match=r"a: design\.json: missing input"):
-        sessions.begin(archive, "a", "testfield", TESTFIELD)
+        conducting.begin(archive, "a", "testfield", TESTFIELD)
 
 
 def test_the_session_to_resume_is_found(archive: Archive) -> None:
     with pytest.raises(UsageError, match="frames: no session can be resumed"):
-        sessions.resume(archive, "frames")
-    first = sessions.begin(archive, "a", "frames", {})
-    assert sessions.resume(archive, "frames").name == "a"
-    sessions.begin(archive, "b", "frames", {})
+        conducting.resume(archive, "frames")
+    first = conducting.begin(archive, "a", "frames", {})
+    assert conducting.resume(archive, "frames").name == "a"
+    conducting.begin(archive, "b", "frames", {})
     with pytest.raises(UsageError, match="a, b can be resumed; name one"):
-        sessions.resume(archive, "frames")
+        conducting.resume(archive, "frames")
     first.end("done")
-    assert sessions.resume(archive, "frames").name == "b"
+    assert conducting.resume(archive, "frames").name == "b"
 
 
 def _bench(*addresses: str) -> Bench:
@@ -176,16 +177,16 @@ def test_two_demos_run_at_the_same_time(tmp_path: Path) -> None:
 
 def test_errors_of_this_package_are_of_one_tree() -> None:
     with pytest.raises(ReseauError, match="unknown plan"):
-        sessions.kind_of("mystery")
+        kinds.kind_of("mystery")
 
 
 def test_archives_with_the_former_keys_are_read_as_before(tmp_path: Path) -> None:
     former = {"model": "", "pitch": 0.027, "free": ["c"], "row_jitter": 0.01, "fill": 0.8}
     with Archive.open(tmp_path, create=True) as archive:
         archive.begin("old", plan="photographs", parameters=former)
-        given = sessions.parameters_of(archive.session("old"))
+        given = conducting.parameters_of(archive.session("old"))
         assert archive.session("old").parameters == former
-    assert isinstance(given, sessions.PhotographsParameters)
+    assert isinstance(given, PhotographsParameters)
     assert (given.pitch_mm, given.row_jitter_px) == (0.027, 0.01)
     with pytest.raises(FormatError, match="unknown key `pitch`"):
-        sessions.check("new", "photographs", former, {"design.json": ""})
+        conducting.check("new", "photographs", former, {"design.json": ""})

@@ -40,7 +40,7 @@ def alone(world: World) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("display", ["wong", "polynomial"])
+@pytest.mark.parametrize("display", ["wong", pytest.param("polynomial", marks=pytest.mark.slow)])
 def test_middles_of_arcs_are_at_their_true_positions(seed: int, display: str) -> None:
     world = quiet(World.standard(seed, display=display))  # type: ignore[arg-type]
     found = errors(echoes(world, world.rods), world.truth_ii(), alone(world))
@@ -181,6 +181,7 @@ def test_a_displaced_camera_shifts_everything_after_photo_i() -> None:
     assert np.abs(errors(echoes(pushed, pushed.rods), pushed.truth_ii(), alone(pushed))).max() < 0.02
 
 
+@pytest.mark.slow
 def test_a_rotated_test_object_is_imaged_rotated_but_the_body_is_not() -> None:
     straight, turned = (quiet(World.standard(2, faults=Faults(object_turned_deg=d))) for d in (0.0, 3.0))
 
@@ -197,6 +198,7 @@ def test_a_rotated_test_object_is_imaged_rotated_but_the_body_is_not() -> None:
     np.testing.assert_array_equal(truth.object_xy, straight.truth_ii().object_xy)
 
 
+@pytest.mark.slow
 def test_a_missing_row_of_rods_is_not_drawn() -> None:
     world = quiet(World.standard(2, faults=Faults(missing_row="D")))
     light, truth = echoes(world, world.rods), world.truth_ii()

@@ -15,7 +15,8 @@ import numpy as np
 from reseau.archive import Session, Verdict
 from reseau.capture import Step, plans
 from reseau.core.data import Frame
-from reseau.sessions import FramesParameters, SessionKind
+from reseau.sessions.kinds import SessionKind
+from reseau.sessions.parameters import FramesParameters
 
 
 class Flicker:

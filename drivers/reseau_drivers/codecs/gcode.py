@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from reseau.core.errors import ProtocolError, SettingError
 
-from ..profiles import controller
+from ..profiles import known
 from .numbers import number
 from .stream import LineMessageDecoder, excerpt
 
@@ -45,7 +45,7 @@ LIMIT = 256
 AXES = "XYZABC"
 """Letters of the axes, in order."""
 
-_KNOWN = controller("grbl")
+_KNOWN = known("grbl")
 ERRORS: dict[int, str] = {int(code): meaning for code, meaning in _KNOWN["errors"].items()}
 """Codes of ``error:``, those that a table can meet."""
 ALARMS: dict[int, str] = {int(code): meaning for code, meaning in _KNOWN["alarms"].items()}

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from reseau.core.errors import ProtocolError
 
+from ..profiles import known
+
 __all__ = ["GENICAM", "VIDEO", "PixelFormat", "decode", "encode", "size_of"]
 
 
@@ -96,99 +98,10 @@ class PixelFormat:
         return np.dtype(np.uint8 if self.bits <= 8 else "<u2")
 
 
-_BAYER = {"GR": "GRBG", "RG": "RGGB", "GB": "GBRG", "BG": "BGGR"}
-
-
-def _video(bits: int, stored: int, codes: str, packed: str = "") -> dict[str, PixelFormat]:
-    """Mosaics of V4L2, by their codes in the order of `_BAYER`."""
-    return {
-        f"S{pattern}{bits}{'P' if packed else ''}": PixelFormat(code, bits, stored, pattern, packed)
-        for pattern, code in zip(_BAYER.values(), codes.split(), strict=True)
-    }
-
-
-VIDEO: dict[str, PixelFormat] = {
-    "GREY": PixelFormat("GREY", 8, 1),
-    "Y10": PixelFormat("Y10 ", 10, 2),
-    "Y12": PixelFormat("Y12 ", 12, 2),
-    "Y14": PixelFormat("Y14 ", 14, 2),
-    "Y16": PixelFormat("Y16 ", 16, 2),
-    "Y10P": PixelFormat("Y10P", 10, 0, packed="mipi"),
-    "Y12P": PixelFormat("Y12P", 12, 0, packed="mipi"),
-    "Y14P": PixelFormat("Y14P", 14, 0, packed="mipi"),
-    "Y10BPACK": PixelFormat("Y10B", 10, 0, packed="stream"),
-    "RGB24": PixelFormat("RGB3", 8, 3, "RGB"),
-    "BGR24": PixelFormat("BGR3", 8, 3, "BGR"),
-    "YUYV": PixelFormat("YUYV", 8, 2, "YUYV"),
-    "UYVY": PixelFormat("UYVY", 8, 2, "UYVY"),
-    "NV12": PixelFormat("NV12", 8, 1, "NV12"),
-    "MJPEG": PixelFormat("MJPG", 8, 0, "MJPEG"),
-    **_video(8, 1, "GRBG RGGB GBRG BA81"),
-    **_video(10, 2, "BA10 RG10 GB10 BG10"),
-    **_video(12, 2, "BA12 RG12 GB12 BG12"),
-    **_video(14, 2, "GR14 RG14 GB14 BG14"),
-    **_video(16, 2, "GR16 RG16 GB16 BYR2"),
-    **_video(10, 0, "pgAA pRAA pGAA pBAA", "mipi"),
-    **_video(12, 0, "pgCC pRCC pGCC pBCC", "mipi"),
-    **_video(14, 0, "pgEE pREE pGEE pBEE", "mipi"),
-}
+_KNOWN = known("pixels")
+VIDEO: dict[str, PixelFormat] = {name: PixelFormat(*told) for name, told in _KNOWN["video"].items()}
 """Formats of V4L2, by the names of its documentation."""
-
-
-def _genicam(name: str, bits: int, stored: int, *codes: int, packed: str = "") -> dict[str, PixelFormat]:
-    """Mosaics of GenICam, by their codes in the order of `_BAYER`."""
-    return {
-        f"Bayer{each}{name}": PixelFormat(code, bits, stored, pattern, packed)
-        for (each, pattern), code in zip(_BAYER.items(), codes, strict=True)
-    }
-
-
-GENICAM: dict[str, PixelFormat] = {
-    "Mono8": PixelFormat(0x01080001, 8, 1),
-    "Mono10": PixelFormat(0x01100003, 10, 2),
-    "Mono12": PixelFormat(0x01100005, 12, 2),
-    "Mono14": PixelFormat(0x01100025, 14, 2),
-    "Mono16": PixelFormat(0x01100007, 16, 2),
-    "Mono10p": PixelFormat(0x010A0046, 10, 0, packed="p"),
-    "Mono12p": PixelFormat(0x010C0047, 12, 0, packed="p"),
-    "Mono14p": PixelFormat(0x010E0104, 14, 0, packed="p"),
-    "Mono10Packed": PixelFormat(0x010C0004, 10, 0, packed="gige"),
-    "Mono12Packed": PixelFormat(0x010C0006, 12, 0, packed="gige"),
-    **_genicam("8", 8, 1, *range(0x01080008, 0x0108000C)),
-    **_genicam("10", 10, 2, *range(0x0110000C, 0x01100010)),
-    **_genicam("12", 12, 2, *range(0x01100010, 0x01100014)),
-    **_genicam("14", 14, 2, *range(0x01100109, 0x0110010D)),
-    **_genicam("14p", 14, 0, *range(0x010E0105, 0x010E0109), packed="p"),
-    **_genicam("16", 16, 2, *range(0x0110002E, 0x01100032)),
-    **_genicam("10p", 10, 0, 0x010A0056, 0x010A0058, 0x010A0054, 0x010A0052, packed="p"),
-    **_genicam("12p", 12, 0, 0x010C0057, 0x010C0059, 0x010C0055, 0x010C0053, packed="p"),
-    **_genicam("10Packed", 10, 0, *range(0x010C0026, 0x010C002A), packed="gige"),
-    **_genicam("12Packed", 12, 0, *range(0x010C002A, 0x010C002E), packed="gige"),
-    **{
-        f"{order}{bits}": PixelFormat(code, bits, size, order)
-        for order, bits, size, code in (
-            ("RGB", 8, 3, 0x02180014),
-            ("BGR", 8, 3, 0x02180015),
-            ("RGB", 10, 6, 0x02300018),
-            ("BGR", 10, 6, 0x02300019),
-            ("RGB", 12, 6, 0x0230001A),
-            ("BGR", 12, 6, 0x0230001B),
-            ("RGB", 16, 6, 0x02300033),
-            ("BGR", 16, 6, 0x0230004B),
-        )
-    },
-    "RGBa8": PixelFormat(0x02200016, 8, 4, "RGBA"),
-    "BGRa8": PixelFormat(0x02200017, 8, 4, "BGRA"),
-    "RGB8_Planar": PixelFormat(0x02180021, 8, 1, _PLANES),
-    "RGB10_Planar": PixelFormat(0x02300022, 10, 2, _PLANES),
-    "RGB12_Planar": PixelFormat(0x02300023, 12, 2, _PLANES),
-    "RGB16_Planar": PixelFormat(0x02300024, 16, 2, _PLANES),
-    "YCbCr422_8": PixelFormat(0x0210003B, 8, 2, "YUYV"),
-    "YUV422_8": PixelFormat(0x02100032, 8, 2, "YUYV"),
-    "YUV422_8_UYVY": PixelFormat(0x0210001F, 8, 2, "UYVY"),
-    "YUV411_8_UYYVYY": PixelFormat(0x020C001E, 8, 0, "UYYVYY"),
-    "YUV8_UYV": PixelFormat(0x02180020, 8, 3, "UYV"),
-}
+GENICAM: dict[str, PixelFormat] = {name: PixelFormat(*told) for name, told in _KNOWN["genicam"].items()}
 """Formats of GenICam, by the names of the convention."""
 
 
@@ -287,7 +200,10 @@ def _joined(
 def _number(shared: NDArray[np.uint8], big: bool = False) -> NDArray[np.uint64]:
     """The number that a few bytes are."""
     order = range(shared.shape[-1])[:: -1 if big else 1]
-    return np.sum([shared[..., k].astype(np.uint64) << np.uint64(8 * n) for n, k in enumerate(order)], axis=0)
+    found = np.zeros(shared.shape[:-1], np.uint64)
+    for n, k in enumerate(order):
+        found |= shared[..., k].astype(np.uint64) << np.uint64(8 * n)
+    return found
 
 
 def _packed(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
@@ -303,10 +219,10 @@ def _packed(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
     word = np.sum([parts[:, k] << np.uint64(step * k) for k in range(count)], axis=0).astype("<u8")
     coded = word.view(np.uint8).reshape(-1, 8)
     if layout.packed in ("p", "stream"):
-        return coded[:, size - 1 :: -1].tobytes() if big else coded[:, :size].tobytes()
+        return bytes((coded[:, size - 1 :: -1] if big else coded[:, :size]).tobytes())
     rest = coded[:, : size - count]
     whole = [high[:, :1], rest, high[:, 1:]] if layout.packed == "gige" else [high, rest]
-    return np.hstack(whole).tobytes()
+    return bytes(np.hstack(whole).tobytes())
 
 
 def _words(rows: NDArray[np.uint8]) -> NDArray[Any]:

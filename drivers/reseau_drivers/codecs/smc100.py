@@ -13,7 +13,7 @@ from enum import Enum
 
 from reseau.core.errors import ProtocolError, SettingError
 
-from ..profiles import controller
+from ..profiles import known
 from .stream import excerpt
 
 __all__ = ["BITS", "ERRORS", "LIMIT", "Line", "Phase", "Status", "decode", "decode_status", "encode", "phase"]
@@ -23,7 +23,7 @@ LIMIT = 128
 
 _LINE = re.compile(rb"(\d{1,2})([A-Z]{2})([ -~]*)")
 
-_KNOWN = controller("smc100")
+_KNOWN = known("smc100")
 ERRORS: dict[str, str] = _KNOWN["errors"]
 """Answers to TE."""
 BITS: dict[int, str] = {int(bit, 16): meaning for bit, meaning in _KNOWN["bits"].items()}

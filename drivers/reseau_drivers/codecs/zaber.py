@@ -14,7 +14,7 @@ from typing import ClassVar
 
 from reseau.core.errors import ProtocolError, SettingError
 
-from ..profiles import controller
+from ..profiles import known
 from .stream import LineMessageDecoder, excerpt
 
 __all__ = [
@@ -37,7 +37,7 @@ __all__ = [
 LIMIT = 512
 """Largest size of an accepted message (bytes); devices send at most 80 by default."""
 
-_KNOWN = controller("zaber")
+_KNOWN = known("zaber")
 FAULTS: dict[str, str] = _KNOWN["flags"]
 """Fault and warning flags of an axis that may not be where it says, or will not move, with their meaning."""
 UNREFERENCED: tuple[str, ...] = tuple(_KNOWN["unreferenced"])

@@ -277,7 +277,8 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         while self._answer_pending and self._link.pending() and not deadline.expired:
             self._link.read(deadline)
         self._answer_pending = False
-        self._link.write(text.encode("ascii") + b"\n", deadline)
+        end = self._dialect.ends if self._dialect else "\n"
+        self._link.write(f"{text}{end}".encode("ascii"), deadline)
 
     def _start_query(self, text: str, deadline: Deadline) -> None:
         self._received.clear()

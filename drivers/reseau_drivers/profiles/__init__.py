@@ -2,7 +2,7 @@
 
 Those of oscilloscopes (``reseau-instrument-profile/1``) are read by
 :mod:`reseau_drivers.oscilloscope.dialects`, those of controllers
-(``reseau-controller-profile/1``) by the codecs.
+(``reseau-controller-profile/1``) and of pixels by the codecs.
 """
 
 from __future__ import annotations
@@ -11,17 +11,18 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-__all__ = ["FOLDER", "controller"]
+__all__ = ["CONTROLLERS", "FOLDER", "known"]
 
 FOLDER = Path(__file__).parent
+CONTROLLERS = ("grbl", "smc100", "zaber")
 
 
-def controller(name: str) -> dict[str, Any]:
-    """Return what is known of a controller: banners, codes, flags.
+def known(name: str) -> dict[str, Any]:
+    """Return what is known of a controller (banners, codes, flags), or of formats of pixels.
 
     Examples
     --------
-    >>> controller("grbl")["alarms"]["1"]
+    >>> known("grbl")["alarms"]["1"]
     'a limit switch was reached'
     """
     return tomllib.loads((FOLDER / f"{name}.toml").read_text("utf-8"))

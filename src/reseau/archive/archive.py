@@ -118,7 +118,7 @@ class Archive:
     ) -> Session:
         """Begin a session with its input files, in one transaction.
 
-        This method stores any parameters. :func:`reseau.sessions.begin` also checks them.
+        This method stores any parameters. :func:`reseau.sessions.conducting.begin` also checks them.
 
         Parameters
         ----------

@@ -159,7 +159,8 @@ def rerun(session: Session, procedure: Procedure) -> list[Rerun]:
     session : Session
         A session of the archive.
     procedure : Procedure
-        A new procedure, made with the parameters of the session; see :func:`reseau.sessions.procedure_of`.
+        A new procedure, made with the parameters of the session; see
+        :func:`reseau.sessions.conducting.procedure_of`.
 
     Examples
     --------

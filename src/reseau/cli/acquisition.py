@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ..archive import Archive, Session
     from ..capture import Bench
     from ..capture.engine import Decision
-    from ..sessions import SessionParameters
+    from ..sessions.parameters import SessionParameters
 
 
 def _from_toml(context: typer.Context, path: Path | None) -> Path | None:
@@ -138,8 +138,8 @@ def conduct(
     also_resumed : sequence of str
         Options of the command that can be used with ``--resume``; the session determines all others.
     """
-    from .. import sessions
     from ..service.orders import held_by_service
+    from ..sessions import conducting
 
     if where.resume:
         where.refuse_changes(also_resumed)
@@ -153,14 +153,14 @@ def conduct(
         if held_by_service(bench.file):
             _asked(where, archive, bench.file.name, name, order)
             return
-        with sessions.lock(bench, archive, name), bench:
+        with conducting.lock(bench, archive, name), bench:
             if not given.home:
                 given.check_homed(bench)
             session = begin(archive)
             with Display(where.as_json, given.frames_on(bench), plan == "scan", given.units) as display:
                 facts = {"session": session.name, "archive": where.archive, "poses": given.expected}
                 display.watch("begin", facts)
-                why = sessions.capture(
+                why = conducting.capture(
                     session, bench, watch=display.watch, operator=display.aside(operator),
                     paused=display.aside(_paused), home=where.home,
                 )  # fmt: skip
@@ -189,37 +189,37 @@ def _new(
     parameters: Callable[[Bench], SessionParameters | Mapping[str, Any]],
     inputs: Mapping[str, Path | None],
 ) -> _Started:
-    from .. import sessions
     from ..capture import Bench, BenchFile
     from ..io import read_text
+    from ..sessions import conducting, kinds
 
     texts = {}
     for role, path in inputs.items():
         if path is None:
-            option = sessions.input_option(role).replace("_", "-")
+            option = kinds.input_option(role).replace("_", "-")
             raise UsageError("is missing", where=f"--{option}", do="give the file")
         texts[role] = read_text(path)
-        sessions.kind_of(plan).read(texts[role], role, path)
+        kinds.kind_of(plan).read(texts[role], role, path)
     path = where.bench or Path("bench.toml")
     text = read_text(path)
     bench = Bench(BenchFile.parse_toml(text, where=path))
     name = where.name or f"{plan}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
     given = parameters(bench)
-    checked = sessions.check(name, plan, given, texts, bench)
+    checked = conducting.check(name, plan, given, texts, bench)
     order = {"name": name, "plan": plan, "parameters": checked.to_archive(), "inputs": texts}
 
     def begun(archive: Archive) -> Session:
-        return sessions.begin(archive, name, plan, given, texts, bench=text)
+        return conducting.begin(archive, name, plan, given, texts, bench=text)
 
     return name, checked, bench, begun, order
 
 
 def _resumed(archive: Archive, where: Where, plan: str) -> _Started:
-    from .. import sessions
     from ..capture import Bench, BenchFile
     from ..io import read_text
+    from ..sessions import conducting
 
-    session = sessions.resume(archive, plan, where.name)
+    session = conducting.resume(archive, plan, where.name)
     text = session.bench if where.bench is None else read_text(where.bench)
     bench = Bench(BenchFile.parse_toml(text, where=where.bench or session.name))
 
@@ -228,7 +228,7 @@ def _resumed(archive: Archive, where: Where, plan: str) -> _Started:
         return session
 
     order = {"name": session.name, "plan": plan}
-    return session.name, sessions.parameters_of(session), bench, recovered, order
+    return session.name, conducting.parameters_of(session), bench, recovered, order
 
 
 def _conclude(where: Where, session: Session, why: str | None) -> None:

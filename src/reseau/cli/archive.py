@@ -113,15 +113,15 @@ def rerun(
     as_json: v.AsJson = False,
 ) -> None:
     """Recompute the results of sessions from their frames, and compare them byte for byte."""
-    from .. import sessions
     from ..core.failure import Failure
     from ..core.provenance import canonical_json
+    from ..sessions import conducting
 
     with place.open() as found:
         names = [each.name for each in found.sessions() if each.results] if session is None else [session]
     rows, same = [], True
-    with computing.executor(["reseau.sessions"], len(names)) as executor:
-        for name, done in sessions.rerun_all(place.archive, place.objects, names, executor):
+    with computing.executor(["reseau.sessions.conducting"], len(names)) as executor:
+        for name, done in conducting.rerun_all(place.archive, place.objects, names, executor):
             if isinstance(done, Failure):
                 if session is not None:
                     required(done, name)

@@ -24,8 +24,7 @@ from .sensor import event, lines
 if TYPE_CHECKING:
     from ..archive import Session
     from ..capture import Bench
-    from ..sessions import TestfieldParameters
-    from ..sessions.parameters import BlurredParameters, SensorParameters
+    from ..sessions.parameters import BlurredParameters, SensorParameters, TestfieldParameters
 
 app = Commands(
     help="Acquire frames on a bench. Each frame is archived before the next exposure.",
@@ -103,7 +102,7 @@ def coded_field(
         from ..capture import Goal, paper_steps
         from ..capture.steps import at_heights, read_steps
         from ..instruments import Turntable
-        from ..sessions import TestfieldParameters
+        from ..sessions.parameters import TestfieldParameters
 
         if until:
             Goal.parse(until)
@@ -245,7 +244,7 @@ def _print_result(session: Session, out: Path | None, as_json: bool) -> None:
     """
     from ..core.errors import EstimationError
     from ..io import write_whole
-    from ..sessions import calibration_of, parameters_of
+    from ..sessions.conducting import calibration_of, parameters_of
 
     found = calibration_of(session)
     if out is not None:

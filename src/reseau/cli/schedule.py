@@ -225,10 +225,10 @@ def recalibrate(
         if repeats is not None:
             assert configuration is not None
             assert rules is not None
-            stated = None if data is None else CertificateData.read(data).to_dict()
+            certificate = None if data is None else CertificateData.read(data).to_dict()
             made = known.define(
                 name, found.session(repeats), configuration, AcceptanceRules.read(rules),
-                warm_up_minutes=warm_up_minutes, self_test=self_test, certificate=stated,
+                warm_up_minutes=warm_up_minutes, self_test=self_test, certificate=certificate,
                 notify=tuple(notify or ()), inside=tuple(inside or ()),
             )  # fmt: skip
             say(f"{name}: repeats {repeats}, plan {made.plan}, for {configuration}\n")

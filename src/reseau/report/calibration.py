@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from markupsafe import Markup
 
 from ..calibration import Calibration
@@ -37,13 +39,21 @@ def calibration_report(calibration: Calibration) -> str:
         assert figure is not None
         picture = to_svg(figure.get_figure(root=True))
     verdict = calibration.assessment
+    model: Mapping[str, object] = calibration.model
+    images = calibration.validity.get("images")
+    camera = f"{model.get('model')}, {model.get('width')} × {model.get('height')} px"
+    facts = [camera] if calibration.kind == "camera" else []
+    facts += [f"{images} photographs"] if images else []
+    facts += filter(None, [calibration.provenance.get("software")])
     sigma0 = [] if calibration.sigma0 is None else [(f"{calibration.sigma0:.3f}", "", "sigma0")]
     return rendered(
         "calibration.html.j2",
         title=f"Calibration {calibration.name}",
         kind=calibration.kind.capitalize(),
         summary=[(str(len(calibration.parameters)), "", "parameters"), *sigma0],
-        lines=[] if verdict is None else list(verdict.lines),
+        facts=facts,
+        lines=[] if verdict is None else list(verdict.lines or (verdict.short,)),
+        use="" if verdict is None else verdict.use.value,
         map=Markup(picture),
         parameters=calibration.printed(),
         **({"provenance": calibration.provenance} if calibration.provenance else {}),

@@ -13,12 +13,12 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from .. import sessions
 from ..archive import Archive, Session, Verdict
 from ..archive.records import ArchivedFrame
 from ..capture.steps import Step, as_taken
 from ..core.errors import ImageError, ReseauError
 from ..core.threads import one_thread
+from ..sessions import conducting
 from .decoding import PHOTOGRAPH, Decoder
 
 
@@ -41,7 +41,7 @@ def finish(session: Session) -> str:
         If the archive fails.
     """
     try:
-        procedure = sessions.procedure_of(session)
+        procedure = conducting.procedure_of(session)
         assert procedure is not None
         with one_thread(), Decoder() as decoder:
             for original in session.frames(kind=PHOTOGRAPH):
@@ -93,7 +93,7 @@ def rerun(session: Session) -> dict[str, Any]:
     ReseauError
         If they cannot be computed.
     """
-    return {each.result.name: each.same for each in sessions.rerun(session)}
+    return {each.result.name: each.same for each in conducting.rerun(session)}
 
 
 def _main() -> None:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
-from .. import sessions
 from ..archive import Archive, Session
 from ..calibration import Calibration
 from ..capture import Bench, BenchFile
@@ -22,6 +21,8 @@ from ..capture.judging import Watch
 from ..core.errors import InstrumentError, UsageError
 from ..core.optional import optional
 from ..io import Document
+from ..sessions import conducting
+from ..sessions.parameters import present_keys
 from .alarms import sender
 from .decisions import Decision
 from .inforce import Configurations
@@ -45,7 +46,7 @@ def slept(seconds: float) -> bool:
 @contextmanager
 def locked(bench: Bench, archive: Archive, session: str) -> Iterator[None]:
     """Lock and connect a bench for a session."""
-    with sessions.lock(bench, archive, session), bench:
+    with conducting.lock(bench, archive, session), bench:
         yield
 
 
@@ -165,7 +166,7 @@ class Recalibrations:
         UsageError
             If the session has no calibration, or the configuration is unknown.
         """
-        sessions.calibration_of(session)
+        conducting.calibration_of(session)
         Configurations(self._archive).parts(configuration)
         if steps.get("certificate") is not None:  # what it needs is missed now, and not after the acquisition
             _certificate_of(steps["certificate"], name)
@@ -191,7 +192,7 @@ class Recalibrations:
                 "is not a recalibration of this archive", where=name, do="define it with --repeats"
             )
         content = dict(entries[-1].document)
-        content["parameters"] = sessions.present_keys(content["parameters"])
+        content["parameters"] = present_keys(content["parameters"])
         return Recalibration.from_content(content, where=name)
 
     def unfinished(self, name: str) -> str | None:
@@ -214,7 +215,7 @@ class Recalibrations:
         watch: Watch = lambda kind, facts: None,
         bench: Callable[[BenchFile], Bench] = Bench,
         using: Using = locked,
-        capture: Callable[..., Any] = sessions.capture,
+        capture: Callable[..., Any] = conducting.capture,
         wait: Callable[[float], Any] = time.sleep,
     ) -> Recalibrated:
         """Carry out a recalibration, or continue it.
@@ -258,7 +259,7 @@ class Recalibrations:
             instruments = bench(BenchFile.parse_toml(made.bench, where=f"bench of {name}"))
             found = self._carried_out(made, title, there, instruments, using, partial(capture, watch=watch),
                                       lambda: _prepared(made, instruments, watch, wait))  # fmt: skip
-        calibration, known = sessions.calibration_of(found), Configurations(self._archive)
+        calibration, known = conducting.calibration_of(found), Configurations(self._archive)
         decision = known.decide(
             made.configuration, calibration, rules, since=found.begun, session=title,
             by=f"{by}, recalibration {name}" if by else f"recalibration {name}",
@@ -348,15 +349,15 @@ class Recalibrations:
     ) -> Session:  # fmt: skip
         """Begin or resume the session, and carry it out to its end."""
         if not there:
-            sessions.check(title, made.plan, made.parameters, made.inputs, instruments)
+            conducting.check(title, made.plan, made.parameters, made.inputs, instruments)
         with using(instruments, self._archive, title):
             prepare()
             if there:
-                found = sessions.resume(self._archive, made.plan, title)
+                found = conducting.resume(self._archive, made.plan, title)
                 found.recover()
             else:
                 self._archive.journal(_PREFIX + made.name).append(title, "begun", {"session": title})
-                found = sessions.begin(
+                found = conducting.begin(
                     self._archive, title, made.plan, made.parameters, made.inputs, bench=made.bench
                 )
             capture(found, instruments)

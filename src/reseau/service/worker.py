@@ -27,7 +27,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from .. import sessions
 from ..archive import Archive
 from ..capture import Bench, BenchFile, BenchLock, by_hand
 from ..capture.checks import edge_sigma, exposure_fault, grey_counts
@@ -36,6 +35,8 @@ from ..core.errors import BenchError, InstrumentError, ReseauError, StateError, 
 from ..core.memory import keep_loaded, share_freed_memory
 from ..instruments import Camera, Turntable
 from ..io import read_text
+from ..sessions import conducting, kinds
+from ..sessions.parameters import SessionParameters
 from .orders import Order, Orders, owner
 from .state import StateFolder, private_file
 from .wire import Certificates, Wire, checked_peer, to_error
@@ -325,7 +326,7 @@ class Worker:
         given = self._checked(name, plan, parameters, inputs)
         with self._lock:
             self._prepare(given)
-            session = sessions.begin(self._archive, name, plan, given, inputs, bench=self._text)
+            session = conducting.begin(self._archive, name, plan, given, inputs, bench=self._text)
             return self._run(session, by)
 
     def _checked(self, name: str, plan: str, parameters: dict[str, Any], inputs: dict[str, str]) -> Any:
@@ -333,8 +334,8 @@ class Worker:
         if plan == "own":
             raise UsageError("is a program of the user, which the service does not run", where="plan own")
         bench = self._required()
-        parameters = sessions.kind_of(plan).parameters.defaults(bench) | parameters
-        return sessions.check(name, plan, parameters, inputs, bench)
+        parameters = kinds.kind_of(plan).parameters.defaults(bench) | parameters
+        return conducting.check(name, plan, parameters, inputs, bench)
 
     def _resume_session(self, name: str, by: str = "") -> dict[str, Any]:
         self._free()
@@ -344,14 +345,14 @@ class Worker:
             raise UsageError("is done", where=name)
         if session.bench != self._text:
             raise UsageError("was begun on another bench", where=name)
-        given = sessions.parameters_of(session)
+        given = conducting.parameters_of(session)
         given.check_bench(bench)
         with self._lock:
             self._prepare(given)
             session.recover()
             return self._run(session, by)
 
-    def _prepare(self, given: sessions.SessionParameters) -> None:
+    def _prepare(self, given: SessionParameters) -> None:
         """Check that the instruments of a session answer, and that its axes have their reference."""
         used = given.part_of(self._required())
         if used.instruments.keys() & self._silent.keys():
@@ -361,7 +362,7 @@ class Worker:
             given.check_homed(used)
 
     def _run(self, session: Any, by: str) -> dict[str, Any]:
-        given = sessions.parameters_of(session)
+        given = conducting.parameters_of(session)
         self._describe(session.name, session.plan, by, given.expected, dict(given.units))
         control = self._control = Control(lambda: self._set("paused"))
         self._thread = threading.Thread(target=self._carry_out, args=(session, control), name="session")
@@ -376,7 +377,7 @@ class Worker:
     def _carry_out(self, session: Any, control: Control) -> None:
         """Carry out a session in a thread of its own."""
         with self._reported(), self._archive_lock(session.name):
-            sessions.capture(session, self._bench, watch=self._watched, operator=self._ask, control=control)
+            conducting.capture(session, self._bench, watch=self._watched, operator=self._ask, control=control)
         self._control = None
         self._set(session.status)
 
@@ -435,10 +436,10 @@ class Worker:
             self._watched(kind, facts)
 
         def capture(session: Any, bench: Bench, watch: Any) -> None:
-            given = sessions.parameters_of(session)
+            given = conducting.parameters_of(session)
             self._prepare(given)
             self._describe(session.name, session.plan, order.by, given.expected, dict(given.units))
-            sessions.capture(session, bench, watch=watch, operator=self._ask, control=control)
+            conducting.capture(session, bench, watch=watch, operator=self._ask, control=control)
 
         found = Recalibrations(self._archive).run(
             order.given["name"], order.session, by=order.by, watch=watch, bench=lambda file: self._bench,
@@ -465,13 +466,13 @@ class Worker:
         else:
             checked = self._checked(order.session, given["plan"], given["parameters"], given["inputs"])
             self._prepare(checked)
-            session = sessions.begin(
+            session = conducting.begin(
                 self._archive, order.session, given["plan"], checked, given["inputs"], bench=self._text
             )
-        made = sessions.parameters_of(session)
+        made = conducting.parameters_of(session)
         self._describe(session.name, session.plan, order.by, made.expected, dict(made.units))
         with self._archive_lock(session.name):
-            sessions.capture(session, self._bench, watch=self._watched, operator=self._ask, control=control)
+            conducting.capture(session, self._bench, watch=self._watched, operator=self._ask, control=control)
         if session.status != "done":
             raise StateError(f"is {session.status}", where=f"session {session.name}", do="resume it")
         return session.status

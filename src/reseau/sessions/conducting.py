@@ -39,7 +39,7 @@ def check(
     name : str
         Name of the session, for messages.
     plan : str
-        Plan; a key of :data:`reseau.sessions.KINDS`.
+        Plan; a key of :data:`reseau.sessions.kinds.KINDS`.
     parameters : mapping or SessionParameters
         Parameters of the plan.
     inputs : mapping of str to str, optional

@@ -5,9 +5,9 @@ from __future__ import annotations
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from reseau import sessions
 from reseau.archive import Archive
 from reseau.service import AcceptanceRules, Configurations, Limits
+from reseau.sessions import conducting
 
 from ...capture.fieldrig import DESIGN, FieldRig
 from ..test_inforce import RULES, camera
@@ -35,12 +35,12 @@ def populate(folder: Path) -> None:
     with Archive.open(folder / "archive", create=True) as archive:
         rig = FieldRig()
         given = dict(PARAMETERS)
-        monday = sessions.begin(archive, "monday", "testfield", given, {"design.json": DESIGN.to_json()})
+        monday = conducting.begin(archive, "monday", "testfield", given, {"design.json": DESIGN.to_json()})
         rig.camera.spoil = lambda number, pixels: pixels * 0 if number == 2 else pixels
-        sessions.capture(monday, rig.bench)
+        conducting.capture(monday, rig.bench)
         known = Configurations(archive)
         known.define("vidicon", {"camera": "vidicon"})
-        known.decide("vidicon", sessions.calibration_of(monday), FIELD_RULES, by="Ada", session="monday")
+        known.decide("vidicon", conducting.calibration_of(monday), FIELD_RULES, by="Ada", session="monday")
         known.define("left", {"camera": "DMK 33", "lens": "8 mm"})
         for k in range(12):
             off = 1e-6 * k + 2e-5 * (-1) ** k + (2e-3 if k > 9 else 0.0)

@@ -35,7 +35,7 @@ def defined(one: Served) -> Served:  # noqa: F811
     archive = one.service.archive
     known = Configurations(archive)
     known.define("left", {"camera": "vidicon"})
-    from reseau.sessions import calibration_of
+    from reseau.sessions.conducting import calibration_of
 
     decision = known.decide("left", calibration_of(archive.session("first")), FIELD_RULES)
     known.review("left", decision.key, "accepted", comment="first")

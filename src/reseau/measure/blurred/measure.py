@@ -22,6 +22,7 @@ from ...optics.lenses.images import PlaneTarget, RayImage, ray_images
 from ...optics.lenses.surrogate import RaySurrogate
 from ..matching import Matches, match, with_alike_errors
 from ..matching.patches import MatchOptions
+from ..mosaic import balanced
 from ..points import Measured, Reason
 from ..screening import Screened, screen
 from .likeness import Likeness, Residuals
@@ -270,6 +271,7 @@ class Run:
         targets: tuple[PlaneTarget, ...],
         options: BlurredOptions,
     ) -> None:
+        frame = balanced(frame)
         self.frame, self.camera, self.ids, self.targets, self.options = frame, camera, ids, targets, options
         screened, n = screen(frame, None), len(ids)
         self.blank = screened if isinstance(screened, Failure) else None

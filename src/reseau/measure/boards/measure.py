@@ -16,6 +16,7 @@ from ...core.threads import one_thread
 from ...designs.boards import marker_cells
 from ...designs.dots import halves_of_dots
 from ...io.board import BoardDesign
+from ..mosaic import balanced
 from ..plane.lattice_mapping import second_order, stretches
 from ..points import Measured, Reason
 from ..reseau.disks import find_disks
@@ -138,7 +139,7 @@ def measure_board(
     >>> found.found, bool(np.abs(found.xy[0] - 49.5).max() < 0.05)
     (20, True)
     """
-    options = options or BoardOptions()
+    options, frame = options or BoardOptions(), balanced(frame)
     with one_thread():
         if not options.mirrored:
             return _measured(frame, design, options)
@@ -168,7 +169,7 @@ def puzzle_part(frame: Frame) -> PuzzlePart | Failure:
     <Code.NOT_FOUND: 'not-found'>
     """
     with one_thread():
-        screened = screen(frame, None)
+        screened = screen(balanced(frame), None)
         if isinstance(screened, Failure):
             return screened
         return find_puzzle(screened.grey, find_saddles(screened.grey, screened.noise))

@@ -18,6 +18,7 @@ from ...core.threads import one_thread
 from ...designs.boards import board
 from ...io.board import BoardDesign, BoardKind
 from ...optics.composition import Chain
+from ..mosaic import balanced
 from ..plane.growth import first_mapping
 from ..plane.lattice_mapping import slope_of
 from ..reseau.disks import Disks, find_disks
@@ -66,6 +67,7 @@ def boards_shown(frame: Frame) -> list[BoardDesign]:
     [('chess', 6, 5)]
     """
     with one_thread():
+        frame = balanced(frame)
         screened = screen(frame, None)
         if isinstance(screened, Failure):
             return []

@@ -26,6 +26,7 @@ from ...optics.field import SmoothField
 from ..fitting import on_one_line
 from ..marks.judging import columns_of, spread
 from ..matching import Matches
+from ..mosaic import balanced
 from ..points import Measured, Reason, deviating
 from ..screening import lost_in_blocks
 from .assignment import in_sight, spacing
@@ -188,7 +189,7 @@ def measure_reseau(
     >>> found.found, bool(np.abs(found.xy - centres).max() < 0.05)
     (20, True)
     """
-    options = options or ReseauOptions()
+    options, frame = options or ReseauOptions(), balanced(frame)
     source = _source(design)
     known = np.flatnonzero(np.isfinite(source).all(axis=1))
     if len(known) < 4:

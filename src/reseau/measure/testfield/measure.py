@@ -23,6 +23,7 @@ from ...optics.formation import PixelResponse
 from ..marks.judging import Objection, columns_of, reasons_of
 from ..matching import Matches
 from ..matching.shapes import Window
+from ..mosaic import balanced
 from ..plane.lattice_mapping import images_of, numbers_of, slope_of, stretches
 from ..plane.plane_mapping import plane_through
 from ..plane.polynomial import common_part, median, refit
@@ -213,7 +214,7 @@ def measure_testfield(
     (16, 1, True)
     """
     with one_thread():
-        return _measured(frame, design, options or TestfieldOptions())
+        return _measured(balanced(frame), design, options or TestfieldOptions())
 
 
 def _measured(frame: Frame, design: TestfieldDesign, options: TestfieldOptions) -> TestfieldResult | Failure:

@@ -117,9 +117,9 @@ def uncertainty_of(
     if "covariates" in calibration.validity:
         _add_function(found, missing, calibration, covariance, data)
     else:
-        shared = _add_adjustment(found, missing, calibration, covariance)
+        shared, held = _add_adjustment(found, missing, calibration, covariance)
         _add_temperature(found, missing, names, data)
-        _add_model(found, missing, calibration, covariance, shared)
+        _add_model(found, missing, calibration, covariance, shared, held)
         _add_reproducibility(found, missing, calibration, earlier)
     for each in () if data is None else data.contributions:
         row = _row(each.sensitivities, names, each.name)
@@ -166,8 +166,8 @@ def _add_function(
 
 def _add_adjustment(
     found: _Found, missing: dict[str, str], calibration: Calibration, covariance: Array
-) -> Array:
-    """Contributions that share the variance factor of the adjustment; returns the covariance less these."""
+) -> tuple[Array, Array]:
+    """Contributions of the adjustment; returns what images have in common, and what held coefficients do."""
     where = f"calibration {calibration.name}"
     degrees = float(calibration.redundancy) if calibration.sigma0 is not None else np.inf
     parts = {name: calibration.validity.get(f"covariance_of_{name}") for name in ("targets", "held")}
@@ -189,7 +189,7 @@ def _add_adjustment(
         found.append(
             ("target coordinates", Contribution("target coordinates", targets, degrees, group=_ADJUSTMENT))
         )
-    return shared
+    return shared, held
 
 
 def _shared(calibration: Calibration, rest: Array, targets: Array) -> Array:
@@ -227,15 +227,16 @@ def _add_temperature(
 
 
 def _add_model(
-    found: _Found, missing: dict[str, str], calibration: Calibration, covariance: Array, shared: Array
-) -> None:
+    found: _Found, missing: dict[str, str], calibration: Calibration, covariance: Array, shared: Array,
+    held: Array,
+) -> None:  # fmt: skip
     names, validity = calibration.covariance.names, calibration.validity
     images = int(validity.get("images", 0))
     if "sigma_formal" in validity:
         if 0 < images < _LEAST_IMAGES:
             missing["model"] = f"what images have in common needs {_LEAST_IMAGES} of them"
         else:
-            degrees = _degrees_of(calibration, covariance, shared)
+            degrees = _degrees_of(calibration, covariance, shared, held)
             found.append(("model", Contribution("model: what images have in common", shared, degrees)))
         return
     between = validity.get("sigma_between_images") or {}
@@ -250,18 +251,26 @@ def _add_model(
     found.append(("model", Contribution("model: scatter between images", cov, degrees)))
 
 
-def _degrees_of(calibration: Calibration, covariance: Array, shared: Array) -> float:
+def _degrees_of(calibration: Calibration, covariance: Array, shared: Array, held: Array) -> float:
     """Degrees of freedom of what images have in common: with them the whole has those of the calibration."""
-    whole = float(calibration.validity.get("degrees_of_freedom", np.inf))
-    size = np.sqrt(np.diag(covariance))
-    scale = np.outer(size, size)
-    root = np.linalg.pinv(covariance / np.where(scale > 0, scale, 1.0), hermitian=True)
-    part = float(np.trace(root @ (shared / np.where(scale > 0, scale, 1.0)))) / max(len(size), 1)
+    estimated = covariance - held
+    formal = estimated - shared
+    # Those of the calibration are, in relation to the formal covariance, with what held coefficients do.
+    known = _relative(covariance, formal) / _relative(estimated, formal) if held.any() else 1.0
+    whole = float(calibration.validity.get("degrees_of_freedom", np.inf)) / known**2
+    part = _relative(shared, estimated)
     if not part > 0 or not np.isfinite(whole):
         return whole
     redundancy = float(calibration.redundancy) if calibration.redundancy > 0 else np.inf
     spread = 1 / whole - (1 - part) ** 2 / redundancy
     return max(part**2 / spread, 1.0) if spread > 0 else whole
+
+
+def _relative(part: Array, whole: Array) -> float:
+    """Mean over the parameters of a covariance in relation to another one."""
+    size = np.sqrt(np.diag(whole))
+    scale = np.where(np.outer(size, size) > 0, np.outer(size, size), 1.0)
+    return float(np.trace(np.linalg.pinv(whole / scale, hermitian=True) @ (part / scale))) / max(len(size), 1)
 
 
 def _add_reproducibility(

@@ -300,7 +300,7 @@ def release(bench: BenchName, who: Operating, service: Here) -> BenchAnswer:
 @router.post("/benches/{bench}/sessions", status_code=201)
 def begin(bench: BenchName, given: NewSession, who: Operating, service: Here) -> BenchAnswer:
     """Begin a session on a bench, with a plan."""
-    from ...sessions import kind_of
+    from ...sessions.kinds import kind_of
 
     the_bench(service, bench)
     new_name(service, given.name)

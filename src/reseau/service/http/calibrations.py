@@ -385,8 +385,8 @@ def configuration(name: Name, who: Reading, service: Here) -> ConfigurationDetai
 @router.post("/configurations/{name}/decisions", status_code=201)
 def decide(name: Name, given: NewDecision, who: Administering, service: Here) -> DecisionRow:
     """Judge a calibration by rules, and put it in force if they accept it."""
-    from ... import sessions as kinds
     from ...calibration import Calibration
+    from ...sessions import conducting
     from ..rules import AcceptanceRules
 
     known = the_configuration(service, name)
@@ -396,7 +396,7 @@ def decide(name: Name, given: NewDecision, who: Administering, service: Here) ->
     since = given.since
     if given.session is not None:
         session = the_session(service, given.session)
-        calibration, since = kinds.calibration_of(session), since or session.begun
+        calibration, since = conducting.calibration_of(session), since or session.begun
     else:
         assert given.calibration is not None
         calibration = Calibration.from_content(dict(given.calibration), where="calibration")

@@ -60,12 +60,12 @@ def chosen(service: Service, text: str) -> Chosen:
     NotFound
         If there is none.
     """
-    from ... import sessions as kinds
+    from ...sessions import conducting
 
     name, slash, key = text.rpartition("/")
     if not slash:
         session = the_session(service, text)
-        return Chosen(text, text, f"/sessions/{quote(text, safe='')}", kinds.calibration_of(session))
+        return Chosen(text, text, f"/sessions/{quote(text, safe='')}", conducting.calibration_of(session))
     known = the_configuration(service, name)
     decision = the_decision(known, name, key)
     page = f"/calibrations/{quote(name, safe='')}/{decision.key}"

@@ -79,8 +79,8 @@ def upload(
     Photographs of an oscilloscope are taken in the order PHOTO I, II, III. The frames of film are oriented by
     their edges, with what the frames of the roll have in common.
     """
-    from ... import sessions as kinds
     from ...io import FrameCorners
+    from ...sessions import conducting, kinds
 
     if len(photographs) > MOST_FILES:
         raise UsageError(f"are more than {MOST_FILES}", where="photographs")
@@ -121,8 +121,8 @@ def upload(
         labels = [f"PHOTO {'I' * k}" for k in range(1, len(photographs) + 1)]
     with service.audited(who, "upload", name, {"photographs": len(photographs), "plan": plan}):
         new_name(service, name)
-        kinds.check(name, plan, given, inputs)
-        session = kinds.begin(service.archive, name, plan, given, inputs)
+        conducting.check(name, plan, given, inputs)
+        session = conducting.begin(service.archive, name, plan, given, inputs)
         for each, label, suffix in zip(photographs, labels, suffixes, strict=True):
             session.store(label, each.file.read(), kind=PHOTOGRAPH, suffix=suffix)
     return Uploaded(session=name, job=service.jobs.add("finish", name).number)

@@ -172,7 +172,7 @@ def recalibrate(bench: BenchName, given: NewRecalibration, who: Operating, servi
 def session_later(bench: BenchName, given: NewSession, who: Operating, service: Here) -> OrderRow:
     """Have a session carried out as soon as its turn comes."""
     from ...core.options import values_of_texts
-    from ...sessions import kind_of
+    from ...sessions.kinds import kind_of
 
     new_name(service, given.name)
     wanted = given.model_dump(exclude={"texts"})

@@ -25,7 +25,7 @@ from .forms import FormField, form_of
 from .service import Service
 
 if TYPE_CHECKING:
-    from ...sessions import SessionKind
+    from ...sessions.kinds import SessionKind
 
 router = APIRouter(include_in_schema=False)
 
@@ -198,7 +198,7 @@ def benches_page(request: Request, who: Reading, service: Here) -> Response:
 @router.get("/benches/{bench}")
 def bench_page(request: Request, bench: str, who: Reading, service: Here) -> Response:
     """A bench: live picture, axes, settings, session."""
-    from ... import sessions as kinds
+    from ...sessions import kinds
 
     link = benches.the_bench(service, bench)
     found = benches.bench_answer(service, link)
@@ -237,7 +237,7 @@ class _PlanForm:
 
     @classmethod
     def of(cls, kind: SessionKind) -> Self:
-        from ...sessions import input_option
+        from ...sessions.kinds import input_option
 
         fields = kind.parameters.model_fields
         found = {
@@ -294,8 +294,8 @@ def _read_verdict(session: Session, found: sessions.SessionDetail) -> list[str]:
 
 def _verdict(session: Session, found: sessions.SessionDetail) -> list[str]:
     """What the results of a session are good for, in lines."""
-    from ... import sessions as kinds
     from ...io.frame import RollSummary
+    from ...sessions import conducting
 
     latest = {each.name: each for each in session.results()}
     if found.plan == "film" and "summary.json" in latest:
@@ -304,7 +304,7 @@ def _verdict(session: Session, found: sessions.SessionDetail) -> list[str]:
         return [f"{len(summary.frames)} frames: {counts}"]
     if "calibration.json" not in latest:
         return []
-    calibration = kinds.calibration_of(session)
+    calibration = conducting.calibration_of(session)
     if found.plan == "oscilloscope":
         points = {
             each.step: each.verdict.facts.get("points")

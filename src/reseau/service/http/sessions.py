@@ -209,12 +209,12 @@ def latest_frames(session: Session, count: int) -> list[FrameRow]:
 
 def session_detail(service: Service, session: Session) -> SessionDetail:
     """Return a session with what it has and what is to come."""
-    from ... import sessions as kinds
+    from ...sessions import conducting
 
     taken, good = session.counts()
     expected, steps = None, list[str]()
     try:
-        given = kinds.parameters_of(session)
+        given = conducting.parameters_of(session)
         expected = given.expected
         poses = getattr(given, "poses", None)
         steps = [each.name for each in poses()] if poses is not None and expected is not None else []
@@ -354,7 +354,7 @@ def scene(session: SessionName, who: Reading, service: Here) -> Scene:
 
 def scene_result(session: Session) -> ArchivedResult | None:
     """Return the result of a session with cameras and target in space, or None."""
-    from ... import sessions as kinds
+    from ...sessions import kinds
 
     found = [each for each in session.results() if each.name == kinds.SCENE]
     return found[-1] if found else None

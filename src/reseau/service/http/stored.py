@@ -131,7 +131,7 @@ def marks_of(session: Session, archived: ArchivedFrame) -> tuple[Frame, Marks, s
     from ...measure.testfield.measure import TestfieldOptions
     from ...procedures.target_measurement import measurer_of
     from ...report.overlay import Marks
-    from ...sessions import present_keys
+    from ...sessions.parameters import present_keys
 
     names = [name for name in session.inputs() if name in ("design.json", "reseau.json")]
     if not names:

@@ -1,0 +1,67 @@
+"""Raw frames of colour sensors are measured without interpolation: filters are gains of pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reseau.core.data import Array, Frame
+from reseau.core.failure import Failure
+from reseau.io import BoardDesign
+from reseau.measure import measure_board
+from reseau.measure.mosaic import balanced, gains_of
+
+from .board_pictures import picture
+
+FILTERS = {"RGGB": (0.5, 1.0, 1.0, 0.6), "BGGR": (0.6, 1.0, 1.0, 0.5), "GRBG": (1.0, 0.5, 0.6, 1.0)}
+CHESS = BoardDesign(name="b", unit="mm", kind="chess", columns=9, rows=6, pitch=26.0)
+DESIGNS = {
+    "chess": CHESS,
+    "circles": BoardDesign(name="b", unit="mm", kind="circles", columns=9, rows=6, pitch=24.0, size=14.0),
+}
+
+
+def behind(frame: Frame, gains: tuple[float, ...], seed: int = 0) -> Frame:
+    """A frame behind filters, with the noise and the grey values of a camera."""
+    height, width = frame.pixels.shape
+    whole = np.tile(np.reshape(gains, (2, 2)), (height // 2, width // 2))
+    noise = np.random.default_rng(seed).normal(0, 0.7, whole.shape)
+    return replace(frame, pixels=np.clip(np.rint(frame.pixels * whole + noise), 0, 255).astype(np.uint8))
+
+
+def errors(frame: Frame, design: BoardDesign, truth: Array) -> tuple[Array, Array]:
+    found = measure_board(frame, design)
+    assert not isinstance(found, Failure), found.reason
+    assert found.ok.all()
+    sigma = np.sqrt(np.stack([found.cov[:, 0, 0], found.cov[:, 1, 1]], axis=1))
+    return found.xy - truth, sigma
+
+
+@pytest.mark.parametrize("pattern", FILTERS)
+@pytest.mark.parametrize("kind", DESIGNS)
+def test_boards_behind_filters_are_measured_as_precisely_as_they_say(kind: str, pattern: str) -> None:
+    frame, truth = picture(DESIGNS[kind], seed=2, moved=(0.3, 0.6))
+    error, sigma = errors(behind(frame, FILTERS[pattern]), DESIGNS[kind], truth)
+    # Half of the pixels have half of the light: 0.005 px without filters, noise of both against one level.
+    assert np.sqrt(np.mean(error**2)) < 0.012
+    assert 0.7 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
+
+
+def test_gains_are_those_of_the_filters_and_grey_frames_are_left_alone() -> None:
+    frame, _ = picture(CHESS, seed=4)
+    assert gains_of(behind(frame, FILTERS["RGGB"])) == pytest.approx(
+        np.array([[0.5, 1], [1, 0.6]]), abs=0.005
+    )
+    for seed in range(3):
+        grey, _ = picture(CHESS, seed=seed, noise=0.5 + seed)
+        assert balanced(grey) is grey
+    small = Frame(np.random.default_rng(0).normal(100, 3, (9, 9)), 255.0)
+    assert balanced(small) is small
+
+
+def test_a_picture_of_lines_two_pixels_wide_is_no_mosaic() -> None:
+    lines = 100 + 60 * np.sin(np.arange(200) * 2 * np.pi / 4.4)
+    frame = Frame(np.tile(lines, (120, 1)) + np.random.default_rng(1).normal(0, 1, (120, 200)), 255.0)
+    assert balanced(frame) is frame
