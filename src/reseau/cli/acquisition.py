@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 import json
 import math
 import sys
@@ -137,6 +138,7 @@ def conduct(
     also_resumed : sequence of str
         Options of the command that can be used with ``--resume``; the session determines all others.
     """
+    from ..service.orders import held_by_service
     from ..sessions import conducting
 
     if where.resume:
@@ -144,10 +146,13 @@ def conduct(
     # A new session is checked before an archive is made for it.
     new = None if where.resume else _new(where, plan, parameters, inputs or {})
     with where.open(create=not where.resume) as archive:
-        name, given, bench, begin = new or _resumed(archive, where, plan)
+        name, given, bench, begin, order = new or _resumed(archive, where, plan)
         if where.home:
             given = given.model_copy(update={"home": True})
         bench = given.part_of(bench)
+        if held_by_service(bench.file):
+            _asked(where, archive, bench.file.name, name, order)
+            return
         with conducting.lock(bench, archive, name), bench:
             if not given.home:
                 given.check_homed(bench)
@@ -163,8 +168,19 @@ def conduct(
         afterwards(session)
 
 
-_Started = tuple[str, "SessionParameters", "Bench", Callable[["Archive"], "Session"]]
-"""Name, parameters and bench of a session, and a function that begins or recovers it once all is checked."""
+_Started = tuple[str, "SessionParameters", "Bench", Callable[["Archive"], "Session"], dict[str, Any]]
+"""Name, parameters and bench of a session, a function that begins or recovers it once all is checked, and
+what a service that holds the bench is asked for."""
+
+
+def _asked(where: Where, archive: Archive, bench: str, name: str, order: dict[str, Any]) -> None:
+    """Have the service that holds the bench carry out the session, and print its outcome."""
+    from ..service.orders import asked
+    from ..service.recalibration import slept
+
+    typer.echo(f"note: reseau serve holds bench {bench} and carries out {name} in its turn", err=True)
+    asked(archive, bench, "session", order, getpass.getuser(), name, slept)
+    _conclude(where, archive.session(name), None)
 
 
 def _new(
@@ -190,12 +206,12 @@ def _new(
     name = where.name or f"{plan}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
     given = parameters(bench)
     checked = conducting.check(name, plan, given, texts, bench)
-    return (
-        name,
-        checked,
-        bench,
-        lambda archive: conducting.begin(archive, name, plan, given, texts, bench=text),
-    )
+    order = {"name": name, "plan": plan, "parameters": checked.to_archive(), "inputs": texts}
+
+    def begun(archive: Archive) -> Session:
+        return conducting.begin(archive, name, plan, given, texts, bench=text)
+
+    return name, checked, bench, begun, order
 
 
 def _resumed(archive: Archive, where: Where, plan: str) -> _Started:
@@ -211,7 +227,8 @@ def _resumed(archive: Archive, where: Where, plan: str) -> _Started:
         session.recover()
         return session
 
-    return session.name, conducting.parameters_of(session), bench, recovered
+    order = {"name": session.name, "plan": plan}
+    return session.name, conducting.parameters_of(session), bench, recovered, order
 
 
 def _conclude(where: Where, session: Session, why: str | None) -> None:

@@ -242,7 +242,7 @@ def asked(
     archive : Archive
         The archive that both use.
     bench : str
-        Content of ``bench.toml``.
+        Name of the bench.
     what, given, by, session
         As for :meth:`Orders.add`.
     over : callable
@@ -257,7 +257,7 @@ def asked(
     UsageError
         If it is withdrawn, or fails.
     """
-    orders = Orders(archive, BenchFile.parse_toml(bench, where="bench").name)
+    orders = Orders(archive, bench)
     order, begun = orders.add(what, given, by, session), archive.clock()
     while order.state not in OVER:
         idle = all(each.state != "running" for each in orders.all())

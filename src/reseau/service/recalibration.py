@@ -322,9 +322,10 @@ class Recalibrations:
             As :meth:`run`.
         """
         made = self.get(name)
-        if not held_by_service(BenchFile.parse_toml(made.bench, where=f"bench of {name}")):
+        bench = BenchFile.parse_toml(made.bench, where=f"bench of {name}")
+        if not held_by_service(bench):
             return self.run(name, session, by=by, **options).decision
-        order = asked(self._archive, made.bench, "recalibration", {"name": name}, by, session, over)
+        order = asked(self._archive, bench.name, "recalibration", {"name": name}, by, session, over)
         decided = Configurations(self._archive).history(made.configuration)
         return next(each for each in reversed(decided) if each.session == order.session)
 

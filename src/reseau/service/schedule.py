@@ -47,7 +47,7 @@ class Schedule(Document):
     rule, start, zone, except_for
         See :class:`~reseau.service.schedule.Recurrence`; times as ``2026-03-02T08:00``.
     window_minutes : int
-        A run may start from its time to this time later.
+        A run may start from its time to this time later (min).
 
     Examples
     --------

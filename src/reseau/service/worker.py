@@ -460,6 +460,8 @@ class Worker:
         given = order.given
         if any(each.name == order.session for each in self._archive.sessions()):
             session = self._archive.session(order.session)
+            if session.status == "done" or ("inputs" in given and order.attempts == 1):
+                raise UsageError(f"exists ({session.status})", where=f"session {order.session}")
             session.recover()
         else:
             checked = self._checked(order.session, given["plan"], given["parameters"], given["inputs"])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -87,6 +89,28 @@ def test_the_command_line_and_a_schedule_ask_the_service_that_holds_the_bench(
     )
     assert (first.state, first.why.split(":")[0]) == ("done", "accepted"), first
     assert Orders(archive, "cellar").all()[-1].by == "schedule weekly"
+
+
+def test_a_capture_of_the_command_line_is_carried_out_by_the_service_that_holds_the_bench(
+    defined: Served,
+    rig: Rig,  # noqa: F811
+) -> None:
+    command = [
+        sys.executable,
+        "-c",
+        "from reseau.cli import main; main()",
+        "capture",
+        "frames",
+        "--count",
+        "2",
+    ]
+    done = subprocess.run([*command, "--name", "by hand"], cwd=rig.folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "holds bench cellar" in done.stderr
+    assert "by hand: done, 2 frames" in done.stdout
+    again = subprocess.run([*command, "--name", "by hand"], cwd=rig.folder, capture_output=True, text=True)
+    assert again.returncode == 2
+    assert len([line for line in again.stderr.splitlines() if line.startswith("reseau:")]) == 1
 
 
 def test_a_paused_queue_is_put_in_order_and_withdrawn(defined: Served) -> None:
