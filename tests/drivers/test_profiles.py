@@ -187,6 +187,7 @@ def test_a_file_of_ones_own_is_a_dialect(tmp_path: Path) -> None:
         assert {data[-2:] for data in said} == {b"\r\n"}
         assert scope.dialect is not None
         assert scope.dialect.name == "Rigol mine"
+    assert read_profiles(described(f"{path}#Rigol mine"), where=path)[1][0].ends == "\r\n"
     assert dialect_named(f"{path}#Rigol mine").models == r"(DS|MSO)1\d{3}Z"
     with pytest.raises(SettingError, match="choose from Rigol mine"):
         dialect_named(f"{path}#other")
@@ -208,6 +209,15 @@ OWN = described("Rigol 1000Z")
         (OWN.replace("fetch :DISP", "grab :DISP"), r"`screen.0`: String should match"),
         (OWN.replace("(code - y0 - yref) * dy", "code ** 2"), r"has more than \+ - \* /"),
         (OWN.replace("(code - y0 - yref) * dy", "(code"), "is not a formula"),
+        (OWN.replace("(code - y0 - yref) * dy", "code * gain"), "no query gives gain"),
+        (OWN.replace('dtype = "u1"', 'dtype = "u9"'), "'u9' is no data type"),
+        (OWN.replace("fetch :DISPlay", "fetch {name}:DISPlay"), r"`screen.0`: String should match"),
+        (
+            OWN.replace(
+                'examples = ["RIGOL TECHNOLOGIES,DS1104Z', 'examples = ["DS1104Z", "RIGOL TECHNOLOGIES,'
+            ),
+            "`examples.0`",
+        ),
         (OWN.replace("(code - y0 - yref) * dy", "__import__('os')"), r"has more than \+ - \* /"),
     ],
 )

@@ -116,8 +116,11 @@ def test_a_stored_calibration_is_compared_and_reported_as_a_fresh_one(
         assert found.greatest_px < 1e-6
     read.report(tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text("utf-8")
-    assert all(line in page for line in done.assessments["camera"].lines)
+    assert all(line[1:] in page for line in done.assessments["camera"].lines)
     assert all(text in page for text in read.printed().values())
+    first = page.split("<header>")[1].split("</header>")[0]
+    assert f"{len(done.measured)} photographs" in first
+    assert "the total error of the projection" in first
     with pytest.raises(UsageError, match=r"report\.txt: has the suffix"):
         read.report(tmp_path / "report.txt")
     with pytest.raises(UsageError, match="has no image points"):

@@ -21,7 +21,15 @@ import pytest
 from reseau.archive import Archive
 from reseau.cli import run
 from reseau.core.errors import InputError, StateError, UsageError
-from reseau.service import AcceptanceRules, Alarms, Configurations, Limits, Schedule, Schedules
+from reseau.service import (
+    AcceptanceRules,
+    Alarms,
+    Configurations,
+    Limits,
+    Recalibrations,
+    Schedule,
+    Schedules,
+)
 from reseau.service.alarms import sender
 
 from ..capture.fieldrig import TESTFIELD, FieldRig, enter, write_inputs
@@ -86,6 +94,31 @@ def test_a_recalibration_is_acquired_adjusted_compared_and_put_in_force(
         assert applied is not None
         assert applied.key == made["key"]
         assert made["by"] == f"{getpass.getuser()}, recalibration left"
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_the_steps_of_a_recalibration_follow_one_another_to_the_certificate(
+    rig: FieldRig, mailbox: tuple[str, list[Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("lxml", reason="needs lxml (extra `service`)")
+    contact = {"name": "Institute of Photogrammetry", "city": "Bonn", "country": "DE"}
+    data = {"schema": "reseau-certificate-data/1", "laboratory": contact, "customer": contact,
+            "responsible": ["Ada Byron"], "item": {"name": "camera", "serial": "4711"}}  # fmt: skip
+    Path("data.json").write_text(json.dumps(data))
+    define = ["recalibrate", "left", "--repeats", "first", "--configuration", "left", "--rules", "rules.json"]
+    steps = ["--warm-up-minutes", "0.01", "--self-test", "--data", "data.json", "--inside", "127.0.0.1"]
+    assert run([*define, *steps, "--notify", mailbox[0]]) == 0
+    with Archive.open("archive") as archive:
+        said = list[str]()
+        watch = lambda kind, facts: said.append(facts["text"]) if kind == "step" else None  # noqa: E731
+        made = Recalibrations(archive).run("left", watch=watch)
+        kept = {each.name for each in archive.session(made.session).results()}
+    assert {"certificate.html", "certificate.xml"} <= kept
+    warm, tested, decided, issued, notified = said
+    assert (warm, tested) == ("warms up for 0.01 min", "self-test passed")
+    assert decided.startswith("decided: accepted")
+    assert (issued, notified) == ("certificate issued", "notified")
+    assert made.session in body(mailbox[1][0])
 
 
 def test_a_recalibration_that_stops_is_continued_where_it_stopped(

@@ -14,10 +14,10 @@ import struct
 import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from reseau.core.data import Array
 from reseau.core.errors import FormatError, InputError, ProtocolError, SettingError
@@ -75,6 +75,7 @@ class Formula:
             self._tree = ast.parse(text, mode="eval").body
         except SyntaxError:
             raise ValueError(f"{text!r} is not a formula") from None
+        self.names = {node.id for node in ast.walk(self._tree) if isinstance(node, ast.Name)}
         for node in ast.walk(self._tree):
             known = isinstance(node, ast.Name | ast.Load | ast.BinOp | ast.UnaryOp) or type(node) in _ACTS
             if not (known or (isinstance(node, ast.Constant) and type(node.value) in (int, float))):
@@ -157,6 +158,21 @@ class WaveformDialect(_Part):
     piece: str = ""
     more: tuple[int, ...] = (0,)
 
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        """Formulas have numbers that are asked for; types of samples exist."""
+        known = {name for names in self.scale for name in names.split()} | set(self.fields)
+        lacking = (self.volts.names - {"code"} | self.start.names | self.step.names) - known
+        if lacking:
+            raise ValueError(f"no query gives {', '.join(sorted(lacking))}")
+        for each in (self.dtype, *(self.wide or ())[1:]):
+            try:
+                np.dtype(each)
+            except TypeError:
+                raise ValueError(f"{each!r} is no data type of NumPy") from None
+        struct.calcsize("".join(form for _, form in self.fields.values()).replace("<", "").replace(">", ""))
+        return self
+
     def sampled(self, numbers: Numbers) -> tuple[str, str]:
         """Return the command for the sample width, and the data type."""
         return self.wide if self.wide and numbers.get("bits", 8) > 8 else ("", self.dtype)
@@ -228,8 +244,8 @@ class Dialect(_Part):
 
     name: str
     models: str
-    examples: tuple[str, ...] = ()
-    screen: tuple[Annotated[str, Field(pattern="^(send|query|fetch) .")], ...]
+    examples: tuple[Annotated[str, Field(pattern=",")], ...] = ()
+    screen: tuple[Annotated[str, Field(pattern=r"^(send|query|fetch) ([^{}]|\{port\})+$")], ...]
     answer: Literal[tuple(_ANSWERS)] = "picture"  # type: ignore[valid-type]
     waveform: WaveformDialect | None = None
     setup: tuple[str, ...] = ()
@@ -285,7 +301,7 @@ def read_profiles(text: str, *, where: object) -> tuple[Maker, tuple[Dialect, ..
         raise FormatError(f"is not TOML ({error})", where=where) from None
     except KeyError as error:
         raise FormatError(f"there are no [waveforms.{error.args[0]}]", where=where) from None
-    except (ValidationError, TypeError) as error:
+    except (ValidationError, TypeError, struct.error) as error:
         raise FormatError(_first(error), where=where) from None
     fetches = [sum(step.startswith("fetch") for step in each.screen) for each in dialects]
     if fetches != [1] * len(dialects):
@@ -359,8 +375,9 @@ def described(name: str = "") -> str:
         return "".join(f"{each}: {models}".rstrip(": ") + "\n" for each, models in examples.items())
     if name in CONTROLLERS:
         return (FOLDER / f"{name}.toml").read_text("utf-8")
-    dialect = dialect_named(name)
-    text = next(text for text in _FILES.values() if f'name = "{dialect.name}"' in text)
+    dialect, path = dialect_named(name), name.partition("#")[0]
+    texts = [_text_of(path)] if path.endswith(".toml") else _FILES.values()
+    text = next(text for text in texts if f'name = "{dialect.name}"' in text)
     head, *parts = re.split(r"(?m)^(?=\[)", text)
     kept = [part for part in parts if not part.startswith(("[[profiles]]", "[waveforms"))]
     own = next(part for part in parts if f'name = "{dialect.name}"' in part)

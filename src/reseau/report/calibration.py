@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from markupsafe import Markup
 
 from ..calibration import Calibration
@@ -36,9 +38,11 @@ def calibration_report(calibration: Calibration) -> str:
         figure = calibration.plot().figure
         assert figure is not None
         picture = to_svg(figure.get_figure(root=True))
-    verdict, model = calibration.assessment, calibration.model
+    verdict = calibration.assessment
+    model: Mapping[str, object] = calibration.model
     images = calibration.validity.get("images")
-    facts = [f"{model['model']}, {model['width']} × {model['height']} px"] if "width" in model else []
+    camera = f"{model.get('model')}, {model.get('width')} × {model.get('height')} px"
+    facts = [camera] if calibration.kind == "camera" else []
     facts += [f"{images} photographs"] if images else []
     facts += filter(None, [calibration.provenance.get("software")])
     sigma0 = [] if calibration.sigma0 is None else [(f"{calibration.sigma0:.3f}", "", "sigma0")]

@@ -6,11 +6,11 @@ A recalibration repeats an archived session: its plan, parameters, input files a
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
@@ -19,6 +19,7 @@ from ..calibration import Calibration
 from ..capture import Bench, BenchFile
 from ..capture.judging import Watch
 from ..core.errors import InstrumentError, UsageError
+from ..core.optional import optional
 from ..io import Document
 from ..sessions import conducting
 from ..sessions.parameters import present_keys
@@ -29,8 +30,17 @@ from .orders import asked, held_by_service
 from .rules import AcceptanceRules
 from .schedule import Run, Schedule
 
+if TYPE_CHECKING:
+    from .certificates import CertificateData
+
 _PREFIX, _TEST_S = "recalibrations/", 20.0
 Using = Callable[[Bench, Archive, str], AbstractContextManager[Any]]
+
+
+def slept(seconds: float) -> bool:
+    """Wait; never a reason to end waiting."""
+    time.sleep(seconds)
+    return False
 
 
 @contextmanager
@@ -158,6 +168,8 @@ class Recalibrations:
         """
         conducting.calibration_of(session)
         Configurations(self._archive).parts(configuration)
+        if steps.get("certificate") is not None:  # what it needs is missed now, and not after the acquisition
+            _certificate_of(steps["certificate"], name)
         made = Recalibration(
             name=name, configuration=configuration, plan=session.plan, parameters=session.parameters,
             inputs={each: session.input(each) for each in session.inputs()}, bench=session.bench,
@@ -289,7 +301,7 @@ class Recalibrations:
 
     def ask(
         self, name: str, session: str = "", by: str = "",
-        over: Callable[[float], bool] = lambda seconds: bool(time.sleep(seconds)), **options: Any,
+        over: Callable[[float], bool] = slept, **options: Any,
     ) -> Decision:  # fmt: skip
         """Have a recalibration carried out by the service that holds its bench, or, without one, do it here.
 
@@ -318,13 +330,12 @@ class Recalibrations:
 
     def _certify(self, made: Recalibration, session: Session, decision: Decision) -> None:
         """Issue the certificate of an accepted calibration, kept among the results of its session."""
-        from .certificates import CertificateData, certify, html_of
-        from .certificates.dcc import dcc_of
+        from .certificates import certify, html_of
 
         known = Configurations(self._archive)
+        data, dcc_of = _certificate_of(made.certificate or {}, made.name)
         found = certify(
-            known.calibration(made.configuration, decision.key),
-            CertificateData.from_content(dict(made.certificate or {}), where=f"certificate of {made.name}"),
+            known.calibration(made.configuration, decision.key), data,
             issued=self._archive.clock().date(), decision=decision, configuration=made.configuration,
             earlier=known.earlier(made.configuration, decision),
         )  # fmt: skip
@@ -354,6 +365,16 @@ class Recalibrations:
                 f"is {found.status}", where=f"session {title}", do="continue it with --resume"
             )
         return found
+
+
+def _certificate_of(content: Mapping[str, Any], name: str) -> tuple[CertificateData, Callable[..., bytes]]:
+    """Data of a certificate, and what makes the document of it."""
+    from .certificates import CertificateData
+
+    with optional():
+        from .certificates.dcc import dcc_of
+
+    return CertificateData.from_content(dict(content), where=f"certificate of {name}"), dcc_of
 
 
 def _prepared(made: Recalibration, bench: Bench, watch: Watch, wait: Callable[[float], Any]) -> None:

@@ -117,9 +117,9 @@ def uncertainty_of(
     if "covariates" in calibration.validity:
         _add_function(found, missing, calibration, covariance, data)
     else:
-        shared, held = _add_adjustment(found, missing, calibration, covariance)
+        shared = _add_adjustment(found, missing, calibration, covariance)
         _add_temperature(found, missing, names, data)
-        _add_model(found, missing, calibration, covariance, shared, held)
+        _add_model(found, missing, calibration, covariance, shared)
         _add_reproducibility(found, missing, calibration, earlier)
     for each in () if data is None else data.contributions:
         row = _row(each.sensitivities, names, each.name)
@@ -166,8 +166,8 @@ def _add_function(
 
 def _add_adjustment(
     found: _Found, missing: dict[str, str], calibration: Calibration, covariance: Array
-) -> tuple[Array, Array]:
-    """Contributions of the adjustment; returns what images have in common, and what held coefficients do."""
+) -> Array:
+    """Contributions of the adjustment; returns what images have in common."""
     where = f"calibration {calibration.name}"
     degrees = float(calibration.redundancy) if calibration.sigma0 is not None else np.inf
     parts = {name: calibration.validity.get(f"covariance_of_{name}") for name in ("targets", "held")}
@@ -189,7 +189,7 @@ def _add_adjustment(
         found.append(
             ("target coordinates", Contribution("target coordinates", targets, degrees, group=_ADJUSTMENT))
         )
-    return shared, held
+    return shared
 
 
 def _shared(calibration: Calibration, rest: Array, targets: Array) -> Array:
@@ -227,16 +227,15 @@ def _add_temperature(
 
 
 def _add_model(
-    found: _Found, missing: dict[str, str], calibration: Calibration, covariance: Array, shared: Array,
-    held: Array,
-) -> None:  # fmt: skip
+    found: _Found, missing: dict[str, str], calibration: Calibration, covariance: Array, shared: Array
+) -> None:
     names, validity = calibration.covariance.names, calibration.validity
     images = int(validity.get("images", 0))
     if "sigma_formal" in validity:
         if 0 < images < _LEAST_IMAGES:
             missing["model"] = f"what images have in common needs {_LEAST_IMAGES} of them"
         else:
-            degrees = _degrees_of(calibration, covariance, shared, held)
+            degrees = _degrees_of(calibration, covariance, shared)
             found.append(("model", Contribution("model: what images have in common", shared, degrees)))
         return
     between = validity.get("sigma_between_images") or {}
@@ -251,12 +250,13 @@ def _add_model(
     found.append(("model", Contribution("model: scatter between images", cov, degrees)))
 
 
-def _degrees_of(calibration: Calibration, covariance: Array, shared: Array, held: Array) -> float:
+def _degrees_of(calibration: Calibration, covariance: Array, shared: Array) -> float:
     """Degrees of freedom of what images have in common: with them the whole has those of the calibration."""
-    estimated = covariance - held
+    held = calibration.validity.get("covariance_of_held")
+    estimated = covariance if held is None else covariance - np.array(held, np.float64)
     formal = estimated - shared
     # Those of the calibration are, in relation to the formal covariance, with what held coefficients do.
-    known = _relative(covariance, formal) / _relative(estimated, formal) if held.any() else 1.0
+    known = 1.0 if held is None else _relative(covariance, formal) / _relative(estimated, formal)
     whole = float(calibration.validity.get("degrees_of_freedom", np.inf)) / known**2
     part = _relative(shared, estimated)
     if not part > 0 or not np.isfinite(whole):

@@ -76,7 +76,7 @@ class NewRecalibration(Answer, json_schema_extra={"example": {"name": "left"}}):
 
 
 def _row(order: Order) -> OrderRow:
-    log = [Line(at=at, text=text) for at, text in order.log]
+    log = [Line.model_validate({"at": at, "text": text}) for at, text in order.log]
     shown = {k: getattr(order, k) for k in OrderRow.model_fields if k not in ("name", "log")}
     return OrderRow(name=str(order.given["name"]), log=log, **shown)
 
