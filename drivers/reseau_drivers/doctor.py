@@ -6,7 +6,6 @@ attempt to connect and echo requests.
 
 from __future__ import annotations
 
-import grp
 import os
 import re
 import shutil
@@ -95,8 +94,9 @@ def _device(path: str) -> Iterator[Finding]:
         yield Finding(False, f"{path} does not exist", do)
         return
     if not os.access(path, os.R_OK | os.W_OK):
-        with suppress(KeyError):
-            group = grp.getgrgid(status.st_gid).gr_name
+        # Not every system has groups of files.
+        with suppress(KeyError, NotImplementedError):
+            group = Path(path).group()
             shared = status.st_mode & stat.S_IRGRP and status.st_mode & stat.S_IWGRP
             do = (
                 f"sudo usermod -a -G {group} $USER, and log in again"
