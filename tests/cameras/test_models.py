@@ -447,7 +447,9 @@ def test_commands_accept_the_model_and_write_report_and_calibration(
     assert abs(found["value"] - expected[case.model.names.index(f)]) < 5 * found["sigma"]
     points = tmp_path / "00.csv"
     status, out, err = reseau("apply", tmp_path / "K.json", points, "--directions", "-o", tmp_path / "D.csv")
-    assert (status, err) == (0, "")
+    # What is less than measurement is said, as which poses there are and not the model decides.
+    assert status == 0
+    assert err == "" or err.startswith("note: calibration camera is usable for 3-D reconstruction")
     given = np.array([line.split(",")[1:3] for line in points.read_text().split()[1:]], dtype=np.float64)
     lines = (tmp_path / "D.csv").read_text().split()[1:]
     uv = np.array([line.split(",")[1:3] for line in lines], dtype=np.float64)
