@@ -121,11 +121,19 @@ def test_an_axis_is_moved_within_its_limits_and_recorded(one: Served, rig: Rig) 
     assert one.client("read").post(f"{BENCH}/move", json={"axis": "tilt", "position": 1.0}).status_code == 403
 
 
-def test_a_stop_acts_at_once_and_is_not_queued(one: Served, rig: Rig) -> None:
+def test_a_stop_acts_at_once_and_is_not_queued(
+    one: Served, rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import threading
 
-    client, answers = one.client("operate"), []
+    client, answers, asked, record = one.client("operate"), [], list[str](), one.service.audit.record
     client.post(f"{BENCH}/move", json={"axis": "tilt", "position": 0.0})
+
+    def noted(by: str, via: str, action: str, *more: Any) -> Any:
+        asked.append(action)
+        return record(by, via, action, *more)
+
+    monkeypatch.setattr(one.service.audit, "record", noted)
 
     def move(position: float) -> None:
         answers.append(
@@ -137,7 +145,7 @@ def test_a_stop_acts_at_once_and_is_not_queued(one: Served, rig: Rig) -> None:
     threads[0].start()
     until(lambda: rig.position() > 1.0)
     threads[1].start()
-    time.sleep(0.3)
+    until(lambda: asked.count("move") == 2)
     stopped = client.post(f"{BENCH}/stop")
     assert stopped.status_code == 200, stopped.text
     assert stopped.json()["ms"] < 1000  # on a loaded machine; on an idle one below 100
