@@ -18,10 +18,22 @@ from reseau_drivers.link import SerialLink
 from reseau_drivers.oscilloscope import DIALECTS, Oscilloscope, dialect_of, oscilloscope
 from reseau_drivers.oscilloscope.dialects import Formula, described, dialect_named, read_profiles
 from reseau_drivers.profiles import FOLDER
-from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, Table, Zaber
+from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, Marlin, Smc100, Table, Zaber
 
 from .behaviours import named
-from .fakes import GrblBoard, Lines, Screen, Spoiled, TCube, Transcript, Wire, ZaberStage, transcripts
+from .fakes import (
+    GrblBoard,
+    Lines,
+    MarlinBoard,
+    NewportStage,
+    Screen,
+    Spoiled,
+    TCube,
+    Transcript,
+    Wire,
+    ZaberStage,
+    transcripts,
+)
 from .test_references import FLUID, FLUID_VERSION, HAL, HAL_VERSION
 
 TOLD = transcripts()
@@ -103,6 +115,8 @@ TABLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], float]] = {
     "FluidNC": (lambda: GrblBoard(FLUID, FLUID_VERSION, locks=False), lambda wire: Grbl(wire, 0.02), 1.0),
     "Zaber": (ZaberStage, lambda wire: Zaber(wire, 0.02), 1000.0),
     "T-Cube": (TCube, lambda wire: Kinesis([wire], answer_s=0.02), 1919.64),
+    "SMC100": (NewportStage, lambda wire: Smc100(wire, 0.02), 1.0),
+    "Marlin": (MarlinBoard, lambda wire: Marlin(wire, 0.02), 1.0),
 }
 
 
