@@ -22,6 +22,8 @@ from reseau.instruments import Deadline
 __all__ = [
     "GrblBoard",
     "Lines",
+    "MarlinBoard",
+    "NewportStage",
     "Receiver",
     "Screen",
     "Spoiled",
@@ -463,3 +465,165 @@ class TCube:
                 bits = 0x80000000 | (0x400 if self.homed else 0) | (0x10 if self._left else 0)
                 said = struct.pack("<HihhI", 1, self.place, 0, 0, bits)
         return struct.pack("<HHBB", kind + 1, len(said), 0x81, 0) + said if said else b""
+
+
+class NewportStage:
+    """One SMC100CC with a stage; positions in its unit.
+
+    Sources: Newport, SMC100CC & SMC100PP User's Manual (commands OR, PA, ST, MM, VA, TE, TP, TS, VE: states
+    0A to 3E, what is allowed in each; TE reports an error once), and its states as drivers of bliss, qmi and
+    pyvisa users list them. Commands are answered only if they ask; the home position is at 0.
+    """
+
+    def __init__(self) -> None:
+        self.place = self.off = 0.0
+        self.start()
+
+    def start(self) -> None:
+        """Switch it on: it is not referenced."""
+        self._state, self._error, self._line = 0x0A, "@", b""
+        self._left, self._target, self._then = 0, self.place, 0x0A
+
+    def reset(self) -> None:
+        """Switch it off and on; it counts from 0 where it stands."""
+        self.off, self.place = self.off + self.place, 0.0
+        self.start()
+
+    def receive(self, data: bytes) -> bytes:
+        """Answer the lines that end in these bytes."""
+        *lines, self._line = (self._line + data).split(b"\r\n")
+        return b"".join(self._answer(line.decode()) for line in lines)
+
+    def _answer(self, line: str) -> bytes:
+        found = re.fullmatch(r"1([A-Z]{2})(.*)", line)
+        if found is None:
+            self._error = "A"
+            return b""
+        name, value = found[1], found[2]
+        said = {"TE": self._error, "VE": " SMC_CC_01-11-02", "TP": f"{self.place:.7f}"}.get(name)
+        if name == "TS":
+            self._advance()
+            said = f"0000{self._state:02X}"
+        if name == "TE":
+            self._error = "@"
+        if said is not None:
+            return f"1{name}{said}\r\n".encode()
+        self._obey(name, value)
+        return b""
+
+    def _advance(self) -> None:
+        self._left = max(0, self._left - 1)
+        if not self._left and self._state in (0x1E, 0x28):
+            if self._state == 0x1E:
+                self.off = 0.0
+            self._state, self.place = self._then, self._target
+
+    def _obey(self, name: str, value: str) -> None:
+        referenced, ready = self._state >= 0x28, 0x32 <= self._state <= 0x35
+        refusals = {0x0: "H", 0x1: "H" if self._state < 0x14 else "L", 0x2: "M", 0x3: "J"}
+        refused = refusals[self._state >> 4]
+        match name:
+            case "OR" if self._state < 0x14:
+                self._state, self._left, self._target, self._then = 0x1E, 3, 0.0, 0x32
+            case "PA" if ready:
+                if abs(float(value)) > 180:
+                    self._error = "G"
+                else:
+                    self._state, self._left, self._target, self._then = 0x28, 3, float(value), 0x33
+            case "VA" if ready or self._state >= 0x3C:
+                pass
+            case "ST" if self._state == 0x28:
+                self._target, self._left = (self.place + self._target) / 2, 1
+            case "ST" if referenced:
+                pass
+            case "MM" if ready or self._state >= 0x3C:
+                self._state = 0x34 if value == "1" else 0x3C
+            case _:
+                self._error = "K" if ready else refused
+
+
+class MarlinBoard:
+    """A board with Marlin 2 of one axis, with 80 steps per millimetre.
+
+    Sources: marlinfw.org, G-code (G28, M92, M110, M114, M115, M220, M410); RepRap wiki, G-code, Checking; the
+    threads and logs of OctoPrint that quote ``Error:Line Number is not Last Line Number+1``, ``Resend:``,
+    ``echo:busy: processing``, and of M114 with ``Count``. What M114 says before it is the target; the
+    steps are those that were made. After a start it counts from 0 where it stands.
+    """
+
+    STEPS = 80
+
+    def __init__(self) -> None:
+        self.place, self.off = 0.0, 7.0
+        self.start()
+
+    def start(self) -> bytes:
+        """Switch it on."""
+        self._last, self._percent, self._line = 0, 100, b""
+        self._target, self._left, self._homes = self.place, 0, False
+        return b"start\necho:Marlin 2.1.2\n"
+
+    def reset(self) -> bytes:
+        """Switch it off and on; its words at a start are lost."""
+        self.place, self.off = 0.0, self.off + self.place
+        self.start()
+        return b""
+
+    def receive(self, data: bytes) -> bytes:
+        """Answer the lines that end in these bytes."""
+        *lines, self._line = (self._line + data).split(b"\n")
+        return b"".join(self._take(line.strip()) for line in lines if line.strip())
+
+    def _take(self, line: bytes) -> bytes:
+        content, star, told = line.rpartition(b"*")
+        if not star:
+            return self._obey(line.decode())
+        found, check = re.match(rb"N(\d+) ?(.*)", content), 0
+        for value in content:
+            check ^= value
+        if found is None or not told.isdigit() or int(told) != check:
+            return self._again("checksum mismatch")
+        number, words = int(found[1]), found[2].decode()
+        if words.startswith("M110"):
+            self._last = number
+            return b"ok\n"
+        if number != self._last + 1:
+            return self._again("Line Number is not Last Line Number+1")
+        self._last = number
+        return self._obey(words)
+
+    def _again(self, why: str) -> bytes:
+        return f"Error:{why}, Last Line: {self._last}\nResend: {self._last + 1}\nok\n".encode()
+
+    def _obey(self, words: str) -> bytes:
+        name, *rest = words.split()
+        said = ""
+        match name:
+            case "M114":
+                self._left = max(0, self._left - 1)
+                self.place = self.place if self._left else self._target
+                counts = round(self.place * self.STEPS)
+                said = f"X:{self._target:.2f} Y:0.00 Z:0.00 E:0.00 Count X:{counts} Y:0 Z:0\n"
+            case "M115":
+                said = (
+                    "FIRMWARE_NAME:Marlin 2.1.2 (Jan  1 2023 00:00:00) MACHINE_TYPE:Table EXTRUDER_COUNT:1\n"
+                )
+            case "M92":
+                said = f"echo:  M92 X{self.STEPS}.00 Y80.00 Z400.00 E93.00\n"
+            case "M220" if rest:
+                self._percent = int(rest[0][1:])
+            case "M220":
+                said = f"FR:{self._percent}%\n"
+            case "G28":
+                self.place = self._target = self.off = 0.0
+                self._left = 0
+                said = "echo:busy: processing\nX:0.00 Y:0.00 Z:0.00 E:0.00 Count X:0 Y:0 Z:0\n"
+            case "G1":
+                self._target, self._left = float(rest[0][1:]), 3
+            case "M410":
+                self._target, self._left = (self.place + self._target) / 2, 1
+            case "G21" | "G90" | "M84":
+                pass
+            case _:
+                said = f'echo:Unknown command: "{words}"\n'
+        return f"{said}ok\n".encode()

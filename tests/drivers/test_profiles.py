@@ -17,11 +17,23 @@ from reseau.core.errors import FormatError, InputError, InstrumentError, Protoco
 from reseau_drivers.link import SerialLink
 from reseau_drivers.oscilloscope import DIALECTS, Oscilloscope, dialect_of, oscilloscope
 from reseau_drivers.oscilloscope.dialects import Formula, described, dialect_named, read_profiles
-from reseau_drivers.profiles import FOLDER
-from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, Table, Zaber
+from reseau_drivers.profiles import CONTROLLERS, FOLDER, controller
+from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, Marlin, Smc100, Table, Zaber, grbl
 
 from .behaviours import named
-from .fakes import GrblBoard, Lines, Screen, Spoiled, TCube, Transcript, Wire, ZaberStage, transcripts
+from .fakes import (
+    GrblBoard,
+    Lines,
+    MarlinBoard,
+    NewportStage,
+    Screen,
+    Spoiled,
+    TCube,
+    Transcript,
+    Wire,
+    ZaberStage,
+    transcripts,
+)
 from .test_references import FLUID, FLUID_VERSION, HAL, HAL_VERSION
 
 TOLD = transcripts()
@@ -103,6 +115,8 @@ TABLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], float]] = {
     "FluidNC": (lambda: GrblBoard(FLUID, FLUID_VERSION, locks=False), lambda wire: Grbl(wire, 0.02), 1.0),
     "Zaber": (ZaberStage, lambda wire: Zaber(wire, 0.02), 1000.0),
     "T-Cube": (TCube, lambda wire: Kinesis([wire], answer_s=0.02), 1919.64),
+    "SMC100": (NewportStage, lambda wire: Smc100(wire, 0.02), 1.0),
+    "Marlin": (MarlinBoard, lambda wire: Marlin(wire, 0.02), 1.0),
 }
 
 
@@ -229,9 +243,61 @@ def test_a_file_that_is_no_profile_is_refused_in_one_line(text: str, message: st
 
 def test_all_profiles_are_listed_and_shown() -> None:
     listed = [line.partition(":")[0] for line in described().splitlines()]
-    assert set(listed) == {dialect.name for dialect in DIALECTS} | {"grbl", "smc100", "zaber"}
+    assert set(listed) == {dialect.name for dialect in DIALECTS} | set(CONTROLLERS)
     for name in listed:
         assert "[sources]" in described(name)
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_the_profile_of_a_controller_is_one_of_ones_own(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(described(name))
+    assert controller(name, str(path)) == controller(name)
+    assert f"a controller, {name}" in described(str(path))
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "own", "message"),
+    [
+        ("grbl", 'name = "grbl"', 'name = "zaber"', "is of 'zaber', not of grbl"),
+        ("grbl", "[alarms]", "[alarm]", "`alarm` is missing, or not of this controller"),
+        ("grbl", "banner = 'grbl", "banner = '(grbl", "is no pattern"),
+        ("marlin", "unhomed", "unhoned", "`replies` is not as that of a profile: it has firmware"),
+        ("kinesis", "stepper = 53.68", 'stepper = "53.68"', "`motors`: '53.68' is no number"),
+        ("kinesis", '"00004000"', '"follows"', "'follows' is no hexadecimal number"),
+        ("smc100", "controller-profile/1", "controller-profile/2", "is not reseau-controller-profile/1"),
+        ("zaber", '"FQ" = "the', '"FQ" = 7 # "the', "`flags`: 7 is no text"),
+    ],
+)
+def test_a_file_that_is_no_profile_of_a_controller_is_refused_in_one_line(
+    name: str, line: str, own: str, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "mine.toml"
+    assert line in described(name)
+    path.write_text(described(name).replace(line, own))
+    with pytest.raises(FormatError, match=re.escape(message)) as caught:
+        controller(name, str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_table_speaks_a_dialect_of_ones_own(tmp_path: Path) -> None:
+    """A board of one's own, with another banner and an error that GRBL does not have."""
+    path = tmp_path / "mine.toml"
+    text = described("grbl").replace("banner = 'grbl", "banner = 'millboard.*|grbl")
+    path.write_text(text.replace("[alarms]", '"99" = "the lid is open"\n[alarms]'))
+    for dialect, message in ((None, "error 99"), (str(path), "the lid is open")):
+        board = GrblBoard()
+        table = grbl("table", Wire(board), axes={"tilt": {"low": -90.0, "high": 90.0}}, dialect=dialect)
+        board.answers["$I"] = b"error:99\r\n"
+        with pytest.raises(InstrumentError, match=message):
+            table.connect()
+        table.close()
+    board = GrblBoard(banner="Millboard 7")
+    with grbl("table", Wire(board), axes={"tilt": {"low": -90.0, "high": 90.0}}, dialect=str(path)) as table:
+        table.home("tilt")
+        board.ends = lambda: board.start()
+        with pytest.raises(InstrumentError, match="started anew"):
+            table.move("tilt", -10.0)
 
 
 def test_formulas() -> None:

@@ -6,10 +6,13 @@ import pytest
 from zaber_motion.ascii import WarningFlags
 
 from reseau.core.errors import StateError
-from reseau_drivers.codecs.zaber import FAULTS, UNREFERENCED, UNRELIABLE
+from reseau_drivers.profiles import known
 from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, References, Table, Zaber
 
 from .fakes import GrblBoard, TCube, Wire, ZaberStage
+
+ZABER = known("zaber")
+FAULTS, UNREFERENCED, UNRELIABLE = ZABER["flags"], ZABER["unreferenced"], set(ZABER["unreliable"])
 
 HAL = "GrblHAL 1.1f ['$' or '$HELP' for help]"
 HAL_VERSION = "[VER:1.1f.20231015:]\r\n[OPT:VNMSL,100,1024,3,0]\r\n[FIRMWARE:grblHAL]"

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
+from numpy.typing import NDArray
 
 from reseau.core.data import Array, Frame
+from reseau.core.errors import ImageError, InputError, UsageError
 from reseau.core.failure import Failure
 from reseau.io import BoardDesign
+from reseau.io.images import read_image, write_image
 from reseau.measure import measure_board
 from reseau.measure.mosaic import balanced, gains_of
 
@@ -47,6 +52,52 @@ def test_boards_behind_filters_are_measured_as_precisely_as_they_say(kind: str, 
     # Half of the pixels have half of the light: 0.005 px without filters, noise of both against one level.
     assert np.sqrt(np.mean(error**2)) < 0.012
     assert 0.7 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
+
+
+def dng(path: Path, mosaic: NDArray[np.uint16], black: int = 512, white: int = 16383, side: int = 2) -> None:
+    """A raw file by the specification of DNG 1.4, with filters in cells of so many pixels."""
+    cell = np.resize((0, 1, 1, 2), side * side).tolist()
+    tags = [
+        (50706, "B", 4, (1, 4, 0, 0), True),
+        (50708, "s", 0, "test camera", True),
+        (33421, "H", 2, (side, side), True),
+        (33422, "B", len(cell), cell, True),
+        (50714, "H", 1, black, True),
+        (50717, "H", 1, white, True),
+        (50721, "2i", 9, (1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1), True),
+        (50728, "2I", 3, (1, 1, 1, 1, 1, 1), True),
+        (50778, "H", 1, 21, True),
+    ]
+    tifffile.imwrite(path, mosaic, photometric=32803, extratags=tags)
+
+
+def test_a_raw_file_is_measured_behind_its_filters_as_a_frame_of_a_camera(tmp_path: Path) -> None:
+    pytest.importorskip("rawpy", reason="no rawpy: pip install reseau[photographs]")
+    picture_, truth = picture(CHESS, seed=2, moved=(0.3, 0.6))
+    seen = behind(picture_, FILTERS["RGGB"])
+    dng(tmp_path / "a.dng", seen.pixels.astype(np.uint16) * 62 + 512)
+    found = read_image(tmp_path / "a.dng", "mosaic")
+    assert found.full_scale == 16383 - 512
+    assert (found.pixels == seen.pixels.astype(np.uint16) * 62).all()
+    assert gains_of(found) == pytest.approx(gains_of(seen), abs=1e-6)
+    error, _ = errors(found, CHESS, truth)
+    assert np.sqrt(np.mean(error**2)) < 0.012
+
+
+def test_what_has_no_mosaic_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("rawpy", reason="no rawpy: pip install reseau[photographs]")
+    dng(tmp_path / "x.dng", np.full((96, 96), 900, np.uint16), side=6)
+    with pytest.raises(ImageError, match="no filters in cells of 2 × 2 pixels"):
+        read_image(tmp_path / "x.dng", "mosaic")
+    write_image(tmp_path / "c.png", np.zeros((20, 20, 3), np.uint8))
+    with pytest.raises(UsageError, match="mosaic: is no channel of colours"):
+        read_image(tmp_path / "c.png", "mosaic")
+    write_image(tmp_path / "g.png", np.full((20, 20), 7, np.uint8))
+    assert (read_image(tmp_path / "g.png", "mosaic").pixels == 7).all()
+    (tmp_path / "b.cr2").write_bytes(b"no raw file")
+    for name, message in (("b.cr2", "no raw file"), ("none.dng", "cannot be read")):
+        with pytest.raises((ImageError, InputError), match=message):
+            read_image(tmp_path / name, "mosaic")
 
 
 def test_gains_are_those_of_the_filters_and_grey_frames_are_left_alone() -> None:

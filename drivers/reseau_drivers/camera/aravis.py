@@ -29,7 +29,7 @@ from reseau.core.errors import (
 from reseau.instruments import Deadline, Identity, choice, quantity, text
 
 from ..codecs.gige import Action
-from ..codecs.pixels import GENICAM, decode
+from ..codecs.pixels import GENICAM, decode, format_named
 from .camera import CameraSettings, OriginalValues, RawFrame, Ready
 from .clocks import BlockCounter, ExposureTimes, realtime_offset
 from .features import Feature, found_features
@@ -461,7 +461,7 @@ class Aravis:
         layout = GENICAM[self._settings.format]
         if buffer.get_image_pixel_format() != layout.code or (width, height) != self._size:
             raise ProtocolError(
-                f"sent {width}×{height} pixels of format {buffer.get_image_pixel_format():#x}, not "
+                f"sent {width}×{height} pixels of {format_named(buffer.get_image_pixel_format())}, not "
                 f"{self._size[0]}×{self._size[1]} {self._settings.format}"
             )
         stride = layout.row(width) + int(buffer.get_image_padding()[0])
@@ -542,6 +542,14 @@ class Aravis:
         self._parser = camera.create_chunk_parser()
 
     def _set_region(self, camera: Any, settings: AravisSettings) -> None:
+        offered = [format_named(code & 0xFFFFFFFF) for code in camera.dup_available_pixel_formats()]
+        if settings.format not in offered:
+            known = ", ".join(name for name in offered if name in GENICAM) or "none that is read"
+            others = "; ".join(name for name in offered if name not in GENICAM)
+            raise RefusedError(
+                f"does not offer the format {settings.format}" + (f", but {others}" if others else ""),
+                do=f"set `format` to what it offers: {known}",
+            )
         camera.set_pixel_format_from_string(settings.format)
         now = tuple(camera.get_region())
         asked = settings.left, settings.top, settings.width, settings.height

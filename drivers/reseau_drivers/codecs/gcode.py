@@ -8,7 +8,9 @@ line numbers and checksums; RepRap, *G-code*, "Checking" for the checksum.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from reseau.core.errors import ProtocolError, SettingError
 
@@ -17,9 +19,7 @@ from .numbers import number
 from .stream import LineMessageDecoder, excerpt
 
 __all__ = [
-    "ALARMS",
     "AXES",
-    "ERRORS",
     "LIMIT",
     "Alarm",
     "AnswerDecoder",
@@ -45,18 +45,12 @@ LIMIT = 256
 AXES = "XYZABC"
 """Letters of the axes, in order."""
 
-_KNOWN = known("grbl")
-ERRORS: dict[int, str] = {int(code): meaning for code, meaning in _KNOWN["errors"].items()}
-"""Codes of ``error:``, those that a table can meet."""
-ALARMS: dict[int, str] = {int(code): meaning for code, meaning in _KNOWN["alarms"].items()}
-"""Codes of ``ALARM:``; from 10 those of grblHAL."""
-
 _WORD = re.compile(r"([A-Z])\s*([-+]?\d*\.?\d+|[-+]?\d+\.)")
 _NUMBERED = re.compile(rb"\s*N(-?\d+)\s*(.*?)\s*\*(\d{1,3})\s*")
 _REPORT = re.compile(r"<([A-Z][a-z]+)(?::(\d+))?((?:\|[^|<>]+)*)>")
 _OUTDATED = re.compile(r"<[A-Z][a-z]+,[MW]Pos:[^|<>]*>|\[G\d[^:\]]*\]")
 """Status, and modes of the parser, as GRBL up to 0.9 gives them."""
-_BANNER = re.compile(_KNOWN["banner"], re.IGNORECASE)
+_GRBL = known("grbl")
 
 
 def checksum(line: bytes) -> int:
@@ -161,26 +155,19 @@ class Error:
     ----------
     text : str
         Code of GRBL, or text of Marlin.
+    meaning : str
+        The error in words.
     """
 
     text: str
-
-    @property
-    def meaning(self) -> str:
-        """The error in words."""
-        return ERRORS.get(int(self.text), f"error {self.text}") if self.text.isdigit() else self.text
+    meaning: str
 
 
 @dataclass(frozen=True)
 class Alarm:
-    """GRBL has stopped and is locked."""
+    """GRBL has stopped and is locked, for a reason in words."""
 
-    code: int
-
-    @property
-    def meaning(self) -> str:
-        """The alarm in words."""
-        return ALARMS.get(self.code, f"alarm {self.code}")
+    meaning: str
 
 
 @dataclass(frozen=True)
@@ -240,8 +227,15 @@ class Said:
 Message = Ok | Error | Alarm | Banner | Outdated | Busy | Resend | Report | Said
 
 
-def decode(line: bytes) -> Message:
+def decode(line: bytes, profile: Mapping[str, Any] = _GRBL) -> Message:
     """Decode a line of GRBL or Marlin.
+
+    Parameters
+    ----------
+    line : bytes
+        The line.
+    profile : mapping
+        What is known of the controller: its `banner`, the meanings of `errors` and `alarms`.
 
     Raises
     ------
@@ -264,14 +258,15 @@ def decode(line: bytes) -> Message:
     if text == "ok" or text.startswith("ok "):
         return Ok(text[3:])
     if found := re.fullmatch(r"ALARM:(\d+)", text):
-        return Alarm(int(found[1]))
+        return Alarm(profile.get("alarms", {}).get(found[1], f"alarm {found[1]}"))
     if found := re.match(r"[Ee]rror:\s*(.*)", text):
-        return Error(found[1])
+        code = f"error {found[1]}" if found[1].isdigit() else found[1]
+        return Error(found[1], profile["errors"].get(found[1], code))
     if found := re.match(r"(?:Resend|rs):?\s*N?(\d+)", text):
         return Resend(int(found[1]))
     if found := re.match(r"(?:echo:\s*)?busy:\s*(.*)", text):
         return Busy(found[1])
-    if _BANNER.fullmatch(text):
+    if re.fullmatch(profile["banner"], text, re.IGNORECASE):
         return Banner(text)
     return Said(text)
 
@@ -295,5 +290,5 @@ def _report(text: str) -> Report:
 class AnswerDecoder(LineMessageDecoder[Message]):
     """Decode answers from a stream."""
 
-    def __init__(self) -> None:
-        super().__init__(decode, limit=LIMIT)
+    def __init__(self, profile: Mapping[str, Any] = _GRBL) -> None:
+        super().__init__(lambda line: decode(line, profile), limit=LIMIT)

@@ -17,12 +17,13 @@ from reseau.core.errors import ProtocolError
 
 from ..profiles import known
 
-__all__ = ["GENICAM", "VIDEO", "PixelFormat", "decode", "encode", "size_of"]
+__all__ = ["GENICAM", "VIDEO", "PixelFormat", "decode", "encode", "format_named", "size_of"]
 
 
 _PACKED = {
     ("p", 10): (4, 5), ("p", 12): (2, 3), ("p", 14): (4, 7), ("gige", 10): (2, 3), ("gige", 12): (2, 3),
     ("mipi", 10): (4, 5), ("mipi", 12): (2, 3), ("mipi", 14): (4, 7), ("stream", 10): (4, 5),
+    ("565", 8): (1, 2),
 }  # fmt: skip
 _LUMINANCE = {
     "YUYV": (4, (0, 2)), "UYVY": (4, (1, 3)), "UYYVYY": (6, (1, 2, 4, 5)), "UYV": (3, (1,)),
@@ -31,6 +32,10 @@ _LUMINANCE = {
 _COLOURS = {"RGB": cv2.COLOR_RGB2GRAY, "BGR": cv2.COLOR_BGR2GRAY, "RGBA": cv2.COLOR_RGBA2GRAY,
             "BGRA": cv2.COLOR_BGRA2GRAY}  # fmt: skip
 _PLANES = "planes of RGB"
+_565 = ((0, 31), (5, 63), (11, 31))
+"""Lowest bit and largest value of the three colours of a word."""
+_CUSTOM = 0x80000000
+"""Bit of the numbers of formats that a maker has defined."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ class PixelFormat:
     packed : str
         How pixels share bytes: ``p``, a stream of bits from the lowest on; ``stream``, from the highest on;
         ``gige``, two pixels in three bytes, the middle one with the low bits of both; ``mipi``, the last
-        bytes with the low bits of all.
+        bytes with the low bits of all; ``565``, colours of 5, 6 and 5 bits, the first of `pattern` lowest.
     """
 
     code: str | int
@@ -103,6 +108,19 @@ VIDEO: dict[str, PixelFormat] = {name: PixelFormat(*told) for name, told in _KNO
 """Formats of V4L2, by the names of its documentation."""
 GENICAM: dict[str, PixelFormat] = {name: PixelFormat(*told) for name, told in _KNOWN["genicam"].items()}
 """Formats of GenICam, by the names of the convention."""
+
+
+def format_named(code: int) -> str:
+    """Return the name of a format of GenICam, or in words what its number says.
+
+    Examples
+    --------
+    >>> format_named(0x01080001), format_named(0x81080001)
+    ('Mono8', "the maker's own format 0x81080001")
+    """
+    found = next((name for name, layout in GENICAM.items() if layout.code == code), None)
+    kind = "the maker's own" if code & _CUSTOM else "the unknown"
+    return found or f"{kind} format {code:#010x}"
 
 
 def size_of(layout: PixelFormat, width: int, height: int, stride: int = 0) -> int:
@@ -156,9 +174,12 @@ def decode(layout: PixelFormat, width: int, height: int, data: bytes, stride: in
     if layout.pattern in _LUMINANCE:
         together, luminances = _LUMINANCE[layout.pattern]
         return rows.reshape(height, -1, together)[..., list(luminances)].reshape(height, width)
-    if layout.packed:
+    if layout.packed == "565":
+        pixels = _widened(_words(rows))
+    elif layout.packed:
         return _unpacked(layout, rows)
-    pixels = rows if layout.bits == 8 else _words(rows)
+    else:
+        pixels = rows if layout.bits == 8 else _words(rows)
     if layout.pattern in (*_COLOURS, _PLANES):
         if layout.pattern == _PLANES:
             coloured = np.moveaxis(pixels.reshape(3, height, width), 0, -1)
@@ -169,6 +190,12 @@ def decode(layout: PixelFormat, width: int, height: int, data: bytes, stride: in
     if 8 < layout.bits < 16 and int(pixels.max()) >> layout.bits:
         raise ProtocolError(f"a frame of {layout.bits} bits contains the grey value {int(pixels.max())}")
     return pixels
+
+
+def _widened(words: NDArray[Any]) -> NDArray[np.uint8]:
+    """Three colours (8 bits) of words with 5, 6 and 5 bits, the first lowest."""
+    parts = [np.rint((words >> at & most) * (255 / most)) for at, most in _565]
+    return np.stack(parts, axis=-1).astype(np.uint8)
 
 
 def _unpacked(layout: PixelFormat, rows: NDArray[np.uint8]) -> NDArray[np.uint16]:
@@ -258,6 +285,10 @@ def encode(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
         coloured = np.full((len(pixels), pixels.shape[1] // len(luminances), together), 128, np.uint8)
         coloured[..., list(luminances)] = pixels.reshape(len(pixels), -1, len(luminances))
         return coloured.tobytes()
+    if layout.packed == "565":
+        grey = pixels.astype(float) / 255
+        parts = [np.rint(grey * most).astype("<u2") << np.uint16(at) for at, most in _565]
+        return np.sum(parts, axis=0, dtype="<u2").tobytes()
     if layout.pattern in _COLOURS:
         return np.repeat(pixels.astype(layout.dtype)[..., None], len(layout.pattern), axis=-1).tobytes()
     if layout.pattern == _PLANES:

@@ -13,21 +13,14 @@ from enum import Enum
 
 from reseau.core.errors import ProtocolError, SettingError
 
-from ..profiles import known
 from .stream import excerpt
 
-__all__ = ["BITS", "ERRORS", "LIMIT", "Line", "Phase", "Status", "decode", "decode_status", "encode", "phase"]
+__all__ = ["LIMIT", "Line", "Phase", "Status", "decode", "decode_status", "encode", "phase"]
 
 LIMIT = 128
 """Largest size of an accepted line (bytes)."""
 
 _LINE = re.compile(rb"(\d{1,2})([A-Z]{2})([ -~]*)")
-
-_KNOWN = known("smc100")
-ERRORS: dict[str, str] = _KNOWN["errors"]
-"""Answers to TE."""
-BITS: dict[int, str] = {int(bit, 16): meaning for bit, meaning in _KNOWN["bits"].items()}
-"""Error bits in the first four digits of TS."""
 
 
 class Phase(Enum):
@@ -103,11 +96,6 @@ class Status:
         """State of the axis."""
         return phase(self.state)
 
-    @property
-    def error_texts(self) -> tuple[str, ...]:
-        """Texts of the error bits."""
-        return tuple(text for bit, text in BITS.items() if self.errors & bit)
-
 
 def encode(line: Line) -> bytes:
     r"""Encode a command or an answer.
@@ -152,8 +140,8 @@ def decode_status(value: str) -> Status:
 
     Examples
     --------
-    >>> decode_status("002028").error_texts
-    ('following error',)
+    >>> decode_status("002028")
+    Status(errors=32, state=40)
     """
     if re.fullmatch(r"[0-9A-Fa-f]{6}", value) is None:
         raise ProtocolError(f"not a status: {value!r}")

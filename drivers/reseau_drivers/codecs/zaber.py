@@ -14,14 +14,10 @@ from typing import ClassVar
 
 from reseau.core.errors import ProtocolError, SettingError
 
-from ..profiles import known
 from .stream import LineMessageDecoder, excerpt
 
 __all__ = [
-    "FAULTS",
     "LIMIT",
-    "UNREFERENCED",
-    "UNRELIABLE",
     "Alert",
     "Command",
     "Info",
@@ -36,14 +32,6 @@ __all__ = [
 
 LIMIT = 512
 """Largest size of an accepted message (bytes); devices send at most 80 by default."""
-
-_KNOWN = known("zaber")
-FAULTS: dict[str, str] = _KNOWN["flags"]
-"""Fault and warning flags of an axis that may not be where it says, or will not move, with their meaning."""
-UNREFERENCED: tuple[str, ...] = tuple(_KNOWN["unreferenced"])
-"""Flags of an axis without a reference: no reference position, not homed."""
-UNRELIABLE: frozenset[str] = frozenset(_KNOWN["unreliable"])
-"""Flags after which positions are those of the axis only once it is homed again."""
 
 _REPLY = re.compile(rb"(\d{1,2}) (\d)(?: (\d{2}))? (OK|RJ) (IDLE|BUSY) ([A-Z]{2}|--) ([ -~]+)")
 _INFO = re.compile(rb"(\d{1,2}) (\d)(?: (\d{2}))? ([ -~]*)")

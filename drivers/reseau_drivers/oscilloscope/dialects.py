@@ -13,18 +13,17 @@ import re
 import struct
 import tomllib
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from reseau.core.data import Array
-from reseau.core.errors import FormatError, InputError, ProtocolError, SettingError
+from reseau.core.errors import FormatError, ProtocolError, SettingError
 
 from ..codecs.ieee488 import picture
 from ..codecs.numbers import INFINITE
-from ..profiles import CONTROLLERS, FOLDER
+from ..profiles import CONTROLLER_SCHEMA, CONTROLLERS, FOLDER, controller, text_of
 from .screens import bytes_of_colours, picture_after, runs_of_colours
 
 __all__ = [
@@ -336,7 +335,7 @@ def dialect_named(name: str) -> Dialect:
     path, _, wanted = name.partition("#")
     known, chosen = DIALECTS, name
     if path.endswith(".toml"):
-        _, known = read_profiles(_text_of(path), where=path)
+        _, known = read_profiles(text_of(path), where=path)
         chosen = wanted or (known[0].name if len(known) == 1 else "")
     found = next((each for each in known if each.name == chosen), None)
     if found is None:
@@ -366,8 +365,10 @@ def described(name: str = "") -> str:
     >>> read_profiles(described("Rigol 1000Z"), where="")[1][0].examples[1]
     'RIGOL TECHNOLOGIES,MSO1104Z,M,1'
     """
+    if name.endswith(".toml") and "#" not in name and CONTROLLER_SCHEMA in text_of(name):
+        return f"a controller, {controller(own=name)['name']}: for `dialect` in the options of a table\n"
     if not name or (name.endswith(".toml") and "#" not in name):
-        known = DIALECTS if not name else read_profiles(_text_of(name), where=name)[1]
+        known = DIALECTS if not name else read_profiles(text_of(name), where=name)[1]
         examples = {
             each.name: ", ".join(example.split(",")[1] for example in each.examples) for each in known
         }
@@ -376,7 +377,7 @@ def described(name: str = "") -> str:
     if name in CONTROLLERS:
         return (FOLDER / f"{name}.toml").read_text("utf-8")
     dialect, path = dialect_named(name), name.partition("#")[0]
-    texts = [_text_of(path)] if path.endswith(".toml") else _FILES.values()
+    texts = [text_of(path)] if path.endswith(".toml") else _FILES.values()
     text = next(text for text in texts if f'name = "{dialect.name}"' in text)
     head, *parts = re.split(r"(?m)^(?=\[)", text)
     kept = [part for part in parts if not part.startswith(("[[profiles]]", "[waveforms"))]
@@ -384,13 +385,6 @@ def described(name: str = "") -> str:
     if found := re.search(r'(?m)^waveform = "(\w+)"', own):
         kept += [part for part in parts if part.startswith(f"[waveforms.{found[1]}]")]
     return "".join([head, *kept, own]).rstrip() + "\n"
-
-
-def _text_of(path: str) -> str:
-    try:
-        return Path(path).read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read ({error})", where=path) from None
 
 
 def _is(maker: Maker, models: str, identity: str) -> bool:

@@ -2,19 +2,24 @@
 
 Those of oscilloscopes (``reseau-instrument-profile/1``) are read by
 :mod:`reseau_drivers.oscilloscope.dialects`, those of controllers
-(``reseau-controller-profile/1``) and of pixels by the codecs.
+(``reseau-controller-profile/1``) by :func:`controller`, those of pixels by their codec.
 """
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
-__all__ = ["CONTROLLERS", "FOLDER", "known"]
+from reseau.core.errors import FormatError, InputError
+
+__all__ = ["CONTROLLERS", "CONTROLLER_SCHEMA", "FOLDER", "controller", "known", "text_of", "told_bits"]
 
 FOLDER = Path(__file__).parent
-CONTROLLERS = ("grbl", "smc100", "zaber")
+CONTROLLERS = ("grbl", "kinesis", "marlin", "smc100", "zaber")
+CONTROLLER_SCHEMA = "reseau-controller-profile/1"
+_PATTERNS = ("banner", "replies")
 
 
 def known(name: str) -> dict[str, Any]:
@@ -26,3 +31,90 @@ def known(name: str) -> dict[str, Any]:
     'a limit switch was reached'
     """
     return tomllib.loads((FOLDER / f"{name}.toml").read_text("utf-8"))
+
+
+def text_of(path: str) -> str:
+    """Return the text of a file of profiles.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        return Path(path).read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read ({error})", where=path) from None
+
+
+def controller(name: str = "", own: str | None = None) -> dict[str, Any]:
+    """Return what is known of a controller, or what a file of one's own says of it.
+
+    Parameters
+    ----------
+    name : str
+        One of `CONTROLLERS`; empty: the one that the file names.
+    own : str, optional
+        A file of the same form, with the same parts.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    FormatError
+        If it is no profile of this controller.
+
+    Examples
+    --------
+    >>> controller("marlin")["banner"]
+    'start'
+    """
+    if not own:
+        return known(name)
+    try:
+        mine = tomllib.loads(text_of(own))
+    except tomllib.TOMLDecodeError as error:
+        raise FormatError(f"is not TOML ({error})", where=own) from None
+    if mine.get("schema") != CONTROLLER_SCHEMA:
+        raise FormatError(f"schema {mine.get('schema')!r} is not {CONTROLLER_SCHEMA}", where=own)
+    if mine.get("name") not in ((name,) if name else CONTROLLERS):
+        wanted = name or ", ".join(CONTROLLERS)
+        raise FormatError(f"is of {mine.get('name')!r}, not of {wanted}", where=own, do="set `name`")
+    _require_alike(known(mine["name"]), mine, own)
+    return mine
+
+
+def _require_alike(ours: dict[str, Any], mine: dict[str, Any], where: str) -> None:
+    """Refuse a profile whose parts are not those of ours, or whose lines are of another kind."""
+    if missing := sorted(ours.keys() ^ mine.keys()):
+        raise FormatError(f"`{missing[0]}` is missing, or not of this controller", where=where)
+    for key, part in ours.items():
+        told = mine[key].values() if isinstance(mine[key], dict) else mine[key]
+        fixed = isinstance(part, dict) and key in ("replies", "motors")
+        if type(mine[key]) is not type(part) or (fixed and part.keys() != mine[key].keys()):
+            names = f": it has {', '.join(part)}" if isinstance(part, dict) else ""
+            raise FormatError(f"`{key}` is not as that of a profile{names}", where=where)
+        kind = float if key == "motors" else str
+        wrong = next((each for each in told if type(each) is not kind), None)
+        if wrong is not None:
+            expected = "number" if kind is float else "text"
+            raise FormatError(f"`{key}`: {wrong!r} is no {expected}", where=where)
+        for pattern in ([told] if isinstance(told, str) else told) if key in _PATTERNS else ():
+            try:
+                re.compile(pattern)
+            except re.error as error:
+                raise FormatError(f"`{key}`: {pattern!r} is no pattern ({error})", where=where) from None
+        for code in mine[key] if key in ("bits", "usb") else ():
+            if re.fullmatch(r"[0-9A-Fa-f]{1,8}", code) is None:
+                raise FormatError(f"`{key}`: {code!r} is no hexadecimal number", where=where)
+
+
+def told_bits(profile: dict[str, Any], value: int) -> tuple[str, ...]:
+    """Return the meanings of the bits that are set.
+
+    Examples
+    --------
+    >>> told_bits(known("smc100"), 0x0020)
+    ('following error',)
+    """
+    return tuple(meaning for bit, meaning in profile["bits"].items() if value & int(bit, 16))

@@ -48,6 +48,7 @@ def zaber(
     address: str | Link,
     *,
     axes: Mapping[str, Mapping[str, Any]],
+    dialect: str | None = None,
     settings: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Table:
@@ -63,6 +64,8 @@ def zaber(
         Fields of :class:`AxisPlan` by name of the axis.
     settings : mapping, optional
         Values for :class:`TableSettings`.
+    dialect : str, optional
+        File of a profile of one's own, as ``reseau bench profile NAME`` shows one.
     **options
         Further arguments of :class:`Table`, as `keep_out`.
 
@@ -73,9 +76,8 @@ def zaber(
     >>> table.axes["tilt"].unit, table.axes["tilt"].limits
     ('deg', (-44.8, 45.0))
     """
-    return Table(
-        name, Zaber(link_to(address)), AxisPlan.read(axes), TableSettings().changed(settings or {}), **options
-    )
+    controller = Zaber(link_to(address), dialect=dialect)
+    return Table(name, controller, AxisPlan.read(axes), TableSettings().changed(settings or {}), **options)
 
 
 def smc100(
@@ -83,6 +85,7 @@ def smc100(
     address: str | Link,
     *,
     axes: Mapping[str, Mapping[str, Any]],
+    dialect: str | None = None,
     settings: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Table:
@@ -90,7 +93,7 @@ def smc100(
 
     Parameters
     ----------
-    name, address, axes, settings, **options
+    name, address, axes, dialect, settings, **options
         As for :func:`zaber`; for a CONEX controller use the address ``device@921600``.
 
     Examples
@@ -101,7 +104,7 @@ def smc100(
     """
     return Table(
         name,
-        Smc100(link_to(address, baud=57600, xonxoff=True)),
+        Smc100(link_to(address, baud=57600, xonxoff=True), dialect=dialect),
         AxisPlan.read(axes),
         TableSettings().changed(settings or {}),
         **options,
@@ -115,6 +118,7 @@ def kinesis(
     axes: Mapping[str, Mapping[str, Any]],
     motor: MotorKind = "dc",
     rack: bool = False,
+    dialect: str | None = None,
     settings: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Table:
@@ -122,7 +126,7 @@ def kinesis(
 
     Parameters
     ----------
-    name, axes, settings, **options
+    name, axes, dialect, settings, **options
         As for :func:`zaber`; `per_unit` of an axis is the number of its encoder counts, or of its microsteps,
         per unit: 1919.64 per degree for a PRM1-Z8, 136533.33 for a K10CR1.
     address : str or Link
@@ -145,7 +149,7 @@ def kinesis(
         if not rack and not 1 <= plan.device <= len(links):
             do = "give the addresses of all controllers, separated by commas"
             raise SettingError(f"device {plan.device} has no address", where=f"axis {axis}", do=do)
-    controller = Kinesis(links, motor, rack=rack)
+    controller = Kinesis(links, motor, rack=rack, dialect=dialect)
     return Table(name, controller, plans, TableSettings().changed(settings or {}), **options)
 
 
@@ -199,6 +203,7 @@ def grbl(
     address: str | Link,
     *,
     axes: Mapping[str, Mapping[str, Any]],
+    dialect: str | None = None,
     settings: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Table:
@@ -206,7 +211,7 @@ def grbl(
 
     Parameters
     ----------
-    name, address, axes, settings, **options
+    name, address, axes, dialect, settings, **options
         As for :func:`zaber`; `axis` of an axis is 1 for X, 2 for Y and so on, `per_unit` the number of GRBL's
         units (of ``$100`` and following) per unit, `low` and `high` are machine positions.
 
@@ -217,7 +222,7 @@ def grbl(
     >>> table.axes["z"].limits
     (-120.0, -1.0)
     """
-    return _by_lines(Grbl, name, address, axes, settings, options)
+    return _by_lines(Grbl, name, address, axes, dialect, settings, options)
 
 
 def marlin(
@@ -225,6 +230,7 @@ def marlin(
     address: str | Link,
     *,
     axes: Mapping[str, Mapping[str, Any]],
+    dialect: str | None = None,
     settings: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Table:
@@ -232,7 +238,7 @@ def marlin(
 
     Parameters
     ----------
-    name, address, axes, settings, **options
+    name, address, axes, dialect, settings, **options
         As for :func:`grbl`; `per_unit` is the number of Marlin's units (of M92) per unit. Many boards have
         the address ``device@250000``.
 
@@ -241,7 +247,7 @@ def marlin(
     >>> marlin("table", "/dev/ttyACM0", axes={"roll": {"axis": 4}}).axes["roll"].unit
     'deg'
     """
-    return _by_lines(Marlin, name, address, axes, settings, options)
+    return _by_lines(Marlin, name, address, axes, dialect, settings, options)
 
 
 def _by_lines(
@@ -249,6 +255,7 @@ def _by_lines(
     name: str,
     address: str | Link,
     axes: Mapping[str, Mapping[str, Any]],
+    dialect: str | None,
     settings: Mapping[str, Any] | None,
     options: Mapping[str, Any],
 ) -> Table:
@@ -256,5 +263,5 @@ def _by_lines(
     plans = AxisPlan.read(axes)
     for plan in plans.values():
         letter_of(plan)
-    made = controller(link_to(address, keep_up=True))
+    made = controller(link_to(address, keep_up=True), dialect=dialect)
     return Table(name, made, plans, TableSettings().changed(settings or {}), **options)

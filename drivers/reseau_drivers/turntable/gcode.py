@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from reseau.core.errors import DeadlineError, SettingError
 
@@ -22,16 +23,19 @@ class Lines(MessageLink[Message]):
         Link to the controller.
     overhear : callable
         Called with each message that is not an answer.
+    profile : mapping
+        What is known of the controller.
 
     Examples
     --------
     >>> from reseau_drivers.link import link_to
-    >>> Lines(link_to("/dev/ttyUSB0"), lambda message: None).ignored
+    >>> from reseau_drivers.profiles import known
+    >>> Lines(link_to("/dev/ttyUSB0"), lambda message: None, known("marlin")).ignored
     0
     """
 
-    def __init__(self, link: Link, overhear: Callable[[Message], None]) -> None:
-        super().__init__(link, AnswerDecoder(), overhear)
+    def __init__(self, link: Link, overhear: Callable[[Message], None], profile: Mapping[str, Any]) -> None:
+        super().__init__(link, AnswerDecoder(profile), overhear)
 
 
 def letter_of(plan: AxisPlan) -> str:

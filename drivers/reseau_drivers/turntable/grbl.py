@@ -21,6 +21,7 @@ from reseau.instruments import Deadline, Identity
 
 from ..codecs.gcode import Alarm, Banner, Error, Message, Ok, Outdated, Report, Said, encode
 from ..link import Link
+from ..profiles import controller
 from .gcode import Lines, letter_of, until
 from .reference import References, Reported
 from .table import AxisPlan
@@ -51,6 +52,8 @@ class Grbl:
         Link to the controller.
     answer_s : float
         Time limit of an answer (s).
+    dialect : str, optional
+        File of a profile of one's own.
 
     Examples
     --------
@@ -60,9 +63,10 @@ class Grbl:
 
     checked = False
 
-    def __init__(self, link: Link, answer_s: float = 1.0) -> None:
+    def __init__(self, link: Link, answer_s: float = 1.0, dialect: str | None = None) -> None:
+        self._known = controller("grbl", dialect)
         self._answer_s = answer_s
-        self._link = Lines(link, self._overheard)
+        self._link = Lines(link, self._overheard, self._known)
         self._synchronised = self._suitable = False
         self._speed: dict[str, float] = {}
         self._alarm: Alarm | None = None

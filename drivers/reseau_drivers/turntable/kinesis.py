@@ -33,26 +33,18 @@ from ..codecs.apt import (
     encode_velocities,
 )
 from ..link import Link, MessageLink
+from ..profiles import controller, known, told_bits
 from .reference import References, Reported
 from .table import AxisPlan
 
-__all__ = ["MOTORS", "Kinesis", "MotorKind", "kinesis_ports"]
+__all__ = ["Kinesis", "MotorKind", "kinesis_ports"]
 
 MotorKind = Literal["dc", "brushless", "stepper"]
-MOTORS: Mapping[MotorKind, float] = {
-    "dc": 65536 * 2048 / 6e6,
-    "brushless": 65536 * 102.4e-6,
-    "stepper": 53.68,
-}
-"""Velocity in the controller's units for one count per second; the protocol's section on conversions."""
-
 _BEGINS_S = 2.0
 """Time in which an order must show in the status (s)."""
 _POLL_S = 0.01
 _STEPPERS = ("stepper",)
 _OFF = "the motor is switched off"
-_CUBE_USB = (0x0403, 0xFAF0)
-"""Vendor and product of the USB converters in Thorlabs' controllers."""
 
 
 class Kinesis:
@@ -68,6 +60,8 @@ class Kinesis:
         Whether there is one link, to a rack: `AxisPlan.device` is then the number of the bay.
     answer_s : float
         Time limit of an answer (s).
+    dialect : str, optional
+        File of a profile of one's own.
 
     Examples
     --------
@@ -84,9 +78,11 @@ class Kinesis:
         *,
         rack: bool = False,
         answer_s: float = 1.0,
+        dialect: str | None = None,
     ) -> None:
-        if motor not in MOTORS:
-            raise SettingError(f"{motor!r} is not one of {', '.join(MOTORS)}", where="motor")
+        self._known = controller("kinesis", dialect)
+        if motor not in self._known["motors"]:
+            raise SettingError(f"{motor!r} is not one of {', '.join(self._known['motors'])}", where="motor")
         if rack and len(links) != 1:
             raise SettingError("has one address", where="rack")
         self._links = [_Cube(link, answer_s) for link in links]
@@ -122,7 +118,7 @@ class Kinesis:
     def set_speed(self, plan: AxisPlan, units_per_s: float, deadline: Deadline) -> None:
         """Set the speed of an axis, and read it back; its acceleration stays."""
         cube, address = self._at(plan.device)
-        maximum = max(1, round(units_per_s * plan.per_unit * MOTORS[self._motor]))
+        maximum = max(1, round(units_per_s * plan.per_unit * self._known["motors"][self._motor]))
         now = self._velocities(plan, deadline)
         if now.maximum == maximum:
             return
@@ -166,8 +162,7 @@ class Kinesis:
         faults = []
         if Bits.ENABLED not in bits:
             faults.append(_OFF)
-        if Bits.POSITION_ERROR in bits:
-            faults.append("the axis does not follow: it stalled")
+        faults += told_bits(self._known, bits)
         # At its reference a stage may stand on a switch: that is an end only where it was to go farther.
         target = self._targets.get((plan.device, plan.axis), counts)
         short = abs(target - counts) > plan.tolerance * plan.per_unit
@@ -223,7 +218,8 @@ def kinesis_ports() -> tuple[str, ...]:
     >>> isinstance(kinesis_ports(), tuple)
     True
     """
-    return tuple(sorted(port.device for port in list_ports.comports() if (port.vid, port.pid) == _CUBE_USB))
+    usb = tuple(int(each, 16) for each in known("kinesis")["usb"])
+    return tuple(sorted(port.device for port in list_ports.comports() if (port.vid, port.pid) == usb))
 
 
 class _Cube:

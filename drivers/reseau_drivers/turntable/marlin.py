@@ -20,6 +20,7 @@ from reseau.instruments import Deadline, Identity
 
 from ..codecs.gcode import AXES, Banner, Busy, Error, Message, Ok, Resend, Said, encode_numbered
 from ..link import Link
+from ..profiles import controller
 from .gcode import Lines, letter_of, until
 from .reference import References, Reported
 from .table import AxisPlan
@@ -55,6 +56,8 @@ class Marlin:
         Link to the controller.
     answer_s : float
         Time limit of an answer (s); while Marlin says that it is busy, the time begins anew.
+    dialect : str, optional
+        File of a profile of one's own.
 
     Examples
     --------
@@ -64,9 +67,10 @@ class Marlin:
 
     checked = False
 
-    def __init__(self, link: Link, answer_s: float = 1.0) -> None:
+    def __init__(self, link: Link, answer_s: float = 1.0, dialect: str | None = None) -> None:
+        self._known = controller("marlin", dialect)
         self._answer_s = answer_s
-        self._link = Lines(link, self._overheard)
+        self._link = Lines(link, self._overheard, self._known)
         self._number = 0
         self._synchronised = False
         self._steps: dict[str, float] = {}
@@ -92,8 +96,8 @@ class Marlin:
         for plan in plans.values():
             letter_of(plan)
         said = " ".join(self._line("M115", deadline))
-        firmware = re.search(r"FIRMWARE_NAME:\s*(.*?)(?= \(| SOURCE_CODE_URL| PROTOCOL_VERSION|$)", said)
-        machine = re.search(r"MACHINE_TYPE:\s*(.*?)(?= [A-Z_]+:|$)", said)
+        firmware = self._found("firmware", said)
+        machine = self._found("machine", said)
         return Identity("Marlin", machine[1] if machine else "", "", firmware[1] if firmware else "")
 
     def set_speed(self, plan: AxisPlan, units_per_s: float, deadline: Deadline) -> None:
@@ -122,7 +126,7 @@ class Marlin:
         feed *= _FRESH / max(1, self._percent)
         self._underway.add(letter)
         said = self._line(f"G1 {letter}{position * plan.per_unit:.4f} F{feed:.3f}", deadline)
-        if any(re.search(r"Home [A-Z]+ First", text) for text in said):
+        if any(self._found("unhomed", text) for text in said):
             raise StateError("is not homed", do=f"home {plan.name} first")
 
     def halt(self, plan: AxisPlan, deadline: Deadline) -> None:
@@ -275,7 +279,7 @@ class Marlin:
                 if isinstance(each, Error):
                     raise RefusedError(f"refused the line: {each.meaning}", command=line)
             said = [each.text for each in heard if isinstance(each, Said)]
-            if any("Unknown command" in text for text in said):
+            if any(self._found("unknown", text) for text in said):
                 raise RefusedError("does not know the command", command=line)
             return said
         raise ProtocolError(f"wanted the line {_RESENDS} times", command=line, do="check cable and baud rate")
@@ -300,8 +304,12 @@ class Marlin:
     def _overheard(self, message: Message) -> None:
         if isinstance(message, Banner):
             self.references.void("the controller has started anew")
-        if isinstance(message, Said) and "endstops hit" in message.text:
-            self._endstop = message.text.partition("hit:")[2].strip()
+        if isinstance(message, Said) and (found := self._found("endstops", message.text)):
+            self._endstop = found[1].strip()
+
+    def _found(self, reply: str, text: str) -> re.Match[str] | None:
+        """Whether a text is a reply of the profile."""
+        return re.search(self._known["replies"][reply], text)
 
 
 def _bit(letter: str) -> int:

@@ -12,9 +12,10 @@ from reseau.core.errors import ProtocolError, RefusedError, StateError
 from reseau.instruments import Deadline, Identity
 
 from ..codecs.numbers import number
-from ..codecs.smc100 import ERRORS, LIMIT, Line, Phase, decode, decode_status, encode
+from ..codecs.smc100 import LIMIT, Line, Phase, decode, decode_status, encode
 from ..codecs.stream import LineDecoder
 from ..link import Link, MessageLink
+from ..profiles import controller, told_bits
 from .reference import References, Reported
 from .table import AxisPlan
 
@@ -33,6 +34,8 @@ class Smc100:
         Link to the controllers.
     answer_s : float
         Time limit of an answer (s).
+    dialect : str, optional
+        File of a profile of one's own.
 
     Examples
     --------
@@ -42,7 +45,8 @@ class Smc100:
 
     checked = False
 
-    def __init__(self, link: Link, answer_s: float = 1.0) -> None:
+    def __init__(self, link: Link, answer_s: float = 1.0, dialect: str | None = None) -> None:
+        self._known = controller("smc100", dialect)
         self._answer_s = answer_s
         self._link: MessageLink[bytes] = MessageLink(link, LineDecoder(limit=LIMIT))
         self.references = References()
@@ -91,7 +95,8 @@ class Smc100:
         """Return what it reports of the axis."""
         status = decode_status(self._query(plan, "TS", deadline))
         position = number(self._query(plan, "TP", deadline)) / plan.per_unit
-        phase, faults = status.phase, status.error_texts
+        phase = status.phase
+        faults = told_bits(self._known, status.errors)
         if phase is Phase.DISABLED:
             faults = (*faults, "the motor is disabled")
         moving = phase in (Phase.HOMING, Phase.MOVING, Phase.JOGGING)
@@ -104,11 +109,13 @@ class Smc100:
         self._query(plan, "TE", deadline)
         self._link.send(encode(Line(plan.device, name, value)), deadline.part(self._answer_s))
         error = self._query(plan, "TE", deadline).strip()
-        if error not in ERRORS:
+        if error not in self._known["errors"]:
             raise ProtocolError(f"{error!r} is not a valid answer to TE")
         if error != "@":
             kind = StateError if error in _STATES else RefusedError
-            raise kind(f"refused the command: {ERRORS[error]}", command=f"{plan.device}{name}{value}")
+            raise kind(
+                f"refused the command: {self._known['errors'][error]}", command=f"{plan.device}{name}{value}"
+            )
 
     def _query(self, plan: AxisPlan, name: str, deadline: Deadline) -> str:
         """Send a query and wait for the answer, which repeats its address and name."""

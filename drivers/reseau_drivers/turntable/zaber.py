@@ -11,8 +11,9 @@ from reseau.core.errors import ProtocolError, RefusedError, StateError
 from reseau.instruments import Deadline, Identity
 
 from ..codecs.numbers import number
-from ..codecs.zaber import FAULTS, UNREFERENCED, UNRELIABLE, Command, Message, MessageDecoder, Reply, encode
+from ..codecs.zaber import Command, Message, MessageDecoder, Reply, encode
 from ..link import Link, MessageLink
+from ..profiles import controller
 from .reference import References, Reported
 from .table import AxisPlan
 
@@ -31,6 +32,8 @@ class Zaber:
         Link to the first device.
     answer_s : float
         Time limit of an answer (s).
+    dialect : str, optional
+        File of a profile of one's own.
 
     Examples
     --------
@@ -40,7 +43,8 @@ class Zaber:
 
     checked = True
 
-    def __init__(self, link: Link, answer_s: float = 1.0) -> None:
+    def __init__(self, link: Link, answer_s: float = 1.0, dialect: str | None = None) -> None:
+        self._known = controller("zaber", dialect)
         self._answer_s = answer_s
         self._link: MessageLink[Message] = MessageLink(link, MessageDecoder())
         self._id = 0
@@ -91,15 +95,16 @@ class Zaber:
             raise ProtocolError(f"{reply.data!r} is not a list of warnings")
         # Query the movement first: a position read before it could be an intermediate one.
         position = self._query(plan.device, plan.axis, "get pos", deadline).data
+        known, unreferenced = self._known["flags"], self._known["unreferenced"]
         found = {
-            flag: FAULTS.get(flag, f"it reports {flag}, which is not known")
+            flag: known.get(flag, f"it reports {flag}, which is not known")
             for flag in flags
-            if flag[0] in "FW" and flag not in UNREFERENCED
+            if flag[0] in "FW" and flag not in unreferenced
         }
         for flag, what in found.items():
-            if flag in UNRELIABLE or flag not in FAULTS:
+            if flag in self._known["unreliable"] or flag not in known:
                 self.references.void(what, plan.name)
-        referenced = not any(flag in UNREFERENCED for flag in flags)
+        referenced = not any(flag in unreferenced for flag in flags)
         return Reported(number(position) / plan.per_unit, reply.busy, referenced, tuple(found.values()))
 
     def _query(self, device: int, axis: int, words: str, deadline: Deadline) -> Reply:

@@ -208,9 +208,9 @@ def profile(
     address: Annotated[str, Option("Try it: fetch a picture of the screen at this address.")] = "",
     out: v.Out | None = None,
 ) -> None:
-    """Show what is known of a family of oscilloscopes, as a file; check a file of your own; try it.
+    """Show what is known of oscilloscopes or a controller, as a file; check a file of your own; try it.
 
-    Give a file of your own as `dialect` in the options of an oscilloscope in the bench file.
+    Give a file of your own as `dialect` in the options of an oscilloscope or a table in the bench file.
     """
     from ..core.plugins import INSTRUMENTS, TOOLS, plugin
     from ..io import write_whole

@@ -46,7 +46,10 @@ Anyway = Annotated[bool, Option("Go on with a calibration that is usable for not
 AsJson = Annotated[bool, Option("Write JSON to standard output.", Group.FILES, called="json")]
 
 # Images and marks.
-Channel = Annotated[Literal["luma", "red", "green", "blue"], Option("Channel of colour images.")]
+Channel = Annotated[
+    Literal["luma", "red", "green", "blue", "mosaic"],
+    Option("Channel of colour images; `mosaic`: pixels of raw files behind their filters."),
+]
 Mirrored = Annotated[
     bool,
     Option("The image shows the target from behind, or in a mirror.", Group.TARGET, off="--not-mirrored"),

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from ..core.provenance import sha256_of
 from ..core.tone import ToneCurve
 from . import write_whole
 from .dicom import is_dicom, open_dicom
-from .photographs import decoded_heic, decoded_raw, is_heic, is_raw
+from .photographs import decoded_heic, decoded_raw, is_heic, is_raw, mosaic_of_raw
 from .profiles import curve_of_file, curve_of_profile
 from .scans import CHANNELS, Scan, Window, full_scale_of, scan_of
 
@@ -50,7 +50,7 @@ _AGAIN = "copy or scan it again"
 _BY_OPENCV = (5, 7, 8, 32946)
 """Compressions LZW, JPEG and Deflate of a TIFF, which OpenCV decodes, too."""
 
-Channel = Literal["luma", "red", "green", "blue"]
+Channel = Literal["luma", "red", "green", "blue", "mosaic"]
 
 
 def read_image(path: Path | str, channel: Channel = "luma", digest: str | None = None) -> Frame:
@@ -62,9 +62,10 @@ def read_image(path: Path | str, channel: Channel = "luma", digest: str | None =
         PNG, JPEG, BMP, TIFF, HEIC, WebP, AVIF, GIF, JPEG 2000, PGM, a raw file or DICOM; see
         :mod:`reseau.io.images` for the kinds of TIFF. ``loop.dcm#3`` is the third frame of a DICOM file;
         without a number the first is read, with a note.
-    channel : {"luma", "red", "green", "blue"}
+    channel : {"luma", "red", "green", "blue", "mosaic"}
         Channel of a colour image that is used. A lens images colours at slightly different scales; a single
-        channel avoids the shifts that this causes. The pixels of a grey image are the same for every channel.
+        channel avoids the shifts that this causes. ``mosaic``: the pixels of a raw file behind their filters,
+        none interpolated. The pixels of a grey image are the same for every channel.
     digest : str, optional
         SHA-256 of the file, if it is known.
 
@@ -80,7 +81,7 @@ def read_image(path: Path | str, channel: Channel = "luma", digest: str | None =
     ImageError
         When it is not an image, damaged, of an unsupported kind, or larger than `MAX_PIXELS`.
     UsageError
-        When there is no such channel.
+        When there is no such channel, or no mosaic.
 
     Examples
     --------
@@ -92,8 +93,12 @@ def read_image(path: Path | str, channel: Channel = "luma", digest: str | None =
     ('flat.png', 6, 4, 255.0)
     """
     path = Path(path)
-    if channel != "luma" and channel not in _LUMA:
-        raise UsageError("is not a channel", where=channel, do="use luma, red, green or blue")
+    if channel not in get_args(Channel):
+        raise UsageError("is not a channel", where=channel, do="use luma, red, green, blue or mosaic")
+    if channel == "mosaic" and is_raw(path) and path.exists():
+        mosaic, full_scale = mosaic_of_raw(path)
+        _check_size(path, mosaic.shape[1], mosaic.shape[0])
+        return Frame(mosaic, full_scale, path.name, digest or sha256_of(path))
     scan = open_scan(path)
     digest = sha256_of(path) if digest is None else digest
     _check_size(path, scan.width, scan.height)
@@ -112,6 +117,8 @@ def grey_of(
     >>> grey_of(np.array([[[10, 20, 30]]], np.uint8), "luma")
     array([[18]], dtype=uint8)
     """
+    if channel == "mosaic":
+        raise UsageError("is no channel of colours", where=channel, do="use luma, red, green or blue")
     if channel != "luma":
         return np.array(pixels[:, :, channels.index(channel)])
     return luma(pixels, channels)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -124,6 +126,8 @@ def _as_sensor(pixels: NDArray[Any], shown: int) -> NDArray[Any]:
 def decoded_raw(path: Path) -> NDArray[Any]:
     """Red, green and blue (h, w, 3) of a raw file: 16 bit, proportional to the light, as the sensor has them.
 
+    See :func:`mosaic_of_raw` for pixels without interpolation.
+
     Raises
     ------
     UsageError
@@ -131,17 +135,44 @@ def decoded_raw(path: Path) -> NDArray[Any]:
     ImageError
         When the file is damaged, or of a camera that is not known.
     """
+    with _opened_raw(path) as (rawpy, raw):
+        pixels = raw.postprocess(
+            gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0,
+            output_color=rawpy.ColorSpace.raw,
+        )  # fmt: skip
+    return np.asarray(pixels)
+
+
+def mosaic_of_raw(path: Path) -> tuple[NDArray[np.uint16], float]:
+    """Pixels (h, w) of a raw file behind their filters, above black, and the value at which they saturate.
+
+    Raises
+    ------
+    UsageError
+        When rawpy is missing.
+    ImageError
+        When the file is damaged, of a camera that is not known, or its filters are no cells of 2 × 2 pixels.
+    """
+    with _opened_raw(path) as (_, raw):
+        pattern, sensor = raw.raw_pattern, np.array(raw.raw_image_visible)
+        if pattern is None or pattern.shape != (2, 2) or sensor.ndim != 2:
+            what = "has no filters in cells of 2 × 2 pixels"
+            raise ImageError(what, where=path, do="read another channel of it: luma, red, green or blue")
+        black = np.array(raw.black_level_per_channel, np.int64)[np.array(raw.raw_colors_visible)]
+        full = float(raw.white_level - max(raw.black_level_per_channel))
+    return np.clip(sensor - black, 0, full).astype(np.uint16), full
+
+
+@contextmanager
+def _opened_raw(path: Path) -> Iterator[tuple[Any, Any]]:
+    """The library, and a raw file."""
     with optional():
         import rawpy
     try:
         with rawpy.imread(str(path)) as raw:
-            pixels = raw.postprocess(
-                gamma=(1, 1), no_auto_bright=True, output_bps=16, use_camera_wb=True, user_flip=0,
-                output_color=rawpy.ColorSpace.raw,
-            )  # fmt: skip
+            yield rawpy, raw
     except (rawpy.LibRawError, OSError) as error:
         raise ImageError("is no raw file that can be read", where=path, do="convert it to TIFF") from error
-    return np.asarray(pixels)
 
 
 def _tells(path: Path) -> bool:

@@ -255,7 +255,7 @@ def photograph_reader(
 
     Parameters
     ----------
-    channel : {"luma", "red", "green", "blue"}
+    channel : {"luma", "red", "green", "blue", "mosaic"}
         Channel of colour images.
     correction : SensorCorrection, optional
         Correction for the sensor.

@@ -7,6 +7,7 @@ import pytest
 from reseau.core.errors import ProtocolError, SettingError
 from reseau_drivers.codecs import bk, compactpulser, hislip, ieee488, ping, rpc, smc100, usbtmc, vxi11, zaber
 from reseau_drivers.codecs.stream import Damaged
+from reseau_drivers.profiles import known, told_bits
 
 
 def test_zaber_replies_of_the_manual_with_and_without_id_and_checksum() -> None:
@@ -69,23 +70,27 @@ def test_smc100_states_of_the_manual(codes: str, phase: smc100.Phase) -> None:
         assert smc100.decode_status(f"0000{code}").phase is phase
 
 
+def _bits(answer: str) -> tuple[str, ...]:
+    return told_bits(known("smc100"), smc100.decode_status(answer).errors)
+
+
 def test_smc100_status_bits_are_the_first_four_digits() -> None:
     # The manual's own example of TS: 0x004C is homing time-out, RMS and peak current limit.
-    assert smc100.decode_status("004C0A").error_texts == (
+    assert _bits("004C0A") == (
         "peak current limit",
         "RMS current limit",
         "homing time-out",
     )
-    assert smc100.decode_status("002132").error_texts == ("negative end of run", "following error")
-    assert smc100.decode_status("000232").error_texts == ("positive end of run",)
-    assert smc100.decode_status("030033").error_texts == ("DC voltage too low", "80 W output power exceeded")
+    assert _bits("002132") == ("negative end of run", "following error")
+    assert _bits("000232") == ("positive end of run",)
+    assert _bits("030033") == ("DC voltage too low", "80 W output power exceeded")
 
 
 def test_smc100_errors_are_those_of_the_manual() -> None:
     # TE, page 61: @, A to N but for none, S, U to X; P is the CONEX-CC's.
-    assert "".join(smc100.ERRORS) == "@ABCDEFGHIJKLMNPSUVWX"
-    assert "NOT REFERENCED" in smc100.ERRORS["H"]
-    assert smc100.ERRORS["G"] == "displacement out of limits"
+    assert "".join(known("smc100")["errors"]) == "@ABCDEFGHIJKLMNPSUVWX"
+    assert "NOT REFERENCED" in known("smc100")["errors"]["H"]
+    assert known("smc100")["errors"]["G"] == "displacement out of limits"
 
 
 def test_ping_request_of_the_documentation() -> None:
