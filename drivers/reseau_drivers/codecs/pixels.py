@@ -288,7 +288,7 @@ def encode(layout: PixelFormat, pixels: NDArray[Any]) -> bytes:
     if layout.packed == "565":
         grey = pixels.astype(float) / 255
         parts = [np.rint(grey * most).astype("<u2") << np.uint16(at) for at, most in _565]
-        return np.sum(parts, axis=0, dtype="<u2").tobytes()
+        return bytes(np.sum(parts, axis=0, dtype="<u2").tobytes())
     if layout.pattern in _COLOURS:
         return np.repeat(pixels.astype(layout.dtype)[..., None], len(layout.pattern), axis=-1).tobytes()
     if layout.pattern == _PLANES:
