@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-import sys
 import venv
 import zipfile
 from pathlib import Path
@@ -31,8 +30,11 @@ def pip(python: Path | str, *arguments: object) -> None:
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
-    # Isolated, as `pip install .` builds it: with what pip installs for the build.
-    pip(sys.executable, "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, ".")
+    # Isolated, as `pip install .` builds it: with what pip installs for the build. Not by this Python, whose
+    # site names the sources: pip hides what a site has.
+    venv.create(folder / "venv", with_pip=True)
+    python = folder / "venv" / ("Scripts" if os.name == "nt" else "bin") / "python"
+    pip(python, "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, ".")
     (path,) = folder.glob("reseau-*.whl")
     return path
 
