@@ -40,6 +40,13 @@ def text_of(path: str) -> str:
     ------
     InputError
         If it cannot be read.
+
+    Examples
+    --------
+    >>> text_of("none.toml")
+    Traceback (most recent call last):
+        ...
+    reseau.core.errors.InputError: none.toml: cannot be read ([Errno 2] No such file or directory: 'none.toml')
     """
     try:
         return Path(path).read_text("utf-8")
