@@ -46,7 +46,7 @@ def text_of(path: str) -> str:
     >>> text_of("none.toml")
     Traceback (most recent call last):
         ...
-    reseau.core.errors.InputError: none.toml: cannot be read ([Errno 2] No such file or directory: 'none.toml')
+    reseau.core.errors.InputError: none.toml: cannot be read ([Errno 2] No such file or ...)
     """
     try:
         return Path(path).read_text("utf-8")
