@@ -10,7 +10,8 @@ import numpy as np
 from reseau.core.data import Frame
 from reseau.core.failure import Failure
 from reseau.designs import board
-from reseau.procedures.calibration import calibrate_camera, copies_among
+from reseau.procedures.calibration import calibrate_camera
+from reseau.procedures.copies import copies_among
 from reseau.procedures.target_measurement import measurer_of
 
 from ..measure.board_pictures import picture
