@@ -13,10 +13,8 @@ from pathlib import Path
 import pytest
 
 from reseau.cli import run
-from reseau.io.images import write_image
-from reseau_sims import World
 
-from .touring import DOCS, follow, steps
+from .touring import DOCS, draw_demo, follow, steps
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
@@ -104,12 +102,7 @@ def test_pages_that_continue_the_tour_of_film(tmp_path: Path, monkeypatch: pytes
 def test_pages_that_continue_the_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the photographs of the demo's world, without its bench."""
     monkeypatch.chdir(tmp_path)
-    world, out = World.standard(seed=1), Path("out")
-    out.mkdir()
-    world.design.write(out / "reseau.json")
-    world.test_object.write(out / "rods.json")
-    for name in ("photo_i", "photo_ii", "photo_iii"):
-        write_image(out / f"{name}.png", getattr(world, name)().pixels)
+    draw_demo()
     follow("howto/measure-a-reseau", tmp_path)
     follow("howto/correct-your-own-instrument", tmp_path)
     lying = ["--not-mirrored", "--max-rotation-deg", "45", "--out", "marks.csv"]

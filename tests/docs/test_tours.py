@@ -11,12 +11,11 @@ import pytest
 from reseau.archive import Archive
 from reseau.calibration import Calibration
 from reseau.cli import run
-from reseau.io.images import write_image
 from reseau.service import Configurations
 from reseau_sims import World
 
 from ..capture.fieldrig import BENCH, DESIGN, FieldRig, enter
-from .touring import follow, same
+from .touring import draw_demo, follow, same
 
 
 def test_numbers_may_differ_in_the_last_digits_and_words_not() -> None:
@@ -131,12 +130,7 @@ def test_an_instrument_is_corrected_in_three_photographs(
     def demo(words: list[str]) -> bool:
         if words[:2] != ["reseau", "demo"]:
             return words[:3] == ["reseau", "archive", "list"]
-        world, out = World.standard(seed=1), Path("out")
-        out.mkdir()
-        world.design.write(out / "reseau.json")
-        world.test_object.write(out / "rods.json")
-        for name in ("photo_i", "photo_ii", "photo_iii"):
-            write_image(out / f"{name}.png", getattr(world, name)().pixels)
+        draw_demo()
         photos = ["--photo-i", "out/photo_i.png", "--photo-ii", "out/photo_ii.png"]
         designs = ["--reseau", "out/reseau.json", "--test-object", "out/rods.json"]
         return run(["refine", *photos, *designs, "--out", "out/calibration.json"]) == 0

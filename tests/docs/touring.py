@@ -14,6 +14,8 @@ from io import StringIO
 from pathlib import Path
 
 from reseau.cli import run
+from reseau.io.images import write_image
+from reseau_sims import World
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -33,6 +35,16 @@ class Step:
     text: str
     name: str = ""
     shown: tuple[str, ...] = ()
+
+
+def draw_demo() -> None:
+    """Draw the photographs of the demo's world, without its bench, in the folder ``out``."""
+    world, out = World.standard(seed=1), Path("out")
+    out.mkdir()
+    world.design.write(out / "reseau.json")
+    world.test_object.write(out / "rods.json")
+    for name in ("photo_i", "photo_ii", "photo_iii"):
+        write_image(out / f"{name}.png", getattr(world, name)().pixels)
 
 
 def steps(page: str) -> list[Step]:
