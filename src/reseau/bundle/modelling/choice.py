@@ -542,7 +542,8 @@ class _Search:
         density = {each: float(one.log_density(variance).sum()) for each, one in found.items()}
         best = max(density.values(), default=0.0)
         compared = []
-        for each in sorted(self.candidates, key=lambda each: -density.get(each, -np.inf)):
+        # What was chosen comes first: it may predict worse than others, by no more than chance.
+        for each in sorted(self.candidates, key=lambda each: (each != self.pick, -density.get(each, -np.inf))):
             one = found.get(each)
             if each == self.pick and one is None:
                 reason = "chosen: the images are too few to compare models"
@@ -582,15 +583,13 @@ class _Search:
         gain = one.better(chosen)
         if found.candidate == self.pick:
             return "chosen: none with more parameters predicts images better"
-        if self.pick.within(found.candidate):
-            return "too many parameters: predicts images " + (
-                "no better than chance" if gain > 0 else "worse"
-            )
-        if one.parameters > chosen.parameters and gain > 0:
-            return "more parameters, and predicts images no better than chance"
         if found.candidate.within(self.pick):
             return f"too simple: predicts images worse, the parameters that it lacks have p = {found.p:.2g}"
-        return "predicts images worse"
+        how = "no better than chance" if gain > 0 else "worse"
+        if self.pick.within(found.candidate):
+            return f"too many parameters: predicts images {how}"
+        more = "more parameters, and " if one.parameters > chosen.parameters and gain > 0 else ""
+        return f"{more}predicts images {how}"
 
     def _mapping(self, own: Candidate, one: Prediction) -> CameraMapping:
         """The camera with the parameters by which images were predicted."""
