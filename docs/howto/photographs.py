@@ -1,10 +1,12 @@
-"""Photographs of some how-to pages, drawn by OpenCV; nothing of reseau is used.
+"""What some how-to pages begin with, drawn by OpenCV; nothing of reseau is used.
 
 python photographs.py rig          # left/, right/: a board before two cameras that are fixed to each other
 python photographs.py turntable    # table/, angles.csv: a board on a turntable
 python photographs.py wires        # frame.png: an ultrasonic scan of an N-wire phantom
+python photographs.py points       # network.json: points in eight images, with two errors
 """
 
+import json
 import sys
 from pathlib import Path
 
@@ -97,5 +99,36 @@ def wires():
     write("frame.png", 5 + 150 * echoes + RNG.normal(0, 1.5, echoes.shape))
 
 
+def points():
+    """Forty points in eight images, and four distances: one is in centimetres, and two points have each other's names."""
+    xyz = RNG.uniform((-300, -220, -80), (300, 220, 80), (40, 3))
+    matrix, k1 = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]]), np.array([-0.1, 0, 0, 0])
+    seen = []
+    for k in range(8):
+        lean, way = 30 * (k > 0), 2 * np.pi * k / 7
+        turn = turned(lean * np.sin(way), lean * np.cos(way), 90 * (k % 4))
+        seen.append(cv2.projectPoints(xyz, cv2.Rodrigues(turn)[0], np.array([0, 0, 1150.0]), matrix, k1)[0])
+    xy = np.reshape(seen, (8, 40, 2)) + RNG.normal(0, 0.05, (8, 40, 2))
+    xy[5, [3, 4]] = xy[5, [4, 3]]
+    ends = np.array([[0, 1], [2, 3], [4, 5], [6, 7]])
+    length = np.linalg.norm(xyz[ends[:, 0]] - xyz[ends[:, 1]], axis=1) + RNG.normal(0, 0.05, 4)
+    length[2] /= 10
+    names = np.array([f"p{j}" for j in range(40)])
+    Path("network.json").write_text(json.dumps({
+        "schema": "reseau-network/1", "unit": "mm", "datum": "free",
+        "cameras": [{"id": "cam", "model": "opencv", "width": 640, "height": 480,
+                     "parameters": {"fx": 790, "fy": 790, "cx": 320, "cy": 240},
+                     "free": ["fx", "fy", "cx", "cy", "k1"]}],
+        "images": {"id": [f"i{k}" for k in range(8)], "camera": ["cam"] * 8, "X0": [None] * 8,
+                   "rotation": [None] * 8},
+        "points": {"id": names.tolist(), "xyz": [None] * 40, "sigma": [None] * 40, "role": ["tie"] * 40},
+        "observations": {"image": [f"i{k // 40}" for k in range(320)], "point": [*names] * 8,
+                         "x": xy[..., 0].ravel().tolist(), "y": xy[..., 1].ravel().tolist(),
+                         "sx": [0.05] * 320, "sy": [0.05] * 320},
+        "distances": {"from": names[ends[:, 0]].tolist(), "to": names[ends[:, 1]].tolist(),
+                      "length": length.tolist(), "sigma": [0.05] * 4},
+    }))  # fmt: skip
+
+
 if __name__ == "__main__":
-    {"rig": rig, "turntable": turntable, "wires": wires}[sys.argv[1]]()
+    {"rig": rig, "turntable": turntable, "wires": wires, "points": points}[sys.argv[1]]()

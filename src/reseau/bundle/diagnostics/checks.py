@@ -426,7 +426,7 @@ def unmodelled_pattern(result: Result, camera: int) -> CommonPattern | None:
         pattern = common_pattern(result, by_place(result, camera))
     except UsageError:
         return None
-    return pattern if pattern.p < _ALPHA else None
+    return pattern if pattern.p < _ALPHA and pattern.rms > 0 else None
 
 
 def _patterns(result: Result) -> list[Remark]:
