@@ -5,7 +5,7 @@ python photographs.py turntable    # table/, angles.csv: a board on a turntable
 python photographs.py wires        # frame.png: an ultrasonic scan of an N-wire phantom
 python photographs.py points       # network.json: points in eight images, with two errors
 python photographs.py tele         # tele/: images of a plate of circles by parallel rays
-python photographs.py rolling      # rolling/: images of a board by a moving camera that reads its lines one after the other
+python photographs.py rolling      # rolling/: images of a moving board, line after line
 """
 
 import json
@@ -100,7 +100,7 @@ def table(path, xy, size, sigma=0.02):
 
 
 def tele():
-    """Sixteen images of 9 x 7 circles, 1 mm apart, 1280 x 1024 pixels of 3.45 um: m = 0.5, K1 = -0.002 / mm2."""
+    """Sixteen images of 9 x 7 circles, 1 mm apart, in pixels of 3.45 um: m = 0.5, K1 = -0.002 / mm2."""
     at = np.array([(x - 4, y - 3, 0.0) for y in range(7) for x in range(9)])
     for k in range(16):
         lean, way = (0, 18, 25)[k % 3], 2 * np.pi * k / 12
@@ -111,8 +111,10 @@ def tele():
 
 
 def rolling():
-    """Twelve images of the board, 1920 x 1080; fx 1506.4, k3 0.061, a line each 23 us, 0.2 m/s and 0.2 rad/s."""
-    board = np.array([(x * SQUARE_MM, y * SQUARE_MM, 0.0) for y in range(ROWS - 1) for x in range(COLUMNS - 1)])
+    """Twelve images of a board that moves by 0.2 m/s and 0.2 rad/s; fx 1506.4, k3 0.061, a line each 23 us."""
+    board = np.array(
+        [(x * SQUARE_MM, y * SQUARE_MM, 0.0) for y in range(ROWS - 1) for x in range(COLUMNS - 1)]
+    )
     matrix = np.array([[1506.4, 0, 948.2], [0, 1507.1, 546.1], [0, 0, 1]])
     k1_k2_p1_p2_k3 = np.array([0.082, -0.163, 4e-4, -7e-4, 0.061])
     for k in range(12):
@@ -143,7 +145,7 @@ def wires():
 
 
 def points():
-    """Forty points in eight images, and four distances: one is in centimetres, and two points have each other's names."""
+    """Forty points in eight images; of four distances one is in centimetres, two names are exchanged."""
     xyz = RNG.uniform((-300, -220, -80), (300, 220, 80), (40, 3))
     matrix, k1 = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]]), np.array([-0.1, 0, 0, 0])
     seen = []

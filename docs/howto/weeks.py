@@ -24,7 +24,8 @@ def calibrated(temperature, rng):
     values = {name: value + BY_KELVIN.get(name, 0) * (temperature - 20) for name, value in TRUE.items()}
     return Calibration.from_content(
         {
-            "schema": "reseau-calibration/1", "kind": "camera", "name": "left", "sigma0": 1.0, "redundancy": 400,
+            "schema": "reseau-calibration/1", "kind": "camera", "name": "left",
+            "sigma0": 1.0, "redundancy": 400,
             "model": {"model": "brown", "width": 640, "height": 480, "pitch_mm": [0.01, 0.01]},
             "parameters": {
                 name: {"value": value + SIGMA[name] * rng.normal(), "sigma": SIGMA[name],
@@ -39,13 +40,16 @@ def calibrated(temperature, rng):
 
 
 def main():
+    """Write the archive and the table."""
     rng, rows = np.random.default_rng(1), ["calibration,temperature [°C]"]
     with Archive.open("archive", create=True) as archive:
         known = Configurations(archive)
         known.define("left", {"camera": "DMK 33", "lens": "8 mm"})
         for week in range(75):
             temperature = 20.5 + 4 * (week >= 35) + rng.uniform(-0.6, 0.6)
-            made = known.decide("left", calibrated(temperature, rng), RULES, since=FIRST + timedelta(weeks=week))
+            made = known.decide(
+                "left", calibrated(temperature, rng), RULES, since=FIRST + timedelta(weeks=week)
+            )
             if made.outcome == "needs review":
                 known.review("left", made.key, "accepted", comment="first")
             rows.append(f"{made.key},{temperature:.1f}")

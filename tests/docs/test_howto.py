@@ -1,7 +1,7 @@
 """How-to pages: their commands, in the order of the page, print what the page shows.
 
-Pages continue in the folder of a tour, or draw what they need; the camera of the live picture is simulated, and
-the workers of other machines run on this one. Not followed are blocks without output.
+Pages continue in the folder of a tour, or draw what they need; the camera of the live picture is simulated,
+and the workers of other machines run on this one. Not followed are blocks without output.
 """
 
 from __future__ import annotations

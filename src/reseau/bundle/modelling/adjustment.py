@@ -526,9 +526,7 @@ def _doubts(
 
 def _gross(network: Network, rows: Rows) -> Remark:
     where = in_images(network, rows)
-    return Remark(
-        f"unless image points deviate together, gross errors are likely {where}", Code.GROSS_ERRORS
-    )
+    return Remark(f"unless image points deviate together, gross errors are likely {where}", Code.GROSS_ERRORS)
 
 
 def _worst_images(network: Network, size: Array) -> list[Remark]:

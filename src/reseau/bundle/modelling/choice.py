@@ -543,7 +543,9 @@ class _Search:
         best = max(density.values(), default=0.0)
         compared = []
         # What was chosen comes first: it may predict worse than others, by no more than chance.
-        for each in sorted(self.candidates, key=lambda each: (each != self.pick, -density.get(each, -np.inf))):
+        for each in sorted(
+            self.candidates, key=lambda each: (each != self.pick, -density.get(each, -np.inf))
+        ):
             one = found.get(each)
             if each == self.pick and one is None:
                 reason = "chosen: the images are too few to compare models"
