@@ -111,7 +111,7 @@ def tele():
 
 
 def rolling():
-    """Twelve images of a board that moves by 0.2 m/s and 0.2 rad/s; fx 1506.4, k3 0.061, a line each 23 us."""
+    """Twelve images of a board that moves by 0.2 m/s, 0.2 rad/s; fx 1506.4, k3 0.061, 23 us a line."""
     board = np.array(
         [(x * SQUARE_MM, y * SQUARE_MM, 0.0) for y in range(ROWS - 1) for x in range(COLUMNS - 1)]
     )
