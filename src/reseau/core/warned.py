@@ -16,6 +16,7 @@ def warn_user(lines: Iterable[str]) -> None:
     Examples
     --------
     >>> with warnings.catch_warnings(record=True) as seen:
+    ...     warnings.simplefilter("always")
     ...     warn_user(["is usable to remove visible distortion only"])
     >>> [str(each.message) for each in seen]
     ['is usable to remove visible distortion only']
