@@ -310,6 +310,7 @@ class GrblBoard:
         """What happens, and is said, in the midst of the next movement."""
         self.answers: dict[str, bytes] = {}
         """Other answers to lines."""
+        self.homes = "$H"
         self.start()
 
     def start(self) -> bytes:
@@ -371,7 +372,7 @@ class GrblBoard:
         for asked, said in {"$G": modes, "$I": self.version, "$$": self.settings}.items():
             if line == asked:
                 return f"{said}\r\nok\r\n".encode()
-        if line == "$H":
+        if line == self.homes:
             self.state, self._left, self._target, self.homed = "Home", 3, 0.0, False
             return b""
         if line == "$X":
@@ -429,6 +430,7 @@ class TCube:
     def __init__(self) -> None:
         self.place, self._target, self._left, self._speed, self.off = 5, 5, 0, 1000, 0
         self.homed = self._homing = False
+        self.bits: int | None = None
 
     def reset(self) -> None:
         """Switch it off and on: it counts from 0 where it stands."""
@@ -463,7 +465,7 @@ class TCube:
                     self.homed, self.place = self.homed or self._homing, self._target
                     self.off = 0 if self._homing else self.off
                 bits = 0x80000000 | (0x400 if self.homed else 0) | (0x10 if self._left else 0)
-                said = struct.pack("<HihhI", 1, self.place, 0, 0, bits)
+                said = struct.pack("<HihhI", 1, self.place, 0, 0, bits if self.bits is None else self.bits)
         return struct.pack("<HHBB", kind + 1, len(said), 0x81, 0) + said if said else b""
 
 

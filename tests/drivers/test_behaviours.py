@@ -14,21 +14,20 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import ReseauError
+from reseau.instruments import Deadline
 from reseau_drivers.camera import v4l2
 from reseau_drivers.codecs import v4l2 as uapi
-from reseau_drivers.codecs.apt import Id, decode_status, encode_status
-from reseau_drivers.codecs.apt import Message as AptMessage
 from reseau_drivers.codecs.numbers import number
 from reseau_drivers.codecs.pixels import GENICAM, VIDEO, decode
 from reseau_drivers.environment import environment_line, environment_modbus
 from reseau_drivers.oscilloscope import oscilloscope
 from reseau_drivers.scanner import dicom_files
-from reseau_drivers.turntable import AxisPlan, Grbl, Table, Zaber
+from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, Table, Zaber
 from reseau_sims.serving import SimulatedCamera
 from reseau_sims.serving.v4l2 import VideoCamera
 
 from .behaviours import behaviours, counted
-from .fakes import GrblBoard, Lines, Screen, Transcript, Wire, ZaberStage
+from .fakes import GrblBoard, Lines, Screen, TCube, Transcript, Wire, ZaberStage
 
 ROWS = behaviours()
 
@@ -146,8 +145,10 @@ def test_zaber(row: dict[str, Any]) -> None:
 
 @rows("apt")
 def test_apt(row: dict[str, Any]) -> None:
-    _, bits = decode_status(AptMessage(Id.DC_STATUS, 0x01, 0x50, data=encode_status(1, 0, row["bits"])))
-    assert {"homed": bool(bits & bits.HOMED), "moving": bits.moving} == row["gives"]
+    cube = TCube()
+    cube.bits = row["bits"]
+    state = Kinesis([Wire(cube)]).state(AxisPlan(), Deadline(1.0))
+    assert {"homed": state.referenced, "moving": state.moving} == row["gives"]
 
 
 def _bytes(text: str) -> bytes:

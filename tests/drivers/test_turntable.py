@@ -17,7 +17,7 @@ from reseau.core.errors import (
     StateError,
     UsageError,
 )
-from reseau.instruments import AxisState, Movable, Turntable
+from reseau.instruments import AxisState, Deadline, Movable, Turntable
 from reseau_drivers.link import link_to
 from reseau_drivers.turntable import AxisPlan, Table, Zaber, grbl, kinesis, marlin, smc100, zaber
 from reseau_sims.serving import (
@@ -69,6 +69,32 @@ def boards(axis: dict[str, Any]) -> list[tuple[Table, Board]]:
 
 def _in_process(machine: Board, script: FaultScript | None = None) -> InProcess:
     return InProcess(lambda: FaultyConnection(machine, script))
+
+
+@pytest.mark.parametrize("call", ["home", "move", "check"])
+def test_a_part_of_a_call_that_has_no_time_left_is_a_time_out_of_the_instrument(
+    call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a loaded machine the time of the whole call may be used up before its next part begins."""
+    table, _ = boards({"high": 100.0})[1]
+    with table:
+        table.home("tilt")
+        calls = {
+            "home": lambda: table.home("tilt", 0.5),
+            "move": lambda: table.move("tilt", 20.0, 0.5),
+            "check": lambda: table.check(0.5),
+        }
+        whole = Deadline.__init__
+
+        def late(self: Deadline, seconds: float) -> None:
+            whole(self, seconds)
+            self._at -= 0.5
+
+        with monkeypatch.context() as loaded:
+            loaded.setattr(Deadline, "__init__", late)
+            with pytest.raises(DeadlineError, match=r"table \(.*\): did not finish within 0.5 s"):
+                calls[call]()
+        assert table.move("tilt", 20.0).position == pytest.approx(20.0, abs=2e-3)
 
 
 @pytest.mark.parametrize("which", range(3))

@@ -479,8 +479,8 @@ class CameraDriver(Device[S]):
         patterns cancel. Cover the lens to measure the dark noise.
         """
         deadline = Deadline(self._seconds if seconds is None else seconds)
-        found = {"identity": str(self.connect(deadline.left_or_minimum))}
-        shots = list(self.frames(_CHECKED, deadline.left_or_minimum))
+        found = {"identity": str(self.connect(deadline.left))}
+        shots = list(self.frames(_CHECKED, deadline.left))
         elapsed = (shots[-1].taken - shots[0].taken).total_seconds()
         steps = shots[-1].sequence - shots[0].sequence
         height, width = shots[0].pixels.shape
@@ -493,7 +493,7 @@ class CameraDriver(Device[S]):
         before, shortest = self.settings, self._source.dark(self.settings)
         try:
             self.configure(**_differences(before, shortest))
-            one, two = (self.expose(deadline.left_or_minimum).pixels.astype(np.float64) for _ in range(2))
+            one, two = (self.expose(deadline.left).pixels.astype(np.float64) for _ in range(2))
         finally:
             self.configure(**_differences(shortest, before))
         noise = (one - two).std() / np.sqrt(2)
@@ -501,7 +501,7 @@ class CameraDriver(Device[S]):
         return found
 
     def _exchanged(self, ask: Callable[[Deadline], str], command: str, deadline: Deadline) -> str:
-        with self._exchange(command, deadline.left_or_minimum) as part:
+        with self._exchange(command, deadline.left) as part:
             return ask(part)
 
 

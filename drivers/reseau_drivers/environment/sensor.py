@@ -226,7 +226,7 @@ class EnvironmentSensor(Device[SensorSettings]):
         }
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        measured = self.environment(deadline.left_or_minimum)
+        measured = self.environment(deadline.left)
         return {key: str(each) for key, each in measured.conditions.items()}
 
     def environment(self, seconds: float | None = None) -> Environment:

@@ -111,7 +111,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         for dialect in asked:
             if deadline.expired:
                 break
-            trial = Deadline(min(_TRIAL_S, deadline.left_or_minimum))
+            trial = deadline.part(_TRIAL_S)
             try:
                 for command in dialect.setup:
                     self._send(command, trial)
@@ -159,7 +159,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         if self._guessed:
             found["advice"] = f"its model has no profile; set dialect = {found['dialect']!r} to ask no more"
         if self._required_dialect.errors:
-            with self._exchange("check", deadline.left_or_minimum) as time:
+            with self._exchange("check", deadline.left) as time:
                 number, text = error_entry(self._query(self._required_dialect.errors, time))
                 found["error"] = f"{number} {text}".strip() if number else "none"
         return found

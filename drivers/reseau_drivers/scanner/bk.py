@@ -120,7 +120,7 @@ class BkScanner(Device[BkSettings]):
         }
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        scan = self.scan(deadline.left_or_minimum)
+        scan = self.scan(deadline.left)
         height, width = scan.pixels.shape
         mm = "of unknown size" if scan.mm_per_px is None else "of {:g} × {:g} mm".format(*scan.mm_per_px)
         return {"frame": f"{width}×{height} px {mm}"}

@@ -172,7 +172,7 @@ class DicomFiles(Device[DicomSettings]):
         return staged
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        with self._exchange("check", deadline.left_or_minimum):
+        with self._exchange("check", deadline.left):
             path, index = self._frames[0]
             scale = self._scale(self._header(path))
             self._pixels(path, index)

@@ -137,7 +137,7 @@ class Ping360(Device[Ping360Settings]):
         }
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        line = self.line(0, deadline.left_or_minimum)
+        line = self.line(0, deadline.left)
         return {"line": f"{len(line)} samples, mean {line.mean():.1f}"}
 
     def line(self, angle: int, seconds: float | None = None) -> NDArray[np.uint8]:

@@ -332,7 +332,7 @@ class Table(Device[TableSettings]):
     def _test(self, deadline: Deadline) -> dict[str, str]:
         found = {}
         for key in self.plans:
-            state = self.state(key, deadline.left_or_minimum)
+            state = self.state(key, deadline.left)
             found[key] = "; ".join(
                 (
                     f"{state.position:g} {self.plans[key].unit}"
