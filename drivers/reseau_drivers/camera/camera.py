@@ -12,7 +12,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.core.data import Frame
+from reseau.core.data import Frame, filters_of
 from reseau.core.errors import DeadlineError, InstrumentError, RefusedError, StateError
 from reseau.core.provenance import sha256_of
 from reseau.instruments import Deadline, Device, Identity, Limits, Settings, quantity
@@ -220,7 +220,8 @@ class CameraExposure:
     @cached_property
     def frame(self) -> Frame:
         """Image; its hash is that of the original frame if there is one."""
-        return Frame(self.pixels, self.full_scale, self.name, sha256_of(self.raw or self.pixels.tobytes()))
+        digest = sha256_of(self.raw or self.pixels.tobytes())
+        return Frame(self.pixels, self.full_scale, self.name, digest, filters=filters_of(self.pattern))
 
 
 class CameraDriver(Device[S]):

@@ -47,8 +47,11 @@ AsJson = Annotated[bool, Option("Write JSON to standard output.", Group.FILES, c
 
 # Images and marks.
 Channel = Annotated[
-    Literal["luma", "red", "green", "blue", "mosaic"],
-    Option("Channel of colour images; `mosaic`: pixels of raw files behind their filters."),
+    Literal["luma", "red", "green", "blue", "interpolated"],
+    Option(
+        "Channel of colour images; `luma` of raw files are the pixels behind their filters, all others are "
+        "interpolated."
+    ),
 ]
 Mirrored = Annotated[
     bool,

@@ -30,7 +30,7 @@ def frames_of(path: Path | str, channel: Channel = "luma") -> Iterator[Frame]:
     ----------
     path : path
         As for :func:`reseau.io.images.read_image`, or a video; ``scan.tif#2`` is one page.
-    channel : {"luma", "red", "green", "blue", "mosaic"}
+    channel : {"luma", "red", "green", "blue", "interpolated"}
         Channel of a colour image.
 
     Yields

@@ -255,7 +255,7 @@ def photograph_reader(
 
     Parameters
     ----------
-    channel : {"luma", "red", "green", "blue", "mosaic"}
+    channel : {"luma", "red", "green", "blue", "interpolated"}
         Channel of colour images.
     correction : SensorCorrection, optional
         Correction for the sensor.

@@ -296,7 +296,7 @@ def add_files(
         Takes the frames, as in an acquisition.
     exposures : sequence of FileExposure
         The files.
-    channel : {"luma", "red", "green", "blue", "mosaic"}
+    channel : {"luma", "red", "green", "blue", "interpolated"}
         Channel of colour images.
     root : Path, optional
         Folder to which names of files are relative in the provenance.
