@@ -125,7 +125,8 @@ class VisaLink:
     def open(self, deadline: Deadline) -> None:
         """Open the resource; an open one is closed before."""
         self.close()
-        self._bare, self.ended = None, False
+        # Raw USB has packets of its own, no messages.
+        self._bare, self.ended = False if self._name.upper().endswith("::RAW") else None, False
         if self._name.upper().startswith("VICP") and find_spec("pyvicp") is None:
             do = "pip install pyvicp; or set its remote control to LXI and write TCPIP::host::inst0::INSTR"
             raise ConnectionLost(f"{self._name} needs the package pyvicp", do=do)
