@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from typing import Any
@@ -19,7 +20,19 @@ from reseau.core.errors import (
 )
 from reseau.instruments import AxisState, Deadline, Movable, Turntable
 from reseau_drivers.link import link_to
-from reseau_drivers.turntable import AxisPlan, Table, Zaber, grbl, kinesis, marlin, smc100, zaber
+from reseau_drivers.turntable import (
+    AxisPlan,
+    ByHand,
+    HandTable,
+    Table,
+    Zaber,
+    grbl,
+    kinesis,
+    marlin,
+    smc100,
+    zaber,
+)
+from reseau_drivers.turntable.zones import KeepOut
 from reseau_sims.serving import (
     Fault,
     FaultScript,
@@ -425,6 +438,49 @@ def test_a_movement_under_way_counts_as_everywhere_on_its_way() -> None:
             table.move("roll", 70.0)
         assert under_way.exception(10.0) is None
         table.move("roll", 70.0)
+
+
+@pytest.mark.parametrize("which", range(6), ids=["zaber", "smc100", "kinesis", "grbl", "marlin", "hand"])
+def test_no_driver_begins_to_move_beyond_a_limit_or_into_a_zone(
+    which: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = [each for each, _ in tables()][which] if which < 5 else by_hand()
+    with table:
+        table.configure(speed=900.0)
+        table.home("tilt")
+        assert table.move("tilt", 20.0).position == pytest.approx(20.0, abs=0.01)
+        begun = list[float]()
+        whole = table._controller.begin_move
+        monkeypatch.setattr(
+            table._controller,
+            "begin_move",
+            lambda plan, position, deadline: (begun.append(position), whole(plan, position, deadline))[1],
+        )
+        table._zones = KeepOut([{"tilt": (40.0, 60.0)}], table.plans)
+        for target, message in ((-0.1, "outside"), (100.1, "outside"), (50.0, "zone"), (80.0, "zone")):
+            with pytest.raises(SettingError, match=message):
+                table.move("tilt", target)
+            with pytest.raises(SettingError, match=message):
+                table.axes["tilt"].set(target).wait(5.0)
+        assert begun == []
+        assert table.move("tilt", 30.0).position == pytest.approx(30.0, abs=0.01)
+        assert begun
+
+
+def by_hand() -> Table:
+    """A person who sets and reads what is asked."""
+
+    class Person:
+        address = "here"
+
+        def __call__(self, request: str) -> None:
+            self.there = float(found[-1]) if (found := re.findall(r"-?[\d.]+(?= deg)", request)) else 0.0
+
+        def read(self, request: str, unit: str, seconds: float | None = None) -> float:
+            self(request)
+            return self.there
+
+    return HandTable("table", ByHand(Person(), {}), {"tilt": AxisPlan(high=100.0)})
 
 
 def test_a_zone_names_axes_of_the_table() -> None:
