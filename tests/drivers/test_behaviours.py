@@ -27,7 +27,7 @@ from reseau_sims.serving import SimulatedCamera
 from reseau_sims.serving.v4l2 import VideoCamera
 
 from .behaviours import behaviours, counted
-from .fakes import GrblBoard, Lines, Screen, TCube, Transcript, Wire, ZaberStage
+from .fakes import GrblBoard, Lines, Screen, TCube, Transcript, Wire, ZaberStage, transcripts
 
 ROWS = behaviours()
 
@@ -48,6 +48,28 @@ def test_there_are_as_many_behaviours_and_sources_as_were_asked() -> None:
     assert all(
         ("refuses" in row) != ("gives" in row) for kind in ROWS.keys() - {"picture"} for row in ROWS[kind]
     )
+
+
+REPORTED = Path(__file__).parents[2] / "docs" / "benchmarks" / "reported.md"
+
+
+def test_each_reported_situation_has_its_test() -> None:
+    rows_ = [
+        line.split(" | ") for line in REPORTED.read_text("utf-8").splitlines() if re.match(r"\| \d", line)
+    ]
+    assert [int(row[0].strip("| ")) for row in rows_] == list(range(1, 45))
+    written = "".join(path.read_text("utf-8") for path in Path(__file__).parent.rglob("test_*.py"))
+    sources = [row["source"] for found in ROWS.values() for row in found]
+    profiles = {told["profile"] for told in transcripts()}
+    for row in rows_:
+        for test in row[-1].strip("| ").split("; "):
+            kind, _, name = test.partition(" ")
+            if kind == "behaviours":
+                assert any(source.startswith(name) for source in sources), test
+            elif kind == "transcripts":
+                assert name in profiles, test
+            else:
+                assert f"def {test.strip('`')}(" in written, test
 
 
 class Pieces(Wire):
