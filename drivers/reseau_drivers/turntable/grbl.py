@@ -20,10 +20,10 @@ from contextlib import suppress
 from reseau.core.errors import ProtocolError, RefusedError, StateError
 from reseau.instruments import Deadline, Identity
 
-from ..codecs.gcode import Alarm, Banner, Error, Message, Ok, Outdated, Report, Said, encode
-from ..link import Link
+from ..codecs.gcode import Alarm, AnswerDecoder, Banner, Error, Message, Ok, Outdated, Report, Said, encode
+from ..link import Link, MessageLink
 from ..profiles import controller, order
-from .gcode import Lines, letter_of, until
+from .gcode import letter_of, until
 from .reference import References, Reported
 from .table import AxisPlan
 
@@ -58,7 +58,7 @@ class Grbl:
     def __init__(self, link: Link, answer_s: float = 1.0, dialect: str | None = None) -> None:
         self._known = controller("grbl", dialect)
         self._answer_s = answer_s
-        self._link = Lines(link, self._overheard, self._known)
+        self._link: MessageLink[Message] = MessageLink(link, AnswerDecoder(self._known), self._overheard)
         # Bytes that are obeyed at once.
         self._status, self._hold, self._reset_, self._full_status = (
             order(self._known, name).encode("latin-1") for name in ("status", "hold", "reset", "full_status")

@@ -18,10 +18,22 @@ from dataclasses import dataclass
 from reseau.core.errors import DeadlineError, InstrumentError, ProtocolError, RefusedError, StateError
 from reseau.instruments import Deadline, Identity
 
-from ..codecs.gcode import AXES, Banner, Busy, Error, Message, Ok, Resend, Said, encode, encode_numbered
-from ..link import Link
+from ..codecs.gcode import (
+    AXES,
+    AnswerDecoder,
+    Banner,
+    Busy,
+    Error,
+    Message,
+    Ok,
+    Resend,
+    Said,
+    encode,
+    encode_numbered,
+)
+from ..link import Link, MessageLink
 from ..profiles import controller, order
-from .gcode import Lines, letter_of, until
+from .gcode import letter_of, until
 from .reference import References, Reported
 from .table import AxisPlan
 
@@ -70,7 +82,7 @@ class Marlin:
     def __init__(self, link: Link, answer_s: float = 1.0, dialect: str | None = None) -> None:
         self._known = controller("marlin", dialect)
         self._answer_s = answer_s
-        self._link = Lines(link, self._overheard, self._known)
+        self._link: MessageLink[Message] = MessageLink(link, AnswerDecoder(self._known), self._overheard)
         self._number = 0
         self._synchronised = False
         self._steps: dict[str, float] = {}
