@@ -440,6 +440,40 @@ def test_a_movement_under_way_counts_as_everywhere_on_its_way() -> None:
         table.move("roll", 70.0)
 
 
+def test_zones_of_a_bench_hold_for_axes_of_several_tables() -> None:
+    """The plate of one table under the lift of another: none enters while the other is there."""
+    machines = [ZaberChain([1], high=300_000.0), GrblController(1, low=-10.0, high=200.0, speed=9000.0)]
+    wires = [InProcess(lambda: FaultyConnection(machines[0])), _in_process(machines[1])]  # type: ignore[arg-type]
+    speed = {"settings": {"speed": 500.0}}
+    zone = {"tilt": [40.0, 60.0], "lift.z": [0.0, 50.0]}
+    table = zaber(
+        "plate", wires[0], axes={"tilt": {"per_unit": 1000.0, "high": 90.0}}, keep_out=[zone], **speed
+    )
+    lift = grbl("lift", wires[1], axes={"z": {"unit": "mm", "high": 150.0}}, **speed)
+    with table:
+        table.home("tilt")
+        with pytest.raises(StateError, match=r"where lift.z is, is not known"):
+            table.move("tilt", 50.0)  # alone it does not know of the lift
+    for each in (table, lift):
+        each.combine({"plate": table, "lift": lift})
+    assert (table.uses, lift.uses) == (("lift",), ("plate",))
+    with table, lift:
+        table.home("tilt")
+        with pytest.raises(StateError, match=r"where lift.z is, is not known; home lift.z first"):
+            table.move("tilt", 50.0)
+        lift.home("z")
+        with pytest.raises(SettingError, match=r"plate.tilt: would enter .*; move lift.z out of 0…50 first"):
+            table.move("tilt", 50.0)
+        lift.move("z", 100.0)
+        table.move("tilt", 50.0)
+        with pytest.raises(SettingError, match=r"lift.z: would enter .*; move plate.tilt out of 40…60 first"):
+            lift.move("z", 10.0)
+        table.move("tilt", 70.0)
+        assert lift.move("z", 10.0).position == pytest.approx(10.0, abs=0.01)
+    with pytest.raises(SettingError, match="keep_out"):
+        table.combine({"plate": table})
+
+
 @pytest.mark.parametrize("which", range(6), ids=["zaber", "smc100", "kinesis", "grbl", "marlin", "hand"])
 def test_no_driver_begins_to_move_beyond_a_limit_or_into_a_zone(
     which: int, monkeypatch: pytest.MonkeyPatch

@@ -283,16 +283,17 @@ class HandTable(Table):
     @property
     def uses(self) -> tuple[str, ...]:
         """Other instruments that it needs."""
-        return (self._camera,) if self._camera else ()
+        return super().uses + ((self._camera,) if self._camera else ())
 
     def combine(self, instruments: Mapping[str, Instrument]) -> None:
-        """Find the camera that sees the markers.
+        """Find the camera that sees the markers, and join zones.
 
         Raises
         ------
         SettingError
             If there is no such camera.
         """
+        super().combine(instruments)
         if not self._camera:
             return
         found = instruments.get(self._camera)
