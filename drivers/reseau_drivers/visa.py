@@ -26,8 +26,6 @@ from reseau.instruments import Deadline
 from .budget import Account
 from .link import Link, TcpLink, link_to
 
-__all__ = ["VisaLink", "resources", "scpi_link"]
-
 _READ = 1 << 20
 """Bytes requested in one read; longer messages take several reads."""
 _MOST = 16 << 20

@@ -20,8 +20,6 @@ from reseau.instruments import Deadline, Device, Identity, Limits, Settings, qua
 from .clocks import TimeInterval, utc
 from .features import Feature, differences, matching
 
-__all__ = ["CameraDriver", "CameraExposure", "CameraInterface", "CameraSettings", "RawFrame", "Ready"]
-
 _SLICE_S = 0.05
 """Time to wait for a frame before checking for a stop request (s)."""
 Ready = Callable[[], bool]

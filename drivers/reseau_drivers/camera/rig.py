@@ -31,8 +31,6 @@ from reseau.instruments import (
 from .camera import CameraExposure
 from .gvcp import send_action
 
-__all__ = ["Rig", "RigSettings"]
-
 
 @dataclass(frozen=True)
 class RigSettings(Settings):

@@ -19,24 +19,6 @@ from reseau.core.errors import ProtocolError, SettingError
 from ..profiles import known
 from .stream import Damaged, excerpt
 
-__all__ = [
-    "HOST",
-    "USB",
-    "Info",
-    "Message",
-    "MessageDecoder",
-    "Velocities",
-    "bay",
-    "decode_info",
-    "decode_status",
-    "decode_velocities",
-    "encode",
-    "encode_info",
-    "encode_status",
-    "encode_velocities",
-    "move",
-]
-
 HOST, USB = 0x01, 0x50
 """Addresses: the computer, and a controller with one USB connection of its own."""
 _ADDRESSES = frozenset({0x00, HOST, 0x11, *range(0x21, 0x2B), USB})

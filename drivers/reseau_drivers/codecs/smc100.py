@@ -17,8 +17,6 @@ from reseau.core.errors import ProtocolError, SettingError
 from ..profiles import known
 from .stream import excerpt
 
-__all__ = ["LIMIT", "Line", "decode", "decode_status", "encode"]
-
 LIMIT = 128
 """Largest size of an accepted line (bytes)."""
 

@@ -11,8 +11,6 @@ from reseau.core.environment import Condition
 from reseau.core.errors import ProtocolError, SettingError, StateError
 from reseau.instruments import Deadline, Device, Environment, Identity, Limits, Settings
 
-__all__ = ["KNOWN", "EnvironmentSensor", "Probe", "Quantity", "SensorSettings", "quantities_of"]
-
 KNOWN: Mapping[str, tuple[str, float, float]] = {
     "temperature": ("°C", -40.0, 85.0),
     "humidity": ("%", 0.0, 100.0),

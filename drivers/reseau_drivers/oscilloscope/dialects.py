@@ -26,20 +26,6 @@ from ..codecs.numbers import INFINITE
 from ..profiles import CONTROLLER_SCHEMA, CONTROLLERS, FOLDER, controller, text_of
 from .screens import bytes_of_colours, packets_missing, picture_after, pixels_of_packets, runs_of_colours
 
-__all__ = [
-    "DIALECTS",
-    "Dialect",
-    "Formula",
-    "WaveformDialect",
-    "candidates_of",
-    "described",
-    "dialect_named",
-    "dialect_of",
-    "fields_of",
-    "read_profiles",
-    "samples_of",
-]
-
 Numbers = Mapping[str, Any]
 SCHEMA = "reseau-instrument-profile/1"
 _ACTS: Mapping[type, Callable[..., Any]] = {

@@ -20,8 +20,6 @@ from ..codecs.stream import excerpt
 from ..link import Link, SerialLink
 from .dialects import MAKERS, Dialect, WaveformDialect, candidates_of, dialect_of, fields_of, samples_of
 
-__all__ = ["Oscilloscope", "OscilloscopeSettings"]
-
 _TRIAL_S = 3.0
 """Time in which an instrument of an unknown model must send a picture."""
 _LONGEST_LINE = 65536

@@ -20,8 +20,6 @@ from reseau.core.errors import ProtocolError
 from ..codecs.ieee488 import parse_block, picture
 from ..codecs.stream import excerpt
 
-__all__ = ["bytes_of_colours", "packets_missing", "picture_after", "pixels_of_packets", "runs_of_colours"]
-
 
 def bytes_of_colours(answer: bytes) -> bytes:
     """Return the screen of a Rigol DS1000E: a byte for each pixel, two bits red, three green, three blue.

@@ -21,8 +21,6 @@ from ..codecs import bk
 from ..codecs.stream import excerpt
 from ..link import Link, MessageLink
 
-__all__ = ["BkScanner", "BkSettings"]
-
 _LARGEST_SIDE = 8192
 _ON, _OFF = b'QUERY:GRAB_FRAME "ON",20;', b'QUERY:GRAB_FRAME "OFF";'
 _BOXES = ("B_GEOMETRY_US_FRAME_GRAB", "B_GEOMETRY_PIXEL")

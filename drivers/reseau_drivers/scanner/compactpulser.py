@@ -37,8 +37,6 @@ from ..codecs.compactpulser import LIMIT, Setting, decode, encode
 from ..codecs.stream import LineDecoder
 from ..link import Link, MessageLink
 
-__all__ = ["CompactPulser", "CompactPulserSettings"]
-
 _MOST_GAIN = 840
 
 

@@ -28,8 +28,6 @@ from reseau.core.errors import (
 )
 from reseau.instruments import BScan, Deadline, Device, Identity, Limits, Settings, quantity
 
-__all__ = ["DicomFiles", "DicomSettings"]
-
 _LARGEST_SIDE, _MOST_FRAMES, _MOST_FILES = 8192, 100_000, 100_000
 _TWO_DIMENSIONS, _CENTIMETRES = 1, 3
 

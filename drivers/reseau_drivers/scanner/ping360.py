@@ -20,8 +20,6 @@ from reseau.instruments import BScan, Deadline, Device, Identity, Limits, Settin
 from ..codecs import ping
 from ..link import Link, MessageLink
 
-__all__ = ["Ping360", "Ping360Settings"]
-
 _SHORTEST = 80
 """Shortest sample period of the instrument, in units of 25 ns."""
 _ROWS = 400

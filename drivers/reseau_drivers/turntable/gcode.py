@@ -9,8 +9,6 @@ from reseau.core.errors import DeadlineError, SettingError
 from ..codecs.gcode import AXES
 from .table import AxisPlan
 
-__all__ = ["letter_of", "until"]
-
 
 def letter_of(plan: AxisPlan) -> str:
     """Return the letter of an axis: 1 is X.

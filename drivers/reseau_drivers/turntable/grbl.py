@@ -27,8 +27,6 @@ from .gcode import letter_of, until
 from .reference import References, Reported
 from .table import AxisPlan
 
-__all__ = ["Grbl"]
-
 _BOOT_S, _BEGINS_S, _POLL_S = 4.0, 2.0, 0.01
 
 

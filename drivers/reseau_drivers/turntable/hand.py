@@ -24,8 +24,6 @@ from reseau.instruments import Camera, Deadline, Identity, Instrument
 from .reference import References, Reported
 from .table import AxisPlan, Table
 
-__all__ = ["ByHand", "HandTable", "Marker", "Person", "marker_position"]
-
 _TRIES = 3
 """How often a person is asked to set an axis that is not where it should be."""
 

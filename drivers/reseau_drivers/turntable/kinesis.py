@@ -35,8 +35,6 @@ from ..profiles import controller, known, told_bits
 from .reference import References, Reported
 from .table import AxisPlan
 
-__all__ = ["Kinesis", "MotorKind", "kinesis_ports"]
-
 MotorKind = Literal["dc", "brushless", "stepper"]
 _BEGINS_S = 2.0
 """Time in which an order must show in the status (s)."""

@@ -37,8 +37,6 @@ from .gcode import letter_of, until
 from .reference import References, Reported
 from .table import AxisPlan
 
-__all__ = ["Marlin"]
-
 _FRESH = 100
 """Feed rate (%) of a controller that has just started."""
 _BOOT_S, _SILENT_S, _STANDS_S, _POLL_S = 6.0, 4.0, 1.0, 0.01

@@ -19,8 +19,6 @@ from ..profiles import controller, order, told_bits
 from .reference import References, Reported
 from .table import AxisPlan
 
-__all__ = ["Smc100"]
-
 
 class Smc100:
     """Controllers on one line with one axis each; `AxisPlan.device` is the address of the controller.

@@ -25,8 +25,6 @@ from reseau.instruments import (
 from .reference import References, Reported
 from .zones import EVERYWHERE, NOWHERE, KeepOut, Span
 
-__all__ = ["Axis", "AxisPlan", "Controller", "Table", "TableSettings"]
-
 _POLL_S, _HALT_S = 0.02, 1.0
 _ATTEMPTS = 3
 """Number of queries during a movement when answers are invalid: one bad answer must not end the wait."""

@@ -17,8 +17,6 @@ from ..profiles import controller, order
 from .reference import References, Reported
 from .table import AxisPlan
 
-__all__ = ["Zaber"]
-
 
 class Zaber:
     """Chain of Zaber devices.

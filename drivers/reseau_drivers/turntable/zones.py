@@ -9,8 +9,6 @@ from contextlib import contextmanager
 
 from reseau.core.errors import SettingError, StateError
 
-__all__ = ["EVERYWHERE", "NOWHERE", "KeepOut", "Span"]
-
 Span = tuple[float, float]
 """Lowest and highest position."""
 EVERYWHERE: Span = (-math.inf, math.inf)

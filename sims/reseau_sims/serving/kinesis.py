@@ -30,8 +30,6 @@ from .faults import Kind
 from .machine import Machine
 from .motion import Clock, Motor
 
-__all__ = ["KinesisController"]
-
 _VELOCITY = 65536 * 2048 / 6e6
 """Velocity in the units of a controller of DC motors, for one count per second."""
 _STOP_IMMEDIATE, _STOP_PROFILED = 1, 2
