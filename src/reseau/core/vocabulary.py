@@ -48,10 +48,7 @@ AsJson = Annotated[bool, Option("Write JSON to standard output.", Group.FILES, c
 # Images and marks.
 Channel = Annotated[
     Literal["luma", "red", "green", "blue", "interpolated"],
-    Option(
-        "Channel of colour images; `luma` of raw files are the pixels behind their filters, all others are "
-        "interpolated."
-    ),
+    Option("Channel of colour images; `luma` of raw files: all pixels, behind their filters."),
 ]
 Mirrored = Annotated[
     bool,

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ..core.data import Frame
 from ..core.errors import ImageError, InputError, UsageError
-from ..core.files import split_frame
+from ..core.files import head_of, readable, split_frame
 from ..core.provenance import sha256_of
 from ..core.tone import ToneCurve
 from . import write_whole
@@ -161,11 +161,7 @@ def open_scan(path: Path | str, *, mosaic: bool = False) -> Scan:
     (('grey',), (2, 3, 1))
     """
     whole, number = split_frame(Path(path))
-    try:
-        with whole.open("rb") as stream:
-            magic = stream.read(132)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    magic = head_of(whole)
     if not magic:
         raise ImageError("is empty", where=path, do=_AGAIN)
     if is_dicom(whole, magic):
@@ -471,12 +467,9 @@ def _decoding(page: Any, path: Path) -> Window:
 
     def segment(index: int) -> NDArray[Any]:
         if index not in kept:
-            try:
-                with path.open("rb") as stream:
-                    stream.seek(page.dataoffsets[index])
-                    coded = stream.read(page.databytecounts[index])
-            except OSError as error:
-                raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+            with readable(path), path.open("rb") as stream:
+                stream.seek(page.dataoffsets[index])
+                coded = stream.read(page.databytecounts[index])
             try:
                 found = decode(coded, index, jpegtables=tables, jpegheader=header)[0]
             except Exception as error:

@@ -374,12 +374,9 @@ class Worker:
                 threading.Thread(target=self._insist, args=(self._stops,), daemon=True).start()
             self._say("stopped", {"ms": round(1e3 * spent, 1)})
             return True, {"ms": round(1e3 * spent, 1), **self.status()}, b""
-        if what == "status":
-            return True, self.status(), b""
-        if what == "bench":
-            return True, self.text, b""
-        if what == "settings":
-            return True, self._settings(), b""
+        asked = {"status": self.status, "bench": lambda: self.text, "settings": self._settings}.get(str(what))
+        if asked is not None:
+            return True, asked(), b""
         if what == "axes" and self._moving and self._places:
             return True, self._places, b""
         if what == "picture":
