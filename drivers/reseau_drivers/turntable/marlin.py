@@ -31,6 +31,7 @@ from ..codecs.gcode import (
     encode,
     encode_numbered,
 )
+from ..codecs.numbers import number
 from ..link import Link, MessageLink
 from ..profiles import controller, order
 from .gcode import letter_of, until
@@ -234,7 +235,7 @@ class Marlin:
             if count:
                 there, steps = dict(_PAIR.findall(wanted)), dict(_PAIR.findall(counted))
                 if letter in there and letter in steps and letter in self._steps:
-                    return float(there[letter]), float(steps[letter])
+                    return number(there[letter]), number(steps[letter])
         raise ProtocolError(f"does not tell position and steps of {letter}", do="is it Cartesian Marlin?")
 
     def _ready(self, deadline: Deadline) -> None:
@@ -265,13 +266,13 @@ class Marlin:
             return heard and isinstance(message, Ok)
 
         asked = (order(self._known, "first"), order(self._known, "identity"))
-        lines = b"\n" + b"".join(encode_numbered(line, number) for number, line in enumerate(asked))
+        lines = b"\n" + b"".join(encode_numbered(line, k) for k, line in enumerate(asked))
         self._link.query(lines, ends, deadline.part(self._answer_s))
 
     def _steps_per_unit(self, deadline: Deadline) -> dict[str, float]:
         for text in self._exchange(line := order(self._known, "steps"), deadline):
             if found := dict(re.findall(r"([XYZABC])(\d+(?:\.\d+)?)(?=\s|$)", text.partition(line)[2])):
-                return {letter: float(steps) for letter, steps in found.items() if float(steps) > 0}
+                return {letter: number(steps) for letter, steps in found.items() if number(steps) > 0}
         raise ProtocolError(f"does not tell its steps per unit ({line})")
 
     def _line(self, deadline: Deadline, command: str, **values: object) -> list[str]:
