@@ -373,7 +373,9 @@ def described(name: str = "") -> str:
         examples = {
             each.name: ", ".join(example.split(",")[1] for example in each.examples) for each in known
         }
-        examples |= {} if name else dict.fromkeys(CONTROLLERS, "codes, flags and banners of a controller")
+        examples |= (
+            {} if name else dict.fromkeys(CONTROLLERS, "commands, states, codes and flags of a controller")
+        )
         return "".join(f"{each}: {models}".rstrip(": ") + "\n" for each, models in examples.items())
     if name in CONTROLLERS:
         return (FOLDER / f"{name}.toml").read_text("utf-8")

@@ -61,8 +61,10 @@ def gains_of(frame: Frame) -> Array:
     power = (level * level).reshape(cells).sum(axis=(0, 2), dtype=np.float64)
     found: Array = (grey * level).reshape(cells).sum(axis=(0, 2), dtype=np.float64) / np.maximum(power, 1e-30)
     found /= max(found.max(), 1e-30)
+    if found.min() <= 0:
+        return even
     told = frame.filters or 2 * _unpredicted(_divided(grey, found)) < _unpredicted(grey)
-    return found if found.min() > 0 and told else even
+    return found if told else even
 
 
 def _divided(pixels: NDArray[np.float32], gains: Array) -> NDArray[np.float32]:
