@@ -1,4 +1,4 @@
-"""The least-squares engine: Levenberg–Marquardt and Gauss–Newton over either kind of problem.
+"""The least-squares engine: Levenberg–Marquardt over either kind of problem.
 
 Convergence is decided by the *relative offset* (Bates & Watts 1981): the length of the residual vector in the
 space of the parameters over its length outside, each per degree of freedom. It is the correction still to
@@ -25,7 +25,8 @@ NullVector = Mapping[str, float]
 
 _EPS = float(np.finfo(np.float64).eps)
 _MEMORY, _SHRINK, _LEAST_DAMPING, _MOST_DAMPING = 0.7, 1.0 / 3.0, 1e-18, 1e18
-_LEAST_LENGTH = 2.0**-20
+# Largest geodesic acceleration of a step, relative to its length, both in scaled parameters.
+_CURVATURE = 0.75
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,6 @@ class Options:
 
     Parameters
     ----------
-    method : {"levenberg-marquardt", "gauss-newton"}
-        Gauss–Newton halves a step until the sum of squares decreases.
     max_iterations : int
         Maximum number of corrections tried.
     tolerance : float
@@ -43,9 +42,6 @@ class Options:
         deviations a posteriori.
     damping : float
         Initial damping of Levenberg–Marquardt, relative to the scaled columns of length one.
-    curvature : float
-        Levenberg–Marquardt rejects a step v whose geodesic acceleration a has 2|a|/|v| above this, in scaled
-        parameters. For Gauss–Markov problems only.
     rank_tolerance : float, optional
         Singular values of the scaled design below this fraction of the largest are treated as zero. By
         default 1e-13 with analytic derivatives and 1e-9 with differences.
@@ -53,54 +49,33 @@ class Options:
         Whether :attr:`Adjustment.covariance` and :attr:`Adjustment.sigma` are multiplied by the estimated
         variance factor, or computed from the input covariance of the observations alone. Without redundancy
         always a priori.
-    check_jacobian : float, optional
-        Compare analytic derivatives with differences at the approximate values, and raise `UsageError` when
-        they differ by more than this, relative to the largest value of each column.
 
     Raises
     ------
     UsageError
-        For an unknown method or scale, for values out of range, and for an option that the method ignores.
+        For an unknown scale, and for values out of range.
 
     Examples
     --------
-    >>> Options(method="gauss-newton", max_iterations=20).max_iterations
+    >>> Options(max_iterations=20).max_iterations
     20
     """
 
-    method: Literal["levenberg-marquardt", "gauss-newton"] = "levenberg-marquardt"
     max_iterations: int = 1000
     tolerance: float = 1e-10
     damping: float = 1e-4
-    curvature: float = 0.75
     rank_tolerance: float | None = None
     scale: Literal["a-posteriori", "a-priori"] = "a-posteriori"
-    check_jacobian: float | None = None
 
     def __post_init__(self) -> None:
-        if self.method not in ("levenberg-marquardt", "gauss-newton"):
-            raise UsageError(
-                f"{self.method!r} is not levenberg-marquardt or gauss-newton", where="Options.method"
-            )
         if self.scale not in ("a-posteriori", "a-priori"):
             raise UsageError(f"{self.scale!r} is not a-posteriori or a-priori", where="Options.scale")
-        if (
-            self.max_iterations < 0
-            or not self.tolerance > 0
-            or not self.damping > 0
-            or not self.curvature > 0
-        ):
+        if self.max_iterations < 0 or not self.tolerance > 0 or not self.damping > 0:
             raise UsageError(
-                "tolerance, damping and curvature must be positive, max_iterations not negative",
-                where="Options",
+                "tolerance and damping must be positive, max_iterations not negative", where="Options"
             )
         if self.rank_tolerance is not None and not 0 <= self.rank_tolerance < 1:
             raise UsageError("must be in [0, 1)", where="Options.rank_tolerance")
-        usual = (Options.damping, Options.curvature)
-        if self.method == "gauss-newton" and (self.damping, self.curvature) != usual:
-            raise UsageError(
-                "apply to levenberg-marquardt only", where="Options.damping and Options.curvature"
-            )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -151,8 +126,6 @@ class Solved:
         vᵀPv.
     redundancy : int
         Degrees of freedom.
-    defect : int
-        Rank defect that inner constraints removed.
     iterations : int
         Number of corrections tried.
     costs : tuple of float
@@ -166,25 +139,13 @@ class Solved:
     residuals: Array
     cost: float
     redundancy: int
-    defect: int
     iterations: int
     costs: tuple[float, ...]
     solution: Solution
 
 
 def solve(model: Model, options: Options) -> Solved | AdjustmentFailure:
-    """Minimise the weighted sum of squares of a model, from its approximate values.
-
-    Raises
-    ------
-    UsageError
-        When `options.check_jacobian` is given and the derivatives disagree with differences, and for an
-        option that the model cannot honour.
-    """
-    if options.check_jacobian is not None:
-        _check(model, options.check_jacobian)
-    if options.curvature != Options.curvature and not model.constant_weights:
-        raise UsageError("applies to Gauss-Markov problems only", where="Options.curvature")
+    """Minimise the weighted sum of squares of a model, from its approximate values."""
     return _Run(model, options).solve()
 
 
@@ -202,8 +163,7 @@ class _Run:
         self.rank_tolerance = default if options.rank_tolerance is None else options.rank_tolerance
         datum = set(problem.datum)
         self.datum = np.array([name in datum for name in parameters.free], dtype=bool)
-        self.marquardt = options.method == "levenberg-marquardt"
-        self.damping, self.growth, self.length = options.damping if self.marquardt else 0.0, 2.0, 1.0
+        self.damping, self.growth = options.damping, 2.0
         self.lengths = np.zeros(len(self.free))
         self.costs: list[float] = []
         self.iterations = 0
@@ -242,11 +202,9 @@ class _Run:
             closer = self._closer(state, linear) if left else None
             if closer is not None or self._offset(linear, state) < 1e-6:
                 return closer
-        self.length = 1.0
         while self.iterations < self.options.max_iterations:
-            bend = self.marquardt and self.model.constant_weights
-            trial = self._trial(state, linear, self.damping, self.length, bend)
-            promised = linear.predicted(self.damping) if self.marquardt else self.length * linear.reducible
+            trial = self._trial(state, linear, self.damping, bend=self.model.constant_weights)
+            promised = linear.predicted(self.damping)
             gain = (state.cost - trial.cost) / promised if trial.usable and promised > 0 else -1.0
             if gain > 1e-4:
                 self._relax(gain)
@@ -262,11 +220,9 @@ class _Run:
                 )
         return self._failure(f"not converged in {self.iterations} iterations", Code.NOT_CONVERGED, state)
 
-    def _trial(
-        self, state: State, linear: Linearised, damping: float, length: float, bend: bool = False
-    ) -> State:
+    def _trial(self, state: State, linear: Linearised, damping: float, *, bend: bool = False) -> State:
         self.iterations += 1
-        step = length * self._datum_step(state, linear, damping)
+        step = self._datum_step(state, linear, damping)
         if bend:
             bent = self._bend(state, linear, damping, step)
             if bent is None:
@@ -287,13 +243,13 @@ class _Run:
         second = 2.0 / h * ((ahead.whitened - state.whitened) / h - linear.design @ step)
         bent = linear.answer(second, damping)
         size, bend = np.linalg.norm(step / linear.scale), np.linalg.norm(bent / linear.scale)
-        if 2.0 * bend > self.options.curvature * size:
+        if 2.0 * bend > _CURVATURE * size:
             return None
         return 0.5 * bent
 
     def _closer(self, state: State, linear: Linearised) -> tuple[State, Linearised] | None:
         """Where the sum of squares is flat to rounding: the full step, if it decreases the offset."""
-        trial = self._trial(state, linear, 0.0, 1.0)
+        trial = self._trial(state, linear, 0.0)
         if not trial.usable or trial.cost > state.cost * (1.0 + 1e-8) + self.floor:
             return None
         following = self._linearise(trial)
@@ -309,17 +265,14 @@ class _Run:
 
     def _relax(self, gain: float) -> None:
         shrink = max(_SHRINK, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
-        self.damping = max(self.damping * shrink, _LEAST_DAMPING) if self.damping else 0.0
+        self.damping = max(self.damping * shrink, _LEAST_DAMPING)
         self.growth = 2.0
 
     def _restrain(self) -> bool:
         """Shorten the next step; False when it cannot be shortened further."""
-        if self.marquardt:
-            self.damping = max(self.damping, _LEAST_DAMPING) * self.growth
-            self.growth *= 2.0
-            return self.damping < _MOST_DAMPING
-        self.length *= 0.5
-        return self.length > _LEAST_LENGTH
+        self.damping = max(self.damping, _LEAST_DAMPING) * self.growth
+        self.growth *= 2.0
+        return self.damping < _MOST_DAMPING
 
     def _linearise(self, state: State) -> Linearised | AdjustmentFailure:
         design = self.model.design(state)[:, self.free]
@@ -376,9 +329,9 @@ class _Run:
                 return self._failure(reason, Code.NO_DATUM, state, vectors)
             weight = np.linalg.solve(inner, np.where(self.datum[:, None], g, 0.0).T)
             factor = factor - g @ (weight @ factor)
-        return self._solved(state, linear, factor, defect)
+        return self._solved(state, linear, factor)
 
-    def _solved(self, state: State, linear: Linearised, factor: Array, defect: int) -> Solved:
+    def _solved(self, state: State, linear: Linearised, factor: Array) -> Solved:
         parameters = self.problem.parameters
         cofactor = np.zeros((len(parameters), len(parameters)))
         cofactor[np.ix_(self.free, self.free)] = factor @ factor.T
@@ -396,7 +349,6 @@ class _Run:
             residuals=state.residuals,
             cost=state.cost,
             redundancy=redundancy,
-            defect=defect,
             iterations=self.iterations,
             costs=tuple(self.costs),
             solution=solution,
@@ -433,13 +385,4 @@ class _Run:
             iterations=self.iterations,
             costs=tuple(self.costs),
             null_space=null_space,
-        )
-
-
-def _check(model: Model, tolerance: float) -> None:
-    found = model.check(np.array(model.problem.parameters.values, dtype=np.float64))
-    if not found.agrees(tolerance):
-        raise UsageError(
-            f"differs from differences by {found.error:.2g} of its column, at row {found.row}",
-            where=f"derivative with respect to {found.worst}",
         )

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..core.data import Array
 from ..core.errors import UsageError
-from .differences import JacobianCheck, compare_jacobians, differences
+from .differences import differences
 from .parameters import Constraint, Parameters
 from .stochastic import Blocks, Covariance, Weighting, blocks_of
 
@@ -202,21 +202,6 @@ class Model:
         """Whether analytic derivatives were given."""
         raise NotImplementedError
 
-    def check(self, x: Array) -> JacobianCheck:
-        """Compare the analytic derivatives at x with differences.
-
-        Raises
-        ------
-        UsageError
-            When there are no analytic derivatives.
-        """
-        if not self.analytic:
-            raise UsageError("has no analytic derivatives to check", where="problem")
-        return self._check(x)
-
-    def _check(self, x: Array) -> JacobianCheck:
-        raise NotImplementedError
-
     def _evaluate(self, x: Values, near: State | None) -> State | None:
         raise NotImplementedError
 
@@ -246,10 +231,6 @@ class MarkovModel(Model):
     def analytic(self) -> bool:
         """Whether a Jacobian was given."""
         return self._jacobian is not None
-
-    def _check(self, x: Array) -> JacobianCheck:
-        names = self.problem.parameters.free
-        return compare_jacobians(self.jacobian(x)[:, self.mask], self.numeric(x)[:, self.mask], names)
 
     def _compute(self, x: Values) -> Values:
         computed = np.asarray(self._function(x))
@@ -330,20 +311,6 @@ class HelmertModel(Model):
     def analytic(self) -> bool:
         """Whether Jacobians were given."""
         return self._jacobians is not None
-
-    def _check(self, x: Array) -> JacobianCheck:
-        observed = self.problem.observations.ravel()
-        self.evaluate(self.carry(x))
-        (a, b), (a_numeric, b_numeric) = self.derivatives(observed, x), self.numeric(observed, x)
-        u, k = len(x), b.shape[-1]
-        of_x = compare_jacobians(
-            a.reshape(-1, u)[:, self.mask],
-            a_numeric.reshape(-1, u)[:, self.mask],
-            self.problem.parameters.free,
-        )
-        columns = tuple(f"observation {i}" for i in range(k))
-        of_l = compare_jacobians(b.reshape(-1, k), b_numeric.reshape(-1, k), columns)
-        return of_x if of_x.error >= of_l.error else of_l
 
     def _conditions(self, observed: Array, x: Array) -> Array:
         g = np.asarray(

@@ -178,10 +178,6 @@ class Parameters:
             values[[self.index(name) for name in names]] = at
         return Parameters(self.names, values, [n for n in self.free if n not in gone], prior=self.prior)
 
-    def release(self, *names: str) -> Parameters:
-        """A copy with these parameters free."""
-        return Parameters(self.names, self.values, (*self.free, *self._known(names)), prior=self.prior)
-
     def with_values(self, values: ArrayLike) -> Parameters:
         """A copy with other (approximate) values (u,); prior observations are kept."""
         return Parameters(self.names, values, self.free, prior=self.prior)

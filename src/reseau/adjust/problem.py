@@ -13,12 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.data import Array
 from ..core.errors import UsageError
 from ..core.threads import one_thread
-from .differences import JacobianCheck
 from .engine import AdjustmentFailure, Options, solve
 from .fitted import Fitted
 from .models import Conditions, Function, HelmertModel, Jacobian, Jacobians, MarkovModel, Model, Values
 from .parameters import Constraint, Parameters
-from .reliability import ExternalReliability, Solution, noncentrality
+from .reliability import Solution
 from .significance import CoefficientTest, ratio_test
 from .stochastic import Covariance, blocks_of
 
@@ -269,8 +268,6 @@ class Adjustment(Fitted):
         Number of corrections tried.
     costs : tuple of float
         vᵀPv at the approximate values and after each accepted correction.
-    datum_defect : int
-        Rank defect that inner constraints removed.
     options : Options
         Options of the adjustment.
     solution : Solution
@@ -296,7 +293,6 @@ class Adjustment(Fitted):
     scale: str
     iterations: int
     costs: tuple[float, ...]
-    datum_defect: int
     options: Options
     solution: Solution
 
@@ -375,25 +371,6 @@ class Adjustment(Fitted):
         correlation: Array = self.cofactor * np.outer(scale, scale)
         np.fill_diagonal(correlation, 1.0)
         return correlation
-
-    def external_reliability(self, alpha: float = 0.001, power: float = 0.8) -> ExternalReliability:
-        """Effects of undetected errors of the minimal detectable size on the parameters.
-
-        Parameters
-        ----------
-        alpha, power : float
-            As of :meth:`minimal_detectable_errors`.
-
-        Returns
-        -------
-        ExternalReliability
-            Effects by observation.
-        """
-        with one_thread():
-            effects, lengths = self.solution.effects(self.standardised, noncentrality(alpha, power))
-        full = np.zeros((len(effects), len(self.names)))
-        full[:, self.problem.parameters.mask] = effects
-        return ExternalReliability(self.names, self._of_observations(full), self._of_observations(lengths))
 
     def test_of(
         self, name: str, value: float = 0.0, alpha: float = 0.05, scale: str | None = None
@@ -479,40 +456,6 @@ def adjust(problem: Problem, options: Options | None = None) -> Adjustment | Adj
         scale=options.scale if redundancy > 0 else "a-priori",
         iterations=found.iterations,
         costs=found.costs,
-        datum_defect=found.defect,
         options=options,
         solution=found.solution,
     )
-
-
-def check_jacobian(problem: Problem, at: Array | None = None) -> JacobianCheck:
-    """Compare analytic derivatives with differences of fourth order.
-
-    Parameters
-    ----------
-    problem : GaussMarkov or GaussHelmert
-        With `jacobian` or `jacobians`; for the latter the derivatives by the observations are compared too,
-        and are named ``observation 0``, ``observation 1`` … by their column.
-    at : ndarray (u,), optional
-        Parameters; the approximate values by default.
-
-    Returns
-    -------
-    JacobianCheck
-        The largest disagreement of all free parameters.
-
-    Raises
-    ------
-    UsageError
-        When the problem has no analytic derivatives.
-
-    Examples
-    --------
-    >>> t = np.arange(4.0)
-    >>> jacobian = lambda x: np.stack([np.ones(4), t], axis=1)
-    >>> line = GaussMarkov(lambda x: x[0] + x[1] * t, t, 0.1, Parameters("ab", [0, 1]), jacobian)
-    >>> check_jacobian(line).agrees()
-    True
-    """
-    x = np.array(problem.parameters.values if at is None else at, dtype=np.float64)
-    return problem.model().check(x)
