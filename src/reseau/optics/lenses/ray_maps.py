@@ -27,7 +27,7 @@ _GOLDEN = np.pi * (3 - np.sqrt(5.0))
 
 
 class RayMap(Protocol):
-    """What forms images by rays: a lens whose design is known, a surrogate of it, or a stand-in.
+    """What forms images by rays: a lens whose design is known, or a stand-in.
 
     Examples
     --------
