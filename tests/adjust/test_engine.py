@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from reseau.adjust import GaussMarkov, Options, Parameters, adjust
 from reseau.adjust.differences import differences
 from reseau.adjust.engine import AdjustmentFailure
-from reseau.adjust.parameters import Constraint, Prior
+from reseau.adjust.parameters import Prior
 from reseau.adjust.problem import GaussHelmert
 from reseau.core.errors import EstimationError, UsageError
 
@@ -114,33 +114,6 @@ def test_fixing_parameters_is_equivalent_to_the_smaller_problem(free):
 def test_an_unknown_name_is_an_error():
     with pytest.raises(UsageError, match="d: is not among the parameters"):
         Parameters("abc", [0, 0, 0], free=["d"])
-    with pytest.raises(UsageError, match="d"):
-        decay_problem(constraints=[Constraint({"d": 1.0})])
-
-
-def test_constraints_hold_exactly_and_add_redundancy():
-    constraint = Constraint({"a": 1.0, "c": -3.0}, 0.5)
-    fit = adjust(decay_problem(constraints=[constraint])).required()
-    assert fit["a"] - 3 * fit["c"] == pytest.approx(0.5, abs=1e-12)
-    assert fit.redundancy == len(T) - 3 + 1
-
-    # The same by substitution a = 0.5 + 3 c.
-    substituted = GaussMarkov(
-        lambda x: decay(np.array([0.5 + 3 * x[1], x[0], x[1]])), noisy(), 0.01, Parameters("bc", [1.0, 0.0])
-    )
-    other = adjust(substituted).required()
-    assert fit["b"] == pytest.approx(other["b"], abs=1e-9)
-    assert fit.sigma_of("b") == pytest.approx(other.sigma_of("b"), rel=1e-6)
-    variance = np.array([1.0, -3.0]) @ fit.covariance_of("a", "c") @ [1.0, -3.0]
-    assert abs(variance) < 1e-12 * fit.sigma_of("a") ** 2 * 1e3
-
-
-def test_dependent_constraints_count_once_and_contradictions_are_errors():
-    twice = [Constraint({"a": 1.0, "c": -1.0}, 1.5), Constraint({"a": -2.0, "c": 2.0}, -3.0)]
-    assert adjust(decay_problem(constraints=twice)).required().redundancy == len(T) - 2
-    wrong = [twice[0], Constraint({"a": 1.0, "c": -1.0}, 1.0)]
-    with pytest.raises(UsageError, match="contradict"):
-        adjust(decay_problem(constraints=wrong))
 
 
 def test_a_prior_is_an_observation_of_the_parameter():
@@ -258,85 +231,20 @@ ERRORS = np.array([0.01, -0.02, 0.01, 0.0, 0.02, -0.01])
 LEVELLED = np.array([HEIGHTS[j] - HEIGHTS[i] for i, j in PAIRS]) + ERRORS
 
 
-def net(datum=(), start=START):
+def net(start=START):
     names = ["H1", "H2", "H3", "H4"]
     return GaussMarkov(
         lambda x: np.array([x[j] - x[i] for i, j in PAIRS]),
         LEVELLED,
         0.01,
         Parameters(names, start),
-        datum=datum,
     )
-
-
-def test_inner_constraints_give_corrections_and_covariance_of_minimum_norm():
-    fit = adjust(net(["H1", "H2", "H3", "H4"])).required()
-    assert fit.redundancy == len(PAIRS) - 3
-    assert (fit.values - START).sum() == pytest.approx(0.0, abs=1e-12)
-    a = np.zeros((len(PAIRS), 4))
-    for row, (i, j) in enumerate(PAIRS):
-        a[row, i], a[row, j] = -1.0, 1.0
-    np.testing.assert_allclose(fit.cofactor, np.linalg.pinv(a.T @ a / 0.01**2), atol=1e-14)
-
-
-def test_a_datum_over_some_parameters_moves_only_along_the_null_space():
-    some, every = (adjust(net(d)).required() for d in (["H1", "H2"], ["H1", "H2", "H3", "H4"]))
-    shift = some.values - every.values
-    np.testing.assert_allclose(shift, shift[0], atol=1e-12)
-    np.testing.assert_allclose(some.residuals, every.residuals, atol=1e-12)
-    assert (some.values - START)[:2].sum() == pytest.approx(0.0, abs=1e-12)
-    assert np.trace(some.cofactor[:2, :2]) < np.trace(every.cofactor[:2, :2])
-    assert np.trace(some.cofactor) > np.trace(every.cofactor)
 
 
 def test_a_net_without_datum_names_all_heights():
     failed = adjust(net())
     assert not failed
     assert set(failed.null_space[0]) == {"H1", "H2", "H3", "H4"}
-
-
-def test_a_datum_that_does_not_remove_the_rank_defect_is_a_failure():
-    names = ["H1", "H2", "H3", "H4", "free"]
-    problem = GaussMarkov(
-        lambda x: np.array([x[j] - x[i] for i, j in PAIRS]),
-        LEVELLED,
-        0.01,
-        Parameters(names, [*HEIGHTS, 0.0]),
-        datum=["H1"],
-    )
-    failed = adjust(problem)
-    assert not failed
-    assert "free" in failed.reason
-
-
-def test_a_free_plane_net_of_distances_keeps_its_nonlinear_datum():
-    """Distances leave two shifts and a rotation; inner constraints hold over the whole correction."""
-    rng = np.random.default_rng(2)
-    xy = np.array([[0.0, 0.0], [100.0, 5.0], [90.0, 80.0], [10.0, 110.0], [50.0, 40.0]])
-    pairs = np.array(list(itertools.combinations(range(5), 2)))
-
-    def distances(x):
-        p = np.asarray(x).reshape(5, 2)
-        return np.hypot(*(p[pairs[:, 0]] - p[pairs[:, 1]]).T)
-
-    def slopes(x):
-        p, out = np.asarray(x).reshape(5, 2), np.zeros((len(pairs), 5, 2))
-        unit = p[pairs[:, 0]] - p[pairs[:, 1]]
-        unit /= np.hypot(*unit.T)[:, None]
-        out[np.arange(len(pairs)), pairs[:, 0]], out[np.arange(len(pairs)), pairs[:, 1]] = unit, -unit
-        return out.reshape(len(pairs), 10)
-
-    names = [f"{axis}{i}" for i in range(5) for axis in "xy"]
-    start = (xy + rng.normal(0, 2.0, xy.shape)).ravel()
-    observed = distances(xy.ravel()) + rng.normal(0, 0.01, len(pairs))
-    problem = GaussMarkov(distances, observed, 0.01, Parameters(names, start), slopes, datum=names)
-    fit = adjust(problem).required()
-    assert fit.redundancy == len(pairs) - 7
-    p, correction = fit.values.reshape(5, 2), (fit.values - start).reshape(5, 2)
-    rotation = (p[:, 0] * correction[:, 1] - p[:, 1] * correction[:, 0]).sum()
-    assert np.abs(correction.sum(axis=0)).max() < 1e-9
-    # Over Σ(x² + y²) = 4e4 mm² this is a rotation of 1e-9.
-    assert abs(rotation) < 4e-5
 
 
 # --- Gauss–Helmert
@@ -543,7 +451,6 @@ def test_a_covariance_that_does_not_fit_is_an_error(covariance, words):
         lambda: Prior("ab", [1.0], [1.0, 1.0]),
         lambda: decay_problem(np.full(30, np.nan)),
         lambda: decay_problem(weights=-np.ones(30)),
-        lambda: adjust(decay_problem(constraints=[Constraint({})])),
         lambda: adjust(decay_problem(jacobian=lambda x: np.zeros((3, 3)))),
         lambda: adjust(GaussMarkov(lambda x: x, np.zeros(3), 1.0, Parameters("ab", [0.0, 0.0]))),
         lambda: GaussHelmert(line_conditions, np.zeros((2, 2, 2)), 1.0, Parameters("ab", [0.0, 0.0])),

@@ -17,7 +17,7 @@ import numpy as np
 from ..core.data import Array
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure
-from .linear import Linearised, constraint_matrix, linearise
+from .linear import Linearised, linearise
 from .models import Model, State, Values
 from .reliability import Solution
 
@@ -154,25 +154,17 @@ class _Run:
 
     def __init__(self, model: Model, options: Options) -> None:
         self.model, self.problem, self.options = model, model.problem, options
-        problem, parameters = self.problem, self.problem.parameters
-        self.free = np.flatnonzero(parameters.mask)
-        self.constraints = constraint_matrix(
-            problem.constraints, parameters.names, parameters.values, parameters.mask
-        )
+        self.free = np.flatnonzero(self.problem.parameters.mask)
         default = 1e-13 if model.analytic else 1e-9
         self.rank_tolerance = default if options.rank_tolerance is None else options.rank_tolerance
-        datum = set(problem.datum)
-        self.datum = np.array([name in datum for name in parameters.free], dtype=bool)
         self.damping, self.growth = options.damping, 2.0
         self.lengths = np.zeros(len(self.free))
         self.costs: list[float] = []
         self.iterations = 0
 
     def solve(self) -> Solved | AdjustmentFailure:
-        model, x = self.model, self.model.start
-        x = self._moved(x, self.constraints.onto(x[self.free].astype(np.float64)))
-        self.begin = x[self.free].astype(np.float64)
-        state = model.evaluate(x)
+        model = self.model
+        state = model.evaluate(model.start)
         if not state.usable:
             return self._failure(
                 "the problem has no finite residuals at the approximate values", Code.NOT_FINITE, state
@@ -222,7 +214,7 @@ class _Run:
 
     def _trial(self, state: State, linear: Linearised, damping: float, *, bend: bool = False) -> State:
         self.iterations += 1
-        step = self._datum_step(state, linear, damping)
+        step = linear.step(damping)
         if bend:
             bent = self._bend(state, linear, damping, step)
             if bent is None:
@@ -285,7 +277,7 @@ class _Run:
         # After Moré (1978): the scale of a column decreases slowly, so that a parameter that loses its
         # influence does not diverge; it does decrease, because narrow valleys would be slow otherwise.
         self.lengths = np.maximum(_MEMORY * self.lengths, np.sqrt((design**2).sum(axis=0)))
-        return linearise(design, state.whitened, self.constraints, self.rank_tolerance, self.lengths)
+        return linearise(design, state.whitened, self.rank_tolerance, self.lengths)
 
     def _moved(self, x: Array, step: Array) -> Array:
         full = np.zeros(len(x))
@@ -302,38 +294,15 @@ class _Run:
             return float(inside) if inside**2 > self.floor else 0.0
         return float(inside / (linear.outside / np.sqrt(redundancy)))
 
-    def _datum_step(self, state: State, linear: Linearised, damping: float) -> Array:
-        step = linear.step(damping)
-        if not self.datum.any() or linear.rank == len(linear.singular):
-            return step
-        # Inner constraints: Gᵀ (x − x_begin) = 0 over the chosen parameters (Förstner & Wrobel 2016, sect.
-        # 4.5).
-        past = np.where(self.datum, state.x[self.free].astype(np.float64) - self.begin + step, 0.0)
-        g = linear.null
-        inner = g[self.datum].T @ g[self.datum]
-        return step - g @ (np.linalg.pinv(inner) @ (g.T @ past)) / (1.0 + damping)
-
     def _arrived(self, state: State, linear: Linearised) -> Solved | AdjustmentFailure:
-        factor, defect = linear.factor, linear.null.shape[1]
+        defect = linear.scaled_null.shape[1]
         if defect:
             vectors = self._null_vectors(linear)
             listed = "; ".join(" with ".join(vector) for vector in vectors)
-            if not self.datum.any():
-                reason = f"rank defect {defect}: the observations do not determine {listed}"
-                return self._failure(reason, Code.RANK_DEFECT, state, vectors)
-            g = linear.null
-            inner = g[self.datum].T @ g[self.datum]
-            size = np.sqrt(np.maximum(np.diag(inner), np.finfo(float).tiny))
-            if np.linalg.eigvalsh(inner / np.outer(size, size))[0] < 1e-10:
-                reason = f"rank defect {defect}: the chosen datum does not determine {listed}"
-                return self._failure(reason, Code.NO_DATUM, state, vectors)
-            weight = np.linalg.solve(inner, np.where(self.datum[:, None], g, 0.0).T)
-            factor = factor - g @ (weight @ factor)
-        return self._solved(state, linear, factor)
-
-    def _solved(self, state: State, linear: Linearised, factor: Array) -> Solved:
-        parameters = self.problem.parameters
-        cofactor = np.zeros((len(parameters), len(parameters)))
+            reason = f"rank defect {defect}: the observations do not determine {listed}"
+            return self._failure(reason, Code.RANK_DEFECT, state, vectors)
+        factor, count = linear.factor, len(self.problem.parameters)
+        cofactor = np.zeros((count, count))
         cofactor[np.ix_(self.free, self.free)] = factor @ factor.T
         redundancy = len(linear.design) - self.model.left_out - linear.rank
         solution = Solution(

@@ -143,7 +143,7 @@ class Fitted(Estimated):
 
 
 def compare(nested: Fitted, full: Fitted, alpha: float = 0.05, scale: str | None = None) -> NestedTest:
-    """Test a model with fewer parameters (or more constraints) against a wider one.
+    """Test a model with fewer parameters against a wider one.
 
     Parameters
     ----------

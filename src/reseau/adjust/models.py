@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..core.data import Array
 from ..core.errors import UsageError
 from .differences import differences
-from .parameters import Constraint, Parameters
+from .parameters import Parameters
 from .stochastic import Blocks, Covariance, Weighting, blocks_of
 
 Values = NDArray[Any]
@@ -47,14 +47,6 @@ class Specification(Protocol):
     @property
     def parameters(self) -> Parameters:
         """Names, approximate values, which are free, and their observations."""
-
-    @property
-    def constraints(self) -> tuple[Constraint, ...]:
-        """Linear conditions between parameters."""
-
-    @property
-    def datum(self) -> tuple[str, ...]:
-        """Names of the parameters of the inner constraints."""
 
     @property
     def weights(self) -> Array | None:
