@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike
 from ..core.data import Array, Mask
 from ..core.errors import UsageError
 
-__all__ = ["Parameters", "Prior"]
-
 
 @dataclass(frozen=True, eq=False)
 class Prior:

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from ..core.data import Array, Frame
 
-__all__ = ["balanced", "gains_of"]
-
 _LEAST = 16
 """Smallest side of a frame in which gains are looked for, and height of the bands of a large one (px)."""
 _BANDS = 16
