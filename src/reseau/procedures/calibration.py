@@ -292,7 +292,7 @@ class _Job:
                 return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
             return found
         # What was not chosen may yet be there.
-        found = replace(found, considers=bool(choices))
+        found = replace(found, rivals=tuple(each.rivals for each in choices.values()) or None)
         calibrated = Calibrated(found, measured, self.declined, choices, board, notes, wrong)
         loose = _without_scale(calibrated.result)
         return calibrated if loose is None else loose
