@@ -28,7 +28,6 @@ from reseau.optics import (
     rotation_matrix,
 )
 from reseau.optics.formation import Outline, PixelResponse, draw
-from reseau.optics.grids import line_grid
 from reseau.optics.sensor import sigma_of_snr
 from reseau.optics.targets import target_outline
 
@@ -36,6 +35,7 @@ from .frame import SpaceFrame
 from .photograph import Photograph
 from .streams import stream
 from .water import Water
+from .wires import line_grid
 
 __all__ = ["FieldBench", "FieldTruth", "Stain", "Station", "paper_stations"]
 
