@@ -17,14 +17,11 @@ from .bundle_options import (
     level_of,
     positive,
     say_difference,
+    say_estimated,
     say_left_out,
     say_model,
-    say_motion,
     say_parameters,
     say_priors,
-    say_refraction,
-    say_rig,
-    say_turntable,
 )
 from .common import (
     CameraChoice,
@@ -412,15 +409,7 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
         for away in distances:
             field = _uncertainty(projection_field_at(result, c, away))
             say(f"  σ at {away:g} {result.network.unit}: {field}\n")
-    if result.rig is not None:
-        say_rig(result.rig)
-    if result.stage is not None:
-        say_turntable(result.stage)
-    if result.motion is not None:
-        say_motion(result.motion)
-    if result.refraction is not None:
-        say("windows and media\n")
-        say_refraction(result.refraction)
+    say_estimated(result)
     say_model(done.result)
     for name, found in differences.items():
         say_difference(name, found)

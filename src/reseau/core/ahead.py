@@ -20,8 +20,6 @@ from .executors import Executor
 from .failure import Code, Failure
 from .lazy import without_collecting
 
-__all__ = ["LOOPS", "Ahead", "Loop", "by_module", "compile_ahead", "main_loops", "missing_loops"]
-
 LOOPS = Path(__file__).with_name("ahead.json")
 
 

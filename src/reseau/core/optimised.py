@@ -15,8 +15,6 @@ from typing import Any
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 
-__all__ = ["Optimised"]
-
 _FIRST, _THEN = {"opt": 1, "loop_vectorize": False}, {"opt": 2}
 """Levels of LLVM's optimisation: loops become vector instructions after what they call is in them and simple.
 The third level takes longer, and loops are not faster."""

@@ -25,8 +25,6 @@ from __future__ import annotations
 from ..core.errors import UsageError
 from ..io import FiducialDesign, FiducialMark, FiducialPoint, MarkPart
 
-__all__ = ["aerial_camera", "aerial_cameras"]
-
 _CORNERS = {"1": (-1, -1), "2": (1, 1), "3": (-1, 1), "4": (1, -1)}
 _MIDDLES = {"5": (-1, 0), "6": (1, 0), "7": (0, 1), "8": (0, -1)}
 

@@ -14,16 +14,6 @@ from ..core.errors import UsageError
 from ..io.board import BoardDesign, BoardKind
 from .dots import dotted_squares
 
-__all__ = [
-    "board",
-    "board_figures",
-    "dictionary_cells",
-    "dictionary_name",
-    "marker_cells",
-    "marker_dictionary",
-    "unusual_size",
-]
-
 _SIZES = {"puzzle": 1 / 3, "charuco": 0.75, "circles": 0.5, "aprilgrid": 1 / 1.3, "markers": 0.8}
 """Sizes of dots, markers, circles and tags in pitches, where none is given; tags are 0.3 of a side apart."""
 _USUAL_MM, _UNITS = 25.0, {"mm": 1.0, "m": 1000.0, "µm": 0.001}

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from ..core.data import Array
 from ..io.board import BoardDesign
 
-__all__ = ["dot_signs", "dotted_squares", "halves_of_dots", "puzzle_maps"]
-
 _DOT = 0.34
 """Diameter of a dot in a square of OpenCV's board, in squares."""
 _VERTICAL = (

@@ -23,8 +23,6 @@ from .paper import Content, Page, page_of, room_on, sheets_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["content_of", "design_pdf", "design_svg"]
-
 Drawable = ReseauDesign | TestfieldDesign | SpaceTargets | BoardDesign
 
 _GREY = "#555555"

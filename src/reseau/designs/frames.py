@@ -9,8 +9,6 @@ import numpy as np
 from ..core.errors import UsageError
 from ..io.targets import SpaceTargets, TargetColumns
 
-__all__ = ["space_frame"]
-
 
 def space_frame(
     sides: tuple[float, float, float] = (1200.0, 900.0, 400.0),

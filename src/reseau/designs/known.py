@@ -12,8 +12,6 @@ from .paper import PAPERS, Content, largest_pitch
 from .reseaus import coded_sheet
 from .testfield import coded_testfield
 
-__all__ = ["known_designs"]
-
 _SHEET, _FIELD, _BOARD = (10, 13), (8, 8), (7, 10)
 _KINDS: tuple[BoardKind, ...] = ("charuco", "aprilgrid", "markers", "circles", "chess", "deltille")
 """All but the PuzzleBoard, whose dots tell what a photograph shows of it."""

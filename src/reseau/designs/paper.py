@@ -10,8 +10,6 @@ import numpy as np
 from ..core.data import Array
 from ..core.errors import UsageError
 
-__all__ = ["PAPERS", "Content", "Page", "largest_pitch", "page_of", "room_on", "sheets_of"]
-
 PAPERS: dict[str, tuple[float, float]] = {
     "A4": (210.0, 297.0),
     "A3": (297.0, 420.0),

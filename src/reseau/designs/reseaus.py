@@ -9,8 +9,6 @@ import numpy as np
 from ..core.errors import UsageError
 from ..io import DesignPoint, Mark, ReseauDesign, Rings
 
-__all__ = ["coded_sheet", "n_wire_phantom", "regular_reseau", "standard_reseau", "test_object"]
-
 
 def regular_reseau(
     columns: int,

@@ -11,8 +11,6 @@ from ..core.errors import UsageError
 from ..io import SHAPES, FieldLines, FieldTargets, TestfieldDesign
 from .topology import words
 
-__all__ = ["coded_testfield"]
-
 _SMALL = (9.0, 13.0, 15.0, 12.0)
 _LARGE = (17.0, 25.0, 25.0, 22.0)
 """Sizes of squares, triangles, crosses and circles. The areas of the first two are slightly smaller than

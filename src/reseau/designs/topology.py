@@ -26,8 +26,6 @@ from ..core.errors import UsageError
 from ..core.failure import Code
 from ..io import TestfieldDesign
 
-__all__ = ["HIDDEN", "Decoded", "TopologicalCode"]
-
 HIDDEN = -1
 """Symbol of a target that is not visible."""
 _SIDE = 4

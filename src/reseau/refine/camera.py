@@ -32,8 +32,6 @@ from ..optics import RationalPolynomial
 from ..optics.composition import Similarity
 from ..optics.field import SmoothField
 
-__all__ = ["CorrectionFit", "FittedCamera", "correct_camera"]
-
 
 @dataclass(frozen=True, eq=False)
 class CorrectionFit:

@@ -19,8 +19,6 @@ from ..core.data import Array
 from ..core.errors import UsageError
 from ..core.failure import Failure
 
-__all__ = ["CAUSES", "COEFFICIENTS", "CONDITIONS", "Causes", "ConditionTest", "causes_of", "physical_causes"]
-
 CAUSES = ("P0", "P1", "P2", "P3", "P4", "k0", "k1", "h'1", "h'2", "h'3", "h'4", "m1", "m2")
 """Orientation, symmetric and asymmetric distortion of the display, the ultrasonic beam."""
 

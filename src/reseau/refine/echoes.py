@@ -15,8 +15,6 @@ from ..calibration import CameraCorrection
 from ..core.data import Array, ImagePoints
 from .registration import Registration
 
-__all__ = ["middles_on_screen"]
-
 
 def middles_on_screen(
     points: ImagePoints,

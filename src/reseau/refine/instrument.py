@@ -30,8 +30,6 @@ from .camera import defining_marks
 from .registration import Registration
 from .rivals import Rivalry, rivals
 
-__all__ = ["FittedInstrument", "InstrumentFit", "correct_instrument"]
-
 _DATUM = ("A0", "A1", "A2", "B0", "B1", "B2")
 """Coefficients that absorb the errors of M, N and of the scales between the systems; never dropped."""
 

@@ -25,8 +25,6 @@ from ..optics import RationalPolynomial
 from ..optics.composition import Similarity
 from ..optics.field import SmoothField
 
-__all__ = ["Registration", "register"]
-
 _LEAST_PX = 0.05
 """Smaller displacements are ignored, even where they are significant."""
 _UNLIKE = 2.0

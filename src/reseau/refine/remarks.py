@@ -14,8 +14,6 @@ from .instrument import FittedInstrument
 from .registration import Registration
 from .standard import StandardTest
 
-__all__ = ["ANOTHER_SHAPE_PX", "of_gross_errors", "of_the_camera", "of_the_change", "of_the_object"]
-
 _UPRIGHT = np.deg2rad(20.0)
 """Rotation of the test object against the reseau, or of the reseau in the image, that is accepted."""
 ANOTHER_SHAPE_PX = 0.3

@@ -19,8 +19,6 @@ from ..core.failure import Code, Failure
 from ..measure.fitting import fit_mapping
 from ..optics.mapping import PlaneMapping
 
-__all__ = ["Rivalry", "leave_one_out", "rivals"]
-
 
 @dataclass(frozen=True, eq=False)
 class Rivalry:

@@ -24,8 +24,6 @@ from ..core.errors import UsageError
 from ..core.failure import Code, Estimated, Failure
 from ..io import ReseauDesign
 
-__all__ = ["StandardTest", "still_standard"]
-
 
 @dataclass(frozen=True, eq=False)
 class StandardTest(Estimated):

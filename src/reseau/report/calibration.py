@@ -10,8 +10,6 @@ from ..calibration import Calibration
 from ..core.figures import drawing, to_svg
 from .template import rendered
 
-__all__ = ["calibration_report"]
-
 
 def calibration_report(calibration: Calibration) -> str:
     """Return the report of a calibration as an HTML page.

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from ..archive.objects import objects_at
 from ..core import vocabulary as v
-from ..core.errors import EstimationError, InputError, ReseauError, UsageError
+from ..core.errors import EstimationError, ReseauError, UsageError
 from ..core.failure import Failure
-from ..core.files import made_folder
+from ..core.files import made_folder, readable
 from ..core.provenance import Provenance, canonical_json, sha256_of
 from ..execution import Executor
 from ..io import FrameCorners, FrameOrientation, write_whole
@@ -266,10 +266,8 @@ def _sent(job: ScanJob, store: str) -> tuple[ScanJob, dict[str, str]]:
     objects, files = objects_at(store, durable=False), {}
     for path in (job.image, job.corners):
         if path is not None:
-            try:
+            with readable(path):
                 files[str(path)] = objects.put(path.read_bytes(), path.suffix)
-            except OSError as error:
-                raise InputError(f"cannot be read ({error.strerror})", where=path) from None
     return job, files
 
 

@@ -27,20 +27,6 @@ if TYPE_CHECKING:
     from ..procedures.calibration_options import CameraOptions
     from ..procedures.film_frame import FrameOptions
 
-__all__ = [
-    "BlurredParameters",
-    "FilmParameters",
-    "FramesParameters",
-    "OscilloscopeParameters",
-    "OwnParameters",
-    "PhotographsParameters",
-    "ScanParameters",
-    "SensorParameters",
-    "SessionParameters",
-    "TestfieldParameters",
-    "present_keys",
-]
-
 
 _FORMERLY = {
     "pitch": "pitch_mm", "row_jitter": "row_jitter_px", "psf": "psf_px", "search": "search_px",
