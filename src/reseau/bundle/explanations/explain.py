@@ -281,7 +281,7 @@ class _Comparison:
                          advice("noise", f"{factor:.2g}"))  # fmt: skip
         amount = sigma * np.sqrt(max(explained, 0.0) / (2 * len(sight.rows)))
         return Cause(code, name, amount, min(explained / first.square, 1.0), probability, where,
-                     advice(code, name, sight.result.considers))  # fmt: skip
+                     advice(code, name, sight.result.rivals is not None))  # fmt: skip
 
 
 def _compared(
