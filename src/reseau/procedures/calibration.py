@@ -58,6 +58,7 @@ _SHIFTED = (
 )
 _UNNAMED = "which part of the target it shows is not certain, and no other photograph tells"
 _LEFT_OUT = "{} image points are gross errors, and are left out: {}; --no-reject keeps them"
+_VIEWS = "{} photographs are {} views: {} repeat their errors, and count once"
 _MORE_TILTED = "add images with the camera tilted by 20 to 40 degrees in different directions"
 # Relative standard deviation of a diagonal of the target.
 _PRINTED = 1e-4
@@ -293,6 +294,7 @@ class _Job:
             return found
         # What was not chosen may yet be there.
         found = replace(found, rivals=tuple(each.rivals for each in choices.values()) or None)
+        notes = (*notes, *_of_views(found))
         calibrated = Calibrated(found, measured, self.declined, choices, board, notes, wrong)
         loose = _without_scale(calibrated.result)
         return calibrated if loose is None else loose
@@ -302,6 +304,16 @@ def _cameras_of(images: Iterable[str], taken: Mapping[str, Taken] | None) -> tup
     """Names of the cameras, and the number of that of each image."""
     cameras = list(dict.fromkeys(each.camera for each in taken.values())) if taken else [ONE_CAMERA]
     return cameras, [cameras.index(taken[name].camera) if taken else 0 for name in images]
+
+
+def _of_views(result: Result) -> list[str]:
+    """A note where photographs repeat each other's errors, naming the most that do."""
+    if result.shared is None:
+        return []
+    views, images = result.shared.views, np.array(result.network.images)
+    count = np.bincount(views)
+    alike = images[views == int(count.argmax())].tolist()
+    return [_VIEWS.format(len(images), len(count), few_of(alike))] if len(count) < len(images) else []
 
 
 def _without_scale(result: Result) -> Failure | None:
