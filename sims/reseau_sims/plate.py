@@ -11,9 +11,10 @@ from reseau.core.errors import UsageError
 from reseau.designs import regular_reseau
 from reseau.io import Mark, ReseauDesign
 from reseau.optics.formation import Outline, draw, mark_outline
-from reseau.optics.grids import Wires, line_grid, wire_grid
+from reseau.optics.grids import Wires, wire_grid
 
 from .camera import FilmCamera
+from .wires import line_grid
 
 _SPACING_PX = 0.7
 """Distance of the nodes of an outline in widths of the point-spread function; see `Outline.polygon`."""

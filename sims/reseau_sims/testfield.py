@@ -28,7 +28,6 @@ from reseau.optics import (
     rotation_matrix,
 )
 from reseau.optics.formation import Outline, PixelResponse, draw
-from reseau.optics.grids import line_grid
 from reseau.optics.sensor import sigma_of_snr
 from reseau.optics.targets import target_outline
 
@@ -36,6 +35,7 @@ from .frame import SpaceFrame
 from .photograph import Photograph
 from .streams import stream
 from .water import Water
+from .wires import line_grid
 
 PITCH_MM, PIXELS, C_MM, DISTANCE_MM = 0.027, 240, 57.5, 5000.0
 """The paper's camera: table 1 and section 2.2."""

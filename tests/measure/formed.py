@@ -15,7 +15,7 @@ from reseau.measure.reseau.marks import ReseauOptions
 from reseau.measure.reseau.measure import ReseauResult
 from reseau.optics import Sensor, illumination
 from reseau.optics.formation import Outline, PixelResponse, coverage_derivatives, draw, mark_outline
-from reseau.optics.grids import line_grid
+from reseau_sims.wires import line_grid
 
 __all__ = ["MARKS", "Formed", "Scene", "Statistics", "bounds", "form", "measure_many", "measured"]
 

@@ -19,7 +19,8 @@ from reseau.optics.formation import (
     mark_outline,
     rectangles,
 )
-from reseau.optics.grids import Wires, line_grid, wire_grid
+from reseau.optics.grids import Wires, wire_grid
+from reseau_sims.wires import line_grid
 
 SIGMA = 0.8
 SPACING = 0.7 * SIGMA

@@ -429,16 +429,8 @@ class _Run:
         )
 
     def _null_vectors(self, linear: Linearised) -> tuple[NullVector, ...]:
-        """A sparse basis of the null space: reduced by pivots, in scaled parameters."""
-        vectors = linear.scaled_null.copy()
-        count = vectors.shape[1]
-        for column in range(count):
-            rest = vectors[:, column:]
-            row, pick = divmod(int(np.argmax(np.abs(rest))), rest.shape[1])
-            vectors[:, [column, column + pick]] = vectors[:, [column + pick, column]]
-            vectors[:, column] /= vectors[row, column]
-            others = np.arange(count) != column
-            vectors[:, others] -= np.outer(vectors[:, column], vectors[row, others])
+        """A sparse basis of the null space, in scaled parameters."""
+        vectors = sparse_basis(linear.scaled_null)
         free = self.problem.parameters.free
         length = np.sqrt((linear.design**2).sum(axis=0))
         scale = 1.0 / np.where(length > 0, length, 1.0)
@@ -460,3 +452,24 @@ class _Run:
             costs=tuple(self.costs),
             null_space=null_space,
         )
+
+
+def sparse_basis(vectors: Array) -> Array:
+    """A basis (n, k) of the same space with as many zeros as possible, reduced by pivots.
+
+    Examples
+    --------
+    >>> sparse_basis(np.array([[1.0, 1.0], [1.0, -1.0], [0.0, 0.0]])) + 0.0
+    array([[1., 0.],
+           [0., 1.],
+           [0., 0.]])
+    """
+    vectors, count = vectors.copy(), vectors.shape[1]
+    for column in range(count):
+        rest = vectors[:, column:]
+        row, pick = divmod(int(np.argmax(np.abs(rest))), rest.shape[1])
+        vectors[:, [column, column + pick]] = vectors[:, [column + pick, column]]
+        vectors[:, column] /= vectors[row, column]
+        others = np.arange(count) != column
+        vectors[:, others] -= np.outer(vectors[:, column], vectors[row, others])
+    return vectors

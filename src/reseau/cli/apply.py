@@ -12,7 +12,7 @@ from ..core.errors import UsageError
 from ..core.files import made_folder, writable
 from ..core.options import Option
 from .calibrations import time_of
-from .common import Place, progress, say, say_files_left_out
+from .common import Place, progress, say, say_files_left_out, say_json
 
 if TYPE_CHECKING:
     from ..calibration import Calibration
@@ -352,14 +352,12 @@ def _frame(
     applied: Application, source: Path, out: Path | None, exposure_ms: float | None, as_json: bool
 ) -> None:
     """Correct the grey values of a frame: a TIFF of floats, or a PNG of 16 bit up to the full scale."""
-    from ..core.provenance import canonical_json
-
     out = out or source.with_name(f"{source.stem}-corrected.tif")
     suffix = writable(out, ".tif", ".tiff", ".png").suffix.lower()
     found = applied.frame(source, out, None if exposure_ms is None else 1000 * exposure_ms)
     if as_json:
         content = {"image": str(out), "dn_per_step": found.dn_per_step, "full_scale_dn": found.full_scale}
-        say(canonical_json(content | {"provenance": found.provenance.to_dict()}))
+        say_json(content | {"provenance": found.provenance.to_dict()})
     else:
         kind = f"16 bit, {found.dn_per_step:.6g} DN per step" if suffix == ".png" else "32 bit float"
         say(f"{out}: {found.width} × {found.height} px, {kind}, full scale {found.full_scale:.6g} DN\n")

@@ -8,7 +8,7 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.files import writable
-from .common import Computing, Place, SessionName, progress, required, say
+from .common import Computing, Place, SessionName, progress, required, say, say_json
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -21,13 +21,11 @@ app = Commands(help="List, show, verify, export and recompute archived sessions.
 @app.command("list")
 def list_(place: Place, as_json: v.AsJson = False) -> None:
     """List the sessions of an archive."""
-    from ..core.provenance import canonical_json
-
     with place.open() as found:
         sessions = found.sessions()
     if as_json:
         rows = [vars(each) | {"begun": each.begun.isoformat()} for each in sessions]
-        say(canonical_json({"schema": "reseau-sessions/1", "sessions": rows}))
+        say_json({"schema": "reseau-sessions/1", "sessions": rows})
         return
     for each in sessions:
         counts = f"{each.frames:6d} frames {each.results:3d} results"
@@ -43,14 +41,13 @@ def show(
 ) -> None:
     """Show a session: frames with verdicts, and results with their inputs."""
     from ..archive.exporting import describe
-    from ..core.provenance import canonical_json
 
     with place.open() as found:
         stored = found.session(session)
         if out is not None:
             stored.write_results(out)
         if as_json:
-            say(canonical_json(describe(stored)))
+            say_json(describe(stored))
             return
         start = f"{stored.begun:%Y-%m-%d %H:%M:%S}Z"
         say(f"{stored.name}: plan {stored.plan}, started {start} with {stored.software}, {stored.status}\n")
@@ -71,12 +68,11 @@ def _verdict(frame: ArchivedFrame) -> str:
 def verify(place: Place, as_json: v.AsJson = False) -> None:
     """Read every file, and compare its SHA-256 with the index."""
     from ..archive.verification import verify as verified
-    from ..core.provenance import canonical_json
 
     with place.open() as found, progress("verifying", len(found.files())) as step:
         result = verified(found, step)
     if as_json:
-        say(canonical_json({"schema": "reseau-verified/1", **vars(result), "sound": bool(result)}))
+        say_json({"schema": "reseau-verified/1", **vars(result), "sound": bool(result)})
     else:
         say(f"{result.files} files, {result.size / 1e6:.1f} MB: {'intact' if result else 'damaged'}\n")
         say("".join(f"  {line}\n" for line in result.damaged))
@@ -114,7 +110,6 @@ def rerun(
 ) -> None:
     """Recompute the results of sessions from their frames, and compare them byte for byte."""
     from ..core.failure import Failure
-    from ..core.provenance import canonical_json
     from ..sessions import conducting
 
     with place.open() as found:
@@ -139,5 +134,5 @@ def rerun(
                     outcome = "identical" if each.same else f"differs; made with {made.software}"
                     say(f"{'' if session is not None else name + ': '}{made.name}: {outcome}\n")
     if as_json:
-        say(canonical_json({"schema": "reseau-rerun/1", "same": same, "results": rows}))
+        say_json({"schema": "reseau-rerun/1", "same": same, "results": rows})
     raise typer.Exit(0 if same else 1)

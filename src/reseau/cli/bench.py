@@ -15,7 +15,7 @@ from ..core.files import writable
 from ..core.options import Option
 from . import bench_by_hand as by_hand
 from .bench_by_hand import held_one
-from .common import say
+from .common import say, say_json
 from .declared import Commands
 
 
@@ -38,7 +38,6 @@ def features(
     What is set stays until the camera is switched off or opened with other settings: keep it in a user set,
     or in the bench file with `reseau bench set camera features=...`.
     """
-    from ..core.provenance import canonical_json
     from ..instruments import Camera
 
     wanted = dict(_pair(text) for text in set_ or [])
@@ -60,7 +59,7 @@ def features(
             {key: value for key, value in vars(each).items() if value not in (None, "", ())}
             for each in listed
         ]
-        say(canonical_json({"schema": "reseau-features/1", "features": rows}))
+        say_json({"schema": "reseau-features/1", "features": rows})
         return
     category = ""
     for each in listed:
@@ -81,14 +80,12 @@ def _pair(text: str) -> tuple[str, str]:
 
 def _compare(camera: Any, names: list[str], as_json: bool) -> None:
     """Print the features that differ between two user sets, or between one and the present values."""
-    from ..core.provenance import canonical_json
-
     if len(names) > 2 or not all(names):
         raise UsageError("takes one or two user sets", where="--compare", do="write UserSet1,UserSet2")
     different = camera.compare_user_sets(*names)
     names = [*names, "present"][:2]
     if as_json:
-        say(canonical_json({"schema": "reseau-user-sets/1", "sets": names, "different": different}))
+        say_json({"schema": "reseau-user-sets/1", "sets": names, "different": different})
         return
     say(
         "".join(f"{key}: {one} in {names[0]}, {two} in {names[1]}\n" for key, (one, two) in different.items())
@@ -117,7 +114,6 @@ def list_(
     """Search for cameras, VISA instruments and serial ports, and list the installed drivers."""
     from ..capture import found_instruments
     from ..capture.bench import bench_text, drivers
-    from ..core.provenance import canonical_json
     from ..io import write_whole
 
     if write is not None and write.exists():
@@ -129,7 +125,7 @@ def list_(
         addresses = {k: [] if isinstance(v, Exception) else list(v) for k, v in found.items()}
         errors = {k: str(v) for k, v in found.items() if isinstance(v, Exception)}
         document = {"schema": "reseau-instruments/1", "found": addresses, "errors": errors}
-        say(canonical_json(document | {"drivers": list(drivers())}))
+        say_json(document | {"drivers": list(drivers())})
         return
     for way, addresses_ in found.items():
         if isinstance(addresses_, Exception):
@@ -149,7 +145,6 @@ def check(
 ) -> None:
     """Connect all instruments and run their self-tests; list all failures."""
     from ..capture import Bench
-    from ..core.provenance import canonical_json
 
     found = Bench.read(bench)
     try:
@@ -163,7 +158,7 @@ def check(
             | ({"error": str(c.error)} if c.error else {})
             for c in checked
         ]
-        say(canonical_json({"schema": "reseau-bench-check/1", "failed": failed, "instruments": rows}))
+        say_json({"schema": "reseau-bench-check/1", "failed": failed, "instruments": rows})
     else:
         say(f"{found.file.name}\n")
         for last, each in zip([*[False] * (len(checked) - 1), True], checked, strict=True):
@@ -187,13 +182,12 @@ def doctor(
     firmware. Nothing is changed.
     """
     from ..capture import Bench
-    from ..core.provenance import canonical_json
 
     found = Bench.read(bench).diagnose(timeout_s)
     wrong = sum(each.fine is False for findings in found.values() for each in findings)
     if as_json:
         rows = {name: [vars(each) for each in findings] for name, findings in found.items()}
-        say(canonical_json({"schema": "reseau-bench-doctor/1", "wrong": wrong, "instruments": rows}))
+        say_json({"schema": "reseau-bench-doctor/1", "wrong": wrong, "instruments": rows})
     else:
         marks = {True: "fine", None: "note", False: "wrong"}
         say("".join(f"{name}: {marks[e.fine]}: {e}\n" for name, findings in found.items() for e in findings))

@@ -16,7 +16,7 @@ from ..core import vocabulary as v
 from ..core.errors import InputError, ReseauError, StateError, UsageError
 from ..core.files import writable
 from ..core.options import Option
-from .common import say
+from .common import say, say_json
 
 if TYPE_CHECKING:
     from ..capture import Bench
@@ -56,11 +56,10 @@ def held_one(path: Path, kind: type, name: str | None, purpose: str) -> Iterator
 def status(bench: v.Bench = _BENCH, as_json: v.AsJson = False) -> None:
     """Show identity, positions and settings of each instrument, or who uses it; nothing moves."""
     from ..capture import Bench
-    from ..core.provenance import canonical_json
 
     rows = _states(Bench.read(bench))
     if as_json:
-        say(canonical_json({"schema": "reseau-bench-status/1", "instruments": rows}))
+        say_json({"schema": "reseau-bench-status/1", "instruments": rows})
     else:
         for row in rows:
             say(f"{row['name']} ({row['driver']}): {row.get('error') or row['identity']}\n")
@@ -266,7 +265,6 @@ def expose(
 ) -> None:
     """Take a frame, and say how it is exposed and how sharp it is; it is not archived."""
     from ..capture.lighting import LightRule, steer
-    from ..core.provenance import canonical_json
     from ..instruments import Camera
     from ..io import read_text, write_whole
     from ..io.images import write_image
@@ -290,11 +288,7 @@ def expose(
     if out is not None:
         write_image(out, frame.pixels)
     if as_json:
-        say(
-            canonical_json(
-                {"schema": "reseau-exposure/1", "width": frame.width, "height": frame.height} | facts
-            )
-        )
+        say_json({"schema": "reseau-exposure/1", "width": frame.width, "height": frame.height} | facts)
         return
     say(f"{frame.width} × {frame.height} px: {_words(facts)}\n")
     if steered is not None:

@@ -14,7 +14,7 @@ from ..core import vocabulary as v
 from ..core.errors import EstimationError, UsageError
 from ..core.files import writable
 from ..core.options import Option
-from .common import Place, say
+from .common import Place, say, say_json
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -182,8 +182,6 @@ def show(
     as_json: v.AsJson = False,
 ) -> None:
     """Show the calibration that applies at a time; --out writes it."""
-    from ..core.provenance import canonical_json
-
     time, entered = time_of(at, "--at") or datetime.now(UTC), time_of(known, "--known")
     if out is not None:
         writable(out, ".json")
@@ -201,7 +199,7 @@ def show(
                     applied.calibration.write(out)
             rows.append(row)
     if as_json:
-        say(canonical_json({"schema": "reseau-in-force/1", "at": time.isoformat(), "configurations": rows}))
+        say_json({"schema": "reseau-in-force/1", "at": time.isoformat(), "configurations": rows})
     else:
         for row in rows:
             since = "" if row["calibration"] is None else f" since {row['since'][:16]}Z, by {row['why']}"
@@ -213,14 +211,12 @@ def show(
 @app.command()
 def history(name: Name, place: Place, as_json: v.AsJson = False) -> None:
     """Show all decisions with their findings, reviews and comments, and the service events."""
-    from ..core.provenance import canonical_json
-
     with _opened(place) as found:
         decisions, events = found.history(name), found.events(name)
     if as_json:
         rows = [_row(each) for each in decisions]
         said = [{"at": time.isoformat(), "what": what} for time, what in events]
-        say(canonical_json({"schema": "reseau-history/1", "decisions": rows, "events": said}))
+        say_json({"schema": "reseau-history/1", "decisions": rows, "events": said})
         return
     for each in decisions:
         say_decision(each, False)
@@ -242,10 +238,8 @@ def _row(made: Decision) -> dict[str, Any]:
 
 def say_decision(made: Decision, as_json: bool) -> None:
     """Print a decision with its findings, review and comments."""
-    from ..core.provenance import canonical_json
-
     if as_json:
-        say(canonical_json({"schema": "reseau-decision/1", **_row(made)}))
+        say_json({"schema": "reseau-decision/1", **_row(made)})
         return
     by = f"by {made.by}, rules {made.judgement.rules['version']}"
     say(f"{made.key}  {made.since:%Y-%m-%d %H:%M}Z  {made.outcome}, {by}\n")
@@ -277,7 +271,6 @@ def drift(
 
     With covariates, drift that they explain is distinguished from other drift.
     """
-    from ..core.provenance import canonical_json
     from ..service import ChartOptions, CovariateTable
 
     options = ChartOptions(kind=chart, rate=rate, runs_per_year=runs_per_year)
@@ -320,7 +313,7 @@ def drift(
         }
         if table is not None:
             content["verdicts"] = verdicts
-        say(canonical_json({"schema": "reseau-drift/1", **content}))
+        say_json({"schema": "reseau-drift/1", **content})
     else:
         say(f"{name}: {last + 1} calibrations since the last service event\n")
         if made.conversion_px:

@@ -16,7 +16,7 @@ from ..core.errors import UsageError
 from ..core.files import writable
 from ..core.options import Option
 from .calibrations import time_of
-from .common import Place, say
+from .common import Place, say, say_json
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -183,7 +183,6 @@ def verify(
     as_json: v.AsJson = False,
 ) -> None:
     """Verify a certificate: syntax, schema, rules, signature, numbers, pages; exit status 1 if refused."""
-    from ..core.provenance import canonical_json
     from ..service.certificates import verify as verified
 
     if schema is None and not without_schema:
@@ -192,7 +191,7 @@ def verify(
     refused = any(each.state == "failed" for each in found)
     if as_json:
         rows = [vars(each) | {"more": list(each.more)} for each in found]
-        say(canonical_json({"schema": "reseau-verification/1", "refused": refused, "checks": rows}))
+        say_json({"schema": "reseau-verification/1", "refused": refused, "checks": rows})
     else:
         for each in found:
             say(f"{each.state:<12} {each.check:<11} {each.text}\n")
@@ -275,7 +274,7 @@ def uncertainty(
     if out is not None:
         write_whole(out, canonical_json(document))
     if as_json:
-        say(canonical_json(document))
+        say_json(document)
     else:
         _say_budget(budget, probability, simulated)
         for what, why in sources.missing.items():

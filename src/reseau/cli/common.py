@@ -214,6 +214,13 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
+def say_json(value: object) -> None:
+    """Write a value as JSON to standard output."""
+    from ..core.provenance import canonical_json
+
+    say(canonical_json(value))
+
+
 def say_files_left_out(paths: Iterable[Path]) -> None:
     """Say which files of folders are no photographs."""
     from ..procedures.exposures import files_left_out

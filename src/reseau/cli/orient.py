@@ -11,7 +11,7 @@ from ..core import vocabulary as v
 from ..core.errors import InputError
 from ..core.files import writable
 from ..core.options import Group, Option
-from .common import Computing, overlay_files, progress, required, say, say_files_left_out
+from .common import Computing, overlay_files, progress, required, say, say_files_left_out, say_json
 from .measure import Output
 
 if TYPE_CHECKING:
@@ -66,11 +66,9 @@ def orient(
 
 
 def _report(found: OrientedFiles, as_json: bool) -> None:
-    from ..core.provenance import canonical_json
-
     if as_json:
         content = [each.to_dict() for each in found.documents]
-        say(canonical_json(content[0] if len(found.jobs) == len(content) == 1 else content))
+        say_json(content[0] if len(found.jobs) == len(content) == 1 else content)
     else:
         for document in found.documents:
             say(_line(document))
@@ -263,7 +261,6 @@ def perforations(
 
     from ..core.errors import UsageError
     from ..core.numbers import measured
-    from ..core.provenance import canonical_json
     from ..io.images import open_scan
     from ..measure.film import film_plane
     from ..procedures.film_frame import film_scale
@@ -293,7 +290,7 @@ def perforations(
             "centre_px": plane.centre.tolist(),
             "unit_px": plane.unit,
         }
-        say(canonical_json(document))
+        say_json(document)
         return
     say(f"{scan.name}: {plane.edges} edges of perforations, rms {plane.rms_px:.2g} px\n")
     for name, each in found.items():

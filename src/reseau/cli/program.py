@@ -12,7 +12,7 @@ import typer
 
 from ..core import vocabulary as v
 from ..core.errors import UsageError
-from .common import compile_first, progress, say
+from .common import compile_first, progress, say, say_json
 
 if TYPE_CHECKING:
     from ..io.document import Document
@@ -25,7 +25,6 @@ def demo(
     as_json: v.AsJson = False,
 ) -> None:
     """Capture, correct and adjust on a simulated bench with real protocols; compare with the true values."""
-    from ..core.provenance import canonical_json
     from ..report.summary import comparison_table
     from ..sessions.demo import STEPS, run_demo
 
@@ -33,7 +32,7 @@ def demo(
     with progress("taking photographs", STEPS) as step:
         done = run_demo(out, seed, step)
     if as_json:
-        say(canonical_json(done.to_dict()))
+        say_json(done.to_dict())
     else:
         say(comparison_table(done.comparison))
         say(_camera_table(done.testfield))

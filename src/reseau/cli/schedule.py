@@ -17,7 +17,7 @@ from ..core.errors import ReseauError, UsageError
 from ..core.files import writable
 from ..core.options import Option
 from .calibrations import say_decision, time_of
-from .common import Place, say
+from .common import Place, say, say_json
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -76,14 +76,13 @@ def show(
     as_json: v.AsJson = False,
 ) -> None:
     """Show all runs of a schedule; exit status 1 if one is overdue, or the last one failed."""
-    from ..core.provenance import canonical_json
     from ..service import Schedules
 
     with place.open() as found:
         runs = Schedules(found).runs(name, time_of(at, "--at"), ahead)
     if as_json:
         rows = [vars(each) | {"time": each.time.isoformat()} for each in runs]
-        say(canonical_json({"schema": "reseau-runs/1", "runs": rows}))
+        say_json({"schema": "reseau-runs/1", "runs": rows})
     else:
         for run in runs:
             say(_row(run))
@@ -250,14 +249,13 @@ def list_alarms(
     as_json: v.AsJson = False,
 ) -> None:
     """List the alarms that nobody acknowledged; exit status 1 if there are any."""
-    from ..core.provenance import canonical_json
     from ..service import Alarms
 
     with place.open() as found:
         known = Alarms(found).all() if everything else Alarms(found).open()
     if as_json:
         rows = [vars(each) | {"sent": [at.isoformat() for at in each.sent]} for each in known]
-        say(canonical_json({"schema": "reseau-alarms/1", "alarms": rows}))
+        say_json({"schema": "reseau-alarms/1", "alarms": rows})
     else:
         for each in known:
             by = f", acknowledged by {each.acknowledged}" if each.acknowledged else ""

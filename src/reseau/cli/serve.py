@@ -13,7 +13,7 @@ from ..core import vocabulary as v
 from ..core.errors import UsageError
 from ..core.files import writable
 from ..core.options import Option
-from .common import Place, say
+from .common import Place, say, say_json
 from .declared import Commands
 
 if TYPE_CHECKING:
@@ -226,13 +226,11 @@ def list_users(
     as_json: v.AsJson = False,
 ) -> None:
     """List the users."""
-    from ..core.provenance import canonical_json
-
     with known.open() as found:
         users = found.users()
     if as_json:
         rows = [vars(each) | {"created": each.created.isoformat()} for each in users]
-        say(canonical_json({"schema": "reseau-users/1", "users": rows}))
+        say_json({"schema": "reseau-users/1", "users": rows})
         return
     for each in users:
         say(f"{each.name}: {each.scope}{', one-time password' if each.one_time else ''}\n")
@@ -407,7 +405,6 @@ def verify(
     as_json: v.AsJson = False,
 ) -> None:
     """Verify chain, signatures and end of the audit log; exit status 1 if something is wrong."""
-    from ..core.provenance import canonical_json
     from ..io import read_text
     from ..service.audit import Audit, Head, verify_log
 
@@ -419,7 +416,7 @@ def verify(
             wrong = verify_log(found, read_text(public_key).encode(), heads)
         count = len(found.journal("audit").entries())
     if as_json:
-        say(canonical_json({"schema": "reseau-audit-verification/1", "entries": count, "wrong": wrong}))
+        say_json({"schema": "reseau-audit-verification/1", "entries": count, "wrong": wrong})
     else:
         say("".join(f"{each}\n" for each in wrong) or f"{count} entries: nothing is wrong\n")
     raise typer.Exit(1 if wrong else 0)

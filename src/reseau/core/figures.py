@@ -251,15 +251,13 @@ def _scale_arrow(axes: Axes, scale: float, shown: float, unit: str) -> None:
     x, y = right - 0.02 * (right - left) - shown * scale, low + 0.06 * (high - low)
     arrow = {"arrowstyle": "-|>", "color": INK, "lw": 0.9, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 7}
     axes.annotate("", xy=(x + shown * scale, y), xytext=(x, y), arrowprops=arrow)
-    axes.annotate(
-        length(shown, unit),
-        (x, y),
-        xytext=(-4, 0),
-        textcoords="offset points",
-        ha="right",
-        va="center",
-        fontsize=8.5,
-    )
+    beside(axes, x, y, length(shown, unit))
+
+
+def beside(axes: Axes, x: float, y: float, text: str) -> None:
+    """Write a text left of a bar or an arrow."""
+    how: Any = {"xytext": (-4, 0), "textcoords": "offset points", "ha": "right", "va": "center"}
+    axes.annotate(text, (x, y), fontsize=8.5, **how)
 
 
 def new_axes(axes: Axes | None, size: tuple[float, float] = (6.4, 4.8)) -> Axes:

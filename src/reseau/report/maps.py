@@ -9,7 +9,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from ..core.data import Array, ImagePoints
-from ..core.figures import ACCENT, BLUE, FAINT, INK, Panel, drawing, length, nice, plane_axes, to_svg
+from ..core.figures import ACCENT, BLUE, FAINT, INK, Panel, beside, drawing, length, nice, plane_axes, to_svg
 
 PROBABILITY = 0.95
 """Probability that a point lies within its ellipse."""
@@ -111,12 +111,4 @@ def _scale_bar(axes: Axes, enlarged: float, shown: float, unit: str) -> None:
         color=INK,
         lw=0.8,
     )
-    axes.annotate(
-        length(shown, unit),
-        (start, y),
-        xytext=(-4, 0),
-        textcoords="offset points",
-        ha="right",
-        va="center",
-        fontsize=8.5,
-    )
+    beside(axes, start, y, length(shown, unit))

@@ -273,19 +273,13 @@ def grouped(network: Network, rows: Rows | Sequence[int]) -> list[Remark]:
     if whole and len(whole) <= 0.5 * len(network.images):
         names = listed(network.images[i] for i in sorted(whole))
         found.append(
-            Remark(
-                f"many points of image{'s' * (len(whole) > 1)} {names} contradict the others: names of "
-                "another image, another camera, or a mirrored image?",
-                Code.GROSS_ERRORS,
-            )
+            f"many points of image{'s' * (len(whole) > 1)} {names} contradict the others: names of another "
+            "image, another camera, or a mirrored image?"
         )
     if twice:
         names = listed(network.points[j] for j in sorted(twice))
         found.append(
-            Remark(
-                f"the rays of point{'s' * (len(twice) > 1)} {names} contradict each other: one name for two "
-                "points?",
-                Code.GROSS_ERRORS,
-            )
+            f"the rays of point{'s' * (len(twice) > 1)} {names} contradict each other: one name for two "
+            "points?"
         )
-    return found
+    return [Remark(text, Code.GROSS_ERRORS) for text in found]

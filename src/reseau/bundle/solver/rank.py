@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...adjust.engine import AdjustmentFailure
+from ...adjust.engine import AdjustmentFailure, sparse_basis
 from ...core.data import Array, Mask, Rows
 from ...core.failure import Code, Failure
 from ...optics.refraction import RefractedRays
@@ -347,15 +347,7 @@ def _null_vectors(linear: Linear, freedom: Freedom) -> list[dict[str, float]]:
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = s * scale[:, None] * scale
     values, vectors = np.linalg.eigh(scaled)
-    null = vectors[:, values < _ZERO * max(values[-1], 1.0)]
-    count = null.shape[1]
-    for column in range(count):
-        rest = null[:, column:]
-        row, pick = divmod(int(np.argmax(np.abs(rest))), rest.shape[1])
-        null[:, [column, column + pick]] = null[:, [column + pick, column]]
-        null[:, column] /= null[row, column]
-        others = np.arange(count) != column
-        null[:, others] -= np.outer(null[:, column], null[row, others])
+    null = sparse_basis(vectors[:, values < _ZERO * max(values[-1], 1.0)])
     named = []
     for vector in null.T:
         strong = np.flatnonzero(np.abs(vector) > 1e-3)
