@@ -25,7 +25,7 @@ from reseau.core.data import Array
 from reseau.execution import Executor
 from reseau.service.charts import ChartOptions, KnownSeries, monitor
 from reseau.service.explaining import RunHistory, explain_runs
-from reseau.service.runlength import Cusum, Ewma, Prerun, Shewhart
+from reseau.service.runlength import Cusum, Ewma, Shewhart
 
 PARAMETERS, YEAR, AT_ONCE = 10, 52, 2500
 SHIFTS = (0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0)
@@ -93,18 +93,9 @@ def _cases() -> Iterator[tuple[str, str, float]]:
             yield "CUSUM, two-sided, zero state", f'xcusum.arl({k},{h},{mu},sided="two")', Cusum(k, h).arl(mu)
             one = Cusum(k, h, two_sided=False)
             yield "CUSUM, one-sided, zero state", f'xcusum.arl({k},{h},{mu},sided="one")', one.arl(mu)
-            yield "CUSUM, one-sided, steady state", f'xcusum.ad({k},{h},{mu},sided="one")', one.delay(mu)
-            late = f'xcusum.arl({k},{h},{mu},q=11,sided="one")[11]'
-            yield "CUSUM, one-sided, shift after 10 runs", late, one.delay(mu, 10)
         for weight, c in ((0.05, 2.5), (0.1, 2.7), (0.2, 2.86), (0.5, 3.0)):
             chart, call = Ewma(weight, c), f'({weight},{c},{mu},sided="two"'
             yield "EWMA, zero state", f"xewma.arl{call},r=80)", chart.arl(mu)
-            yield "EWMA, steady state", f"xewma.ad{call},r=80)", chart.delay(mu)
-            yield "EWMA, shift after 10 runs", f"xewma.arl{call},q=11,r=80)[11]", chart.delay(mu, 10)
-        for runs in (20, 52):
-            for kind, name in (("mean", "mu"), ("sigma", "sigma"), ("both", "both")):
-                call = f'xewma.arl.prerun(0.1,2.7,{mu},sided="two",size={runs},estimated="{name}")'
-                yield f"EWMA, prerun, {kind} estimated", call, Prerun(Ewma(0.1, 2.7), runs, kind).arl(mu)
         yield "Shewhart", f'xshewhartrunsrules.arl({mu},c=1,type="1")', Shewhart(3.0).arl(mu)
 
 

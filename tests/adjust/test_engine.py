@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reseau.adjust import GaussMarkov, Options, Parameters, adjust
+from reseau.adjust.differences import differences
 from reseau.adjust.engine import AdjustmentFailure
-from reseau.adjust.parameters import Constraint, Prior
-from reseau.adjust.problem import GaussHelmert, check_jacobian
+from reseau.adjust.parameters import Prior
+from reseau.adjust.problem import GaussHelmert
 from reseau.core.errors import EstimationError, UsageError
 
 T = np.linspace(0.0, 4.0, 30)
@@ -44,21 +45,16 @@ def spd(rng, n):
     return a @ a.T / n * 1e-4
 
 
-METHODS = ["levenberg-marquardt", "gauss-newton"]
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_exact_observations_give_the_true_parameters(method):
-    fit = adjust(decay_problem(decay(TRUE)), Options(method=method)).required()
+def test_exact_observations_give_the_true_parameters():
+    fit = adjust(decay_problem(decay(TRUE))).required()
     np.testing.assert_allclose(fit.values, TRUE, atol=1e-11)
 
 
-@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("jacobian", [decay_jacobian, None])
-def test_linear_theory_holds_at_the_minimum(method, jacobian):
+def test_linear_theory_holds_at_the_minimum(jacobian):
     """v ⟂ columns, Q = (AᵀPA)⁻¹, sigma0² = vᵀPv / r with a full covariance."""
     covariance = spd(np.random.default_rng(1), len(T))
-    fit = adjust(decay_problem(covariance=covariance, jacobian=jacobian), Options(method=method)).required()
+    fit = adjust(decay_problem(covariance=covariance, jacobian=jacobian)).required()
     a, p = decay_jacobian(fit.values), np.linalg.inv(covariance)
     normal = a.T @ p @ a
     gradient = a.T @ p @ fit.residuals
@@ -118,33 +114,6 @@ def test_fixing_parameters_is_equivalent_to_the_smaller_problem(free):
 def test_an_unknown_name_is_an_error():
     with pytest.raises(UsageError, match="d: is not among the parameters"):
         Parameters("abc", [0, 0, 0], free=["d"])
-    with pytest.raises(UsageError, match="d"):
-        decay_problem(constraints=[Constraint({"d": 1.0})])
-
-
-def test_constraints_hold_exactly_and_add_redundancy():
-    constraint = Constraint({"a": 1.0, "c": -3.0}, 0.5)
-    fit = adjust(decay_problem(constraints=[constraint])).required()
-    assert fit["a"] - 3 * fit["c"] == pytest.approx(0.5, abs=1e-12)
-    assert fit.redundancy == len(T) - 3 + 1
-
-    # The same by substitution a = 0.5 + 3 c.
-    substituted = GaussMarkov(
-        lambda x: decay(np.array([0.5 + 3 * x[1], x[0], x[1]])), noisy(), 0.01, Parameters("bc", [1.0, 0.0])
-    )
-    other = adjust(substituted).required()
-    assert fit["b"] == pytest.approx(other["b"], abs=1e-9)
-    assert fit.sigma_of("b") == pytest.approx(other.sigma_of("b"), rel=1e-6)
-    variance = np.array([1.0, -3.0]) @ fit.covariance_of("a", "c") @ [1.0, -3.0]
-    assert abs(variance) < 1e-12 * fit.sigma_of("a") ** 2 * 1e3
-
-
-def test_dependent_constraints_count_once_and_contradictions_are_errors():
-    twice = [Constraint({"a": 1.0, "c": -1.0}, 1.5), Constraint({"a": -2.0, "c": 2.0}, -3.0)]
-    assert adjust(decay_problem(constraints=twice)).required().redundancy == len(T) - 2
-    wrong = [twice[0], Constraint({"a": 1.0, "c": -1.0}, 1.0)]
-    with pytest.raises(UsageError, match="contradict"):
-        adjust(decay_problem(constraints=wrong))
 
 
 def test_a_prior_is_an_observation_of_the_parameter():
@@ -162,10 +131,9 @@ def test_a_prior_is_an_observation_of_the_parameter():
     np.testing.assert_allclose(fit.values, other.values, atol=1e-9)
     np.testing.assert_allclose(fit.cofactor, other.cofactor, rtol=1e-5)
     assert fit.redundancy == other.redundancy
-    np.testing.assert_allclose(fit.prior_w, other.w[30:], atol=1e-5)
-    np.testing.assert_allclose(fit.prior_redundancy_numbers, other.redundancy_numbers[30:], atol=1e-7)
-    numbers = fit.redundancy_numbers.sum() + fit.prior_redundancy_numbers.sum()
-    assert numbers == pytest.approx(fit.redundancy, abs=1e-8)
+    np.testing.assert_allclose(fit.standardised.w, other.w, atol=1e-5)
+    np.testing.assert_allclose(fit.standardised.redundancy_numbers, other.redundancy_numbers, atol=1e-7)
+    assert fit.standardised.redundancy_numbers.sum() == pytest.approx(fit.redundancy, abs=1e-8)
 
 
 def test_the_prior_of_a_fixed_parameter_does_not_count():
@@ -246,19 +214,6 @@ def test_a_problem_without_redundancy_has_a_covariance_a_priori_only():
         fit.covariance_of(scaled=True)
 
 
-def test_a_wrong_derivative_is_found_and_named():
-    def wrong(x):
-        jacobian = decay_jacobian(x)
-        jacobian[7, 1] *= 1.01
-        return jacobian
-
-    assert check_jacobian(decay_problem()).agrees()
-    check = check_jacobian(decay_problem(jacobian=wrong))
-    assert (check.worst, check.row) == ("b", 7)
-    with pytest.raises(UsageError, match="respect to b"):
-        adjust(decay_problem(jacobian=wrong), Options(check_jacobian=1e-6))
-
-
 def test_scale_chooses_between_the_variance_factors():
     y = decay(TRUE) + np.random.default_rng(3).normal(0, 0.05, len(T))
     posterior = adjust(decay_problem(y)).required()
@@ -276,87 +231,20 @@ ERRORS = np.array([0.01, -0.02, 0.01, 0.0, 0.02, -0.01])
 LEVELLED = np.array([HEIGHTS[j] - HEIGHTS[i] for i, j in PAIRS]) + ERRORS
 
 
-def net(datum=(), start=START):
+def net(start=START):
     names = ["H1", "H2", "H3", "H4"]
     return GaussMarkov(
         lambda x: np.array([x[j] - x[i] for i, j in PAIRS]),
         LEVELLED,
         0.01,
         Parameters(names, start),
-        datum=datum,
     )
-
-
-def test_inner_constraints_give_corrections_and_covariance_of_minimum_norm():
-    fit = adjust(net(["H1", "H2", "H3", "H4"])).required()
-    assert fit.datum_defect == 1
-    assert fit.redundancy == len(PAIRS) - 3
-    assert (fit.values - START).sum() == pytest.approx(0.0, abs=1e-12)
-    a = np.zeros((len(PAIRS), 4))
-    for row, (i, j) in enumerate(PAIRS):
-        a[row, i], a[row, j] = -1.0, 1.0
-    np.testing.assert_allclose(fit.cofactor, np.linalg.pinv(a.T @ a / 0.01**2), atol=1e-14)
-
-
-def test_a_datum_over_some_parameters_moves_only_along_the_null_space():
-    some, every = (adjust(net(d)).required() for d in (["H1", "H2"], ["H1", "H2", "H3", "H4"]))
-    shift = some.values - every.values
-    np.testing.assert_allclose(shift, shift[0], atol=1e-12)
-    np.testing.assert_allclose(some.residuals, every.residuals, atol=1e-12)
-    assert (some.values - START)[:2].sum() == pytest.approx(0.0, abs=1e-12)
-    assert np.trace(some.cofactor[:2, :2]) < np.trace(every.cofactor[:2, :2])
-    assert np.trace(some.cofactor) > np.trace(every.cofactor)
 
 
 def test_a_net_without_datum_names_all_heights():
     failed = adjust(net())
     assert not failed
     assert set(failed.null_space[0]) == {"H1", "H2", "H3", "H4"}
-
-
-def test_a_datum_that_does_not_remove_the_rank_defect_is_a_failure():
-    names = ["H1", "H2", "H3", "H4", "free"]
-    problem = GaussMarkov(
-        lambda x: np.array([x[j] - x[i] for i, j in PAIRS]),
-        LEVELLED,
-        0.01,
-        Parameters(names, [*HEIGHTS, 0.0]),
-        datum=["H1"],
-    )
-    failed = adjust(problem)
-    assert not failed
-    assert "free" in failed.reason
-
-
-def test_a_free_plane_net_of_distances_keeps_its_nonlinear_datum():
-    """Distances leave two shifts and a rotation; inner constraints hold over the whole correction."""
-    rng = np.random.default_rng(2)
-    xy = np.array([[0.0, 0.0], [100.0, 5.0], [90.0, 80.0], [10.0, 110.0], [50.0, 40.0]])
-    pairs = np.array(list(itertools.combinations(range(5), 2)))
-
-    def distances(x):
-        p = np.asarray(x).reshape(5, 2)
-        return np.hypot(*(p[pairs[:, 0]] - p[pairs[:, 1]]).T)
-
-    def slopes(x):
-        p, out = np.asarray(x).reshape(5, 2), np.zeros((len(pairs), 5, 2))
-        unit = p[pairs[:, 0]] - p[pairs[:, 1]]
-        unit /= np.hypot(*unit.T)[:, None]
-        out[np.arange(len(pairs)), pairs[:, 0]], out[np.arange(len(pairs)), pairs[:, 1]] = unit, -unit
-        return out.reshape(len(pairs), 10)
-
-    names = [f"{axis}{i}" for i in range(5) for axis in "xy"]
-    start = (xy + rng.normal(0, 2.0, xy.shape)).ravel()
-    observed = distances(xy.ravel()) + rng.normal(0, 0.01, len(pairs))
-    problem = GaussMarkov(distances, observed, 0.01, Parameters(names, start), slopes, datum=names)
-    fit = adjust(problem).required()
-    assert fit.datum_defect == 3
-    assert fit.redundancy == len(pairs) - 7
-    p, correction = fit.values.reshape(5, 2), (fit.values - start).reshape(5, 2)
-    rotation = (p[:, 0] * correction[:, 1] - p[:, 1] * correction[:, 0]).sum()
-    assert np.abs(correction.sum(axis=0)).max() < 1e-9
-    # Over Σ(x² + y²) = 4e4 mm² this is a rotation of 1e-9.
-    assert abs(rotation) < 4e-5
 
 
 # --- Gauss–Helmert
@@ -436,9 +324,7 @@ def test_gauss_helmert_is_gauss_markov_when_the_conditions_are_observation_equat
     np.testing.assert_allclose(a.residuals.ravel(), b.residuals, atol=1e-9)
     np.testing.assert_allclose(a.w.ravel(), b.w, atol=1e-5)
     np.testing.assert_allclose(a.redundancy_numbers.ravel(), b.redundancy_numbers, atol=1e-7)
-    np.testing.assert_allclose(
-        a.external_reliability().effects.reshape(len(T), 3), b.external_reliability().effects, atol=1e-6
-    )
+    np.testing.assert_allclose(a.external_lengths().ravel(), b.external_lengths(), rtol=1e-5)
 
 
 def test_gauss_helmert_redundancy_numbers_sum_to_the_redundancy():
@@ -471,17 +357,6 @@ def test_a_mark_of_weight_zero_is_excluded_with_both_coordinates():
     assert fit.redundancy == other.redundancy
 
 
-def test_wrong_derivatives_by_the_observations_are_found():
-    def wrong(xy, x):
-        a, b = line_jacobians(xy, x)
-        return a, b * [1.1, 1.0]
-
-    good = GaussHelmert(line_conditions, line_points(), 0.05, Parameters("ab", [0.3, 0.4]), line_jacobians)
-    assert check_jacobian(good).agrees()
-    bad = GaussHelmert(line_conditions, line_points(), 0.05, Parameters("ab", [0.3, 0.4]), wrong)
-    assert check_jacobian(bad).worst == "observation 0"
-
-
 @given(st.sampled_from([1e-9, 1e-4, 1.0, 1e6]), st.sampled_from([0.0, 1.0, -3.0]))
 @settings(max_examples=12)
 def test_differences_find_the_scale_of_a_parameter_that_is_zero(unit, offset):
@@ -494,35 +369,26 @@ def test_differences_find_the_scale_of_a_parameter_that_is_zero(unit, offset):
         Parameters("a", [0.0]),
         jacobian=lambda x: (at / unit * np.exp(x[0] / unit * at))[:, None],
     )
-    assert check_jacobian(problem).agrees(1e-6)
+    function, jacobian = problem.function, problem.jacobian(np.zeros(1))
+    np.testing.assert_allclose(differences(function, np.zeros(1)), jacobian, rtol=1e-6)
 
 
-@given(st.integers(1, 5), st.integers(1, 12), st.integers(0, 2**32 - 1), st.sampled_from(METHODS))
+@given(st.integers(1, 5), st.integers(1, 12), st.integers(0, 2**32 - 1))
 @settings(max_examples=60)
-def test_a_linear_problem_is_solved_as_by_the_pseudoinverse(u, extra, seed, method):
+def test_a_linear_problem_is_solved_as_by_the_pseudoinverse(u, extra, seed):
     rng = np.random.default_rng(seed)
     design = rng.normal(size=(u + extra, u))
     covariance = spd(rng, u + extra)
     y = rng.normal(size=u + extra)
     names = [f"p{i}" for i in range(u)]
     problem = GaussMarkov(lambda x: design @ x, y, covariance, Parameters(names, np.zeros(u)))
-    fit = adjust(problem, Options(method=method)).required()
+    fit = adjust(problem).required()
     root = np.linalg.inv(np.linalg.cholesky(covariance))
     direct = np.linalg.lstsq(root @ design, root @ y, rcond=None)[0]
     # In standard deviations of unit weight.
     assert np.abs((fit.values - direct) / np.sqrt(np.diag(fit.cofactor))).max() < 1e-6
     assert fit.redundancy_numbers.sum() == pytest.approx(extra, abs=1e-6)
     assert np.abs(fit.correlation).max() < 1.0 + 1e-12
-
-
-def test_gauss_newton_shortens_steps_that_overshoot():
-    """atan has its zero at 0; from 2 the full step leads farther and farther away."""
-    problem = GaussMarkov(
-        np.arctan, np.zeros(1), 1.0, Parameters("a", [2.0]), lambda x: np.array([[1.0 / (1.0 + x[0] ** 2)]])
-    )
-    fit = adjust(problem, Options(method="gauss-newton")).required()
-    assert fit["a"] == pytest.approx(0.0, abs=1e-9)
-    assert (np.diff(fit.costs) < 0).all()
 
 
 @pytest.mark.parametrize("number", [np.longdouble, "decimal"])
@@ -576,7 +442,6 @@ def test_a_covariance_that_does_not_fit_is_an_error(covariance, words):
 @pytest.mark.parametrize(
     "misuse",
     [
-        lambda: Options(method="newton"),
         lambda: Options(scale="both"),
         lambda: Options(tolerance=0.0),
         lambda: Parameters("ab", [1.0]),
@@ -586,7 +451,6 @@ def test_a_covariance_that_does_not_fit_is_an_error(covariance, words):
         lambda: Prior("ab", [1.0], [1.0, 1.0]),
         lambda: decay_problem(np.full(30, np.nan)),
         lambda: decay_problem(weights=-np.ones(30)),
-        lambda: adjust(decay_problem(constraints=[Constraint({})])),
         lambda: adjust(decay_problem(jacobian=lambda x: np.zeros((3, 3)))),
         lambda: adjust(GaussMarkov(lambda x: x, np.zeros(3), 1.0, Parameters("ab", [0.0, 0.0]))),
         lambda: GaussHelmert(line_conditions, np.zeros((2, 2, 2)), 1.0, Parameters("ab", [0.0, 0.0])),

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from reseau.adjust import Options, adjust
-from reseau.adjust.problem import check_jacobian
+from reseau.adjust.differences import differences
 
 from . import nist
 
@@ -48,8 +48,9 @@ def test_the_files_are_read_completely(problems, name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_derivatives_are_those_of_the_model(problems, name):
-    problem = problems[name].problem(1)
-    assert check_jacobian(problem, problems[name].certified).agrees(1e-6)
+    problem, at = problems[name].problem(1), np.array(problems[name].certified, dtype=np.float64)
+    found, expected = problem.jacobian(at), differences(problem.function, at)
+    assert (np.abs(found - expected).max(axis=0) <= 1e-6 * np.abs(expected).max(axis=0)).all()
 
 
 @pytest.mark.parametrize("name", NAMES)

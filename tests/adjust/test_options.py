@@ -90,15 +90,6 @@ def test_the_scale_option_determines_the_covariance(run, problem):
 
 @path
 @kind
-def test_wrong_derivatives_are_refused_where_they_are_checked(run, problem):
-    wrong = problem(lambda x: derivatives(x) * [1.0, 1.01, 1.0])
-    with pytest.raises(UsageError, match="derivative with respect to b"):
-        run(wrong, Options(check_jacobian=1e-6))
-    assert run(problem(), Options(check_jacobian=1e-6))
-
-
-@path
-@kind
 def test_the_rank_tolerance_determines_a_rank_defect(run, problem):
     found = run(problem(), Options(rank_tolerance=0.5))
     assert isinstance(found, Failure)
@@ -106,28 +97,17 @@ def test_the_rank_tolerance_determines_a_rank_defect(run, problem):
 
 
 @pytest.mark.parametrize("problem", [markov, helmert])
-def test_tolerance_damping_and_method_change_the_iterations(problem):
+def test_tolerance_and_damping_change_the_iterations(problem):
     usual = adjust(problem()).required()
     assert adjust(problem(), Options(tolerance=0.1)).required().iterations < usual.iterations
     assert adjust(problem(), Options(damping=1e3)).required().iterations > usual.iterations
-    newton = adjust(problem(), Options(method="gauss-newton")).required()
-    assert newton.costs[:2] != usual.costs[:2]
-    np.testing.assert_allclose(newton.values, usual.values, rtol=1e-8)
-
-
-def test_a_small_limit_of_the_curvature_costs_iterations():
-    usual = adjust(markov()).required()
-    assert adjust(markov(), Options(curvature=0.02)).required().iterations > usual.iterations
 
 
 def test_an_option_without_effect_is_refused():
     for call in (
-        lambda: Options(method="gauss-newton", damping=1.0),
-        lambda: Options(method="gauss-newton", curvature=0.5),
-        lambda: Options(curvature=0.0),
+        lambda: Options(damping=0.0),
         lambda: Options(rank_tolerance=-1.0),
         lambda: Options(max_iterations=-1),
-        lambda: adjust(helmert(), Options(curvature=0.5)),
         lambda: robust(markov(), max_iterations=0),
         lambda: BatchOptions(share=0.0),
         lambda: BatchOptions(max_iterations=-1),

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reseau.adjust import GaussMarkov, Options, Parameters, adjust, eliminate, variance_components
+from reseau.adjust import GaussMarkov, Parameters, adjust, eliminate, variance_components
 from reseau.adjust.engine import AdjustmentFailure
 from reseau.adjust.fitted import compare
-from reseau.adjust.parameters import Constraint
 from reseau.adjust.problem import GaussHelmert
 from reseau.core.errors import UsageError
 
@@ -101,19 +100,6 @@ def test_the_f_test_of_nested_models_keeps_its_level_and_finds_what_is_missing()
     assert abs(false - alpha * trials) < 4 * np.sqrt(trials * alpha * (1 - alpha))
     nested = adjust(polynomial(cubic(), parameters=start.fix("a3", "a4", "a5"))).required()
     assert compare(nested, adjust(polynomial(cubic())).required()).significant
-
-
-def test_a_constraint_is_tested_as_a_nested_model():
-    full = adjust(polynomial(cubic())).required()
-    true = adjust(polynomial(cubic(), constraints=[Constraint({"a0": 2.0, "a1": 1.0})])).required()
-    false = adjust(polynomial(cubic(), constraints=[Constraint({"a0": 1.0, "a1": 1.0})])).required()
-    assert not compare(true, full, 0.001).significant
-    assert compare(false, full, 0.001).significant
-    priori = Options(scale="a-priori")
-    nested = adjust(polynomial(cubic(), constraints=[Constraint({"a0": 1.0, "a1": 1.0})]), priori)
-    assert compare(nested.required(), adjust(polynomial(cubic()), priori).required()).distribution == "chi2"
-    with pytest.raises(UsageError, match="within another"):
-        compare(full, true)
 
 
 GROUPS = {"fine": np.arange(40) % 2 == 0, "coarse": np.arange(40) % 2 == 1}

@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 from reseau.bundle import Camera, Network, Result, adjust_network
 from reseau.bundle.network.settings import network_document
 from reseau.bundle.network.shutter import MOTION, Shutter
+from reseau.bundle.solver.approximation import resect_line
 from reseau.bundle.solver.linear import linearised
-from reseau.bundle.solver.pushbroom import resect_line
 from reseau.bundle.solver.values import Correction
 from reseau.cli import run
 from reseau.core.data import Array

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from reseau.bundle import Camera, adjust_network
-from reseau.bundle.solver.parallel import resect_parallel
+from reseau.bundle.solver.approximation import resect_parallel
 from reseau.core.data import Array
 from reseau.core.failure import Code
 from reseau.optics.cameras.telecentric import Telecentric

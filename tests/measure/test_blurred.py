@@ -23,7 +23,6 @@ from reseau.optics.lenses.images import PlaneTarget
 from reseau.optics.lenses.media import Cauchy
 from reseau.optics.lenses.prescription import Surface
 from reseau.optics.lenses.ray_maps import LensCamera, SensorPlane
-from reseau.optics.lenses.surrogate import RaySurrogate
 
 from . import blurs
 
@@ -75,15 +74,6 @@ def test_pixels_of_principal_rays_agree_with_those_of_other_rays() -> None:
     points = CENTRE + np.array([[0, 0, 0], [10, 0, 50], [-60, -40, 300], [5, 30, -200.0]])
     other = [blurs.principal_pixel(point) for point in points]
     assert np.abs(camera().corresponding(points) - other).max() < 1e-8
-
-
-def test_a_surrogate_gives_the_same_places() -> None:
-    traced = measure_blurred(photograph(), camera(), ["1"], [target()])
-    slopes = ((0.06, 0.13), (0.02, 0.1))
-    fast = RaySurrogate.of(camera(), PupilElements.gauss(8), slopes, (600.0, 800.0))
-    assert fast.error_px < 1e-3
-    found = measure_blurred(photograph(), fast, ["1"], [target()])
-    assert np.abs(found.xy - traced.xy).max() < 1 / 200
 
 
 def test_the_focus_is_estimated_with_the_place() -> None:

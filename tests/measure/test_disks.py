@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from reseau.core.data import Mask
-from reseau.measure.reseau.components import part_sums
+from reseau.measure.reseau.disks import part_sums
 
 
 def masks() -> list[Mask]:

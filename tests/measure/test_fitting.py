@@ -8,7 +8,6 @@ from scipy.stats import chi2
 
 from reseau.adjust import Adjustment, Options, adjust
 from reseau.adjust.elimination import Elimination
-from reseau.adjust.problem import check_jacobian
 from reseau.core.data import ImagePoints
 from reseau.core.errors import UsageError
 from reseau.core.failure import Failure
@@ -86,8 +85,12 @@ def test_every_family_is_recovered_from_points_without_noise(name):
 @pytest.mark.parametrize("name", families())
 def test_the_jacobians_of_the_conditions_are_correct(name):
     model = families()[name]
-    check = check_jacobian(mapping_problem(approximate(model), points(XY), model(XY)), at=model.values)
-    assert check.agrees(1e-7), str(check)
+    problem, at = mapping_problem(approximate(model), points(XY), model(XY)).model(), np.array(model.values)
+    problem.evaluate(problem.carry(at))
+    observed = problem.problem.observations.ravel()
+    for own, numeric in zip(problem.derivatives(observed, at), problem.numeric(observed, at), strict=True):
+        size = np.abs(numeric).max(axis=(0, 1))
+        assert (np.abs(own - numeric) <= 1e-7 * np.where(size > 0, size, 1.0)).all()
 
 
 def test_adding_the_residuals_moves_the_points_onto_the_model():

@@ -6,8 +6,7 @@ import pytest
 
 from reseau.core.data import Array
 from reseau.measure.plane.lattice_mapping import second_order, slope_of
-from reseau.measure.plane.lens_mapping import lens_through, mapping_through
-from reseau.measure.plane.plane_lens import distorted, moving, projected
+from reseau.measure.plane.lens_mapping import distorted, lens_through, mapping_through, moving, projected
 from reseau.measure.plane.plane_mapping import plane_through
 
 SHAPE, FOCAL, NOISE_PX = (1024, 1024), 380.0, 0.3

@@ -15,7 +15,7 @@ from reseau.designs import regular_reseau
 from reseau.io import Mark, ReseauDesign
 from reseau.measure import measure_reseau
 from reseau.measure.reseau.marks import ReseauOptions
-from reseau.measure.reseau.orientation import misfit
+from reseau.measure.reseau.measure import misfit
 
 from .formed import MARKS, PX_PER_MM, Scene, form
 

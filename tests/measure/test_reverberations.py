@@ -11,7 +11,7 @@ from reseau.core.failure import Code
 from reseau.designs import regular_reseau
 from reseau.io import Mark
 from reseau.measure import find_pins, measure_reseau
-from reseau.measure.pins.assignment import assign
+from reseau.measure.pins.measure import assign
 from reseau.measure.pins.reverberations import Reverberations, find_reverberations
 
 from .test_pins import arcs, frame, nearest, picture

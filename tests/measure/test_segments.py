@@ -12,7 +12,7 @@ import pytest
 from reseau.io import DesignPoint, Mark, ReseauDesign
 from reseau.io.images import read_image
 from reseau.measure import measure_pins
-from reseau.measure.pins.segments import cut_segments
+from reseau.measure.pins.measure import cut_segments
 
 SOURCE = np.array([[0.0, 0], [40, 0], [0, 15], [40, 15], [0, 30], [32, 30]])
 SEGMENTS = np.array([[[0.0, 0], [40, 0]], [[40.0, 15], [0, 15]]])

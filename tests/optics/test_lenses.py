@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reseau.core.errors import UsageError
 from reseau.optics.lenses import AIR, Aperture, Medium, Prescription, Tracer, glass, in_order
 from reseau.optics.lenses.media import Constant
 from reseau.optics.lenses.prescription import Surface
-from reseau.optics.lenses.trace import SURFACE_PARAMETERS, Rays
+from reseau.optics.lenses.trace import Rays
 
 from .batoid_lenses import prescription
 
@@ -231,81 +230,6 @@ def bundle() -> Rays:
     rng = np.random.default_rng(1)
     start = rng.uniform(-2, 2, (20, 3)) - 50 * AHEAD
     return Rays.between(start, rng.uniform(-5, 5, (20, 3)) * [1, 1, 0])
-
-
-def slope(at: Callable[[float], np.ndarray]) -> tuple[np.ndarray, float]:
-    """Derivative by differences of fourth order, and its error.
-
-    The step is the first decade that moves the end of a ray by more than 1e-4 mm; ends are rounded to some
-    1e-13 mm.
-    """
-    nominal, step = at(0.0), 1e-60
-    while step < 1e-3 and not np.abs(at(step) - nominal).max() > 1e-4:
-        step *= 10
-    found = (8 * (at(step) - at(-step)) - (at(2 * step) - at(-2 * step))) / (12 * step)
-    return found, 1e-8 * float(np.abs(found).max()) + 1e-12 / step
-
-
-def changed(surface: Surface, name: str, by: float) -> Surface:
-    kind, _, axis = name.partition("_")
-    if name in ("curvature", "conic"):
-        return replace(surface, **{name: getattr(surface, name) + by})
-    if kind == "vertex":
-        return replace(surface, vertex=surface.vertex + by * np.eye(3)["xyz".index(axis)])
-    if kind == "tilt":
-        return replace(surface, axes=surface.axes @ _turned(*(by * np.eye(3)["xyz".index(axis)])))
-    coefficients = [*surface.coefficients, *[0.0] * 10][:10]
-    coefficients[int(name[1:]) // 2 - 2] += by
-    return replace(surface, coefficients=tuple(coefficients))
-
-
-@pytest.mark.parametrize("parameter", SURFACE_PARAMETERS)
-@pytest.mark.parametrize("s", range(len(FOLDED)), ids=[surface.name for surface in FOLDED])
-def test_derivatives_by_the_parameters_of_a_surface_agree_with_differences(
-    bundle: Rays, s: int, parameter: str
-) -> None:
-    def at(by: float) -> np.ndarray:
-        if parameter.startswith("index"):
-            tracer = Tracer(folded())
-            if FOLDED[s].kind == "refracting":
-                return _with_index(tracer, s, parameter, by).trace(bundle).xy
-            return tracer.trace(bundle).xy
-        one = changed(FOLDED[s], parameter, by)
-        return Tracer(folded((*FOLDED[:s], one, *FOLDED[s + 1 :]))).trace(bundle).xy
-
-    expected, error = slope(at)
-    found = Tracer(folded()).derivatives(bundle).by_surface[:, :, s, SURFACE_PARAMETERS.index(parameter)]
-    np.testing.assert_allclose(found, expected, rtol=0, atol=error)
-
-
-def _with_index(tracer: Tracer, s: int, parameter: str, by: float) -> Tracer:
-    """The tracer with another ratio of indices at one surface only."""
-    indices = tracer.indices[s : s + 2].copy()
-    indices[0 if parameter == "index_before" else 1] += by
-    table = tracer._tables[0].copy()
-    assert table[s, -1] == tracer.indices[s] / tracer.indices[s + 1]
-    table[s, -1] = indices[0] / indices[1]
-    tracer._tables = (table, *tracer._tables[1:])
-    return tracer
-
-
-@pytest.mark.parametrize("k", range(6), ids=["x", "y", "z", "direction x", "direction y", "direction z"])
-def test_derivatives_by_where_a_ray_starts_agree_with_differences(bundle: Rays, k: int) -> None:
-    def at(by: float) -> np.ndarray:
-        change = by * np.eye(6)[k]
-        direction = bundle.directions + change[3:]
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        return Tracer(folded()).trace(Rays(bundle.xyz + change[:3], direction)).xy
-
-    expected, error = slope(at)
-    found = Tracer(folded()).derivatives(bundle).by_ray[:, :, k]
-    np.testing.assert_allclose(found, expected, rtol=0, atol=error)
-
-
-def test_derivatives_of_a_lost_ray_are_refused(bundle: Rays) -> None:
-    lost = Rays(bundle.xyz + 500 * np.eye(3)[0], bundle.directions)
-    with pytest.raises(UsageError, match="misses"):
-        Tracer(folded()).derivatives(lost)
 
 
 # Lost rays -----------------------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -31,10 +30,8 @@ from reseau.optics.lenses import (
 )
 from reseau.optics.lenses.images import PlaneTarget
 from reseau.optics.lenses.prescription import Surface
-from reseau.optics.lenses.pupils import labels
 from reseau.optics.lenses.ray_maps import CalibratedLens, LensCamera, SensorPlane
 from reseau.optics.lenses.stand_ins import AberratedLens
-from reseau.optics.lenses.surrogate import RaySurrogate
 
 ROWS = (
     (0.01779284094091543, 8.75, "N-SSK2"),
@@ -75,24 +72,14 @@ def test_first_order_optics_are_those_of_the_listing_of_code_v() -> None:
         "BFL": 61.4875,
         "FNO": 2.0001,
         "entrance": 57.9120,
-        "exit": -53.1569,
-        "DIA": 57.3201,
     }
     found = {
         "EFL": first.focal_length,
         "BFL": first.back_focus,
         "FNO": first.f_number,
         "entrance": first.entrance_pupil[0],
-        "exit": first.exit_pupil[0],
-        "DIA": 2 * first.exit_pupil[1] * (first.lens.stop_radius or 0.0),
     }
     assert found == pytest.approx(printed, abs=6e-5)
-
-
-def test_lagranges_invariant_is_the_same_at_all_surfaces() -> None:
-    for distance in (np.inf, 400.0):
-        invariant = Paraxial(double_gauss()).invariant(0.2, distance)
-        assert np.ptp(invariant) < 1e-12 * abs(invariant[0])
 
 
 def test_a_mirror_has_half_its_radius_as_focal_length() -> None:
@@ -110,18 +97,6 @@ def test_aimed_rays_pass_the_real_stop_at_their_points() -> None:
     assert aimed.found.all()
     hit = Tracer(lens, last=5).trace(aimed.rays).xy
     assert np.abs(hit - pupil * lens.stop_radius).max() < 1e-8
-
-
-def test_rays_are_labelled_by_their_place_in_the_pupil() -> None:
-    at = np.array([[0, 0], [0, 1.0], [0, -0.4], [0.6, 0], [0.2, 0.3]])
-    assert labels(at, np.array([0.0, 5.0])).tolist() == [
-        "principal",
-        "marginal",
-        "meridional",
-        "sagittal",
-        "skew",
-    ]
-    assert labels(at, np.zeros(2)).tolist() == ["principal", "marginal", *["meridional"] * 3]
 
 
 def test_elements_of_the_stop_have_equal_areas_and_quadrature_is_exact() -> None:
@@ -232,22 +207,15 @@ def test_light_within_a_blurred_image_is_that_seen_from_the_sensor(tilt: float) 
     assert np.abs(image.centroid - centroid).max() < 0.002
 
 
-@cache
-def surrogate(shift: float) -> RaySurrogate:
-    slopes = ((-0.2, 0.2), (-0.15, 0.15))
-    return RaySurrogate.of(camera(shift), PupilElements.gauss(5), slopes, (560.0, 640.0), (6, 2))
-
-
 @pytest.mark.parametrize("place", [(0.0, 0.0), (60.0, 40.0), (-95.0, 60.0)])
 @pytest.mark.parametrize("shift", [0.0, 0.06, -0.1])
-def test_the_fast_image_is_matched_with_many_rays_to_a_two_hundredth_of_a_pixel(
+def test_an_image_of_few_rays_is_matched_with_many_to_a_two_hundredth_of_a_pixel(
     place: tuple[float, float], shift: float
 ) -> None:
-    at, fast = target(*place, 600.0, 20.0), surrogate(shift)
-    assert fast.error_px < 1e-3
-    middle = np.rint(ray_image(fast, at, fast.elements).point)
-    one = formed(fast, at, fast.elements, middle, 34)
-    many = formed(camera(shift), at, PupilElements.gauss(16), middle, 34)
+    at, view, few = target(*place, 600.0, 20.0), camera(shift), PupilElements.gauss(5)
+    middle = np.rint(ray_image(view, at, few).point)
+    one = formed(view, at, few, middle, 34)
+    many = formed(view, at, PupilElements.gauss(16), middle, 34)
     assert np.abs(shift_between(one, many)).max() < 1 / 200
 
 
@@ -361,12 +329,6 @@ def test_edges_of_the_open_part_are_those_between_rays_that_pass_and_that_are_st
     ]
     assert passes[0].all()
     assert not passes[1].any()
-
-
-def test_no_surrogate_is_made_where_apertures_stop_light() -> None:
-    view = vignetted_camera(camera(0.1))
-    with pytest.raises(UsageError, match="stopped by an aperture"):
-        RaySurrogate.of(view, PupilElements.gauss(3), ((-0.2, 0.2), (-0.15, 0.15)), (590.0, 610.0), (4, 1))
 
 
 def test_a_target_out_of_the_field_is_said() -> None:

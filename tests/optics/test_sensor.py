@@ -7,7 +7,7 @@ import pytest
 
 from reseau.core.errors import UsageError
 from reseau.optics import Sensor, illumination, snr_db
-from reseau.optics.sensor import jpeg, sigma_of_snr
+from reseau.optics.sensor import sigma_of_snr
 
 SIZE = 300  # 90 000 pixels: a variance is known to 0.5 %, a mean to σ/300
 
@@ -103,18 +103,6 @@ def test_impossible_sensors_and_light_are_refused() -> None:
         with pytest.raises(UsageError, match="irradiance"):
             sensor.expose(light, rng)
     assert not sensor.expose(np.full((4, 4), -1e-9), rng).any()  # rounding error of a formed image
-
-
-def test_jpeg_keeps_a_smooth_image_to_a_grey_value_and_loses_detail_at_low_quality() -> None:
-    x = np.linspace(0, 255, 64)
-    smooth = np.rint(np.add.outer(x, x) / 2).astype(np.uint8)
-    assert np.abs(jpeg(smooth, 100).astype(int) - smooth).max() <= 2
-    noisy = np.random.default_rng(4).integers(0, 256, (64, 64)).astype(np.uint8)
-    lost = [np.abs(jpeg(noisy, quality).astype(int) - noisy).mean() for quality in (95, 50, 10)]
-    assert lost == sorted(lost)
-    for image, quality in ((noisy.astype(np.uint16), 90), (noisy, 0), (noisy[0], 90)):
-        with pytest.raises(UsageError, match="compressed"):
-            jpeg(image, quality)  # type: ignore[arg-type]
 
 
 def test_illumination_is_one_at_the_centre_and_follows_its_coefficients() -> None:

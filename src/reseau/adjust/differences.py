@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -81,39 +80,3 @@ def _step_from_zero(function: Callable[[Array], Array], x: Array, j: int, here: 
             break
         h, wide = 10.0 * h, wider
     return h
-
-
-@dataclass(frozen=True)
-class JacobianCheck:
-    """Largest disagreement of an analytic Jacobian with differences.
-
-    Parameters
-    ----------
-    error : float
-        Largest difference in any column, relative to the largest value of the column.
-    worst : str
-        Parameter of the column where it occurs.
-    row : int
-        Observation or condition where it occurs.
-
-    Examples
-    --------
-    >>> JacobianCheck(error=3e-9, worst="K1", row=4).agrees()
-    True
-    """
-
-    error: float
-    worst: str
-    row: int
-
-    def agrees(self, tolerance: float = 1e-6) -> bool:
-        """Whether the derivatives agree to this relative error."""
-        return self.error <= tolerance
-
-
-def compare_jacobians(analytic: Array, numeric: Array, names: tuple[str, ...]) -> JacobianCheck:
-    """Compare two Jacobians (n, u) column by column, each relative to its greatest entry."""
-    size = np.maximum(np.abs(analytic), np.abs(numeric)).max(axis=0)
-    error = np.abs(analytic - numeric) / np.where(size > 0, size, 1.0)
-    row, column = np.unravel_index(int(np.argmax(error)), error.shape)
-    return JacobianCheck(float(error[row, column]), names[int(column)], int(row))

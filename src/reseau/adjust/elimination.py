@@ -196,7 +196,7 @@ def _tests(
 
 def _without(fit: Adjustment, name: str, value: float) -> Adjustment | AdjustmentFailure:
     """The adjustment with one parameter fixed, starting at the estimates with it."""
-    start = fit.problem.parameters if fit.problem.datum else fit.parameters
+    start = fit.parameters
     return adjust(fit.problem.with_parameters(start.fix(name, at=value)), fit.options)
 
 

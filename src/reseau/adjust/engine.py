@@ -1,4 +1,4 @@
-"""The least-squares engine: Levenberg–Marquardt and Gauss–Newton over either kind of problem.
+"""The least-squares engine: Levenberg–Marquardt over either kind of problem.
 
 Convergence is decided by the *relative offset* (Bates & Watts 1981): the length of the residual vector in the
 space of the parameters over its length outside, each per degree of freedom. It is the correction still to
@@ -17,15 +17,121 @@ import numpy as np
 from ..core.data import Array
 from ..core.errors import UsageError
 from ..core.failure import Code, Failure
-from .linear import Linearised, constraint_matrix, linearise
 from .models import Model, State, Values
 from .reliability import Solution
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Scaled design A D = Q U diag(s) Vᵀ over the free parameters, and the residuals seen through it.
+
+    Parameters
+    ----------
+    design : ndarray (N, f)
+        Whitened design of the free parameters.
+    basis : ndarray (f, q)
+        D V: corrections of the free parameters for each singular direction.
+    singular : ndarray (q,)
+        Singular values, descending; zero below the rank.
+    projected : ndarray (q,)
+        Uᵀ Qᵀ r.
+    rank : int
+        Numerical rank.
+    scaled_null : ndarray (f, q − rank)
+        Corrections that leave all residuals unchanged, in scaled parameters, orthonormal.
+    outside : float
+        Norm of r outside the column space.
+    """
+
+    design: Array
+    basis: Array
+    singular: Array
+    projected: Array
+    rank: int
+    scaled_null: Array
+    outside: float
+    scale: Array
+
+    def step(self, damping: float) -> Array:
+        """Return the correction (f,) that minimises ``|r + A dx|² + damping · |D⁻¹ dx|²``.
+
+        Without damping it is the one of least norm.
+        """
+        s, g = self.singular[: self.rank], self.projected[: self.rank]
+        return -self.basis[:, : self.rank] @ (s / (s**2 + damping) * g)
+
+    def predicted(self, damping: float) -> float:
+        """Decrease of the sum of squares predicted for :meth:`step`."""
+        s, g = self.singular[: self.rank], self.projected[: self.rank]
+        left = damping / (s**2 + damping)
+        return float(((1.0 - left**2) * g**2).sum())
+
+    def answer(self, residuals: Array, damping: float) -> Array:
+        """The correction (f,) to other residuals (N,) of the same design."""
+        basis, s = self.basis[:, : self.rank], self.singular[: self.rank]
+        return -basis @ ((basis.T @ (self.design.T @ residuals)) / (s**2 + damping))
+
+    @property
+    def reducible(self) -> float:
+        """The decrease of the sum of squares that a correction can still give, to first order."""
+        g = self.projected[: self.rank]
+        return float(g @ g)
+
+    @property
+    def factor(self) -> Array:
+        """F (f, rank) with the cofactor matrix of the parameters F Fᵀ; least norm at a rank defect."""
+        return self.basis[:, : self.rank] / self.singular[: self.rank]
+
+
+def linearise(
+    design: Array,
+    whitened: Array,
+    tolerance: float,
+    lengths: Array | None = None,
+) -> Linearised:
+    """Factorise the linear problem ``|r + A dx|``.
+
+    Parameters
+    ----------
+    design : ndarray (N, f)
+        Whitened design A of the free parameters.
+    whitened : ndarray (N,)
+        r.
+    tolerance : float
+        Singular values of the scaled design below this fraction of the largest are treated as zero.
+    """
+    length = np.sqrt((design**2).sum(axis=0)) if lengths is None else lengths
+    scale = 1.0 / np.where(length > 0, length, 1.0)
+    scaled = design * scale
+    columns = len(scale)
+    triangle: Array = np.asarray(np.linalg.qr(np.column_stack([scaled, whitened]), mode="r"))
+    u, singular, vt = np.linalg.svd(triangle[:columns, :columns])
+    singular = np.pad(singular, (0, columns - len(singular)))
+    projected = np.zeros(columns)
+    head = triangle[:columns, columns]
+    projected[: len(head)] = u.T @ head
+    largest = singular[0] if columns else 0.0
+    rank = int((singular > tolerance * largest).sum()) if largest > 0 else 0
+    v = np.ascontiguousarray(vt.T)
+    basis = scale[:, None] * v
+    return Linearised(
+        design=design,
+        basis=basis,
+        singular=singular,
+        projected=projected,
+        rank=rank,
+        scaled_null=v[:, rank:],
+        scale=scale,
+        outside=abs(float(triangle[columns, columns])) if len(triangle) > columns else 0.0,
+    )
+
 
 NullVector = Mapping[str, float]
 
 _EPS = float(np.finfo(np.float64).eps)
 _MEMORY, _SHRINK, _LEAST_DAMPING, _MOST_DAMPING = 0.7, 1.0 / 3.0, 1e-18, 1e18
-_LEAST_LENGTH = 2.0**-20
+# Largest geodesic acceleration of a step, relative to its length, both in scaled parameters.
+_CURVATURE = 0.75
 
 
 @dataclass(frozen=True)
@@ -34,8 +140,6 @@ class Options:
 
     Parameters
     ----------
-    method : {"levenberg-marquardt", "gauss-newton"}
-        Gauss–Newton halves a step until the sum of squares decreases.
     max_iterations : int
         Maximum number of corrections tried.
     tolerance : float
@@ -43,9 +147,6 @@ class Options:
         deviations a posteriori.
     damping : float
         Initial damping of Levenberg–Marquardt, relative to the scaled columns of length one.
-    curvature : float
-        Levenberg–Marquardt rejects a step v whose geodesic acceleration a has 2|a|/|v| above this, in scaled
-        parameters. For Gauss–Markov problems only.
     rank_tolerance : float, optional
         Singular values of the scaled design below this fraction of the largest are treated as zero. By
         default 1e-13 with analytic derivatives and 1e-9 with differences.
@@ -53,54 +154,33 @@ class Options:
         Whether :attr:`Adjustment.covariance` and :attr:`Adjustment.sigma` are multiplied by the estimated
         variance factor, or computed from the input covariance of the observations alone. Without redundancy
         always a priori.
-    check_jacobian : float, optional
-        Compare analytic derivatives with differences at the approximate values, and raise `UsageError` when
-        they differ by more than this, relative to the largest value of each column.
 
     Raises
     ------
     UsageError
-        For an unknown method or scale, for values out of range, and for an option that the method ignores.
+        For an unknown scale, and for values out of range.
 
     Examples
     --------
-    >>> Options(method="gauss-newton", max_iterations=20).max_iterations
+    >>> Options(max_iterations=20).max_iterations
     20
     """
 
-    method: Literal["levenberg-marquardt", "gauss-newton"] = "levenberg-marquardt"
     max_iterations: int = 1000
     tolerance: float = 1e-10
     damping: float = 1e-4
-    curvature: float = 0.75
     rank_tolerance: float | None = None
     scale: Literal["a-posteriori", "a-priori"] = "a-posteriori"
-    check_jacobian: float | None = None
 
     def __post_init__(self) -> None:
-        if self.method not in ("levenberg-marquardt", "gauss-newton"):
-            raise UsageError(
-                f"{self.method!r} is not levenberg-marquardt or gauss-newton", where="Options.method"
-            )
         if self.scale not in ("a-posteriori", "a-priori"):
             raise UsageError(f"{self.scale!r} is not a-posteriori or a-priori", where="Options.scale")
-        if (
-            self.max_iterations < 0
-            or not self.tolerance > 0
-            or not self.damping > 0
-            or not self.curvature > 0
-        ):
+        if self.max_iterations < 0 or not self.tolerance > 0 or not self.damping > 0:
             raise UsageError(
-                "tolerance, damping and curvature must be positive, max_iterations not negative",
-                where="Options",
+                "tolerance and damping must be positive, max_iterations not negative", where="Options"
             )
         if self.rank_tolerance is not None and not 0 <= self.rank_tolerance < 1:
             raise UsageError("must be in [0, 1)", where="Options.rank_tolerance")
-        usual = (Options.damping, Options.curvature)
-        if self.method == "gauss-newton" and (self.damping, self.curvature) != usual:
-            raise UsageError(
-                "apply to levenberg-marquardt only", where="Options.damping and Options.curvature"
-            )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -151,8 +231,6 @@ class Solved:
         vᵀPv.
     redundancy : int
         Degrees of freedom.
-    defect : int
-        Rank defect that inner constraints removed.
     iterations : int
         Number of corrections tried.
     costs : tuple of float
@@ -166,25 +244,13 @@ class Solved:
     residuals: Array
     cost: float
     redundancy: int
-    defect: int
     iterations: int
     costs: tuple[float, ...]
     solution: Solution
 
 
 def solve(model: Model, options: Options) -> Solved | AdjustmentFailure:
-    """Minimise the weighted sum of squares of a model, from its approximate values.
-
-    Raises
-    ------
-    UsageError
-        When `options.check_jacobian` is given and the derivatives disagree with differences, and for an
-        option that the model cannot honour.
-    """
-    if options.check_jacobian is not None:
-        _check(model, options.check_jacobian)
-    if options.curvature != Options.curvature and not model.constant_weights:
-        raise UsageError("applies to Gauss-Markov problems only", where="Options.curvature")
+    """Minimise the weighted sum of squares of a model, from its approximate values."""
     return _Run(model, options).solve()
 
 
@@ -193,26 +259,17 @@ class _Run:
 
     def __init__(self, model: Model, options: Options) -> None:
         self.model, self.problem, self.options = model, model.problem, options
-        problem, parameters = self.problem, self.problem.parameters
-        self.free = np.flatnonzero(parameters.mask)
-        self.constraints = constraint_matrix(
-            problem.constraints, parameters.names, parameters.values, parameters.mask
-        )
+        self.free = np.flatnonzero(self.problem.parameters.mask)
         default = 1e-13 if model.analytic else 1e-9
         self.rank_tolerance = default if options.rank_tolerance is None else options.rank_tolerance
-        datum = set(problem.datum)
-        self.datum = np.array([name in datum for name in parameters.free], dtype=bool)
-        self.marquardt = options.method == "levenberg-marquardt"
-        self.damping, self.growth, self.length = options.damping if self.marquardt else 0.0, 2.0, 1.0
+        self.damping, self.growth = options.damping, 2.0
         self.lengths = np.zeros(len(self.free))
         self.costs: list[float] = []
         self.iterations = 0
 
     def solve(self) -> Solved | AdjustmentFailure:
-        model, x = self.model, self.model.start
-        x = self._moved(x, self.constraints.onto(x[self.free].astype(np.float64)))
-        self.begin = x[self.free].astype(np.float64)
-        state = model.evaluate(x)
+        model = self.model
+        state = model.evaluate(model.start)
         if not state.usable:
             return self._failure(
                 "the problem has no finite residuals at the approximate values", Code.NOT_FINITE, state
@@ -242,11 +299,9 @@ class _Run:
             closer = self._closer(state, linear) if left else None
             if closer is not None or self._offset(linear, state) < 1e-6:
                 return closer
-        self.length = 1.0
         while self.iterations < self.options.max_iterations:
-            bend = self.marquardt and self.model.constant_weights
-            trial = self._trial(state, linear, self.damping, self.length, bend)
-            promised = linear.predicted(self.damping) if self.marquardt else self.length * linear.reducible
+            trial = self._trial(state, linear, self.damping, bend=self.model.constant_weights)
+            promised = linear.predicted(self.damping)
             gain = (state.cost - trial.cost) / promised if trial.usable and promised > 0 else -1.0
             if gain > 1e-4:
                 self._relax(gain)
@@ -262,11 +317,9 @@ class _Run:
                 )
         return self._failure(f"not converged in {self.iterations} iterations", Code.NOT_CONVERGED, state)
 
-    def _trial(
-        self, state: State, linear: Linearised, damping: float, length: float, bend: bool = False
-    ) -> State:
+    def _trial(self, state: State, linear: Linearised, damping: float, *, bend: bool = False) -> State:
         self.iterations += 1
-        step = length * self._datum_step(state, linear, damping)
+        step = linear.step(damping)
         if bend:
             bent = self._bend(state, linear, damping, step)
             if bent is None:
@@ -287,13 +340,13 @@ class _Run:
         second = 2.0 / h * ((ahead.whitened - state.whitened) / h - linear.design @ step)
         bent = linear.answer(second, damping)
         size, bend = np.linalg.norm(step / linear.scale), np.linalg.norm(bent / linear.scale)
-        if 2.0 * bend > self.options.curvature * size:
+        if 2.0 * bend > _CURVATURE * size:
             return None
         return 0.5 * bent
 
     def _closer(self, state: State, linear: Linearised) -> tuple[State, Linearised] | None:
         """Where the sum of squares is flat to rounding: the full step, if it decreases the offset."""
-        trial = self._trial(state, linear, 0.0, 1.0)
+        trial = self._trial(state, linear, 0.0)
         if not trial.usable or trial.cost > state.cost * (1.0 + 1e-8) + self.floor:
             return None
         following = self._linearise(trial)
@@ -309,17 +362,14 @@ class _Run:
 
     def _relax(self, gain: float) -> None:
         shrink = max(_SHRINK, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
-        self.damping = max(self.damping * shrink, _LEAST_DAMPING) if self.damping else 0.0
+        self.damping = max(self.damping * shrink, _LEAST_DAMPING)
         self.growth = 2.0
 
     def _restrain(self) -> bool:
         """Shorten the next step; False when it cannot be shortened further."""
-        if self.marquardt:
-            self.damping = max(self.damping, _LEAST_DAMPING) * self.growth
-            self.growth *= 2.0
-            return self.damping < _MOST_DAMPING
-        self.length *= 0.5
-        return self.length > _LEAST_LENGTH
+        self.damping = max(self.damping, _LEAST_DAMPING) * self.growth
+        self.growth *= 2.0
+        return self.damping < _MOST_DAMPING
 
     def _linearise(self, state: State) -> Linearised | AdjustmentFailure:
         design = self.model.design(state)[:, self.free]
@@ -332,7 +382,7 @@ class _Run:
         # After Moré (1978): the scale of a column decreases slowly, so that a parameter that loses its
         # influence does not diverge; it does decrease, because narrow valleys would be slow otherwise.
         self.lengths = np.maximum(_MEMORY * self.lengths, np.sqrt((design**2).sum(axis=0)))
-        return linearise(design, state.whitened, self.constraints, self.rank_tolerance, self.lengths)
+        return linearise(design, state.whitened, self.rank_tolerance, self.lengths)
 
     def _moved(self, x: Array, step: Array) -> Array:
         full = np.zeros(len(x))
@@ -349,38 +399,15 @@ class _Run:
             return float(inside) if inside**2 > self.floor else 0.0
         return float(inside / (linear.outside / np.sqrt(redundancy)))
 
-    def _datum_step(self, state: State, linear: Linearised, damping: float) -> Array:
-        step = linear.step(damping)
-        if not self.datum.any() or linear.rank == len(linear.singular):
-            return step
-        # Inner constraints: Gᵀ (x − x_begin) = 0 over the chosen parameters (Förstner & Wrobel 2016, sect.
-        # 4.5).
-        past = np.where(self.datum, state.x[self.free].astype(np.float64) - self.begin + step, 0.0)
-        g = linear.null
-        inner = g[self.datum].T @ g[self.datum]
-        return step - g @ (np.linalg.pinv(inner) @ (g.T @ past)) / (1.0 + damping)
-
     def _arrived(self, state: State, linear: Linearised) -> Solved | AdjustmentFailure:
-        factor, defect = linear.factor, linear.null.shape[1]
+        defect = linear.scaled_null.shape[1]
         if defect:
             vectors = self._null_vectors(linear)
             listed = "; ".join(" with ".join(vector) for vector in vectors)
-            if not self.datum.any():
-                reason = f"rank defect {defect}: the observations do not determine {listed}"
-                return self._failure(reason, Code.RANK_DEFECT, state, vectors)
-            g = linear.null
-            inner = g[self.datum].T @ g[self.datum]
-            size = np.sqrt(np.maximum(np.diag(inner), np.finfo(float).tiny))
-            if np.linalg.eigvalsh(inner / np.outer(size, size))[0] < 1e-10:
-                reason = f"rank defect {defect}: the chosen datum does not determine {listed}"
-                return self._failure(reason, Code.NO_DATUM, state, vectors)
-            weight = np.linalg.solve(inner, np.where(self.datum[:, None], g, 0.0).T)
-            factor = factor - g @ (weight @ factor)
-        return self._solved(state, linear, factor, defect)
-
-    def _solved(self, state: State, linear: Linearised, factor: Array, defect: int) -> Solved:
-        parameters = self.problem.parameters
-        cofactor = np.zeros((len(parameters), len(parameters)))
+            reason = f"rank defect {defect}: the observations do not determine {listed}"
+            return self._failure(reason, Code.RANK_DEFECT, state, vectors)
+        factor, count = linear.factor, len(self.problem.parameters)
+        cofactor = np.zeros((count, count))
         cofactor[np.ix_(self.free, self.free)] = factor @ factor.T
         redundancy = len(linear.design) - self.model.left_out - linear.rank
         solution = Solution(
@@ -396,7 +423,6 @@ class _Run:
             residuals=state.residuals,
             cost=state.cost,
             redundancy=redundancy,
-            defect=defect,
             iterations=self.iterations,
             costs=tuple(self.costs),
             solution=solution,
@@ -433,13 +459,4 @@ class _Run:
             iterations=self.iterations,
             costs=tuple(self.costs),
             null_space=null_space,
-        )
-
-
-def _check(model: Model, tolerance: float) -> None:
-    found = model.check(np.array(model.problem.parameters.values, dtype=np.float64))
-    if not found.agrees(tolerance):
-        raise UsageError(
-            f"differs from differences by {found.error:.2g} of its column, at row {found.row}",
-            where=f"derivative with respect to {found.worst}",
         )

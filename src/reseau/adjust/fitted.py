@@ -84,11 +84,6 @@ class Fitted(Estimated):
         return self._of_observations(self.standardised.redundancy_numbers)
 
     @property
-    def prior_redundancy_numbers(self) -> Array:
-        """Redundancy numbers of the observed parameters that are free."""
-        return self.standardised.redundancy_numbers[self._observed.observations.size :]
-
-    @property
     def weighted_squares(self) -> Array:
         """Contribution vᵢ (P v)ᵢ of each observation to vᵀPv; zero where its weight is zero."""
         weighted = self._of_observations(self._whitened.weighted_residuals())
@@ -98,11 +93,6 @@ class Fitted(Estimated):
     def w(self) -> Array:
         """Baarda's test value of each observation, N(0, 1) when the input covariance is correct."""
         return self._of_observations(self.standardised.w)
-
-    @property
-    def prior_w(self) -> Array:
-        """Baarda's test value of the observed parameters that are free."""
-        return self.standardised.w[self._observed.observations.size :]
 
     @property
     def tau(self) -> Array:
@@ -131,7 +121,7 @@ class Fitted(Estimated):
         """Maximum effect of an undetected error on the parameters, in their standard deviations.
 
         The square root of Baarda's λ̄: an error of the minimal detectable size changes no function of the
-        parameters by more than this number of its standard deviations; see :class:`ExternalReliability`.
+        parameters by more than this number of its standard deviations.
 
         Parameters
         ----------
@@ -153,7 +143,7 @@ class Fitted(Estimated):
 
 
 def compare(nested: Fitted, full: Fitted, alpha: float = 0.05, scale: str | None = None) -> NestedTest:
-    """Test a model with fewer parameters (or more constraints) against a wider one.
+    """Test a model with fewer parameters against a wider one.
 
     Parameters
     ----------

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from ..core.data import Array
 from ..core.errors import UsageError
-from .differences import JacobianCheck, compare_jacobians, differences
-from .parameters import Constraint, Parameters
+from .differences import differences
+from .parameters import Parameters
 from .stochastic import Blocks, Covariance, Weighting, blocks_of
 
 Values = NDArray[Any]
@@ -47,14 +47,6 @@ class Specification(Protocol):
     @property
     def parameters(self) -> Parameters:
         """Names, approximate values, which are free, and their observations."""
-
-    @property
-    def constraints(self) -> tuple[Constraint, ...]:
-        """Linear conditions between parameters."""
-
-    @property
-    def datum(self) -> tuple[str, ...]:
-        """Names of the parameters of the inner constraints."""
 
     @property
     def weights(self) -> Array | None:
@@ -202,21 +194,6 @@ class Model:
         """Whether analytic derivatives were given."""
         raise NotImplementedError
 
-    def check(self, x: Array) -> JacobianCheck:
-        """Compare the analytic derivatives at x with differences.
-
-        Raises
-        ------
-        UsageError
-            When there are no analytic derivatives.
-        """
-        if not self.analytic:
-            raise UsageError("has no analytic derivatives to check", where="problem")
-        return self._check(x)
-
-    def _check(self, x: Array) -> JacobianCheck:
-        raise NotImplementedError
-
     def _evaluate(self, x: Values, near: State | None) -> State | None:
         raise NotImplementedError
 
@@ -246,10 +223,6 @@ class MarkovModel(Model):
     def analytic(self) -> bool:
         """Whether a Jacobian was given."""
         return self._jacobian is not None
-
-    def _check(self, x: Array) -> JacobianCheck:
-        names = self.problem.parameters.free
-        return compare_jacobians(self.jacobian(x)[:, self.mask], self.numeric(x)[:, self.mask], names)
 
     def _compute(self, x: Values) -> Values:
         computed = np.asarray(self._function(x))
@@ -330,20 +303,6 @@ class HelmertModel(Model):
     def analytic(self) -> bool:
         """Whether Jacobians were given."""
         return self._jacobians is not None
-
-    def _check(self, x: Array) -> JacobianCheck:
-        observed = self.problem.observations.ravel()
-        self.evaluate(self.carry(x))
-        (a, b), (a_numeric, b_numeric) = self.derivatives(observed, x), self.numeric(observed, x)
-        u, k = len(x), b.shape[-1]
-        of_x = compare_jacobians(
-            a.reshape(-1, u)[:, self.mask],
-            a_numeric.reshape(-1, u)[:, self.mask],
-            self.problem.parameters.free,
-        )
-        columns = tuple(f"observation {i}" for i in range(k))
-        of_l = compare_jacobians(b.reshape(-1, k), b_numeric.reshape(-1, k), columns)
-        return of_x if of_x.error >= of_l.error else of_l
 
     def _conditions(self, observed: Array, x: Array) -> Array:
         g = np.asarray(

@@ -1,4 +1,4 @@
-"""The unknowns of an adjustment: named, fixed or free, with prior observations and linear constraints."""
+"""The unknowns of an adjustment: named, fixed or free, with prior observations."""
 
 from __future__ import annotations
 
@@ -59,27 +59,6 @@ class Prior:
         diagonal = self.covariance.ndim == 1
         covariance = self.covariance[rows] if diagonal else self.covariance[np.ix_(rows, rows)]
         return Prior([self.names[i] for i in rows], self.values[rows], covariance)
-
-
-@dataclass(frozen=True)
-class Constraint:
-    """A linear condition between parameters: Σ coefficient · parameter = value.
-
-    Parameters
-    ----------
-    coefficients : mapping of str to float
-        By the names of the parameters.
-    value : float
-        The right-hand side.
-
-    Examples
-    --------
-    >>> Constraint({"H1": 1.0, "H2": -1.0}, 0.25)  # H1 − H2 = 0.25
-    Constraint(coefficients={'H1': 1.0, 'H2': -1.0}, value=0.25)
-    """
-
-    coefficients: Mapping[str, float]
-    value: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,10 +154,6 @@ class Parameters:
         if at is not None:
             values[[self.index(name) for name in names]] = at
         return Parameters(self.names, values, [n for n in self.free if n not in gone], prior=self.prior)
-
-    def release(self, *names: str) -> Parameters:
-        """A copy with these parameters free."""
-        return Parameters(self.names, self.values, (*self.free, *self._known(names)), prior=self.prior)
 
     def with_values(self, values: ArrayLike) -> Parameters:
         """A copy with other (approximate) values (u,); prior observations are kept."""

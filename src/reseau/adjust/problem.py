@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
@@ -13,12 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.data import Array
 from ..core.errors import UsageError
 from ..core.threads import one_thread
-from .differences import JacobianCheck
 from .engine import AdjustmentFailure, Options, solve
 from .fitted import Fitted
 from .models import Conditions, Function, HelmertModel, Jacobian, Jacobians, MarkovModel, Model, Values
-from .parameters import Constraint, Parameters
-from .reliability import ExternalReliability, Solution, noncentrality
+from .parameters import Parameters
+from .reliability import Solution
 from .significance import CoefficientTest, ratio_test
 from .stochastic import Covariance, blocks_of
 
@@ -39,16 +37,9 @@ class Problem:
     observations: Values
     covariance: Covariance
     parameters: Parameters
-    constraints: tuple[Constraint, ...]
-    datum: tuple[str, ...]
     weights: Array | None
 
     def _check(self) -> None:
-        known = set(self.parameters.names)
-        named = [name for c in self.constraints for name in c.coefficients] + list(self.datum)
-        unknown = [name for name in named if name not in known]
-        if unknown:
-            raise UsageError("is not among the parameters", where=", ".join(unknown[:5]))
         if self.weights is not None:
             weights = np.asarray(self.weights, dtype=np.float64)
             if weights.shape != self.observations.shape or not (weights >= 0).all():
@@ -71,11 +62,8 @@ class Problem:
         return replace(self, weights=weights)  # type: ignore[type-var]
 
     def continued(self, fit: Adjustment) -> Self:
-        """The same problem, starting at the estimates of an adjustment.
-
-        With inner constraints it is unchanged, because they refer to the approximate values.
-        """
-        return self if self.datum else self.with_parameters(fit.parameters)
+        """The same problem, starting at the estimates of an adjustment."""
+        return self.with_parameters(fit.parameters)
 
     def model(self) -> Model:
         """The problem in the form that the engine iterates on."""
@@ -112,11 +100,6 @@ class GaussMarkov(Problem):
     jacobian : callable, optional
         `jacobian(x)` with x (u,) in double precision gives the derivatives, the observations' shape + (u,).
         By default differences of `function`, accurate to about ten digits.
-    constraints : sequence of Constraint
-        Linear conditions between parameters, satisfied exactly.
-    datum : sequence of str
-        Names of the parameters of inner constraints: at a datum defect the solution with the least norm of
-        their corrections is taken.
     weights : array_like, optional
         Factors on the weights, of the observations' shape: zero leaves an observation out.
 
@@ -140,8 +123,6 @@ class GaussMarkov(Problem):
     covariance: Covariance
     parameters: Parameters
     jacobian: Jacobian | None = None
-    constraints: tuple[Constraint, ...] = ()
-    datum: tuple[str, ...] = ()
     weights: Array | None = None
 
     def __post_init__(self) -> None:
@@ -172,7 +153,7 @@ class GaussHelmert(Problem):
     jacobians : callable, optional
         `jacobians(l, x)` gives A = ∂g/∂x and B = ∂g/∂l: (r, u) and (r, n), or (m, c, u) and (m, c, k). By
         default differences of `conditions`.
-    constraints, datum, weights
+    weights
         As in :class:`GaussMarkov`; weight zero of one observation leaves its whole mark out.
 
     Raises
@@ -196,8 +177,6 @@ class GaussHelmert(Problem):
     covariance: Covariance
     parameters: Parameters
     jacobians: Jacobians | None = None
-    constraints: tuple[Constraint, ...] = ()
-    datum: tuple[str, ...] = ()
     weights: Array | None = None
 
     def __post_init__(self) -> None:
@@ -232,9 +211,6 @@ def _tidy(problem: Problem) -> None:
             "are not finite", where="observations", do="give missing ones any value and weight 0"
         )
     object.__setattr__(problem, "observations", observed)
-    constraints: Iterable[Constraint] = problem.constraints or ()
-    object.__setattr__(problem, "constraints", tuple(constraints))
-    object.__setattr__(problem, "datum", tuple(problem.datum or ()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,7 +234,7 @@ class Adjustment(Fitted):
     sigma0 : float
         Standard deviation of unit weight a posteriori, √(vᵀPv / redundancy); NaN without redundancy.
     redundancy : int
-        Observations, observed parameters and constraints less free parameters (plus the datum defect).
+        Observations and observed parameters less free parameters.
     cost : float
         vᵀPv, that of the observed parameters included.
     residuals : ndarray
@@ -269,8 +245,6 @@ class Adjustment(Fitted):
         Number of corrections tried.
     costs : tuple of float
         vᵀPv at the approximate values and after each accepted correction.
-    datum_defect : int
-        Rank defect that inner constraints removed.
     options : Options
         Options of the adjustment.
     solution : Solution
@@ -296,7 +270,6 @@ class Adjustment(Fitted):
     scale: str
     iterations: int
     costs: tuple[float, ...]
-    datum_defect: int
     options: Options
     solution: Solution
 
@@ -376,25 +349,6 @@ class Adjustment(Fitted):
         np.fill_diagonal(correlation, 1.0)
         return correlation
 
-    def external_reliability(self, alpha: float = 0.001, power: float = 0.8) -> ExternalReliability:
-        """Effects of undetected errors of the minimal detectable size on the parameters.
-
-        Parameters
-        ----------
-        alpha, power : float
-            As of :meth:`minimal_detectable_errors`.
-
-        Returns
-        -------
-        ExternalReliability
-            Effects by observation.
-        """
-        with one_thread():
-            effects, lengths = self.solution.effects(self.standardised, noncentrality(alpha, power))
-        full = np.zeros((len(effects), len(self.names)))
-        full[:, self.problem.parameters.mask] = effects
-        return ExternalReliability(self.names, self._of_observations(full), self._of_observations(lengths))
-
     def test_of(
         self, name: str, value: float = 0.0, alpha: float = 0.05, scale: str | None = None
     ) -> CoefficientTest:
@@ -449,8 +403,8 @@ def adjust(problem: Problem, options: Options | None = None) -> Adjustment | Adj
     -----
     Derived in ``docs/mathematics/adjustment.md``.
 
-    Minimises Ω = vᵀPv + (x−x₀)ᵀP₀(x−x₀) subject to linear constraints (Mikhail 1976; Förstner & Wrobel 2016,
-    ch. 4). Damping after Nielsen (1999), IMM-REP-1999-05; convergence after Bates & Watts (1981),
+    Minimises Ω = vᵀPv + (x−x₀)ᵀP₀(x−x₀) (Mikhail 1976; Förstner & Wrobel 2016, ch. 4).
+    Damping after Nielsen (1999), IMM-REP-1999-05; convergence after Bates & Watts (1981),
     *Technometrics* 23, 179–183.
 
     Examples
@@ -479,40 +433,6 @@ def adjust(problem: Problem, options: Options | None = None) -> Adjustment | Adj
         scale=options.scale if redundancy > 0 else "a-priori",
         iterations=found.iterations,
         costs=found.costs,
-        datum_defect=found.defect,
         options=options,
         solution=found.solution,
     )
-
-
-def check_jacobian(problem: Problem, at: Array | None = None) -> JacobianCheck:
-    """Compare analytic derivatives with differences of fourth order.
-
-    Parameters
-    ----------
-    problem : GaussMarkov or GaussHelmert
-        With `jacobian` or `jacobians`; for the latter the derivatives by the observations are compared too,
-        and are named ``observation 0``, ``observation 1`` … by their column.
-    at : ndarray (u,), optional
-        Parameters; the approximate values by default.
-
-    Returns
-    -------
-    JacobianCheck
-        The largest disagreement of all free parameters.
-
-    Raises
-    ------
-    UsageError
-        When the problem has no analytic derivatives.
-
-    Examples
-    --------
-    >>> t = np.arange(4.0)
-    >>> jacobian = lambda x: np.stack([np.ones(4), t], axis=1)
-    >>> line = GaussMarkov(lambda x: x[0] + x[1] * t, t, 0.1, Parameters("ab", [0, 1]), jacobian)
-    >>> check_jacobian(line).agrees()
-    True
-    """
-    x = np.array(problem.parameters.values if at is None else at, dtype=np.float64)
-    return problem.model().check(x)

@@ -42,34 +42,6 @@ class Standardised:
     unit_error: Array
 
 
-@dataclass(frozen=True, eq=False)
-class ExternalReliability:
-    """Effects of undetected errors on the parameters.
-
-    Parameters
-    ----------
-    names : tuple of str (u,)
-        Parameters.
-    effects : ndarray (..., u)
-        Change of each parameter, for a minimal detectable error in each observation; of the observations'
-        shape. Infinite or NaN where no other observation controls it.
-    lengths : ndarray (...)
-        Length of the change in the metric of the parameters, √(∇xᵀ Q⁻¹ ∇x) (square root of Baarda's λ̄): no
-        function of the parameters changes by more than this number of its standard deviations.
-
-    Examples
-    --------
-    >>> from reseau.adjust import GaussMarkov, Parameters, adjust
-    >>> mean = GaussMarkov(lambda x: np.full(4, x[0]), [1.0, 1.1, 0.9, 1.0], 0.1, Parameters("m", [0.0]))
-    >>> adjust(mean).required().external_reliability().effects.round(3).ravel()
-    array([0.119, 0.119, 0.119, 0.119])
-    """
-
-    names: tuple[str, ...]
-    effects: Array
-    lengths: Array
-
-
 class Whitened(ABC):
     """The part of the whitened linear problem at the estimates that reliability needs.
 
@@ -144,16 +116,6 @@ class Solution(Whitened):
             b, k, _ = turn.matrices.shape
             a = turn.times(through).reshape(b, k, -1)
             yield a @ np.swapaxes(a, 1, 2)
-
-    def effects(self, standardised: Standardised, delta: float) -> tuple[Array, Array]:
-        """Changes (N, f) of the parameters, and their lengths, for errors of delta times the unit error."""
-        through = self.design @ self.factor
-        turned = np.concatenate([turn.times(through) for turn in self.influence])
-        size = (delta * standardised.unit_error)[:, None]
-        with np.errstate(invalid="ignore"):
-            moved = turned * size
-            lengths: Array = np.sqrt((moved**2).sum(axis=1))
-            return moved @ self.factor.T, lengths
 
 
 def noncentrality(alpha: float, power: float) -> float:

@@ -188,7 +188,7 @@ def say_left_out(result: Result) -> None:
     gross = dict[str, list[str]]()
     for image, point, value, critical in result.rejected_points():
         if value == value:
-            say(f"left out: point {point} in image {image}, test value {value:.1f} above {critical:.1f}\n")
+            say(f"left out: point {point} in image {image}, test value {value:.2f} above {critical:.2f}\n")
         else:
             gross.setdefault(image, []).append(point)
     for image, points in gross.items():

@@ -424,7 +424,7 @@ def _say_board(choice: BoardChoice, unit: str) -> None:
     import numpy as np
 
     said = {"flat": "flat as designed", "warp": "bent; all points are free", "free": "all points free"}
-    say(f"target {said[choice.chosen.name]}\n")
+    say(f"target {said[choice.chosen.name]} (each model with the same {choice.points} image points)\n")
     for each in choice.models:
         line = f"  {each.name:5} {each.parameters:5} parameters  sigma0 {each.sigma0:.4f}  "
         line += f"length {each.length:.1f}"

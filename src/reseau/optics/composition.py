@@ -17,33 +17,6 @@ from .newton import solve_2x2
 
 
 @dataclass(frozen=True, eq=False)
-class Identity(PlaneMapping):
-    """The identity mapping; it has no parameters.
-
-    Examples
-    --------
-    >>> Identity()([[1.0, 2.0]])
-    array([[1., 2.]])
-    """
-
-    names: ClassVar[tuple[str, ...]] = ()
-    values: Array = field(default_factory=lambda: np.zeros(0))
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "values", as_values(self.names, self.values))
-
-    def derivatives(self, xy: ArrayLike) -> Derivatives:
-        """The points, unit matrices, and no derivatives with respect to parameters."""
-        points = as_points(xy)
-        return Derivatives(
-            points.copy(), np.tile(np.eye(2), (len(points), 1, 1)), np.zeros((len(points), 2, 0))
-        )
-
-    def _inverse(self, xy: Array) -> Array:
-        return xy.copy()
-
-
-@dataclass(frozen=True, eq=False)
 class Similarity(PlaneMapping):
     """Shift, rotation and one scale: X = X0 + a·x − b·y, Y = Y0 + b·x + a·y.
 

@@ -25,14 +25,6 @@ Where Wishahy's printed formulas are inconsistent, the components above are used
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar
-
-import numpy as np
-from numpy.typing import ArrayLike
-
-from ..core.data import Array, Mask
-from .mapping import Derivatives, PlaneMapping, as_values
 from .polynomials import RationalPolynomial
 
 _RADII = ["x2 + y2", "x4 + 2x2y2 + y4", "x6 + 3x4y2 + 3x2y4 + y6"]
@@ -73,63 +65,3 @@ def wong_display() -> RationalPolynomial:
         "h'4": {"Y": _RADII[1]},
     }
     return RationalPolynomial(_SYMMETRIC | decentering | _ORIENTATION | _BEAM, fixed=_UNCHANGED)
-
-
-# The display with the decentering as six numbers, linear: g_i sin θ and g_i cos θ.
-_LINEAR = (
-    _SYMMETRIC
-    | {f"s{i + 1}": {"X": _negative(terms)} for i, terms in enumerate(_RADII)}
-    | {f"c{i + 1}": {"Y": terms} for i, terms in enumerate(_RADII)}
-    | _ORIENTATION
-    | _BEAM
-)
-
-
-@dataclass(frozen=True, eq=False)
-class DecenteredDisplay(PlaneMapping):
-    """Wong's display with his parameters of decentering: profile g1, g2, g3 and direction θ of its axis.
-
-    Unlike :func:`wong_display` it is not linear in θ, and θ is undetermined where all g are zero.
-
-    Parameters
-    ----------
-    values : array_like (15,)
-        k0 … k3, g1, g2, g3, theta (radians), P0 … P4, m1, m2; default the identity.
-
-    Examples
-    --------
-    >>> display = DecenteredDisplay().with_values({"g1": 1e-4, "theta": 0.0})
-    >>> display([[10.0, 20.0]]).round(3)
-    array([[10.  , 20.05]])
-    """
-
-    names: ClassVar[tuple[str, ...]] = (*_SYMMETRIC, "g1", "g2", "g3", "theta", *_ORIENTATION, *_BEAM)
-    values: Array = field(default_factory=lambda: np.zeros(15))
-
-    def __post_init__(self) -> None:
-        values = as_values(self.names, self.values)
-        object.__setattr__(self, "values", values)
-        symmetric, g, theta, others = values[:4], values[4:7], values[7], values[8:]
-        linear = np.concatenate([symmetric, g * np.sin(theta), g * np.cos(theta), others])
-        object.__setattr__(self, "_polynomial", RationalPolynomial(_LINEAR, linear, _UNCHANGED))
-
-    _polynomial: RationalPolynomial = field(init=False, repr=False)
-
-    def derivatives(self, xy: ArrayLike) -> Derivatives:
-        """See :meth:`PlaneMapping.derivatives`."""
-        value, d_xy, d_linear = self._polynomial.derivatives(xy)
-        g, sin, cos = self.values[4:7], np.sin(self.values[7]), np.cos(self.values[7])
-        by_sin, by_cos = d_linear[:, :, 4:7], d_linear[:, :, 7:10]
-        by_theta = by_sin @ (g * cos) - by_cos @ (g * sin)
-        columns = [d_linear[:, :, :4], by_sin * sin + by_cos * cos, by_theta[:, :, None], d_linear[:, :, 10:]]
-        return Derivatives(value, d_xy, np.concatenate(columns, axis=2))
-
-    def one_to_one(self, xy: ArrayLike) -> Mask:
-        """See :meth:`PlaneMapping.one_to_one`."""
-        return self._polynomial.one_to_one(xy)
-
-    def _value(self, xy: Array) -> Array:
-        return self._polynomial._value(xy)
-
-    def _slope(self, xy: Array) -> tuple[Array, Array]:
-        return self._polynomial._slope(xy)

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping as Named
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,38 +51,6 @@ class Derivatives(NamedTuple):
     value: Array
     d_xy: Array
     d_parameters: Array
-
-
-@runtime_checkable
-class Mapping(Protocol):
-    """Interface of a plane mapping; :class:`PlaneMapping` implements most of it.
-
-    Examples
-    --------
-    >>> from reseau.optics.composition import Similarity
-    >>> isinstance(Similarity(), Mapping), isinstance(np.eye(2), Mapping)
-    (True, False)
-    """
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters (u)."""
-
-    @property
-    def values(self) -> Array:
-        """Values of the parameters, (u,)."""
-
-    def __call__(self, xy: ArrayLike) -> Array:
-        """Map points (n, 2)."""
-
-    def derivatives(self, xy: ArrayLike) -> Derivatives:
-        """Map points and differentiate."""
-
-    def inverse(self, xy: ArrayLike) -> Array:
-        """Points (n, 2) that are mapped to `xy`; NaN where there is none."""
-
-    def with_values(self, values: ArrayLike | Named[str, float]) -> Self:
-        """The same model with other values of its parameters."""
 
 
 def as_points(xy: ArrayLike) -> Array:

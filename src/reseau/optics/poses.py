@@ -277,8 +277,8 @@ class Projection(NamedTuple):
     --------
     See :func:`project`:
 
-    >>> from reseau.optics.composition import Identity
-    >>> seen = project(Identity(), Pose([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]), [[1.0, 2.0, -4.0]])
+    >>> from reseau.optics.composition import Similarity
+    >>> seen = project(Similarity(), Pose([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]), [[1.0, 2.0, -4.0]])
     >>> isinstance(seen, Projection), bool(np.isnan(seen.xy).all())
     (True, True)
     """
@@ -309,10 +309,10 @@ def project(camera: PlaneMapping, pose: Pose, points: ArrayLike) -> Projection:
 
     Examples
     --------
-    >>> from reseau.optics.composition import Identity
-    >>> seen = project(Identity(), Pose([0.0, 0.0, 0.0], [0.0, 0.0, -6.0]), [[1.0, 2.0, 4.0]])
+    >>> from reseau.optics.composition import Similarity
+    >>> seen = project(Similarity(), Pose([0.0, 0.0, 0.0], [0.0, 0.0, -6.0]), [[1.0, 2.0, 4.0]])
     >>> seen.xy, seen.d_pose.shape, seen.d_point.shape, seen.d_camera.shape
-    (array([[0.1, 0.2]]), (1, 2, 6), (1, 2, 3), (1, 2, 0))
+    (array([[0.1, 0.2]]), (1, 2, 6), (1, 2, 3), (1, 2, 4))
     """
     object_points = np.asarray(points, dtype=np.float64)
     if object_points.ndim != 2 or object_points.shape[1] != 3:

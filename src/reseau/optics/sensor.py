@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -165,38 +164,6 @@ class Sensor:
         if not (light.min() >= -1e-6 * self.full_scale and light.max() < np.inf):
             raise UsageError("is negative or not finite somewhere", where="irradiance of a sensor")
         return np.maximum(light, 0.0)
-
-
-def jpeg(pixels: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
-    """Compress an image with JPEG and decompress it.
-
-    Parameters
-    ----------
-    pixels : ndarray (height, width)
-        Grey values of 8 bits.
-    quality : int
-        1 to 100.
-
-    Raises
-    ------
-    UsageError
-        When the image is not grey with 8 bits, or the quality is not possible.
-
-    Examples
-    --------
-    >>> ramp = np.tile(np.arange(0, 256, 4, dtype=np.uint8), (8, 1))
-    >>> jpeg(ramp, 90).shape
-    (8, 64)
-    """
-    if pixels.dtype != np.uint8 or pixels.ndim != 2 or not 1 <= quality <= 100:
-        raise UsageError(
-            f"cannot be compressed: {pixels.dtype} of shape {pixels.shape} at quality {quality}",
-            where="image",
-            do="JPEG takes grey values of 8 bits and a quality of 1 to 100",
-        )
-    _, stream = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    decoded = cv2.imdecode(stream, cv2.IMREAD_GRAYSCALE)
-    return np.asarray(decoded, dtype=np.uint8)
 
 
 def illumination(

@@ -199,21 +199,24 @@ class _Job:
         stand_in = Camera(ONE_CAMERA, 1, 1, (1.0, 1.0), "opencv", np.zeros(len(camera_model("opencv").names)))
         wrong = left_out(network_of(measured, design, stand_in), cameras, sizes, of)
         if wrong is None:
-            return self._decided(measured, None)
+            return self._decided(self._adjusted(measured, None), measured, None)
         # Which points are wrong is seen best with the target as designed: its errors are small beside theirs.
         more = options.target != "free" or options.control or options.heights or options.refraction
         first = self if more else replace(self, options=replace(options, target="flat"))
         done = first._adjusted(wrong.kept(measured), wrong.found)
         still = wrong if isinstance(done, Failure) else wrong.after(done.result)
         same = still is not None and np.array_equal(still.found.rows, wrong.found.rows)
-        if still is not None and same and more:
-            return done if isinstance(done, Failure) else replace(done, misnamed=still.found)
         kept, found = (measured, None) if still is None else (still.kept(measured), still.found)
-        return self._decided(kept, found)
+        if not same or not more:
+            done = self._adjusted(kept, found)
+        elif not isinstance(done, Failure):
+            done = replace(done, misnamed=found)
+        return self._decided(done, kept, found)
 
-    def _decided(self, measured: dict[str, ImagePoints], wrong: Misnamed | None) -> Calibrated | Failure:
-        """Adjust the points; without gross errors where these explain what is left, unless told."""
-        done = self._adjusted(measured, wrong)
+    def _decided(
+        self, done: Calibrated | Failure, measured: dict[str, ImagePoints], wrong: Misnamed | None
+    ) -> Calibrated | Failure:
+        """What was adjusted from the points; without gross errors where these explain what is left."""
         if isinstance(done, Failure) or self.options.reject is not None:
             return done
         causes = done.explanation.causes
@@ -289,7 +292,7 @@ class _Job:
                 return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
             return found
         # What was not chosen may yet be there.
-        found = replace(found, considers=bool(choices))
+        found = replace(found, rivals=tuple(each.rivals for each in choices.values()) or None)
         calibrated = Calibrated(found, measured, self.declined, choices, board, notes, wrong)
         loose = _without_scale(calibrated.result)
         return calibrated if loose is None else loose

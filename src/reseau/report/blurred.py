@@ -13,7 +13,6 @@ from ..measure.blurred.measure import BlurredResult
 from ..optics.formation import PixelResponse
 from ..optics.lenses import PupilElements, RayMap, ray_image
 from ..optics.lenses.images import PlaneTarget
-from ..optics.lenses.surrogate import RaySurrogate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -58,8 +57,7 @@ def blurred_figure(
     k = int(np.argmax(blur)) if name is None else found.ids.index(name)
     if not found.ok[k]:
         raise UsageError(f"{found.ids[k]} was not measured: {found.why[k]}", where=found.image)
-    elements = camera.elements if isinstance(camera, RaySurrogate) else PupilElements.gauss(_RINGS)
-    target, xy = targets[k], found.xy[k]
+    elements, target, xy = PupilElements.gauss(_RINGS), targets[k], found.xy[k]
     image = ray_image(camera, target, elements)
     half = int(np.abs(image.outline.xy).max()) + 6
     columns, rows = (np.rint(at) + np.arange(-half, half + 1.0) for at in xy)

@@ -19,7 +19,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from reseau.core.errors import ArchiveError, UsageError
 from reseau.service.accounts import Accounts, one_time_code
-from reseau.service.http import guard, patience
+from reseau.service.http import app, guard
 from reseau.service.http.app import create_app
 from reseau.service.http.options import ServeOptions
 from reseau.service.http.service import Service
@@ -194,8 +194,8 @@ def test_the_body_of_a_request_is_not_read_for_nobody(one: Served) -> None:
 def test_requests_that_arrive_too_slowly_and_connections_without_any_are_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(patience, "_HEAD_S", 0.5)
-    monkeypatch.setattr(patience, "_MOST_WAITING", 5)
+    monkeypatch.setattr(app, "_HEAD_S", 0.5)
+    monkeypatch.setattr(app, "_MOST_WAITING", 5)
     monkeypatch.setattr(guard, "_BODY_S", 0.5)
     found: list[bytes] = []
     with served(tmp_path) as one, running(one) as port:
@@ -223,7 +223,7 @@ def test_requests_that_arrive_too_slowly_and_connections_without_any_are_closed(
 def test_connections_whose_answers_are_not_read_are_closed_and_keep_nobody_from_being_served(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(patience, "_MOST_WAITING", 5)
+    monkeypatch.setattr(app, "_MOST_WAITING", 5)
     with served(tmp_path) as one, running(one) as port:
         asked = f"GET /login HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode()
         held = []
@@ -269,7 +269,7 @@ def running(one: Served) -> Iterator[int]:
         port = sock.getsockname()[1]
         object.__setattr__(one.service.options, "port", port)
         config = uvicorn.Config(
-            create_app(one.service), http=patience.PatientProtocol, log_config=None, lifespan="off",
+            create_app(one.service), http=app.PatientProtocol, log_config=None, lifespan="off",
             timeout_keep_alive=300,
         )  # fmt: skip
         server = uvicorn.Server(config)

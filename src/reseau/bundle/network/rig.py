@@ -7,7 +7,7 @@ the rig, a rotation R_c and a projection centre b_c in the axes of the rig, so t
 
 The rig has the axes of its first camera; where cameras never share an exposure with it, directly or by
 others, they form a rig of their own. The adjustment is described in
-:mod:`reseau.bundle.solver.rig_constraints`.
+:mod:`reseau.bundle.solver.constraints`.
 """
 
 from __future__ import annotations

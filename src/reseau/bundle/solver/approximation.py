@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -17,9 +18,8 @@ from ...optics.refraction.windows import Refraction
 from ..network.network import Network, finite
 from .datum import similarity_onto
 from .intersection import Rays
-from .parallel import resect_parallel
-from .pushbroom import resect_line
 from .spatial import (
+    Resection,
     behind_ports,
     directions,
     field_of,
@@ -29,6 +29,168 @@ from .spatial import (
     resect_through,
 )
 from .values import Values
+
+# Points are in a plane where their extent across it is this part of the largest.
+_FLAT = 1e-4
+# Distance of the camera from the points, in their largest extent: any would do.
+_AWAY = 3.0
+# Subsets of four points that are tried, and points that are consistent with the best one at least.
+_TRIES, _FEWEST = 200, 4
+
+
+def resect_parallel(xyz: Array, uv: Array, tolerance: float) -> Resection | None:
+    """Compute the pose of an image with parallel rays from the largest consistent set of points.
+
+    An affine mapping of the points to the image is fitted; the nearest scaled orthographic projection has the
+    rotation (Huang & Lee 1989). The scale is not used: the magnification may be known roughly only. Points in
+    a plane leave two rotations, mirrored at the image plane, that no single image tells apart; one is
+    returned. The distance along the axis is not determined; it is three times the extent of the points.
+
+    Parameters
+    ----------
+    xyz : ndarray (k, 3)
+        Object points.
+    uv : ndarray (k, 2)
+        xc, yc of their rays.
+    tolerance : float
+        Largest misfit of a consistent point, in the extent of the image points.
+
+    Returns
+    -------
+    Resection or None
+        None where fewer than four points are consistent.
+
+    Examples
+    --------
+    >>> xyz = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], dtype=float)
+    >>> found = resect_parallel(xyz, xyz[:, 1::-1] * [1, -1], 0.01)
+    >>> found.rotation.round(6) + 0.0
+    array([[ 0.,  1.,  0.],
+           [-1.,  0.,  0.],
+           [ 0.,  0.,  1.]])
+    """
+    size = float(np.ptp(uv, axis=0).max()) or 1.0
+    agree = _consistent(xyz, uv, tolerance * size)
+    if agree is None:
+        return None
+    centre, middle = xyz[agree].mean(axis=0), uv[agree].mean(axis=0)
+    _, extent, axes = np.linalg.svd(xyz[agree] - centre)
+    flat = extent[2] <= _FLAT * extent[0]
+    if extent[1] <= _FLAT * extent[0]:
+        return None
+    used = axes[:2] if flat else axes
+    affine = np.linalg.lstsq((xyz[agree] - centre) @ used.T, uv[agree] - middle, rcond=None)[0].T
+    if flat:
+        # U diag(1, cos τ) Vᵀ of a plane tilted by τ; across it, sin τ of one sign or the other.
+        u, s, vt = np.linalg.svd(affine)
+        tilt = u @ np.array([0.0, np.sqrt(max(0.0, 1.0 - (s[1] / s[0]) ** 2))])
+        two = np.column_stack([u @ np.diag([1.0, s[1] / s[0]]) @ vt, tilt]) @ axes
+    else:
+        u, _, vt = np.linalg.svd(affine, full_matrices=False)
+        two = (u @ vt) @ axes
+    rotation = np.vstack([two, np.cross(two[0], two[1])])
+    x0 = centre - rotation.T @ [*middle, _AWAY * max(float(np.ptp(xyz, axis=0).max()), size)]
+    return Resection(rotation, x0, agree)
+
+
+def _consistent(xyz: Array, uv: Array, limit: float) -> Mask | None:
+    """Points (k,) that agree with the affine mapping of most of them."""
+    design = np.column_stack([xyz - xyz.mean(axis=0), np.ones(len(xyz))])
+
+    def fits(rows: Rows | Mask) -> Mask:
+        mapping = np.linalg.lstsq(design[rows], uv[rows], rcond=1e-9)[0]
+        return np.asarray(np.linalg.norm(design @ mapping - uv, axis=1) < limit)
+
+    best = fits(np.ones(len(xyz), dtype=bool))
+    if not best.all():
+        rng = np.random.default_rng(0)
+        for _ in range(_TRIES):
+            agree = fits(rng.choice(len(xyz), min(5, len(xyz)), replace=False))
+            if agree.sum() > best.sum():
+                best = agree
+    if best.sum() < _FEWEST:
+        return None
+    again = fits(best)
+    return again if again.sum() >= _FEWEST else None
+
+
+# Smallest singular value of the equations, relative to the largest, with which they have one solution only.
+_RANK = 1e-6
+# Six points give eleven equations for the quotient and six for the lines.
+_LEAST = 6
+
+
+class Pushbroom(NamedTuple):
+    """Rotation (3, 3), projection centre (3,) at time 0, and velocity (3,) along the axes of the camera."""
+
+    rotation: Array
+    x0: Array
+    velocity: Array
+
+
+def resect_line(xyz: Array, u: Array, t: Array) -> Pushbroom | None:
+    """Compute the pose and the velocity of a line camera that moves straight, from known points.
+
+    A point is seen when it is in the plane of the line: with (a, b, c) = R(X − X0), at the time t = b/vy, and
+    there u = (a − vx·t)/(c − vz·t). So t is linear in X, and u is a quotient of linear functions: both follow
+    from linear equations (Gupta & Hartley 1997, sect. 4). Here u is known, as the camera is, and the twelve
+    numbers give R, X0 and v in closed form.
+
+    Parameters
+    ----------
+    xyz : ndarray (k, 3)
+        Points, at least six, not in one plane.
+    u : ndarray (k,)
+        Ideal directions along the line.
+    t : ndarray (k,)
+        Times of the lines on which the points are seen.
+
+    Returns
+    -------
+    Pushbroom or None
+        None where the points do not determine it.
+
+    Examples
+    --------
+    >>> xyz = np.random.default_rng(1).uniform(-1, 1, (8, 3))
+    >>> found = resect_line(xyz, xyz[:, 0] / (xyz[:, 2] + 5.0), xyz[:, 1] / 0.5)
+    >>> found.x0.round(6) + 0.0, found.velocity.round(6) + 0.0
+    (array([ 0.,  0., -5.]), array([0. , 0.5, 0. ]))
+    """
+    centre = xyz.mean(axis=0)
+    size = float(np.abs(xyz - centre).max()) or 1.0
+    x = (xyz - centre) / size
+    if len(x) < _LEAST:
+        return None
+    design = np.column_stack([x, np.ones(len(x))])
+    singular = np.linalg.svd(design, compute_uv=False)
+    if singular[-1] < _RANK * singular[0]:
+        return None
+    line = np.linalg.lstsq(design, t, rcond=None)[0]
+    # a − vx·t − u·(c − vz·t) = 0, homogeneous in eight numbers.
+    _, singular, vt = np.linalg.svd(np.column_stack([design, -u[:, None] * design]))
+    if singular[-2] < _RANK * singular[0] or not np.linalg.norm(line[:3]) > 0:
+        return None
+    above, below = vt[-1, :4], vt[-1, 4:]
+    speed = 1.0 / np.linalg.norm(line[:3])
+    y = speed * line[:3]
+    # Above and below are r1 − (vx/vy) r2 and r3 − (vz/vy) r2, times a factor of either sign.
+    z = below[:3] - (below[:3] @ y) * y
+    factor = np.linalg.norm(z)
+    if not factor > 0:
+        return None
+    # Points are in front of the camera.
+    if np.median(design @ below) < 0:
+        above, below, z = -above, -below, -z
+    above, below, z = above / factor, below / factor, z / factor
+    rotation = np.stack([np.cross(y, z), y, z])
+    velocity = speed * np.array([-(above[:3] @ y), 1.0, -(below[:3] @ y)])
+    # The constants are those of −R X0.
+    shift = np.array([0.0, speed * line[3], 0.0])
+    shift[0] = above[3] + velocity[0] * line[3]
+    shift[2] = below[3] + velocity[2] * line[3]
+    return Pushbroom(rotation, centre - size * (rotation.T @ shift), size * velocity)
+
 
 # Largest misfit of a direction (rad) that is not a gross error while distortion and principal distance are
 # only roughly known.

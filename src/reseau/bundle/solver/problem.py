@@ -47,8 +47,6 @@ from .system import System, residuals
 from .unknowns import Unknowns
 from .values import Values
 
-# Options of the dense engine that this solver does not support, and their defaults.
-_UNSUPPORTED, _DEFAULTS = ("method", "curvature", "rank_tolerance", "check_jacobian"), AdjustOptions()
 # Initial damping, relative to the diagonal of the normal equations.
 _DAMPING = 1e-5
 # Maximum number of rounds in which points that diverge to infinity are left out.
@@ -231,13 +229,8 @@ class BundleProblem(Display):
             return self._adjusted(
                 AdjustOptions(max_iterations=self.max_iterations, tolerance=self.tolerance, damping=_DAMPING)
             )
-        for name in _UNSUPPORTED:
-            if getattr(options, name) != getattr(_DEFAULTS, name):
-                raise UsageError(
-                    f"is not supported by the bundle adjustment: {getattr(options, name)!r}",
-                    where=f"Options.{name}",
-                    do="use its default",
-                )
+        if options.rank_tolerance is not None:
+            raise UsageError("is not supported by the bundle adjustment", where="Options.rank_tolerance")
         return self._adjusted(options)
 
     def approached(self, max_iterations: int) -> Values | None:

@@ -19,7 +19,6 @@ from ...core.failure import Code, Failure, Remark
 from ...optics.formation import Outline, PixelResponse
 from ...optics.lenses import PupilElements, RayMap, ray_image
 from ...optics.lenses.images import PlaneTarget, RayImage, ray_images
-from ...optics.lenses.surrogate import RaySurrogate
 from ..matching import Matches, match, with_alike_errors
 from ..matching.patches import MatchOptions
 from ..mosaic import balanced
@@ -144,7 +143,7 @@ class BlurredResult(Measured):
     varied, varied_sigma : ndarray (n, p)
         Estimates of varied parameters of the optics, and their standard deviations.
     rings : int
-        Rings of elements of the stop that were used; 0 for those of a surrogate.
+        Rings of elements of the stop that were used.
     misfit : float
         Residuals of the targets, in means over 3×3 pixels, ÷ those beside them, both in units of the noise of
         their grey values: about 1 where they are like their images; NaN if none was measured.
@@ -217,7 +216,7 @@ def measure_blurred(
     ----------
     frame : Frame
     camera : RayMap
-        The lens with its sensor, a surrogate or a stand-in of it.
+        The lens with its sensor, or a stand-in of it.
     ids : sequence of str (n,)
         Names of the targets.
     targets : sequence of PlaneTarget (n,)
@@ -538,7 +537,7 @@ class Run:
         return (Remark(text, Code.INCONSISTENT),)
 
     def _images(self) -> tuple[int, PupilElements, list[RayImage | None]]:
-        """Rings of elements of the stop (0: of a surrogate), these elements, and images of all targets.
+        """Rings of elements of the stop, these elements, and images of all targets.
 
         As many rings that more of them no longer change the images of the most critical targets within the
         noise.
@@ -547,8 +546,6 @@ class Run:
         def images(elements: PupilElements) -> list[RayImage | None]:
             return self._imaged(range(len(self.ids)), elements)
 
-        if isinstance(self.camera, RaySurrogate):
-            return 0, self.camera.elements, images(self.camera.elements)
         rings = self.options.rings or RINGS[0]
         elements = PupilElements.gauss(rings)
         found = images(elements)

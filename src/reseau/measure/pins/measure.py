@@ -3,23 +3,278 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from ...core.data import Array, Frame, Mask, Rows
 from ...core.errors import UsageError
 from ...core.failure import Code, Failure, Remark
 from ...io import ReseauDesign, ReseauMeasurement
+from ...optics.field import SmoothField, trend_degree
+from ..marks.judging import robust_spread
 from ..points import Measured, Reason, deviating
-from .assignment import assign
 from .detection import PinDetections, PinOptions, find_pins
-from .segments import cut_segments
 from .wires import Layout, LayoutOptions, Wires, lay_wires
 
 if TYPE_CHECKING:
     from ...core.overlay import Layer
+
+
+_GROSS = 0.05
+"""Share of rods beside whose place something else is seen."""
+_ROUNDS = 12
+"""Rounds of fitting the field and assigning echoes with it; usually six suffice."""
+_FEWEST = 5
+"""Minimum number of rods that test a field."""
+_LOCAL = 20
+"""Minimum number of rods from which a field is more than a polynomial."""
+
+
+@dataclass
+class Assignment:
+    """Echoes of rods, and the field that they show.
+
+    Parameters
+    ----------
+    row : ndarray of int (n,)
+        Index of the echo of each rod, -1 where there is none.
+    predicted : ndarray (n, 2)
+        Places of the rods in the image.
+    deviation : ndarray (n, 2)
+        Echo minus its prediction by all other rods; NaN where there is none.
+    excluded : dict of int to float
+        Rods beside whose place something else is seen, and its distance, pixels.
+    """
+
+    row: Rows
+    predicted: Array
+    deviation: Array
+    excluded: dict[int, float] = field(default_factory=dict)
+
+
+def assign(
+    source: Array, xy: Array, cov: Array, row: Rows, predicted: Array, gate_px: float, tolerance_px: Array
+) -> Assignment:
+    """Assign echoes to rods.
+
+    Parameters
+    ----------
+    source : ndarray (n, 2)
+        Rods in the design.
+    xy, cov : ndarray (m, 2), (m, 2, 2)
+        Echoes.
+    row, predicted : ndarray (n,), (n, 2)
+        First assignment, -1 for none, and first places of the rods.
+    gate_px : float
+        Search distance.
+    tolerance_px : ndarray (n,)
+        Standard deviation of each rod in the design, in pixels.
+
+    Examples
+    --------
+    A rod whose echo is hidden does not take what lies 12 px beside its place:
+
+    >>> rods = np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), axis=-1).reshape(-1, 2) * 100
+    >>> echoes = rods + 0.00002 * rods**2
+    >>> echoes[7] += [0.0, 12.0]
+    >>> cov, none = np.tile(0.01 * np.eye(2), (20, 1, 1)), np.zeros(20)
+    >>> found = assign(rods, echoes, cov, np.arange(20), rods, 20.0, none)
+    >>> np.flatnonzero(found.row < 0), round(found.excluded[7])
+    (array([7]), 12)
+    """
+    found = Assignment(row.copy(), predicted, np.full(source.shape, np.nan))
+    own = np.sqrt(np.trace(cov, axis1=1, axis2=2) / 2)
+    sigma, degree, before = gate_px / 2, 1, (-1, row)
+    for _ in range(_ROUNDS):
+        has = np.flatnonzero(found.row >= 0)
+        if len(has) < _FEWEST:
+            return found
+        degree = max(1, min(degree, trend_degree(len(has)), 3))
+        trend = SmoothField.fit(source[has], xy[found.row[has]], degree=degree, local=False)
+        found.predicted = trend(source)
+        rest = xy[found.row[has]] - found.predicted[has]
+        free = 1 - (degree + 1) * (degree + 2) / 2 / len(has)
+        scatter = robust_spread(rest, 0.0) / np.sqrt(max(free, 0.1))
+        sigma = max(scatter, float(np.median(own[found.row[has]])), sigma / 2)
+        found.row = _likeliest(found.predicted, xy, cov, np.full(len(source), sigma), gate_px, tolerance_px)
+        if degree == before[0] and (found.row == before[1]).all() and sigma <= 2 * scatter:
+            break
+        before, degree = (degree, found.row), degree + 1
+    _settled(found, source, xy, cov, gate_px, tolerance_px)
+    others = xy[np.setdiff1d(np.arange(len(xy)), found.row)]
+    for rod in np.flatnonzero(found.row < 0):
+        off = np.hypot(*(others - found.predicted[rod]).T)
+        if len(off) and off.min() < gate_px:
+            found.excluded[int(rod)] = float(off.min())
+    return found
+
+
+def _settled(
+    found: Assignment, source: Array, xy: Array, cov: Array, gate_px: float, tolerance_px: Array
+) -> None:
+    """Assign with the field of all others, which is more than a polynomial."""
+    for _ in range(_ROUNDS):
+        has = np.flatnonzero(found.row >= 0)
+        if len(has) < _FEWEST:
+            return
+        degree = max(1, min(3, trend_degree(len(has))))
+        smooth = SmoothField.fit(source[has], xy[found.row[has]], degree=degree, local=len(has) >= _LOCAL)
+        found.predicted = smooth(source)
+        found.deviation[:] = np.nan
+        found.deviation[has], spread = smooth.leave_one_out()
+        wide = np.sqrt((spread**2).mean(axis=1))
+        worst = _worst(found.deviation[has], cov[found.row[has]], wide, gate_px, tolerance_px[has])
+        if worst >= 0:
+            found.row[has[worst]] = -1
+            found.deviation[has[worst]] = np.nan
+            continue
+        scatter = np.full(len(source), np.quantile(wide, 0.9))
+        scatter[has] = wide
+        again = _likeliest(found.predicted, xy, cov, scatter, gate_px, tolerance_px)
+        gained = (found.row < 0) & (again >= 0) & ~np.isin(again, found.row)
+        if not gained.any():
+            return
+        found.row[gained] = again[gained]
+
+
+def _worst(deviation: Array, cov: Array, sigma: Array, gate_px: float, tolerance_px: Array) -> int:
+    """The rod that is most likely a gross error; -1 for none."""
+    total = cov + (sigma**2 + tolerance_px**2)[:, None, None] * np.eye(2)
+    odds = _misfit(deviation, total) - _limit(total, gate_px)
+    return int(odds.argmax()) if odds.max() > 0 else -1
+
+
+def _likeliest(
+    predicted: Array, xy: Array, cov: Array, sigma: Array, gate_px: float, tolerance_px: Array
+) -> Rows:
+    """The echoes (n,) of the rods with the largest likelihood of all, -1 for none."""
+    row = np.full(len(predicted), -1)
+    off = xy[None] - predicted[:, None]
+    near = np.hypot(off[..., 0], off[..., 1]) < gate_px
+    rods, echoes = np.nonzero(near)
+    if not len(rods):
+        return row
+    total = cov[echoes] + (sigma[rods] ** 2 + tolerance_px[rods] ** 2)[:, None, None] * np.eye(2)
+    gain: Array = np.zeros(near.shape)
+    gain[rods, echoes] = np.maximum(_limit(total, gate_px) - _misfit(off[rods, echoes], total), 0)
+    mine, theirs = scipy.optimize.linear_sum_assignment(-gain)
+    taken: Mask = gain[mine, theirs] > 0
+    row[mine[taken]] = theirs[taken]
+    return row
+
+
+def _misfit(off: Array, cov: Array) -> Array:
+    """Half of the weighted squares of offsets (k, 2)."""
+    return np.asarray(0.5 * np.einsum("ki,ki->k", off, np.linalg.solve(cov, off[..., None])[..., 0]))
+
+
+def _limit(cov: Array, gate_px: float) -> Array:
+    """The same (k,) from which anything within the search distance is as likely."""
+    share = (1 - _GROSS) / _GROSS * gate_px**2 / (2 * np.sqrt(np.linalg.det(cov)))
+    return np.asarray(np.log(np.maximum(share, 1.0)))
+
+
+_BEYOND = 0.05
+"""A wire may be seen beyond the ends of its segment by this share of its length: its design is not exact. Its
+uncertainty may add as much again."""
+_CLEARER = 3.0
+"""Factor by which another echo must be farther from a segment than the one that is taken."""
+_LEAST = 4
+"""Minimum number of points that test an affinity; three define one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cuts:
+    """Echoes on segments, in columns.
+
+    Parameters
+    ----------
+    row : ndarray of int (k,)
+        Index of the echo on each segment, -1 where there is none.
+    share, sigma : ndarray (k,)
+        Position of the echo on the segment, 0 at its start and 1 at its end, and its standard deviation; NaN
+        where there is none.
+    ends : ndarray (k, 2, 2)
+        Ends of the segments in the image; NaN if their places are unknown.
+    why : tuple of str (k,)
+        Why a segment has no echo; empty where it has one.
+    """
+
+    row: Rows
+    share: Array
+    sigma: Array
+    ends: Array
+    why: tuple[str, ...]
+
+
+def cut_segments(
+    segments: Array, xy: Array, cov: Array, source: Array, target: Array, gate_px: float
+) -> Cuts:
+    """Assign echoes to segments, and determine the shares at which they are cut.
+
+    Parameters
+    ----------
+    segments : ndarray (k, 2, 2)
+        Ends of the segments in the plane of the design.
+    xy, cov : ndarray (m, 2), (m, 2, 2)
+        Echoes that belong to no point of the design (px, px²).
+    source, target : ndarray (f, 2)
+        Points of the design that were found, and their echoes (px).
+    gate_px : float
+        Largest distance of an echo from its segment.
+
+    Examples
+    --------
+    >>> source = np.array([[0.0, 0.0], [30.0, 0.0], [0.0, 15.0], [30.0, 15.0]])
+    >>> segment, echo = np.array([[[0.0, 0.0], [30.0, 0.0]]]), np.array([[36.0, 0.2]])
+    >>> cuts = cut_segments(segment, echo, 1e-4 * np.eye(2)[None], source, 3 * source, 5.0)
+    >>> cuts.row, cuts.share.round(3)
+    (array([0]), array([0.4]))
+    """
+    count = len(segments)
+    none = np.full(count, np.nan)
+    row = np.full(count, -1)
+    if len(source) < _LEAST:
+        unknown = Reason(f"fewer than {_LEAST} parallel wires determine its place", Code.TOO_FEW_POINTS)
+        return Cuts(row, none, none, np.full((count, 2, 2), np.nan), (unknown,) * count)
+    design = np.column_stack([source, np.ones(len(source))])
+    inverse = np.linalg.pinv(design)
+    matrix = np.asarray(inverse @ target)
+    rest = target - design @ matrix
+    scatter = float((rest**2).sum() / (2 * (len(source) - 3)))
+    ends = segments @ matrix[:2] + matrix[2]
+    along = ends[:, 1] - ends[:, 0]
+    length = np.hypot(*along.T)
+    unit = along / length[:, None]
+    offset = xy[None] - ends[:, :1]
+    share = (offset * unit[:, None]).sum(axis=-1) / length[:, None]
+    across = np.abs(offset[..., 0] * unit[:, None, 1] - offset[..., 1] * unit[:, None, 0])
+    # The points tell how well an echo agrees with the affinity, in x and y alike; the point predicted on the
+    # segment is that much less certain.
+    at = segments[:, :1] + share[..., None] * (segments[:, 1] - segments[:, 0])[:, None]
+    lever = np.concatenate([at, np.ones((*at.shape[:2], 1))], axis=-1) @ inverse
+    own = np.einsum("ki,mij,kj->km", unit, cov, unit)
+    sigma = np.sqrt(np.maximum(own, scatter) + scatter * (lever**2).sum(axis=-1)) / length[:, None]
+    beyond = np.abs(share - np.clip(share, 0, 1)) > _BEYOND + np.minimum(3 * sigma, _BEYOND)
+    cost = np.where(beyond | (across > gate_px), 2.0, across / gate_px)
+    why = Reason("no echo on its segment", Code.NOT_FOUND).repeated(count)
+    mine, theirs = scipy.optimize.linear_sum_assignment(cost) if xy.size else (row[:0], row[:0])
+    for wire, echo in zip(mine, theirs, strict=True):
+        if cost[wire, echo] > 1:
+            continue
+        others = np.setdiff1d(np.flatnonzero(cost[wire] <= 1), theirs)
+        if len(others) and cost[wire, others].min() < _CLEARER * max(float(cost[wire, echo]), 0.1):
+            why[wire] = Reason(f"{len(others) + 1} echoes lie on its segment", Code.AMBIGUOUS)
+            continue
+        row[wire], why[wire] = echo, ""
+    found = row >= 0
+    taken = (np.flatnonzero(found), row[found])
+    picked, spread = none.copy(), none.copy()
+    picked[found], spread[found] = share[taken], sigma[taken]
+    return Cuts(row, picked, spread, ends, tuple(why))
 
 
 _AMBIGUOUS = Remark(

@@ -86,12 +86,6 @@ class Converted(Display):
         """The largest difference."""
         return float(np.hypot(*self.difference.T).max())
 
-    @property
-    def worst_xy(self) -> Array:
-        """Where the largest difference is (2,), pixels."""
-        worst: Array = self.xy[int(np.hypot(*self.difference.T).argmax())]
-        return worst
-
     def covariance(self, names: Sequence[str], covariance: ArrayLike) -> Array:
         """Covariance of the parameters that were estimated, from that of parameters of the original.
 

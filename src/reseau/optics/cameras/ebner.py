@@ -12,7 +12,7 @@ from ...core.compiled import kernel
 from ...core.data import Array
 from ...core.errors import UsageError
 from ..mapping import Derivatives, PlaneMapping, as_points, as_values
-from .kernels import CameraColumns
+from .kernels import CameraColumns, corrected
 from .registry import AdditionalModel, register_additional
 
 
@@ -56,24 +56,7 @@ class EbnerCorrection(PlaneMapping):
 
     def derivatives(self, xy: ArrayLike) -> Derivatives:
         """See :meth:`PlaneMapping.derivatives`."""
-        points = as_points(xy)
-        x, y = points.T
-        k, m = 2 * self.base_mm**2 / 3, 4 * self.base_mm**2 / 3
-        s, t = x * x - k, y * y - k
-        d = np.zeros((len(points), 2, 12))
-        d[:, 0] = np.stack(
-            [x, y, m - 2 * x * x, x * y, t, 0 * x, x * t, 0 * x, y * s, 0 * x, s * t, 0 * x], 1
-        )
-        d[:, 1] = np.stack(
-            [-y, x, x * y, m - 2 * y * y, 0 * x, s, 0 * x, y * s, 0 * x, x * t, 0 * x, s * t], 1
-        )
-        b = self.values
-        d_xy = np.empty((len(points), 2, 2))
-        d_xy[:, 0, 0] = b[0] - 4 * b[2] * x + b[3] * y + b[6] * t + 2 * b[8] * x * y + 2 * b[10] * x * t
-        d_xy[:, 0, 1] = b[1] + b[3] * x + 2 * b[4] * y + 2 * b[6] * x * y + b[8] * s + 2 * b[10] * s * y
-        d_xy[:, 1, 0] = b[1] + b[2] * y + 2 * b[5] * x + 2 * b[7] * x * y + b[9] * t + 2 * b[11] * x * t
-        d_xy[:, 1, 1] = -b[0] + b[2] * x - 4 * b[3] * y + b[7] * s + 2 * b[9] * x * y + 2 * b[11] * s * y
-        return Derivatives(points + d @ b, d_xy + np.eye(2), d)
+        return corrected(_ebner, self.values, self.base_mm, 0, as_points(xy))
 
 
 B1, B2, B3, B4, B5, B6, B7, B8, B9, B10, B11, B12 = range(len(EbnerCorrection.names))

@@ -14,7 +14,7 @@ from ...core.compiled import kernel
 from ...core.data import Array
 from ..mapping import Derivatives, PlaneMapping, as_points, as_values
 from .grid import PixelGrid
-from .kernels import CameraColumns
+from .kernels import CameraColumns, evaluated
 from .opencv import OpenCV
 from .registry import CameraModel, Parameter, register_camera
 
@@ -66,11 +66,7 @@ class LineScan(PlaneMapping):
 
     def derivatives(self, xy: ArrayLike) -> Derivatives:
         """See :meth:`PlaneMapping.derivatives`."""
-        seen = self._frame.derivatives(as_points(xy))
-        d = np.zeros((*seen.value.shape, len(PARAMETERS)))
-        for own, column in zip(_OPENCV, np.moveaxis(seen.d_parameters, 2, 0), strict=True):
-            d[:, :, own] += column
-        return Derivatives(seen.value, seen.d_xy, d)
+        return evaluated(_line_scan, self.values, as_points(xy))
 
     def one_to_one(self, xy: ArrayLike) -> Any:
         """See :meth:`PlaneMapping.one_to_one`."""

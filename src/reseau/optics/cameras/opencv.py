@@ -9,14 +9,13 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.polynomial import polynomial as poly
-from numpy.typing import ArrayLike
 
 from ...core.compiled import kernel
 from ...core.data import Array
 from ...core.errors import UsageError
-from ..mapping import Derivatives, as_points, as_values
+from ..mapping import Derivatives, as_values
 from .grid import PixelGrid
-from .kernels import CameraColumns
+from .kernels import CameraColumns, either, evaluated
 from .radial import Radial, first_root
 from .registry import CameraModel, Parameter, register_camera
 
@@ -134,82 +133,11 @@ class OpenCV(Radial):
         growth = poly.polyadd(poly.polymul(n, m), poly.polymulx(2 * cross))
         return first_root(growth, m)
 
-    def _distorted(self, xy: Array) -> tuple[Array, Array, Array, Array]:
-        """Distorted direction, its derivatives by the direction, 1/m and q."""
-        p1, p2 = self.values[6:8]
-        u, v = xy[:, 0], xy[:, 1]
-        s = u * u + v * v
-        n, m = self._quotient
-        with np.errstate(divide="ignore", invalid="ignore"):
-            one_by_m = 1 / poly.polyval(s, m)
-            q = poly.polyval(s, n) * one_by_m
-            by_s = 2 * (poly.polyval(s, poly.polyder(n)) - q * poly.polyval(s, poly.polyder(m))) * one_by_m
-        value = np.stack(
-            [
-                u * q + 2 * p1 * u * v + p2 * (s + 2 * u * u),
-                v * q + p1 * (s + 2 * v * v) + 2 * p2 * u * v,
-            ],
-            axis=1,
-        )
-        d_xy = np.empty((len(xy), 2, 2))
-        d_xy[:, 0, 0] = q + u * u * by_s + 2 * p1 * v + 6 * p2 * u
-        d_xy[:, 0, 1] = d_xy[:, 1, 0] = u * v * by_s + 2 * p1 * u + 2 * p2 * v
-        d_xy[:, 1, 1] = q + v * v * by_s + 6 * p1 * v + 2 * p2 * u
-        if len(self.values) == _FULL:
-            s1, s2, s3, s4 = self.values[S1:TAU_X]
-            value += np.stack([s * (s1 + s * s2), s * (s3 + s * s4)], axis=1)
-            by = 2 * np.stack([s1 + 2 * s * s2, s3 + 2 * s * s4], axis=1)
-            d_xy += by[:, :, None] * xy[:, None, :]
-        return value, d_xy, one_by_m, q
-
-    def _tilted(self, xy: Array) -> tuple[Array, Array, Array]:
-        """Points on the tilted sensor, and their derivatives by the point and by the angles."""
-        sx, sy = np.sin(self.values[TAU_X:])
-        cx, cy = np.cos(self.values[TAU_X:])
-        x, y = xy.T
-        w = sy * x - cy * sx * y + cy * cx
-        w = np.where(w > 0, w, np.nan)[:, None]
-        value = np.stack([cx * x, cy * y - sx * sy * x], axis=1) / w
-        top = np.array([[cx, 0.0], [-sx * sy, cy]])
-        by_xy = (top - value[:, :, None] * [sy, -cy * sx]) / w[:, :, None]
-        by_first = np.stack([-sx * x, -cx * sy * x], axis=1) + value * (cy * (cx * y + sx))[:, None]
-        by_second = np.stack([0 * x, -sx * cy * x - sy * y], axis=1)
-        by_second -= value * (cy * x + sy * (sx * y - cx))[:, None]
-        return value, by_xy, np.stack([by_first, by_second], axis=2) / w[:, :, None]
-
-    def _slope(self, xy: Array) -> tuple[Array, Array]:
-        value, d_xy, *_ = self._distorted(xy)
-        if len(self.values) == _FULL:
-            value, by_xy, _ = self._tilted(value)
-            d_xy = by_xy @ d_xy
-        focal = self.values[:2]
-        return value * focal + self.values[2:4], d_xy * focal[:, None]
-
-    def derivatives(self, xy: ArrayLike) -> Derivatives:
-        """See :meth:`PlaneMapping.derivatives`."""
-        points = as_points(xy)
-        value, d_xy, one_by_m, q = self._distorted(points)
-        focal = self.values[:2]
-        u, v = points[:, 0], points[:, 1]
-        s = u * u + v * v
-        d = np.zeros((len(points), 2, len(self.values)))
-        powers = points[:, :, None] * (np.stack([s, s**2, s**3], axis=1) * one_by_m[:, None])[:, None, :]
-        d[:, :, [4, 5, 8]] = powers * focal[:, None]
-        d[:, 0, 6], d[:, 1, 6] = focal[0] * 2 * u * v, focal[1] * (s + 2 * v * v)
-        d[:, 0, 7], d[:, 1, 7] = focal[0] * (s + 2 * u * u), focal[1] * 2 * u * v
-        if len(self.values) > _PLAIN:
-            d[:, :, 9:12] = -powers * q[:, None, None] * focal[:, None]
-        if len(self.values) == _FULL:
-            d[:, 0, S1], d[:, 0, S2] = focal[0] * s, focal[0] * s * s
-            d[:, 1, S3], d[:, 1, S4] = focal[1] * s, focal[1] * s * s
-            value, by_xy, by_angles = self._tilted(value)
-            d_xy = by_xy @ d_xy
-            # The derivatives are those of pixels: the focal lengths go around the tilt.
-            d = (by_xy * focal[:, None] / focal) @ d
-            d[:, :, TAU_X:] = by_angles * focal[:, None]
-        d[:, [0, 1], [0, 1]] = value
-        d[:, [0, 1], [2, 3]] = 1.0
-        return Derivatives(value * focal + self.values[2:4], d_xy * focal[:, None], d)
+    def _evaluated(self, xy: Array, *, parameters: bool = True) -> Derivatives:
+        count = len(self.values)
+        values = np.pad(self.values, (0, _FULL - count))
+        found = evaluated(_opencv, values, xy, [float(count == _FULL)], parameters=parameters)
+        return found._replace(d_parameters=found.d_parameters[:, :, :count])
 
     def _start(self, xy: Array) -> Array:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -236,7 +164,7 @@ def _sensor(
         sx, cx = np.sin(p[c, TAU_X]), np.cos(p[c, TAU_X])
         sy, cy = np.sin(p[c, TAU_Y]), np.cos(p[c, TAU_Y])
     w = sy * x - cy * sx * y + cy * cx
-    w = 1.0 / w if w > 0.0 else np.nan
+    w = either(w > 0.0, 1.0 / w, np.nan)
     px, py = cx * x * w, (cy * y - sx * sy * x) * w
     fx, fy = p[c, FX], p[c, FY]
     ax, ay = fx * (cx - px * sy) * w, fx * px * cy * sx * w

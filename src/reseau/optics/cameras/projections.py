@@ -14,13 +14,12 @@ from functools import cached_property
 from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ...core.compiled import kernel
 from ...core.data import Array
-from ..mapping import Derivatives, as_points, as_values
+from ..mapping import Derivatives, as_values
 from .grid import PixelGrid
-from .kernels import CameraColumns
+from .kernels import CameraColumns, either, evaluated
 from .radial import Radial, first_root
 from .registry import CameraModel, Parameter, register_camera
 
@@ -81,10 +80,6 @@ class Projected(Radial):
     def _plane(self) -> Array:
         return self.values[SHAPE + len(self.shape_start) :]
 
-    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
-        """g (n,), dg/ds (n,) and the derivatives of g by the shape (n, k); see :meth:`derivatives`."""
-        raise NotImplementedError
-
     def _tangent(self, size: Array) -> Array:
         """Tangents of the angles from the axis at radii (n,) of the plane; NaN where there are none."""
         raise NotImplementedError
@@ -103,41 +98,10 @@ class Projected(Radial):
             r = float(self._tangent(np.array([np.sqrt(t)]))[0])
         return min(r * r, self._limit()) if np.isfinite(r) else self._limit()
 
-    def derivatives(self, xy: ArrayLike) -> Derivatives:
-        """See :meth:`PlaneMapping.derivatives`."""
-        uv = as_points(xy)
-        s = (uv**2).sum(axis=1)
-        with np.errstate(all="ignore"):
-            g, by_s, by_shape = self._projection(np.where(s < self._limit(), s, np.nan))
-        m = uv * g[:, None]
-        x, y = m.T
-        t = x * x + y * y
-        k1, k2, k3, k4, p1, p2, sx1, sy1 = self._plane
-        bend = 1 + t * (k1 + t * (k2 + t * (k3 + t * k4)))
-        by_t = 2 * (k1 + t * (2 * k2 + t * (3 * k3 + t * 4 * k4)))
-        xx, yy, xy2 = t + 2 * x * x, t + 2 * y * y, 2 * x * y
-        image = np.stack(
-            [x * bend + p1 * xy2 + p2 * xx + sx1 * t, y * bend + p1 * yy + p2 * xy2 + sy1 * t], 1
-        )
-        by_m = np.empty((len(uv), 2, 2))
-        cross = x * y * by_t + 2 * p1 * x + 2 * p2 * y
-        by_m[:, 0, 0] = bend + x * x * by_t + 2 * p1 * y + 6 * p2 * x + 2 * sx1 * x
-        by_m[:, 0, 1] = cross + 2 * sx1 * y
-        by_m[:, 1, 0] = cross + 2 * sy1 * x
-        by_m[:, 1, 1] = bend + y * y * by_t + 6 * p1 * y + 2 * p2 * x + 2 * sy1 * y
-        by_uv = g[:, None, None] * np.eye(2) + 2 * by_s[:, None, None] * uv[:, :, None] * uv[:, None, :]
-        focal, count = self.values[:2], len(self.shape_start)
-        d = np.zeros((len(uv), 2, len(self.values)))
-        d[:, [0, 1], [FX, FY]] = image
-        d[:, [0, 1], [CX, CY]] = 1.0
-        along = (by_m @ uv[:, :, None])[:, :, 0] * focal
-        d[:, :, SHAPE : SHAPE + count] = along[:, :, None] * by_shape[:, None, :]
-        plane = d[:, :, SHAPE + count :]
-        plane[:, :, :P1] = (focal * m)[:, :, None] * (t[:, None] ** np.arange(1, 5))[:, None, :]
-        plane[:, 0, P1], plane[:, 1, P1] = focal[0] * xy2, focal[1] * yy
-        plane[:, 0, P2], plane[:, 1, P2] = focal[0] * xx, focal[1] * xy2
-        plane[:, 0, SX1], plane[:, 1, SY1] = focal[0] * t, focal[1] * t
-        return Derivatives(image * focal + self.values[2:4], (by_m @ by_uv) * focal[:, None], d)
+    def _evaluated(self, xy: Array, *, parameters: bool = True) -> Derivatives:
+        inside = np.where(((xy**2).sum(axis=1) < self._limit())[:, None], xy, np.nan)
+        constants = [self.kind, len(self.shape_start)]
+        return evaluated(_projected, self.values, inside, constants, parameters=parameters)
 
     def _start(self, xy: Array) -> Array:
         image = (xy - self.values[2:4]) / self.values[:2]
@@ -178,14 +142,6 @@ class Fisheye(Projected):
     kind: ClassVar[int] = EQUIDISTANT
     names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", *PLANE)
 
-    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
-        near = s < _SMALL
-        r = np.sqrt(np.where(near, 1.0, s))
-        full = np.arctan(r) / r
-        g = np.where(near, 1 - s * (1 / 3 - s * (0.2 - s / 7)), full)
-        by_s = np.where(near, -1 / 3 + s * (0.4 - s * 3 / 7), (1 / (1 + r * r) - full) / (2 * r * r))
-        return g, by_s, np.zeros((len(s), 0))
-
     def _tangent(self, size: Array) -> Array:
         return np.where(size < np.pi / 2, np.tan(size), np.nan)
 
@@ -206,11 +162,6 @@ class Equisolid(Projected):
     kind: ClassVar[int] = EQUISOLID
     names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", *PLANE)
 
-    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
-        h = np.sqrt(1 + s)
-        g = np.sqrt(2 / (h * (h + 1)))
-        return g, -(2 * h + 1) / (2 * h * g * (h * h + h) ** 2), np.zeros((len(s), 0))
-
     def _tangent(self, size: Array) -> Array:
         return np.where(size < np.sqrt(2), np.tan(2 * np.arcsin(size / 2)), np.nan)
 
@@ -230,10 +181,6 @@ class Orthographic(Projected):
     kind: ClassVar[int] = ORTHOGRAPHIC
     names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", *PLANE)
 
-    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
-        g = 1 / np.sqrt(1 + s)
-        return g, -0.5 * g**3, np.zeros((len(s), 0))
-
     def _tangent(self, size: Array) -> Array:
         return size / np.sqrt(1 - size * size)
 
@@ -252,11 +199,6 @@ class Stereographic(Projected):
 
     kind: ClassVar[int] = STEREOGRAPHIC
     names: ClassVar[tuple[str, ...]] = ("fx", "fy", "cx", "cy", *PLANE)
-
-    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
-        h = np.sqrt(1 + s)
-        g = 2 / (1 + h)
-        return g, -1 / (h * (1 + h) ** 2), np.zeros((len(s), 0))
 
     def _tangent(self, size: Array) -> Array:
         return np.where(size < 2, np.tan(2 * np.arctan(size / 2)), np.nan)
@@ -282,11 +224,6 @@ class Omni(Projected):
     def _limit(self) -> float:
         xi = self._shape[0]
         return float(1 / xi**2 - 1) if -1 < xi < 0 else np.inf if xi >= 0 else 0.0
-
-    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
-        xi, h = self._shape[0], np.sqrt(1 + s)
-        g = 1 / (1 + xi * h)
-        return g, -xi * g * g / (2 * h), (-h * g * g)[:, None]
 
     def _tangent(self, size: Array) -> Array:
         xi, t = self._shape[0], size * size
@@ -319,17 +256,6 @@ class DoubleSphere(Projected):
         w1 = alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
         w2 = (w1 + xi) / np.sqrt(2 * w1 * xi + xi * xi + 1)
         return float(1 / w2**2 - 1) if w2 < 0 else np.inf
-
-    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
-        xi, alpha = self._shape
-        h = np.sqrt(1 + s)
-        w = 1 + xi * h
-        far = np.sqrt(s + w * w)
-        g = 1 / (alpha * far + (1 - alpha) * w)
-        by_h = xi / (2 * h)
-        by_s = alpha * (1 + 2 * w * by_h) / (2 * far) + (1 - alpha) * by_h
-        by_xi = h * (alpha * w / far + 1 - alpha)
-        return g, -by_s * g * g, np.stack([-by_xi * g * g, (w - far) * g * g], axis=1)
 
     def _tangent(self, size: Array) -> Array:
         xi, alpha = self._shape
@@ -365,13 +291,6 @@ class EnhancedUnified(Projected):
         d = 1 - 1 / alpha if alpha < 0 else alpha / (alpha - 1) if alpha > 1 else np.inf
         return float((d * d - 1) / beta)
 
-    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
-        alpha, beta = self._shape
-        d = np.sqrt(1 + beta * s)
-        g = 1 / (1 + alpha * (d - 1))
-        by_d = -alpha * g * g / (2 * d)
-        return g, beta * by_d, np.stack([(1 - d) * g * g, s * by_d], axis=1)
-
     def _tangent(self, size: Array) -> Array:
         alpha, beta = self._shape
         t = beta * size * size
@@ -400,12 +319,6 @@ class Division(Projected):
         bend = self._shape[0]
         return float(1 / (4 * bend)) if bend > 0 else np.inf
 
-    def _projection(self, s: Array) -> tuple[Array, Array, Array]:
-        bend = self._shape[0]
-        root = np.sqrt(1 - 4 * bend * s)
-        q = 4 / (root * (1 + root) ** 2)
-        return 2 / (1 + root), bend * q, (s * q)[:, None]
-
     def _tangent(self, size: Array) -> Array:
         return _positive(size, 1 + self._shape[0] * size * size)
 
@@ -427,13 +340,9 @@ def _projected(
     h = np.sqrt(1.0 + s)
     g, by_s, by_a, by_b = 1.0, 0.0, 0.0, 0.0
     if kind == EQUIDISTANT:
-        if s < _SMALL:
-            g = 1.0 - s * (1.0 / 3.0 - s * (0.2 - s / 7.0))
-            by_s = -1.0 / 3.0 + s * (0.4 - s * 3.0 / 7.0)
-        else:
-            r = np.sqrt(s)
-            g = np.arctan(r) / r
-            by_s = (1.0 / (1.0 + s) - g) / (2.0 * s)
+        r = np.sqrt(s)
+        g = either(s < _SMALL, 1.0 - s * (1.0 / 3.0 - s * (0.2 - s / 7.0)), np.arctan(r) / r)
+        by_s = either(s < _SMALL, -1.0 / 3.0 + s * (0.4 - s * 3.0 / 7.0), (1.0 / (1.0 + s) - g) / (2.0 * s))
     elif kind == EQUISOLID:
         g = np.sqrt(2.0 / (h * (h + 1.0)))
         by_s = -(2.0 * h + 1.0) / (2.0 * h * g * (h * h + h) ** 2)
@@ -446,14 +355,14 @@ def _projected(
     elif kind == SPHERE:
         a = p[c, SHAPE]
         below = 1.0 + a * h
-        g = 1.0 / below if below > 0.0 else np.nan
+        g = either(below > 0.0, 1.0 / below, np.nan)
         by_s, by_a = -a * g * g / (2.0 * h), -h * g * g
     elif kind == TWO_SPHERES:
         a, b = p[c, SHAPE], p[c, SHAPE + 1]
         w = 1.0 + a * h
         far = np.sqrt(s + w * w)
         below = b * far + (1.0 - b) * w
-        g = 1.0 / below if below > 0.0 else np.nan
+        g = either(below > 0.0, 1.0 / below, np.nan)
         by_h = a / (2.0 * h)
         by_s = -(b * (1.0 + 2.0 * w * by_h) / (2.0 * far) + (1.0 - b) * by_h) * g * g
         by_a, by_b = -h * (b * w / far + 1.0 - b) * g * g, (w - far) * g * g
@@ -461,13 +370,13 @@ def _projected(
         a, b = p[c, SHAPE], p[c, SHAPE + 1]
         far = np.sqrt(1.0 + b * s) if b > 0.0 else np.nan
         below = 1.0 + a * (far - 1.0)
-        g = 1.0 / below if below > 0.0 else np.nan
+        g = either(below > 0.0, 1.0 / below, np.nan)
         by_b = -a * g * g / (2.0 * far)
         by_s, by_a, by_b = b * by_b, (1.0 - far) * g * g, s * by_b
     else:
         a = p[c, SHAPE]
         inside = 1.0 - 4.0 * a * s
-        root = np.sqrt(inside) if inside > 0.0 else np.nan
+        root = np.sqrt(either(inside > 0.0, inside, np.nan))
         g = 2.0 / (1.0 + root)
         by_s, by_a = a * g * g / root, s * g * g / root
     x, y = u * g, v * g
@@ -509,7 +418,7 @@ def _register(name: str, camera: type[Projected], usual: tuple[str, ...], *, ben
     """Register one of the family; `bends` where the shape is zero without distortion."""
     count = len(camera.shape_start)
     # Focal lengths over those on the axis.
-    scale = 1.0 / float(camera()._projection(np.zeros(1))[0][0])
+    scale = 1.0 / float(camera().derivatives(np.zeros((1, 2))).d_xy[0, 0, 0])
 
     def build(values: Array, grid: PixelGrid, options: Named[str, Any]) -> Projected:
         return camera(values)

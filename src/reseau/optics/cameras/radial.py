@@ -9,7 +9,7 @@ from numpy.polynomial import polynomial as poly
 from numpy.typing import ArrayLike
 
 from ...core.data import Array, Mask
-from ..mapping import PlaneMapping, as_points
+from ..mapping import Derivatives, PlaneMapping, as_points
 
 
 def first_root(*polynomials: ArrayLike) -> float:
@@ -36,6 +36,17 @@ class Radial(PlaneMapping):
         @property
         def fold(self) -> float:
             """Square of the radius at which the image radius stops growing; infinite where it does not."""
+
+    def _evaluated(self, xy: Array, *, parameters: bool = True) -> Derivatives:
+        """Values and derivatives, those by the parameters only where they are wanted."""
+        raise NotImplementedError
+
+    def _slope(self, xy: Array) -> tuple[Array, Array]:
+        return self._evaluated(xy, parameters=False)[:2]
+
+    def derivatives(self, xy: ArrayLike) -> Derivatives:
+        """See :meth:`PlaneMapping.derivatives`."""
+        return self._evaluated(as_points(xy))
 
     def one_to_one(self, xy: ArrayLike) -> Mask:
         """Whether the image radius grows up to these points, and decentering does not fold there, (n,)."""

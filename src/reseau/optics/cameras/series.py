@@ -18,7 +18,7 @@ from ...core.compiled import Kernel, kernel
 from ...core.data import Array
 from ...core.errors import UsageError
 from ..mapping import Derivatives, PlaneMapping, as_points, as_values
-from .kernels import CameraColumns
+from .kernels import CameraColumns, corrected
 from .registry import AdditionalModel, register_additional
 
 # Parameters of the first two degrees of Chebyshev's series, which exclude those of the orientations.
@@ -52,17 +52,6 @@ class _Series(PlaneMapping):
     def names(self) -> tuple[str, ...]:
         """Names of the parameters: a letter and their number."""
         return tuple(f"{self.letter}{k}" for k in range(1, self.count + 1))
-
-    def _fields(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Fields (n, 2, u) at x/b, y/b (n,), and their derivatives by these, (n, 2, u) each."""
-        raise NotImplementedError
-
-    def derivatives(self, xy: ArrayLike) -> Derivatives:
-        """See :meth:`PlaneMapping.derivatives`."""
-        points = as_points(xy)
-        value, by_x, by_y = self._fields(*(points / self.base_mm).T)
-        slope = np.stack([by_x @ self.values, by_y @ self.values], axis=2) / self.base_mm
-        return Derivatives(points + value @ self.values, np.eye(2) + slope, value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +92,13 @@ class ChebyshevCorrection(_Series):
     def count(self) -> int:
         """Number of parameters."""
         return (self.degree + 1) * (self.degree + 2) - 6
+
+    def derivatives(self, xy: ArrayLike) -> Derivatives:
+        """See :meth:`PlaneMapping.derivatives`."""
+        points = as_points(xy)
+        value, by_x, by_y = self._fields(*(points / self.base_mm).T)
+        slope = np.stack([by_x @ self.values, by_y @ self.values], axis=2) / self.base_mm
+        return Derivatives(points + value @ self.values, np.eye(2) + slope, value)
 
     def _fields(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         (tx, dx), (ty, dy) = (_chebyshev(each, self.degree) for each in (x, y))
@@ -162,19 +158,9 @@ class FourierCorrection(_Series):
         """Number of parameters."""
         return 2 * (2 * self.degree + 1) ** 2 - 2
 
-    def _fields(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        out = np.zeros((3, len(x), 2, self.count))
-        k = 0
-        for m in range(self.degree + 1):
-            for n in range(-self.degree if m else 1, self.degree + 1):
-                c, s = np.cos(np.pi * (m * x + n * y)), np.sin(np.pi * (m * x + n * y))
-                for axis in (0, 1):
-                    at = k + 2 * axis
-                    out[0, :, axis, at], out[0, :, axis, at + 1] = c, s
-                    for by, factor in ((1, np.pi * m), (2, np.pi * n)):
-                        out[by, :, axis, at], out[by, :, axis, at + 1] = -factor * s, factor * c
-                k += 4
-        return out[0], out[1], out[2]
+    def derivatives(self, xy: ArrayLike) -> Derivatives:
+        """See :meth:`PlaneMapping.derivatives`."""
+        return corrected(_by_fourier, self.values, self.base_mm, self.degree, as_points(xy))
 
 
 def _chebyshev(x: Array, degree: int) -> tuple[list[Array], list[Array]]:

@@ -133,21 +133,6 @@ class Paraxial:
         return (b / a, 1 / a) if abs(a) > 1e-12 else (np.inf, np.inf)
 
     @cached_property
-    def exit_pupil(self) -> tuple[float, float]:
-        """Position behind the last surface with power, mm (infinite if telecentric), and magnification."""
-        stop, last = self.lens.stop, self._power
-        if last <= stop:
-            between = float(sum(self.distances[last:stop]))
-            return between, 1.0
-        # From the centre of the stop with unit slope, and from unit height with a slope of zero.
-        y, u = (float(part[-1]) for part in self.ray(0.0, 1.0, first=stop, last=last))
-        if abs(u) < 1e-12:
-            return np.inf, np.inf
-        position = -y / u
-        heights, slopes = self.ray(1.0, 0.0, first=stop, last=last)
-        return position, float(heights[-1] + position * slopes[-1])
-
-    @cached_property
     def entrance_pupil_radius(self) -> float:
         """Radius of the entrance pupil, mm.
 
@@ -190,17 +175,3 @@ class Paraxial:
     def principal(self, slope: float) -> tuple[Array, Array]:
         """Heights and slopes at all surfaces of the ray through the centre of the stop."""
         return self.ray(-slope * self.entrance_pupil[0], slope)
-
-    def invariant(self, slope: float, object_distance: float = np.inf) -> Array:
-        """Lagrange invariant n (u ȳ − ū y) behind each surface, (s,): the same at all of them.
-
-        Parameters
-        ----------
-        slope : float
-            Slope of the principal ray in front of the lens.
-        object_distance : float
-            As for :meth:`image_distance`.
-        """
-        y, u = self.marginal(object_distance)
-        y_bar, u_bar = self.principal(slope)
-        return np.asarray(self.indices[1:] * (u * y_bar - u_bar * y))

@@ -8,10 +8,8 @@ gives the solid angle of an element of the stop, and with it the light that pass
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...core.data import Array, Mask
 from ...core.errors import UsageError
@@ -19,8 +17,6 @@ from ..newton import determinant, solve_2x2
 from .paraxial import Paraxial
 from .prescription import Prescription
 from .trace import Rays, Tracer
-
-RayKind = Literal["principal", "marginal", "meridional", "sagittal", "skew"]
 
 _STEPS = 12
 """Largest number of Newton steps."""
@@ -107,43 +103,6 @@ class Aimed:
     rays: Rays
     solid_angle: Array
     found: Mask
-
-
-def labels(pupil: Array, object_xy: Array) -> NDArray[np.str_]:
-    """Name rays by where they pass the stop: principal, marginal, meridional, sagittal, skew.
-
-    Parameters
-    ----------
-    pupil : ndarray (n, 2)
-        Points of the stop, in its radii.
-    object_xy : ndarray (2,)
-        Point of the object, in the axes of the lens: with the axis it spans the meridional plane. For a point
-        on the axis every plane through the axis is meridional.
-
-    Examples
-    --------
-    >>> at = np.array([[0, 0], [0, 1.0], [0, 0.5], [0.5, 0], [0.3, 0.3]])
-    >>> labels(at, np.array([0.0, 10.0])).tolist()
-    ['principal', 'marginal', 'meridional', 'sagittal', 'skew']
-    """
-    away = np.hypot(*object_xy)
-    radius = np.hypot(pupil[:, 0], pupil[:, 1])
-    if away < 1e-12:
-        along, across = radius, np.zeros(len(pupil))
-    else:
-        e = np.asarray(object_xy) / away
-        along, across = pupil @ e, pupil[:, 0] * e[1] - pupil[:, 1] * e[0]
-    near = 1e-9
-    return np.select(
-        [
-            radius < near,
-            (np.abs(across) < near) & (radius > 1 - near),
-            np.abs(across) < near,
-            np.abs(along) < near,
-        ],
-        ["principal", "marginal", "meridional", "sagittal"],
-        "skew",
-    )
 
 
 def aim(lens: Prescription, points: Array, pupil: Array, wavelength_nm: float | None = None) -> Aimed:
