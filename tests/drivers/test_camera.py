@@ -114,6 +114,7 @@ def test_frames_are_bit_exact_with_their_colour_pattern(device: VideoCamera, nam
         coloured |= {each: each for each in ("YUYV", "UYVY", "NV12")}
         assert shot.pattern == coloured.get(name, mosaic)
         assert shot.frame.pixels is shot.pixels
+        assert shot.frame.filters == mosaic
         assert bool(shot.raw) == (name in coloured)
 
 

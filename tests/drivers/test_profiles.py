@@ -95,7 +95,7 @@ def endured(told: dict[str, Any], count: int, seed: int) -> Counter[str]:
         wire.rate = 0.0
         for _ in range(2):  # the first call may find what is left of the last fault
             try:
-                assert fake.screen.shows(scope.screen().data)
+                assert fake.screen.shows(scope.screen(1.0).data)
                 break
             except InstrumentError:
                 fake.reset()

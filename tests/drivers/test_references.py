@@ -95,6 +95,35 @@ def test_a_start_during_a_movement_voids_the_reference(heard: bool) -> None:
         assert table.move("tilt", 10.0).position == 10.0
 
 
+def test_a_start_during_the_search_is_no_end_of_it() -> None:
+    """Without lock the board is Idle after it, as after a search; its banner is lost."""
+    board = GrblBoard(locks=False)
+
+    def lost() -> bytes:
+        board.reset()
+        return b""
+
+    with table_of(board) as table:
+        board.ends = lost
+        with pytest.raises(StateError, match="did not find its reference: the controller has started anew"):
+            table.home("tilt")
+        with pytest.raises(StateError, match="home tilt first"):
+            table.move("tilt", 10.0)
+        table.home("tilt")
+        assert table.move("tilt", 10.0).position == 10.0
+        assert (board.place, board.off) == (10.0, 0.0)
+
+
+def test_a_search_whose_connection_was_lost_is_no_evidence_where_the_controller_does_not_tell() -> None:
+    known = References()
+    known.connected()
+    known.searching("tilt")
+    known.connected()
+    known.found("tilt")
+    assert not known.judged("tilt", None)[0]
+    assert known.judged("tilt", True)[0]
+
+
 @pytest.mark.parametrize("after_ok", [True, False])
 def test_an_alarm_is_named_and_voids_the_reference(after_ok: bool) -> None:
     board = GrblBoard()

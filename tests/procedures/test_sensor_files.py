@@ -23,6 +23,7 @@ from reseau.sensor import Level, SensorSeries, calibrate_sensor
 from reseau_sims.pixels import PixelSensor
 
 from ..io.test_dicom_images import file
+from ..measure.test_mosaic import dng
 
 LIGHT_US = (200.0, 1000.0, 4000.0, 8000.0, 12000.0, 16000.0, 40000.0)
 DARK_US = (200.0, 40000.0)
@@ -209,3 +210,22 @@ def test_a_level_of_one_frame_is_not_used_with_a_note(
     write_image(tmp_path / "light" / "2ms.tif", levels["light", 1000.0][0])
     assert run(["sensor", str(tmp_path)]) == 0
     assert "2ms.tif: not used: the only frame of its exposure" in capsys.readouterr().err
+
+
+def test_raw_files_are_calibrated_without_interpolation(
+    levels: dict[tuple[str, float], Frames],
+    expected: dict[str, float],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The noise of a pixel is its own: interpolated ones have less, and their gain is wrong."""
+    pytest.importorskip("rawpy", reason="no rawpy: pip install reseau[photographs]")
+    for (kind, us), frames in levels.items():
+        (tmp_path / kind).mkdir(exist_ok=True)
+        for number, frame in enumerate(frames):
+            dng(tmp_path / kind / f"{us:g}us-{number}.dng", frame.astype(np.uint16) + 500, black=500)
+    assert run(["sensor", str(tmp_path), "--out", str(tmp_path / "s.json")]) == 0
+    assert "behind colour filters (RGGB)" in capsys.readouterr().err
+    found = Calibration.read(tmp_path / "s.json").parameters
+    for name in ("gain", "read_noise"):
+        assert found[name].value == pytest.approx(expected[name], rel=0.02), name

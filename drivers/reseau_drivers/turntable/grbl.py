@@ -3,7 +3,8 @@
 Source: see :mod:`reseau_drivers.codecs.gcode`. GRBL and FluidNC do not tell whether they have homed: Idle is
 no evidence, because the lock after a start is an option, and ``$X`` opens it. The driver therefore marks a
 GRBL 1.1 that has homed, by the tool number T111, which every start and reset sets to 0 (`gc_init`), and which
-has no other effect. grblHAL tells by the field ``H`` of its status, with a bit for each axis where axes home
+has no other effect; by T112 before a search, so that a start during it is no end of it. grblHAL tells by the
+field ``H`` of its status, with a bit for each axis where axes home
 singly. Others count as homed only in the connection that has homed them. The driver never unlocks by ``$X``.
 Positions are machine positions, which must be reported (``$10=1``) in millimetres (``$13=0``); those of GRBL
 are negative as a rule, and so are the limits of its axes.
@@ -66,7 +67,9 @@ class Grbl:
         self._alarm: Alarm | None = None
         self._acknowledged = False
         """Whether an `ok` came that no line waited for: that of a search for the reference."""
-        self._searching = self._underway = False
+        self._searching = self._underway = self._announced = False
+        self._tools: set[str] = set()
+        """Words of the parser's state when it was last asked for."""
         self._version: list[str] = []
         self._told: tuple[float, ...] = ()
         """Field H of the last status that had one."""
@@ -99,7 +102,11 @@ class Grbl:
         """Start the search for the reference, of all axes that GRBL is configured to home."""
         self._ready(deadline)
         self._reset(deadline)
-        self._alarm = None
+        self._alarm, self._announced = None, False
+        if self._bears_marks:
+            with suppress(RefusedError, StateError):  # one that is locked takes it only after the search
+                self._exchange(order(self._known, "search"), deadline)
+                self._announced = True
         # GRBL says `ok` to $H when it has ended; a refusal comes at once, and the status shows the search.
         line, patience, self._acknowledged = order(self._known, "home"), deadline.part(_BEGINS_S), False
         asked = encode(line)
@@ -165,7 +172,12 @@ class Grbl:
             self._still_marked(deadline)
         if self._searching and found.state == "Idle":
             self._searching = False
-            self._mark(deadline)
+            if self._announced:
+                self._synchronise(deadline)
+            if self._announced and order(self._known, "search") not in self._tools:
+                self.references.void("the controller has started anew")
+            else:
+                self._mark(deadline)
         return Reported(
             positions[plan.axis - 1] / plan.per_unit,
             self._moves(found),
@@ -183,9 +195,13 @@ class Grbl:
             return self._told[0] == 1
         return True if self._marked else None
 
+    @property
+    def _bears_marks(self) -> bool:
+        return re.search(self._known["marks"], " ".join(self._version)) is not None and not self._told
+
     def _mark(self, deadline: Deadline) -> None:
         """Mark a GRBL 1.1 that has homed; of others a reset is not known to remove the mark."""
-        if re.search(self._known["marks"], " ".join(self._version)) and not self._told:
+        if self._bears_marks:
             with suppress(RefusedError):
                 self._exchange(order(self._known, "mark"), deadline)
             self._synchronise(deadline)
@@ -230,8 +246,8 @@ class Grbl:
         def ends(message: Message) -> bool:
             nonlocal heard
             if isinstance(message, Said) and message.text.startswith("[GC:"):
-                words = message.text.rstrip("]").split()
-                heard, self._marked = True, order(self._known, "mark") in words
+                heard, self._tools = True, set(message.text.rstrip("]").split())
+                self._marked = order(self._known, "mark") in self._tools
             return (heard and isinstance(message, Ok)) or isinstance(message, Outdated)
 
         _require_current(

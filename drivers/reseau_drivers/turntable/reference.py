@@ -56,7 +56,7 @@ class References:
 
     def __init__(self) -> None:
         self._connection = self._events = 0
-        self._searched: dict[str, int] = {}
+        self._searched: dict[str, tuple[int, int]] = {}
         self._found: dict[str, tuple[datetime, int]] = {}
         self._voided: dict[str | None, tuple[int, str]] = {}
 
@@ -67,12 +67,12 @@ class References:
     def searching(self, axis: str) -> None:
         """Note that a search for the reference begins: there is none until it has ended."""
         self._events += 1
-        self._searched[axis] = self._events
+        self._searched[axis] = self._events, self._connection
         self._found.pop(axis, None)
 
     def found(self, axis: str) -> None:
-        """Note that the search has ended as the controller's protocol says."""
-        self._found[axis] = (datetime.now(UTC), self._connection)
+        """Note that the search has ended as the controller's protocol says; it belongs to where it began."""
+        self._found[axis] = (datetime.now(UTC), self._searched[axis][1])
 
     def void(self, why: str, axis: str | None = None) -> None:
         """Note what makes the positions of an axis, or of all, unreliable until the next search."""
@@ -89,7 +89,7 @@ class References:
         referenced : bool or None
             What the controller says.
         """
-        searched = self._searched.get(axis, 0)
+        searched, _ = self._searched.get(axis, (0, 0))
         when, why = max(self._voided.get(axis, (0, "")), self._voided.get(None, (0, "")))
         if when > searched:
             return False, why

@@ -144,7 +144,7 @@ def decoded_raw(path: Path) -> NDArray[Any]:
     return np.asarray(pixels)
 
 
-def mosaic_of_raw(path: Path) -> tuple[NDArray[np.uint16], float, str] | None:
+def mosaic_of_raw(path: Path) -> tuple[NDArray[np.float32], float, str] | None:
     """Pixels (h, w) of a raw file behind their filters, above black; where they saturate; the filters.
 
     None if its filters are not red, green, green and blue in cells of 2 × 2 pixels.
@@ -164,9 +164,9 @@ def mosaic_of_raw(path: Path) -> tuple[NDArray[np.uint16], float, str] | None:
         filters = filters_of("".join(raw.color_desc.decode()[kind] for kind in kinds[:2, :2].ravel()))
         if not filters:
             return None
-        black = np.array(raw.black_level_per_channel, np.int64)[kinds]
+        black = np.array(raw.black_level_per_channel, np.float32)[kinds]
         full = float(raw.white_level - max(raw.black_level_per_channel))
-    return np.clip(sensor - black, 0, full).astype(np.uint16), full, filters
+    return np.minimum(sensor - black, np.float32(full)), full, filters  # noise is on both sides of black
 
 
 @contextmanager

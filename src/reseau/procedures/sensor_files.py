@@ -323,7 +323,7 @@ def add_files(
             for frame in frames_of(each.file, channel):
                 first = first or frame
                 _check_alike(frame, first, each.file)
-                notes |= dict.fromkeys(_notes(frame, channel))
+                notes |= dict.fromkeys(_notes(frame))
                 name = _relative(each.file, root)
                 suffix = frame.name.rpartition("#")[2] if "#" in frame.name and "#" not in name else ""
                 name = f"{level.kind} {level.number:02d} {name}{'#' + suffix if suffix else ''}"
@@ -355,12 +355,17 @@ def _check_alike(frame: Frame, first: Frame, where: Path) -> None:
         )
 
 
-def _notes(frame: Frame, channel: Channel) -> Iterator[str]:
+def _notes(frame: Frame) -> Iterator[str]:
     """What about a file makes its grey values differ from those of the sensor; once for all frames."""
     suffix = Path(frame.name.partition("#")[0]).suffix.lower()
     yield from (note for note in frame.notes if "compressed" in note)
     if suffix in (".jpg", ".jpeg", ".heic", ".heif"):
         yield f"{suffix} files are compressed: their noise is not that of the sensor"
+    if frame.filters:
+        yield (
+            f"pixels are behind colour filters ({frame.filters}): the non-uniformity contains them; leave "
+            "exposures out that saturate one of the colours"
+        )
     if frame.curve is not None and not frame.curve.linear:
         yield (
             "files state that grey values are not proportional to the light "
