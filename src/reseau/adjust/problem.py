@@ -332,8 +332,7 @@ class Adjustment(Fitted):
     @property
     def sigma(self) -> Array:
         """Standard deviations of all parameters (u,), scaled according to `scale`; zero for fixed ones."""
-        sigma: Array = np.sqrt(np.diag(self.covariance))
-        return sigma
+        return np.sqrt(np.diag(self.covariance))
 
     def sigma_of(self, name: str) -> float:
         """Standard deviation of one parameter, scaled according to `scale`."""

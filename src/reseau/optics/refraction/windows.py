@@ -517,8 +517,7 @@ class Refraction(Display):
         """Which parameters (u,) are estimated: free, and passed by the rays of an image."""
         own = [name in window.free for window in self.windows for name in window.names]
         given = np.array([*own, *(medium.free for medium in self.media)], dtype=np.bool_)
-        used: Mask = given & self.used
-        return used
+        return given & self.used
 
     @cached_property
     def used(self) -> Mask:
