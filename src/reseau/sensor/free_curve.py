@@ -268,20 +268,6 @@ class FreeCurve:
         light = self.spline.lines(distance) @ a[:-1] + a[-1] * _tail_slope(distance, self.width)
         return (step * gaussian + light) / whole, gaussian
 
-    @property
-    def tail(self) -> tuple[float, float]:
-        """Share of the light in the tail beyond the outermost pixels of the region, and its sigma."""
-        each, k = self._averaged, self.spline.knots
-        areas = np.append(self.spline.transforms(np.zeros(1)).real[0], 1.0)
-        outside = 1 - float(_tail_spread(k[-1:], self.width)[0] - _tail_spread(k[:1], self.width)[0])
-        whole = self._step[0] + each.values @ areas
-        share = outside * each.values[:, -1] / whole
-        by = -share[:, None] * areas / whole[:, None]
-        by[:, -1] += outside / whole
-        mean = float(each.weight @ share)
-        own = np.einsum("ni,nij,nj->n", by, each.cov, by)
-        return mean, float(np.sqrt(each.share @ own + each.weight @ (share - mean) ** 2))
-
     def ends(self) -> tuple[float, float]:
         """Share of the step that rises in the outer quarters of the region beside the tail, and the
         probability that noise alone causes the coefficients there. A significant rise means blur beyond the
