@@ -35,7 +35,7 @@ from reseau.io.images import open_scan
 from reseau.io.scans import scan_of
 from reseau.measure.film import orient_frames
 from reseau.measure.film.orientation import FrameOptions, FrameResult
-from reseau.measure.film.roll import Roll, roll_of, transformed
+from reseau.measure.film.roll import Roll, rolls_of, transformed
 from reseau.procedures.film_frame import reorient_scan
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 
@@ -125,11 +125,11 @@ def _errors(result: FrameResult, frame: FilmFrame) -> tuple[Array, Array]:
     return np.asarray(result.lines.corners - frame.truth.corners), sigma
 
 
-def with_roll(doubtful: tuple[FrameResult, FilmFrame, Roll]) -> tuple[str, float]:
+def with_roll(doubtful: tuple[FrameResult, FilmFrame, tuple[Roll, ...]]) -> tuple[str, float]:
     """Status and largest error of a frame with the shape of its roll, if it was not oriented without."""
-    before, frame, roll = doubtful
+    before, frame, rolls = doubtful
     options = FrameOptions(formats=(frame.format[:2],))
-    result = reorient_scan(scan_of(frame.scan(), dpi=frame.dpi), roll, [before], options)[0]
+    result = reorient_scan(scan_of(frame.scan(), dpi=frame.dpi), rolls, [before], options)[0]
     return result.status, float(np.abs(_errors(result, frame)[0]).max())
 
 
@@ -174,13 +174,13 @@ def print_cases(executor: Executor, count: int, only: list[str], stated: bool) -
 
 def _of_roll(executor: Executor, frame: FilmFrame, results: list[FrameResult]) -> str:
     """Orient the remaining frames with the shape of the oriented frames of the same camera."""
-    roll = roll_of(results, frame.dpi)
+    rolls = rolls_of(results, frame.dpi)
     doubtful = [
-        (result, frame.with_seed(SEEDS + seed), roll)
+        (result, frame.with_seed(SEEDS + seed), rolls)
         for seed, result in enumerate(results)
         if result.status != "oriented"
     ]
-    if not doubtful or not isinstance(roll, Roll):
+    if not doubtful or not rolls:
         return ""
     again = [far for status, far in outcomes(executor, with_roll, doubtful) if status == "oriented"]
     share = 100 * (1 - (len(doubtful) - len(again)) / len(results))
@@ -194,10 +194,11 @@ def print_table_1(executor: Executor, count: int) -> None:
     for name, form, dpi in (("Ricoh, 600 dpi", RICOH, 600.0), ("Hasselblad, 1200 dpi", HASSELBLAD, 1200.0)):
         base = FilmFrame(format=form, dpi=dpi, gate_seed=5, film_mm=0.008, scanner=3e-4)
         found = list(outcomes(executor, _results, map(base.with_seed, range(2 * count))))
-        roll = roll_of(found[count:], dpi)
-        if not roll:
-            print(f"  {name:22s} {roll.reason}")
+        rolls = rolls_of(found[count:], dpi)
+        if not rolls:
+            print(f"  {name:22s} too few frames are oriented")
             continue
+        roll = rolls[0]
         cells = []
         for kind in ("affine", "similarity"):
             sigmas = []

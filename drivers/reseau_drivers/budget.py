@@ -19,8 +19,6 @@ from pyvisa_py.protocols import hislip, rpc
 
 from reseau.core.errors import ProtocolError
 
-__all__ = ["Account"]
-
 _AT_ONCE = 1 << 20
 _thread = threading.local()
 

@@ -26,8 +26,6 @@ from reseau.instruments import Deadline, Finding
 
 from .camera.gvcp import is_ip, require_control
 
-__all__ = ["examine"]
-
 _CONNECTS, _ECHOES, _LARGE_MTU = 5, 20, 8000
 _BUFFER = 4 << 20
 """Buffer of a socket that takes a frame of some megapixels (bytes)."""

@@ -18,8 +18,6 @@ from reseau.instruments import Deadline
 
 from .codecs.stream import Damaged, Decoder
 
-__all__ = ["Link", "MessageLink", "SerialLink", "TcpLink", "UdpLink", "link_to", "serial_ports"]
-
 M = TypeVar("M")
 
 _CHUNK = 65536

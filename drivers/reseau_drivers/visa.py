@@ -26,8 +26,6 @@ from reseau.instruments import Deadline
 from .budget import Account
 from .link import Link, TcpLink, link_to
 
-__all__ = ["VisaLink", "resources", "scpi_link"]
-
 _READ = 1 << 20
 """Bytes requested in one read; longer messages take several reads."""
 _MOST = 16 << 20
@@ -125,7 +123,8 @@ class VisaLink:
     def open(self, deadline: Deadline) -> None:
         """Open the resource; an open one is closed before."""
         self.close()
-        self._bare, self.ended = None, False
+        # Raw USB has packets of its own, no messages.
+        self._bare, self.ended = False if self._name.upper().endswith("::RAW") else None, False
         if self._name.upper().startswith("VICP") and find_spec("pyvicp") is None:
             do = "pip install pyvicp; or set its remote control to LXI and write TCPIP::host::inst0::INSTR"
             raise ConnectionLost(f"{self._name} needs the package pyvicp", do=do)

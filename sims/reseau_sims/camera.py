@@ -21,8 +21,6 @@ from reseau.optics.composition import Chain, Inverted
 from reseau.optics.formation import PixelResponse
 from reseau.optics.mapping import PlaneMapping
 
-__all__ = ["FilmCamera", "film"]
-
 _FILM = {
     "ax": {"X": "x"},
     "ay": {"Y": "y"},

@@ -20,8 +20,6 @@ from reseau.optics.resampling import on_lattice
 from .scanner import Video
 from .screen import Screen
 
-__all__ = ["Bending", "Display", "Instrument"]
-
 _SPARE_MM = 6.0
 """Margin of the raster beyond the phosphor; distortion displaces parts of it into the visible area."""
 _CHARGE_STEP = 10

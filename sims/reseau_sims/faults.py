@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from reseau.core.errors import UsageError
 from reseau.io import ReseauDesign
 
-__all__ = ["Faults", "swapped"]
-
 
 def swapped(design: ReseauDesign) -> ReseauDesign:
     """The design with O and S, or M and N, exchanged.

@@ -21,8 +21,6 @@ from reseau.core.data import Array
 
 from .streams import stream
 
-__all__ = ["HASSELBLAD", "RICOH", "Beside", "FilmFrame", "FrameFormat", "FrameTruth"]
-
 Plane = NDArray[np.float32]
 
 _DARK, _BRIGHT = 14.0, 230.0

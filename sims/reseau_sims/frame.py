@@ -30,8 +30,6 @@ from reseau.optics.poses import matrix_to_vector
 
 from .water import Water
 
-__all__ = ["PROJECT_POSES", "SpaceFrame", "project"]
-
 SIZE, PITCH_MM, DISTANCE_MM = (640, 480), 0.02, 1000.0
 _ROWS = ((0.056, 2.5, "N-BK7"), (-0.04, 0.75, "SF2"), (-0.012, 1.5, ""))
 """Curvature (1/mm), distance to the next surface (mm) and glass of an achromat; its stop lies behind it."""

@@ -29,8 +29,6 @@ from .screen import Screen
 from .testfield import FieldBench, FieldTruth, Station
 from .world import World
 
-__all__ = ["AXES", "GRADIANS", "Laboratory", "Room", "Seat"]
-
 AXES = ("tilt", "roll", "camera_roll", "z")
 """Axes of the turntable: tilt of the board, its roll in the mount, roll of the camera (degrees), and
 displacement of the table away from the camera (mm)."""

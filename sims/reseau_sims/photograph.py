@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from reseau.core.data import Array
 
-__all__ = ["Photograph"]
-
 _POINTS = 12
 """Points of a disk out of focus, and of a path."""
 _GOLDEN = np.pi * (3 - np.sqrt(5))

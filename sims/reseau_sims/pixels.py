@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from reseau.core.data import Array, Mask
 
-__all__ = ["PixelSensor"]
-
 
 @dataclass(frozen=True, eq=False)
 class PixelSensor:

@@ -15,8 +15,6 @@ from reseau.optics.grids import Wires, line_grid, wire_grid
 
 from .camera import FilmCamera
 
-__all__ = ["Plate", "uneven_wires", "wired"]
-
 _SPACING_PX = 0.7
 """Distance of the nodes of an outline in widths of the point-spread function; see `Outline.polygon`."""
 

@@ -11,8 +11,6 @@ from reseau.core.errors import UsageError
 from reseau.io import ReseauDesign
 from reseau.optics.mapping import PlaneMapping
 
-__all__ = ["Reflectors", "body_of", "rods_of"]
-
 _APART = np.array([14.0, 8.0])
 """Least distance of the points of a body, along the edge and in depth (mm): their echoes do not touch."""
 

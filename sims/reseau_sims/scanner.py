@@ -24,8 +24,6 @@ from reseau.optics import RationalPolynomial
 
 from .reflectors import Reflectors
 
-__all__ = ["Scanner", "Video"]
-
 _REACH = 4.5
 """Widths beyond which an echo is neglected."""
 _MIXING = 4

@@ -12,8 +12,6 @@ from reseau.core.data import Array
 from reseau.optics.mapping import PlaneMapping
 from reseau.optics.resampling import on_lattice
 
-__all__ = ["Screen"]
-
 
 @dataclass
 class Screen:

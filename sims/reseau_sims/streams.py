@@ -6,8 +6,6 @@ from hashlib import sha256
 
 import numpy as np
 
-__all__ = ["stream"]
-
 
 def stream(seed: int, *purpose: str | int | float) -> np.random.Generator:
     """The random stream of a seed for one purpose, named by words."""

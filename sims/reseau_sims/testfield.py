@@ -37,8 +37,6 @@ from .photograph import Photograph
 from .streams import stream
 from .water import Water
 
-__all__ = ["FieldBench", "FieldTruth", "Stain", "Station", "paper_stations"]
-
 PITCH_MM, PIXELS, C_MM, DISTANCE_MM = 0.027, 240, 57.5, 5000.0
 """The paper's camera: table 1 and section 2.2."""
 WET_C_MM, WET_DISTANCE_MM = 8.0, 1000.0

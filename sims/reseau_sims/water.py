@@ -18,8 +18,6 @@ from reseau.core.errors import UsageError
 from reseau.optics import rotation_matrix
 from reseau.optics.lenses.media import Water as WaterMedium
 
-__all__ = ["Directions", "Water"]
-
 _GLASS = 1.5195, -5.0e-5
 """Index of the glass at 546 nm, and its change per nm."""
 _GREEN_NM = 546.0

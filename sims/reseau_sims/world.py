@@ -30,8 +30,6 @@ from .scanner import Scanner, Video
 from .screen import Screen
 from .streams import stream
 
-__all__ = ["Truth", "World"]
-
 PHOTO_I, PHOTO_II, PHOTO_III = "PHOTO I", "PHOTO II", "PHOTO III"
 """Names of the photographs of the procedure."""
 _LEVEL = 190.0

@@ -66,7 +66,7 @@ def read_image(source: ImageLike, channel: Channel = "luma", *, colours: Colours
     ----------
     source : str, Path, ndarray (h, w) or (h, w, 3), or Frame
         An image file (PNG, JPEG, TIFF, BMP; 8 or 16 bit), an array, or a frame, which is returned as it is.
-    channel : {"luma", "red", "green", "blue", "mosaic"}
+    channel : {"luma", "red", "green", "blue", "interpolated"}
         What is taken of a colour image.
     colours : {"bgr", "rgb"}, optional
         Order of the channels of an array; required for arrays in colour: those of OpenCV are ``bgr``.
@@ -236,7 +236,7 @@ def measure(
         Options of the measurement of this kind of target.
     sensor : str, Path or Calibration, optional
         Calibration of the sensor, applied first.
-    channel : {"luma", "red", "green", "blue", "mosaic"}
+    channel : {"luma", "red", "green", "blue", "interpolated"}
         What is taken of a colour image.
     colours : {"bgr", "rgb"}, optional
         Order of the channels of an array; required for arrays in colour: those of OpenCV are ``bgr``.

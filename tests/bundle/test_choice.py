@@ -83,7 +83,7 @@ def test_the_model_of_the_lens_is_chosen(k: tuple[float, ...], label: str) -> No
             assert each.p < 0.01
             assert each.reason.startswith("too simple")
         elif found.chosen.candidate.within(each.candidate):
-            assert each.reason.startswith("too many")
+            assert each.reason.startswith(("too many", "the images do not determine"))
 
 
 @pytest.mark.slow

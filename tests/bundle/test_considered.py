@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from reseau.bundle import Camera, Result
+from reseau.bundle.diagnostics.considered import Rival
 from reseau.bundle.diagnostics.fields import camera_mapping
-from reseau.calibration import calibration_difference, projection_field
+from reseau.calibration import CameraMapping, calibration_difference, projection_field
 from reseau.core.data import Array
+from reseau.optics import PixelGrid
+from reseau.optics.cameras.registry import camera_model
 
 from . import networks
 
@@ -29,7 +32,7 @@ def result(true: Camera, seed: int, *, considers: bool, free: tuple[str, ...] = 
     world = networks.world(images=6, points=30, cameras=(true,), seed=seed, datum="free", control=0, size=1.6)
     network = replace(world.noisy(seed), cameras=(replace(lens(0.0), free=free),))
     fit = world.problem(network).adjusted().required()
-    return Result(network, fit, np.zeros(len(network.xy), dtype=bool), considers=considers)
+    return Result(network, fit, np.zeros(len(network.xy), dtype=bool), rivals=((),) if considers else None)
 
 
 def ratio(k3: float, seed: int, *, considers: bool) -> float:
@@ -64,7 +67,8 @@ def test_no_more_is_claimed_than_where_the_coefficient_is_estimated() -> None:
     for free, considers in ((FREE, False), (FREE, True), ((*FREE, "k3"), False)):
         network = replace(world.noisy(1), cameras=(replace(true, free=free),))
         fit = world.problem(network).adjusted().required()
-        result = Result(network, fit, np.zeros(len(network.xy), dtype=bool), considers=considers)
+        rejected, rivals = np.zeros(len(network.xy), dtype=bool), ((),) if considers else None
+        result = Result(network, fit, rejected, rivals=rivals)
         sigma.append(projection_field(camera_mapping(result, 0), 9).sigma)
     held, considered, estimated = sigma
     assert (considered >= held - 1e-12).all()
@@ -77,5 +81,25 @@ def test_denominators_that_repeat_the_powers_are_not_considered() -> None:
     every = result(lens(0.0), 2, considers=True, free=(*FREE, "k3"))
     assert camera_mapping(every, 0).names == (*FREE, "k3")
     assert every.uncertainty(every.camera_columns(0)[1]).covariance == pytest.approx(
-        replace(every, considers=False).uncertainty(every.camera_columns(0)[1]).covariance
+        replace(every, rivals=None).uncertainty(every.camera_columns(0)[1]).covariance
     )
+
+
+def test_a_model_of_another_kind_is_in_the_uncertainty_as_probable_as_it_is() -> None:
+    """Points up to the corners: parameters describe the other model where points are seen."""
+    true, grid = lens(0.0), PixelGrid(640, 480, (0.01, 0.01))
+    world = networks.world(images=12, points=300, cameras=(true,), datum="free", control=0, size=2.4)
+    fit = world.problem(world.noisy(3)).adjusted().required()
+    alone = Result(world.network, fit, np.zeros(len(world.network.xy), dtype=bool), rivals=((),))
+    chosen, model = camera_mapping(alone, 0), camera_model("division")
+    values = np.zeros(len(model.names))
+    values[:5] = *chosen.mapping.values[:4], -0.2
+    other = CameraMapping(model.mapping(values, grid), 640, 480, np.zeros(0, dtype=np.intp), np.zeros((0, 0)))
+    between = calibration_difference(replace(chosen, covariance=0 * chosen.covariance), other, 9).difference
+    with_it = replace(alone, rivals=((Rival(0.25, other),),))
+    more = projection_field(camera_mapping(with_it, 0), 9).cov - projection_field(chosen, 9).cov
+    claimed, inner = np.sqrt(np.trace(more, axis1=2, axis2=3))[1:-1, 1:-1], between[1:-1, 1:-1]
+    off = np.hypot(*np.moveaxis(inner, -1, 0))
+    assert off.max() > 1
+    # What no parameters of the chosen model describe is less than a fifth of the difference.
+    assert claimed == pytest.approx(0.5 * off, abs=0.1 * off.max())

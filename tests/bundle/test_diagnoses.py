@@ -506,13 +506,13 @@ BROKEN = [
         "sigmas a thousand times too small",
         lambda: (lambda n: replace(n, cov=n.cov * 1e-6))(block()),
         Code.SIGMAS_DOUBTFUL,
-        ("input sigmas are too small",),
+        ("times what input sigmas say",),
     ),
     Broken(
         "sigmas a hundred times too large",
         lambda: (lambda n: replace(n, cov=n.cov * 1e4))(block()),
         Code.SIGMAS_DOUBTFUL,
-        ("input sigmas are too large",),
+        ("% of what input sigmas say",),
     ),
     Broken(
         "given rotations in the other sense",

@@ -47,3 +47,21 @@ def test_all_schemas_are_listed_and_an_unknown_name_is_one_line(capsys: pytest.C
     assert [line.split()[0] for line in lines] == list(documents())
     assert run(["schema", "reseau-net/1"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_without_the_packages_of_an_extra_the_other_schemas_are_listed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def imported(name: str) -> object:
+        if name == "reseau.capture.bench":
+            raise ModuleNotFoundError("No module named 'bluesky'", name="bluesky")
+        return importlib.import_module(name)
+
+    monkeypatch.setattr("reseau.cli.program.import_module", imported)
+    assert run(["schema"]) == 0
+    printed = capsys.readouterr()
+    assert "reseau-network/1" in printed.out
+    assert "reseau-bench/1" not in printed.out
+    assert "left out: needs bluesky, which is not installed; pip install 'reseau[bench]'" in printed.err
+    assert run(["schema", "reseau-network/1"]) == 0
+    assert capsys.readouterr().err == ""

@@ -134,9 +134,8 @@ def test_fields_of_options_have_the_types_of_the_vocabulary(cls: type) -> None:
 
 def test_parameters_of_sessions_have_the_meaning_and_the_limits_of_the_options() -> None:
     known = names()
-    for name in parameters.__all__:
-        kind = getattr(parameters, name)
-        if not isinstance(kind, type):
+    for kind in vars(parameters).values():
+        if not (isinstance(kind, type) and issubclass(kind, parameters.SessionParameters)):
             continue
         hints = get_type_hints(kind, include_extras=True)
         schema = kind.json_schema()["properties"]

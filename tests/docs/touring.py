@@ -133,7 +133,7 @@ def _carried_out(words: list[str]) -> tuple[int, str]:
     """Exit status and output of a command; `reseau` runs in this process."""
     if words[0] == "reseau":
         # One process: each further one would import and compile everything again.
-        alone = ["--jobs", "1"] if words[1] in {"calibrate", "orient"} else []
+        alone = ["--jobs", "1"] if words[1] in {"calibrate", "orient"} and "--cluster" not in words else []
         written = StringIO()
         with redirect_stdout(written), redirect_stderr(written):
             status = run([*words[1:], *alone])

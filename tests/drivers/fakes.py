@@ -125,6 +125,17 @@ class Screen:
                 line = np.stack([value << 3 & 0xF8, value >> 3 & 0xFC, value >> 8 & 0xF8], axis=-1)
                 self.colours = np.repeat(line.astype(np.uint8)[:, None], 800, axis=1)
                 self.data = np.stack([np.full(480, 800, "<u2"), value], axis=1).tobytes()
+            case "words":  # red in the highest five bits, green in six, blue in five
+                value = np.repeat(rng.integers(0, 1 << 16, (480, 80)).astype("<u2"), 10, axis=1)
+                parts = [value << 3 & 0xF8, value >> 3 & 0xFC, value >> 8 & 0xF8]
+                self.colours, self.data = np.stack(parts, axis=-1).astype(np.uint8), value.tobytes()
+            case "codes":  # of four colours of the table of dsoc
+                table = {0: (0, 0, 0), 35: (0, 255, 255), 131: (187, 187, 187), 255: (255, 255, 255)}
+                value = rng.choice(np.array(list(table), np.uint8), (480, 800))
+                self.colours = np.zeros((480, 800, 3), np.uint8)
+                for code, colour in table.items():
+                    self.colours[value == code] = colour
+                self.data = value.tobytes()
             case _:
                 self.colours = rng.integers(0, 256, (24, 32, 3), dtype=np.uint8)
                 self.data = bytes(cv2.imencode(f".{kind}", self.colours)[1])
@@ -156,6 +167,8 @@ class Transcript:
 
     def receive(self, data: bytes) -> bytes:
         """Answer the lines that end in these bytes."""
+        if self.told.get("ends") == "":
+            return self._answer(data.decode("latin-1"))
         *lines, self._line = (self._line + data).split(b"\n")
         return b"".join(self._answer(line.decode().strip()) for line in lines)
 
@@ -182,6 +195,10 @@ class Transcript:
             "picture": picture,
             "block": b"#%d%b%b" % (len(length), length, picture),
             "length": struct.pack("<I", len(picture)),
+            "packets": b"".join(
+                [_packet(b"\xa0\x01" + picture[k : k + 10000]) for k in range(0, len(picture), 10000)]
+                + [_packet(bytes([0xA0, 2, sum(picture) & 0xFF]))]
+            ),
         }
         found = b""
         for part in re.split(r"(\{[^}]+\})", text):
@@ -191,6 +208,12 @@ class Transcript:
             else:
                 found += bytes.fromhex(inner[4:]) if inner[:4] == "hex " else parts[inner]
         return found
+
+
+def _packet(content: bytes) -> bytes:
+    """Das Oszi Protocol: S, length of what follows, content, sum."""
+    head = b"S" + struct.pack("<H", len(content) + 1) + content
+    return head + bytes([sum(head) & 0xFF])
 
 
 def transcripts() -> list[dict[str, Any]]:
@@ -246,9 +269,9 @@ class Spoiled(Wire):
 
     def _spoiled(self, said: bytes) -> bytes:
         # A line of text has neither length nor checksum: its parts in another order may be another number.
-        binary = b"#" in said or b"IDAT" in said or b"BM" in said
-        hidden = set() if binary else {"reordered"}
-        hidden |= set() if b"IDAT" in said or said[:1] == b"@" else {"bad checksum"}
+        summed = b"IDAT" in said or said[:1] == b"@" or said[3:4] == b"\xa0"
+        hidden = set() if summed or b"#" in said or b"BM" in said else {"reordered"}
+        hidden |= set() if summed else {"bad checksum"}
         kinds = [kind for kind in self.kinds if kind not in hidden]
         kind = kinds[self._rng.integers(len(kinds))]
         self.faults.append(kind)
@@ -310,6 +333,7 @@ class GrblBoard:
         """What happens, and is said, in the midst of the next movement."""
         self.answers: dict[str, bytes] = {}
         """Other answers to lines."""
+        self.homes = "$H"
         self.start()
 
     def start(self) -> bytes:
@@ -371,7 +395,7 @@ class GrblBoard:
         for asked, said in {"$G": modes, "$I": self.version, "$$": self.settings}.items():
             if line == asked:
                 return f"{said}\r\nok\r\n".encode()
-        if line == "$H":
+        if line == self.homes:
             self.state, self._left, self._target, self.homed = "Home", 3, 0.0, False
             return b""
         if line == "$X":
@@ -429,6 +453,7 @@ class TCube:
     def __init__(self) -> None:
         self.place, self._target, self._left, self._speed, self.off = 5, 5, 0, 1000, 0
         self.homed = self._homing = False
+        self.bits: int | None = None
 
     def reset(self) -> None:
         """Switch it off and on: it counts from 0 where it stands."""
@@ -463,7 +488,7 @@ class TCube:
                     self.homed, self.place = self.homed or self._homing, self._target
                     self.off = 0 if self._homing else self.off
                 bits = 0x80000000 | (0x400 if self.homed else 0) | (0x10 if self._left else 0)
-                said = struct.pack("<HihhI", 1, self.place, 0, 0, bits)
+                said = struct.pack("<HihhI", 1, self.place, 0, 0, bits if self.bits is None else self.bits)
         return struct.pack("<HHBB", kind + 1, len(said), 0x81, 0) + said if said else b""
 
 

@@ -14,21 +14,20 @@ import numpy as np
 import pytest
 
 from reseau.core.errors import ReseauError
+from reseau.instruments import Deadline
 from reseau_drivers.camera import v4l2
 from reseau_drivers.codecs import v4l2 as uapi
-from reseau_drivers.codecs.apt import Id, decode_status, encode_status
-from reseau_drivers.codecs.apt import Message as AptMessage
 from reseau_drivers.codecs.numbers import number
 from reseau_drivers.codecs.pixels import GENICAM, VIDEO, decode
 from reseau_drivers.environment import environment_line, environment_modbus
 from reseau_drivers.oscilloscope import oscilloscope
 from reseau_drivers.scanner import dicom_files
-from reseau_drivers.turntable import AxisPlan, Grbl, Table, Zaber
+from reseau_drivers.turntable import AxisPlan, Grbl, Kinesis, Table, Zaber
 from reseau_sims.serving import SimulatedCamera
 from reseau_sims.serving.v4l2 import VideoCamera
 
 from .behaviours import behaviours, counted
-from .fakes import GrblBoard, Lines, Screen, Transcript, Wire, ZaberStage
+from .fakes import GrblBoard, Lines, Screen, TCube, Transcript, Wire, ZaberStage, transcripts
 
 ROWS = behaviours()
 
@@ -49,6 +48,28 @@ def test_there_are_as_many_behaviours_and_sources_as_were_asked() -> None:
     assert all(
         ("refuses" in row) != ("gives" in row) for kind in ROWS.keys() - {"picture"} for row in ROWS[kind]
     )
+
+
+REPORTED = Path(__file__).parents[2] / "docs" / "benchmarks" / "reported.md"
+
+
+def test_each_reported_situation_has_its_test() -> None:
+    rows_ = [
+        line.split(" | ") for line in REPORTED.read_text("utf-8").splitlines() if re.match(r"\| \d", line)
+    ]
+    assert [int(row[0].strip("| ")) for row in rows_] == list(range(1, 45))
+    written = "".join(path.read_text("utf-8") for path in Path(__file__).parent.rglob("test_*.py"))
+    sources = [row["source"] for found in ROWS.values() for row in found]
+    profiles = {told["profile"] for told in transcripts()}
+    for row in rows_:
+        for test in row[-1].strip("| ").split("; "):
+            kind, _, name = test.partition(" ")
+            if kind == "behaviours":
+                assert any(source.startswith(name) for source in sources), test
+            elif kind == "transcripts":
+                assert name in profiles, test
+            else:
+                assert f"def {test.strip('`')}(" in written, test
 
 
 class Pieces(Wire):
@@ -146,8 +167,10 @@ def test_zaber(row: dict[str, Any]) -> None:
 
 @rows("apt")
 def test_apt(row: dict[str, Any]) -> None:
-    _, bits = decode_status(AptMessage(Id.DC_STATUS, 0x01, 0x50, data=encode_status(1, 0, row["bits"])))
-    assert {"homed": bool(bits & bits.HOMED), "moving": bits.moving} == row["gives"]
+    cube = TCube()
+    cube.bits = row["bits"]
+    state = Kinesis([Wire(cube)]).state(AxisPlan(), Deadline(1.0))
+    assert {"homed": state.referenced, "moving": state.moving} == row["gives"]
 
 
 def _bytes(text: str) -> bytes:

@@ -28,6 +28,7 @@ from reseau.core.errors import (
 from reseau.instruments import Camera
 from reseau_drivers import camera as cameras
 from reseau_drivers.camera import V4l2Settings, v4l2
+from reseau_drivers.camera.clocks import ExposureTimes
 from reseau_drivers.codecs import v4l2 as uapi
 from reseau_drivers.codecs.pixels import VIDEO
 from reseau_sims import World
@@ -401,6 +402,20 @@ def test_unknown_exposure_and_period_widen_the_interval() -> None:
     device.period = uapi.Interval(0, 0)
     with v4l2("camera", device.open) as camera, pytest.raises(DeadlineError, match="may have started before"):
         camera.expose(0.4)
+
+
+def test_a_camera_whose_clock_begins_anew_gets_no_wrong_times() -> None:
+    """Its stamps fall back after it was reset: the offset that was read before is void."""
+    ms = 1_000_000
+    times = ExposureTimes()
+    times.restart(period=40 * ms)
+    times.offset, times.read_at = (500 * ms, 1000), 1000 * ms
+    before = times.began(1000 * ms, 1512 * ms, before=0, exposure=10 * ms)
+    assert before.earliest <= 1500 * ms <= before.latest
+    true = 2500 * ms  # when the exposure of the next frame began, by the computer's clock
+    after = times.began(3 * ms, true + 12 * ms, before=0, exposure=10 * ms)
+    assert after.earliest <= true <= after.latest
+    assert times.offset is None
 
 
 class _Fields:

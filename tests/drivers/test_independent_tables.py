@@ -29,28 +29,28 @@ def _eventually(condition: Callable[[], bool], seconds: float = 20.0) -> None:
 def test_messages_of_the_apt_protocol_are_those_of_another_implementation() -> None:
     theirs = pytest.importorskip("thorlabs_apt_protocol", reason="thorlabs-apt-protocol is not installed")
     to = {"dest": apt.USB, "source": apt.HOST}
-    Id, Message = apt.Id, apt.Message
+    Message = apt.Message
     at = (apt.USB, apt.HOST)
-    assert apt.encode(Message(Id.REQUEST_INFO, *at)) == theirs.hw_req_info(**to)
+    assert apt.encode(Message("REQUEST_INFO", *at)) == theirs.hw_req_info(**to)
     for id_, function in (
-        (Id.HOME, theirs.mot_move_home),
-        (Id.REQUEST_VELOCITIES, theirs.mot_req_velparams),
-        (Id.REQUEST_STATUS, theirs.mot_req_statusupdate),
-        (Id.REQUEST_DC_STATUS, theirs.mot_req_dcstatusupdate),
-        (Id.IDENTIFY, theirs.mod_identify),
+        ("HOME", theirs.mot_move_home),
+        ("REQUEST_VELOCITIES", theirs.mot_req_velparams),
+        ("REQUEST_STATUS", theirs.mot_req_statusupdate),
+        ("REQUEST_DC_STATUS", theirs.mot_req_dcstatusupdate),
+        ("IDENTIFY", theirs.mod_identify),
     ):
         assert apt.encode(Message(id_, *at, (2, 0))) == function(**to, chan_ident=2)
-    assert apt.encode(Message(Id.STOP, *at, (1, 2))) == theirs.mot_move_stop(**to, chan_ident=1, stop_mode=2)
-    assert apt.encode(Message(Id.SET_ENABLED, *at, (1, 1))) == theirs.mod_set_chanenablestate(
+    assert apt.encode(Message("STOP", *at, (1, 2))) == theirs.mot_move_stop(**to, chan_ident=1, stop_mode=2)
+    assert apt.encode(Message("SET_ENABLED", *at, (1, 1))) == theirs.mod_set_chanenablestate(
         **to, chan_ident=1, enable_state=1
     )
     for position in (0, 1, -1, 200_000, -(1 << 31), (1 << 31) - 1):
         order = theirs.mot_move_absolute(**to, chan_ident=1, position=position)
-        assert apt.encode_move(apt.USB, 1, position) == order
+        assert apt.encode(apt.move(apt.USB, 1, position)) == order
         by = theirs.mot_move_relative(**to, chan_ident=1, distance=position)
-        assert apt.encode_move(apt.USB, 1, position, id_=Id.MOVE_RELATIVE) == by
+        assert apt.encode(apt.move(apt.USB, 1, position, name="MOVE_RELATIVE")) == by
     wanted = apt.Velocities(1, acceleration=263, maximum=767_367, minimum=5)
-    assert apt.encode(Message(Id.SET_VELOCITIES, *at, data=apt.encode_velocities(wanted))) == (
+    assert apt.encode(Message("SET_VELOCITIES", *at, data=apt.encode_velocities(wanted))) == (
         theirs.mot_set_velparams(**to, chan_ident=1, min_velocity=5, acceleration=263, max_velocity=767_367)
     )
 
@@ -91,7 +91,7 @@ def test_what_the_simulated_controller_says_is_understood_by_another_implementat
     assert (found.acceleration, found.max_velocity) == (7, 44_739)
     cube.inject_fault("stuck")
     assert said(theirs.mot_req_dcstatusupdate(**to, chan_ident=1)).motion_error
-    asked = apt.encode(apt.Message(apt.Id.REQUEST_STATUS_BITS, apt.USB, apt.HOST, (1, 0)))
+    asked = apt.encode(apt.Message("REQUEST_STATUS_BITS", apt.USB, apt.HOST, (1, 0)))
     assert said(asked).motion_error
     assert cube.violations == []
 

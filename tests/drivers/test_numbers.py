@@ -137,6 +137,16 @@ def test_a_channel_that_is_off_has_no_samples() -> None:
         volts(ROHDE, **{"CHANnel1:DATA?": nothing})
 
 
+def test_a_waveform_with_fewer_samples_than_announced_is_an_error() -> None:
+    """STOP of the last transfer was left at 600 by another program."""
+    part = {
+        ":WAVeform:PREamble?": b"0,2,1200,1,1.0e-6,-6e-4,0,2.0e-2,0,127\n",
+        ":WAVeform:DATA?": b"#9000000600" + bytes(600) + b"\n",
+    }
+    with pytest.raises(ProtocolError, match="received 600 samples; 1200 were announced"):
+        volts(RIGOL, **part)
+
+
 @pytest.mark.parametrize("text", ["23,51", "23.51;45.2", "9.91E+37", "nan", "23.51 45"])
 def test_sensors_and_scanners_decline_what_is_no_number(text: str) -> None:
     probe = ScpiProbe(Wire(Lines({"*IDN?": b"a,b,c,d\n", "T?": text.encode() + b"\n"})), {"t": "T?"}, 0.2)

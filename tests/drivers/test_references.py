@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import pytest
 from zaber_motion.ascii import WarningFlags
 
@@ -161,6 +163,30 @@ def test_a_cube_that_gives_no_address_is_understood() -> None:
             table.move("tilt", 10.0)
         table.home("tilt")
         assert table.move("tilt", 10.0).position == pytest.approx(10.0, abs=1e-3)
+
+
+def test_messages_between_answers_are_no_answers() -> None:
+    """A cube tells its firmware's troubles (HW_RICHRESPONSE) and ends of movements when it likes."""
+    trouble = struct.pack("<HHBB", 0x0081, 68, 0x81, 0x50) + bytes(68)
+    cube, moved = TCube(), bytes.fromhex("64 04 01 00 01 50")
+    whole = cube.receive
+    cube.receive = lambda data: trouble + moved + whole(data) + trouble  # type: ignore[method-assign]
+    with Table("table", Kinesis([Wire(cube)], answer_s=0.2), {"tilt": AxisPlan(per_unit=1919.64)}) as table:
+        table.home("tilt")
+        assert table.move("tilt", 10.0).position == pytest.approx(10.0, abs=1e-3)
+        assert cube.place == round(10.0 * 1919.64)
+
+
+def test_noise_at_the_start_of_a_board_is_no_answer() -> None:
+    """The boot loader of an ESP32 speaks at another speed than GRBL."""
+    board = GrblBoard()
+    noise = b"ets Jul 29 2019\xc0\x80\xff\r\nrst:0x1 (POWERON_RESET)\x1c\x86\n<\xfe"
+    table = Table(
+        "table", Grbl(Wire(board, lambda: noise + board.start()), 0.2), {"tilt": AxisPlan(low=-90.0)}
+    )
+    with table:
+        table.home("tilt")
+        assert table.move("tilt", -10.0).position == -10.0
 
 
 def test_what_befalls_one_axis_does_not_void_the_others() -> None:

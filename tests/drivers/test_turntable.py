@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from typing import Any
@@ -17,9 +18,21 @@ from reseau.core.errors import (
     StateError,
     UsageError,
 )
-from reseau.instruments import AxisState, Movable, Turntable
+from reseau.instruments import AxisState, Deadline, Movable, Turntable
 from reseau_drivers.link import link_to
-from reseau_drivers.turntable import AxisPlan, Table, Zaber, grbl, kinesis, marlin, smc100, zaber
+from reseau_drivers.turntable import (
+    AxisPlan,
+    ByHand,
+    HandTable,
+    Table,
+    Zaber,
+    grbl,
+    kinesis,
+    marlin,
+    smc100,
+    zaber,
+)
+from reseau_drivers.turntable.zones import KeepOut
 from reseau_sims.serving import (
     Fault,
     FaultScript,
@@ -69,6 +82,32 @@ def boards(axis: dict[str, Any]) -> list[tuple[Table, Board]]:
 
 def _in_process(machine: Board, script: FaultScript | None = None) -> InProcess:
     return InProcess(lambda: FaultyConnection(machine, script))
+
+
+@pytest.mark.parametrize("call", ["home", "move", "check"])
+def test_a_part_of_a_call_that_has_no_time_left_is_a_time_out_of_the_instrument(
+    call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a loaded machine the time of the whole call may be used up before its next part begins."""
+    table, _ = boards({"high": 100.0})[1]
+    with table:
+        table.home("tilt")
+        calls = {
+            "home": lambda: table.home("tilt", 0.5),
+            "move": lambda: table.move("tilt", 20.0, 0.5),
+            "check": lambda: table.check(0.5),
+        }
+        whole = Deadline.__init__
+
+        def late(self: Deadline, seconds: float) -> None:
+            whole(self, seconds)
+            self._at -= 0.5
+
+        with monkeypatch.context() as loaded:
+            loaded.setattr(Deadline, "__init__", late)
+            with pytest.raises(DeadlineError, match=r"table \(.*\): did not finish within 0.5 s"):
+                calls[call]()
+        assert table.move("tilt", 20.0).position == pytest.approx(20.0, abs=2e-3)
 
 
 @pytest.mark.parametrize("which", range(3))
@@ -399,6 +438,83 @@ def test_a_movement_under_way_counts_as_everywhere_on_its_way() -> None:
             table.move("roll", 70.0)
         assert under_way.exception(10.0) is None
         table.move("roll", 70.0)
+
+
+def test_zones_of_a_bench_hold_for_axes_of_several_tables() -> None:
+    """The plate of one table under the lift of another: none enters while the other is there."""
+    machines = [ZaberChain([1], high=300_000.0), GrblController(1, low=-10.0, high=200.0, speed=9000.0)]
+    wires = [InProcess(lambda: FaultyConnection(machines[0])), _in_process(machines[1])]  # type: ignore[arg-type]
+    speed = {"settings": {"speed": 500.0}}
+    zone = {"tilt": [40.0, 60.0], "lift.z": [0.0, 50.0]}
+    table = zaber(
+        "plate", wires[0], axes={"tilt": {"per_unit": 1000.0, "high": 90.0}}, keep_out=[zone], **speed
+    )
+    lift = grbl("lift", wires[1], axes={"z": {"unit": "mm", "high": 150.0}}, **speed)
+    with table:
+        table.home("tilt")
+        with pytest.raises(StateError, match=r"where lift.z is, is not known"):
+            table.move("tilt", 50.0)  # alone it does not know of the lift
+    for each in (table, lift):
+        each.combine({"plate": table, "lift": lift})
+    assert (table.uses, lift.uses) == (("lift",), ("plate",))
+    with table, lift:
+        table.home("tilt")
+        with pytest.raises(StateError, match=r"where lift.z is, is not known; home lift.z first"):
+            table.move("tilt", 50.0)
+        lift.home("z")
+        with pytest.raises(SettingError, match=r"plate.tilt: would enter .*; move lift.z out of 0…50 first"):
+            table.move("tilt", 50.0)
+        lift.move("z", 100.0)
+        table.move("tilt", 50.0)
+        with pytest.raises(SettingError, match=r"lift.z: would enter .*; move plate.tilt out of 40…60 first"):
+            lift.move("z", 10.0)
+        table.move("tilt", 70.0)
+        assert lift.move("z", 10.0).position == pytest.approx(10.0, abs=0.01)
+    with pytest.raises(SettingError, match="keep_out"):
+        table.combine({"plate": table})
+
+
+@pytest.mark.parametrize("which", range(6), ids=["zaber", "smc100", "kinesis", "grbl", "marlin", "hand"])
+def test_no_driver_begins_to_move_beyond_a_limit_or_into_a_zone(
+    which: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = [each for each, _ in tables()][which] if which < 5 else by_hand()
+    with table:
+        table.configure(speed=900.0)
+        table.home("tilt")
+        assert table.move("tilt", 20.0).position == pytest.approx(20.0, abs=0.01)
+        begun = list[float]()
+        whole = table._controller.begin_move
+        monkeypatch.setattr(
+            table._controller,
+            "begin_move",
+            lambda plan, position, deadline: (begun.append(position), whole(plan, position, deadline))[1],
+        )
+        table._zones = KeepOut([{"tilt": (40.0, 60.0)}], table.plans)
+        for target, message in ((-0.1, "outside"), (100.1, "outside"), (50.0, "zone"), (80.0, "zone")):
+            with pytest.raises(SettingError, match=message):
+                table.move("tilt", target)
+            with pytest.raises(SettingError, match=message):
+                table.axes["tilt"].set(target).wait(5.0)
+        assert begun == []
+        assert table.move("tilt", 30.0).position == pytest.approx(30.0, abs=0.01)
+        assert begun
+
+
+def by_hand() -> Table:
+    """A person who sets and reads what is asked."""
+
+    class Person:
+        address = "here"
+
+        def __call__(self, request: str) -> None:
+            self.there = float(found[-1]) if (found := re.findall(r"-?[\d.]+(?= deg)", request)) else 0.0
+
+        def read(self, request: str, unit: str, seconds: float | None = None) -> float:
+            self(request)
+            return self.there
+
+    return HandTable("table", ByHand(Person(), {}), {"tilt": AxisPlan(high=100.0)})
 
 
 def test_a_zone_names_axes_of_the_table() -> None:

@@ -296,7 +296,9 @@ def test_both_name_a_file_that_cannot_be_read(tmp_path: Path) -> None:
 
 def test_an_unknown_channel_is_named(tmp_path: Path) -> None:
     path = _other(".png", RGB8)(tmp_path)
-    with pytest.raises(UsageError, match="cyan: is not a channel; use luma, red, green, blue or mosaic"):
+    with pytest.raises(
+        UsageError, match="cyan: is not a channel; use luma, red, green, blue or interpolated"
+    ):
         read_image(path, "cyan")  # type: ignore[arg-type]
 
 

@@ -14,9 +14,16 @@ from reseau.core.tone import ToneCurve
 from reseau.io.scans import scan_of
 from reseau.measure.film import orient_frames
 from reseau.measure.film.adjacent_lines import softness_of
-from reseau.measure.film.lines import EdgeData, FrameShape, departing_line, explained_shape, robust_line
+from reseau.measure.film.lines import (
+    EdgeData,
+    FrameShape,
+    Lines,
+    departing_line,
+    explained_shape,
+    robust_line,
+)
 from reseau.measure.film.orientation import FrameOptions, FrameResult
-from reseau.measure.film.roll import Roll, roll_of
+from reseau.measure.film.roll import corner_files, rolls_of
 from reseau.procedures.film_frame import reorient_scan
 from reseau_sims.filmframe import HASSELBLAD, RICOH, Beside, FilmFrame
 
@@ -184,14 +191,36 @@ def test_a_trunk_in_the_picture_is_no_edge_of_a_frame_that_stands_upright(seed: 
     assert bool(result) or not stated
 
 
+def squares(count: int = 7) -> list[FrameResult]:
+    """Oriented frames of 56 × 56 mm, 4 px/mm."""
+    corners = np.array([[20.0, 20.0], [244.0, 20.0], [244.0, 244.0], [20.0, 244.0]])
+    lines = [Lines(corners + k, 0.01 * np.eye(8), *np.zeros((7, 4)), 1.0, 8) for k in range(count)]
+    return [
+        FrameResult(f"{k}", "oriented", "", (56.0, 56.0), "grey", each, {}) for k, each in enumerate(lines)
+    ]
+
+
+def test_each_format_in_a_folder_makes_a_roll_of_its_own() -> None:
+    wide = [replace(each, format_mm=(56.0, 41.5)) for each in squares(4)]
+    few = [replace(each, format_mm=(36.0, 24.0)) for each in squares(3)]
+    found = rolls_of([*few, *wide, *squares()])
+    assert [(each.format_mm, each.frames) for each in found] == [((56.0, 56.0), 7), ((56.0, 41.5), 4)]
+    assert list(corner_files(found)) == ["corners-56x56.json", "corners-56x41.5.json"]
+    assert list(corner_files(found[:1])) == ["corners.json"]
+
+
 @pytest.mark.slow
 def test_an_edge_hidden_by_a_line_is_no_unflagged_error_with_the_shape_of_its_roll() -> None:
     """The line is parallel to the edge: in a single frame they cannot be distinguished."""
     frame = FilmFrame(320035, beside=Beside(lines=1))
     alone = oriented(frame)
-    roll = roll_of([oriented(FilmFrame(seed)) for seed in range(6)], 600.0)
-    assert isinstance(roll, Roll)
-    (found,) = reorient_scan(scan_of(frame.scan(), dpi=600.0), roll, [alone], FrameOptions(((36.0, 24.0),)))
+    rolls = (*rolls_of([oriented(FilmFrame(seed)) for seed in range(6)], 600.0), *rolls_of(squares()))
+    assert [each.format_mm for each in rolls] == [(36.0, 24.0), (56.0, 56.0)]
+    scan, options = scan_of(frame.scan(), dpi=600.0), FrameOptions(((36.0, 24.0),))
+    (found,) = reorient_scan(scan, rolls, [alone], options)
+    # The roll of another format says nothing about it.
+    (other,) = reorient_scan(scan, rolls[1:], [alone], options)
+    assert (other.status, other.why) == (alone.status, alone.why)
     assert found.status == "oriented", found.why
     assert covered(found, frame)
 

@@ -35,8 +35,6 @@ from .clocks import BlockCounter, ExposureTimes, realtime_offset
 from .features import Feature, found_features
 from .gvcp import HEARTBEAT_S, controlled_elsewhere, is_ip, require_answer, require_control, send_action
 
-__all__ = ["Aravis", "AravisSettings", "aravis_cameras"]
-
 _UNKNOWN_PERIOD_NS = 1_000_000_000
 _RELEASE_S = 0.5
 _CLOCK_IS_OLD_NS = 1_000_000_000

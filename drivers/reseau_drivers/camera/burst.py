@@ -11,8 +11,6 @@ from reseau.instruments import ImageStore, Status
 
 from .camera import CameraDriver
 
-__all__ = ["Burst"]
-
 
 class Burst:
     """Consecutive frames of a camera, for ``bluesky.plans.fly``.

@@ -12,15 +12,13 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from reseau.core.data import Frame
+from reseau.core.data import Frame, filters_of
 from reseau.core.errors import DeadlineError, InstrumentError, RefusedError, StateError
 from reseau.core.provenance import sha256_of
 from reseau.instruments import Deadline, Device, Identity, Limits, Settings, quantity
 
 from .clocks import TimeInterval, utc
 from .features import Feature, differences, matching
-
-__all__ = ["CameraDriver", "CameraExposure", "CameraInterface", "CameraSettings", "RawFrame", "Ready"]
 
 _SLICE_S = 0.05
 """Time to wait for a frame before checking for a stop request (s)."""
@@ -220,7 +218,8 @@ class CameraExposure:
     @cached_property
     def frame(self) -> Frame:
         """Image; its hash is that of the original frame if there is one."""
-        return Frame(self.pixels, self.full_scale, self.name, sha256_of(self.raw or self.pixels.tobytes()))
+        digest = sha256_of(self.raw or self.pixels.tobytes())
+        return Frame(self.pixels, self.full_scale, self.name, digest, filters=filters_of(self.pattern))
 
 
 class CameraDriver(Device[S]):
@@ -479,8 +478,8 @@ class CameraDriver(Device[S]):
         patterns cancel. Cover the lens to measure the dark noise.
         """
         deadline = Deadline(self._seconds if seconds is None else seconds)
-        found = {"identity": str(self.connect(deadline.left_or_minimum))}
-        shots = list(self.frames(_CHECKED, deadline.left_or_minimum))
+        found = {"identity": str(self.connect(deadline.left))}
+        shots = list(self.frames(_CHECKED, deadline.left))
         elapsed = (shots[-1].taken - shots[0].taken).total_seconds()
         steps = shots[-1].sequence - shots[0].sequence
         height, width = shots[0].pixels.shape
@@ -493,7 +492,7 @@ class CameraDriver(Device[S]):
         before, shortest = self.settings, self._source.dark(self.settings)
         try:
             self.configure(**_differences(before, shortest))
-            one, two = (self.expose(deadline.left_or_minimum).pixels.astype(np.float64) for _ in range(2))
+            one, two = (self.expose(deadline.left).pixels.astype(np.float64) for _ in range(2))
         finally:
             self.configure(**_differences(shortest, before))
         noise = (one - two).std() / np.sqrt(2)
@@ -501,7 +500,7 @@ class CameraDriver(Device[S]):
         return found
 
     def _exchanged(self, ask: Callable[[Deadline], str], command: str, deadline: Deadline) -> str:
-        with self._exchange(command, deadline.left_or_minimum) as part:
+        with self._exchange(command, deadline.left) as part:
             return ask(part)
 
 

@@ -9,8 +9,6 @@ import time
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-__all__ = ["BlockCounter", "ExposureTimes", "FrameCounter", "TimeInterval", "realtime_offset", "utc"]
-
 _TRIES = 5
 _SHORT, _SHORT_WITH_ZERO, _LONG = 65535, 65536, 1 << 64
 _DRIFT = 10_000

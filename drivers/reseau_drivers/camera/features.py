@@ -10,8 +10,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["Feature", "differences", "found_features", "matching"]
-
 
 @dataclass(frozen=True)
 class Feature:

@@ -18,15 +18,6 @@ from reseau.instruments import Deadline
 
 from ..codecs.gige import PORT, PRIVILEGE, Action, Command, Kind, Status
 
-__all__ = [
-    "HEARTBEAT_S",
-    "controlled_elsewhere",
-    "is_ip",
-    "require_answer",
-    "require_control",
-    "send_action",
-]
-
 _EXCLUSIVE, _CONTROL = 0x1, 0x2
 _TRY_S = 0.2
 _TRIES = 5

@@ -31,8 +31,6 @@ from reseau.instruments import (
 from .camera import CameraExposure
 from .gvcp import send_action
 
-__all__ = ["Rig", "RigSettings"]
-
 
 @dataclass(frozen=True)
 class RigSettings(Settings):
@@ -183,12 +181,12 @@ class Rig(Device[RigSettings]):
 
             def ready() -> bool:
                 nonlocal passed
-                barrier.wait(deadline.left_or_minimum)
+                barrier.wait(deadline.left)
                 passed = True
                 return fired
 
             try:
-                shot: CameraExposure = self._members[name].expose(deadline.left_or_minimum, ready=ready)
+                shot: CameraExposure = self._members[name].expose(deadline.left, ready=ready)
             except threading.BrokenBarrierError:
                 raise _Unready("was not triggered: another camera was not ready", where=name) from None
             finally:
@@ -241,7 +239,7 @@ class Rig(Device[RigSettings]):
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
         """Expose, and report the skew."""
-        skew, within = self.expose_all(deadline.left_or_minimum).skew
+        skew, within = self.expose_all(deadline.left).skew
         return {"trigger": self._settings.trigger, "skew": f"{1e3 * skew:.3g} ± {1e3 * within:.2g} ms"}
 
     def _acquire(self) -> dict[str, Any]:

@@ -28,8 +28,6 @@ from ..codecs.pixels import VIDEO, decode, size_of
 from .camera import CameraSettings, OriginalValues, RawFrame, Ready
 from .clocks import FrameCounter, TimeInterval
 
-__all__ = ["KernelNode", "Mapping", "Node", "OpenNode", "V4l2", "V4l2Settings", "video_devices"]
-
 _UNKNOWN_PERIOD_NS = 1_000_000_000
 """Frame period if the driver does not report one: an upper bound."""
 _TICK_NS = 100_000

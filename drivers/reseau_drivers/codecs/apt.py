@@ -10,116 +10,22 @@ both addresses are possible.
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
+from typing import Any
 
 from reseau.core.errors import ProtocolError, SettingError
 
+from ..profiles import known
 from .stream import Damaged, excerpt
-
-__all__ = [
-    "HOST",
-    "USB",
-    "Bits",
-    "Id",
-    "Info",
-    "Message",
-    "MessageDecoder",
-    "Velocities",
-    "bay",
-    "decode_info",
-    "decode_status",
-    "decode_velocities",
-    "encode",
-    "encode_info",
-    "encode_move",
-    "encode_status",
-    "encode_velocities",
-]
 
 HOST, USB = 0x01, 0x50
 """Addresses: the computer, and a controller with one USB connection of its own."""
 _ADDRESSES = frozenset({0x00, HOST, 0x11, *range(0x21, 0x2B), USB})
 _LONG = 0x80
 _HEADER = 6
+_KINESIS = known("kinesis")
 _NO_HEADER = "not a header of the APT protocol"
-
-
-class Id(IntEnum):
-    """Messages."""
-
-    DISCONNECT = 0x0002
-    REQUEST_INFO = 0x0005
-    INFO = 0x0006
-    START_UPDATES = 0x0011
-    STOP_UPDATES = 0x0012
-    NO_FLASH = 0x0018
-    SET_ENABLED = 0x0210
-    REQUEST_ENABLED = 0x0211
-    ENABLED = 0x0212
-    IDENTIFY = 0x0223
-    SET_VELOCITIES = 0x0413
-    REQUEST_VELOCITIES = 0x0414
-    VELOCITIES = 0x0415
-    REQUEST_STATUS_BITS = 0x0429
-    STATUS_BITS = 0x042A
-    REQUEST_HOMING = 0x0441
-    REQUEST_GENERAL = 0x043B
-    REQUEST_JOG = 0x0417
-    HOME = 0x0443
-    HOMED = 0x0444
-    MOVE_RELATIVE = 0x0448
-    MOVE_ABSOLUTE = 0x0453
-    MOVED = 0x0464
-    STOP = 0x0465
-    STOPPED = 0x0466
-    REQUEST_STATUS = 0x0480
-    STATUS = 0x0481
-    REQUEST_DC_STATUS = 0x0490
-    DC_STATUS = 0x0491
-    ACKNOWLEDGE = 0x0492
-
-
-_SIZES: dict[int, tuple[int, ...]] = dict.fromkeys(Id, (0,)) | {
-    Id.INFO: (84,),
-    Id.SET_VELOCITIES: (14,),
-    Id.VELOCITIES: (14,),
-    Id.STATUS_BITS: (6,),
-    Id.MOVE_RELATIVE: (0, 6),
-    Id.MOVE_ABSOLUTE: (0, 6),
-    Id.MOVED: (0, 14),
-    Id.STOPPED: (0, 14),
-    Id.STATUS: (14,),
-    Id.DC_STATUS: (14,),
-}
-"""Possible lengths of the data of each message; 0: the header alone."""
-
-
-class Bits(IntFlag):
-    """Status bits of an axis, as far as they are used here."""
-
-    LIMIT_FORWARD = 0x1
-    LIMIT_REVERSE = 0x2
-    MOVING_FORWARD = 0x10
-    MOVING_REVERSE = 0x20
-    JOGGING_FORWARD = 0x40
-    JOGGING_REVERSE = 0x80
-    CONNECTED = 0x100
-    HOMING = 0x200
-    HOMED = 0x400
-    SETTLED = 0x2000
-    POSITION_ERROR = 0x4000
-    OVERCURRENT = 0x1000000
-    ENABLED = 0x80000000
-
-    @property
-    def moving(self) -> bool:
-        """Whether the axis moves."""
-        return bool(self & _MOVING)
-
-
-_MOVING = Bits(0x2F0)
-"""Moving and jogging both ways, and homing."""
 
 
 def bay(number: int) -> int:
@@ -146,8 +52,8 @@ class Message:
 
     Parameters
     ----------
-    id : int
-        One of :class:`Id`.
+    name : str
+        One of the `messages` of the profile.
     destination, source : int
         Addresses.
     parameters : (int, int)
@@ -156,7 +62,7 @@ class Message:
         Data of a message that has some.
     """
 
-    id: int
+    name: str
     destination: int
     source: int
     parameters: tuple[int, int] = (0, 0)
@@ -168,8 +74,8 @@ class Message:
         return struct.unpack_from("<H", self.data)[0] if len(self.data) >= 2 else self.parameters[0]
 
 
-def encode(message: Message) -> bytes:
-    r"""Encode a message.
+def encode(message: Message, profile: Mapping[str, Any] = _KINESIS) -> bytes:
+    r"""Encode a message, with the numbers of a profile.
 
     Raises
     ------
@@ -178,20 +84,21 @@ def encode(message: Message) -> bytes:
 
     Examples
     --------
-    >>> encode(Message(Id.HOME, USB, HOST, (1, 0))).hex(" ")
+    >>> encode(Message("HOME", USB, HOST, (1, 0))).hex(" ")
     '43 04 01 00 50 01'
     """
     two, ends = message.data and any(message.parameters), {message.destination, message.source}
-    if two or len(message.data) not in _SIZES.get(message.id, ()) or not ends <= _ADDRESSES:
+    number, sizes = _told(profile["messages"].get(message.name, "0000 -1"))
+    if two or len(message.data) not in sizes or not ends <= _ADDRESSES:
         raise SettingError("is not a message of the APT protocol", where=repr(message))
     if message.data:
-        head = (message.id, len(message.data), message.destination | _LONG, message.source)
+        head = (number, len(message.data), message.destination | _LONG, message.source)
         return struct.pack("<HHBB", *head) + message.data
-    return struct.pack("<HBBBB", message.id, *message.parameters, message.destination, message.source)
+    return struct.pack("<HBBBB", number, *message.parameters, message.destination, message.source)
 
 
-def encode_move(destination: int, channel: int, position: int, *, id_: Id = Id.MOVE_ABSOLUTE) -> bytes:
-    """Encode an order to move to a position, or by a distance (counts).
+def move(destination: int, channel: int, position: int, *, name: str = "MOVE_ABSOLUTE") -> Message:
+    """Return an order to move to a position, or by a distance (counts).
 
     Raises
     ------
@@ -200,12 +107,12 @@ def encode_move(destination: int, channel: int, position: int, *, id_: Id = Id.M
 
     Examples
     --------
-    >>> encode_move(USB, 1, 200_000).hex(" ")
+    >>> encode(move(USB, 1, 200_000)).hex(" ")
     '53 04 06 00 d0 01 01 00 40 0d 03 00'
     """
     if not -(1 << 31) <= position < 1 << 31:
         raise SettingError(f"{position} counts do not fit into 32 bits", where="position")
-    return encode(Message(id_, destination, HOST, data=struct.pack("<Hi", channel, position)))
+    return Message(name, destination, HOST, data=struct.pack("<Hi", channel, position))
 
 
 @dataclass(frozen=True)
@@ -249,18 +156,18 @@ def encode_status(channel: int, position: int, bits: int, *, more: bytes = bytes
     return struct.pack("<Hi4sI", channel, position, more, bits)
 
 
-def decode_status(message: Message) -> tuple[int, Bits]:
+def decode_status(message: Message) -> tuple[int, int]:
     """Decode position (counts) and bits of STATUS, DC_STATUS, and MOVED or STOPPED with data.
 
     Examples
     --------
-    >>> data = encode_status(1, -5, Bits.HOMED | Bits.ENABLED)
-    >>> position, bits = decode_status(Message(Id.DC_STATUS, HOST, USB, data=data))
-    >>> position, bits.moving, Bits.HOMED in bits
-    (-5, False, True)
+    >>> data = encode_status(1, -5, 0x80000400)
+    >>> position, bits = decode_status(Message("DC_STATUS", HOST, USB, data=data))
+    >>> position, hex(bits)
+    (-5, '0x80000400')
     """
     _, position, _, bits = struct.unpack("<Hi4sI", message.data)
-    return position, Bits(bits)
+    return position, bits
 
 
 @dataclass(frozen=True)
@@ -305,7 +212,7 @@ def decode_info(message: Message) -> Info:
     Examples
     --------
     >>> data = encode_info(Info(27001234, "KDC101", (2, 1, 3)))
-    >>> decode_info(Message(Id.INFO, HOST, USB, data=data))
+    >>> decode_info(Message("INFO", HOST, USB, data=data))
     Info(serial=27001234, model='KDC101', firmware=(2, 1, 3), channels=1)
     """
     serial, model, _, minor, interim, major, _, _, _, channels = _INFO.unpack(message.data)
@@ -324,12 +231,16 @@ class MessageDecoder:
     >>> decoder.feed(b"\x44\x04\x01")
     []
     >>> decoder.feed(b"\x00\x01\x50")
-    [Message(id=1092, destination=1, source=80, parameters=(1, 0), data=b'')]
+    [Message(name='HOMED', destination=1, source=80, parameters=(1, 0), data=b'')]
     >>> decoder.feed(b"\xff\xff" + bytes.fromhex("660401000150"))[0].why
     'not a header of the APT protocol'
     """
 
-    def __init__(self) -> None:
+    def __init__(self, profile: Mapping[str, Any] = _KINESIS) -> None:
+        self._names = {}
+        for name, text in profile["messages"].items():
+            number, sizes = _told(text)
+            self._names[number] = (name, sizes)
         self.reset()
 
     def reset(self) -> None:
@@ -342,7 +253,7 @@ class MessageDecoder:
         self._held += data
         held, at, skipped = bytes(self._held), 0, 0
         while len(held) - at >= _HEADER:
-            size = _size(held[at : at + _HEADER]) if held[at + _HEADER - 1] in _ADDRESSES else None
+            size = self._size(held[at : at + _HEADER]) if held[at + _HEADER - 1] in _ADDRESSES else None
             if size is None:
                 at, skipped = at + 1, skipped + 1
                 continue
@@ -351,26 +262,32 @@ class MessageDecoder:
                 skipped = 0
             if len(held) - at < _HEADER + size:
                 break
-            found.append(_message(held[at : at + _HEADER + size]))
+            found.append(self._message(held[at : at + _HEADER + size]))
             at += _HEADER + size
         if skipped:
             found.append(Damaged(held[at - skipped : at][:_HEADER], _NO_HEADER))
         del self._held[:at]
         return found
 
+    def _size(self, header: bytes) -> int | None:
+        """Length of the data after a header; None if it is none."""
+        number, length, destination, source = struct.unpack("<HHBB", header)
+        size = length if destination & _LONG else 0
+        _, sizes = self._names.get(number, ("", ()))
+        if {destination & ~_LONG, source} <= _ADDRESSES and size in sizes:
+            # A long message has data.
+            return size if bool(size) == bool(destination & _LONG) else None
+        return None
 
-def _size(header: bytes) -> int | None:
-    """Length of the data after a header; None if it is none."""
-    id_, length, destination, source = struct.unpack("<HHBB", header)
-    size = length if destination & _LONG else 0
-    if {destination & ~_LONG, source} <= _ADDRESSES and size in _SIZES.get(id_, ()):
-        # A long message has data.
-        return size if bool(size) == bool(destination & _LONG) else None
-    return None
+    def _message(self, data: bytes) -> Message:
+        number, first, second, destination, source = struct.unpack("<HBBBB", data[:_HEADER])
+        name, _ = self._names[number]
+        if destination & _LONG:
+            return Message(name, destination & ~_LONG, source, data=data[_HEADER:])
+        return Message(name, destination, source, (first, second))
 
 
-def _message(data: bytes) -> Message:
-    id_, first, second, destination, source = struct.unpack("<HBBBB", data[:_HEADER])
-    if destination & _LONG:
-        return Message(id_, destination & ~_LONG, source, data=data[_HEADER:])
-    return Message(id_, destination, source, (first, second))
+def _told(text: str) -> tuple[int, tuple[int, ...]]:
+    """Number of a message, and possible lengths of its data; 0: the header alone."""
+    number, *sizes = text.split()
+    return int(number, 16), tuple(map(int, sizes)) or (0,)

@@ -17,8 +17,6 @@ from reseau.core.errors import ProtocolError
 from .numbers import number
 from .stream import Damaged, excerpt
 
-__all__ = ["PORT", "GrabbedFrame", "MessageDecoder", "encode", "encode_frame", "numbers", "parse_frame"]
-
 PORT = 7915
 START, END, ESCAPE = 0x01, 0x04, 0x1B
 

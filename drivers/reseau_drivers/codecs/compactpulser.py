@@ -14,8 +14,6 @@ from reseau.core.errors import ProtocolError, SettingError
 
 from .stream import excerpt
 
-__all__ = ["LETTERS", "LIMIT", "Setting", "decode", "encode", "encode_answer"]
-
 LIMIT = 64
 """Largest size of a line (bytes)."""
 

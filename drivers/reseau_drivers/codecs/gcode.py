@@ -18,28 +18,6 @@ from ..profiles import known
 from .numbers import number
 from .stream import LineMessageDecoder, excerpt
 
-__all__ = [
-    "AXES",
-    "LIMIT",
-    "Alarm",
-    "AnswerDecoder",
-    "Banner",
-    "Busy",
-    "Error",
-    "Message",
-    "Ok",
-    "Outdated",
-    "Report",
-    "Resend",
-    "Said",
-    "checksum",
-    "decode",
-    "decode_numbered",
-    "encode",
-    "encode_numbered",
-    "words_of",
-]
-
 LIMIT = 256
 """Largest size of an accepted line (bytes)."""
 AXES = "XYZABC"

@@ -17,22 +17,6 @@ from reseau.core.errors import ProtocolError
 
 from .stream import excerpt
 
-__all__ = [
-    "ACTION_DEVICE_KEY",
-    "ACTION_GROUP_KEY",
-    "ACTION_GROUP_MASK",
-    "PORT",
-    "PRIVILEGE",
-    "Action",
-    "Command",
-    "Kind",
-    "Leader",
-    "Status",
-    "acknowledgement",
-    "data_packet",
-    "trailer",
-]
-
 PORT = 3956
 """UDP port of the control protocol."""
 PRIVILEGE = 0x0A00

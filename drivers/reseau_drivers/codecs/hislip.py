@@ -14,8 +14,6 @@ from reseau.core.errors import SettingError
 
 from .stream import Damaged
 
-__all__ = ["HEAD", "PORT", "Message", "MessageDecoder", "Type", "encode"]
-
 PORT = 4880
 HEAD = 16
 """Size of the header (bytes)."""

@@ -18,17 +18,6 @@ from reseau.core.errors import ProtocolError
 
 from .stream import excerpt
 
-__all__ = [
-    "LARGEST",
-    "Header",
-    "block",
-    "error_entry",
-    "missing_bytes",
-    "parse_block",
-    "picture",
-    "split_message",
-]
-
 LARGEST = 64_000_000
 """Largest size of an accepted answer (bytes)."""
 

@@ -18,28 +18,6 @@ from reseau.core.errors import ProtocolError, RefusedError, SettingError
 
 from .stream import Damaged, excerpt
 
-__all__ = [
-    "DIAGNOSTICS",
-    "EXCEPTIONS",
-    "FORMATS",
-    "HOLDING",
-    "INPUT",
-    "Frame",
-    "RtuDecoder",
-    "TcpDecoder",
-    "WordOrder",
-    "crc",
-    "decode_read",
-    "decode_registers",
-    "encode",
-    "encode_echo",
-    "encode_exception",
-    "encode_read",
-    "encode_registers",
-    "number",
-    "words_of",
-]
-
 HOLDING, INPUT, DIAGNOSTICS = 3, 4, 8
 """Functions: read holding registers, read input registers, diagnostics."""
 MOST = 125

@@ -11,8 +11,6 @@ import re
 
 from reseau.core.errors import ProtocolError
 
-__all__ = ["INFINITE", "number", "numbers"]
-
 _NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[Ee][-+]?\d+)?)\s*([^\d\s,;.+-][^\d\s,;]*)?", re.ASCII)
 INFINITE = 9.9e37
 """From here on, SCPI's numbers stand for infinity, or for none."""

@@ -15,33 +15,6 @@ from reseau.core.errors import ProtocolError, SettingError
 
 from .stream import Damaged
 
-__all__ = [
-    "ACK",
-    "ASCII_TEXT",
-    "AUTO_DEVICE_DATA",
-    "AUTO_TRANSMIT",
-    "DEVICE_DATA",
-    "DEVICE_ID",
-    "DEVICE_INFORMATION",
-    "GENERAL_REQUEST",
-    "GRADIANS",
-    "MOTOR_OFF",
-    "NACK",
-    "PERIOD_NS",
-    "PROTOCOL_VERSION",
-    "RESET",
-    "SCAN",
-    "TRANSDUCER",
-    "DeviceData",
-    "Frame",
-    "FrameDecoder",
-    "Information",
-    "ScanData",
-    "Sector",
-    "Transducer",
-    "encode",
-]
-
 ACK, NACK, ASCII_TEXT, DEVICE_INFORMATION, PROTOCOL_VERSION, GENERAL_REQUEST = 1, 2, 3, 4, 5, 6
 DEVICE_ID, DEVICE_DATA, AUTO_DEVICE_DATA = 2000, 2300, 2301
 RESET, TRANSDUCER, AUTO_TRANSMIT, MOTOR_OFF = 2600, 2601, 2602, 2903

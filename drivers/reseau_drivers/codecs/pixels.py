@@ -17,9 +17,6 @@ from reseau.core.errors import ProtocolError
 
 from ..profiles import known
 
-__all__ = ["GENICAM", "VIDEO", "PixelFormat", "decode", "encode", "format_named", "size_of"]
-
-
 _PACKED = {
     ("p", 10): (4, 5), ("p", 12): (2, 3), ("p", 14): (4, 7), ("gige", 10): (2, 3), ("gige", 12): (2, 3),
     ("mipi", 10): (4, 5), ("mipi", 12): (2, 3), ("mipi", 14): (4, 7), ("stream", 10): (4, 5),

@@ -14,26 +14,6 @@ from reseau.core.errors import ProtocolError
 
 from .stream import Damaged, excerpt
 
-__all__ = [
-    "ACCEPTED",
-    "GARBAGE_ARGS",
-    "GETPORT",
-    "PORTMAPPER",
-    "PORTMAPPER_VERSION",
-    "PROC_UNAVAIL",
-    "PROG_UNAVAIL",
-    "SUCCESS",
-    "Call",
-    "RecordDecoder",
-    "Unpacker",
-    "decode_call",
-    "decode_reply",
-    "encode_call",
-    "encode_reply",
-    "pack",
-    "record",
-]
-
 PORTMAPPER, PORTMAPPER_VERSION, GETPORT = 100000, 2, 3
 ACCEPTED = 0
 SUCCESS, PROG_UNAVAIL, PROC_UNAVAIL, GARBAGE_ARGS = 0, 1, 3, 4

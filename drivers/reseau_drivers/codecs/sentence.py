@@ -14,8 +14,6 @@ from reseau.core.errors import ProtocolError, SettingError
 from .numbers import number
 from .stream import excerpt
 
-__all__ = ["Checksum", "Sentence", "checksum", "with_checksum"]
-
 Checksum = Literal["none", "xor"]
 
 

@@ -8,61 +8,20 @@ the CONEX. Commands that set or move are not acknowledged: TE returns their erro
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import Enum
+from typing import Any
 
 from reseau.core.errors import ProtocolError, SettingError
 
+from ..profiles import known
 from .stream import excerpt
-
-__all__ = ["LIMIT", "Line", "Phase", "Status", "decode", "decode_status", "encode", "phase"]
 
 LIMIT = 128
 """Largest size of an accepted line (bytes)."""
 
+_SMC100 = known("smc100")
 _LINE = re.compile(rb"(\d{1,2})([A-Z]{2})([ -~]*)")
-
-
-class Phase(Enum):
-    """State of an axis, from the last two digits of TS."""
-
-    NOT_REFERENCED = "not referenced"
-    CONFIGURATION = "configuration"
-    HOMING = "homing"
-    MOVING = "moving"
-    READY = "ready"
-    DISABLED = "disabled"
-    JOGGING = "jogging"
-
-
-def phase(code: int) -> Phase:
-    """Return the phase of a state code.
-
-    Raises
-    ------
-    ProtocolError
-        If the code is unknown.
-
-    Examples
-    --------
-    >>> phase(0x33)
-    <Phase.READY: 'ready'>
-    """
-    for codes, found in (
-        (range(0x0A, 0x12), Phase.NOT_REFERENCED),
-        (range(0x14, 0x15), Phase.CONFIGURATION),
-        (range(0x1E, 0x20), Phase.HOMING),
-        (range(0x28, 0x29), Phase.MOVING),
-        (range(0x32, 0x36), Phase.READY),
-        # CONEX: ready to track.
-        (range(0x36, 0x39), Phase.READY),
-        (range(0x3C, 0x40), Phase.DISABLED),
-        # CONEX: tracking.
-        (range(0x46, 0x48), Phase.JOGGING),
-    ):
-        if code in codes:
-            return found
-    raise ProtocolError(f"{code:02X} is not a state of an SMC100")
 
 
 @dataclass(frozen=True)
@@ -82,19 +41,6 @@ class Line:
     address: int
     name: str
     value: str = ""
-
-
-@dataclass(frozen=True)
-class Status:
-    """Answer to TS: error bits and state."""
-
-    errors: int
-    state: int
-
-    @property
-    def phase(self) -> Phase:
-        """State of the axis."""
-        return phase(self.state)
 
 
 def encode(line: Line) -> bytes:
@@ -130,8 +76,8 @@ def decode(line: bytes) -> Line:
     return Line(int(found[1]), found[2].decode(), found[3].decode())
 
 
-def decode_status(value: str) -> Status:
-    """Decode an answer to TS.
+def decode_status(value: str, profile: Mapping[str, Any] = _SMC100) -> tuple[int, str]:
+    """Decode an answer to TS: error bits, and the name of the state in a profile.
 
     Raises
     ------
@@ -141,10 +87,12 @@ def decode_status(value: str) -> Status:
     Examples
     --------
     >>> decode_status("002028")
-    Status(errors=32, state=40)
+    (32, 'moving')
     """
     if re.fullmatch(r"[0-9A-Fa-f]{6}", value) is None:
         raise ProtocolError(f"not a status: {value!r}")
-    status = Status(int(value[:4], 16), int(value[4:], 16))
-    phase(status.state)
-    return status
+    for name, codes in profile["states"].items():
+        first, last = (int(code, 16) for code in codes.split("-"))
+        if first <= int(value[4:], 16) <= last:
+            return int(value[:4], 16), name
+    raise ProtocolError(f"{value[4:]} is not a state of an SMC100")

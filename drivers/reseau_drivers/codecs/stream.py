@@ -8,8 +8,6 @@ from typing import Generic, Protocol, TypeVar
 
 from reseau.core.errors import ProtocolError
 
-__all__ = ["Damaged", "Decoder", "LineDecoder", "LineMessageDecoder", "excerpt"]
-
 T = TypeVar("T")
 
 _SHOWN = 60

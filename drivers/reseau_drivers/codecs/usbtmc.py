@@ -13,8 +13,6 @@ from reseau.core.errors import ProtocolError
 
 from .stream import excerpt
 
-__all__ = ["END", "HEAD", "OUT", "REQUEST_IN", "Transfer", "decode", "encode_in"]
-
 OUT, REQUEST_IN = 1, 2
 HEAD = 12
 END = 1

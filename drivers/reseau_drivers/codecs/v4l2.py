@@ -9,44 +9,6 @@ import struct
 from dataclasses import dataclass
 from typing import Self
 
-__all__ = [
-    "AUTOGAIN",
-    "BRIGHTNESS",
-    "DQBUF",
-    "ENUM_FMT",
-    "EXPOSURE_ABSOLUTE",
-    "EXPOSURE_AUTO",
-    "EXPOSURE_MANUAL",
-    "FIELDS",
-    "GAIN",
-    "G_CTRL",
-    "G_FMT",
-    "G_PARM",
-    "G_SELECTION",
-    "QBUF",
-    "QUERYBUF",
-    "QUERYCAP",
-    "QUERYCTRL",
-    "REQBUFS",
-    "STREAMOFF",
-    "STREAMON",
-    "S_CTRL",
-    "S_FMT",
-    "S_PARM",
-    "S_SELECTION",
-    "Buffer",
-    "Capability",
-    "Control",
-    "Format",
-    "Interval",
-    "Request",
-    "Selection",
-    "control_value",
-    "fourcc_of",
-    "fourcc_text",
-    "stream_type",
-]
-
 CAPTURE = 1
 """V4L2_BUF_TYPE_VIDEO_CAPTURE."""
 MMAP = 1

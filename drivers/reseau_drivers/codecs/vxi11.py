@@ -12,19 +12,6 @@ from typing import Self
 
 from .rpc import Unpacker, pack
 
-__all__ = [
-    "CORE",
-    "VERSION",
-    "Error",
-    "Flag",
-    "Procedure",
-    "ReadParameters",
-    "Reason",
-    "WriteParameters",
-    "generic_link",
-    "read_response",
-]
-
 CORE, VERSION = 0x0607AF, 1
 
 

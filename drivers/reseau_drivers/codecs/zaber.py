@@ -16,20 +16,6 @@ from reseau.core.errors import ProtocolError, SettingError
 
 from .stream import LineMessageDecoder, excerpt
 
-__all__ = [
-    "LIMIT",
-    "Alert",
-    "Command",
-    "Info",
-    "Message",
-    "MessageDecoder",
-    "Reply",
-    "decode",
-    "decode_command",
-    "encode",
-    "lrc",
-]
-
 LIMIT = 512
 """Largest size of an accepted message (bytes); devices send at most 80 by default."""
 

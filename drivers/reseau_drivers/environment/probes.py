@@ -15,8 +15,6 @@ from ..codecs.sentence import Sentence
 from ..codecs.stream import LineDecoder
 from ..link import Link, MessageLink
 
-__all__ = ["Framing", "LineProbe", "ModbusProbe", "Register", "ScpiProbe"]
-
 Framing = Literal["rtu", "tcp"]
 
 _LONGEST = 512

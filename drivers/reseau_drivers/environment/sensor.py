@@ -11,8 +11,6 @@ from reseau.core.environment import Condition
 from reseau.core.errors import ProtocolError, SettingError, StateError
 from reseau.instruments import Deadline, Device, Environment, Identity, Limits, Settings
 
-__all__ = ["KNOWN", "EnvironmentSensor", "Probe", "Quantity", "SensorSettings", "quantities_of"]
-
 KNOWN: Mapping[str, tuple[str, float, float]] = {
     "temperature": ("°C", -40.0, 85.0),
     "humidity": ("%", 0.0, 100.0),
@@ -226,7 +224,7 @@ class EnvironmentSensor(Device[SensorSettings]):
         }
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        measured = self.environment(deadline.left_or_minimum)
+        measured = self.environment(deadline.left)
         return {key: str(each) for key, each in measured.conditions.items()}
 
     def environment(self, seconds: float | None = None) -> Environment:

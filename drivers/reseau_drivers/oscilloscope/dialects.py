@@ -21,24 +21,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from reseau.core.data import Array
 from reseau.core.errors import FormatError, ProtocolError, SettingError
 
-from ..codecs.ieee488 import picture
+from ..codecs.ieee488 import missing_bytes, picture
 from ..codecs.numbers import INFINITE
 from ..profiles import CONTROLLER_SCHEMA, CONTROLLERS, FOLDER, controller, text_of
-from .screens import bytes_of_colours, picture_after, runs_of_colours
-
-__all__ = [
-    "DIALECTS",
-    "Dialect",
-    "Formula",
-    "WaveformDialect",
-    "candidates_of",
-    "described",
-    "dialect_named",
-    "dialect_of",
-    "fields_of",
-    "read_profiles",
-    "samples_of",
-]
+from .screens import bytes_of_colours, packets_missing, picture_after, pixels_of_packets, runs_of_colours
 
 Numbers = Mapping[str, Any]
 SCHEMA = "reseau-instrument-profile/1"
@@ -52,6 +38,7 @@ _ANSWERS: Mapping[str, Callable[[bytes], bytes]] = {
     "runs of colours": runs_of_colours,
     "picture after 4 bytes": lambda answer: picture_after(answer, 4),
     "picture after 12 bytes": lambda answer: picture_after(answer, 12),
+    "packets of pixels": lambda answer: answer,
 }
 
 
@@ -232,6 +219,8 @@ class Dialect(_Part):
         Whether it answers ``*IDN?``.
     silent : str
         What it may lack if it does not answer.
+    palette : tuple of str
+        Colours of the codes of pixels, in hexadecimal: 256 of them, or none.
     maker : Maker
         Its maker.
 
@@ -253,16 +242,28 @@ class Dialect(_Part):
     ends: Annotated[str, Field(pattern=r"^[\r\n\x00;]*$")] = "\n"
     identifies: bool = True
     silent: str = ""
+    palette: tuple[Annotated[str, Field(pattern=r"^([0-9A-Fa-f]{6})+$")], ...] = ()
     maker: Maker
 
+    @model_validator(mode="after")
+    def _coloured(self) -> Self:
+        if (self.answer == "packets of pixels") != (len("".join(self.palette)) == 6 * 256):
+            raise ValueError("`palette` has 256 colours with packets of pixels, and none otherwise")
+        return self
+
     @property
-    def ahead(self) -> int:
-        """Number of bytes before a picture."""
-        return int(self.answer.split()[2]) if self.answer.startswith("picture after") else 0
+    def missing(self) -> Callable[[bytes, bool], int | None] | None:
+        """How many bytes are missing from an answer with the picture; None: as of a block or picture."""
+        match self.answer.split():
+            case ["picture", "after", ahead, _]:
+                return lambda answer, ended: missing_bytes(answer[int(ahead) :], ended)
+            case ["packets", *_]:
+                return lambda answer, ended: packets_missing(answer)
+        return None
 
     def decode(self, answer: bytes) -> bytes:
         """Make a PNG or BMP file from the answer with the picture."""
-        return _ANSWERS[self.answer](answer)
+        return pixels_of_packets(answer, self.palette) if self.palette else _ANSWERS[self.answer](answer)
 
 
 def read_profiles(text: str, *, where: object) -> tuple[Maker, tuple[Dialect, ...]]:
@@ -372,7 +373,9 @@ def described(name: str = "") -> str:
         examples = {
             each.name: ", ".join(example.split(",")[1] for example in each.examples) for each in known
         }
-        examples |= {} if name else dict.fromkeys(CONTROLLERS, "codes, flags and banners of a controller")
+        examples |= (
+            {} if name else dict.fromkeys(CONTROLLERS, "commands, states, codes and flags of a controller")
+        )
         return "".join(f"{each}: {models}".rstrip(": ") + "\n" for each, models in examples.items())
     if name in CONTROLLERS:
         return (FOLDER / f"{name}.toml").read_text("utf-8")

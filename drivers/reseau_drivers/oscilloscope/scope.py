@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,8 +19,6 @@ from ..codecs.numbers import numbers
 from ..codecs.stream import excerpt
 from ..link import Link, SerialLink
 from .dialects import MAKERS, Dialect, WaveformDialect, candidates_of, dialect_of, fields_of, samples_of
-
-__all__ = ["Oscilloscope", "OscilloscopeSettings"]
 
 _TRIAL_S = 3.0
 """Time in which an instrument of an unknown model must send a picture."""
@@ -111,7 +110,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         for dialect in asked:
             if deadline.expired:
                 break
-            trial = Deadline(min(_TRIAL_S, deadline.left_or_minimum))
+            trial = deadline.part(_TRIAL_S)
             try:
                 for command in dialect.setup:
                     self._send(command, trial)
@@ -159,7 +158,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
         if self._guessed:
             found["advice"] = f"its model has no profile; set dialect = {found['dialect']!r} to ask no more"
         if self._required_dialect.errors:
-            with self._exchange("check", deadline.left_or_minimum) as time:
+            with self._exchange("check", deadline.left) as time:
                 number, text = error_entry(self._query(self._required_dialect.errors, time))
                 found["error"] = f"{number} {text}".strip() if number else "none"
         return found
@@ -185,7 +184,7 @@ class Oscilloscope(Device[OscilloscopeSettings]):
             elif how == "query":
                 self._query(text, deadline)
             else:
-                data = dialect.decode(self._fetch(text, deadline, dialect.ahead))
+                data = dialect.decode(self._fetch(text, deadline, dialect.missing))
         _verify_png(data)
         return data
 
@@ -306,17 +305,19 @@ class Oscilloscope(Device[OscilloscopeSettings]):
             if text in said:
                 raise ProtocolError(f"refuses: {excerpt(said.encode())}", do=do)
 
-    def _fetch(self, text: str, deadline: Deadline, ahead: int = 0) -> bytes:
-        """Return a block or picture, with the bytes that are ahead of it."""
+    def _fetch(
+        self, text: str, deadline: Deadline, missing: Callable[[bytes, bool], int | None] | None = None
+    ) -> bytes:
+        """Return a block or picture, or what a function on missing bytes takes for whole."""
         self._start_query(text, deadline)
         lacking: int | None = None
         while True:
             # Parse again only when the missing bytes have arrived: a picture is large.
-            if len(self._received) > ahead and not lacking:
-                start = 0 if ahead else _start_of_binary(self._received)
+            if self._received and not lacking:
+                start = 0 if missing else _start_of_binary(self._received)
                 ended = getattr(self._link, "ended", False)
                 try:
-                    lacking = missing_bytes(bytes(self._received[start + ahead :]), ended)
+                    lacking = (missing or missing_bytes)(bytes(self._received[start:]), ended)
                 except ProtocolError:
                     self._require_willing(self._received[:200].decode("latin-1"))
                     raise

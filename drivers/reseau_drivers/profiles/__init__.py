@@ -9,17 +9,38 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 from reseau.core.errors import FormatError, InputError
 
-__all__ = ["CONTROLLERS", "CONTROLLER_SCHEMA", "FOLDER", "controller", "known", "text_of", "told_bits"]
+__all__ = [
+    "CONTROLLERS",
+    "CONTROLLER_SCHEMA",
+    "FOLDER",
+    "controller",
+    "known",
+    "order",
+    "text_of",
+    "told_bits",
+]
 
 FOLDER = Path(__file__).parent
 CONTROLLERS = ("grbl", "kinesis", "marlin", "smc100", "zaber")
 CONTROLLER_SCHEMA = "reseau-controller-profile/1"
-_PATTERNS = ("banner", "replies")
+_PATTERNS = ("banner", "marks", "replies", "tells")
+_FIXED = ("commands", "factors", "masks", "messages", "motors", "replies", "states", "status")
+"""Tables whose names the drivers ask for."""
+_FORMS = {
+    "bits": (r"[0-9A-Fa-f]{1,8}", "hexadecimal number"),
+    "usb": (r"[0-9A-Fa-f]{4}", "hexadecimal number"),
+    "masks": (r"[0-9A-Fa-f]{8}", "hexadecimal number"),
+    "messages": (r"[0-9A-Fa-f]{4}( \d+)*", "hexadecimal number with lengths"),
+    "states": (r"[0-9A-Fa-f]{2}-[0-9A-Fa-f]{2}", "range of hexadecimal numbers"),
+}
+"""How the keys of ``bits`` and the values of others are written."""
 
 
 def known(name: str) -> dict[str, Any]:
@@ -96,12 +117,12 @@ def _require_alike(ours: dict[str, Any], mine: dict[str, Any], where: str) -> No
     if missing := sorted(ours.keys() ^ mine.keys()):
         raise FormatError(f"`{missing[0]}` is missing, or not of this controller", where=where)
     for key, part in ours.items():
-        told = mine[key].values() if isinstance(mine[key], dict) else mine[key]
-        fixed = isinstance(part, dict) and key in ("replies", "motors")
+        told = list(mine[key].values()) if isinstance(mine[key], dict) else mine[key]
+        fixed = isinstance(part, dict) and key in _FIXED
         if type(mine[key]) is not type(part) or (fixed and part.keys() != mine[key].keys()):
             names = f": it has {', '.join(part)}" if isinstance(part, dict) else ""
             raise FormatError(f"`{key}` is not as that of a profile{names}", where=where)
-        kind = float if key == "motors" else str
+        kind = float if key in ("factors", "motors") else str
         wrong = next((each for each in told if type(each) is not kind), None)
         if wrong is not None:
             expected = "number" if kind is float else "text"
@@ -111,12 +132,36 @@ def _require_alike(ours: dict[str, Any], mine: dict[str, Any], where: str) -> No
                 re.compile(pattern)
             except re.error as error:
                 raise FormatError(f"`{key}`: {pattern!r} is no pattern ({error})", where=where) from None
-        for code in mine[key] if key in ("bits", "usb") else ():
-            if re.fullmatch(r"[0-9A-Fa-f]{1,8}", code) is None:
-                raise FormatError(f"`{key}`: {code!r} is no hexadecimal number", where=where)
+        for name, text in mine[key].items() if key == "commands" else ():
+            if (values := _values_of(text)) is None or not values <= (_values_of(part[name]) or set()):
+                raise FormatError(f"`commands`: {text!r} has other values than {part[name]!r}", where=where)
+        form, called = _FORMS.get(key, (".*", ""))
+        for text in mine[key] if key == "bits" else told if called else ():
+            if re.fullmatch(form, text) is None:
+                raise FormatError(f"`{key}`: {text!r} is no {called}", where=where)
 
 
-def told_bits(profile: dict[str, Any], value: int) -> tuple[str, ...]:
+def _values_of(text: str) -> set[str] | None:
+    """Names of the values in a command; None if it is none."""
+    try:
+        return {name for _, name, _, _ in Formatter().parse(text) if name is not None}
+    except ValueError:
+        return None
+
+
+def order(profile: Mapping[str, Any], command: str, **values: object) -> str:
+    """Return a command of a profile with these values.
+
+    Examples
+    --------
+    >>> order(known("zaber"), "move", position=200_000)
+    'move abs 200000'
+    """
+    text: str = profile["commands"][command]
+    return text.format(**values)
+
+
+def told_bits(profile: Mapping[str, Any], value: int) -> tuple[str, ...]:
     """Return the meanings of the bits that are set.
 
     Examples

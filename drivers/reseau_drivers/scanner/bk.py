@@ -21,8 +21,6 @@ from ..codecs import bk
 from ..codecs.stream import excerpt
 from ..link import Link, MessageLink
 
-__all__ = ["BkScanner", "BkSettings"]
-
 _LARGEST_SIDE = 8192
 _ON, _OFF = b'QUERY:GRAB_FRAME "ON",20;', b'QUERY:GRAB_FRAME "OFF";'
 _BOXES = ("B_GEOMETRY_US_FRAME_GRAB", "B_GEOMETRY_PIXEL")
@@ -120,7 +118,7 @@ class BkScanner(Device[BkSettings]):
         }
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        scan = self.scan(deadline.left_or_minimum)
+        scan = self.scan(deadline.left)
         height, width = scan.pixels.shape
         mm = "of unknown size" if scan.mm_per_px is None else "of {:g} × {:g} mm".format(*scan.mm_per_px)
         return {"frame": f"{width}×{height} px {mm}"}

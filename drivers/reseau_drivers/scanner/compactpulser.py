@@ -37,8 +37,6 @@ from ..codecs.compactpulser import LIMIT, Setting, decode, encode
 from ..codecs.stream import LineDecoder
 from ..link import Link, MessageLink
 
-__all__ = ["CompactPulser", "CompactPulserSettings"]
-
 _MOST_GAIN = 840
 
 
@@ -197,7 +195,7 @@ class CompactPulser(Device[CompactPulserSettings]):
             self._verify(_letters(self.settings), deadline)
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        self.verify(deadline.left_or_minimum)
+        self.verify(deadline.left)
         alone = len(self._readable) == 1
         return {"settings": "gain as sent; others are not readable" if alone else "as sent"}
 
@@ -263,7 +261,7 @@ class CompactPulser(Device[CompactPulserSettings]):
             lines = [self._line_at(self._carrier, k, deadline) for k in range(s.lines)]
         finally:
             self._scanning = False
-        with self._exchange("scan", deadline.left_or_minimum):
+        with self._exchange("scan", deadline.left):
             pixels, row, step_s = section(lines, s.full_scale_v)
         mm = (s.step_mm, s.speed_m_s * 1e3 * step_s / 2)
         return BScan(pixels, mm, ((s.lines - 1) / 2, row), s.speed_m_s, float("nan"), s.gain_db, asked)
@@ -274,10 +272,8 @@ class CompactPulser(Device[CompactPulserSettings]):
         if deadline.expired:
             what = f"did not finish within {deadline.seconds:g} s"
             raise DeadlineError(what, where=self.name, command="scan")
-        carrier.move(
-            self._axis, self.settings.first_mm + number * self.settings.step_mm, deadline.left_or_minimum
-        )
-        return self.line(deadline.left_or_minimum)
+        carrier.move(self._axis, self.settings.first_mm + number * self.settings.step_mm, deadline.left)
+        return self.line(deadline.left)
 
     def depths_mm(self, line: Waveform) -> Array:
         """Return the depths of the samples of a line (n,), in millimetres."""

@@ -28,8 +28,6 @@ from reseau.core.errors import (
 )
 from reseau.instruments import BScan, Deadline, Device, Identity, Limits, Settings, quantity
 
-__all__ = ["DicomFiles", "DicomSettings"]
-
 _LARGEST_SIDE, _MOST_FRAMES, _MOST_FILES = 8192, 100_000, 100_000
 _TWO_DIMENSIONS, _CENTIMETRES = 1, 3
 
@@ -172,7 +170,7 @@ class DicomFiles(Device[DicomSettings]):
         return staged
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        with self._exchange("check", deadline.left_or_minimum):
+        with self._exchange("check", deadline.left):
             path, index = self._frames[0]
             scale = self._scale(self._header(path))
             self._pixels(path, index)

@@ -20,8 +20,6 @@ from reseau.instruments import BScan, Deadline, Device, Identity, Limits, Settin
 from ..codecs import ping
 from ..link import Link, MessageLink
 
-__all__ = ["Ping360", "Ping360Settings"]
-
 _SHORTEST = 80
 """Shortest sample period of the instrument, in units of 25 ns."""
 _ROWS = 400
@@ -137,7 +135,7 @@ class Ping360(Device[Ping360Settings]):
         }
 
     def _test(self, deadline: Deadline) -> dict[str, str]:
-        line = self.line(0, deadline.left_or_minimum)
+        line = self.line(0, deadline.left)
         return {"line": f"{len(line)} samples, mean {line.mean():.1f}"}
 
     def line(self, angle: int, seconds: float | None = None) -> NDArray[np.uint8]:

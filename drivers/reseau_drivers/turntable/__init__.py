@@ -16,7 +16,7 @@ from .kinesis import Kinesis, MotorKind, kinesis_ports
 from .marlin import Marlin
 from .reference import References
 from .smc100 import Smc100
-from .table import Axis, AxisPlan, Table, TableSettings
+from .table import Axis, AxisPlan, Controller, Table, TableSettings
 from .zaber import Zaber
 
 __all__ = [
@@ -76,8 +76,7 @@ def zaber(
     >>> table.axes["tilt"].unit, table.axes["tilt"].limits
     ('deg', (-44.8, 45.0))
     """
-    controller = Zaber(link_to(address), dialect=dialect)
-    return Table(name, controller, AxisPlan.read(axes), TableSettings().changed(settings or {}), **options)
+    return _table(Zaber(link_to(address), dialect=dialect), name, axes, settings, options)
 
 
 def smc100(
@@ -102,13 +101,8 @@ def smc100(
     >>> sorted(table.axes)
     ['roll']
     """
-    return Table(
-        name,
-        Smc100(link_to(address, baud=57600, xonxoff=True), dialect=dialect),
-        AxisPlan.read(axes),
-        TableSettings().changed(settings or {}),
-        **options,
-    )
+    controller = Smc100(link_to(address, baud=57600, xonxoff=True), dialect=dialect)
+    return _table(controller, name, axes, settings, options)
 
 
 def kinesis(
@@ -144,13 +138,11 @@ def kinesis(
     (0.0, 360.0)
     """
     links = [link_to(each.strip()) for each in address.split(",")] if isinstance(address, str) else [address]
-    plans = AxisPlan.read(axes)
-    for axis, plan in plans.items():
+    for axis, plan in AxisPlan.read(axes).items():
         if not rack and not 1 <= plan.device <= len(links):
             do = "give the addresses of all controllers, separated by commas"
             raise SettingError(f"device {plan.device} has no address", where=f"axis {axis}", do=do)
-    controller = Kinesis(links, motor, rack=rack, dialect=dialect)
-    return Table(name, controller, plans, TableSettings().changed(settings or {}), **options)
+    return _table(Kinesis(links, motor, rack=rack, dialect=dialect), name, axes, settings, options)
 
 
 def hand(
@@ -222,7 +214,8 @@ def grbl(
     >>> table.axes["z"].limits
     (-120.0, -1.0)
     """
-    return _by_lines(Grbl, name, address, axes, dialect, settings, options)
+    controller = Grbl(link_to(address, keep_up=True), dialect=dialect)
+    return _table(controller, name, axes, settings, options, letters=True)
 
 
 def marlin(
@@ -247,21 +240,21 @@ def marlin(
     >>> marlin("table", "/dev/ttyACM0", axes={"roll": {"axis": 4}}).axes["roll"].unit
     'deg'
     """
-    return _by_lines(Marlin, name, address, axes, dialect, settings, options)
+    controller = Marlin(link_to(address, keep_up=True), dialect=dialect)
+    return _table(controller, name, axes, settings, options, letters=True)
 
 
-def _by_lines(
-    controller: type[Grbl] | type[Marlin],
+def _table(
+    controller: Controller,
     name: str,
-    address: str | Link,
     axes: Mapping[str, Mapping[str, Any]],
-    dialect: str | None,
     settings: Mapping[str, Any] | None,
     options: Mapping[str, Any],
+    *,
+    letters: bool = False,
 ) -> Table:
-    """A table whose controller takes lines."""
+    """A table, of which each axis may need a letter."""
     plans = AxisPlan.read(axes)
-    for plan in plans.values():
+    for plan in plans.values() if letters else ():
         letter_of(plan)
-    made = controller(link_to(address, keep_up=True), dialect=dialect)
-    return Table(name, made, plans, TableSettings().changed(settings or {}), **options)
+    return Table(name, controller, plans, TableSettings().changed(settings or {}), **options)

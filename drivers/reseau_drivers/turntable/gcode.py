@@ -1,41 +1,13 @@
-"""What tables with G-code controllers have in common: lines, and the words that end their answers."""
+"""What tables with G-code controllers have in common: letters of axes, and a start that takes time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 from reseau.core.errors import DeadlineError, SettingError
 
-from ..codecs.gcode import AXES, AnswerDecoder, Message
-from ..link import Link, MessageLink
+from ..codecs.gcode import AXES
 from .table import AxisPlan
-
-__all__ = ["Lines", "letter_of", "until"]
-
-
-class Lines(MessageLink[Message]):
-    """Exchange of lines with a controller.
-
-    Parameters
-    ----------
-    link : Link
-        Link to the controller.
-    overhear : callable
-        Called with each message that is not an answer.
-    profile : mapping
-        What is known of the controller.
-
-    Examples
-    --------
-    >>> from reseau_drivers.link import link_to
-    >>> from reseau_drivers.profiles import known
-    >>> Lines(link_to("/dev/ttyUSB0"), lambda message: None, known("marlin")).ignored
-    0
-    """
-
-    def __init__(self, link: Link, overhear: Callable[[Message], None], profile: Mapping[str, Any]) -> None:
-        super().__init__(link, AnswerDecoder(profile), overhear)
 
 
 def letter_of(plan: AxisPlan) -> str:

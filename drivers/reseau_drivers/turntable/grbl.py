@@ -12,6 +12,7 @@ are negative as a rule, and so are the limits of its axes.
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -19,24 +20,13 @@ from contextlib import suppress
 from reseau.core.errors import ProtocolError, RefusedError, StateError
 from reseau.instruments import Deadline, Identity
 
-from ..codecs.gcode import Alarm, Banner, Error, Message, Ok, Outdated, Report, Said, encode
-from ..link import Link
-from ..profiles import controller
-from .gcode import Lines, letter_of, until
+from ..codecs.gcode import Alarm, AnswerDecoder, Banner, Error, Message, Ok, Outdated, Report, Said, encode
+from ..link import Link, MessageLink
+from ..profiles import controller, order
+from .gcode import letter_of, until
 from .reference import References, Reported
 from .table import AxisPlan
 
-__all__ = ["Grbl"]
-
-_STATUS, _HOLD, _RESET, _FULL_STATUS = b"?", b"!", b"\x18", b"\x87"
-"""Bytes that are obeyed at once; the last one is known to grblHAL only."""
-_MARK = "T111"
-"""Tool number of a GRBL that has homed."""
-_MOVING = ("Run", "Jog", "Home")
-_STATES = ("8", "9", "13")
-"""Errors that mean: not allowed in this state."""
-_FAULTS = {"Door": "the safety door is open", "Check": "check mode ($C): nothing moves", "Sleep": "it sleeps"}
-_KNOWN = {"Idle", "Run", "Jog", "Hold", "Home", "Alarm", "Tool", *_FAULTS}
 _BOOT_S, _BEGINS_S, _POLL_S = 4.0, 2.0, 0.01
 
 
@@ -66,7 +56,11 @@ class Grbl:
     def __init__(self, link: Link, answer_s: float = 1.0, dialect: str | None = None) -> None:
         self._known = controller("grbl", dialect)
         self._answer_s = answer_s
-        self._link = Lines(link, self._overheard, self._known)
+        self._link: MessageLink[Message] = MessageLink(link, AnswerDecoder(self._known), self._overheard)
+        # Bytes that are obeyed at once.
+        self._status, self._hold, self._reset_, self._full_status = (
+            order(self._known, name).encode("latin-1") for name in ("status", "hold", "reset", "full_status")
+        )
         self._synchronised = self._suitable = False
         self._speed: dict[str, float] = {}
         self._alarm: Alarm | None = None
@@ -107,36 +101,38 @@ class Grbl:
         self._reset(deadline)
         self._alarm = None
         # GRBL says `ok` to $H when it has ended; a refusal comes at once, and the status shows the search.
-        order, patience, self._acknowledged = encode("$H"), deadline.part(_BEGINS_S), False
+        line, patience, self._acknowledged = order(self._known, "home"), deadline.part(_BEGINS_S), False
+        asked = encode(line)
         while not patience.expired:
-            found = self._link.query(order + _STATUS, _report_or_refusal, deadline.part(self._answer_s))
+            found = self._link.query(asked + self._status, _report_or_refusal, deadline.part(self._answer_s))
             if isinstance(found, Error):
-                raise _refusal(found, "$H")
+                raise self._refusal(found, line)
             if isinstance(found, Alarm):
-                raise StateError(f"refused the search: {found.meaning}", command="$H")
+                raise StateError(f"refused the search: {found.meaning}", command=line)
             homes = isinstance(found, Report) and found.state == "Home"
             self._searching = True
             if homes or isinstance(found, Ok) or self._acknowledged:
                 return
-            order = b""
+            asked = b""
             time.sleep(patience.at_most(_POLL_S))
-        raise StateError("does not begin to search its reference", command="$H")
+        raise StateError("does not begin to search its reference", command=line)
 
     def begin_move(self, plan: AxisPlan, position: float, deadline: Deadline) -> None:
         """Start a movement, in machine coordinates."""
         if not self._still_marked(deadline):
             raise StateError("has started anew", do=f"home {plan.name} again")
         self._underway = True
-        target = f"{letter_of(plan)}{position * plan.per_unit:.4f}"
         feed = self._speed.get(plan.name, 1.0) * plan.per_unit * 60
-        self._line(f"G21 G90 G53 G1 {target} F{feed:.3f}", deadline)
+        there = {"axis": letter_of(plan), "position": position * plan.per_unit}
+        self._ready(deadline)
+        self._exchange(order(self._known, "move", feed=feed, **there), deadline)
 
     def halt(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Stop all axes: a feed hold, and at rest a reset, which discards the movement, not the positions."""
         state = self._report(deadline)
         if state.state in ("Run", "Jog", "Hold"):
-            self._link.send(_HOLD, deadline.part(self._answer_s))
-            while _moves(state := self._report(deadline)):
+            self._link.send(self._hold, deadline.part(self._answer_s))
+            while self._moves(state := self._report(deadline)):
                 if deadline.expired:
                     raise StateError("does not stop", do="switch it off")
                 time.sleep(deadline.at_most(_POLL_S))
@@ -154,10 +150,11 @@ class Grbl:
         if not 1 <= plan.axis <= len(positions):
             what = f"reports {len(positions)} machine positions, not that of {letter_of(plan)}"
             raise ProtocolError(what, do="set $10=1")
-        faults = [_FAULTS[found.state]] if found.state in _FAULTS else []
-        if found.state not in _KNOWN:
+        named = self._known["faults"]
+        faults = [named[found.state]] if found.state in named else []
+        if found.state not in (*self._known["working"], *named):
             faults.append(f"its state is {found.state}, which is not known")
-        if found.state == "Hold" and not _moves(found):
+        if found.state == "Hold" and not self._moves(found):
             faults.append("it is paused by a feed hold")
         if found.state == "Alarm" and self._alarm is not None:
             faults.append(self._alarm.meaning)
@@ -170,7 +167,10 @@ class Grbl:
             self._searching = False
             self._mark(deadline)
         return Reported(
-            positions[plan.axis - 1] / plan.per_unit, _moves(found), self._tells(plan, found), tuple(faults)
+            positions[plan.axis - 1] / plan.per_unit,
+            self._moves(found),
+            self._tells(plan, found),
+            tuple(faults),
         )
 
     def _tells(self, plan: AxisPlan, report: Report) -> bool | None:
@@ -185,10 +185,9 @@ class Grbl:
 
     def _mark(self, deadline: Deadline) -> None:
         """Mark a GRBL 1.1 that has homed; of others a reset is not known to remove the mark."""
-        said = " ".join(self._version)
-        if "[VER:1.1" in said and "FIRMWARE:" not in said and "FluidNC" not in said and not self._told:
+        if re.search(self._known["marks"], " ".join(self._version)) and not self._told:
             with suppress(RefusedError):
-                self._exchange(_MARK, deadline)
+                self._exchange(order(self._known, "mark"), deadline)
             self._synchronise(deadline)
 
     def _still_marked(self, deadline: Deadline) -> bool:
@@ -208,14 +207,15 @@ class Grbl:
             self._synchronised = True
         # It reports version and settings at rest only.
         if not self._suitable and self._report(deadline).state in ("Idle", "Alarm"):
-            self._version = self._exchange("$I", deadline)
-            settings = dict(text.split("=", 1) for text in self._exchange("$$", deadline) if "=" in text)
+            self._version = self._exchange(order(self._known, "version"), deadline)
+            told = self._exchange(order(self._known, "settings"), deadline)
+            settings = dict(text.split("=", 1) for text in told if "=" in text)
             inches = settings.get("$13", "0").split()  # some add a description
             if inches[:1] != ["0"]:
                 what = f"reports in millimetres: $13 is {' '.join(inches)}, not 0"
                 raise StateError(what, do="send $13=0 to it")
-            if any("FIRMWARE:grblHAL" in text for text in self._version) and not self._told:
-                self._report(deadline, _FULL_STATUS)
+            if any(re.search(self._known["tells"], text) for text in self._version) and not self._told:
+                self._report(deadline, self._full_status)
             self._suitable = True
 
     def _forget(self) -> None:
@@ -230,20 +230,25 @@ class Grbl:
         def ends(message: Message) -> bool:
             nonlocal heard
             if isinstance(message, Said) and message.text.startswith("[GC:"):
-                heard, self._marked = True, _MARK in message.text.rstrip("]").split()
+                words = message.text.rstrip("]").split()
+                heard, self._marked = True, order(self._known, "mark") in words
             return (heard and isinstance(message, Ok)) or isinstance(message, Outdated)
 
-        _require_current(self._link.query(b"\n" + encode("$G"), ends, deadline.part(self._answer_s)))
+        _require_current(
+            self._link.query(b"\n" + encode(order(self._known, "modes")), ends, deadline.part(self._answer_s))
+        )
 
     def _reset(self, deadline: Deadline) -> None:
         self._marked = False
         self._link.query(
-            _RESET, lambda message: isinstance(message, Banner), deadline.part(max(self._answer_s, 1.0))
+            self._reset_, lambda message: isinstance(message, Banner), deadline.part(max(self._answer_s, 1.0))
         )
 
-    def _report(self, deadline: Deadline, ask: bytes = _STATUS) -> Report:
+    def _report(self, deadline: Deadline, ask: bytes = b"") -> Report:
         found = self._link.query(
-            ask, lambda message: isinstance(message, Report | Outdated), deadline.part(self._answer_s)
+            ask or self._status,
+            lambda message: isinstance(message, Report | Outdated),
+            deadline.part(self._answer_s),
         )
         _require_current(found)
         if not isinstance(found, Report) or not all(
@@ -252,10 +257,6 @@ class Grbl:
             raise ProtocolError(f"sent {found}, which is no status")
         self._overheard(found)
         return found
-
-    def _line(self, line: str, deadline: Deadline) -> list[str]:
-        self._ready(deadline)
-        return self._exchange(line, deadline)
 
     def _exchange(self, line: str, deadline: Deadline) -> list[str]:
         """Send a line; return what comes before its `ok`."""
@@ -272,8 +273,16 @@ class Grbl:
             what = "has started anew" if isinstance(found, Banner) else found.meaning
             raise StateError(what, command=line, do="home it again")
         if isinstance(found, Error):
-            raise _refusal(found, line)
+            raise self._refusal(found, line)
         return said
+
+    def _moves(self, report: Report) -> bool:
+        stops = report.state in ("Hold", "Door") and report.substate in (1, 2)
+        return stops or report.state in self._known["moving"]
+
+    def _refusal(self, error: Error, line: str) -> RefusedError | StateError:
+        kind = StateError if error.text in self._known["busy"] else RefusedError
+        return kind(f"refused the line: {error.meaning}", command=line)
 
     def _overheard(self, message: Message) -> None:
         if isinstance(message, Alarm):
@@ -294,12 +303,3 @@ def _report_or_refusal(message: Message) -> bool:
 def _require_current(message: Message) -> None:
     if isinstance(message, Outdated):
         raise StateError("speaks as GRBL up to 0.9 does", do="install GRBL 1.1 on it")
-
-
-def _moves(report: Report) -> bool:
-    return report.state in _MOVING or (report.state in ("Hold", "Door") and report.substate in (1, 2))
-
-
-def _refusal(error: Error, line: str) -> RefusedError | StateError:
-    kind = StateError if error.text in _STATES else RefusedError
-    return kind(f"refused the line: {error.meaning}", command=line)

@@ -24,8 +24,6 @@ from reseau.instruments import Camera, Deadline, Identity, Instrument
 from .reference import References, Reported
 from .table import AxisPlan, Table
 
-__all__ = ["ByHand", "HandTable", "Marker", "Person", "marker_position"]
-
 _TRIES = 3
 """How often a person is asked to set an axis that is not where it should be."""
 
@@ -283,16 +281,17 @@ class HandTable(Table):
     @property
     def uses(self) -> tuple[str, ...]:
         """Other instruments that it needs."""
-        return (self._camera,) if self._camera else ()
+        return super().uses + ((self._camera,) if self._camera else ())
 
     def combine(self, instruments: Mapping[str, Instrument]) -> None:
-        """Find the camera that sees the markers.
+        """Find the camera that sees the markers, and join zones.
 
         Raises
         ------
         SettingError
             If there is no such camera.
         """
+        super().combine(instruments)
         if not self._camera:
             return
         found = instruments.get(self._camera)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 from serial.tools import list_ports
 
@@ -19,8 +19,6 @@ from reseau.instruments import Deadline, Identity
 from ..codecs.apt import (
     HOST,
     USB,
-    Bits,
-    Id,
     Message,
     MessageDecoder,
     Velocities,
@@ -29,21 +27,18 @@ from ..codecs.apt import (
     decode_status,
     decode_velocities,
     encode,
-    encode_move,
     encode_velocities,
+    move,
 )
 from ..link import Link, MessageLink
 from ..profiles import controller, known, told_bits
 from .reference import References, Reported
 from .table import AxisPlan
 
-__all__ = ["Kinesis", "MotorKind", "kinesis_ports"]
-
 MotorKind = Literal["dc", "brushless", "stepper"]
 _BEGINS_S = 2.0
 """Time in which an order must show in the status (s)."""
 _POLL_S = 0.01
-_STEPPERS = ("stepper",)
 _OFF = "the motor is switched off"
 
 
@@ -85,15 +80,12 @@ class Kinesis:
             raise SettingError(f"{motor!r} is not one of {', '.join(self._known['motors'])}", where="motor")
         if rack and len(links) != 1:
             raise SettingError("has one address", where="rack")
-        self._links = [_Cube(link, answer_s) for link in links]
+        self._links = [_Cube(link, answer_s, self._known) for link in links]
         self._motor, self._rack = motor, rack
+        self._status = self._known["status"][motor]
+        self._masks = {name: int(mask, 16) for name, mask in self._known["masks"].items()}
         self._targets: dict[tuple[int, int], int] = {}
         self.references = References()
-        # Steppers without an encoder report STATUS, the others DC_STATUS.
-        stepper = motor in _STEPPERS
-        self._request, self._status = (
-            (Id.REQUEST_STATUS, Id.STATUS) if stepper else (Id.REQUEST_DC_STATUS, Id.DC_STATUS)
-        )
 
     def open(self, deadline: Deadline) -> None:
         """Open all connections."""
@@ -110,7 +102,7 @@ class Kinesis:
         found = []
         for device in sorted({plan.device for plan in plans.values()}):
             cube, address = self._at(device)
-            info = decode_info(cube.query(Message(Id.REQUEST_INFO, address, HOST), Id.INFO, deadline))
+            info = decode_info(cube.query(Message("REQUEST_INFO", address, HOST), "INFO", deadline))
             found.append((info.model, str(info.serial), ".".join(map(str, info.firmware))))
         models, serials, versions = (", ".join(column) for column in zip(*found, strict=True))
         return Identity("Thorlabs", models, serials, versions)
@@ -123,7 +115,7 @@ class Kinesis:
         if now.maximum == maximum:
             return
         data = encode_velocities(Velocities(plan.axis, now.acceleration, maximum, now.minimum))
-        cube.send(Message(Id.SET_VELOCITIES, address, HOST, data=data), deadline)
+        cube.send(Message("SET_VELOCITIES", address, HOST, data=data), deadline)
         if (found := self._velocities(plan, deadline).maximum) != maximum:
             raise StateError(
                 f"did not take the speed of axis {plan.name}: {found}, not {maximum}",
@@ -133,9 +125,9 @@ class Kinesis:
     def begin_home(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Switch the motor on and start the search for the reference."""
         cube, address = self._at(plan.device)
-        cube.send(Message(Id.SET_ENABLED, address, HOST, (plan.axis, 1)), deadline)
+        cube.send(Message("SET_ENABLED", address, HOST, (plan.axis, 1)), deadline)
         self._targets.pop((plan.device, plan.axis), None)
-        if not self._begun(plan, encode(Message(Id.HOME, address, HOST, (plan.axis, 0))), Id.HOMED, deadline):
+        if not self._begun(plan, Message("HOME", address, HOST, (plan.axis, 0)), "HOMED", deadline):
             raise StateError("does not begin to search its reference", do="is the stage plugged in?")
 
     def begin_move(self, plan: AxisPlan, position: float, deadline: Deadline) -> None:
@@ -144,14 +136,14 @@ class Kinesis:
         target = round(position * plan.per_unit)
         self._targets[plan.device, plan.axis] = target
         # One that is not carried out is noticed by where the axis stands.
-        self._begun(plan, encode_move(address, plan.axis, target), Id.MOVED, deadline)
+        self._begun(plan, move(address, plan.axis, target), "MOVED", deadline)
 
     def halt(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Stop the axis with its deceleration, and wait until it stands."""
         cube, address = self._at(plan.device)
         self._targets.pop((plan.device, plan.axis), None)
-        cube.send(Message(Id.STOP, address, HOST, (plan.axis, 2)), deadline)
-        while self._ask(plan, deadline)[1].moving:
+        cube.send(Message("STOP", address, HOST, (plan.axis, 2)), deadline)
+        while self._ask(plan, deadline)[1] & self._masks["moving"]:
             if deadline.expired:
                 raise StateError("does not stop", do="switch it off")
             time.sleep(deadline.at_most(_POLL_S))
@@ -159,19 +151,19 @@ class Kinesis:
     def state(self, plan: AxisPlan, deadline: Deadline) -> Reported:
         """Return what it reports of the axis."""
         counts, bits = self._ask(plan, deadline)
-        faults = []
-        if Bits.ENABLED not in bits:
-            faults.append(_OFF)
-        faults += told_bits(self._known, bits)
+        limit, moving, homed, enabled = (
+            bool(bits & self._masks[name]) for name in ("limit", "moving", "homed", "enabled")
+        )
+        faults = [*([] if enabled else [_OFF]), *told_bits(self._known, bits)]
         # At its reference a stage may stand on a switch: that is an end only where it was to go farther.
         target = self._targets.get((plan.device, plan.axis), counts)
         short = abs(target - counts) > plan.tolerance * plan.per_unit
-        if short and not bits.moving and bits & (Bits.LIMIT_FORWARD | Bits.LIMIT_REVERSE):
+        if short and limit and not moving:
             faults.append("a limit switch was reached")
-        lost = [what for what in faults if what != _OFF] if self._motor in _STEPPERS else []
+        lost = [what for what in faults if what != _OFF] if self._motor in self._known["open_loop"] else []
         if lost:  # steps are counted as they are sent, whether the motor follows or not
             self.references.void(lost[0], plan.name)
-        return Reported(counts / plan.per_unit, bits.moving, Bits.HOMED in bits, tuple(faults))
+        return Reported(counts / plan.per_unit, moving, homed, tuple(faults))
 
     def _at(self, device: int) -> tuple[_Cube, int]:
         """Connection and address of a controller."""
@@ -181,18 +173,17 @@ class Kinesis:
             raise SettingError(f"{device} is not 1…{len(self._links)}", where="device", do="give its address")
         return self._links[device - 1], USB
 
-    def _ask(self, plan: AxisPlan, deadline: Deadline) -> tuple[int, Bits]:
+    def _ask(self, plan: AxisPlan, deadline: Deadline) -> tuple[int, int]:
         cube, address = self._at(plan.device)
-        return decode_status(
-            cube.query(Message(self._request, address, HOST, (plan.axis, 0)), self._status, deadline)
-        )
+        query = Message(f"REQUEST_{self._status}", address, HOST, (plan.axis, 0))
+        return decode_status(cube.query(query, self._status, deadline))
 
     def _velocities(self, plan: AxisPlan, deadline: Deadline) -> Velocities:
         cube, address = self._at(plan.device)
-        query = Message(Id.REQUEST_VELOCITIES, address, HOST, (plan.axis, 0))
-        return decode_velocities(cube.query(query, Id.VELOCITIES, deadline))
+        query = Message("REQUEST_VELOCITIES", address, HOST, (plan.axis, 0))
+        return decode_velocities(cube.query(query, "VELOCITIES", deadline))
 
-    def _begun(self, plan: AxisPlan, order: bytes, end: Id, deadline: Deadline) -> bool:
+    def _begun(self, plan: AxisPlan, order: Message, end: str, deadline: Deadline) -> bool:
         """Send an order to move; return whether the axis began to move, or has arrived already."""
         cube, _ = self._at(plan.device)
         where = (plan.device if self._rack else 0, plan.axis)
@@ -202,7 +193,7 @@ class Kinesis:
         patience = deadline.part(_BEGINS_S)
         while not patience.expired:
             now, bits = self._ask(plan, deadline)
-            if bits.moving or now != before or (end, *where) in cube.ended:
+            if bits & self._masks["moving"] or now != before or (end, *where) in cube.ended:
                 return True
             if self._targets.get((plan.device, plan.axis)) == now:
                 return True
@@ -225,10 +216,10 @@ def kinesis_ports() -> tuple[str, ...]:
 class _Cube:
     """Exchange of messages with one controller, or with a rack."""
 
-    def __init__(self, link: Link, answer_s: float) -> None:
-        self._answer_s = answer_s
-        self._link: MessageLink[Message] = MessageLink(link, MessageDecoder(), self._overheard)
-        self.ended: set[tuple[int, int, int]] = set()
+    def __init__(self, link: Link, answer_s: float, profile: Mapping[str, Any]) -> None:
+        self._answer_s, self._known = answer_s, profile
+        self._link: MessageLink[Message] = MessageLink(link, MessageDecoder(profile), self._overheard)
+        self.ended: set[tuple[str, int, int]] = set()
         """Ends of movements that were announced: message, bay (0 without a rack), channel."""
         self._synchronised = False
 
@@ -239,31 +230,30 @@ class _Cube:
     def close(self) -> None:
         self._link.close()
 
-    def send(self, message: Message | bytes, deadline: Deadline) -> None:
-        data = message if isinstance(message, bytes) else encode(message)
-        self._link.send(data, deadline.part(self._answer_s))
+    def send(self, message: Message, deadline: Deadline) -> None:
+        self._link.send(encode(message, self._known), deadline.part(self._answer_s))
 
-    def query(self, message: Message, answer: Id, deadline: Deadline) -> Message:
+    def query(self, message: Message, answer: str, deadline: Deadline) -> Message:
         if not self._synchronised:
             # Answers arrive in order: after the one to this query, which is asked only here and where it is
             # known, none from before the connection is left.
-            self._exchange(Message(Id.REQUEST_INFO, message.destination, HOST), Id.INFO, deadline)
+            self._exchange(Message("REQUEST_INFO", message.destination, HOST), "INFO", deadline)
             self._synchronised = True
         return self._exchange(message, answer, deadline)
 
-    def _exchange(self, message: Message, answer: Id, deadline: Deadline) -> Message:
+    def _exchange(self, message: Message, answer: str, deadline: Deadline) -> Message:
         def answers(found: Message) -> bool:
             # Some T-Cubes give 0 as their address; there is only one device at a USB connection of its own.
             sources = (message.destination, 0) if message.destination == USB else (message.destination,)
-            same = found.id == answer and found.source in sources
-            return same and (answer == Id.INFO or found.channel == message.parameters[0])
+            same = found.name == answer and found.source in sources
+            return same and (answer == "INFO" or found.channel == message.parameters[0])
 
-        found = self._link.query(encode(message), answers, deadline.part(self._answer_s))
+        found = self._link.query(encode(message, self._known), answers, deadline.part(self._answer_s))
         if found.destination not in (0, HOST):
             raise ProtocolError(f"sent an answer to {found.destination:#04x}")
         return found
 
     def _overheard(self, message: Message) -> None:
-        if message.id in (Id.HOMED, Id.MOVED):
+        if message.name in ("HOMED", "MOVED"):
             where = message.source - 0x20 if 0x21 <= message.source <= 0x2A else 0
-            self.ended.add((message.id, where, message.channel))
+            self.ended.add((message.name, where, message.channel))

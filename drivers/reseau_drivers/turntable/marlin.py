@@ -18,14 +18,25 @@ from dataclasses import dataclass
 from reseau.core.errors import DeadlineError, InstrumentError, ProtocolError, RefusedError, StateError
 from reseau.instruments import Deadline, Identity
 
-from ..codecs.gcode import AXES, Banner, Busy, Error, Message, Ok, Resend, Said, encode_numbered
-from ..link import Link
-from ..profiles import controller
-from .gcode import Lines, letter_of, until
+from ..codecs.gcode import (
+    AXES,
+    AnswerDecoder,
+    Banner,
+    Busy,
+    Error,
+    Message,
+    Ok,
+    Resend,
+    Said,
+    encode,
+    encode_numbered,
+)
+from ..codecs.numbers import number
+from ..link import Link, MessageLink
+from ..profiles import controller, order
+from .gcode import letter_of, until
 from .reference import References, Reported
 from .table import AxisPlan
-
-__all__ = ["Marlin"]
 
 _FRESH = 100
 """Feed rate (%) of a controller that has just started."""
@@ -70,7 +81,7 @@ class Marlin:
     def __init__(self, link: Link, answer_s: float = 1.0, dialect: str | None = None) -> None:
         self._known = controller("marlin", dialect)
         self._answer_s = answer_s
-        self._link = Lines(link, self._overheard, self._known)
+        self._link: MessageLink[Message] = MessageLink(link, AnswerDecoder(self._known), self._overheard)
         self._number = 0
         self._synchronised = False
         self._steps: dict[str, float] = {}
@@ -95,7 +106,7 @@ class Marlin:
         """Return the names of firmware and machine."""
         for plan in plans.values():
             letter_of(plan)
-        said = " ".join(self._line("M115", deadline))
+        said = " ".join(self._line(deadline, "identity"))
         firmware = self._found("firmware", said)
         machine = self._found("machine", said)
         return Identity("Marlin", machine[1] if machine else "", "", firmware[1] if firmware else "")
@@ -106,14 +117,17 @@ class Marlin:
 
     def begin_home(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Start the search for the reference of an axis; motors stay on from then on."""
-        self._line("M84 S0", deadline)
+        self._line(deadline, "hold")
         letter = letter_of(plan)
         self._mark(self._marks(deadline) & ~_bit(letter), deadline)
         self._endstop = ""
         # Its `ok` comes when it has ended.
         self._ready(deadline)
         self._number += 1
-        self._link.send(encode_numbered(f"G28 {letter}", self._number), deadline.part(self._answer_s))
+        self._link.send(
+            encode_numbered(order(self._known, "home", axis=letter), self._number),
+            deadline.part(self._answer_s),
+        )
         self._homing = _Homing(letter, time.monotonic())
 
     def begin_move(self, plan: AxisPlan, position: float, deadline: Deadline) -> None:
@@ -121,11 +135,11 @@ class Marlin:
         letter, feed = letter_of(plan), self._speed.get(plan.name, 1.0) * plan.per_unit * 60
         self._endstop = ""
         self._counts.pop(letter, None)
-        for line in ("G21", "G90"):
-            self._line(line, deadline)
+        for name in ("units", "absolute"):
+            self._line(deadline, name)
         feed *= _FRESH / max(1, self._percent)
         self._underway.add(letter)
-        said = self._line(f"G1 {letter}{position * plan.per_unit:.4f} F{feed:.3f}", deadline)
+        said = self._line(deadline, "move", axis=letter, position=position * plan.per_unit, feed=feed)
         if any(self._found("unhomed", text) for text in said):
             raise StateError("is not homed", do=f"home {plan.name} first")
 
@@ -136,9 +150,9 @@ class Marlin:
         """
         if self._homing is not None:
             self._homing, self._synchronised = None, False
-            self._link.send(b"M410\n", deadline.part(self._answer_s))
+            self._link.send(encode(order(self._known, "stop")), deadline.part(self._answer_s))
         else:
-            self._line("M410", deadline)
+            self._line(deadline, "stop")
         if self._underway:
             self._underway.clear()
             self.references.void("it was stopped without deceleration, where steps are lost")
@@ -198,15 +212,15 @@ class Marlin:
             return True
         self._synchronised = False
         what = found.meaning if isinstance(found, Error) else "has started anew"
-        raise StateError(what, command=f"G28 {homing.letter}")
+        raise StateError(what, command=order(self._known, "home", axis=homing.letter))
 
     def _mark(self, axes: int, deadline: Deadline) -> None:
         """Mark which axes have homed."""
-        self._line(f"M220 S{_FRESH + axes}", deadline)
+        self._line(deadline, "mark", percent=_FRESH + axes)
 
     def _marks(self, deadline: Deadline) -> int:
         """Which axes have homed, a bit for each; none where the feed rate is no such mark."""
-        said = self._line("M220", deadline)
+        said = self._line(deadline, "rate")
         found = next((each for each in map(re.compile(r"FR:\s*(\d+)%").search, said) if each), None)
         if found is None:
             raise ProtocolError(f"does not tell its feed rate: {said}")
@@ -216,12 +230,12 @@ class Marlin:
 
     def _positions(self, letter: str, deadline: Deadline) -> tuple[float, float]:
         """Where an axis is to be (mm), and its step counter."""
-        for text in self._line("M114", deadline):
+        for text in self._line(deadline, "position"):
             wanted, count, counted = text.partition(" Count ")
             if count:
                 there, steps = dict(_PAIR.findall(wanted)), dict(_PAIR.findall(counted))
                 if letter in there and letter in steps and letter in self._steps:
-                    return float(there[letter]), float(steps[letter])
+                    return number(there[letter]), number(steps[letter])
         raise ProtocolError(f"does not tell position and steps of {letter}", do="is it Cartesian Marlin?")
 
     def _ready(self, deadline: Deadline) -> None:
@@ -251,18 +265,19 @@ class Marlin:
             heard = heard or (isinstance(message, Said) and "FIRMWARE_NAME" in message.text)
             return heard and isinstance(message, Ok)
 
-        lines = b"\n" + encode_numbered("M110 N0", 0) + encode_numbered("M115", 1)
+        asked = (order(self._known, "first"), order(self._known, "identity"))
+        lines = b"\n" + b"".join(encode_numbered(line, k) for k, line in enumerate(asked))
         self._link.query(lines, ends, deadline.part(self._answer_s))
 
     def _steps_per_unit(self, deadline: Deadline) -> dict[str, float]:
-        for text in self._exchange("M92", deadline):
-            if found := dict(re.findall(r"([XYZABC])(\d+(?:\.\d+)?)(?=\s|$)", text.partition("M92")[2])):
-                return {letter: float(steps) for letter, steps in found.items() if float(steps) > 0}
-        raise ProtocolError("does not tell its steps per unit (M92)")
+        for text in self._exchange(line := order(self._known, "steps"), deadline):
+            if found := dict(re.findall(r"([XYZABC])(\d+(?:\.\d+)?)(?=\s|$)", text.partition(line)[2])):
+                return {letter: number(steps) for letter, steps in found.items() if number(steps) > 0}
+        raise ProtocolError(f"does not tell its steps per unit ({line})")
 
-    def _line(self, line: str, deadline: Deadline) -> list[str]:
+    def _line(self, deadline: Deadline, command: str, **values: object) -> list[str]:
         self._ready(deadline)
-        return self._exchange(line, deadline)
+        return self._exchange(order(self._known, command, **values), deadline)
 
     def _exchange(self, line: str, deadline: Deadline) -> list[str]:
         """Send a line, again if Marlin wants it again; return what comes before its `ok`."""

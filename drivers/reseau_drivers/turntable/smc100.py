@@ -12,17 +12,12 @@ from reseau.core.errors import ProtocolError, RefusedError, StateError
 from reseau.instruments import Deadline, Identity
 
 from ..codecs.numbers import number
-from ..codecs.smc100 import LIMIT, Line, Phase, decode, decode_status, encode
+from ..codecs.smc100 import LIMIT, Line, decode, decode_status, encode
 from ..codecs.stream import LineDecoder
 from ..link import Link, MessageLink
-from ..profiles import controller, told_bits
+from ..profiles import controller, order, told_bits
 from .reference import References, Reported
 from .table import AxisPlan
-
-__all__ = ["Smc100"]
-
-_STATES = "DEHIJKLMP"
-"""Errors that mean: not allowed in this state."""
 
 
 class Smc100:
@@ -62,68 +57,64 @@ class Smc100:
 
     def identify(self, plans: Mapping[str, AxisPlan], deadline: Deadline) -> Identity:
         """Return the versions that the controllers report."""
-        versions = [self._query(plan, "VE", deadline).strip() for plan in plans.values()]
+        versions = [self._query(plan, "version", deadline).strip() for plan in plans.values()]
         return Identity("Newport", "SMC100", "", ", ".join(versions))
 
     def set_speed(self, plan: AxisPlan, units_per_s: float, deadline: Deadline) -> None:
         """Set the speed of an axis; without a reference it is set after homing."""
         # The controller does not accept a speed during a movement. If the axis moves, only the connection was
         # lost, and the speed is unchanged.
-        phase = decode_status(self._query(plan, "TS", deadline)).phase
-        if phase in (Phase.READY, Phase.DISABLED):
-            self._send(plan, "VA", f"{units_per_s * plan.per_unit:.6g}", deadline)
+        if self._status(plan, deadline)[1] in ("ready", "disabled"):
+            self._send(plan, deadline, "speed", speed=units_per_s * plan.per_unit)
 
     def begin_home(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Start the search for the reference; a homed axis stays as it is: the controller homes only once."""
-        status = decode_status(self._query(plan, "TS", deadline))
-        if status.phase is Phase.DISABLED:
-            self._send(plan, "MM", "1", deadline)
-            status = decode_status(self._query(plan, "TS", deadline))
-        if status.phase is Phase.NOT_REFERENCED:
-            self._send(plan, "OR", "", deadline)
+        if self._status(plan, deadline)[1] == "disabled":
+            self._send(plan, deadline, "enable")
+        if self._status(plan, deadline)[1] == "not referenced":
+            self._send(plan, deadline, "home")
 
     def begin_move(self, plan: AxisPlan, position: float, deadline: Deadline) -> None:
         """Start a movement."""
-        self._send(plan, "PA", f"{position * plan.per_unit:.6f}", deadline)
+        self._send(plan, deadline, "move", position=position * plan.per_unit)
 
     def halt(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Stop the axis; one without a reference does not move."""
-        if decode_status(self._query(plan, "TS", deadline)).phase is not Phase.NOT_REFERENCED:
-            self._send(plan, "ST", "", deadline)
+        if self._status(plan, deadline)[1] != "not referenced":
+            self._send(plan, deadline, "stop")
 
     def state(self, plan: AxisPlan, deadline: Deadline) -> Reported:
         """Return what it reports of the axis."""
-        status = decode_status(self._query(plan, "TS", deadline))
-        position = number(self._query(plan, "TP", deadline)) / plan.per_unit
-        phase = status.phase
-        faults = told_bits(self._known, status.errors)
-        if phase is Phase.DISABLED:
-            faults = (*faults, "the motor is disabled")
-        moving = phase in (Phase.HOMING, Phase.MOVING, Phase.JOGGING)
-        homed = phase in (Phase.READY, Phase.MOVING, Phase.DISABLED, Phase.JOGGING)
-        return Reported(position, moving, homed, faults)
+        errors, state = self._status(plan, deadline)
+        position = number(self._query(plan, "position", deadline)) / plan.per_unit
+        faults = told_bits(self._known, errors) + (("the motor is disabled",) if state == "disabled" else ())
+        moving = state in ("homing", "moving", "jogging")
+        return Reported(position, moving, state in ("ready", "moving", "disabled", "jogging"), faults)
 
-    def _send(self, plan: AxisPlan, name: str, value: str, deadline: Deadline) -> None:
+    def _status(self, plan: AxisPlan, deadline: Deadline) -> tuple[int, str]:
+        return decode_status(self._query(plan, "state", deadline), self._known)
+
+    def _send(self, plan: AxisPlan, deadline: Deadline, command: str, **values: object) -> None:
         """Send a command and query whether it was accepted."""
         # Query and clear an earlier error first, so that the answer concerns this command.
-        self._query(plan, "TE", deadline)
-        self._link.send(encode(Line(plan.device, name, value)), deadline.part(self._answer_s))
-        error = self._query(plan, "TE", deadline).strip()
+        self._query(plan, "error", deadline)
+        text = order(self._known, command, **values)
+        self._link.send(encode(Line(plan.device, text[:2], text[2:])), deadline.part(self._answer_s))
+        error = self._query(plan, "error", deadline).strip()
         if error not in self._known["errors"]:
             raise ProtocolError(f"{error!r} is not a valid answer to TE")
         if error != "@":
-            kind = StateError if error in _STATES else RefusedError
-            raise kind(
-                f"refused the command: {self._known['errors'][error]}", command=f"{plan.device}{name}{value}"
-            )
+            kind = StateError if error in self._known["busy"] else RefusedError
+            what = f"refused the command: {self._known['errors'][error]}"
+            raise kind(what, command=f"{plan.device}{text}")
 
-    def _query(self, plan: AxisPlan, name: str, deadline: Deadline) -> str:
+    def _query(self, plan: AxisPlan, command: str, deadline: Deadline) -> str:
         """Send a query and wait for the answer, which repeats its address and name."""
         if not self._synchronised:
             # Answers have no number but arrive in order: after the answer to VE no old one is left.
-            self._exchange(plan, "VE", deadline)
+            self._exchange(plan, order(self._known, "version"), deadline)
             self._synchronised = True
-        return self._exchange(plan, name, deadline)
+        return self._exchange(plan, order(self._known, command), deadline)
 
     def _exchange(self, plan: AxisPlan, name: str, deadline: Deadline) -> str:
         head = f"{plan.device}{name}".encode()

@@ -14,6 +14,7 @@ from reseau.instruments import (
     Deadline,
     Device,
     Identity,
+    Instrument,
     Limits,
     Monitor,
     Settings,
@@ -23,8 +24,6 @@ from reseau.instruments import (
 
 from .reference import References, Reported
 from .zones import EVERYWHERE, NOWHERE, KeepOut, Span
-
-__all__ = ["Axis", "AxisPlan", "Controller", "Table", "TableSettings"]
 
 _POLL_S, _HALT_S = 0.02, 1.0
 _ATTEMPTS = 3
@@ -272,7 +271,8 @@ class Table(Device[TableSettings]):
     limits : mapping, optional
         Limits of settings.
     keep_out : sequence of mapping
-        Zones in which axes must not be together: the lowest and highest position of each.
+        Zones in which axes must not be together: the lowest and highest position of each. ``lift.z`` is the
+        axis z of another table of the bench.
 
     Examples
     --------
@@ -297,10 +297,41 @@ class Table(Device[TableSettings]):
         keep_out: Sequence[Mapping[str, Sequence[float]]] = (),
     ) -> None:
         super().__init__(name, settings or TableSettings(), seconds=seconds, limits=limits)
-        self._zones = KeepOut(keep_out, plans)
+        self._keep_out, self._tables = keep_out, dict[str, Table]()
+        self._zones = KeepOut(keep_out, [*plans, *_foreign(keep_out)])
         self._controller = controller
         self.plans = {key: replace(plan, name=key) for key, plan in plans.items()}
         self.axes: dict[str, Axis] = {key: Axis(self, key) for key in plans}
+
+    @property
+    def uses(self) -> tuple[str, ...]:
+        """Names of other tables with which it has zones in common."""
+        mine = [zone for zone in self._zones.zones if {self._key(axis) for axis in self.plans} & zone.keys()]
+        return tuple({key.rpartition(".")[0] for zone in mine for key in zone} - {"", self.name})
+
+    def combine(self, instruments: Mapping[str, Instrument]) -> None:
+        """Join the zones of all tables of a bench, where some name axes of others.
+
+        Raises
+        ------
+        SettingError
+            If there is no such axis.
+        """
+        tables = {name: each for name, each in instruments.items() if isinstance(each, Table)}
+        if any(_foreign(each._keep_out) for each in tables.values()):
+            zones = [
+                {key if "." in key else f"{name}.{key}": span for key, span in zone.items()}
+                for name, each in tables.items()
+                for zone in each._keep_out
+            ]
+            known = [f"{name}.{axis}" for name, each in tables.items() for axis in each.plans]
+            self._zones, self._tables = KeepOut(zones, known), tables
+            for each in tables.values():
+                each._zones, each._tables = self._zones, tables
+
+    def _key(self, axis: str) -> str:
+        """Name of an axis in the zones."""
+        return f"{self.name}.{axis}" if self._tables else axis
 
     def _open(self, deadline: Deadline) -> None:
         self._controller.open(deadline)
@@ -332,7 +363,7 @@ class Table(Device[TableSettings]):
     def _test(self, deadline: Deadline) -> dict[str, str]:
         found = {}
         for key in self.plans:
-            state = self.state(key, deadline.left_or_minimum)
+            state = self.state(key, deadline.left)
             found[key] = "; ".join(
                 (
                     f"{state.position:g} {self.plans[key].unit}"
@@ -379,8 +410,11 @@ class Table(Device[TableSettings]):
         homed, how = self._controller.references.judged(plan.name, found.referenced)
         return AxisState(found.position, found.moving, homed, found.faults, how)
 
-    def _stands(self, axis: str) -> Span | None:
-        """Where an axis stands; None if it moves, or that is not known."""
+    def _stands(self, key: str) -> Span | None:
+        """Where an axis of this or another table stands; None if it moves, or that is not known."""
+        table, _, axis = key.rpartition(".")
+        if table and table != self.name:
+            return self._tables[table]._stands(axis) if table in self._tables else None
         state, tolerance = self.state(axis), self.plans[axis].tolerance
         known = state.homed and not state.moving
         return (state.position - tolerance, state.position + tolerance) if known else None
@@ -400,7 +434,7 @@ class Table(Device[TableSettings]):
         command, plan = f"home {axis}", self._plan(axis)
         self._begin(command)
         deadline = Deadline(self.MOVE_S if seconds is None else seconds)
-        with self._zones.crossed(axis, EVERYWHERE, lambda each: self._stands(each) or NOWHERE):
+        with self._zones.crossed(self._key(axis), EVERYWHERE, lambda each: self._stands(each) or NOWHERE):
             with self._exchange(command, deadline.left) as time:
                 self._require_unstopped(command)
                 self._controller.references.searching(axis)
@@ -450,7 +484,8 @@ class Table(Device[TableSettings]):
         before = (
             [position - plan.backlash] if plan.backlash and state.position > position - plan.backlash else []
         )
-        with self._zones.crossed(axis, (state.position, *before, position), self._stands):
+        way = (state.position, *before, position)
+        with self._zones.crossed(self._key(axis), way, self._stands):
             for target in (*before, position):
                 with self._exchange(command, deadline.at_most(self._seconds)) as time:
                     self._require_unstopped(command)
@@ -501,3 +536,8 @@ class Table(Device[TableSettings]):
                 f"has no axis {axis!r}", where=self.name, do=f"choose from {', '.join(self.plans)}"
             )
         return self.plans[axis]
+
+
+def _foreign(zones: Sequence[Mapping[str, Sequence[float]]]) -> list[str]:
+    """Axes of other tables in zones."""
+    return [key for zone in zones for key in zone if "." in key]

@@ -13,14 +13,9 @@ from reseau.instruments import Deadline, Identity
 from ..codecs.numbers import number
 from ..codecs.zaber import Command, Message, MessageDecoder, Reply, encode
 from ..link import Link, MessageLink
-from ..profiles import controller
+from ..profiles import controller, order
 from .reference import References, Reported
 from .table import AxisPlan
-
-__all__ = ["Zaber"]
-
-_SPEED = 1.6384
-"""Factor from steps per second to the setting ``maxspeed``."""
 
 
 class Zaber:
@@ -62,39 +57,39 @@ class Zaber:
         """Return device numbers, serial numbers and firmware of all devices in use."""
         found = []
         for device in sorted({plan.device for plan in plans.values()}):
-            said = [self._query(device, 0, f"get {what}", deadline).data for what in _IDENTITY]
+            said = [self._query(device, 0, what, deadline).data for what in self._known["identity"]]
             found.append(said)
         models, serials, versions = (", ".join(column) for column in zip(*found, strict=True))
         return Identity("Zaber", models, serials, versions)
 
     def set_speed(self, plan: AxisPlan, units_per_s: float, deadline: Deadline) -> None:
         """Set the speed of an axis."""
-        speed = max(1, round(units_per_s * plan.per_unit * _SPEED))
-        self._query(plan.device, plan.axis, f"set maxspeed {speed}", deadline)
+        speed = max(1, round(units_per_s * plan.per_unit * self._known["factors"]["speed"]))
+        self._ask(plan, deadline, "speed", speed=speed)
 
     def begin_home(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Start the search for the reference."""
-        self._query(plan.device, plan.axis, "warnings clear", deadline)
-        self._query(plan.device, plan.axis, "home", deadline)
+        self._ask(plan, deadline, "clear")
+        self._ask(plan, deadline, "home")
 
     def begin_move(self, plan: AxisPlan, position: float, deadline: Deadline) -> None:
         """Start a movement."""
         # Clear old warnings, so that later ones concern this movement.
-        self._query(plan.device, plan.axis, "warnings clear", deadline)
-        self._query(plan.device, plan.axis, f"move abs {round(position * plan.per_unit)}", deadline)
+        self._ask(plan, deadline, "clear")
+        self._ask(plan, deadline, "move", position=round(position * plan.per_unit))
 
     def halt(self, plan: AxisPlan, deadline: Deadline) -> None:
         """Stop the axis."""
-        self._query(plan.device, plan.axis, "stop", deadline)
+        self._ask(plan, deadline, "stop")
 
     def state(self, plan: AxisPlan, deadline: Deadline) -> Reported:
         """Return what it reports of the axis; unknown flags of the kinds F and W count as faults."""
-        reply = self._query(plan.device, plan.axis, "warnings", deadline)
+        reply = self._ask(plan, deadline, "warnings")
         count, *flags = reply.data.split()
         if not count.isdigit() or int(count) != len(flags):
             raise ProtocolError(f"{reply.data!r} is not a list of warnings")
         # Query the movement first: a position read before it could be an intermediate one.
-        position = self._query(plan.device, plan.axis, "get pos", deadline).data
+        position = self._ask(plan, deadline, "position").data
         known, unreferenced = self._known["flags"], self._known["unreferenced"]
         found = {
             flag: known.get(flag, f"it reports {flag}, which is not known")
@@ -106,6 +101,9 @@ class Zaber:
                 self.references.void(what, plan.name)
         referenced = not any(flag in unreferenced for flag in flags)
         return Reported(number(position) / plan.per_unit, reply.busy, referenced, tuple(found.values()))
+
+    def _ask(self, plan: AxisPlan, deadline: Deadline, command: str, **values: object) -> Reply:
+        return self._query(plan.device, plan.axis, order(self._known, command, **values), deadline)
 
     def _query(self, device: int, axis: int, words: str, deadline: Deadline) -> Reply:
         """Send a command and wait for its reply, which repeats its number."""
@@ -124,10 +122,7 @@ class Zaber:
             raise ProtocolError("sent a message that is not a reply")
         if not reply.ok:
             command = f"device {device} axis {axis}: {words}"
-            if reply.data in ("STATUSBUSY", "PARKED", "DRIVERDISABLED"):
+            if reply.data in self._known["busy"]:
                 raise StateError(f"rejected the command: {reply.data}", command=command)
             raise RefusedError(f"rejected the command: {reply.data}", command=command)
         return reply
-
-
-_IDENTITY = ("device.id", "system.serial", "version")

@@ -9,8 +9,6 @@ from contextlib import contextmanager
 
 from reseau.core.errors import SettingError, StateError
 
-__all__ = ["EVERYWHERE", "NOWHERE", "KeepOut", "Span"]
-
 Span = tuple[float, float]
 """Lowest and highest position."""
 EVERYWHERE: Span = (-math.inf, math.inf)
@@ -45,13 +43,13 @@ class KeepOut:
     """
 
     def __init__(self, zones: Sequence[Mapping[str, Sequence[float]]], axes: Collection[str]) -> None:
-        self._zones: list[dict[str, Span]] = []
+        self.zones: list[dict[str, Span]] = []
         for zone in zones:
             right = all(len(span) == 2 and span[0] <= span[1] for span in zone.values())
             if not zone or not set(zone) <= set(axes) or not right:
                 what = f"{dict(zone)} does not give lowest and highest positions of {', '.join(axes)}"
                 raise SettingError(what, where="keep_out")
-            self._zones.append({axis: (float(span[0]), float(span[1])) for axis, span in zone.items()})
+            self.zones.append({axis: (float(span[0]), float(span[1])) for axis, span in zone.items()})
         self._underway: dict[str, Span] = {}
         self._lock = threading.Lock()
 
@@ -87,7 +85,7 @@ class KeepOut:
             self._underway.pop(axis, None)
 
     def _require_free(self, axis: str, way: Span, stands: Callable[[str], Span | None]) -> None:
-        for zone in self._zones:
+        for zone in self.zones:
             if axis not in zone or not _meet(way, zone[axis]):
                 continue
             others = [each for each in zone if each != axis]

@@ -46,8 +46,6 @@ from .smc100 import Smc100Line
 from .v4l2 import VideoCamera
 from .zaber import ZaberChain
 
-__all__ = ["ScannerKind", "SensorKind", "SimulatedBench", "TableKind", "serve"]
-
 TableKind = Literal["zaber", "smc100", "kinesis", "grbl", "marlin", "hand"]
 SensorKind = Literal["scpi", "modbus", "line", "all"]
 SceneName = Literal["screen", "testfield", "frame", "sensor"]

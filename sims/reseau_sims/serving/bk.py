@@ -16,8 +16,6 @@ from reseau_drivers.codecs.stream import Damaged
 from .faults import Kind
 from .machine import Machine
 
-__all__ = ["BkScanner"]
-
 
 def _grey() -> NDArray[np.uint8]:
     """Test image that contains every byte that must be escaped."""

@@ -14,8 +14,6 @@ from reseau_drivers.codecs.stream import Damaged, LineDecoder
 from .faults import Kind
 from .machine import Machine
 
-__all__ = ["CompactPulser"]
-
 _START = {"P": 0, "W": 100, "V": 100, "D": 1, "M": 0, "T": 0, "G": 5}
 
 

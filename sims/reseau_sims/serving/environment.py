@@ -22,8 +22,6 @@ from .faults import Kind
 from .machine import Machine
 from .motion import Clock
 
-__all__ = ["Air", "LineSensor", "ModbusSensor", "ScpiSensor"]
-
 _NAN = 9.91e37
 _TROUBLE_S = 0.4
 """How long a fault of a sensor lasts (s)."""

@@ -11,8 +11,6 @@ import numpy as np
 
 from reseau.core.errors import UsageError
 
-__all__ = ["DEVICE_KINDS", "KINDS", "LINE_KINDS", "Fault", "FaultScript", "Kind", "Output"]
-
 Kind = Literal[
     "late",
     "dropped",

@@ -13,8 +13,6 @@ from collections.abc import Sequence
 from .machine import Machine
 from .motion import Clock, Motor
 
-__all__ = ["GcodeController"]
-
 _BEYOND_MM = 50.0
 """Distance of the switches from the soft limits."""
 

@@ -12,8 +12,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 from xml.sax.saxutils import escape, quoteattr
 
-__all__ = ["Feature", "description", "placed"]
-
 _FIRST, _SPACING = 0xA000, 0x10
 """Registers of the maker begin here."""
 

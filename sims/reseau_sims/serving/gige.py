@@ -30,8 +30,6 @@ from . import gige_process
 from .faults import Fault
 from .imaging import SimulatedCamera, View
 
-__all__ = ["GigeCamera", "aravis_is_installed"]
-
 _LARGEST = 2048
 """Rows and columns of the library's fake camera."""
 _FORMATS = {layout.code: layout for layout in GENICAM.values()}

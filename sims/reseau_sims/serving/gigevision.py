@@ -44,8 +44,6 @@ from .faults import Fault
 from .genicam import Feature, description, placed
 from .imaging import SimulatedCamera, View
 
-__all__ = ["GigeVisionCamera", "loopback_addresses"]
-
 _MEMORY, _XML = 0x10000, 0x100000
 _HEARTBEAT, _STREAM_PORT, _PACKET_SIZE, _STREAM_ADDRESS = 0x0938, 0x0D00, 0x0D04, 0x0D18
 _FIRE_TEST = 0x80000000

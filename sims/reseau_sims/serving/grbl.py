@@ -16,8 +16,6 @@ from .faults import Kind
 from .gcode import GcodeController
 from .motion import Clock
 
-__all__ = ["GrblController"]
-
 _BANNER = b"\r\nGrbl 1.1h ['$' for help]\r\n"
 _LOCKED = b"[MSG:'$H'|'$X' to unlock]\r\n"
 _GROUPS = (0, 1, 4, 17, 20, 21, 28, 53, 54, 55, 90, 91, 92, 94)

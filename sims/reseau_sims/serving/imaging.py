@@ -18,8 +18,6 @@ from ..pixels import PixelSensor
 from ..streams import stream
 from .faults import FaultScript
 
-__all__ = ["LaboratoryScene", "LampScene", "Scene", "SimulatedCamera", "StillScene", "StripeScene", "View"]
-
 NOMINAL_US = 10_000.0
 """Exposure time at which a scene has its nominal brightness (µs)."""
 _KEPT = 16

@@ -13,8 +13,6 @@ from dataclasses import dataclass
 from reseau_drivers.codecs.apt import (
     HOST,
     USB,
-    Bits,
-    Id,
     Info,
     Message,
     MessageDecoder,
@@ -32,19 +30,17 @@ from .faults import Kind
 from .machine import Machine
 from .motion import Clock, Motor
 
-__all__ = ["KinesisController"]
-
 _VELOCITY = 65536 * 2048 / 6e6
 """Velocity in the units of a controller of DC motors, for one count per second."""
 _STOP_IMMEDIATE, _STOP_PROFILED = 1, 2
-_OF_ALL = (Id.DISCONNECT, Id.NO_FLASH, Id.START_UPDATES, Id.STOP_UPDATES)
+_OF_ALL = ("DISCONNECT", "NO_FLASH", "START_UPDATES", "STOP_UPDATES")
 
 
 @dataclass
 class _Channel:
     motor: Motor
     acceleration: int = 263
-    ends: Id | None = None
+    ends: str | None = None
     """Message that tells the end of the present movement."""
 
 
@@ -100,10 +96,8 @@ class KinesisController(Machine):
                 continue
             channel = self._channels.get(message.destination)
             if channel is None:
-                if message.id not in _OF_ALL:
-                    self.violations.append(
-                        f"{message.id:#06x} to {message.destination:#04x}: nothing is there"
-                    )
+                if message.name not in _OF_ALL:
+                    self.violations.append(f"{message.name} to {message.destination:#04x}: nothing is there")
                 continue
             said = self._obey(message, channel)
             if said is not None:
@@ -139,76 +133,78 @@ class KinesisController(Machine):
                 channel.acceleration = 263
                 motor.speed = 20_000.0
 
-    def _end(self, address: int, channel: _Channel, end: Id) -> Message:
-        if end is Id.HOMED:
+    def _end(self, address: int, channel: _Channel, end: str) -> Message:
+        if end == "HOMED":
             return Message(end, HOST, address, (1, 0))
         return Message(end, HOST, address, data=self._status(channel))
 
     @staticmethod
-    def _bits(channel: _Channel) -> Bits:
-        motor, bits = channel.motor, Bits.CONNECTED
+    def _bits(channel: _Channel) -> int:
+        """The status bits, as MGMSG_MOT_GET_STATUSBITS lists them."""
+        motor = channel.motor
         before, going = motor.position, motor.target
-        for bit, is_so in (
-            (Bits.LIMIT_FORWARD, motor.limit > 0),
-            (Bits.LIMIT_REVERSE, motor.limit < 0),
-            (Bits.MOVING_FORWARD, motor.moving and going > before),
-            (Bits.MOVING_REVERSE, motor.moving and going < before),
-            (Bits.HOMING, motor.homing),
-            (Bits.HOMED, motor.homed),
-            (Bits.POSITION_ERROR, motor.stalled),
-            (Bits.ENABLED, motor.enabled),
-        ):
-            bits |= bit if is_so else Bits(0)
-        return bits
+        return 0x100 | sum(
+            bit
+            for bit, is_so in (
+                (0x1, motor.limit > 0),
+                (0x2, motor.limit < 0),
+                (0x10, motor.moving and going > before),
+                (0x20, motor.moving and going < before),
+                (0x200, motor.homing),
+                (0x400, motor.homed),
+                (0x4000, motor.stalled),
+                (0x80000000, motor.enabled),
+            )
+            if is_so
+        )
 
     def _status(self, channel: _Channel) -> bytes:
-        bits = self._bits(channel)
-        return encode_status(1, round(channel.motor.position), bits)
+        return encode_status(1, round(channel.motor.position), self._bits(channel))
 
     def _obey(self, message: Message, channel: _Channel) -> Message | None:
         address, motor = message.destination, channel.motor
         if message.source != HOST:
-            self.violations.append(f"{message.id:#06x} came from {message.source:#04x}, not the host")
-        if message.id not in (Id.REQUEST_INFO, *_OF_ALL) and message.channel != 1:
-            self.violations.append(f"{message.id:#06x} to channel {message.channel}: there is one")
+            self.violations.append(f"{message.name} came from {message.source:#04x}, not the host")
+        if message.name not in ("REQUEST_INFO", *_OF_ALL) and message.channel != 1:
+            self.violations.append(f"{message.name} to channel {message.channel}: there is one")
             return None
 
-        def answer(id_: Id, data: bytes) -> Message:
-            return Message(id_, HOST, address, data=data)
+        def answer(name: str, data: bytes) -> Message:
+            return Message(name, HOST, address, data=data)
 
-        match message.id:
-            case Id.REQUEST_INFO:
-                return answer(Id.INFO, encode_info(self._info(address)))
-            case Id.REQUEST_STATUS | Id.REQUEST_DC_STATUS:
-                return answer(Id(message.id + 1), self._status(channel))
-            case Id.REQUEST_STATUS_BITS:
-                return answer(Id.STATUS_BITS, struct.pack("<HI", 1, self._bits(channel)))
-            case Id.REQUEST_ENABLED:
-                return Message(Id.ENABLED, HOST, address, (1, 1 if motor.enabled else 2))
-            case Id.REQUEST_VELOCITIES:
+        match message.name:
+            case "REQUEST_INFO":
+                return answer("INFO", encode_info(self._info(address)))
+            case "REQUEST_STATUS" | "REQUEST_DC_STATUS":
+                return answer(message.name.removeprefix("REQUEST_"), self._status(channel))
+            case "REQUEST_STATUS_BITS":
+                return answer("STATUS_BITS", struct.pack("<HI", 1, self._bits(channel)))
+            case "REQUEST_ENABLED":
+                return Message("ENABLED", HOST, address, (1, 1 if motor.enabled else 2))
+            case "REQUEST_VELOCITIES":
                 speed = round(motor.speed * _VELOCITY)
-                return answer(Id.VELOCITIES, encode_velocities(Velocities(1, channel.acceleration, speed)))
-            case Id.SET_VELOCITIES:
+                return answer("VELOCITIES", encode_velocities(Velocities(1, channel.acceleration, speed)))
+            case "SET_VELOCITIES":
                 self._set_velocities(channel, decode_velocities(message))
-            case Id.SET_ENABLED:
+            case "SET_ENABLED":
                 motor.enabled = message.parameters[1] == 1
                 if not motor.enabled:
                     motor.stop()
-            case Id.HOME:
+            case "HOME":
                 if motor.enabled:
                     motor.home()
-                    channel.ends = Id.HOMED
+                    channel.ends = "HOMED"
                 else:
                     self.violations.append("HOME while the motor is off")
-            case Id.MOVE_ABSOLUTE | Id.MOVE_RELATIVE:
+            case "MOVE_ABSOLUTE" | "MOVE_RELATIVE":
                 self._move(message, channel)
-            case Id.STOP:
+            case "STOP":
                 if message.parameters[1] not in (_STOP_IMMEDIATE, _STOP_PROFILED):
                     self.violations.append(f"STOP with mode {message.parameters[1]}")
                 if motor.moving:
                     motor.stop()
                     channel.ends = None
-                    return self._end(address, channel, Id.STOPPED)
+                    return self._end(address, channel, "STOPPED")
             case _:
                 pass
         return None
@@ -240,5 +236,5 @@ class KinesisController(Machine):
         here = motor.position  # brings the motor up to date
         if not motor.homed:
             self.violations.append("a move without a reference")
-        motor.go(target if message.id == Id.MOVE_ABSOLUTE else here + target)
-        channel.ends = Id.MOVED
+        motor.go(target if message.name == "MOVE_ABSOLUTE" else here + target)
+        channel.ends = "MOVED"

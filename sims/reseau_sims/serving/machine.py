@@ -9,8 +9,6 @@ from typing import Protocol
 
 from .faults import DEVICE_KINDS, FaultScript, Kind, Output
 
-__all__ = ["FaultyConnection", "Machine", "Session"]
-
 
 class Machine(ABC):
     r"""Instrument behind a stream of bytes; may be called from several threads.

@@ -19,8 +19,6 @@ from .faults import Kind
 from .gcode import GcodeController
 from .motion import Clock
 
-__all__ = ["MarlinController"]
-
 _FIRMWARE = (
     "FIRMWARE_NAME:Marlin 2.1.2 (Oct 20 2022 12:00:00) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin "
     "PROTOCOL_VERSION:1.0 MACHINE_TYPE:Table EXTRUDER_COUNT:0\nCap:EEPROM:1\nCap:EMERGENCY_PARSER:1\n"

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 
 from .faults import Kind
 
-__all__ = ["Motor"]
-
 Clock = Callable[[], float]
 
 

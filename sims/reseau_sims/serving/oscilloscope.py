@@ -26,8 +26,6 @@ from .machine import Machine
 from .oscilloscope_settings import SETTINGS
 from .program import Setting, Status, choice, numeric, string, units_of
 
-__all__ = ["FAMILIES", "Family", "Oscilloscope"]
-
 _LONGEST = 4096
 """Largest size of a program message (bytes)."""
 

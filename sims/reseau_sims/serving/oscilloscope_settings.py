@@ -10,8 +10,6 @@ from typing import Any
 
 from .program import Parameter, Setting, boolean, choice, numeric, string
 
-__all__ = ["SETTINGS"]
-
 _NAMED: Mapping[str, Parameter] = {"boolean": boolean, "string": string, "anything": str.strip}
 
 

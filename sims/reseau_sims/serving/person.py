@@ -11,8 +11,6 @@ import numpy as np
 from .faults import Kind
 from .machine import Machine
 
-__all__ = ["SimulatedHands", "SimulatedOperator"]
-
 
 class SimulatedOperator(Machine):
     r"""Carries out requests, a line of JSON each.

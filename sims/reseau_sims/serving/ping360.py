@@ -19,8 +19,6 @@ from reseau_drivers.codecs.stream import Damaged
 from .faults import Kind
 from .machine import Machine
 
-__all__ = ["Ping360"]
-
 Echo = Callable[[int, int, float, float], NDArray[np.uint8]]
 _GAINS = (0.5, 1.0, 2.0)
 

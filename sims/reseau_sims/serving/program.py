@@ -12,8 +12,6 @@ from dataclasses import dataclass, field
 
 from reseau_drivers.codecs.ieee488 import Header, split_message
 
-__all__ = ["Parameter", "Setting", "Status", "boolean", "choice", "numeric", "string", "units_of"]
-
 Parameter = Callable[[str], str]
 """Reads a parameter, returns it as the query reports it; raises ValueError with an error entry."""
 _NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:\s*E\s*[+-]?\d+)?)\s*([A-Z%]*)")

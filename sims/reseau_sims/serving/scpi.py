@@ -18,8 +18,6 @@ from reseau_drivers.codecs.stream import Damaged
 from .faults import DEVICE_KINDS, FaultScript, Output
 from .machine import Machine
 
-__all__ = ["AnswerQueue", "HislipInstrument", "PortmapperSession", "Vxi11Session"]
-
 Execute = Callable[[bytes], bytes | None]
 """Executes a program message; returns the answer, or None if there is none."""
 

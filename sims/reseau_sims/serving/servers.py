@@ -25,8 +25,6 @@ from reseau.instruments import Deadline
 from .faults import Output
 from .machine import Session
 
-__all__ = ["InProcess", "PtyServer", "Server", "TcpServer", "UdpServer"]
-
 _CHUNK = 65536
 _MOST_UNSENT = 64_000_000
 _LARGEST_SENT, _LARGEST_RECEIVED = 4096, 65536

@@ -17,8 +17,6 @@ from .faults import Kind
 from .machine import Machine
 from .motion import Clock, Motor
 
-__all__ = ["Smc100Line"]
-
 
 class Smc100Line(Machine):
     r"""Simulated controllers on one line, addressed from 1.

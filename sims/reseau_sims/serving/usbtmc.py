@@ -25,8 +25,6 @@ from .faults import FaultScript
 from .machine import Machine
 from .scpi import AnswerQueue
 
-__all__ = ["UsbInstrument", "plugged_in"]
-
 _PACKET = 512
 _OUT, _IN = 0x01, 0x82
 _VENDOR, _PRODUCT = 0x1209, 0x0001

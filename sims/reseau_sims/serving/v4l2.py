@@ -16,8 +16,6 @@ from reseau_drivers.codecs.pixels import VIDEO, size_of
 from .imaging import SimulatedCamera
 from .video import CONTROLS, FORMATS, Memory, Stream, Video
 
-__all__ = ["VideoCamera", "VideoNode"]
-
 
 def _fail(number: int) -> OSError:
     return OSError(number, os.strerror(number))

@@ -15,8 +15,6 @@ from reseau_drivers.codecs.pixels import VIDEO, encode
 from .faults import Fault
 from .imaging import SimulatedCamera, View
 
-__all__ = ["CONTROLS", "FORMATS", "Memory", "Stream", "Video"]
-
 _DEFAULTS = {uapi.BRIGHTNESS: 128, uapi.GAIN: 0, uapi.EXPOSURE_AUTO: 3, uapi.EXPOSURE_ABSOLUTE: 50}
 CONTROLS = (
     uapi.Control(uapi.BRIGHTNESS, "Brightness", 1, 0, 255, 1, 128),

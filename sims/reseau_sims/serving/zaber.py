@@ -16,8 +16,6 @@ from .faults import Kind
 from .machine import Machine
 from .motion import Clock, Motor
 
-__all__ = ["ZaberChain"]
-
 _LONGEST = 80
 _SPEED = 1.6384
 _STORED = {

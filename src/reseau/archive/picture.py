@@ -56,6 +56,8 @@ def tiff_of(frame: Frame | Scan, facts: Mapping[str, Any]) -> bytes:
         pixels = frame.pixels
     if frame.curve is not None:
         about["curve"] = [frame.curve.exponent, list(frame.curve.table), frame.curve.source]
+    if frame.filters:
+        about["filters"] = frame.filters
     pixels = pixels.astype(np.float32) if pixels.dtype == np.float64 else pixels
     if pixels.dtype not in (np.uint8, np.uint16, np.float32):
         raise ArchiveError(f"has pixels of the unsupported type {pixels.dtype}", where=frame.name)
@@ -96,7 +98,7 @@ def frame_of(data: bytes, where: object) -> tuple[Frame, dict[str, Any]]:
         pixels = luma(pixels, CHANNELS[3])
     try:
         frame = Frame(pixels, float(about["full_scale"]), about["name"], sha256_of(data), curve=_curve(about))
-        return frame, about["facts"]
+        return replace(frame, filters=about.get("filters", "")), about["facts"]
     except Exception as error:  # what is not of the schema
         raise ArchiveError(f"is not a frame of an archive ({error})", where=where) from None
 

@@ -406,9 +406,10 @@ def two_digits(value: float) -> str:
     Examples
     --------
     >>> two_digits(0.01234), two_digits(1234.5)
-    ('0.012', '1234')
+    ('0.012', '1200')
     """
-    return f"{value:.0f}" if value >= 99.5 else f"{value:.2g}"
+    digits = f"{value:.2g}"
+    return f"{float(digits):.0f}" if value >= 99.5 else digits
 
 
 def _pairs(xy: Array) -> tuple[tuple[float, float], ...]:

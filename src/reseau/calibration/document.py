@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from hashlib import sha256
 from html import escape
@@ -20,6 +19,7 @@ from ..core.errors import FormatError, UsageError
 from ..core.files import writable, write_whole
 from ..core.lazy import above
 from ..core.numbers import measured
+from ..core.warned import warn_user
 from ..io import Document, Strict
 from ..optics.cameras.opencv import opencv_coefficients
 from .assessment import Assessment, required_use
@@ -552,14 +552,12 @@ class Calibration(Document):
         done: Exported = above("reseau.exchange.calibrations:export_calibration")(
             self, to, path, anyway=anyway
         )
-        for line in done.notes:
-            warnings.warn(line, stacklevel=2)
+        warn_user(done.notes)
         return done
 
     def _usable(self, doing: str, anyway: bool) -> None:
         """Refuse what is usable for nothing; warn of what is usable for less than measurement."""
-        for line in required_use([(self.name, self.assessment)], doing, anyway=anyway):
-            warnings.warn(line, stacklevel=3)
+        warn_user(required_use([(self.name, self.assessment)], doing, anyway=anyway))
 
     def write(self, path: Path | str) -> None:
         """Write the calibration, ``reseau-calibration/1``.

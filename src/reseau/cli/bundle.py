@@ -14,14 +14,11 @@ from ..core.options import Group, Option
 from .bundle_options import (
     level_of,
     positive,
+    say_estimated,
     say_left_out,
     say_model,
-    say_motion,
     say_parameters,
     say_priors,
-    say_refraction,
-    say_rig,
-    say_turntable,
 )
 from .common import ended, progress, required, say
 
@@ -213,15 +210,7 @@ def _say(path: Path, result: Result) -> None:
             say(f"camera {camera.id}\n")
             say_parameters(camera)
             say_priors(result.priors(c))
-    if result.refraction is not None:
-        say("windows and media\n")
-        say_refraction(result.refraction)
-    if result.rig is not None:
-        say_rig(result.rig)
-    if result.stage is not None:
-        say_turntable(result.stage)
-    if result.motion is not None:
-        say_motion(result.motion)
+    say_estimated(result)
     say_model(result)
     say_left_out(result)
     for warning in result.warnings:

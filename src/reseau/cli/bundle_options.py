@@ -92,6 +92,19 @@ def say_priors(found: PriorInfluence | None) -> None:
     )
 
 
+def say_estimated(result: Result) -> None:
+    """Print what was estimated besides cameras and points."""
+    if result.rig is not None:
+        say_rig(result.rig)
+    if result.stage is not None:
+        say_turntable(result.stage)
+    if result.motion is not None:
+        say_motion(result.motion)
+    if result.refraction is not None:
+        say("windows and media\n")
+        say_refraction(result.refraction)
+
+
 def say_refraction(found: RefractionEstimate) -> None:
     """Print the parameters of windows and media, their tests against given values, and their partners."""
     from ..core.numbers import measured
@@ -175,7 +188,7 @@ def say_left_out(result: Result) -> None:
     gross = dict[str, list[str]]()
     for image, point, value, critical in result.rejected_points():
         if value == value:
-            say(f"left out: point {point} in image {image}, test value {value:.1f} above {critical:.1f}\n")
+            say(f"left out: point {point} in image {image}, test value {value:.2f} above {critical:.2f}\n")
         else:
             gross.setdefault(image, []).append(point)
     for image, points in gross.items():

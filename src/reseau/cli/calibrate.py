@@ -17,14 +17,11 @@ from .bundle_options import (
     level_of,
     positive,
     say_difference,
+    say_estimated,
     say_left_out,
     say_model,
-    say_motion,
     say_parameters,
     say_priors,
-    say_refraction,
-    say_rig,
-    say_turntable,
 )
 from .common import (
     CameraChoice,
@@ -412,15 +409,7 @@ def _say(done: Calibrated, differences: dict[str, FieldDifference], distances: l
         for away in distances:
             field = _uncertainty(projection_field_at(result, c, away))
             say(f"  σ at {away:g} {result.network.unit}: {field}\n")
-    if result.rig is not None:
-        say_rig(result.rig)
-    if result.stage is not None:
-        say_turntable(result.stage)
-    if result.motion is not None:
-        say_motion(result.motion)
-    if result.refraction is not None:
-        say("windows and media\n")
-        say_refraction(result.refraction)
+    say_estimated(result)
     say_model(done.result)
     for name, found in differences.items():
         say_difference(name, found)
@@ -435,7 +424,7 @@ def _say_board(choice: BoardChoice, unit: str) -> None:
     import numpy as np
 
     said = {"flat": "flat as designed", "warp": "bent; all points are free", "free": "all points free"}
-    say(f"target {said[choice.chosen.name]}\n")
+    say(f"target {said[choice.chosen.name]} (each model with the same {choice.points} image points)\n")
     for each in choice.models:
         line = f"  {each.name:5} {each.parameters:5} parameters  sigma0 {each.sigma0:.4f}  "
         line += f"length {each.length:.1f}"

@@ -74,11 +74,11 @@ def _report(found: OrientedFiles, as_json: bool) -> None:
     else:
         for document in found.documents:
             say(_line(document))
-        roll = found.roll
-        if roll is not None:
+        for roll in found.rolls:
             sx, sy = roll.corners.sigma or (0.0, 0.0)
             x, y = (1000 * scatter for scatter in roll.scatter_mm)
-            say(f"roll: {roll.frames} frames, scatter of corners {x:.2g} µm in x, {y:.2g} µm in y, ")
+            of = " of {:g}x{:g} mm".format(*roll.format_mm) if len(found.rolls) > 1 else ""
+            say(f"roll{of}: {roll.frames} frames, scatter of corners {x:.2g} µm in x, {y:.2g} µm in y, ")
             say(f"calibrated corners ± {1000 * max(sx, sy):.2g} µm\n")
         if found.summary is not None:
             _print_summary(found.summary)

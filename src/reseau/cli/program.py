@@ -63,13 +63,24 @@ _MODULES = (
 """Modules of the project that define documents."""
 
 
-def documents() -> dict[str, type[Document]]:
-    """Every kind of document by the name of its schema, in the order of the names."""
+def documents(missing: set[str] | None = None) -> dict[str, type[Document]]:
+    """Every kind of document by the name of its schema, in the order of the names.
+
+    What is not installed for some of them is added to `missing`, where it is given.
+    """
+    from ..core.optional import optional
     from ..io.document import Document
 
     found = {}
     for name in _MODULES:
-        module = import_module(f"reseau.{name}")
+        try:
+            with optional():
+                module = import_module(f"reseau.{name}")
+        except UsageError as error:
+            if missing is None:
+                raise
+            missing.add(str(error))
+            continue
         for kind in vars(module).values():
             if isinstance(kind, type) and issubclass(kind, Document) and kind.__module__ == module.__name__:
                 found[kind.SCHEMA] = kind
@@ -83,7 +94,10 @@ def schema(
     ] = None,
 ) -> None:
     """Print the format of a document as JSON Schema (draft 2020-12), or list all."""
-    known = documents()
+    missing = set[str]()
+    known = documents(missing)
+    for why in sorted(missing) if name not in known else ():
+        typer.echo(f"note: documents are left out: {why}", err=True)
     if name is None:
         for each, kind in known.items():
             about = (kind.__doc__ or "").strip().splitlines()[0]

@@ -19,7 +19,18 @@ from .tone import ToneCurve
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Array", "Mask", "Rows", "rows_of_groups"]
+__all__ = ["Array", "Mask", "Rows", "filters_of", "rows_of_groups"]
+
+
+def filters_of(pattern: str) -> str:
+    """Return the pattern of a cell of 2 × 2 pixels if it has two green filters, a red and a blue one.
+
+    Examples
+    --------
+    >>> filters_of("GRBG"), filters_of("BGRA")
+    ('GRBG', '')
+    """
+    return pattern if "".join(sorted(pattern)) == "BGGR" else ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,6 +52,8 @@ class Frame(Display):
         What a user should know about how it was read.
     curve : ToneCurve, optional
         Curve between grey values and light that the file states; None if it states none.
+    filters : str
+        Colour filters of the pixels of the first two rows, as RGGB, where they are known; else empty.
 
     Raises
     ------
@@ -60,6 +73,7 @@ class Frame(Display):
     sha256: str = ""
     notes: tuple[str, ...] = ()
     curve: ToneCurve | None = None
+    filters: str = ""
 
     def __post_init__(self) -> None:
         if self.pixels.ndim != 2 or min(self.pixels.shape) < 2:

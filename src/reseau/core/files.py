@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -55,6 +56,46 @@ def writable(path: P, *suffixes: str, folder: bool = False) -> P:
         what = f"has the suffix {path.suffix!r}" if path.suffix else "has no suffix"
         raise UsageError(what, where=path, do=f"use {', '.join(suffixes)}")
     return path
+
+
+@contextmanager
+def readable(path: object) -> Iterator[None]:
+    """Say of a file that the block cannot read it.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+
+    Examples
+    --------
+    >>> with readable("none.txt"):
+    ...     open("none.txt")
+    Traceback (most recent call last):
+    reseau.core.errors.InputError: none.txt: cannot be read (No such file or directory)
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+
+
+def head_of(path: Path, size: int = 4000) -> bytes:
+    """Return the first bytes of a file, which tell its format.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+
+    Examples
+    --------
+    >>> head_of(Path("none.txt"))
+    Traceback (most recent call last):
+    reseau.core.errors.InputError: none.txt: cannot be read (No such file or directory)
+    """
+    with readable(path), path.open("rb") as file:
+        return file.read(size)
 
 
 def empty_folder(path: Path, do: str = "give a new or an empty folder") -> Path:

@@ -47,8 +47,8 @@ AsJson = Annotated[bool, Option("Write JSON to standard output.", Group.FILES, c
 
 # Images and marks.
 Channel = Annotated[
-    Literal["luma", "red", "green", "blue", "mosaic"],
-    Option("Channel of colour images; `mosaic`: pixels of raw files behind their filters."),
+    Literal["luma", "red", "green", "blue", "interpolated"],
+    Option("Channel of colour images; `luma` of raw files: all pixels, behind their filters."),
 ]
 Mirrored = Annotated[
     bool,

@@ -14,6 +14,10 @@ github.com/Behrouz-al/semi-automatic-fiducial-mark-extraction, whose coordinates
 RC 10 by 6 µm at most; it does not say what form its marks have. Forms: the pictures of the documentation of
 spymicmac (cameras.rst, commit dba7a677), in proportion to the cross of the RC 8 in the module wildRc8 of
 OrientAL; for Zeiss the modules zeissRmkA and zeissRmkTop.
+
+Of the Jena LMK 2000 one report is published (OSL/1551 of 1990, camera 271826C, same transcription): its
+coordinates are the nominal ones to 7 µm, and the standard deviation is that of the other cameras. The form of
+its marks is not published: there is a design for each form, to be chosen by what a photograph shows.
 """
 
 from __future__ import annotations
@@ -41,6 +45,7 @@ _MARKS = {
     "dot": FiducialMark(polarity="bright", parts=(MarkPart(shape="disk", size=0.2),), margin=0.7),
 }
 _USGS = "nominal, beside {} USGS calibration reports"
+_LMK = "nominal, beside USGS report OSL/1551; the form of the marks is not published"
 _CAMERAS: dict[str, tuple[str, float, tuple[str, float] | None, tuple[str, float] | None, str]] = {
     "wild-rc8": (
         "Wild RC 5, RC 8, RC 9: crosses in the corners",
@@ -70,6 +75,12 @@ _CAMERAS: dict[str, tuple[str, float, tuple[str, float] | None, tuple[str, float
         "Zeiss RMK TOP: dots in circles with crosses",
         0.012, ("top", 113.0), ("top", 113.0), "nominal, beside USGS report OSL/2432 and a certificate",
     ),
+} | {
+    f"jena-lmk-{words.split()[0]}": (
+        f"Jena LMK 2000, if its marks are {words}",
+        0.012, (mark, 110.0), (mark, 112.0), _LMK,
+    )
+    for mark, words in (("cross", "crosses"), ("circle", "circles with crosses"), ("dot", "dots"))
 }  # fmt: skip
 """Name, standard deviation, mark and distance (mm) in the corners and at the sides, source."""
 

@@ -23,7 +23,6 @@ from .paper import Content, Page, page_of, room_on, sheets_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-
 Drawable = ReseauDesign | TestfieldDesign | SpaceTargets | BoardDesign
 
 _GREY = "#555555"

@@ -10,6 +10,7 @@ import numpy as np
 from ..bundle import Camera, Network
 from ..core.data import Array, Rows
 from ..core.errors import FormatError, InputError
+from ..core.files import readable
 
 
 def numbers(words: Sequence[str], count: int, path: Path, line: int) -> list[float]:
@@ -38,27 +39,10 @@ def read_bytes(path: Path, most_mb: int) -> bytes:
     InputError
         When it cannot be read, or is larger.
     """
-    try:
+    with readable(path):
         if path.stat().st_size > most_mb * 1_000_000:
             raise InputError(f"is larger than {most_mb} MB", where=path)
         return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
-
-
-def read_head(path: Path) -> bytes:
-    """Return the first 4000 bytes of a file, which tell its format.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read.
-    """
-    try:
-        with path.open("rb") as file:
-            return file.read(4000)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
 
 
 def network_of(

@@ -27,10 +27,11 @@ import scipy
 from ..bundle import Camera, Network
 from ..core.data import Array, Mask, Rows
 from ..core.errors import FormatError, UsageError
+from ..core.files import head_of
 from ..io import read_text
 from ..optics import camera_model
 from ..optics.poses import matrix_to_vector
-from .lines import network_of, numbers, read_bytes, read_head
+from .lines import network_of, numbers, read_bytes
 from .markup import Node, read_markup
 
 _PATTERN = "Orientation-*.xml"
@@ -313,7 +314,7 @@ def _control(
     """Read measured and given control points: image, point, x, y; coordinates and standard deviations."""
     measured, given = list[tuple[int, str, float, float]](), dict[str, tuple[Array, Array]]()
     for file in sorted(project.glob("*.xml")):
-        head = read_head(file)
+        head = head_of(file)
         if b"<SetOfMesureAppuisFlottants" in head:
             for image in read_markup(file).all("MesureAppuiFlottant1Im"):
                 row = row_of.get(image.need("NameIm").text)

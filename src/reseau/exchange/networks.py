@@ -17,6 +17,7 @@ from ..bundle.modelling.calibration import with_estimates
 from ..bundle.network.settings import network_document
 from ..calibration import read_calibration
 from ..core.errors import FormatError, InputError, UsageError
+from ..core.files import head_of
 from ..io import FrameOrientation, read_text
 from ..io.network import CalibratedCameraEntry, CameraEntry, FilmCameraEntry, Network1
 from .bal import read_bal, write_bal
@@ -25,7 +26,6 @@ from .calibrations.formats import Exported
 from .colmap import read_colmap, write_colmap
 from .dbat import is_dbat, read_dbat
 from .libmv import is_libmv, read_libmv
-from .lines import read_head
 from .metashape import is_metashape, read_metashape
 from .micmac import is_micmac, read_micmac
 from .openptv import is_openptv, read_openptv
@@ -42,7 +42,7 @@ class _Peek:
     @cached_property
     def head(self) -> bytes:
         """First bytes of a file."""
-        return b"" if self.path.is_dir() else read_head(self.path)
+        return b"" if self.path.is_dir() else head_of(self.path)
 
     @cached_property
     def counts(self) -> list[int]:
@@ -126,7 +126,7 @@ def read_network(
     reseau.core.errors.InputError: missing.json: cannot be read (No such file or directory)
     """
     path, given = Path(path), dict(calibrations or {})
-    if path.is_dir() or path.suffix.lower() != ".json" or is_sfm(read_head(path)):
+    if path.is_dir() or path.suffix.lower() != ".json" or is_sfm(head_of(path)):
         network = _with_sensor_width(read_foreign(path, control_sigma), sensor_width)
         # With a pitch of one, the principal distance is in pixels.
         known = {camera.id: camera for camera in network.cameras}

@@ -27,7 +27,7 @@ class Deadline:
     ----------
     seconds : float
         Time from now (s). Of what another deadline has left, messages name the whole: that is what the caller
-        has set.
+        has set; it may be 0.
 
     Raises
     ------
@@ -39,12 +39,12 @@ class Deadline:
     >>> deadline = Deadline(10.0)
     >>> deadline.expired, deadline.at_most(0.5)
     (False, 0.5)
-    >>> Deadline(deadline.left_or_minimum).seconds
+    >>> Deadline(deadline.left).seconds
     10.0
     """
 
     def __init__(self, seconds: float) -> None:
-        if not 0 < seconds < math.inf:
+        if not (0 < seconds < math.inf or isinstance(seconds, _Remaining)):
             raise UsageError(
                 f"{seconds} s is not a valid time limit: give a positive, finite time", where="deadline"
             )
@@ -54,8 +54,8 @@ class Deadline:
 
     @property
     def left(self) -> float:
-        """Remaining time (s); 0 after the deadline."""
-        return max(0.0, self._at - time.monotonic())
+        """Remaining time (s); 0 after the deadline. A further call within it names the whole."""
+        return _Remaining(max(0.0, self._at - time.monotonic()), self.seconds)
 
     @property
     def expired(self) -> bool:
@@ -66,11 +66,6 @@ class Deadline:
         """Return the given time (s), or the remaining time if that is shorter."""
         return min(seconds, self.left)
 
-    @property
-    def left_or_minimum(self) -> float:
-        """Remaining time (s), at least 1 ms: a valid deadline for a further call."""
-        return _Remaining(max(1e-3, self.left), self.seconds)
-
     def part(self, seconds: float) -> Deadline:
         """Return a deadline for a part of the call; it is never later than this one."""
-        return Deadline(self.left_or_minimum if self.left < seconds else seconds)
+        return Deadline(self.at_most(seconds))

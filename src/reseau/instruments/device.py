@@ -127,6 +127,8 @@ class Device(ABC, Generic[S]):
     def _exchange(self, command: str, seconds: float | None = None) -> Iterator[Deadline]:
         """Reserve the connection, open it if necessary, and add instrument and command to errors."""
         deadline = Deadline(self._seconds if seconds is None else seconds)
+        if deadline.expired:  # part of a call that has used up its time
+            raise DeadlineError(_late(deadline), where=self.name, command=command)
         if not self._lock.acquire(timeout=deadline.left):
             raise DeadlineError("was busy until the deadline", where=self.name, command=command)
         try:
@@ -194,7 +196,7 @@ class Device(ABC, Generic[S]):
     def check(self, seconds: float | None = None) -> dict[str, str]:
         """Run the self-test: identity, firmware and the tests of the driver, within one time limit."""
         deadline = Deadline(self._seconds if seconds is None else seconds)
-        found = self.connect(deadline.left_or_minimum)
+        found = self.connect(deadline.left)
         identity = " ".join(part for part in (found.maker, found.model, found.serial) if part)
         result = {"identity": identity or "unknown", "firmware": found.firmware or "not reported"}
         return result | self._test(deadline)
@@ -407,7 +409,9 @@ class Device(ABC, Generic[S]):
             if done(answer):
                 return answer
             if deadline.expired:
-                raise DeadlineError(
-                    f"did not finish within {deadline.seconds:g} s", where=self.name, command=command
-                )
+                raise DeadlineError(_late(deadline), where=self.name, command=command)
             self._stopping.wait(deadline.at_most(pause_s))
+
+
+def _late(deadline: Deadline) -> str:
+    return f"did not finish within {deadline.seconds:g} s"

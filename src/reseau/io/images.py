@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ..core.data import Frame
 from ..core.errors import ImageError, InputError, UsageError
-from ..core.files import split_frame
+from ..core.files import head_of, readable, split_frame
 from ..core.provenance import sha256_of
 from ..core.tone import ToneCurve
 from . import write_whole
@@ -50,7 +50,8 @@ _AGAIN = "copy or scan it again"
 _BY_OPENCV = (5, 7, 8, 32946)
 """Compressions LZW, JPEG and Deflate of a TIFF, which OpenCV decodes, too."""
 
-Channel = Literal["luma", "red", "green", "blue", "mosaic"]
+_LUMAS = ("luma", "interpolated")
+Channel = Literal["luma", "red", "green", "blue", "interpolated"]
 
 
 def read_image(path: Path | str, channel: Channel = "luma", digest: str | None = None) -> Frame:
@@ -64,8 +65,9 @@ def read_image(path: Path | str, channel: Channel = "luma", digest: str | None =
         without a number the first is read, with a note.
     channel : {"luma", "red", "green", "blue", "mosaic"}
         Channel of a colour image that is used. A lens images colours at slightly different scales; a single
-        channel avoids the shifts that this causes. ``mosaic``: the pixels of a raw file behind their filters,
-        none interpolated. The pixels of a grey image are the same for every channel.
+        channel avoids the shifts that this causes. ``luma`` of a raw file are its pixels behind their filters
+        of 2 × 2 pixels, none interpolated; its other channels, and ``interpolated``, its luma, are
+        interpolated between them. The pixels of a grey image are the same for every channel.
     digest : str, optional
         SHA-256 of the file, if it is known.
 
@@ -81,7 +83,7 @@ def read_image(path: Path | str, channel: Channel = "luma", digest: str | None =
     ImageError
         When it is not an image, damaged, of an unsupported kind, or larger than `MAX_PIXELS`.
     UsageError
-        When there is no such channel, or no mosaic.
+        When there is no such channel.
 
     Examples
     --------
@@ -94,17 +96,13 @@ def read_image(path: Path | str, channel: Channel = "luma", digest: str | None =
     """
     path = Path(path)
     if channel not in get_args(Channel):
-        raise UsageError("is not a channel", where=channel, do="use luma, red, green, blue or mosaic")
-    if channel == "mosaic" and is_raw(path) and path.exists():
-        mosaic, full_scale = mosaic_of_raw(path)
-        _check_size(path, mosaic.shape[1], mosaic.shape[0])
-        return Frame(mosaic, full_scale, path.name, digest or sha256_of(path))
-    scan = open_scan(path)
+        raise UsageError("is not a channel", where=channel, do="use luma, red, green, blue or interpolated")
+    scan = open_scan(path, mosaic=channel == "luma")
     digest = sha256_of(path) if digest is None else digest
     _check_size(path, scan.width, scan.height)
     pixels = scan.window(0, scan.height, 0, scan.width)
     grey = np.array(pixels[:, :, 0]) if len(scan.channels) == 1 else grey_of(pixels, channel, scan.channels)
-    return Frame(grey, scan.full_scale, scan.name, digest, scan.notes, scan.curve)
+    return Frame(grey, scan.full_scale, scan.name, digest, scan.notes, scan.curve, scan.filters)
 
 
 def grey_of(
@@ -117,9 +115,7 @@ def grey_of(
     >>> grey_of(np.array([[[10, 20, 30]]], np.uint8), "luma")
     array([[18]], dtype=uint8)
     """
-    if channel == "mosaic":
-        raise UsageError("is no channel of colours", where=channel, do="use luma, red, green or blue")
-    if channel != "luma":
+    if channel not in _LUMAS:
         return np.array(pixels[:, :, channels.index(channel)])
     return luma(pixels, channels)
 
@@ -138,13 +134,15 @@ def luma(pixels: NDArray[Any], channels: tuple[str, ...]) -> NDArray[Any]:
     return grey if pixels.dtype.kind == "f" else np.rint(grey).astype(pixels.dtype)
 
 
-def open_scan(path: Path | str) -> Scan:
+def open_scan(path: Path | str, *, mosaic: bool = False) -> Scan:
     """Open an image file to read it window by window.
 
     Parameters
     ----------
     path : path
         As for :func:`read_image`; a TIFF may have any size.
+    mosaic : bool
+        Whether pixels of a raw file behind filters of 2 × 2 pixels are wanted as they are, not interpolated.
 
     Raises
     ------
@@ -163,17 +161,16 @@ def open_scan(path: Path | str) -> Scan:
     (('grey',), (2, 3, 1))
     """
     whole, number = split_frame(Path(path))
-    try:
-        with whole.open("rb") as stream:
-            magic = stream.read(132)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+    magic = head_of(whole)
     if not magic:
         raise ImageError("is empty", where=path, do=_AGAIN)
     if is_dicom(whole, magic):
         return open_dicom(whole, number, MAX_PIXELS)
     path = Path(path)
     if is_raw(path):
+        if mosaic and (found := mosaic_of_raw(path)):
+            pixels, full_scale, filters = found
+            return replace(scan_of(pixels, path.name), full_scale=full_scale, filters=filters)
         return scan_of(decoded_raw(path), path.name)
     if is_heic(magic):
         return scan_of(decoded_heic(path), path.name)
@@ -470,12 +467,9 @@ def _decoding(page: Any, path: Path) -> Window:
 
     def segment(index: int) -> NDArray[Any]:
         if index not in kept:
-            try:
-                with path.open("rb") as stream:
-                    stream.seek(page.dataoffsets[index])
-                    coded = stream.read(page.databytecounts[index])
-            except OSError as error:
-                raise InputError(f"cannot be read ({error.strerror})", where=path) from None
+            with readable(path), path.open("rb") as stream:
+                stream.seek(page.dataoffsets[index])
+                coded = stream.read(page.databytecounts[index])
             try:
                 found = decode(coded, index, jpegtables=tables, jpegheader=header)[0]
             except Exception as error:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.data import filters_of
 from ..core.errors import ImageError
 from ..core.optional import optional
 
@@ -143,24 +144,29 @@ def decoded_raw(path: Path) -> NDArray[Any]:
     return np.asarray(pixels)
 
 
-def mosaic_of_raw(path: Path) -> tuple[NDArray[np.uint16], float]:
-    """Pixels (h, w) of a raw file behind their filters, above black, and the value at which they saturate.
+def mosaic_of_raw(path: Path) -> tuple[NDArray[np.uint16], float, str] | None:
+    """Pixels (h, w) of a raw file behind their filters, above black; where they saturate; the filters.
+
+    None if its filters are not red, green, green and blue in cells of 2 × 2 pixels.
 
     Raises
     ------
     UsageError
         When rawpy is missing.
     ImageError
-        When the file is damaged, of a camera that is not known, or its filters are no cells of 2 × 2 pixels.
+        When the file is damaged, or of a camera that is not known.
     """
     with _opened_raw(path) as (_, raw):
         pattern, sensor = raw.raw_pattern, np.array(raw.raw_image_visible)
         if pattern is None or pattern.shape != (2, 2) or sensor.ndim != 2:
-            what = "has no filters in cells of 2 × 2 pixels"
-            raise ImageError(what, where=path, do="read another channel of it: luma, red, green or blue")
-        black = np.array(raw.black_level_per_channel, np.int64)[np.array(raw.raw_colors_visible)]
+            return None
+        kinds = np.array(raw.raw_colors_visible)
+        filters = filters_of("".join(raw.color_desc.decode()[kind] for kind in kinds[:2, :2].ravel()))
+        if not filters:
+            return None
+        black = np.array(raw.black_level_per_channel, np.int64)[kinds]
         full = float(raw.white_level - max(raw.black_level_per_channel))
-    return np.clip(sensor - black, 0, full).astype(np.uint16), full
+    return np.clip(sensor - black, 0, full).astype(np.uint16), full, filters
 
 
 @contextmanager

@@ -48,6 +48,8 @@ class Scan:
         What a user should know about how it was read.
     curve : ToneCurve, optional
         Curve between grey values and light that the file states; None if it states none.
+    filters : str
+        Colour filters of the pixels of the first two rows, as RGGB; empty if there are none.
 
     Examples
     --------
@@ -67,6 +69,7 @@ class Scan:
     window: Window
     notes: tuple[str, ...] = ()
     curve: ToneCurve | None = None
+    filters: str = ""
 
     def overview(self, longest: int) -> tuple[NDArray[np.float32], float]:
         """Reduce the image so that its longer side has at most `longest` pixels.

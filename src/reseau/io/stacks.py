@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.data import Frame
 from ..core.errors import ImageError, InputError
-from ..core.files import split_frame
+from ..core.files import head_of, split_frame
 from ..core.provenance import sha256_of
 from .dicom import count_dicom, is_dicom
 from .images import Channel, count_pages, grey_of, read_image
@@ -30,7 +30,7 @@ def frames_of(path: Path | str, channel: Channel = "luma") -> Iterator[Frame]:
     ----------
     path : path
         As for :func:`reseau.io.images.read_image`, or a video; ``scan.tif#2`` is one page.
-    channel : {"luma", "red", "green", "blue", "mosaic"}
+    channel : {"luma", "red", "green", "blue", "interpolated"}
         Channel of a colour image.
 
     Yields
@@ -103,12 +103,7 @@ def open_video(path: Path) -> Any:
 
 
 def _count(path: Path) -> int:
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(132)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
-    if is_dicom(path, head):
+    if is_dicom(path, head := head_of(path)):
         return count_dicom(path)
     return count_pages(path) if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+") else 1
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -30,6 +29,7 @@ from ..core.failure import Estimated, Remark
 from ..core.files import writable
 from ..core.lazy import above
 from ..core.provenance import Provenance
+from ..core.warned import warn_user
 from ..exchange.calibrations.formats import Exported, export_calibrations
 from ..io import BoardDesign, write_whole
 from ..io.images import Channel, read_image
@@ -289,8 +289,7 @@ class Calibrated(Estimated, Display):
             The cameras as they were written.
         """
         done = export_calibrations([self[name] for name in self.cameras], to, path, anyway=anyway)
-        for line in done[0].notes:
-            warnings.warn(line, stacklevel=2)
+        warn_user(done[0].notes)
         return done
 
     def report(self, path: Path | str, **options: Unpack[ReportOptions]) -> None:

@@ -58,6 +58,7 @@ _SHIFTED = (
 )
 _UNNAMED = "which part of the target it shows is not certain, and no other photograph tells"
 _LEFT_OUT = "{} image points are gross errors, and are left out: {}; --no-reject keeps them"
+_VIEWS = "{} photographs are {} views: {} repeat their errors, and count once"
 _MORE_TILTED = "add images with the camera tilted by 20 to 40 degrees in different directions"
 # Relative standard deviation of a diagonal of the target.
 _PRINTED = 1e-4
@@ -199,21 +200,24 @@ class _Job:
         stand_in = Camera(ONE_CAMERA, 1, 1, (1.0, 1.0), "opencv", np.zeros(len(camera_model("opencv").names)))
         wrong = left_out(network_of(measured, design, stand_in), cameras, sizes, of)
         if wrong is None:
-            return self._decided(measured, None)
+            return self._decided(self._adjusted(measured, None), measured, None)
         # Which points are wrong is seen best with the target as designed: its errors are small beside theirs.
         more = options.target != "free" or options.control or options.heights or options.refraction
         first = self if more else replace(self, options=replace(options, target="flat"))
         done = first._adjusted(wrong.kept(measured), wrong.found)
         still = wrong if isinstance(done, Failure) else wrong.after(done.result)
         same = still is not None and np.array_equal(still.found.rows, wrong.found.rows)
-        if still is not None and same and more:
-            return done if isinstance(done, Failure) else replace(done, misnamed=still.found)
         kept, found = (measured, None) if still is None else (still.kept(measured), still.found)
-        return self._decided(kept, found)
+        if not same or not more:
+            done = self._adjusted(kept, found)
+        elif not isinstance(done, Failure):
+            done = replace(done, misnamed=found)
+        return self._decided(done, kept, found)
 
-    def _decided(self, measured: dict[str, ImagePoints], wrong: Misnamed | None) -> Calibrated | Failure:
-        """Adjust the points; without gross errors where these explain what is left, unless told."""
-        done = self._adjusted(measured, wrong)
+    def _decided(
+        self, done: Calibrated | Failure, measured: dict[str, ImagePoints], wrong: Misnamed | None
+    ) -> Calibrated | Failure:
+        """What was adjusted from the points; without gross errors where these explain what is left."""
         if isinstance(done, Failure) or self.options.reject is not None:
             return done
         causes = done.explanation.causes
@@ -289,7 +293,8 @@ class _Job:
                 return replace(found, reason=f"{found.reason}; {_MORE_TILTED}")
             return found
         # What was not chosen may yet be there.
-        found = replace(found, considers=bool(choices))
+        found = replace(found, rivals=tuple(each.rivals for each in choices.values()) or None)
+        notes = (*notes, *_of_views(found))
         calibrated = Calibrated(found, measured, self.declined, choices, board, notes, wrong)
         loose = _without_scale(calibrated.result)
         return calibrated if loose is None else loose
@@ -299,6 +304,16 @@ def _cameras_of(images: Iterable[str], taken: Mapping[str, Taken] | None) -> tup
     """Names of the cameras, and the number of that of each image."""
     cameras = list(dict.fromkeys(each.camera for each in taken.values())) if taken else [ONE_CAMERA]
     return cameras, [cameras.index(taken[name].camera) if taken else 0 for name in images]
+
+
+def _of_views(result: Result) -> list[str]:
+    """A note where photographs repeat each other's errors, naming the most that do."""
+    if result.shared is None:
+        return []
+    views, images = result.shared.views, np.array(result.network.images)
+    count = np.bincount(views)
+    alike = images[views == int(count.argmax())].tolist()
+    return [_VIEWS.format(len(images), len(count), few_of(alike))] if len(count) < len(images) else []
 
 
 def _without_scale(result: Result) -> Failure | None:

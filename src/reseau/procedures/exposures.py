@@ -17,6 +17,7 @@ from ..calibration.sensor import SensorCorrection
 from ..core.data import Frame, ImagePoints
 from ..core.errors import InputError, UsageError
 from ..core.failure import Code, Failure
+from ..core.files import readable
 from ..io.images import Channel, read_image
 from ..io.photographs import PHOTOGRAPHS, read_exif
 from ..io.reading import is_points, read_measurement
@@ -255,7 +256,7 @@ def photograph_reader(
 
     Parameters
     ----------
-    channel : {"luma", "red", "green", "blue", "mosaic"}
+    channel : {"luma", "red", "green", "blue", "interpolated"}
         Channel of colour images.
     correction : SensorCorrection, optional
         Correction for the sensor.
@@ -329,7 +330,8 @@ def photographs_of(
                 points = read_points.image_points(uncertain=True)
                 yield MeasuredPhotograph(name, points, certain=not read_points.candidates)
             elif isinstance(image, Path) and objects is not None:
-                sha256, suffix = objects.put(_content(image), image.suffix), image.suffix
+                with readable(image):
+                    sha256, suffix = objects.put(image.read_bytes(), image.suffix), image.suffix
                 source = partial(_of_store, read, store, sha256, suffix)
                 yield Unread(name, partial(_named, source, name), {"image": sha256})
             else:
@@ -342,13 +344,6 @@ def photographs_of(
 
 def _named(read: Callable[[], Frame], name: str) -> Frame:
     return replace(read(), name=name)
-
-
-def _content(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
 
 
 def _of_store(read: Callable[[Path | Frame], Frame], place: str, sha256: str, suffix: str) -> Frame:

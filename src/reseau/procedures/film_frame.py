@@ -55,16 +55,18 @@ def orient_scan(scan: Scan, options: FrameOptions | None = None) -> list[FrameRe
 
 
 def reorient_scan(
-    scan: Scan, roll: Roll, before: Sequence[FrameResult], options: FrameOptions
+    scan: Scan, rolls: Sequence[Roll], before: Sequence[FrameResult], options: FrameOptions
 ) -> list[FrameResult]:
     """Repeat a scan with the frame shape of its roll; return the better results.
+
+    Of several rolls that with which the frames are most complete counts; where two are equal, none does.
 
     Parameters
     ----------
     scan : Scan
         The scan.
-    roll : Roll
-        Shape of the other frames of the roll.
+    rolls : sequence of Roll
+        Shapes of the other frames of the roll, or of each roll that it may be of.
     before : sequence of FrameResult
         Results without it.
     options : FrameOptions
@@ -84,17 +86,23 @@ def reorient_scan(
     >>> corners = FrameCorners.from_xy([[-18, 12], [18, 12], [18, -12], [-18, -12]])
     >>> roll = Roll(corners, FrameShape(36.0, 24.0), px_per_mm=4.0, frames=12, scatter_mm=(0.01, 0.01))
     >>> scan, options = scan_of(np.full((136, 184), 128, np.uint8), "07.tif"), FrameOptions()
-    >>> reorient_scan(scan, roll, orient_scan(scan, options), options)
+    >>> reorient_scan(scan, [roll], orient_scan(scan, options), options)
     [<FrameResult: image 07.tif, status declined, reason is of one tone; scan it with more exposure>]
     """
-    again = orient_frames(scan, roll.options(options))
     order = {"oriented": 2, "three-edges": 1, "declined": 0}
 
     def best(results: Sequence[FrameResult]) -> int:
         return max(order[result.status] for result in results)
 
+    # The format of a frame that is oriented is known.
+    known = {r.format_mm for r in before if r} or {each.format_mm for each in rolls}
+    tried = [(orient_frames(scan, each.options(options)), each) for each in rolls if each.format_mm in known]
+    tried.sort(key=lambda one: -best(one[0]))
     # What the roll has in common is additional knowledge of a frame that is as complete without it.
-    if best(again) < max(best(before), 1):
+    if not tried or best(tried[0][0]) < max(best(before), 1):
+        return list(before)
+    again, roll = tried[0]
+    if len(tried) > 1 and best(tried[1][0]) == best(again):
         return list(before)
     note = f"by the shape of {roll.frames} frames of its roll"
     return [

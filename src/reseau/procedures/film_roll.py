@@ -15,7 +15,7 @@ from ..core.provenance import Provenance
 from ..io import FrameCorners, FrameOrientation
 from ..io.frame import FrameOutcome, RollSummary
 from ..io.scans import Scan
-from ..measure.film.roll import Kind, Roll, roll_of
+from ..measure.film.roll import Kind, Roll, corner_files, rolls_of
 from .film_frame import FrameOptions, FrameResult, orient_scan, orientation_of, reorient_scan
 
 
@@ -80,7 +80,7 @@ class FilmRollProcedure:
         self._options, self._calibrated, self._kind = options, calibrated, kind
         self._parameters, self._inputs = dict(parameters or {}), dict(inputs or {})
         self._results: dict[str, list[FrameResult]] = {}
-        self._roll: Roll | None = None
+        self._rolls: tuple[Roll, ...] = ()
         self.frames: tuple[OrientedFrame, ...] = ()
 
     @property
@@ -123,12 +123,11 @@ class FilmRollProcedure:
         EstimationError
             If no frame could be oriented, or a transformation is not determined.
         """
-        common = roll_of([each for results in self._results.values() for each in results])
-        self._roll = None if isinstance(common, Failure) else common
+        self._rolls = rolls_of([each for results in self._results.values() for each in results])
         frames, stems = [], _stems(list(self._results))
         for name, results in self._results.items():
-            if self._roll is not None and any(each.status != "oriented" for each in results):
-                results = reorient_scan(self.opened(name), self._roll, results, self._options)
+            if self._rolls and any(each.status != "oriented" for each in results):
+                results = reorient_scan(self.opened(name), self._rolls, results, self._options)
             for k, each in enumerate(results, start=1):
                 found = orientation_of(each, self._calibrated, self._kind)
                 if isinstance(found, Failure):
@@ -141,9 +140,7 @@ class FilmRollProcedure:
             raise EstimationError(f"no frame could be oriented{why and f' ({why})'}", where="roll")
         made = {f"orientation {each.stem}.json": each.document.to_json() for each in frames}
         made["summary.json"] = self.summary().to_json()
-        if self._roll is not None:
-            made["corners.json"] = self._roll.corners.to_json()
-        return made
+        return made | {name: each.to_json() for name, each in corner_files(self._rolls).items()}
 
 
 def _stems(names: list[str]) -> dict[str, str]:

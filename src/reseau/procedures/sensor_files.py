@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from ..core.data import Frame
 from ..core.errors import FormatError, InputError, UsageError
-from ..core.files import split_frame
+from ..core.files import head_of, split_frame
 from ..io.dicom import exposure_of_dicom, is_dicom
 from ..io.images import Channel
 from ..io.photographs import PHOTOGRAPHS, read_exif
@@ -191,12 +191,7 @@ def _named(name: str) -> float | None:
 def _said(path: Path) -> float | None:
     if path.suffix.lower() in VIDEOS:
         return None
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(132)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
-    return exposure_of_dicom(path) if is_dicom(path, head) else read_exif(path).exposure_us
+    return exposure_of_dicom(path) if is_dicom(path, head_of(path)) else read_exif(path).exposure_us
 
 
 def _descriptor(rows: Sequence[str], path: Path) -> tuple[FileExposure, ...]:
@@ -296,7 +291,7 @@ def add_files(
         Takes the frames, as in an acquisition.
     exposures : sequence of FileExposure
         The files.
-    channel : {"luma", "red", "green", "blue", "mosaic"}
+    channel : {"luma", "red", "green", "blue", "interpolated"}
         Channel of colour images.
     root : Path, optional
         Folder to which names of files are relative in the provenance.

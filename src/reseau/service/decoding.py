@@ -112,7 +112,7 @@ class Decoder:
             If it is not a photograph that can be used, or exceeds a limit.
         """
         about, pixels = self._decoded(path, name, colours=False)
-        return Frame(pixels[:, :, 0], about.full_scale, name, curve=about.curve)
+        return Frame(pixels[:, :, 0], about.full_scale, name, curve=about.curve, filters=about.filters)
 
     def scan(self, path: Path, name: str) -> Scan:
         """Decode a photograph with all its colours, and the resolution that it states.
@@ -220,6 +220,7 @@ class _About:
     dpi: float | None
     curve: ToneCurve | None
     notes: tuple[str, ...]
+    filters: str
 
     @classmethod
     def read(cls, head: bytes, name: str, limits: DecodingLimits) -> _About:
@@ -234,7 +235,7 @@ class _About:
             found = cls(
                 int(given["width"]), int(given["height"]), int(given["channels"]), str(given["type"]),
                 float(given["full_scale"]), None if given["dpi"] is None else float(given["dpi"]), curve,
-                tuple(str(each)[:300] for each in given["notes"][:20]),
+                tuple(str(each)[:300] for each in given["notes"][:20]), str(given["filters"])[:4],
             )  # fmt: skip
         except (ValueError, KeyError, TypeError, IndexError, RecursionError):
             raise ImageError("cannot be decoded", where=name) from None
@@ -320,7 +321,7 @@ def _decode(order: dict[str, Any], writing: int) -> None:
 
     with os.fdopen(writing, "wb") as out:
         try:
-            scan = open_scan(Path(order["path"]))
+            scan = open_scan(Path(order["path"]), mosaic=not order["colours"])
             if scan.width * scan.height > order["pixels"]:
                 raise ImageError(f"has {scan.width}×{scan.height} pixels, more than {order['pixels']}")
             pixels = scan.window(0, scan.height, 0, scan.width)
@@ -334,7 +335,7 @@ def _decode(order: dict[str, Any], writing: int) -> None:
             about = {
                 "width": scan.width, "height": scan.height, "channels": pixels.shape[2],
                 "type": pixels.dtype.name, "full_scale": scan.full_scale, "dpi": scan.dpi,
-                "notes": list(scan.notes),
+                "notes": list(scan.notes), "filters": scan.filters,
                 "curve": None if curve is None else [curve.exponent, list(curve.table), curve.source],
             }  # fmt: skip
             out.write(json.dumps(about).encode() + b"\n")

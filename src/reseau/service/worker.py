@@ -21,23 +21,22 @@ import ssl
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ..archive import Archive
 from ..capture import Bench, BenchFile, BenchLock, by_hand
 from ..capture.checks import edge_sigma, exposure_fault, grey_counts
-from ..capture.engine import Control
-from ..core.errors import BenchError, InstrumentError, ReseauError, StateError, UsageError
+from ..core.errors import BenchError, ReseauError, StateError, UsageError
 from ..core.memory import keep_loaded, share_freed_memory
 from ..instruments import Camera, Turntable
 from ..io import read_text
-from ..sessions import conducting, kinds
+from ..sessions import conducting
 from ..sessions.parameters import SessionParameters
-from .orders import Order, Orders, owner
+from .orders import Orders, owner
+from .performing import Performer, known_error
 from .state import StateFolder, private_file
 from .wire import Certificates, Wire, checked_peer, to_error
 
@@ -84,7 +83,7 @@ class Worker:
 
     def __init__(self, text: str, archive: Archive, certificates: Certificates) -> None:
         self.file = BenchFile.parse_toml(text, where="bench")
-        self.name, self._text, self._archive = self.file.name, text, archive
+        self.name, self.text, self._archive = self.file.name, text, archive
         self._certificates, self._orders = certificates, Orders(archive, self.name)
         every = Bench(self.file)
         self._bench = every.part(every.instruments, required=())
@@ -95,17 +94,13 @@ class Worker:
         self._held: contextlib.ExitStack | None = None
         self._error = "not connected yet"
         self._wanted = True
-        self._control: Control | None = None
-        self._session: dict[str, Any] = {}
-        self._thread: threading.Thread | None = None
-        self._question: str | None = None
-        self._answered = threading.Event()
         self._moving = ""
         self._places: dict[str, Any] = {}
         self._live: tuple[dict[str, Any], bytes] = ({}, b"")
         self._looked = 0.0
         self._stops = 0
         self.over = threading.Event()
+        self._sessions = Performer(archive, self._orders, self, self._say, self.over)
 
     # What is held.
 
@@ -127,7 +122,7 @@ class Worker:
                     each.stage()
             except Exception as error:
                 stack.close()
-                known = _known(error, "bench")
+                known = known_error(error, "bench")
                 self._error = str(known)
                 raise known from None
             self._held, self._error = stack, ""
@@ -147,7 +142,7 @@ class Worker:
                 with self._lock:
                     if self._held is None:  # released meanwhile
                         instrument.close()
-                    elif self._control is None and name in self._silent:
+                    elif self._sessions.control is None and name in self._silent:
                         instrument.stop()
                         instrument.stage()
                         self._answer([name])
@@ -159,16 +154,22 @@ class Worker:
 
     def _release(self) -> None:
         with self._lock:
-            if self._control is not None:
+            if self._sessions.control is not None:
                 raise StateError("a session runs", where=self.name, do="abort it first")
             if self._held is not None:
                 self._held.close()
                 self._held, self._error = None, "released"
 
-    def _required(self) -> Bench:
+    def required(self) -> Bench:
+        """Return the bench, if it is held."""
         if self._held is None:
             raise StateError(self._error or "is not connected", where=self.name)
         return self._bench
+
+    @property
+    def idle(self) -> bool:
+        """Whether it is held, and nothing moves by command."""
+        return self._held is not None and not self._moving
 
     # What is reported.
 
@@ -178,17 +179,17 @@ class Worker:
 
     def status(self) -> dict[str, Any]:
         """Return the state of the bench, without asking an instrument."""
-        session = dict(self._session)
+        session = dict(self._sessions.facts)
         state = "ready" if self._held is not None else ("released" if not self._wanted else "down")
-        if self._control is not None:
+        if self._sessions.control is not None:
             state = session.get("state", "running")
         elif self._moving:
             state = "moving"
-        if self._question is not None:
+        if self._sessions.question is not None:
             state = "asking"
         return {
             "name": self.name, "state": state, "error": self._wrong(), "session": session or None,
-            "question": self._question, "moving": self._moving, "pid": os.getpid(),
+            "question": self._sessions.question, "moving": self._moving, "pid": os.getpid(),
             "instruments": {name: entry.driver for name, entry in self.file.instruments.items()},
             "has_camera": self._bench.has(Camera), "has_table": self._bench.has(Turntable),
             "picture": self._live[0].get("number", 0),
@@ -233,7 +234,7 @@ class Worker:
         return self.status()
 
     def _table(self) -> Turntable:
-        found: Turntable = self._required().one(Turntable)
+        found: Turntable = self.required().one(Turntable)
         return found
 
     def _axes(self) -> dict[str, Any]:
@@ -247,7 +248,7 @@ class Worker:
         return self._places
 
     def _free(self) -> None:
-        if self._control is not None:
+        if self._sessions.control is not None:
             raise StateError("a session runs", where=self.name, do="pause or abort it first")
 
     def _move(self, axis: str, position: float, relative: bool = False, by: str = "") -> dict[str, Any]:
@@ -289,7 +290,7 @@ class Worker:
 
     def _settings(self) -> dict[str, Any]:
         found = {}
-        for name, each in self._required().instruments.items():
+        for name, each in self.required().instruments.items():
             settings, narrower = each.settings, self.file.instruments[name].limits
             rows = {}
             for key, value in settings.to_dict().items():
@@ -305,7 +306,7 @@ class Worker:
 
     def _configure(self, instrument: str, changes: dict[str, Any]) -> dict[str, Any]:
         self._free()
-        self._required()[instrument].configure(**changes)
+        self.required()[instrument].configure(**changes)
         found: dict[str, Any] = self._settings()[instrument]
         return found
 
@@ -316,225 +317,47 @@ class Worker:
                 "name": c.name, "driver": c.driver, "found": c.found,
                 "error": None if c.error is None else str(c.error),
             }
-            for c in self._required().check(seconds)
+            for c in self.required().check(seconds)
         ]  # fmt: skip
 
     def _begin(
         self, name: str, plan: str, parameters: dict[str, Any], inputs: dict[str, str], by: str = ""
     ) -> dict[str, Any]:
         self._free()
-        given = self._checked(name, plan, parameters, inputs)
         with self._lock:
-            self._prepare(given)
-            session = conducting.begin(self._archive, name, plan, given, inputs, bench=self._text)
-            return self._run(session, by)
-
-    def _checked(self, name: str, plan: str, parameters: dict[str, Any], inputs: dict[str, str]) -> Any:
-        """Parameters of a session on this bench, checked."""
-        if plan == "own":
-            raise UsageError("is a program of the user, which the service does not run", where="plan own")
-        bench = self._required()
-        parameters = kinds.kind_of(plan).parameters.defaults(bench) | parameters
-        return conducting.check(name, plan, parameters, inputs, bench)
+            self._sessions.start(self._sessions.made(name, plan, parameters, inputs), by)
+            return self.status()
 
     def _resume_session(self, name: str, by: str = "") -> dict[str, Any]:
         self._free()
-        bench = self._required()
+        bench = self.required()
         session = self._archive.session(name)
         if session.status == "done":
             raise UsageError("is done", where=name)
-        if session.bench != self._text:
+        if session.bench != self.text:
             raise UsageError("was begun on another bench", where=name)
         given = conducting.parameters_of(session)
         given.check_bench(bench)
         with self._lock:
-            self._prepare(given)
+            self.prepare(given)
             session.recover()
-            return self._run(session, by)
+            self._sessions.start(session, by)
+            return self.status()
 
-    def _prepare(self, given: SessionParameters) -> None:
+    def prepare(self, given: SessionParameters) -> None:
         """Check that the instruments of a session answer, and that its axes have their reference."""
-        used = given.part_of(self._required())
+        used = given.part_of(self.required())
         if used.instruments.keys() & self._silent.keys():
             used.connect()
             self._answer(used.instruments)
         if not given.home:
             given.check_homed(used)
 
-    def _run(self, session: Any, by: str) -> dict[str, Any]:
-        given = conducting.parameters_of(session)
-        self._describe(session.name, session.plan, by, given.expected, dict(given.units))
-        control = self._control = Control(lambda: self._set("paused"))
-        self._thread = threading.Thread(target=self._carry_out, args=(session, control), name="session")
-        self._thread.start()
-        self._say("begin", {"session": session.name})
-        return self.status()
-
-    def _set(self, state: str) -> None:
-        self._session["state"] = state
-        self._say("session", {"state": state})
-
-    def _carry_out(self, session: Any, control: Control) -> None:
-        """Carry out a session in a thread of its own."""
-        with self._reported(), self._archive_lock(session.name):
-            conducting.capture(session, self._bench, watch=self._watched, operator=self._ask, control=control)
-        self._control = None
-        self._set(session.status)
-
-    @contextlib.contextmanager
-    def _reported(self) -> Iterator[None]:
-        """Have what fails in the session, also by a defect, said, and the worker go on."""
-        try:
-            yield
-        except Exception as error:
-            self._session["why"] = str(_known(error, "session"))
-        finally:
-            self._question = None
-
-    # The queue of the bench.
-
-    def _take_order(self) -> None:
-        """Begin the order whose turn it is, in a thread of its own."""
-        with self._lock, contextlib.suppress(ReseauError):
-            if self._held is None or self._control is not None or self._moving:
-                return
-            order = self._orders.next()
-            order = None if order is None else self._orders.begin(order)
-            if order is None:
-                return
-            self._control = Control(lambda: self._set("paused"))
-            self._describe(order.session, order.given.get("plan", order.what), order.by, None, {})
-            self._thread = threading.Thread(target=self._fulfil, args=(order, self._control), name="session")
-            self._thread.start()
-
-    def _fulfil(self, order: Order, control: Control) -> None:
-        """Carry out an order, and note what became of it."""
-        self._say("begin", {"session": order.session})
-        try:
-            outcome = (self._recalibrated if order.what == "recalibration" else self._acquired)(
-                order, control
-            )
-            self._orders.end(order, outcome)
-        except Exception as error:
-            known = _known(error, order.session)
-            if self._session["state"] == "ending":
-                known = UsageError("was aborted", where=order.session)
-            self._session["why"] = str(known)
-            with contextlib.suppress(ReseauError):
-                self._orders.fail(order, known)
-        finally:
-            self._question = self._control = None
-            self._set("done" if not self._session.get("why") else "failed")
-
-    def _recalibrated(self, order: Order, control: Control) -> str:
-        """Carry out a recalibration; return the outcome."""
-        from .recalibration import Recalibrations
-
-        def watch(kind: str, facts: dict[str, Any]) -> None:
-            if kind == "step":
-                self._orders.note(order, facts["text"])
-            self._watched(kind, facts)
-
-        def capture(session: Any, bench: Bench, watch: Any) -> None:
-            given = conducting.parameters_of(session)
-            self._prepare(given)
-            self._describe(session.name, session.plan, order.by, given.expected, dict(given.units))
-            conducting.capture(session, bench, watch=watch, operator=self._ask, control=control)
-
-        found = Recalibrations(self._archive).run(
-            order.given["name"], order.session, by=order.by, watch=watch, bench=lambda file: self._bench,
-            using=lambda bench, archive, session: self._archive_lock(session), capture=capture,
-            wait=self._wait,
-        )  # fmt: skip
-        return f"{found.decision.outcome}: {found.decision.key}"
-
-    def _wait(self, seconds: float) -> None:
-        """Wait, unless the order is aborted, or the worker ends."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            if self.over.wait(0.2) or self._session["state"] == "ending":
-                raise StateError("was interrupted", where="warming up")
-
-    def _acquired(self, order: Order, control: Control) -> str:
-        """Carry out a session, or continue it; return its status."""
-        given = order.given
-        if any(each.name == order.session for each in self._archive.sessions()):
-            session = self._archive.session(order.session)
-            if session.status == "done" or ("inputs" in given and order.attempts == 1):
-                raise UsageError(f"exists ({session.status})", where=f"session {order.session}")
-            session.recover()
-        else:
-            checked = self._checked(order.session, given["plan"], given["parameters"], given["inputs"])
-            self._prepare(checked)
-            session = conducting.begin(
-                self._archive, order.session, given["plan"], checked, given["inputs"], bench=self._text
-            )
-        made = conducting.parameters_of(session)
-        self._describe(session.name, session.plan, order.by, made.expected, dict(made.units))
-        with self._archive_lock(session.name):
-            conducting.capture(session, self._bench, watch=self._watched, operator=self._ask, control=control)
-        if session.status != "done":
-            raise StateError(f"is {session.status}", where=f"session {session.name}", do="resume it")
-        return session.status
-
-    def _describe(self, name: str, plan: str, by: str, expected: int | None, units: dict[str, str]) -> None:
-        """Describe the session that begins, as pages show it."""
-        self._session = {
-            "name": name, "plan": plan, "by": by, "state": "running", "good": 0, "expected": expected,
-            "reached": {}, "predicted": {}, "step": "", "rejected": [], "units": units,
-        }  # fmt: skip
-
-    def schedule(self) -> None:
-        """Put scheduled runs that are due into the queue, and note their outcome."""
-        from .recalibration import Recalibrations
-        from .schedule import Schedules
-
-        known = Recalibrations(self._archive)
-        while not self.over.wait(_SCHEDULE_S):
-            if self._held is None:
-                continue
-            with contextlib.suppress(ReseauError):
-                Schedules(self._archive).run_due(
-                    partial(known.carry_out, over=self.over.wait),
-                    only=lambda each: known.get(each.recalibration).bench == self._text,
-                )
-
-    def _archive_lock(self, name: str) -> Any:
-        """The lock of the session itself; the instruments are locked already."""
-        return Bench(BenchFile(name="none", instruments={})).lock(
-            f"session {name}", f"{self._archive.place}: {name}"
-        )
-
-    def _watched(self, kind: str, facts: dict[str, Any]) -> None:
-        mine = self._session
-        if kind == "frame":
-            mine["step"] = facts["step"]
-            if facts["ok"]:
-                mine["good"] += 1
-            else:
-                mine["rejected"] = [*mine["rejected"][-19:], f"{facts['step']}: {facts['why']}"]
-        elif kind == "precision":
-            mine["reached"] = {k: v for k, v in facts.items() if k != "step"}
-        elif kind in ("outlook", "next"):
-            mine["predicted"] = facts
-        self._say(kind, {k: v for k, v in facts.items() if isinstance(v, str | int | float | bool | None)})
-
-    def _ask(self, request: str) -> None:
-        """Ask the person at the bench, and wait for the answer, or for the end."""
-        self._answered.clear()
-        self._question = request
-        self._say("asking", {"question": request})
-        while not self._answered.wait(0.2):
-            if self._control is None or self.over.is_set():
-                raise StateError("was not answered", where=request)
-        self._question = None
-        self._say("answered")
-
     # What is carried out at once, in the thread that reads it.
 
     def _at_once(self, request: dict[str, Any]) -> tuple[bool, Any, bytes]:
         """Carry out what must not wait; return whether it was that."""
-        what, control = request.get("do"), self._control
+        what, control = request.get("do"), self._sessions.control
         if what == "stop":
             self._stops += 1
             begun = time.perf_counter()
@@ -551,36 +374,16 @@ class Worker:
                 threading.Thread(target=self._insist, args=(self._stops,), daemon=True).start()
             self._say("stopped", {"ms": round(1e3 * spent, 1)})
             return True, {"ms": round(1e3 * spent, 1), **self.status()}, b""
-        if what == "status":
-            return True, self.status(), b""
-        if what == "bench":
-            return True, self._text, b""
-        if what == "settings":
-            return True, self._settings(), b""
+        asked = {"status": self.status, "bench": lambda: self.text, "settings": self._settings}.get(str(what))
+        if asked is not None:
+            return True, asked(), b""
         if what == "axes" and self._moving and self._places:
             return True, self._places, b""
         if what == "picture":
             self._looked = time.monotonic()
             return True, *self._live
         if what in ("pause", "continue", "abort", "answer"):
-            if control is None:
-                raise StateError("no session runs", where=self.name)
-            if what == "pause":
-                if self._session.get("state") == "running":
-                    self._session["state"] = "pausing"
-                    control.pause()
-                    self._say("session", {"state": "pausing"})
-            elif what == "continue":
-                if self._session.get("state") != "paused":
-                    raise StateError("is not paused", where=str(self._session.get("name")))
-                self._set("running")
-                control.decide("resume")
-            elif what == "abort":
-                self._session["state"] = "ending"
-                self._answered.set()
-                control.decide("abort")
-            else:
-                self._answered.set()
+            self._sessions.tell(what)
             return True, self.status(), b""
         if what == "end":
             if control is not None:
@@ -621,7 +424,7 @@ class Worker:
                     else:
                         self._commands.put((wire, request))
                 except Exception as error:
-                    known = _known(error, do)
+                    known = known_error(error, do)
                     wire.send({"id": request.get("id"), "error": to_error(known)})
         except ReseauError:
             pass
@@ -635,7 +438,8 @@ class Worker:
         while not self.over.is_set():
             if time.monotonic() >= looked + _QUEUE_S:
                 looked = time.monotonic()
-                self._take_order()
+                with self._lock:
+                    self._sessions.take_order()
             if self._held is None and self._wanted and time.monotonic() >= retry:
                 retry = time.monotonic() + _RETRY_S
                 with contextlib.suppress(ReseauError):
@@ -649,7 +453,7 @@ class Worker:
                 value, body = self._do(request)
                 message = {"id": request.get("id"), "value": value}
             except Exception as error:
-                known = _known(error, str(request.get("do")))
+                known = known_error(error, str(request.get("do")))
                 message, body = {"id": request.get("id"), "error": to_error(known)}, b""
             with contextlib.suppress(ReseauError):
                 wire.send(message, body)
@@ -669,9 +473,13 @@ class Worker:
             ):
                 continue
             try:
-                if self._control is not None:
-                    step = self._session.get("step", "")
-                    kept = self._archive.session(self._session["name"]) if step and step != shown else None
+                if self._sessions.control is not None:
+                    step = self._sessions.facts.get("step", "")
+                    kept = (
+                        self._archive.session(self._sessions.facts["name"])
+                        if step and step != shown
+                        else None
+                    )
                     found = kept.frames(step, last=1) if kept is not None else []
                     if kept is None or not found:
                         continue
@@ -694,13 +502,13 @@ class Worker:
                 _, coded = cv2.imencode(".jpg", preview(frame, _WIDTH), [cv2.IMWRITE_JPEG_QUALITY, 80])
                 self._live = facts, coded.tobytes()
             except Exception as error:
-                self._live = {"number": number, "error": str(_known(error, "live picture"))}, b""
+                self._live = {"number": number, "error": str(known_error(error, "live picture"))}, b""
                 self.over.wait(1.0)
 
     def reconnect(self) -> None:
         """Connect again and again the instruments that were silent when the bench was taken."""
         while not self.over.wait(_RETRY_S):
-            if self._held is not None and self._control is None:
+            if self._held is not None and self._sessions.control is None:
                 self._reconnect()
 
     def _points(self, frame: Any) -> list[list[float]]:
@@ -722,7 +530,7 @@ class Worker:
 
         for each in reversed(self._archive.sessions(last=20)):
             session = self._archive.session(each.name)
-            if session.bench == self._text and "design.json" in session.inputs():
+            if session.bench == self.text and "design.json" in session.inputs():
                 if getattr(self, "_design", None) != session.inputs()["design.json"].sha256:
                     self._design = session.inputs()["design.json"].sha256
                     self._measures = measurer_of(parse_design(session.input("design.json"), "design.json"))
@@ -745,10 +553,10 @@ class Worker:
             where = f"{address[0]}:{address[1]}"
             raise UsageError(f"cannot be used ({error.strerror})", where=where) from None
         with server:
-            about = {"port": server.getsockname()[1], "pid": os.getpid(), "bench": self._text}
+            about = {"port": server.getsockname()[1], "pid": os.getpid(), "bench": self.text}
             if place is not None:
                 private_file(place, json.dumps(about).encode())
-            for each in (self.work, self.live, self.reconnect, self.schedule):
+            for each in (self.work, self.live, self.reconnect, self._sessions.schedule):
                 threading.Thread(target=each, name=each.__name__, daemon=True).start()
             server.settimeout(0.3)
             heard = time.monotonic()
@@ -756,7 +564,7 @@ class Worker:
                 try:
                     raw, _ = server.accept()
                 except TimeoutError:
-                    if self._wires or self._control is not None:
+                    if self._wires or self._sessions.control is not None:
                         heard = time.monotonic()
                     if place is not None and not place.exists():
                         # A service that was about to start another worker has removed it.
@@ -765,14 +573,19 @@ class Worker:
                         self.over.set()  # started by a service, which would start another one
                     continue
                 threading.Thread(target=self._welcome, args=(raw, context), daemon=True).start()
-        if self._thread is not None:
-            self._thread.join(60)
+        self._sessions.join(60)
         with contextlib.suppress(ReseauError):
             self._answering.stop()
         if self._held is not None:
             self._held.close()
         if place is not None:
             place.unlink(missing_ok=True)
+
+    def end(self) -> None:
+        """End, and interrupt the session that runs."""
+        if self._sessions.control is not None:
+            self._sessions.control.decide("stop")
+        self.over.set()
 
     def _welcome(self, raw: socket.socket, context: ssl.SSLContext) -> None:
         try:
@@ -783,13 +596,6 @@ class Worker:
             raw.close()
             return
         self.read(Wire(sock))
-
-
-def _known(error: Exception, where: str) -> ReseauError:
-    """An error as one of ours: a defect of a driver is an answer, too, and ends no thread."""
-    if isinstance(error, ReseauError):
-        return error
-    return InstrumentError(f"{type(error).__name__}: {error}", where=where)
 
 
 def _limits() -> Any:
@@ -833,9 +639,7 @@ def run(
         keep_loaded()
 
         def end(*_: object) -> None:
-            if worker._control is not None:
-                worker._control.decide("stop")
-            worker.over.set()
+            worker.end()
 
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, end)

@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from ..archive.objects import objects_at
 from ..core import vocabulary as v
-from ..core.errors import EstimationError, InputError, ReseauError, UsageError
+from ..core.errors import EstimationError, ReseauError, UsageError
 from ..core.failure import Failure
-from ..core.files import made_folder
+from ..core.files import made_folder, readable
 from ..core.provenance import Provenance, canonical_json, sha256_of
 from ..execution import Executor
 from ..io import FrameCorners, FrameOrientation, write_whole
 from ..io.frame import FrameOutcome, RollSummary
 from ..io.images import open_scan, write_image
-from ..measure.film.roll import Roll, result_of, roll_of
+from ..measure.film.roll import Roll, corner_files, result_of, rolls_of
 from ..procedures.film_frame import FrameOptions, FrameResult, orient_scan, orientation_of, reorient_scan
 from ..report.frames import contact_sheet, frame_tile, roll_page, scan_overlay, write_cut, write_marked
 
@@ -44,7 +44,7 @@ class ScanJob:
     marked: bool = True
     cut: bool = False
     overlay: v.Overlay | None = None
-    roll: Roll | None = None
+    rolls: tuple[Roll, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class OrientedFiles:
 
     jobs: tuple[ScanJob, ...]
     outcomes: tuple[ScanOutcome, ...]
-    roll: Roll | None
+    rolls: tuple[Roll, ...]
     summary: RollSummary | None
 
     @property
@@ -124,15 +124,15 @@ def orient_files(
     if not executor.local and any(job.overlay for job in jobs):
         raise UsageError("is drawn by this machine only", where="--overlay", do="leave out --cluster")
     done = dict(zip((job.name for job in jobs), _all(jobs, executor, store, step), strict=True))
-    found = _common(done) if roll else None
-    if found is not None:
+    found = rolls_of([result for item in done.values() for result in item.results]) if roll else ()
+    if found:
         _again(jobs, done, found)
     summary = RollSummary.of(_outcomes(jobs, done)) if len(jobs) > 1 else None
     out = jobs[0].out
     if out is not None:
         _sheet(out, done, jobs)
-        if found is not None:
-            found.corners.write(out / "corners.json")
+        for name, corners in corner_files(found).items():
+            corners.write(out / name)
         if summary is not None:
             summary.write(out / "summary.json")
             write_whole(out / "summary.html", roll_page(summary, lambda name: _tile(out, name)))
@@ -172,10 +172,10 @@ def _run(job: ScanJob, before: ScanOutcome | None = None) -> ScanOutcome:
     """Orient the frames of one image and write the results, in a worker process."""
     try:
         scan = open_scan(job.image)
-        if job.roll is None or before is None:
+        if not job.rolls or before is None:
             results = orient_scan(scan, _options(job))
         else:
-            results = reorient_scan(scan, job.roll, before.results, _options(job))
+            results = reorient_scan(scan, job.rolls, before.results, _options(job))
         calibrated: FrameCorners | None = FrameCorners.read(job.corners) if job.corners else None
         documents = [
             _required(orientation_of(result, calibrated, job.transform), job.image) for result in results
@@ -266,10 +266,8 @@ def _sent(job: ScanJob, store: str) -> tuple[ScanJob, dict[str, str]]:
     objects, files = objects_at(store, durable=False), {}
     for path in (job.image, job.corners):
         if path is not None:
-            try:
+            with readable(path):
                 files[str(path)] = objects.put(path.read_bytes(), path.suffix)
-            except OSError as error:
-                raise InputError(f"cannot be read ({error.strerror})", where=path) from None
     return job, files
 
 
@@ -304,18 +302,12 @@ def _receive(job: ScanJob, done: ScanOutcome, store: str) -> None:
             write_whole(job.out / path, objects.get(done.files[path], Path(path).suffix))
 
 
-def _common(done: dict[str, ScanOutcome]) -> Roll | None:
-    """Common shape of the frames, or None if there are too few."""
-    found = roll_of([result for item in done.values() for result in item.results])
-    return None if isinstance(found, Failure) else found
-
-
-def _again(work: list[ScanJob], done: dict[str, ScanOutcome], roll: Roll) -> None:
-    """Orient frames that are not fully oriented, or in doubt, again, with the shape of the roll."""
+def _again(work: list[ScanJob], done: dict[str, ScanOutcome], rolls: tuple[Roll, ...]) -> None:
+    """Orient frames that are not fully oriented, or in doubt, again, with the shapes of the rolls."""
     for job in work:
         item = done[job.name]
         if item.results and any(result.status != "oriented" or result.why for result in item.results):
-            done[job.name] = _run(replace(job, roll=roll), item)
+            done[job.name] = _run(replace(job, rolls=rolls), item)
 
 
 def _tile(out: Path, stem: str) -> NDArray[np.uint8] | None:

@@ -187,15 +187,10 @@ def _global(result: Result) -> list[Remark]:
     few = _few(result)
     if test.passed:
         return few
-    why = (
-        "input sigmas are too small, or the model does not fit"
-        if test.statistic > test.upper
-        else "input sigmas are too large"
-    )
     return [
         Remark(
             f"global test: residuals are {_times(result.sigma0)} what input sigmas say (sigma0 "
-            f"{result.sigma0:.4g}), which chance does not explain: {why}",
+            f"{result.sigma0:.4g}), which chance does not explain",
             Code.SIGMAS_DOUBTFUL,
         ),
         *few,
@@ -431,7 +426,7 @@ def unmodelled_pattern(result: Result, camera: int) -> CommonPattern | None:
         pattern = common_pattern(result, by_place(result, camera))
     except UsageError:
         return None
-    return pattern if pattern.p < _ALPHA else None
+    return pattern if pattern.p < _ALPHA and pattern.rms > 0 else None
 
 
 def _patterns(result: Result) -> list[Remark]:
@@ -441,7 +436,7 @@ def _patterns(result: Result) -> list[Remark]:
     found = [
         Remark(
             f"{camera.label}: common residual pattern of its images (F {pattern.statistic:.1f}, "
-            f"{pattern.rms:.2g} px rms): the model does not describe it, and the sigmas do not include it",
+            f"{pattern.rms:.2g} px rms), which the model does not describe",
             Code.UNMODELLED,
         )
         for camera, pattern in patterns

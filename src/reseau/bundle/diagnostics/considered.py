@@ -16,11 +16,16 @@ estimates without them err by
     [−K; I] (V + t tᵀ) [−K; I]ᵀ
 
 about the values that were estimated, and zero.
+
+Where the model was chosen, those of other kinds may be the right ones: model m is as probable as it predicts
+the images, and moves the coefficients by δ_m, which describe its mapping over the image best. To the mean
+squares, Σ P(m) δ_m δ_mᵀ is added (Draper 1995, *J. R. Statist. Soc.* B 57: the variance between models).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -39,6 +44,24 @@ _ACROSS = 15
 _RADIAL, _OWN, _NONE = 1e-3, 0.01, 1e-9
 """Part of the square that is not radial in a radial term; part of a displacement that the terms before it do
 not have, as each power has a quarter of what the one before has; size that is none, by the largest."""
+_PLACES, _SHARE = 400, 0.05
+"""Image points at which models are compared; part of their difference that parameters need not describe."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """A camera model of another kind than the chosen one, by what it predicts.
+
+    Parameters
+    ----------
+    probability : float
+        Probability that it is the right one.
+    lens : CameraMapping
+        The camera with this model.
+    """
+
+    probability: float
+    lens: CameraMapping
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,20 +76,25 @@ class Considered:
         Their mean squares.
     by : ndarray (u, q)
         What one unit of each changes of the reduced unknowns, where it is held at zero.
+    between : ndarray (k + q, k + q)
+        Mean squares of the estimated parameters and of the coefficients by models of other kinds.
     """
 
     names: tuple[str, ...]
     square: Array
     by: Array
+    between: Array
 
     def errors(self, columns: Rows) -> Array:
-        """Mean squares (k + q, k + q) of errors of some unknowns, and of the coefficients."""
+        """Mean squares (k + q, k + q) of errors of the estimated parameters, and of the coefficients."""
         turn = np.concatenate([-self.by[columns], np.eye(len(self.names))])
-        return np.asarray(turn @ self.square @ turn.T)
+        return np.asarray(turn @ self.square @ turn.T + self.between)
 
 
-def considered(fit: BundleFit, c: int, columns: Rows, covariance: Array) -> Considered | None:
-    """Consider the coefficients of a camera that were not estimated.
+def considered(
+    fit: BundleFit, c: int, columns: Rows, covariance: Array, rivals: Sequence[Rival] = ()
+) -> Considered | None:
+    """Consider the coefficients of a camera that were not estimated, and other models.
 
     Parameters
     ----------
@@ -78,6 +106,8 @@ def considered(fit: BundleFit, c: int, columns: Rows, covariance: Array) -> Cons
         Columns of its estimated parameters among the reduced unknowns.
     covariance : ndarray (k, k)
         Their covariance.
+    rivals : sequence of Rival
+        Models of other kinds.
 
     Returns
     -------
@@ -94,7 +124,7 @@ def considered(fit: BundleFit, c: int, columns: Rows, covariance: Array) -> Cons
         k for k, name in enumerate(camera.names)
         if name in names and name not in camera.free and camera.values[k] == 0
     ]  # fmt: skip
-    if not held or not len(columns) or model.priors(camera.free) or fit.redundancy < 1:
+    if not len(columns) or model.priors(camera.free) or fit.redundancy < 1:
         return None
     if too_large(fit, len(held)):
         return None
@@ -102,26 +132,63 @@ def considered(fit: BundleFit, c: int, columns: Rows, covariance: Array) -> Cons
     mapping = camera.bare_mapping(fit.values.cameras[c, : len(camera.values)])
     lens = CameraMapping(mapping, camera.width, camera.height, rows, covariance)
     at = np.flatnonzero([name in names for name in camera.free])
-    terms, radial, kept = _terms(lens, model, np.concatenate([rows[at], held]).astype(np.intp), len(at))
-    held = [held[k] for k in kept]
-    if not held:
-        return None
     own = network.camera_of[network.image_of[used_rows(fit)]] == c
     x, y, z = in_camera(fit)[own].T
     uv = np.column_stack([x, y]) / (1.0 if mapping.parallel else z[:, None])
-    slope = np.zeros((len(own), 2, len(held)))
-    slope[own] = np.nan_to_num(mapping.derivatives(uv).d_parameters[:, :, held])
-    seen = scores(fit, [Effect(slope, np.where(own, 0, -1), 1)])
-    # The noise of the coefficients is that of the estimates, with what the points of an image share.
-    formal = fit.cofactors.reduced.block(columns, columns)
-    noise = float(np.trace(np.linalg.pinv(formal, hermitian=True) @ covariance)) / len(columns)
-    turn = np.concatenate([np.eye(len(at)), seen.carried[columns[at]]], axis=1)
-    inverse = np.linalg.pinv(covariance[np.ix_(at, at)], hermitian=True)
-    known, side = turn.T @ inverse @ turn, turn.T @ inverse @ np.array(mapping.values)[rows[at]]
-    known[len(at) :, len(at) :] += seen.m / noise
-    side[len(at) :] += seen.g / noise
-    square = _mean_square(known, side, terms, radial, float(np.hypot(camera.width, camera.height)))
-    return Considered(tuple(camera.names[k] for k in held), square[len(at) :, len(at) :], seen.carried)
+    found = Considered((), np.zeros((0, 0)), np.zeros((fit.unknowns.size, 0)), np.zeros_like(covariance))
+    if held:
+        terms, radial, kept = _terms(lens, model, np.concatenate([rows[at], held]).astype(np.intp), len(at))
+        held = [held[k] for k in kept]
+    if held:
+        slope = np.zeros((len(own), 2, len(held)))
+        slope[own] = np.nan_to_num(mapping.derivatives(uv).d_parameters[:, :, held])
+        seen = scores(fit, [Effect(slope, np.where(own, 0, -1), 1)])
+        # The noise of the coefficients is that of the estimates, with what the points of an image share.
+        formal = fit.cofactors.reduced.block(columns, columns)
+        noise = float(np.trace(np.linalg.pinv(formal, hermitian=True) @ covariance)) / len(columns)
+        turn = np.concatenate([np.eye(len(at)), seen.carried[columns[at]]], axis=1)
+        inverse = np.linalg.pinv(covariance[np.ix_(at, at)], hermitian=True)
+        known, side = turn.T @ inverse @ turn, turn.T @ inverse @ np.array(mapping.values)[rows[at]]
+        known[len(at) :, len(at) :] += seen.m / noise
+        side[len(at) :] += seen.g / noise
+        square = _mean_square(known, side, terms, radial, float(np.hypot(camera.width, camera.height)))
+        square, count = square[len(at) :, len(at) :], len(columns) + len(held)
+        names = tuple(camera.names[k] for k in held)
+        found = Considered(names, square, seen.carried, np.zeros((count, count)))
+    elif not rivals:
+        return None
+    possible = found.errors(columns)
+    possible[: len(columns), : len(columns)] += covariance
+    some = uv[:: max(1, len(uv) // _PLACES)]
+    between = _between(lens, np.concatenate([rows, held]).astype(np.intp), some, rivals, possible)
+    return replace(found, between=between)
+
+
+def _between(lens: CameraMapping, order: Rows, uv: Array, rivals: Sequence[Rival], possible: Array) -> Array:
+    """Mean squares of parameters in this order by models of other kinds, where points were seen.
+
+    Of the changes of parameters that describe a model, those are taken that are most probable beside what is
+    possible of them: parameters which do the same are not played off against each other.
+    """
+    found = np.zeros_like(possible)
+    seen = lens.mapping.derivatives(uv)
+    turn = seen.d_xy @ by_rotation(uv, lens.mapping.parallel)
+    for rival in rivals:
+        off = rival.lens.mapping(uv) - seen.value
+        at = np.isfinite(off).all(axis=1)
+        if not at.any():
+            continue
+        both = np.concatenate([seen.d_parameters[at][:, :, order], off[at, :, None]], axis=2)
+        flat = referred(turn[at], both).reshape(2 * int(at.sum()), -1)
+        slope, left = flat[:, :-1], flat[:, -1]
+        weight = 1 / max(_SHARE**2 * float(left @ left) / len(left), _NONE**2)
+        # (Jᵀ J w + C⁻¹)⁻¹ Jᵀ w, with the root of C, which may be singular.
+        values, vectors = np.linalg.eigh(possible)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        half = slope @ root
+        moved = root @ np.linalg.solve(np.eye(len(root)) + weight * half.T @ half, weight * half.T @ left)
+        found += rival.probability * np.outer(moved, moved)
+    return found
 
 
 def _terms(lens: CameraMapping, model: CameraModel, order: Rows, free: int) -> tuple[Array, Mask, list[int]]:

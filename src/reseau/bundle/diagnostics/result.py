@@ -24,7 +24,7 @@ from ..network.network import Network
 from ..network.stage import perpendicular
 from ..solver.problem import BundleFit
 from ..solver.rank import missing_windows
-from .considered import Considered, considered
+from .considered import Considered, Rival, considered
 from .estimates import (
     CameraEstimate,
     ImageEstimates,
@@ -102,9 +102,9 @@ class Result(Estimated, Display):
     validation : (float, float), optional
         Cross-validation: root mean square error of predicted image coordinates, in their standard deviations,
         with all parameters and with the kept ones.
-    considers : bool
-        Whether the covariances of cameras contain what coefficients could do that were held at zero; it suits
-        a model that was chosen by these observations.
+    rivals : tuple of tuple of Rival, optional
+        Models of other kinds that each camera may have, where the model was chosen by these observations: the
+        covariances of cameras contain these, and what coefficients could do that were held at zero.
 
     Examples
     --------
@@ -126,7 +126,7 @@ class Result(Estimated, Display):
     components: VarianceComponents[BundleFit] | None = None
     eliminated: tuple[Eliminated, ...] | None = None
     validation: tuple[float, float] | None = None
-    considers: bool = False
+    rivals: tuple[tuple[Rival, ...], ...] | None = None
 
     @property
     def sigma0(self) -> float:
@@ -301,9 +301,9 @@ class Result(Estimated, Display):
     def _considered(self) -> dict[int, Considered]:
         """Coefficients of each camera that were held at zero, where some were."""
         found = dict[int, Considered]()
-        for c in range(len(self.network.cameras) if self.considers else 0):
+        for c, rivals in enumerate(self.rivals or ()):
             columns = self.camera_columns(c)[1]
-            own = considered(self.fit, c, columns, self._shared_uncertainty(columns).covariance)
+            own = considered(self.fit, c, columns, self._shared_uncertainty(columns).covariance, rivals)
             if own is not None:
                 found[c] = own
         return found

@@ -26,108 +26,27 @@ import scipy
 from ...core.data import Array, Rows
 from ...core.threads import one_thread
 from ..solver.problem import BundleFit
-from ..solver.system import residuals
 from .evidence import (
     Effect,
     Scores,
     lower_factor,
-    places_seen,
     scores,
     sensitivities,
     sigma_seen,
     too_large,
     used_rows,
 )
+from .image_effects import distance_effects, point_effects, smooth_effects
+from .views import looked_at, views_of
 
-_LENGTHS = (0.3, 0.6, 1.2)
-"""Distances, in half the diagonal of the image, over which displacements of an image are alike."""
-_DEGREE, _NODES = 4, 12
-"""Degree of the polynomials that describe a smooth field, and nodes of the integration over the image."""
-_LEAST, _MOST = 3, 48
-"""Fewer images show nothing in common; of more, as many are looked at."""
+_LEAST = 3
+"""Fewer images show nothing in common."""
 _SHAPE = 0.7
 """Standard deviation of the logarithm by which fields of another form than assumed do more or less to a
 parameter: a factor of two."""
 _GRID, _FINE, _CONVERGED = np.geomspace(0.05, 100.0, 8), np.geomspace(0.03, 100.0, 80), 0.01
 """Standard deviations of the effects, in that of image points, at which the likelihood is computed first,
 and where that is quick; gain of its logarithm that is none."""
-_POWERS = [(i, d - i) for d in range(_DEGREE + 1) for i in range(d + 1)]
-_COUNT = len(_POWERS)
-
-
-def smooth_effects(fit: BundleFit) -> tuple[Effect, dict[str, Array]]:
-    """Smooth displacements of each image, and their forms by length, (images, q, q).
-
-    The coefficients of polynomials that are orthonormal over the image have the covariance that follows from
-    that of the field.
-    """
-    network, rows = fit.problem.network, used_rows(fit)
-    image = network.image_of[rows]
-    xy = places_seen(fit)
-    slope = np.zeros((len(rows), 2, 2 * _COUNT))
-    sizes = np.array([[camera.width, camera.height] for camera in network.cameras])[network.camera_of]
-    values = _polynomials(2 * (xy + 0.5) / sizes[image] - 1)
-    slope[:, 0, :_COUNT] = slope[:, 1, _COUNT:] = values
-    halves, of = np.unique(sizes / np.hypot(*sizes.T)[:, None], axis=0, return_inverse=True)
-    forms = {}
-    for length in _LENGTHS:
-        both = np.zeros((len(halves), 2 * _COUNT, 2 * _COUNT))
-        for k, half in enumerate(halves):
-            both[k, :_COUNT, :_COUNT] = both[k, _COUNT:, _COUNT:] = _root(half, length)
-        forms[f"{length:g}"] = both[of.ravel()]
-    return Effect(slope, image, len(network.images)), forms
-
-
-def distance_effects(fit: BundleFit) -> Effect:
-    """Displacements of the points of each image by a relative change of its principal distance.
-
-    They are those from the principal point, but for what the distortion changes.
-    """
-    network, rows = fit.problem.network, used_rows(fit)
-    image = network.image_of[rows]
-    xy = places_seen(fit)
-    slope = np.zeros((len(rows), 2, 1))
-    for c, camera in enumerate(network.cameras):
-        own = np.flatnonzero(network.camera_of[image] == c)
-        values = fit.values.cameras[c, : len(camera.values)]
-        centre = camera.bare_mapping(values)(np.zeros((1, 2)))[0] if camera.has_plane_mapping else None
-        centre = np.array([camera.width, camera.height]) / 2 if centre is None else centre
-        slope[own, :, 0] = xy[own] - centre
-    return Effect(slope, image, len(network.images))
-
-
-def point_effects(fit: BundleFit) -> Effect | None:
-    """Displacements of image points by shifts of object points; None where these are unknowns."""
-    network, rows = fit.problem.network, used_rows(fit)
-    seen, group = np.unique(network.point_of[rows], return_inverse=True)
-    if not network.held[seen].all():
-        return None
-    slope = np.zeros((len(rows), 2, 3))
-    step = 1e-4 * float(np.ptp(fit.values.xyz[seen], axis=0).max())
-    for axis in range(3):
-        for sign in (1.0, -1.0):
-            moved = replace(fit.values, xyz=fit.values.xyz + sign * step * np.eye(3)[axis])
-            slope[:, :, axis] += sign * residuals(network, fit.unknowns, rows, moved) / (2 * step)
-    return Effect(slope, group, len(seen))
-
-
-def _polynomials(at: Array) -> Array:
-    """Products of Legendre polynomials, orthonormal over the square from −1 to 1 (n, k)."""
-    x, y = (np.polynomial.legendre.legvander(np.clip(axis, -1.5, 1.5), _DEGREE) for axis in at.T)
-    norm = np.sqrt(2 * np.arange(_DEGREE + 1) + 1)
-    return np.stack([x[:, i] * norm[i] * y[:, j] * norm[j] for i, j in _POWERS], axis=1)
-
-
-def _root(half: Array, length: float) -> Array:
-    """Root (k, k) of the covariance of the coefficients; `half` is the size of the image by its diagonal."""
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    x, y = (axis.ravel() for axis in np.meshgrid(nodes, nodes))
-    weight = np.outer(weights, weights).ravel() / 4
-    at = np.column_stack([x, y]) * half
-    distance = ((at[:, None] - at) ** 2).sum(axis=2)
-    weighted = _polynomials(np.column_stack([x, y])) * weight[:, None]
-    cov = weighted.T @ np.exp(-0.5 * distance / length**2) @ weighted
-    return np.asarray(np.linalg.cholesky(cov + 1e-12 * np.eye(_COUNT)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,9 +95,11 @@ class SharedErrors:
         Weights of the lengths; what is missing to one is that of no shared errors.
     spread : float
         Relative variance of the estimated variance factor.
+    views : ndarray of int (m,)
+        View of each image; those from which the errors were estimated come first.
     scores : Scores
-        Of the parameters of the cameras, as effects of each image that was looked at.
-    pulls : ndarray (i, q, q)
+        Of the parameters of the cameras, as effects of each of these views.
+    pulls : ndarray (v, q, q)
         Covariances of these scores by the shared errors.
     """
 
@@ -189,6 +110,7 @@ class SharedErrors:
     points: float
     weights: Array
     spread: float
+    views: Rows
     scores: Scores
     pulls: Array
 
@@ -251,16 +173,22 @@ class SharedErrors:
         typical = float(np.sqrt(np.mean(sigma**2)))
         if self.smooth.any():
             smooth, forms = smooth_effects(fit)
+            smooth, first = self._by_view(smooth), np.unique(self.views, return_index=True)[1]
             by = sensitivities(fit, smooth, columns).reshape(k, smooth.groups, -1)
             for weight, size, root in zip(self.weights, self.smooth, forms.values(), strict=True):
                 if weight * size > 0:
-                    own = np.einsum("kgq,gqp->kgp", by, typical * root).reshape(k, -1)
+                    own = np.einsum("kgq,gqp->kgp", by, typical * root[first]).reshape(k, -1)
                     found += weight * size**2 * (own @ own.T)
         if self.distance > 0:
-            distance = distance_effects(fit)
+            distance = self._by_view(distance_effects(fit))
             own = sensitivities(fit, distance, columns) * _inverse(distance.rms(sigma)).ravel()
             found += self.distance**2 * (own @ own.T)
         return found
+
+    def _by_view(self, effect: Effect) -> Effect:
+        """Effects of images as those of their views."""
+        group = np.where(effect.group >= 0, self.views[effect.group], -1)
+        return replace(effect, group=group, groups=int(self.views.max()) + 1)
 
     def _by_target(self, columns: Rows) -> Array:
         """Covariance (k, k) of parameters by errors of the points of the target."""
@@ -277,8 +205,8 @@ class SharedErrors:
             return np.ones(len(columns)), np.zeros(len(columns))
         by_image = np.zeros((groups, width, len(columns)))
         place = {column: k for k, column in enumerate(columns.tolist())}
-        for i, image in enumerate(_looked_at(self.fit)):
-            c = int(self.fit.problem.network.camera_of[image])
+        for i in range(groups):
+            c = int(self.fit.problem.network.camera_of[np.argmax(self.views == i)])
             for q in range(int(count[c]) if camera[c] >= 0 else 0):
                 by_image[i, q, place[int(camera[c]) + q]] = 1.0
         turned = by_image @ directions
@@ -322,12 +250,6 @@ def _camera_columns(fit: BundleFit) -> Rows:
     return np.concatenate(parts).astype(np.intp) if parts else np.zeros(0, dtype=np.intp)
 
 
-def _looked_at(fit: BundleFit) -> Rows:
-    """Images from which the components are estimated: all, or as many spread over them."""
-    images = np.flatnonzero(fit.usable.images)
-    return images if len(images) <= _MOST else images[np.linspace(0, len(images) - 1, _MOST).astype(int)]
-
-
 @one_thread()
 def shared_errors(fit: BundleFit) -> SharedErrors | None:
     """Estimate what the points of each image have in common.
@@ -342,22 +264,22 @@ def shared_errors(fit: BundleFit) -> SharedErrors | None:
     SharedErrors or None
         None with fewer than three images, without redundancy, or where the network is too large.
     """
-    network = fit.problem.network
-    images = _looked_at(fit)
+    images = looked_at(fit)
     if len(images) < _LEAST or fit.redundancy < 1 or not fit.sigma0 > 0:
         return None
     (smooth, forms), distance, points = smooth_effects(fit), distance_effects(fit), point_effects(fit)
-    place = np.full(len(network.images), -1, dtype=np.intp)
-    place[images] = np.arange(len(images))
+    views = views_of(fit)
+    groups, first = int(views[images].max()) + 1, images[np.unique(views[images], return_index=True)[1]]
+    place = np.where(np.isin(np.arange(len(views)), images), views, -1)
     some = [
-        Effect(effect.slope, np.where(effect.group >= 0, place[effect.group], -1), len(images))
+        Effect(effect.slope, np.where(effect.group >= 0, place[effect.group], -1), groups)
         for effect in (smooth, distance)
     ]
     if points is not None and not too_large(fit, sum(effect.count for effect in (*some, points))):
         some.append(points)
     if too_large(fit, sum(effect.count for effect in some)) or not len(_camera_columns(fit)):
         return None
-    own = _camera_effects(fit, place, len(images))
+    own = _camera_effects(fit, place, groups)
     every = scores(fit, [*some, own])
     sigma = sigma_seen(fit)
     typical = float(np.sqrt(np.mean(sigma**2)))
@@ -371,12 +293,12 @@ def shared_errors(fit: BundleFit) -> SharedErrors | None:
     cross = every.m[:count, count:end] * unit
     fits = []
     for root in forms.values():
-        field = every.part(slice(0, count)).combined(len(images), typical * root[images])
-        between = _across(cross, typical * root[images])
+        field = every.part(slice(0, count)).combined(groups, typical * root[first])
+        between = _across(cross, typical * root[first])
         m = np.block([[field.m, between], [between.T, others.m]])
         joint = Scores(np.concatenate([field.g, others.g]), m, every.square, every.redundancy, m[:0])
         seen = np.concatenate(
-            [_across(every.m[:count, end:], typical * root[images]), unit[:, None] * every.m[count:end, end:]]
+            [_across(every.m[:count, end:], typical * root[first]), unit[:, None] * every.m[count:end, end:]]
         )
         fits.append((*_largest(joint, parts), joint, seen))
     # Each component pays for itself as a parameter with as many observations as it has groups (Schwarz 1978).
@@ -389,17 +311,17 @@ def shared_errors(fit: BundleFit) -> SharedErrors | None:
     variance, spread = _information(joint, parts, best)
     every_size = np.array([sizes for sizes, *_ in fits])
     width = own.slope.shape[2]
-    pulls = np.zeros((len(images), width, width))
+    pulls = np.zeros((groups, width, width))
     by_image = parts[1].stop
     for weight, sizes, (*_, seen) in zip(weights, every_size, fits, strict=True):
         half = np.repeat(sizes[:2], [count, by_image - count])[:, None] * seen[:by_image]
-        half = half.reshape(by_image, len(images), width)
+        half = half.reshape(by_image, groups, width)
         pulls += weight * np.einsum("niq,nir->iqr", half, half)
     distance_size = float(np.sqrt(weights @ every_size[:, 1] ** 2))
     points_size = float(np.sqrt(weights @ every_size[:, 2] ** 2)) if len(some) > 2 else 0.0
     by_camera = every.part(slice(end, None))
     return SharedErrors(
-        fit, variance, every_size[:, 0], distance_size, points_size, weights, spread, by_camera, pulls
+        fit, variance, every_size[:, 0], distance_size, points_size, weights, spread, views, by_camera, pulls
     )
 
 

@@ -12,8 +12,8 @@ from ...core.data import Array, Mask, Rows
 from ...optics.mapping import PlaneMapping
 from ..diagnostics.evidence import Effect, in_camera, places_seen, sigma_seen, used_rows
 from ..diagnostics.fields import camera_mapping
+from ..diagnostics.image_effects import smooth_effects
 from ..diagnostics.result import Result
-from ..diagnostics.shared import smooth_effects
 
 _RADIAL = (3, 5, 7, 9)
 """Powers of the radius in the effects of a lens."""

@@ -281,7 +281,7 @@ class _Comparison:
                          advice("noise", f"{factor:.2g}"))  # fmt: skip
         amount = sigma * np.sqrt(max(explained, 0.0) / (2 * len(sight.rows)))
         return Cause(code, name, amount, min(explained / first.square, 1.0), probability, where,
-                     advice(code, name))  # fmt: skip
+                     advice(code, name, sight.result.rivals is not None))  # fmt: skip
 
 
 def _compared(
@@ -443,7 +443,7 @@ def _adjusted_with(form: _Form, sight: Sight) -> _Form:
 def _possible(now: _Comparison, sight: Sight) -> list[_Error]:
     """What the lens could have that its model lacks: each form as probable as it is."""
     # Coefficients that the covariance of the cameras contains are not counted twice.
-    known = ("coefficients",) if sight.result.considers else ()
+    known = ("coefficients",) if sight.result.rivals is not None else ()
     lens = [
         form for form in now.forms
         if form.code == "lens" and form.units is not None and form.family.kind not in known

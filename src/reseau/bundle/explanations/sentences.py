@@ -7,7 +7,7 @@ from collections.abc import Sequence
 _SENTENCES = {
     "lens": (
         "the camera model does not describe the lens",
-        "leave out --model, so that models are compared; if they were, none describes it better",
+        "leave out --model and --free, so that models are compared",
     ),
     "refocus": (
         "the principal distance or point changed between the photographs",
@@ -57,14 +57,16 @@ def described(code: str) -> str:
     return _SENTENCES[code][0]
 
 
-def advice(code: str, form: str) -> str:
-    """What to do.
+def advice(code: str, form: str, chosen: bool = False) -> str:
+    """What to do; `chosen` where the model of the lens was chosen among others.
 
     Examples
     --------
     >>> advice("noise", "1.3")
     'nothing: the uncertainties contain it'
     """
+    if code == "lens" and chosen:
+        return "no model that was compared describes it better"
     if code == "lens" and form == "1 more":
         return "estimate the next coefficient too, or leave out --model"
     return _SENTENCES[code][1]

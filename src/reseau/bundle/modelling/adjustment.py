@@ -525,7 +525,8 @@ def _doubts(
 
 
 def _gross(network: Network, rows: Rows) -> Remark:
-    return Remark(f"gross errors are likely {in_images(network, rows)}", Code.GROSS_ERRORS)
+    where = in_images(network, rows)
+    return Remark(f"unless image points deviate together, gross errors are likely {where}", Code.GROSS_ERRORS)
 
 
 def _worst_images(network: Network, size: Array) -> list[Remark]:

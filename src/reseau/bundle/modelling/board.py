@@ -80,6 +80,8 @@ class BoardChoice(Estimated, Display):
         The one with the fewest parameters whose description length is within 2 of the least.
     models : tuple of BoardModel
         Flat, bent and free, as far as they could be adjusted.
+    points : int
+        Image points with which all were adjusted; the result may leave out others.
     network : Network
         With the points held as designed where this was chosen; otherwise as it was, with all points free.
 
@@ -93,6 +95,7 @@ class BoardChoice(Estimated, Display):
 
     chosen: BoardModel
     models: tuple[BoardModel, ...]
+    points: int
     network: Network
 
     def entries(self) -> dict[str, Any]:
@@ -187,7 +190,7 @@ def choose_board(network: Network, options: Options | None = None) -> BoardChoic
         bent = _bent(start.continued(plain), flat)
         if bent is not None:
             found.insert(1, bent)
-    return _compared(network, held, found, 2 * int(seen.sum()))
+    return _compared(network, held, found, int(seen.sum()))
 
 
 def held_as_designed(network: Network) -> Network:
@@ -223,8 +226,9 @@ def _model(
     return BoardModel(name, count, fit.sigma0, fit.cost, np.nan, np.nan, pairs, sigmas, warp, warp_sigma)
 
 
-def _compared(network: Network, held: Network, found: list[BoardModel], count: int) -> BoardChoice:
+def _compared(network: Network, held: Network, found: list[BoardModel], seen: int) -> BoardChoice:
     """Description lengths, tests, and the choice."""
+    count = 2 * seen
     length = np.array([count * np.log(each.cost / count) + each.parameters * np.log(count) for each in found])
     length -= length.min()
     models = []
@@ -238,7 +242,7 @@ def _compared(network: Network, held: Network, found: list[BoardModel], count: i
             p = float(scipy.special.fdtrc(more, rest, ratio))
         models.append(replace(each, length=float(length[k]), p=p))
     chosen = next(each for each in models if each.length <= _EQUAL)
-    return BoardChoice(chosen, tuple(models), held if chosen.name == "flat" else network)
+    return BoardChoice(chosen, tuple(models), seen, held if chosen.name == "flat" else network)
 
 
 def _held(start: BundleProblem, xyz: Array) -> BundleFit | Failure:

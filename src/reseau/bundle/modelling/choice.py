@@ -5,12 +5,13 @@ the same model beyond these predict images that are left out no better, nothing 
 in common, and the lens is perspective. Otherwise the models of wide lenses and of fisheyes are adjusted, too,
 each from the best before it. Then the candidates of all models that were adjusted are compared by the density
 with which images that are left out are predicted (see :mod:`~reseau.bundle.modelling.left_out`); what is
-chosen is adjusted, and compared anew.
+chosen is adjusted, and compared anew. Images of one view are left out together: copies of what is left out
+would predict it with any camera.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,12 +20,15 @@ import scipy
 
 from ...calibration import CameraMapping, calibration_difference
 from ...calibration.camera import projection_field
+from ...core.data import Rows
 from ...core.display import Display
 from ...core.errors import UsageError
 from ...core.failure import Code, Estimated, Failure
 from ...optics.cameras.registry import camera_model
 from ..diagnostics.checks import unmodelled_pattern
+from ..diagnostics.considered import Rival
 from ..diagnostics.evidence import ODDS
+from ..diagnostics.views import views_of
 from ..network.camera import Camera
 from ..network.network import Network
 from ..solver.problem import BundleFit
@@ -49,6 +53,8 @@ _LEVEL = 0.01
 _LEAST = 3
 # Images, and image points of each, beyond which a choice takes longer and becomes no better.
 _IMAGES, _POINTS = 60, 200
+# Logarithm of how much less probable what does not count is.
+_CERTAIN = 20.0
 # Places along the longer side at which cameras are compared.
 _ACROSS = 13
 
@@ -112,6 +118,8 @@ class ModelChoice(Estimated, Display):
         All candidates, by description length; those that failed last.
     chosen : Compared
         The chosen one of them.
+    rivals : tuple of Rival
+        The best candidate of each other kind, as probable as it predicts images that are left out.
 
     Examples
     --------
@@ -127,6 +135,7 @@ class ModelChoice(Estimated, Display):
     camera: Camera
     compared: tuple[Compared, ...]
     chosen: Compared
+    rivals: tuple[Rival, ...] = ()
 
     @property
     def alternatives(self) -> tuple[Compared, ...]:
@@ -401,12 +410,14 @@ class _Search:
     adjusted: dict[Candidate, _Adjusted] = field(default_factory=dict)
     declined: dict[Candidate, str] = field(default_factory=dict)
     before: _Search | None = None
+    views: Rows | None = None
+    loose: set[Candidate] = field(default_factory=set)
     start: Candidate = field(init=False)
     pick: Candidate = field(init=False)
 
     def from_fit(self, first: BundleFit) -> _Search | Failure:
         """Begin with an adjustment, of one of the candidates if possible, and search."""
-        own = first.problem.network.cameras[self.camera]
+        own, self.views = first.problem.network.cameras[self.camera], views_of(first)
         several = families(self.candidates)
         given = next((each for each in self.candidates if each.describes(own)), None)
         if given is not None:
@@ -430,6 +441,7 @@ class _Search:
                 for each in open_:
                     self._adjust(each, (self._nearest(each) if each in beyond else self.best).fit)
                 open_ = []
+                self._look_again()
             elif known:
                 return self
             else:
@@ -484,6 +496,15 @@ class _Search:
         """The adjustment with the least residuals."""
         return min(self.adjusted.values(), key=lambda each: each.fit.cost)
 
+    def _look_again(self) -> None:
+        """Which images are one view, now that a model fits better: what it left made others look alike."""
+        views = views_of(self.best.fit)
+        if not np.array_equal(views, self.views):
+            self.views, every = views, self.adjusted
+            self.adjusted = {}
+            for candidate, each in every.items():
+                self._add(candidate, each.fit)
+
     def _adjust(self, candidate: Candidate, fit: BundleFit) -> None:
         self._add(candidate, adjusted_to(fit, candidate, self.camera))
 
@@ -494,7 +515,8 @@ class _Search:
             return
         wider = wider_model(candidate.model)
         known = any(each.alike(candidate) and each.model == wider for each in self.candidates)
-        self.adjusted[candidate] = _Adjusted(fit, information_of(fit, self.camera, wider if known else None))
+        told = information_of(fit, self.camera, wider if known else None, self.views)
+        self.adjusted[candidate] = _Adjusted(fit, told)
 
     def _nearest(self, candidate: Candidate) -> _Adjusted:
         """The adjustment of its family that differs from a candidate in the fewest parameters."""
@@ -502,14 +524,17 @@ class _Search:
         return min(several, key=lambda item: len(candidate.parts ^ item[0].parts))[1]
 
     def _predictions(self) -> dict[Candidate, Prediction]:
-        """Predictions of all candidates for which a model with their parameters was adjusted."""
-        found = dict[Candidate, Prediction]()
+        """Predictions of all candidates that are determined, and of whose kind one was adjusted."""
+        found, self.loose = dict[Candidate, Prediction](), set()
         for each in self.candidates:
             if each in self.declined or not any(own.alike(each) for own in self.adjusted):
                 continue
             near = self._nearest(each).information
             if near is not None and len(near.own) >= _LEAST:
                 found[each] = near.predicted(each.estimated)
+                if not found[each].determined:
+                    self.loose.add(each)
+                    del found[each]
         return found
 
     def _picked(self) -> Candidate:
@@ -542,13 +567,18 @@ class _Search:
         density = {each: float(one.log_density(variance).sum()) for each, one in found.items()}
         best = max(density.values(), default=0.0)
         compared = []
-        for each in sorted(self.candidates, key=lambda each: -density.get(each, -np.inf)):
+        # What was chosen comes first: it may predict worse than others, by no more than chance.
+        for each in sorted(
+            self.candidates, key=lambda each: (each != self.pick, -density.get(each, -np.inf))
+        ):
             one = found.get(each)
             if each == self.pick and one is None:
                 reason = "chosen: the images are too few to compare models"
                 compared.append(Compared(each, reason, fit.sigma0, fit.cost, np.nan))
             elif one is None:
                 beside = f"not needed: {self.start.label} leaves nothing that the images have in common"
+                if each in self.loose:
+                    beside = "the images do not determine all its parameters"
                 reason = self.declined.get(
                     each, beside if found else "the images are too few to compare models"
                 )
@@ -559,7 +589,25 @@ class _Search:
         if self.before is not None:
             known = {each.candidate for each in compared}
             compared += [each for each in self.before.choice().compared if each.candidate not in known]
-        return ModelChoice(camera_of(fit, self.camera), tuple(compared), chosen)
+        return ModelChoice(camera_of(fit, self.camera), tuple(compared), chosen, self._rivals(density))
+
+    def _rivals(self, density: Mapping[Candidate, float]) -> tuple[Rival, ...]:
+        """The best candidate of each kind but that of the chosen one, with its probability."""
+        if self.before is not None:
+            return self.before.choice().rivals
+        if self.pick not in density:
+            return ()
+        kinds = [self.pick]
+        for each in sorted(density, key=lambda each: -density[each]):
+            kinds += [each] if not any(each.alike(other) for other in kinds) else []
+        alike = max(value for each, value in density.items() if each.alike(self.pick))
+        total = float(scipy.special.logsumexp([alike, *(density[each] for each in kinds[1:])]))
+        found = self._predictions()
+        return tuple(
+            Rival(float(np.exp(density[each] - total)), self._mapping(each, found[each]))
+            for each in kinds[1:]
+            if density[each] - total > -_CERTAIN
+        )
 
     def _compared(self, own: Candidate, one: Prediction, chosen: Prediction, length: float) -> Compared:
         """Compare a candidate with the chosen one."""
@@ -582,15 +630,13 @@ class _Search:
         gain = one.better(chosen)
         if found.candidate == self.pick:
             return "chosen: none with more parameters predicts images better"
-        if self.pick.within(found.candidate):
-            return "too many parameters: predicts images " + (
-                "no better than chance" if gain > 0 else "worse"
-            )
-        if one.parameters > chosen.parameters and gain > 0:
-            return "more parameters, and predicts images no better than chance"
         if found.candidate.within(self.pick):
             return f"too simple: predicts images worse, the parameters that it lacks have p = {found.p:.2g}"
-        return "predicts images worse"
+        how = "no better than chance" if gain > 0 else "worse"
+        if self.pick.within(found.candidate):
+            return f"too many parameters: predicts images {how}"
+        more = "more parameters, and " if one.parameters > chosen.parameters and gain > 0 else ""
+        return f"{more}predicts images {how}"
 
     def _mapping(self, own: Candidate, one: Prediction) -> CameraMapping:
         """The camera with the parameters by which images were predicted."""

@@ -60,6 +60,8 @@ class Prediction:
         Parameters that the images determine, without what is only regularised.
     variance : float
         ω: the variance of unit weight, or that of what images tell of the camera, if it is larger.
+    determined : bool
+        Whether the images determine all free parameters.
     values, covariance : ndarray (u,), (u, u)
         Estimates of all parameters, those that are not free zero; with this variance factor.
     """
@@ -69,6 +71,7 @@ class Prediction:
     cost: float
     parameters: float
     variance: float
+    determined: bool
     values: Array
     covariance: Array
 
@@ -167,7 +170,7 @@ class Information:
         return Prediction(
             self.offset + 0.5 * np.log(alone).sum(axis=1), q, cost - float(x @ x),
             basis.shape[1] - float(self.weight @ np.diag(found)), variance,
-            self.values + moved + basis @ x, variance * found,
+            basis.shape[1] == int(self._at(free).sum()), self.values + moved + basis @ x, variance * found,
         )  # fmt: skip
 
     def _at(self, free: Sequence[str]) -> Mask:
@@ -195,7 +198,9 @@ class Information:
         )
 
 
-def information_of(fit: BundleFit, camera: int = 0, model: str | None = None) -> Information | None:
+def information_of(
+    fit: BundleFit, camera: int = 0, model: str | None = None, views: Rows | None = None
+) -> Information | None:
     """Return what each image tells of the parameters of a camera, where the adjustment ended.
 
     Parameters
@@ -206,6 +211,8 @@ def information_of(fit: BundleFit, camera: int = 0, model: str | None = None) ->
         Row of the camera.
     model : str, optional
         Model of the parameters, of which that of the camera is a part, with the same order of parameters.
+    views : ndarray of int (m,), optional
+        View of each image (see :mod:`~reseau.bundle.diagnostics.views`); images of one view count as one.
 
     Returns
     -------
@@ -235,9 +242,11 @@ def information_of(fit: BundleFit, camera: int = 0, model: str | None = None) ->
         columns = others.eliminated(slopes)
         network = rest.unknowns.network
         of = network.image_of[rest.unknowns.order]
-        images = np.flatnonzero((network.camera_of == camera) & rest.usable.images)
+        own = (network.camera_of == camera) & rest.usable.images
+        view = np.where(own, np.arange(len(own)) if views is None else views, -1)[of]
         try:
-            parts = [others.image(rows, columns[rows]) for rows in (np.flatnonzero(of == i) for i in images)]
+            several = [np.flatnonzero(view == k) for k in np.unique(view[view >= 0])]
+            parts = [others.image(rows, columns[rows]) for rows in several]
         except np.linalg.LinAlgError:
             # Rounding: the rest is hardly determined.
             return None

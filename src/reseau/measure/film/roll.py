@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -55,6 +56,11 @@ class Roll:
     px_per_mm: float
     frames: int
     scatter_mm: tuple[float, float]
+
+    @property
+    def format_mm(self) -> tuple[float, float]:
+        """Width and height of its frames as they lie in the scans."""
+        return self.shape.width, self.shape.height
 
     def options(self, before: FrameOptions) -> FrameOptions:
         """Options for orienting other frames of this roll."""
@@ -162,21 +168,21 @@ def result_of(document: FrameOrientation) -> FrameResult:
     return result
 
 
-def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | Failure:
-    """Determine the common properties of frames of one roll, taken by one camera and scanned alike.
+def rolls_of(results: Sequence[FrameResult], dpi: float | None = None) -> tuple[Roll, ...]:
+    """Determine the common properties of the frames of each format, taken by one camera and scanned alike.
 
     Parameters
     ----------
     results : sequence of FrameResult
-        Frames of the roll; those that are oriented and agree with the majority are used.
+        Frames of one or more rolls; those that are oriented and agree with most of their format are used.
     dpi : float, optional
         Resolution, if it is known better than the format: it then defines the scale of the camera's corners.
         By default the mean sides of the frame are those of the format.
 
     Returns
     -------
-    Roll or Failure
-        A failure if fewer than four frames are oriented.
+    tuple of Roll
+        The roll of each format of which at least four frames are oriented, that of most frames first.
 
     Examples
     --------
@@ -184,22 +190,38 @@ def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | 
     >>> corners = np.array([[20.0, 20.0], [164.0, 20.0], [164.0, 116.0], [20.0, 116.0]])
     >>> lines = [Lines(corners + shift, 0.01 * np.eye(8), *np.zeros((7, 4)), 1.0, 8) for shift in range(4)]
     >>> frames = [FrameResult("", "oriented", "", (36.0, 24.0), "grey", each, {}) for each in lines]
-    >>> roll = roll_of(frames)
+    >>> (roll,) = rolls_of(frames)
     >>> roll.frames, roll.px_per_mm, roll.corners.xy()[1].round(6) + 0.0
     (4, 4.0, array([18., 12.]))
-    >>> roll_of(frames[:3]).code
-    <Code.TOO_FEW_IMAGES: 'too-few-images'>
+    >>> rolls_of(frames[:3])
+    ()
     """
-    # A frame that was oriented by the shape of the roll says nothing about it.
+    # A frame that was oriented by the shape of a roll says nothing about it.
     sure = [r for r in results if r.status == "oriented" and r.lines is not None and not r.roll_frames]
-    lying = [r.format_mm for r in sure]
-    most = max(set(lying), key=lying.count) if lying else None
-    sure = [r for r in sure if r.format_mm == most]
-    if len(sure) < _LEAST_FRAMES or most is None:
-        return Failure(
-            f"{len(sure)} oriented frames do not make a roll; {_LEAST_FRAMES} are needed", Code.TOO_FEW_IMAGES
-        )
-    nominal = FrameShape(*most)
+    number = Counter(r.format_mm for r in sure if r.format_mm is not None)
+    return tuple(
+        _roll([r for r in sure if r.format_mm == size], size, dpi)
+        for size, count in number.most_common()
+        if count >= _LEAST_FRAMES
+    )
+
+
+def corner_files(rolls: Sequence[Roll]) -> dict[str, FrameCorners]:
+    """Names of the files of the calibrated corners: with the formats where there are several rolls.
+
+    Examples
+    --------
+    >>> corner_files([])
+    {}
+    """
+    if len(rolls) == 1:
+        return {"corners.json": rolls[0].corners}
+    return {"corners-{:g}x{:g}.json".format(*each.format_mm): each.corners for each in rolls}
+
+
+def _roll(sure: list[FrameResult], size: tuple[float, float], dpi: float | None) -> Roll:
+    """The roll of oriented frames of one format."""
+    nominal = FrameShape(*size)
     corners = np.array([r.lines.corners for r in sure if r.lines is not None])
     scale = np.array([np.mean(r.px_per_mm or (1.0, 1.0)) for r in sure])
     known = scale if dpi is None else np.full(len(sure), dpi / 25.4)
@@ -221,7 +243,7 @@ def roll_of(results: Sequence[FrameResult], dpi: float | None = None) -> Roll | 
     # by the error of the mean: Student's distribution, with its standard deviation.
     wider = float(np.sqrt((1 + 1 / n) * (n - 1) / max(n - 3, 0.5)))
     shape = FrameShape(
-        *most,
+        *size,
         wider * max(float(own[3]), _LEAST_ASPECT),
         wider * max(float(own[:3].max()), _LEAST_ANGLE),
         deviation,  # type: ignore[arg-type]

@@ -52,7 +52,9 @@ def plane_through(at: Array, xy: Array, shape: tuple[int, int], rough_px: float 
 
 
 def _rms(mapping: Chain, at: Array, xy: Array) -> float:
-    return float(np.sqrt(((images_of(mapping, at) - xy) ** 2).mean()))
+    """Root mean square of what a mapping leaves; infinite where it shows a point nowhere."""
+    left = float(np.sqrt(((images_of(mapping, at) - xy) ** 2).mean()))
+    return left if np.isfinite(left) else np.inf
 
 
 def polynomial_through(

@@ -31,7 +31,8 @@ def refit(mapping: Chain, at: Array, xy: Array, sigma_px: float) -> Chain:
     Parameters
     ----------
     at, xy : ndarray (n, 2)
-        Lattice coordinates and images; the degree grows with their number, up to the fifth.
+        Lattice coordinates and images; the degree grows with their number, up to the fifth. Those that the
+        projectivity takes beyond the horizon say nothing.
     sigma_px : float
         Standard deviation of the images.
     """
@@ -39,6 +40,11 @@ def refit(mapping: Chain, at: Array, xy: Array, sigma_px: float) -> Chain:
     before = degree_of(mapping) if len(at) > len(mapping.second.values) // 2 else 1
     mapping = of_degree(mapping, max(before, trend_degree(len(at))))
     monomials, straight = monomials_of(mapping, at)
+    seen = np.isfinite(straight).all(axis=1) & np.isfinite(monomials).all(axis=1)
+    if not seen.all():
+        if seen.sum() <= monomials.shape[1]:
+            return mapping
+        at, xy, straight, monomials = at[seen], xy[seen], straight[seen], monomials[seen]
     observed = (xy - straight).T
     fit, residuals = _solved(mapping, monomials, observed, sigma_px)
     common = common_part(at, residuals.T)

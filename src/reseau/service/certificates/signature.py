@@ -14,7 +14,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ...core.errors import FormatError, InputError, UsageError
+from ...core.errors import FormatError, UsageError
+from ...core.files import readable
 from ...core.optional import optional
 
 DS = "http://www.w3.org/2000/09/xmldsig#"
@@ -179,7 +180,8 @@ def read_pem(path: Path) -> bytes:
     InputError
         If the file cannot be read, or has none.
     """
-    text = _read(path).decode("ascii", "replace")
+    with readable(path):
+        text = path.read_bytes().decode("ascii", "replace")
     _, begin, rest = text.partition("-----BEGIN CERTIFICATE-----")
     body, end, _ = rest.partition("-----END CERTIFICATE-----")
     try:
@@ -192,20 +194,14 @@ def read_pem(path: Path) -> bytes:
 
 def _private(path: Path, password: str | None) -> Any:
     xmlsec, _ = _modules()
-    content = _read(path)
+    with readable(path):
+        content = path.read_bytes()
     if b"ENCRYPTED" in content and password is None:
         raise UsageError("has a password", where=path, do="set RESEAU_KEY_PASSWORD")
     try:
         return xmlsec.Key.from_memory(content, xmlsec.constants.KeyDataFormatPem, password)
     except (xmlsec.Error, ValueError):
         raise FormatError("is not a private key (PEM), or its password is wrong", where=path) from None
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
 
 
 def _modules() -> tuple[Any, Any]:

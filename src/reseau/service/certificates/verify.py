@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ...core.errors import FormatError, InputError, UsageError
+from ...core.errors import FormatError, UsageError
+from ...core.files import readable
 from ...core.optional import optional
 from .dcc import DCC, SI
 from .page import attached, pages_digest
@@ -76,10 +77,8 @@ def verify(path: Path, *, schema: Path | None = None, trusted: Sequence[Path] = 
     with optional():
         from lxml import etree
 
-    try:
+    with readable(path):
         content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path) from None
     pdf = content if content.startswith(b"%PDF") else None
     xml = content if pdf is None else attached(pdf, path)
     found: list[Verdict] = []
