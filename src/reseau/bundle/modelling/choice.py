@@ -499,7 +499,7 @@ class _Search:
     def _look_again(self) -> None:
         """Which images are one view, now that a model fits better: what it left made others look alike."""
         views = views_of(self.best.fit)
-        if not np.array_equal(views, self.views):
+        if self.views is None or not np.array_equal(views, self.views):
             self.views, every = views, self.adjusted
             self.adjusted = {}
             for candidate, each in every.items():
